@@ -1,0 +1,24 @@
+# make setup | demo | test | lint | bench. The environment is .venv; everything else is in pyproject.toml.
+PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || echo python3.11)
+BIN := .venv/bin
+NATIVE := $(wildcard native/* native/*/*) CMakeLists.txt
+UV_VERSION := 0.13.8
+
+.PHONY: setup build demo test lint format bench lock clean
+setup: .venv/.built
+
+.venv/.packages: requirements/lock.txt
+	@command -v $(PYTHON) >/dev/null || { echo "mien needs Python 3.11 or 3.12: install it, or run 'make PYTHON=/path/to/python3.11 ...'"; exit 1; }
+	@command -v $${CXX:-g++} >/dev/null || { echo "mien needs a C++20 compiler: install g++ 11 or newer"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	test -x $(BIN)/uv || $(BIN)/python -m pip install --disable-pip-version-check uv==$(UV_VERSION)
+	@echo "Installing packages (torch alone is about 3 GB to download; this is the long part) ..."
+	VIRTUAL_ENV=.venv $(BIN)/uv pip sync --require-hashes requirements/lock.txt
+	touch $@
+
+# An editable install: Python from src/, the native core built into .venv.
+.venv/.built: .venv/.packages pyproject.toml $(NATIVE)
+	VIRTUAL_ENV=.venv $(BIN)/uv pip install --no-build-isolation --no-deps --reinstall-package mien -e .
+	touch $@
+
+build: setup

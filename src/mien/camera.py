@@ -1,0 +1,87 @@
+"""The pinhole camera, and the only conversions from other camera conventions (docs/conventions.md)."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.rotation import invert_rigid, rigid_transform
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera with OpenCV axes: +x right, +y down, +z forward.
+
+    Pixel (i, j), column i and row j, has its centre at (i + .5, j + .5).
+    """
+
+    K: Float[Tensor, "3 3"]
+    """Intrinsics in pixels."""
+    viewmat: Float[Tensor, "4 4"]
+    """T_camera_world, in metres."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+
+    @property
+    def position(self) -> Float[Tensor, " 3"]:
+        """The camera's centre in world space, metres."""
+        return invert_rigid(self.viewmat)[:3, 3]
+
+    def to(self, like: Tensor) -> "Camera":
+        """The same camera with the dtype and device of `like`."""
+        return replace(self, K=self.K.to(like), viewmat=self.viewmat.to(like))
+
+    def in_frame(self, T_world_local: Float[Tensor, "4 4"]) -> "Camera":
+        """The camera as seen from a local frame: it views local points as `self` views them in world space."""
+        return replace(self, viewmat=self.viewmat @ T_world_local)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view with another number of pixels."""
+        scale = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
+        return replace(self, K=self.K * scale[:, None], width=width, height=height)
+
+    def cropped(self, left: float, top: float, width: int, height: int) -> "Camera":
+        """The part of the view whose top left corner is at (left, top) pixels; it may reach outside."""
+        K = self.K.clone()
+        K[0, 2] -= left
+        K[1, 2] -= top
+        return replace(self, K=K, width=width, height=height)
+
+    def project(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 2"], Float[Tensor, "*b"]]:
+        """Pixel positions and depths (camera z, metres; not positive behind the camera) of world-space points.
+
+        Differentiable in `points`, `K` and `viewmat`.
+        """
+        in_camera = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        depth = in_camera[..., 2]
+        pixels = (in_camera @ self.K.T)[..., :2] / depth[..., None]
+        return pixels, depth
+
+
+def camera_from_fov(fov_x: float, width: int, height: int, viewmat: Float[Tensor, "4 4"] | None = None) -> Camera:
+    """A camera with square pixels, its principal point at the centre, and a horizontal field of view in radians."""
+    focal = 0.5 * width / math.tan(0.5 * fov_x)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Camera(K, torch.eye(4) if viewmat is None else viewmat, width, height)
+
+
+def camera_from_opengl(
+    T_world_camera: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int
+) -> Camera:
+    """A camera given by an OpenGL camera-to-world matrix (+x right, +y up, +z backward), as in NeRF data sets."""
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).to(T_world_camera)
+    return Camera(K, invert_rigid(T_world_camera @ flip), width, height)
+
+
+def look_at(
+    position: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]
+) -> Float[Tensor, "4 4"]:
+    """The viewmat of a camera at `position` that looks at `target`; `up` points upwards in the picture."""
+    forward = torch.nn.functional.normalize(target - position, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+    down = torch.linalg.cross(forward, right)
+    return invert_rigid(rigid_transform(torch.stack([right, down, forward], dim=-1), position))

@@ -1,0 +1,163 @@
+"""FaceModel: a linear head model with skinned joints, the same for every source (anny, FLAME, ICT, GNM)."""
+
+import hashlib
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien.face.params import FaceParams
+from mien.rotation import matrix_from_axis_angle, rigid_transform
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """l landmarks as points on a mesh's triangles."""
+
+    faces: Int[Tensor, " l"]
+    """Triangle of each landmark."""
+    barycentric: Float[Tensor, "l 3"]
+    """Weights of that triangle's vertices; they sum to 1."""
+
+    def positions(self, vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "*b l 3"]:
+        """Where the landmarks are on a mesh with these vertices."""
+        corners = vertices[..., faces[self.faces], :]
+        return (corners * self.barycentric[:, :, None].to(vertices)).sum(-2)
+
+
+@dataclass(frozen=True, eq=False)
+class FaceModel:
+    """A head: template + identity + expression + pose correctives, then linear blend skinning.
+
+    All lengths are metres, in the head frame: +x to the subject's left, +y up, +z ahead, origin about between the ears.
+    Joint 0 is `head`; it sits at the origin and its motion is the head pose itself (`FaceParams.T_world_head`).
+    Other joints move relative to their parent. A joint's motion is free (a row of `FaceParams.joints`) or derived
+    from the expression, never both: a derived joint (a jaw that follows `jawOpen`) turns by
+    `joint_rotation_basis` and shifts by `joint_translation_basis`, both linear in the expression.
+    """
+
+    name: str
+    template: Float[Tensor, "v 3"]
+    faces: Int[Tensor, "f 3"]
+    """Counter-clockwise seen from outside."""
+    uv: Float[Tensor, "u 2"]
+    """Texture coordinates, 0..1, v upwards."""
+    uv_faces: Int[Tensor, "f 3"]
+    """Indices into `uv`."""
+    region_names: tuple[str, ...]
+    """Of skin, lips, eyelids, eyes, teeth, tongue, mouth, scalp, ears, nose, brows, neck, ... what the model knows."""
+    face_regions: Int[Tensor, " f"]
+    """Index into `region_names` of every triangle."""
+    identity_basis: Float[Tensor, "i v 3"]
+    expression_basis: Float[Tensor, "e v 3"]
+    expression_names: tuple[str, ...]
+    expression_bounds: Float[Tensor, "e 2"]
+    """Lower and upper bound for trackers; equal bounds pin a coefficient."""
+    joint_names: tuple[str, ...]
+    joint_parents: tuple[int, ...]
+    """-1 for the head; parents come before children."""
+    joint_free: tuple[bool, ...]
+    """False for the head and for derived joints."""
+    joint_template: Float[Tensor, "k 3"]
+    """Rest positions."""
+    joint_identity_basis: Float[Tensor, "i k 3"]
+    joint_rotation_basis: Float[Tensor, "e k 3"]
+    """Derived axis-angle a unit of expression, radians."""
+    joint_translation_basis: Float[Tensor, "e k 3"]
+    """Derived shift a unit of expression, metres."""
+    skinning_weights: Float[Tensor, "v k"]
+    landmarks: dict[str, Landmarks]
+    """`mediapipe` (478 points) and `ibug68` (300-W's 68 points)."""
+    pose_basis: Float[Tensor, "p v 3"] | None = None
+    """Pose correctives: p = 9 per free joint, times (R - I) of that joint."""
+
+    @cached_property
+    def content_hash(self) -> str:
+        """SHA-256 over all that decides where vertices are, as 16 hex digits; landmarks and regions do not count."""
+        digest = hashlib.sha256()
+        geometry = (
+            "template", "faces", "identity_basis", "expression_basis", "joint_template", "joint_identity_basis",
+            "joint_rotation_basis", "joint_translation_basis", "skinning_weights", "pose_basis",
+        )  # fmt: skip
+        for name in geometry:
+            tensor = getattr(self, name)
+            if tensor is not None:
+                digest.update(name.encode() + str(tuple(tensor.shape)).encode())
+                digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+        digest.update("|".join((*self.expression_names, *self.joint_names)).encode())
+        return digest.hexdigest()[:16]
+
+    @property
+    def free_joint_names(self) -> tuple[str, ...]:
+        """Names of the rows of `FaceParams.joints`."""
+        return tuple(name for name, free in zip(self.joint_names, self.joint_free, strict=True) if free)
+
+    def neutral(self, timesteps: int = 1) -> FaceParams:
+        """The mean person at rest at the world's origin."""
+        like = self.template
+        return FaceParams(
+            identity=like.new_zeros(self.identity_basis.shape[0]),
+            expression=like.new_zeros(timesteps, self.expression_basis.shape[0]),
+            joints=like.new_zeros(timesteps, len(self.free_joint_names), 3),
+            head_rotation=like.new_zeros(timesteps, 3),
+            head_translation=like.new_zeros(timesteps, 3),
+        )
+
+    def region_mask(self, *names: str) -> Bool[Tensor, " f"]:
+        """Which triangles belong to any of the named regions (names that the model lacks match nothing)."""
+        wanted = [index for index, name in enumerate(self.region_names) if name in names]
+        return torch.isin(self.face_regions, torch.tensor(wanted, dtype=self.face_regions.dtype))
+
+    def __call__(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
+        """Vertices in world space, metres. Differentiable in every field of `face`."""
+        in_head = self.head_vertices(face)
+        pose = face.T_world_head
+        return in_head @ pose[:, :3, :3].transpose(-1, -2) + pose[:, None, :3, 3]
+
+    def head_vertices(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
+        """Vertices in the head frame, metres. Differentiable in every field of `face` but the head pose."""
+        rest = self.template + torch.einsum("i,ivc->vc", face.identity, self.identity_basis)
+        if face.vertex_offsets is not None:
+            rest = rest + face.vertex_offsets
+        e, v = self.expression_basis.shape[:2]
+        shaped = rest + (face.expression @ self.expression_basis.reshape(e, v * 3)).reshape(-1, v, 3)
+        if self.pose_basis is not None:
+            turned = matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)
+            shaped = shaped + torch.einsum("bp,pvc->bvc", turned.flatten(1), self.pose_basis)
+        transforms = self.joint_transforms(face)
+        moved = torch.einsum("vk,bkrc->bvrc", self.skinning_weights, transforms[:, :, :3])
+        return (moved[..., :3] @ shaped[..., None])[..., 0] + moved[..., 3]
+
+    def joint_transforms(self, face: FaceParams) -> Float[Tensor, "b k 4 4"]:
+        """What each joint does to points of the rest pose, in the head frame; the head's own is the identity."""
+        rest = self.joint_template + torch.einsum("i,ikc->kc", face.identity, self.joint_identity_basis)
+        rotation = torch.einsum("be,ekc->bkc", face.expression, self.joint_rotation_basis)
+        shift = torch.einsum("be,ekc->bkc", face.expression, self.joint_translation_basis)
+        free = [index for index, is_free in enumerate(self.joint_free) if is_free]
+        rotation = rotation.index_copy(1, torch.tensor(free, dtype=torch.long, device=rest.device), face.joints)
+        matrices = matrix_from_axis_angle(rotation)
+        # About the joint: x -> R (x - rest) + rest + shift.
+        about = rest + shift - (matrices @ rest[:, :, None])[..., 0]
+        local = rigid_transform(matrices, about)
+        chained: list[Tensor] = []
+        for index, parent in enumerate(self.joint_parents):
+            chained.append(local[:, index] if parent < 0 else chained[parent] @ local[:, index])
+        return torch.stack(chained, dim=1)
+
+    def landmark_positions(self, vertices: Float[Tensor, "*b v 3"], name: str) -> Float[Tensor, "*b l 3"]:
+        """A named landmark set on a posed mesh."""
+        return self.landmarks[name].positions(vertices, self.faces)
+
+    def to(self, like: Tensor) -> "FaceModel":
+        """The same model with the float dtype and the device of `like`."""
+
+        def move(value: object) -> object:
+            if isinstance(value, Tensor):
+                return value.to(like) if value.is_floating_point() else value.to(like.device)
+            return value
+
+        moved = {f.name: move(getattr(self, f.name)) for f in fields(self) if f.name != "landmarks"}
+        marks = {k: Landmarks(m.faces.to(like.device), m.barycentric.to(like)) for k, m in self.landmarks.items()}
+        return replace(self, **moved, landmarks=marks)  # type: ignore[arg-type]

@@ -1,0 +1,95 @@
+"""Activated 3D Gaussians: the value object that renderers take."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """n activated Gaussians, with a leading batch axis where timesteps differ (an axis that is absent is shared)."""
+
+    means: Float[Tensor, "... n 3"]
+    """Centres in the local frame, metres."""
+    quats: Float[Tensor, "... n 4"]
+    """Rotations, wxyz; renderers normalise them."""
+    scales: Float[Tensor, "... n 3"]
+    """Standard deviations along the rotated axes, metres, positive."""
+    opacities: Float[Tensor, "... n"]
+    """0..1."""
+    sh: Float[Tensor, "... n k 3"]
+    """Real spherical-harmonics coefficients of the colour (k = 1, 4, 9 or 16) in the local frame."""
+    T_world_local: Float[Tensor, "... 4 4"] | None = None
+    """Rigid pose of the local frame; None means identity. Renderers move the camera by it, not the Gaussians."""
+
+    def __len__(self) -> int:
+        """The number of Gaussians, n."""
+        return self.means.shape[-2]
+
+    @property
+    def batched(self) -> bool:
+        """Whether there is a leading axis of timesteps."""
+        return any(t.ndim > ndim for t, ndim in self._tensors_with_ndim())
+
+    def timestep(self, index: int) -> "Gaussians":
+        """One entry of the batch axis (entries without that axis are shared); unbatched Gaussians return themselves."""
+        if not self.batched:
+            return self
+        names = ("means", "quats", "scales", "opacities", "sh", "T_world_local")
+        picked = {
+            name: tensor[index] if tensor.ndim > ndim else tensor
+            for name, (tensor, ndim) in zip(names, self._tensors_with_ndim(), strict=False)
+        }
+        return Gaussians(**picked)
+
+    def select(self, mask: Tensor) -> "Gaussians":
+        """The Gaussians where a bool mask [n] holds, or at the given indices."""
+        return replace(
+            self,
+            means=self.means[..., mask, :],
+            quats=self.quats[..., mask, :],
+            scales=self.scales[..., mask, :],
+            opacities=self.opacities[..., mask],
+            sh=self.sh[..., mask, :, :],
+        )
+
+    def to(self, like: Tensor) -> "Gaussians":
+        """The same Gaussians with the dtype and device of `like`."""
+        pose = None if self.T_world_local is None else self.T_world_local.to(like)
+        moved = (t.to(like) for t in (self.means, self.quats, self.scales, self.opacities, self.sh))
+        return Gaussians(*moved, T_world_local=pose)
+
+    def detach(self) -> "Gaussians":
+        """The same values, cut from the autograd graph."""
+        pose = None if self.T_world_local is None else self.T_world_local.detach()
+        cut = (t.detach() for t in (self.means, self.quats, self.scales, self.opacities, self.sh))
+        return Gaussians(*cut, T_world_local=pose)
+
+    def _tensors_with_ndim(self) -> list[tuple[Tensor, int]]:
+        """Each tensor that is there with its number of axes when unbatched, in the order of the fields."""
+        entries = [(self.means, 2), (self.quats, 2), (self.scales, 2), (self.opacities, 1), (self.sh, 3)]
+        return entries if self.T_world_local is None else [*entries, (self.T_world_local, 2)]
+
+
+def world_means(gaussians: Gaussians) -> Float[Tensor, "... n 3"]:
+    """Centres in world space, metres."""
+    if gaussians.T_world_local is None:
+        return gaussians.means
+    rotation = gaussians.T_world_local[..., :3, :3]
+    return gaussians.means @ rotation.transpose(-1, -2) + gaussians.T_world_local[..., None, :3, 3]
+
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * coefficient."""
+
+
+def sh_from_rgb(rgb: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+    """Constant SH coefficients whose colour is `rgb` (0..1)."""
+    return (rgb - 0.5) / SH_C0
+
+
+def rgb_from_sh(dc: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+    """Colours of constant SH coefficients, clamped at 0 from below as renderers do."""
+    return torch.clamp_min(dc * SH_C0 + 0.5, 0)

@@ -1,0 +1,84 @@
+"""Progress bars with an ETA for long work; quiet where the output is no terminal, but never silent."""
+
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Protocol, TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+Item = TypeVar("Item")
+console = Console(stderr=True, highlight=False)
+"""Where people read: standard error, so that standard output stays for results."""
+
+_PLAIN_INTERVAL_SECONDS = 10.0
+
+
+class Advance(Protocol):
+    """Moves a progress bar on."""
+
+    def __call__(self, amount: int = 1, status: str = "") -> None:
+        """Advance by `amount` and show `status` behind the bar."""
+        ...
+
+
+@contextmanager
+def progress_bar(title: str, total: int, completed: int = 0) -> Iterator[Advance]:
+    """A bar from `completed` to `total`; into a log file it prints a line every ten seconds instead."""
+    if not sys.stderr.isatty():
+        with _plain_progress(title, total, completed) as advance:
+            yield advance
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("ETA"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[status]}"),
+    )
+    with Progress(*columns, console=console, refresh_per_second=5) as bars:
+        task = bars.add_task(title, total=total, completed=completed, status="")
+
+        def advance(amount: int = 1, status: str = "") -> None:
+            bars.update(task, advance=amount, **({"status": status} if status else {}))
+
+        yield advance
+
+
+@contextmanager
+def _plain_progress(title: str, total: int, completed: int) -> Iterator[Advance]:
+    start = last = time.monotonic()
+    done, latest = completed, ""
+
+    def report() -> None:
+        elapsed = time.monotonic() - start
+        rate = (done - completed) / elapsed if elapsed > 0 else 0.0
+        eta = f", ETA {(total - done) / rate:.0f} s" if rate > 0 and done < total else ""
+        print(f"{title}: {done}/{total} in {elapsed:.0f} s{eta} {latest}".rstrip(), file=sys.stderr, flush=True)
+
+    def advance(amount: int = 1, status: str = "") -> None:
+        nonlocal done, last, latest
+        done, latest = done + amount, status or latest
+        if time.monotonic() - last >= _PLAIN_INTERVAL_SECONDS:
+            last = time.monotonic()
+            report()
+
+    yield advance
+    report()
+
+
+def track_progress(items: Iterable[Item], title: str, total: int) -> Iterator[Item]:
+    """Iterate with a progress bar."""
+    with progress_bar(title, total) as advance:
+        for item in items:
+            yield item
+            advance()
+
+
+def say(message: str) -> None:
+    """One line for people, on standard error."""
+    console.print(message, markup=False, soft_wrap=True)

@@ -1,0 +1,114 @@
+"""Rotations: axis-angle, matrices and wxyz quaternions, batched over leading axes."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+# Below this angle (radians, squared) the closed forms lose digits and their Taylor series take over.
+_SMALL_ANGLE_SQUARED = 1e-8
+
+
+def skew(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Cross-product matrices: `skew(a) @ b == cross(a, b)`."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = (zero, -z, y, z, zero, -x, -y, x, zero)
+    return torch.stack(rows, dim=-1).reshape(*vectors.shape[:-1], 3, 3)
+
+
+def matrix_from_axis_angle(axis_angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation matrices of axis-angle vectors in radians (Rodrigues' formula); smooth at zero."""
+    squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
+    small = squared < _SMALL_ANGLE_SQUARED
+    safe = torch.where(small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    sine = torch.where(small, 1 - squared / 6, angle.sin() / angle)
+    cosine = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
+    cross = skew(axis_angle)
+    identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
+    return identity + sine * cross + cosine * (cross @ cross)
+
+
+def axis_angle_from_matrix(matrices: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Axis-angle vectors, angle in 0..pi, of rotation matrices."""
+    return axis_angle_from_quaternion(quaternion_from_matrix(matrices))
+
+
+def axis_angle_from_quaternion(quats: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3"]:
+    """Axis-angle vectors, angle in 0..pi, of unit wxyz quaternions."""
+    quats = torch.where(quats[..., :1] < 0, -quats, quats)
+    real, imaginary = quats[..., 0], quats[..., 1:]
+    squared = (imaginary * imaginary).sum(-1)
+    small = squared < _SMALL_ANGLE_SQUARED
+    norm = torch.where(small, torch.ones_like(squared), squared).sqrt()
+    factor = torch.where(small, 2 / real.clamp_min(0.5), 2 * torch.atan2(norm, real) / norm)
+    return imaginary * factor[..., None]
+
+
+def matrix_from_quaternion(quats: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation matrices of wxyz quaternions, which are normalised first."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def quaternion_from_matrix(matrices: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
+    """Unit wxyz quaternions of rotation matrices.
+
+    Of the four equivalent formulas each matrix uses the one with the largest divisor, so that it is well
+    conditioned everywhere, with finite gradients. The sign is arbitrary.
+    """
+    m = matrices
+    m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    # Four candidates, each four times the quaternion times one of its own components.
+    candidates = torch.stack(
+        [
+            torch.stack([1 + m00 + m11 + m22, m[..., 2, 1] - m[..., 1, 2],
+                         m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1),
+            torch.stack([m[..., 2, 1] - m[..., 1, 2], 1 + m00 - m11 - m22,
+                         m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0]], -1),
+            torch.stack([m[..., 0, 2] - m[..., 2, 0], m[..., 0, 1] + m[..., 1, 0],
+                         1 - m00 + m11 - m22, m[..., 1, 2] + m[..., 2, 1]], -1),
+            torch.stack([m[..., 1, 0] - m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0],
+                         m[..., 1, 2] + m[..., 2, 1], 1 - m00 - m11 + m22], -1),
+        ],
+        dim=-2,
+    )  # fmt: skip
+    best = candidates.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    index = best[..., None, None].expand(*best.shape, 1, 4)
+    return torch.nn.functional.normalize(candidates.gather(-2, index).squeeze(-2), dim=-1)
+
+
+def multiply_quaternions(first: Float[Tensor, "*b 4"], second: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
+    """Hamilton product: rotate by `second`, then by `first`."""
+    w1, x1, y1, z1 = first.unbind(-1)
+    w2, x2, y2, z2 = second.unbind(-1)
+    return torch.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        dim=-1,
+    )
+
+
+def rigid_transform(
+    rotations: Float[Tensor, "*b 3 3"], translations: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 4 4"]:
+    """Homogeneous matrices that rotate, then translate."""
+    top = torch.cat([rotations, translations[..., None]], dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 0, 3] = 1
+    return torch.cat([top, bottom], dim=-2)
+
+
+def invert_rigid(transforms: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Inverses of rigid transforms, exact and cheaper than a general inverse."""
+    inverse_rotation = transforms[..., :3, :3].transpose(-1, -2)
+    return rigid_transform(inverse_rotation, -(inverse_rotation @ transforms[..., :3, 3:])[..., 0])

@@ -1,0 +1,34 @@
+"""Tracking: the face model fitted to a capture."""
+
+from dataclasses import dataclass, field
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.face import FaceParams
+
+
+@dataclass(frozen=True, eq=False)
+class Tracking:
+    """Face parameters and cameras of one sequence of t timesteps and c cameras.
+
+    With one camera the world frame is the camera's with y up and z backward (viewmat = diag(1, -1, -1, 1)): a face that
+    looks into the camera has a head rotation of about zero.
+    """
+
+    face_model: str
+    """Name, for `mien.face.load_face_model`."""
+    face_model_hash: str
+    """`FaceModel.content_hash` it was fitted with."""
+    face: FaceParams
+    """All t timesteps; where `valid` is False, interpolated from the neighbours."""
+    valid: Bool[Tensor, " t"]
+    cameras: tuple[Camera, ...]
+    """One a camera_id, for pictures of the capture's size."""
+    neck_lines: Float[Tensor, "t c 3"]
+    """(a, b, d) with a^2 + b^2 = 1: pixels with a x + b y + d >= 0 are above the neck line, and kept."""
+    residuals: Float[Tensor, "t c"]
+    """Median distance of landmarks from their fit, pixels; NaN where not valid."""
+    settings: dict = field(default_factory=dict)
+    """How it was made, for the report."""
