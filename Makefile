@@ -22,3 +22,31 @@ setup: .venv/.built
 	touch $@
 
 build: setup
+
+demo: setup
+	$(BIN)/mien demo --out out/demo
+
+test: setup
+	MIEN_THREADS=2 $(BIN)/pytest
+
+lint: setup
+	$(BIN)/ruff check src tests
+	$(BIN)/ruff format --check src tests
+	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h)
+	$(BIN)/typos
+	$(BIN)/lint-imports
+	$(BIN)/pyright
+
+format: setup
+	$(BIN)/ruff check --fix src tests
+	$(BIN)/ruff format src tests
+	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h)
+
+# Re-resolve the locked requirements (both Pythons, every platform) after a change in pyproject.toml or overrides.txt.
+lock: .venv/.packages
+	$(BIN)/uv pip compile pyproject.toml --group dev --overrides requirements/overrides.txt --universal \
+	  --python-version 3.11 --generate-hashes --no-emit-index-url --custom-compile-command "make lock" \
+	  -o requirements/lock.txt
+
+clean:
+	rm -rf build out .venv

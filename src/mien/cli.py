@@ -1,0 +1,109 @@
+"""The command line: picks the sub-command, loads only what it needs, turns errors into one line."""
+
+import importlib
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+import mien
+from mien.errors import UserError
+
+COMMANDS = {
+    "create": "video in, avatar, report and metrics out: all stages in one command",
+    "capture": "a video (or a folder of pictures) -> frames, mattes, landmarks",
+    "track": "capture -> face parameters, cameras, overlay video",
+    "train": "captures + trackings -> an avatar, by the method of your choice",
+    "evaluate": "avatar -> metrics.json and report.html on held-out frames",
+    "render": "avatar -> a turntable or a still, with any expression",
+    "drive": "avatar + another sequence's motion -> mp4",
+    "export": "avatar at one expression -> standard 3D Gaussian .ply",
+    "face-models": "list the face models and bake them ahead of time",
+    "demo": "the whole path on a synthetic head, in minutes: start here",
+}
+"""Name -> summary; `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command` with `run()`."""
+
+EXIT_USER_ERROR = 2
+EXIT_INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one sub-command; returns the exit code: 0, 2 for the user's mistakes, 1 for ours, 130 after Ctrl-C."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if arguments else EXIT_USER_ERROR
+    if arguments[0] == "--version":
+        print(f"mien {mien.__version__}")
+        return 0
+    name, rest = arguments[0], arguments[1:]
+    if name not in COMMANDS:
+        return _complain(f"no sub-command {name!r}; there are: {', '.join(COMMANDS)}")
+    try:
+        return _run(name, rest)
+    except UserError as error:
+        return _complain(str(error))
+    except KeyboardInterrupt:
+        print("mien: stopped; the same command goes on where it was", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        return 0
+    except Exception:
+        log = _write_crash_log()
+        print(
+            f"mien: this is a bug in mien, not your mistake: {traceback.format_exc().splitlines()[-1]}\n"
+            f"mien: the traceback is in {log}; please report it with the command",
+            file=sys.stderr,
+        )
+        return 1
+
+
+def _run(name: str, rest: list[str]) -> int:
+    import tyro
+
+    module = importlib.import_module("mien.commands." + name.replace("-", "_"))
+    _use_one_torch_thread()
+    command = tyro.cli(
+        module.Command,
+        prog=f"mien {name}",
+        description=module.Command.__doc__,
+        args=rest,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    command.run()
+    return 0
+
+
+def _use_one_torch_thread() -> None:
+    """torch's thread pool and mien's native one stall each other: torch keeps one thread, native ops take the cores."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _overview() -> str:
+    width = max(len(name) for name in COMMANDS)
+    rows = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items())
+    return (
+        f"mien {mien.__version__}: video of a head in, an animatable avatar of 3D Gaussians out.\n\n"
+        f"usage: mien COMMAND [options]      mien COMMAND --help\n\n{rows}\n\n"
+        "First steps:  mien demo    |    mien create my_video.mp4 --out my_avatar"
+    )
+
+
+def _complain(message: str) -> int:
+    print(f"mien: {message}", file=sys.stderr)
+    return EXIT_USER_ERROR
+
+
+def _write_crash_log() -> Path:
+    handle, name = tempfile.mkstemp(prefix="mien-crash-", suffix=".log")
+    with os.fdopen(handle, "w", encoding="utf-8") as log:
+        log.write(f"mien {mien.__version__}\n{' '.join(sys.argv)}\n\n{traceback.format_exc()}")
+    return Path(name)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The sub-commands: one file each, a dataclass of arguments with `run()`."""

@@ -1,0 +1,70 @@
+"""Where things lie on disk: one workspace folder is one subject (design: sequences/NAME/..., runs/NAME/)."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mien.errors import UserError
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """`root/sequences/NAME/{capture,tracking,scoring}/` and `root/runs/NAME/`."""
+
+    root: Path
+
+    def sequence_dir(self, name: str) -> Path:
+        """Folder of one sequence."""
+        return self.root / "sequences" / name
+
+    def run_dir(self, name: str) -> Path:
+        """Folder of one training run."""
+        return self.root / "runs" / name
+
+    def sequence_names(self) -> list[str]:
+        """Names of the sequences that were captured, sorted."""
+        return sorted(p.parent.parent.name for p in self.root.glob("sequences/*/capture/capture.json"))
+
+    def run_names(self) -> list[str]:
+        """Names of the runs, sorted."""
+        return sorted(p.parent.name for p in self.root.glob("runs/*/config.json"))
+
+    def pick_sequence(self, name: str | None) -> str:
+        """`name`, or the only sequence there is.
+
+        Raises:
+            UserError: there is none, several and no name, or none of that name.
+        """
+        return _pick("sequence", name, self.sequence_names(), self.root, "--sequence")
+
+    def pick_run(self, name: str | None) -> str:
+        """`name`, or the only run there is.
+
+        Raises:
+            UserError: there is none, several and no name, or none of that name.
+        """
+        return _pick("run", name, self.run_names(), self.root, "--run")
+
+
+def open_workspace(root: Path) -> Workspace:
+    """An existing workspace.
+
+    Raises:
+        UserError: the folder is not there or holds no sequences and no runs.
+    """
+    workspace = Workspace(root)
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder; make a workspace with `mien create VIDEO --out {root}`")
+    if not workspace.sequence_names() and not workspace.run_names():
+        raise UserError(f"{root}: not a mien workspace (no sequences/NAME/capture, no runs/NAME); see `mien create --help`")
+    return workspace
+
+
+def _pick(kind: str, name: str | None, names: list[str], root: Path, option: str) -> str:
+    if name is None and len(names) == 1:
+        return names[0]
+    listed = ", ".join(names) or "none"
+    if name is None:
+        raise UserError(f"{root}: which {kind}? There are: {listed}; name one with {option} NAME")
+    if name not in names:
+        raise UserError(f"{root}: no {kind} {name!r}; there are: {listed}")
+    return name
