@@ -1,0 +1,98 @@
+"""Image metrics: pure functions of float32 RGB images in 0..1; what is averaged over is an argument."""
+
+import torch
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
+
+PSNR_LIMIT = 100.0
+"""Decibels given to identical images, so that results stay finite."""
+_WINDOW_SIZE, _WINDOW_SIGMA = 11, 1.5
+_C1, _C2 = 0.01**2, 0.03**2
+
+Box = tuple[int, int, int, int]
+"""left, top, width, height in pixels."""
+
+
+def crop_to(image: Shaped[Tensor, "h w *c"], box: Box | None) -> Shaped[Tensor, "y x *c"]:
+    """The part of an image inside `box`, cut at the image's border; all of it where the box is None."""
+    if box is None:
+        return image
+    left, top, width, height = box
+    cut = image[max(top, 0) : max(top + height, 0), max(left, 0) : max(left + width, 0)]
+    assert cut.shape[0] > 0, f"box {box} does not meet the {image.shape[1]}x{image.shape[0]} image"
+    assert cut.shape[1] > 0, f"box {box} does not meet the {image.shape[1]}x{image.shape[0]} image"
+    return cut
+
+
+def l1(
+    image: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"],
+    box: Box | None = None,
+    mask: Bool[Tensor, "h w"] | None = None,
+) -> float:
+    """Mean absolute difference over the channels of the pixels in `box` where `mask` holds, 0..1."""
+    return float(_mean((crop_to(image, box) - crop_to(target, box)).abs(), box, mask))
+
+
+def psnr(
+    image: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"],
+    box: Box | None = None,
+    mask: Bool[Tensor, "h w"] | None = None,
+) -> float:
+    """Peak signal-to-noise ratio in dB for a peak of 1: -10 log10 of the squared difference's mean.
+
+    The mean is over the channels of the pixels in `box` where `mask` holds; at most `PSNR_LIMIT`. The figure of a set
+    of frames is the mean of its frames' figures, as is usual in the field.
+    """
+    squared = _mean((crop_to(image, box) - crop_to(target, box)) ** 2, box, mask)
+    return float(-10 * torch.log10(squared.clamp_min(10 ** (-PSNR_LIMIT / 10))))
+
+
+def ssim(
+    image: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"],
+    box: Box | None = None,
+    mask: Bool[Tensor, "h w"] | None = None,
+) -> float:
+    """Structural similarity (Wang et al. 2004), the mean of `ssim_map` over channels and over `mask`.
+
+    Inside a box the image is cut first: windows at its border see zeros beyond it, not the rest of the image.
+    """
+    return float(_mean(ssim_map(crop_to(image, box), crop_to(target, box)), box, mask))
+
+
+def ssim_map(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Structural similarity of every pixel and channel, -1..1, differentiable.
+
+    As training codes for 3D Gaussians define it: an 11x11 Gaussian window of sigma 1.5, zeros beyond the border,
+    C1 = 0.01^2 and C2 = 0.03^2 for a range of 1, each channel for itself.
+    """
+    x, y = image.permute(2, 0, 1)[:, None], target.permute(2, 0, 1)[:, None]
+    blurred = _blur(torch.cat([x, y, x * x, y * y, x * y]))
+    mean_x, mean_y, square_x, square_y, product = blurred.split(3)
+    variance_x = square_x - mean_x * mean_x
+    variance_y = square_y - mean_y * mean_y
+    covariance = product - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + _C1) / (mean_x * mean_x + mean_y * mean_y + _C1)
+    structure = (2 * covariance + _C2) / (variance_x + variance_y + _C2)
+    return (luminance * structure)[:, 0].permute(1, 2, 0)
+
+
+def _blur(planes: Float[Tensor, "p 1 h w"]) -> Float[Tensor, "p 1 h w"]:
+    """The Gaussian window's weighted mean around every pixel, with zeros beyond the border; separable, so two passes."""
+    offsets = torch.arange(_WINDOW_SIZE, dtype=planes.dtype, device=planes.device) - _WINDOW_SIZE // 2
+    window = torch.exp(-(offsets**2) / (2 * _WINDOW_SIGMA**2))
+    window = window / window.sum()
+    half = _WINDOW_SIZE // 2
+    rows = torch.nn.functional.conv2d(planes, window[None, None, None, :], padding=(0, half))
+    return torch.nn.functional.conv2d(rows, window[None, None, :, None], padding=(half, 0))
+
+
+def _mean(values: Float[Tensor, "y x 3"], box: Box | None, mask: Bool[Tensor, "h w"] | None) -> Float[Tensor, ""]:
+    """Mean in double precision over all channels of the pixels that count."""
+    if mask is None:
+        return values.double().mean()
+    kept = crop_to(mask, box)
+    assert bool(kept.any()), "the mask is empty: there is nothing to average over"
+    return values[kept].double().mean()

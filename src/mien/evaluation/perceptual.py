@@ -1,0 +1,114 @@
+"""ST-LPIPS: a learned perceptual distance (Ghildyal and Liu, ECCV 2022), from the weights that a package ships.
+
+Only the trained numbers of `stlpips-pytorch` are read. The network is written here, from the paper's description and
+the shapes in that file: the package's own code needs torchvision and is never imported.
+"""
+
+import importlib.util
+from functools import lru_cache
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mien.errors import UserError
+
+Backbone = Literal["st-lpips-alex"]
+"""Names of backbones, as written into metrics.json."""
+
+_WEIGHTS = {"st-lpips-alex": "weights/vST0.0/alex_shift_tolerant.pth"}
+_PACKAGE = "stlpips_pytorch"
+MINIMUM_SIZE = 16
+"""Pixels: smaller pictures have no features left in the deepest layers."""
+
+
+class PerceptualDistance(nn.Module):
+    """Distance between pictures by the features of a trained, anti-aliased AlexNet; 0 for equal ones, often below 1.
+
+    Five feature maps are normalised to unit length at each pixel, their squared differences weighted by trained
+    factors a channel, averaged over the picture and summed (the form of LPIPS). ST-LPIPS keeps the first convolution
+    at stride 1 and replaces every stride by a blur and a subsampling, so that a shift of a few pixels costs little.
+    """
+
+    def __init__(self, state: dict[str, Tensor]) -> None:
+        super().__init__()
+        self.register_buffer("shift", state["scaling_layer.shift"])
+        self.register_buffer("scale", state["scaling_layer.scale"])
+        names = ("net.slice1.0", "net.slice2.5", "net.slice3.9", "net.slice4.11", "net.slice5.13")
+        for index, name in enumerate(names):
+            self.register_buffer(f"weight{index}", state[f"{name}.weight"])
+            self.register_buffer(f"bias{index}", state[f"{name}.bias"])
+            self.register_buffer(f"channel_weights{index}", state[f"lin{index}.model.1.weight"][0, :, 0, 0])
+
+    def features(self, image: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "c y x"]]:
+        """Five feature maps, of unit length at each pixel, of an image in 0..1: to be compared by `between`."""
+        assert min(image.shape[:2]) >= MINIMUM_SIZE, f"{tuple(image.shape)} is too small to compare"
+        values = ((image.permute(2, 0, 1)[None] * 2 - 1) - self.shift) / self.scale
+        maps = [torch.relu(_halve(self._convolve(0, values, padding=2)))]
+        maps.append(torch.relu(self._convolve(1, _pool(maps[-1]), padding=2)))
+        maps.append(torch.relu(self._convolve(2, _pool(maps[-1]), padding=1)))
+        maps.append(torch.relu(self._convolve(3, maps[-1], padding=1)))
+        maps.append(torch.relu(self._convolve(4, maps[-1], padding=1)))
+        return [(m / (m.square().sum(1, keepdim=True).sqrt() + 1e-10))[0] for m in maps]
+
+    def between(self, first: list[Float[Tensor, "_ _ _"]], second: list[Float[Tensor, "_ _ _"]]) -> float:
+        """The distance of two pictures of the same size by their `features`."""
+        total = 0.0
+        for index, (a, b) in enumerate(zip(first, second, strict=True)):
+            weights = getattr(self, f"channel_weights{index}")
+            total += float(torch.einsum("c,cyx->", weights, (a - b).square()) / a[0].numel())
+        return total
+
+    @torch.no_grad()
+    def forward(self, image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:
+        """The distance of two images in 0..1."""
+        return self.between(self.features(image), self.features(target))
+
+    def _convolve(self, index: int, values: Tensor, padding: int) -> Tensor:
+        weight, bias = getattr(self, f"weight{index}"), getattr(self, f"bias{index}")
+        return torch.nn.functional.conv2d(values, weight, bias, padding=padding)
+
+
+def _halve(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
+    """Blur by (1, 2, 1) / 4 both ways and keep every second sample, with the border mirrored by two samples."""
+    channels = values.shape[1]
+    line = torch.tensor([0.25, 0.5, 0.25], dtype=values.dtype, device=values.device)
+    kernel = torch.outer(line, line).expand(channels, 1, 3, 3)
+    padded = torch.nn.functional.pad(values, (2, 2, 2, 2), mode="reflect")
+    return torch.nn.functional.conv2d(padded, kernel, stride=2, groups=channels)
+
+
+def _pool(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
+    """Anti-aliased pooling: the maximum of 3x3 at every pixel, then `_halve`."""
+    return _halve(torch.nn.functional.max_pool2d(values, kernel_size=3, stride=1))
+
+
+@lru_cache(maxsize=1)
+def load_perceptual(backbone: Backbone = "st-lpips-alex") -> PerceptualDistance:
+    """The trained distance, ready for use on the CPU (10 MB).
+
+    Raises:
+        UserError: the package with the weights is not installed, or its file is missing or damaged.
+    """
+    path = weights_path(backbone)
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        metric = PerceptualDistance(state)
+    except FileNotFoundError:
+        raise UserError(f"{path}: missing; reinstall it with: pip install stlpips-pytorch==0.0.2") from None
+    except (KeyError, EOFError, OSError, RuntimeError, ValueError, UnpicklingError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{path}: damaged weights ({reason}); reinstall stlpips-pytorch==0.0.2") from None
+    return metric.eval().requires_grad_(False)
+
+
+def weights_path(backbone: Backbone) -> Path:
+    """Where the installed package keeps a backbone's weights; finds the package without importing it."""
+    spec = importlib.util.find_spec(_PACKAGE)
+    folders = spec.submodule_search_locations if spec is not None else None
+    if not folders:
+        raise UserError("no perceptual weights: install them with: pip install stlpips-pytorch==0.0.2")
+    return Path(folders[0]) / _WEIGHTS[backbone]

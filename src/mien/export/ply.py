@@ -1,0 +1,171 @@
+"""The standard 3D Gaussian .ply that viewers, editors and game engines read."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from mien.errors import UserError
+from mien.gaussians import Gaussians, world_means
+from mien.rotation import multiply_quaternions, quaternion_from_matrix
+from mien.storage import write_atomically
+
+_HEADER_LIMIT = 65536
+_REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
+"""SH coefficients (1, 4, 9, 16) by the number of f_rest_* properties."""
+_LOCAL_COMMENT = "mien frame: local"
+_WORLD_COMMENT = "mien frame: world"
+
+
+def property_names(sh_coefficients: int) -> list[str]:
+    """The file's properties in order, all float32, for k = 1, 4, 9 or 16 SH coefficients a channel."""
+    rest = [f"f_rest_{i}" for i in range(3 * (sh_coefficients - 1))]
+    dc, scales, quats = ([f"{name}_{i}" for i in range(n)] for name, n in (("f_dc", 3), ("scale", 3), ("rot", 4)))
+    return ["x", "y", "z", "nx", "ny", "nz", *dc, *rest, "opacity", *scales, *quats]
+
+
+def write_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write unbatched Gaussians as binary little-endian .ply with raw values, as the 3DGS training code lays them out.
+
+    `opacity` is a logit, `scale_*` are natural logarithms of metres, `rot_*` is wxyz of unit length, `f_rest_*` holds all
+    coefficients of red, then of green, then of blue; normals are zero. Positions are in the Gaussians' own local frame
+    where `T_world_local` is set (a comment line keeps that pose for `read_ply`), else in world space: for other
+    programs, which know no local frame, use `in_world` first where the pose matters.
+
+    Raises:
+        UserError: a value is NaN or infinite.
+    """
+    assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
+    rows = _raw_rows(gaussians)
+    if not np.isfinite(rows).all():
+        bad = int((~np.isfinite(rows)).any(1).sum())
+        raise UserError(
+            f"{path}: {bad} of {len(rows)} Gaussians are NaN or infinite; train again or pick an earlier step"
+        )
+    frame = _WORLD_COMMENT
+    if gaussians.T_world_local is not None:
+        pose = gaussians.T_world_local.detach().cpu().double().flatten().tolist()
+        frame = _LOCAL_COMMENT + ", T_world_local row by row: " + " ".join(repr(value) for value in pose)
+    properties = "".join(f"property float {name}\n" for name in property_names(gaussians.sh.shape[-2]))
+    header = (
+        f"ply\nformat binary_little_endian 1.0\ncomment {frame}\ncomment units: metres\n"
+        f"element vertex {len(rows)}\n{properties}end_header\n"
+    )
+    write_atomically(path, lambda temporary: temporary.write_bytes(header.encode("ascii") + rows.tobytes()) and None)
+
+
+def read_ply(path: Path) -> Gaussians:
+    """Read a 3D Gaussian .ply, ours or another program's; properties it does not know are skipped.
+
+    Raises:
+        UserError: the file is missing, truncated, no ply, ASCII or big-endian, or holds no 3D Gaussians.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); give the path of a 3D Gaussian .ply") from None
+    end = content[:_HEADER_LIMIT].find(b"end_header\n")
+    if not content.startswith(b"ply") or end < 0:
+        raise UserError(f"{path}: no .ply file; give one with 3D Gaussians, as `mien export` writes")
+    lines = content[:end].decode("ascii", errors="replace").splitlines()
+    count, names = _parse_header(path, lines)
+    body = content[end + len(b"end_header\n") :]
+    expected = count * len(names) * 4
+    if len(body) < expected:
+        raise UserError(f"{path}: truncated, {len(body)} of {expected} bytes of vertices; copy or export it again")
+    values = np.frombuffer(body, dtype="<f4", count=count * len(names)).reshape(count, len(names))
+    return _activated({name: values[:, i] for i, name in enumerate(names)}, _pose_of(path, lines), path)
+
+
+def in_world(gaussians: Gaussians) -> Gaussians:
+    """The same unbatched Gaussians in world space, for programs that know no local frame.
+
+    Colours that depend on the view direction keep their coefficients: SH of degree 1 and more then belong to a head
+    that is not turned, which shows as slightly wrong highlights.
+    """
+    if gaussians.T_world_local is None:
+        return gaussians
+    turn = quaternion_from_matrix(gaussians.T_world_local[:3, :3])
+    quats = multiply_quaternions(turn.expand_as(gaussians.quats), gaussians.quats)
+    return Gaussians(world_means(gaussians), quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+
+
+def _raw_rows(gaussians: Gaussians) -> Float32[np.ndarray, "n p"]:
+    """One row of float32 a Gaussian, in the order of `property_names`."""
+    # Logits of exactly 0 and 1 are infinite; +-16.6 give 6e-8 and the float32 next to 1.
+    opacities = gaussians.opacities.detach().double().clamp(6e-8, 1 - 6e-8)
+    columns = (
+        gaussians.means.detach(),
+        torch.zeros_like(gaussians.means),
+        gaussians.sh[:, 0].detach(),
+        gaussians.sh[:, 1:].detach().transpose(1, 2).flatten(1),
+        torch.logit(opacities)[:, None],
+        gaussians.scales.detach().double().log(),
+        torch.nn.functional.normalize(gaussians.quats.detach(), dim=-1),
+    )
+    return torch.cat([column.cpu().float() for column in columns], dim=1).numpy().astype("<f4", order="C", copy=False)
+
+
+def _parse_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
+    """The number of vertices and the names of their properties, which must all be float32."""
+    if "format binary_little_endian 1.0" not in lines:
+        found = next((line for line in lines if line.startswith("format")), "no format line")
+        raise UserError(f"{path}: {found!r} is not supported; save it as binary_little_endian 1.0")
+    elements = [line.split() for line in lines if line.startswith("element")]
+    if not elements or elements[0][1:2] != ["vertex"] or not elements[0][-1].isdigit():
+        raise UserError(f"{path}: its first element is not `vertex`; give a .ply with 3D Gaussians")
+    start = lines.index(" ".join(elements[0])) + 1
+    properties: list[list[str]] = []
+    for line in lines[start:]:
+        if line.startswith("element"):
+            break
+        if line.startswith("property"):
+            properties.append(line.split())
+    others = [" ".join(entry) for entry in properties if entry[1] not in ("float", "float32") or len(entry) != 3]
+    names = [entry[-1] for entry in properties]
+    missing = [name for name in ("x", "f_dc_0", "opacity", "scale_0", "rot_0") if name not in names]
+    if missing or others:
+        reason = f"lacks {', '.join(missing)}" if missing else f"has {others[0]!r}, not float"
+        raise UserError(f"{path}: {reason}; give a .ply with 3D Gaussians in full precision")
+    return int(elements[0][2]), names
+
+
+def _pose_of(path: Path, lines: list[str]) -> Tensor | None:
+    """T_world_local of the comment line, or none for a file in world space or of another program."""
+    marked = [line for line in lines if line.startswith(f"comment {_LOCAL_COMMENT}")]
+    if not marked:
+        return None
+    try:
+        return torch.tensor([float(value) for value in marked[0].split(":")[-1].split()]).reshape(4, 4)
+    except (ValueError, RuntimeError):
+        raise UserError(f"{path}: damaged frame comment {marked[0]!r}; export it again") from None
+
+
+def _activated(columns: dict[str, np.ndarray], pose: Tensor | None, path: Path) -> Gaussians:
+    """Gaussians of raw columns by name."""
+    rest = sum(name.startswith("f_rest_") for name in columns)
+    if rest not in _REST_COEFFICIENTS:
+        raise UserError(f"{path}: {rest} f_rest_* properties; expected 0, 9, 24 or 45 (SH degree 0 to 3)")
+
+    def stack(names: list[str]) -> Tensor:
+        missing = [name for name in names if name not in columns]
+        if missing:
+            raise UserError(f"{path}: lacks {missing[0]}; give a .ply with 3D Gaussians")
+        return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(np.float32))
+
+    coefficients = _REST_COEFFICIENTS[rest]
+    dc = stack([f"f_dc_{i}" for i in range(3)])[:, None]
+    higher = dc.new_zeros(len(dc), 0, 3)
+    if rest:
+        channels = stack([f"f_rest_{i}" for i in range(rest)]).reshape(-1, 3, coefficients - 1)
+        higher = channels.transpose(1, 2)
+    return Gaussians(
+        means=stack(["x", "y", "z"]),
+        quats=stack([f"rot_{i}" for i in range(4)]),
+        scales=stack([f"scale_{i}" for i in range(3)]).exp(),
+        opacities=torch.sigmoid(stack(["opacity"])[:, 0]),
+        sh=torch.cat([dc, higher], dim=1).contiguous(),
+        T_world_local=pose,
+    )

@@ -1,0 +1,145 @@
+"""The .ply writer and reader against a byte layout built by hand, round trips, and damaged or foreign files."""
+
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mien.errors import UserError
+from mien.export import read_ply, write_ply
+from mien.export.ply import property_names
+from mien.gaussians import Gaussians
+
+
+def _gaussians(n: int, coefficients: int, seed: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return Gaussians(
+        means=random(n, 3),
+        quats=torch.nn.functional.normalize(random(n, 4), dim=-1),
+        scales=(random(n, 3) - 5).exp(),
+        opacities=torch.sigmoid(random(n)),
+        sh=random(n, coefficients, 3),
+    )
+
+
+def _assert_same(first: Gaussians, second: Gaussians, tolerance: float = 3e-7) -> None:
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=tolerance * 10, atol=tolerance)
+
+
+def test_layout_is_the_one_other_programs_write(tmp_path: Path) -> None:
+    """One Gaussian of SH degree 1, its bytes built here by hand from the format's description."""
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(9)] + ["opacity", "scale_0", "scale_1", "scale_2"]
+    names += ["rot_0", "rot_1", "rot_2", "rot_3"]
+    red, green, blue = (11.0, 12.0, 13.0), (21.0, 22.0, 23.0), (31.0, 32.0, 33.0)
+    row = (
+        1.0,
+        2.0,
+        3.0,
+        0.0,
+        0.0,
+        0.0,
+        10.0,
+        20.0,
+        30.0,
+        *red,
+        *green,
+        *blue,
+        0.0,
+        -1.0,
+        -2.0,
+        -3.0,
+        0.0,
+        0.6,
+        0.0,
+        0.8,
+    )
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
+    header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    path = tmp_path / "other.ply"
+    path.write_bytes(header.encode() + struct.pack(f"<{len(row)}f", *row))
+
+    read = read_ply(path)
+    assert read.means.tolist() == [[1, 2, 3]]
+    assert read.sh[0].tolist() == [[10, 20, 30], [11, 21, 31], [12, 22, 32], [13, 23, 33]]
+    assert float(read.opacities[0]) == 0.5
+    torch.testing.assert_close(read.scales[0], torch.tensor([-1.0, -2.0, -3.0]).exp())
+    torch.testing.assert_close(read.quats[0], torch.tensor([0, 0.6, 0, 0.8]))
+    assert read.T_world_local is None
+
+    ours = tmp_path / "ours.ply"
+    write_ply(ours, read)
+    content = ours.read_bytes()
+    assert content[-len(row) * 4 :] == struct.pack(f"<{len(row)}f", *row)
+    lines = content[: content.index(b"end_header\n")].decode().splitlines()
+    assert [line.split()[-1] for line in lines if line.startswith("property float")] == names == property_names(4)
+    assert "comment mien frame: world" in lines
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_round_trip(tmp_path: Path, coefficients: int) -> None:
+    written = _gaussians(50, coefficients)
+    write_ply(tmp_path / "a.ply", written)
+    read = read_ply(tmp_path / "a.ply")
+    _assert_same(written, read)
+    assert torch.equal(written.means, read.means)
+    assert torch.equal(written.sh, read.sh)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 3), st.integers(0, 2**16))
+def test_round_trip_of_any_number_and_extreme_opacities(tmp_path_factory, n: int, seed: int) -> None:
+    path = tmp_path_factory.mktemp("ply") / "a.ply"
+    written = _gaussians(n, 4, seed)
+    written = Gaussians(written.means, written.quats, written.scales, written.opacities.round(), written.sh)
+    write_ply(path, written)
+    _assert_same(written, read_ply(path))
+
+
+def test_local_frame_is_kept(tmp_path: Path) -> None:
+    pose = torch.eye(4)
+    pose[:3, 3] = torch.tensor([0.1, -0.2, 1 / 3])
+    local = _gaussians(5, 1)
+    write_ply(tmp_path / "a.ply", Gaussians(local.means, local.quats, local.scales, local.opacities, local.sh, pose))
+    read = read_ply(tmp_path / "a.ply")
+    assert read.T_world_local is not None
+    assert torch.equal(read.T_world_local, pose)
+    assert torch.equal(read.means, local.means)
+
+
+def test_damaged_and_foreign_files(tmp_path: Path) -> None:
+    good = tmp_path / "good.ply"
+    write_ply(good, _gaussians(5, 1))
+    content = good.read_bytes()
+    cases = {
+        "truncated": content[:-7],
+        "no .ply": b"GIF89a" + content,
+        "not supported": content.replace(b"binary_little_endian", b"ascii", 1),
+        "lacks f_dc_0": content.replace(b"f_dc_0", b"red_is"),
+        "lacks y": content.replace(b"float y", b"float w"),
+        "not float": content.replace(b"property float x", b"property double x"),
+        "first element": content.replace(b"element vertex", b"element corner"),
+    }
+    for message, damaged in cases.items():
+        path = tmp_path / "damaged.ply"
+        path.write_bytes(damaged)
+        with pytest.raises(UserError, match=message):
+            read_ply(path)
+    with pytest.raises(UserError, match="cannot be read"):
+        read_ply(tmp_path / "missing.ply")
+
+
+def test_nan_is_not_written(tmp_path: Path) -> None:
+    gaussians = _gaussians(3, 1)
+    gaussians.means[1, 0] = torch.nan
+    with pytest.raises(UserError, match="1 of 3 Gaussians"):
+        write_ply(tmp_path / "a.ply", gaussians)
+    assert not list(tmp_path.iterdir())

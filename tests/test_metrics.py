@@ -1,0 +1,113 @@
+"""Metrics against hand-computed values, a slow second implementation of SSIM, and a published ST-LPIPS figure."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mien.errors import UserError
+from mien.evaluation import perceptual
+from mien.evaluation.metrics import PSNR_LIMIT, crop_to, l1, psnr, ssim, ssim_map
+from mien.evaluation.perceptual import load_perceptual
+
+
+@pytest.fixture
+def pair() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(24, 31, 3, generator=generator)
+    return (target + 0.1 * torch.randn(24, 31, 3, generator=generator)).clamp(0, 1), target
+
+
+def test_psnr_and_l1_of_a_constant_difference() -> None:
+    target = torch.full((8, 9, 3), 0.25)
+    assert psnr(target + 0.1, target) == pytest.approx(20.0, abs=1e-4)
+    assert l1(target - 0.1, target) == pytest.approx(0.1, abs=1e-6)
+
+
+def test_identical_images_have_finite_figures(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
+    image = pair[1]
+    assert psnr(image, image) == PSNR_LIMIT
+    assert l1(image, image) == 0
+    assert ssim(image, image) == pytest.approx(1, abs=1e-6)
+
+
+def test_box_and_mask_leave_the_rest_out() -> None:
+    target = torch.zeros(10, 12, 3)
+    image = target.clone()
+    image[2:5, 3:7] = 0.5
+    box = (3, 2, 4, 3)
+    mask = torch.zeros(10, 12, dtype=torch.bool)
+    mask[2:5, 3:5] = True
+    mask[9, 11] = True
+    assert l1(image, target, box=box) == pytest.approx(0.5)
+    assert l1(image, target, mask=mask) == pytest.approx(0.5 * 6 / 7)
+    assert l1(image, target, box=box, mask=mask) == pytest.approx(0.5)
+    assert psnr(image, target) == pytest.approx(-10 * np.log10(0.25 * 12 / 120), abs=1e-4)
+
+
+def test_box_is_cut_at_the_border() -> None:
+    image = torch.arange(20.0).reshape(4, 5)
+    assert crop_to(image, (-2, -1, 4, 3)).tolist() == [[0, 1], [5, 6]]
+    assert crop_to(image, (3, 2, 9, 9)).shape == (2, 2)
+
+
+def test_ssim_equals_a_direct_evaluation_of_its_definition(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
+    image, target = (t.double().numpy() for t in pair)
+    offsets = np.arange(11) - 5
+    window = np.exp(-(offsets**2) / (2 * 1.5**2))
+    window = np.outer(window, window) / window.sum() ** 2
+    got = ssim_map(*pair)
+    padded = [np.pad(t, ((5, 5), (5, 5), (0, 0))) for t in (image, target)]
+    for row, column, channel in ((0, 0, 0), (12, 15, 1), (23, 30, 2), (3, 29, 0)):
+        x, y = (p[row : row + 11, column : column + 11, channel] for p in padded)
+        mean_x, mean_y = (window * x).sum(), (window * y).sum()
+        variance_x, variance_y = (window * x * x).sum() - mean_x**2, (window * y * y).sum() - mean_y**2
+        covariance = (window * x * y).sum() - mean_x * mean_y
+        expected = (2 * mean_x * mean_y + 1e-4) * (2 * covariance + 9e-4)
+        expected /= (mean_x**2 + mean_y**2 + 1e-4) * (variance_x + variance_y + 9e-4)
+        assert float(got[row, column, channel]) == pytest.approx(expected, abs=2e-5)
+
+
+def test_ssim_in_a_box_is_that_of_the_cut_images(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
+    image, target = pair
+    inside = ssim(image[4:20, 5:25], target[4:20, 5:25])
+    assert ssim(image, target, box=(5, 4, 20, 16)) == pytest.approx(inside, abs=1e-9)
+    assert inside != pytest.approx(ssim(image, target), abs=1e-4)
+
+
+def _read(path: str) -> torch.Tensor:
+    return torch.from_numpy(cv2.imread(path)[:, :, ::-1].copy()).float() / 255
+
+
+def test_st_lpips_gives_the_published_figure(test_data) -> None:
+    metric = load_perceptual()
+    example, reference = (_read(str(test_data / "golden" / f"ex_{name}.png")) for name in ("p0", "ref"))
+    assert metric(example, reference) == pytest.approx(0.7777554988861084, abs=1e-5)
+    assert metric(reference, reference) == 0
+    assert metric(reference, example) == pytest.approx(metric(example, reference), abs=1e-6)
+
+
+def test_st_lpips_orders_small_shift_below_blur(test_data) -> None:
+    metric = load_perceptual()
+    picture = _read(str(test_data / "golden" / "ex_ref.png"))
+    blurred = torch.from_numpy(cv2.GaussianBlur(picture.numpy(), (0, 0), 3))
+    shifted = torch.roll(picture, 1, dims=1)
+    assert metric(shifted, picture) < 0.5 * metric(blurred, picture)
+
+
+def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path) -> None:
+    load_perceptual.cache_clear()
+    monkeypatch.setattr(perceptual, "_PACKAGE", "no_such_package_here")
+    with pytest.raises(UserError, match="pip install stlpips-pytorch"):
+        load_perceptual()
+    path = tmp_path / "alex.pth"
+    monkeypatch.setattr(perceptual, "weights_path", lambda backbone: path)
+    with pytest.raises(UserError, match="missing"):
+        load_perceptual()
+    torch.save({"scaling_layer.shift": torch.zeros(1)}, path)
+    with pytest.raises(UserError, match="damaged"):
+        load_perceptual()
+    path.write_bytes(b"no weights")
+    with pytest.raises(UserError, match="damaged"):
+        load_perceptual()
+    load_perceptual.cache_clear()
