@@ -12,12 +12,16 @@ from mien.render.mesh import (
     shade,
     vertex_normals,
 )
+from mien.render.rasterize import rasterize
+from mien.render.rendering import Rendering
 
 __all__ = [
+    "Rendering",
     "Headlight",
     "MeshFragments",
     "Texture",
     "interpolate",
+    "rasterize",
     "rasterize_mesh",
     "render_mesh",
     "sample_texture",

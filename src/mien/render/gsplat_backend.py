@@ -1,0 +1,73 @@
+"""CUDA: one view through gsplat's kernels, with the contract of the other back ends."""
+
+import math
+from types import ModuleType
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.errors import UserError
+from mien.gaussians import Gaussians
+from mien.render.projection import DILATION, NEAR
+from mien.render.rendering import Rendering
+from mien.render.validation import check_finite
+
+_TILE = 16
+"""Pixels; what gsplat's kernels are tuned for."""
+
+
+def render_gsplat(
+    gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], means2d_offset: Float[Tensor, "n 2"]
+) -> Rendering:
+    """One view of unbatched CUDA Gaussians given in the camera's world.
+
+    gsplat's single steps are called instead of its `rasterization`, so that `means2d_offset` can be added between
+    projection and blending and collects the gradient of the centres.
+    """
+    gsplat = _import_gsplat()
+    if not gaussians.means.is_cuda or gaussians.means.dtype != torch.float32:
+        raise ValueError(
+            f"rasterize: backend 'gsplat' takes float32 CUDA tensors, got {gaussians.means.dtype} on "
+            f"{gaussians.means.device}; use backend='auto'"
+        )
+    check_finite(gaussians, camera, background)
+    viewmats, Ks = camera.viewmat[None].contiguous(), camera.K[None].contiguous()
+    means, quats, scales = (t.contiguous() for t in (gaussians.means, gaussians.quats, gaussians.scales))
+    radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
+        means, None, quats, scales, viewmats, Ks, camera.width, camera.height,
+        eps2d=DILATION, near_plane=NEAR, packed=False, opacities=gaussians.opacities.contiguous(),
+    )  # fmt: skip
+    camera_position = -(camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3])
+    visible = (radii > 0).all(-1)
+    degree = math.isqrt(gaussians.sh.shape[-2]) - 1
+    directions = (means - camera_position)[None]
+    colors = gsplat.spherical_harmonics(degree, directions, gaussians.sh[None].contiguous(), masks=visible)
+    columns, rows = math.ceil(camera.width / _TILE), math.ceil(camera.height / _TILE)
+    _, intersections, flat_ids = gsplat.isect_tiles(
+        means2d, radii, depths, _TILE, columns, rows, packed=False, n_images=1
+    )
+    offsets = gsplat.isect_offset_encode(intersections, 1, columns, rows).reshape(1, rows, columns)
+    image, alpha = gsplat.rasterize_to_pixels(
+        means2d + means2d_offset, conics, torch.clamp_min(colors + 0.5, 0), gaussians.opacities[None].contiguous(),
+        camera.width, camera.height, _TILE, offsets, flat_ids, backgrounds=background[None].contiguous(),
+    )  # fmt: skip
+    return Rendering(image[0], alpha[0, ..., 0], _three_sigma(conics[0], visible[0]), means2d_offset)
+
+
+@torch.no_grad()
+def _three_sigma(conics: Float[Tensor, "n 3"], visible: Tensor) -> Tensor:
+    """3 sigma of the longer axis in pixels; gsplat's own radii are boxes that depend on opacity."""
+    xx, xy, yy = conics.unbind(-1)
+    smallest = 0.5 * (xx + yy) - torch.sqrt(0.25 * (xx - yy) ** 2 + xy**2)  # eigenvalue of the inverse covariance
+    radii = torch.ceil(3 / smallest.clamp_min(1e-12).sqrt())
+    return torch.where(visible, radii, 0).to(torch.int32)
+
+
+def _import_gsplat() -> ModuleType:
+    try:
+        import gsplat  # pyright: ignore[reportMissingImports]  # only there with the extra
+    except ImportError as error:
+        raise UserError("rendering on a GPU needs gsplat: install it with `pip install 'mien[cuda]'`") from error
+    return gsplat

@@ -1,0 +1,112 @@
+"""`rasterize`: Gaussians and cameras to pictures; picks the back end and unrolls batches."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.gaussians import Gaussians
+from mien.render.gsplat_backend import render_gsplat
+from mien.render.reference import render_reference
+from mien.render.rendering import Rendering
+from mien.render.validation import check_shapes
+
+Backend = Literal["auto", "native", "gsplat", "reference"]
+RenderView = Callable[[Gaussians, Camera, Tensor, Tensor], Rendering]
+"""One view of unbatched Gaussians given in the camera's world, over a background, with offsets of the 2D centres."""
+
+_BACKENDS: dict[str, RenderView] = {
+    "gsplat": render_gsplat,
+    "reference": render_reference,
+}
+
+
+def rasterize(
+    gaussians: Gaussians,
+    camera: Camera | Sequence[Camera],
+    background: Float[Tensor, " 3"] | None = None,
+    backend: Backend = "auto",
+) -> Rendering:
+    """The picture of `gaussians` seen by `camera` over `background` (RGB; black by default).
+
+    A sequence of cameras, batched Gaussians, or both with equal lengths give a batch; what has no batch is shared.
+    All cameras of a batch have one size. `T_world_local` of the Gaussians moves the camera, not the Gaussians, so
+    spherical harmonics are evaluated in the local frame. The kernel's constants are those of docs/conventions.md.
+
+    Differentiable in the Gaussians (with `T_world_local`), the background and `camera.viewmat`. The rendering's
+    `means2d_offset` is a leaf whose `.grad` is the gradient with respect to the projected centres, in pixels.
+
+    `auto` is `native` for float32 on a CPU, `gsplat` on a GPU, and otherwise (float64) the slow `reference`.
+
+    Raises:
+        ValueError: NaN or infinity in an input (naming it), shapes or lengths that do not fit, a wrong dtype or device.
+    """
+    if background is None:
+        background = gaussians.means.new_zeros(3)
+    check_shapes(gaussians, background)
+    render_view = _BACKENDS[choose_backend(gaussians.means) if backend == "auto" else backend]
+    views = _views(gaussians, camera)
+    shape = (len(gaussians), 2) if views is None else (len(views), len(gaussians), 2)
+    offset = gaussians.means.new_zeros(shape).requires_grad_(torch.is_grad_enabled())
+    if views is None:
+        assert isinstance(camera, Camera)
+        rendering = render_view(*_in_local_frame(gaussians, camera), background, offset)
+        return replace(rendering, means2d_offset=offset)
+    pictures = [
+        render_view(*_in_local_frame(*view), background, view_offset)
+        for view, view_offset in zip(views, offset.unbind(), strict=True)
+    ]
+    return Rendering(
+        torch.stack([picture.image for picture in pictures]),
+        torch.stack([picture.alpha for picture in pictures]),
+        torch.stack([picture.radii for picture in pictures]),
+        offset,
+    )
+
+
+def choose_backend(like: Tensor) -> Literal["native", "gsplat", "reference"]:
+    """The back end for tensors with this dtype and device."""
+    if like.is_cuda:
+        return "gsplat"
+    return "reference"
+
+
+def _views(gaussians: Gaussians, camera: Camera | Sequence[Camera]) -> list[tuple[Gaussians, Camera]] | None:
+    """Each picture's Gaussians and camera; None where there is no batch."""
+    count = _timesteps(gaussians)
+    if isinstance(camera, Camera):
+        if count is None:
+            return None
+        cameras = [camera] * count
+    else:
+        cameras = list(camera)
+    if not cameras:
+        raise ValueError("rasterize: the sequence of cameras is empty")
+    if count is not None and count != len(cameras):
+        raise ValueError(f"rasterize: {count} timesteps of Gaussians but {len(cameras)} cameras")
+    sizes = {(one.width, one.height) for one in cameras}
+    if len(sizes) > 1:
+        raise ValueError(f"rasterize: the cameras of a batch must have one size, got {sorted(sizes)}")
+    return [(gaussians.timestep(index), one) for index, one in enumerate(cameras)]
+
+
+def _timesteps(gaussians: Gaussians) -> int | None:
+    """The length of the batch axis, None without one."""
+    pose = gaussians.T_world_local
+    entries = [(gaussians.means, 2), (gaussians.quats, 2), (gaussians.scales, 2), (gaussians.opacities, 1)]
+    entries += [(gaussians.sh, 3)] + ([] if pose is None else [(pose, 2)])
+    lengths = {tensor.shape[0] for tensor, unbatched in entries if tensor.ndim > unbatched}
+    if len(lengths) > 1:
+        raise ValueError(f"rasterize: the Gaussians' tensors have different numbers of timesteps, {sorted(lengths)}")
+    return lengths.pop() if lengths else None
+
+
+def _in_local_frame(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Camera]:
+    """The same view with the Gaussians' local frame as the world."""
+    pose = gaussians.T_world_local
+    camera = camera.to(gaussians.means)
+    return (gaussians, camera) if pose is None else (replace(gaussians, T_world_local=None), camera.in_frame(pose))
