@@ -1,4 +1,4 @@
-"""What native/bind_*.cpp defines. Arrays are contiguous, on the CPU, float32 unless said otherwise; outputs are filled."""
+"""What native/bind_*.cpp defines. Arrays are contiguous, on the CPU, float32 unless said otherwise."""
 
 from torch import Tensor
 

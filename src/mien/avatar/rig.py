@@ -1,0 +1,86 @@
+"""Triangle frames, and Gaussians that ride on them (GaussianAvatars, CVPR 2024, section 3.2)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from mien.rotation import multiply_quaternions, quaternion_from_matrix
+
+DEGENERATE_LENGTH = 1e-7
+"""Metres: a triangle whose first edge or height is shorter has no frame of its own."""
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleFrames:
+    """Where triangles are, how they are turned and how large they are: world = k R local + T."""
+
+    R: Float[Tensor, "*b f 3 3"]
+    """Columns: along the first edge, along the normal, and their cross product."""
+    T: Float[Tensor, "*b f 3"]
+    """Centroids, metres."""
+    k: Float[Tensor, "*b f"]
+    """Mean of the first edge's length and the height over it, metres, positive."""
+
+
+def triangle_frames(vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]) -> TriangleFrames:
+    """The frame of every triangle; differentiable in `vertices`.
+
+    A degenerate triangle (see `DEGENERATE_LENGTH`) gets a fixed rotation and the size 1e-7 m, both without gradient,
+    so that everything stays finite.
+    """
+    v0, v1, v2 = (vertices[..., faces[:, i], :] for i in range(3))
+    first, second = _usable_edges(v1 - v0, v2 - v0)
+    edge_length = first.norm(dim=-1)
+    along = first / edge_length[..., None]
+    area_normal = torch.linalg.cross(along, second)
+    height = area_normal.norm(dim=-1)
+    normal = area_normal / height[..., None]
+    across = torch.linalg.cross(along, normal)
+    R = torch.stack([along, normal, across], dim=-1)
+    return TriangleFrames(R, (v0 + v1 + v2) / 3, (edge_length + height) / 2)
+
+
+def frames_to_world(
+    frames: TriangleFrames,
+    face_index: Int[Tensor, " n"],
+    local_means: Float[Tensor, "n 3"],
+    local_quats: Float[Tensor, "n 4"],
+    log_scales: Float[Tensor, "n 3"],
+) -> tuple[Float[Tensor, "*b n 3"], Float[Tensor, "*b n 4"], Float[Tensor, "*b n 3"]]:
+    """Means, unit quats (wxyz) and scales in world space of Gaussians bound to triangles, in plain PyTorch.
+
+    `local_means` and exp(`log_scales`) are in units of their triangle's size; `local_quats` are normalised here.
+    Differentiable in all of them and in `frames`.
+    """
+    R, T, k = frames.R[..., face_index, :, :], frames.T[..., face_index, :], frames.k[..., face_index, None]
+    means = k * (R @ local_means[..., None])[..., 0] + T
+    triangle_quats = quaternion_from_matrix(frames.R)[..., face_index, :]
+    local_quats = normalize(local_quats, dim=-1).expand_as(triangle_quats)
+    return means, multiply_quaternions(triangle_quats, local_quats), k * log_scales.exp()
+
+
+def bind_to_world(
+    vertices: Float[Tensor, "*b v 3"],
+    faces: Int[Tensor, "f 3"],
+    face_index: Int[Tensor, " n"],
+    local_means: Float[Tensor, "n 3"],
+    local_quats: Float[Tensor, "n 4"],
+    log_scales: Float[Tensor, "n 3"],
+) -> tuple[Float[Tensor, "*b n 3"], Float[Tensor, "*b n 4"], Float[Tensor, "*b n 3"]]:
+    """`frames_to_world` of the `triangle_frames` of a posed mesh; differentiable in all but the indices.
+
+    Gaussian i rides on triangle `face_index[i]`. Leading axes of `vertices` are timesteps.
+    """
+    return frames_to_world(triangle_frames(vertices, faces), face_index, local_means, local_quats, log_scales)
+
+
+def _usable_edges(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """Two edges of every triangle, replaced by constants where the triangle is degenerate."""
+    edge_length = first.detach().norm(dim=-1, keepdim=True)
+    double_area = torch.linalg.cross(first.detach(), second.detach()).norm(dim=-1, keepdim=True)
+    degenerate = (edge_length < DEGENERATE_LENGTH) | (double_area < DEGENERATE_LENGTH * edge_length)
+    axes = DEGENERATE_LENGTH * torch.eye(3, dtype=first.dtype, device=first.device)
+    return torch.where(degenerate, axes[0], first), torch.where(degenerate, axes[1], second)
