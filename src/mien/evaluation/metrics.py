@@ -80,7 +80,7 @@ def ssim_map(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> F
 
 
 def _blur(planes: Float[Tensor, "p 1 h w"]) -> Float[Tensor, "p 1 h w"]:
-    """The Gaussian window's weighted mean around every pixel, with zeros beyond the border; separable, so two passes."""
+    """The Gaussian window's weighted mean around every pixel, with zeros beyond the border, in two passes."""
     offsets = torch.arange(_WINDOW_SIZE, dtype=planes.dtype, device=planes.device) - _WINDOW_SIZE // 2
     window = torch.exp(-(offsets**2) / (2 * _WINDOW_SIGMA**2))
     window = window / window.sum()

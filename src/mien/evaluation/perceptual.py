@@ -33,6 +33,9 @@ class PerceptualDistance(nn.Module):
     at stride 1 and replaces every stride by a blur and a subsampling, so that a shift of a few pixels costs little.
     """
 
+    shift: Tensor
+    scale: Tensor
+
     def __init__(self, state: dict[str, Tensor]) -> None:
         super().__init__()
         self.register_buffer("shift", state["scaling_layer.shift"])

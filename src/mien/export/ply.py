@@ -29,9 +29,9 @@ def property_names(sh_coefficients: int) -> list[str]:
 def write_ply(path: Path, gaussians: Gaussians) -> None:
     """Write unbatched Gaussians as binary little-endian .ply with raw values, as the 3DGS training code lays them out.
 
-    `opacity` is a logit, `scale_*` are natural logarithms of metres, `rot_*` is wxyz of unit length, `f_rest_*` holds all
-    coefficients of red, then of green, then of blue; normals are zero. Positions are in the Gaussians' own local frame
-    where `T_world_local` is set (a comment line keeps that pose for `read_ply`), else in world space: for other
+    `opacity` is a logit, `scale_*` are natural logarithms of metres, `rot_*` is wxyz of unit length, `f_rest_*` holds
+    all coefficients of red, then of green, then of blue; normals are zero. Positions are in the Gaussians' own local
+    frame where `T_world_local` is set (a comment line keeps that pose for `read_ply`), else in world space: for other
     programs, which know no local frame, use `in_world` first where the pose matters.
 
     Raises:
@@ -41,9 +41,7 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     rows = _raw_rows(gaussians)
     if not np.isfinite(rows).all():
         bad = int((~np.isfinite(rows)).any(1).sum())
-        raise UserError(
-            f"{path}: {bad} of {len(rows)} Gaussians are NaN or infinite; train again or pick an earlier step"
-        )
+        raise UserError(f"{path}: {bad} of {len(rows)} Gaussians are NaN or infinite; train it again")
     frame = _WORLD_COMMENT
     if gaussians.T_world_local is not None:
         pose = gaussians.T_world_local.detach().cpu().double().flatten().tolist()
@@ -53,7 +51,11 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
         f"ply\nformat binary_little_endian 1.0\ncomment {frame}\ncomment units: metres\n"
         f"element vertex {len(rows)}\n{properties}end_header\n"
     )
-    write_atomically(path, lambda temporary: temporary.write_bytes(header.encode("ascii") + rows.tobytes()) and None)
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(header.encode("ascii") + rows.tobytes())
+
+    write_atomically(path, write)
 
 
 def read_ply(path: Path) -> Gaussians:
