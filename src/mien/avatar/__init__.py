@@ -1,1 +1,62 @@
-"""avatar."""
+"""Avatars: functions from face parameters to Gaussians, one file a method."""
+
+from mien.avatar.avatar import (
+    TRAINED,
+    Avatar,
+    FaceTuning,
+    MethodConfig,
+    ParameterGroup,
+    Photometric,
+    Posed,
+    Progress,
+    Rate,
+    network_group,
+    store_group,
+)
+from mien.avatar.baked import BakedAvatar, pose_baked
+from mien.avatar.density import (
+    DensityControl,
+    FixedDensity,
+    GradientDensity,
+    GradientSettings,
+    RefillDensity,
+    RefillSettings,
+)
+from mien.avatar.files import load_avatar, read_baked, write_avatar, write_baked
+from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
+from mien.avatar.methods import METHODS, Method, method_named, method_of
+from mien.avatar.store import GaussianStore, Moments
+
+__all__ = [
+    "METHODS",
+    "TRAINED",
+    "Avatar",
+    "BakedAvatar",
+    "DensityControl",
+    "FaceTuning",
+    "FixedDensity",
+    "GaussianAvatars",
+    "GaussianAvatarsConfig",
+    "GaussianStore",
+    "GradientDensity",
+    "GradientSettings",
+    "Method",
+    "MethodConfig",
+    "Moments",
+    "ParameterGroup",
+    "Photometric",
+    "Posed",
+    "Progress",
+    "Rate",
+    "RefillDensity",
+    "RefillSettings",
+    "load_avatar",
+    "method_named",
+    "method_of",
+    "network_group",
+    "pose_baked",
+    "read_baked",
+    "store_group",
+    "write_avatar",
+    "write_baked",
+]

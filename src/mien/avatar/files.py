@@ -1,0 +1,142 @@
+"""Avatars on disk: a folder with avatar.json, avatar.safetensors and, where its licence allows, the face model."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mien.avatar.avatar import Avatar
+from mien.avatar.baked import BakedAvatar
+from mien.avatar.methods import method_named, method_of
+from mien.config import decode, encode
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams
+from mien.storage import read_json, read_tensors, write_json, write_tensors
+
+_AVATAR, _VERSION = "mien.avatar", 1
+_FACE_MODEL, _BAKED = "mien.face_model", "mien.baked"
+NOT_CARRIED = frozenset({"flame"})
+"""Face models whose licence does not allow them to be passed on inside an avatar."""
+
+
+def write_avatar(folder: Path, avatar: Avatar) -> None:
+    """Write an avatar; avatar.json comes last, so that a folder that has it is whole."""
+    tensors = {f"avatar.{name}": tensor for name, tensor in avatar.state_dict().items()}
+    tensors |= {f"subject.{name}": tensor for name, tensor in avatar.subject.tensors().items()}
+    write_tensors(folder / "avatar.safetensors", tensors)
+    carried = avatar.face_model.name not in NOT_CARRIED
+    if carried:
+        write_tensor_dataclass(folder / "face_model", _FACE_MODEL, avatar.face_model)
+    content = {
+        "kind": method_of(avatar.config),
+        "config": encode(avatar.config),
+        "gaussians": len(avatar.gaussian_store()),
+        "face_model": avatar.face_model.name,
+        "face_model_hash": avatar.face_model.content_hash,
+        "face_model_carried": carried,
+    }
+    write_json(folder / "avatar.json", _AVATAR, _VERSION, content)
+
+
+def load_avatar(folder: Path) -> Avatar:
+    """The avatar of a run folder, or of an avatar folder itself.
+
+    Raises:
+        UserError: the folder holds no avatar, a damaged one, or one whose face model is not to be had.
+    """
+    folder = folder / "avatar" if (folder / "avatar").is_dir() else folder
+    if not (folder / "avatar.json").is_file():
+        raise UserError(
+            f"{folder}: holds no trained avatar (no avatar.json); train one with `mien train` or `mien create`"
+        )
+    content = read_json(folder / "avatar.json", _AVATAR, _VERSION)
+    method = method_named(content["kind"])
+    tensors = read_tensors(folder / "avatar.safetensors")
+    face_model = _face_model_of(folder, content)
+    config = decode(method.config, content["config"], str(folder / "avatar.json"))
+    with torch.random.fork_rng(devices=[]):
+        avatar = method.avatar(config, face_model, FaceParams(**_with_prefix(tensors, "subject.")))
+    overwrite(avatar, _with_prefix(tensors, "avatar."), content["gaussians"], folder)
+    return avatar
+
+
+def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: Path) -> None:
+    """Replace every tensor of an avatar, which may have had another number of Gaussians.
+
+    Raises:
+        UserError: `state`, which came from `source`, is not of this method and config.
+    """
+    avatar.gaussian_store().resize(gaussians)
+    try:
+        avatar.load_state_dict(state)
+    except RuntimeError as error:
+        raise UserError(f"{source}: does not fit its settings ({error}); train it again") from None
+
+
+def write_baked(folder: Path, baked: BakedAvatar) -> None:
+    """Write baked.json and baked.safetensors."""
+    write_tensor_dataclass(folder / "baked", _BAKED, baked)
+
+
+def read_baked(folder: Path) -> BakedAvatar:
+    """Read what `write_baked` wrote.
+
+    Raises:
+        UserError: files are missing, damaged or of another version.
+    """
+    return read_tensor_dataclass(folder / "baked", _BAKED, BakedAvatar)
+
+
+def write_tensor_dataclass(stem: Path, format_name: str, value: Any) -> None:
+    """Write nested dataclasses of tensors and plain values as STEM.safetensors and STEM.json."""
+    tensors: dict[str, Tensor] = {}
+
+    def stash(tensor: Tensor) -> dict[str, str]:
+        name = f"{len(tensors):03d}"
+        # Safetensors refuses tensors that share memory.
+        tensors[name] = tensor.detach().clone()
+        return {"tensor": name}
+
+    tree = encode(value, stash)
+    write_tensors(stem.with_suffix(".safetensors"), tensors)
+    write_json(stem.with_suffix(".json"), format_name, _VERSION, {"content": tree})
+
+
+def read_tensor_dataclass(stem: Path, format_name: str, hint: Any) -> Any:
+    """Read what `write_tensor_dataclass` wrote, as the dataclass (or union of them) `hint`.
+
+    Raises:
+        UserError: files are missing, damaged or of another version.
+    """
+    content = read_json(stem.with_suffix(".json"), format_name, _VERSION)["content"]
+    tensors = read_tensors(stem.with_suffix(".safetensors"))
+
+    def restore(node: Any) -> Any:
+        if isinstance(node, dict) and set(node) == {"tensor"}:
+            return tensors[node["tensor"]]
+        if isinstance(node, dict):
+            return {key: restore(item) for key, item in node.items()}
+        return [restore(item) for item in node] if isinstance(node, list) else node
+
+    return decode(hint, restore(content), str(stem))
+
+
+def _face_model_of(folder: Path, content: dict[str, Any]) -> FaceModel:
+    name = content["face_model"]
+    if content["face_model_carried"]:
+        face_model = read_tensor_dataclass(folder / "face_model", _FACE_MODEL, FaceModel)
+    else:
+        from mien.face import load_face_model
+
+        face_model = load_face_model(name)
+    if face_model.content_hash != content["face_model_hash"]:
+        raise UserError(
+            f"{folder}: was trained with face model {name!r} {content['face_model_hash']}, but the one here is "
+            f"{face_model.content_hash}; install that version of the face model, or train again"
+        )
+    return face_model
+
+
+def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}

@@ -1,0 +1,157 @@
+"""GaussianAvatars (Qian et al., CVPR 2024): Gaussians that live in the frames of a face model's triangles.
+
+Written from the paper and its supplement; what the published code does differently from the paper is noted where
+it matters. Lengths and scales in the store are in units of the triangle's own scale (`mien.avatar.rig`).
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.avatar.avatar import TRAINED, Avatar, MethodConfig, ParameterGroup, Posed, Progress, Rate, store_group
+from mien.avatar.baked import Attributes, MeshBound, bake_rig
+from mien.avatar.density import GradientDensity, GradientSettings
+from mien.avatar.rig import bind_to_world
+from mien.avatar.store import GaussianStore
+from mien.face import FaceModel, FaceParams
+from mien.gaussians import Gaussians
+from mien.render.rendering import Rendering
+
+
+@dataclass(frozen=True)
+class GaussianAvatarsConfig(MethodConfig):
+    """Settings of GaussianAvatars; defaults suit one fixed camera and runs of some thousand steps."""
+
+    sh_degree: int = 0
+    """0..3. With one camera, colours that depend on the view absorb the head's pose: keep 0."""
+    sh_frame: Literal["world", "head"] = "world"
+    """In which frame SH are evaluated: `world` as in the paper, `head` so that light turns with the head."""
+    sh_warmup: float = 0.3
+    """Fraction of the run over which SH degrees are switched on one after the other."""
+    means_rate: Rate = Rate(5e-3, 5e-5)
+    """Of centres, triangle units. The paper multiplies it by the cameras' extent, which is 0 for one camera: 1 here."""
+    log_scales_rate: Rate = Rate(0.017)
+    """Of log scales."""
+    quats_rate: Rate = Rate(1e-3)
+    """Of rotations."""
+    opacity_rate: Rate = Rate(0.05)
+    """Of opacity logits."""
+    colour_rate: Rate = Rate(2.5e-3)
+    """Of constant SH coefficients; the others get a twentieth."""
+    position_threshold: float = 1.0
+    """Triangle units: centres nearer than this to their triangle's are free."""
+    position_weight: float = 0.01
+    """Of what exceeds the threshold."""
+    scale_threshold: float = 0.6
+    """Triangle units: smaller scales are free."""
+    scale_weight: float = 1.0
+    """Of what exceeds the threshold."""
+    density: GradientSettings = field(default_factory=GradientSettings)
+    """When and what to grow and prune."""
+
+
+class GaussianAvatars(Avatar):
+    """One Gaussian per triangle to begin with; all ride on their triangle, so expression and pose move them."""
+
+    config: GaussianAvatarsConfig
+
+    def __init__(self, config: GaussianAvatarsConfig, face_model: FaceModel, face: FaceParams):
+        super().__init__(config, face_model, face)
+        like, n = face_model.template, face_model.faces.shape[0]
+        trained = {
+            "means": like.new_zeros(n, 3),
+            "quats": like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            "log_scales": like.new_zeros(n, 3),
+            "opacity_logits": torch.logit(like.new_full((n,), 0.1)),
+            # Almost mid grey: the paper's code uses small random colours as the SH coefficients themselves.
+            "sh_constant": torch.rand(n, 1, 3).to(like) / 255,
+        }
+        if config.sh_degree > 0:
+            trained["sh_rest"] = like.new_zeros(n, (config.sh_degree + 1) ** 2 - 1, 3)
+        self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})
+
+    def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
+        """The Gaussians in world space (with `sh_frame="head"`, in the head frame), one batch entry a timestep."""
+        store, in_head = self.store, self.config.sh_frame == "head"
+        vertices = self.face_model.head_vertices(face) if in_head else self.face_model(face)
+        means, quats, scales = bind_to_world(
+            vertices,
+            self.face_model.faces,
+            store["face_index"],
+            store["means"],
+            store["quats"],
+            store["log_scales"],
+        )
+        opacities = store["opacity_logits"].sigmoid()
+        T_world_local = face.T_world_head if in_head else None
+        return Posed(Gaussians(means, quats, scales, opacities, self._active_sh(progress), T_world_local), {})
+
+    def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
+        """Section 3.4: of the Gaussians in view, distances and scales beyond their thresholds, in triangle units."""
+        visible = (rendering.radii > 0).reshape(-1, rendering.radii.shape[-1]).any(0)
+        share = visible / visible.sum().clamp_min(1)
+        distances = torch.linalg.vector_norm(self.store["means"], dim=-1)
+        too_far = torch.relu(distances - self.config.position_threshold)
+        too_large = torch.relu(self.store["log_scales"].exp() - self.config.scale_threshold)
+        return {
+            "position": self.config.position_weight * (too_far * share).sum(),
+            "scale": self.config.scale_weight * (torch.linalg.vector_norm(too_large, dim=-1) * share).sum(),
+        }
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """One group a tensor."""
+        config, rates = self.config, {}
+        rates["means"], rates["log_scales"], rates["quats"] = (
+            config.means_rate,
+            config.log_scales_rate,
+            config.quats_rate,
+        )
+        rates["opacity_logits"], rates["sh_constant"] = config.opacity_rate, config.colour_rate
+        if config.sh_degree > 0:
+            rates["sh_rest"] = Rate(config.colour_rate.start / 20)
+        return [store_group(self.store, name, rate) for name, rate in rates.items()]
+
+    def gaussian_store(self) -> GaussianStore:
+        """Every per-Gaussian tensor."""
+        return self.store
+
+    def density(self) -> GradientDensity:
+        """Gradient-based; children stay on their parent's triangle, and no triangle loses its last Gaussian."""
+        return GradientDensity(
+            self.config.density,
+            opacity_logits="opacity_logits",
+            judged_opacities=lambda store, seen: store["opacity_logits"].detach().sigmoid(),
+            may_prune=never_empty_a_triangle,
+        )
+
+    def bake(self) -> MeshBound:
+        """The mesh of this subject and the raw values of all Gaussians."""
+        store = {name: self.store[name].detach() for name in self.store.names()}
+        attributes = Attributes(
+            store["quats"], store["log_scales"], store["opacity_logits"], self._active_sh(TRAINED).detach()
+        )
+        rig = bake_rig(self.face_model, self.subject)
+        return MeshBound(
+            rig, self.face_model.faces, store["face_index"], store["means"], attributes, self.config.sh_frame
+        )
+
+    def _active_sh(self, progress: Progress) -> Float[Tensor, "n k 3"]:
+        """SH coefficients up to the degree that is switched on."""
+        degree = self.config.sh_degree
+        if degree == 0:
+            return self.store["sh_constant"]
+        warmup = max(self.config.sh_warmup, 1e-9)
+        active = min(degree, int(progress.fraction / warmup * (degree + 1)))
+        rest = self.store["sh_rest"][:, : (active + 1) ** 2 - 1]
+        return torch.cat([self.store["sh_constant"], rest], dim=1)
+
+
+def never_empty_a_triangle(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Veto all prunes on a triangle that they would leave without Gaussians (section 3.3)."""
+    face_index = store["face_index"]
+    kept = torch.zeros(int(face_index.max()) + 1, dtype=torch.bool, device=prune.device)
+    kept[face_index[~prune]] = True
+    return prune & kept[face_index]

@@ -1,0 +1,98 @@
+"""GaussianStore: every per-Gaussian tensor with its optimiser state, so that density control treats all alike."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+@dataclass(eq=False)
+class Moments:
+    """Adam's state of one tensor."""
+
+    first: Tensor
+    """Running mean of the gradient."""
+    second: Tensor
+    """Running mean of the squared gradient."""
+    step: Float[Tensor, ""]
+    """How many updates it has seen."""
+
+    @staticmethod
+    def zeros(like: Tensor) -> "Moments":
+        """The state before the first update of a tensor."""
+        return Moments(torch.zeros_like(like), torch.zeros_like(like), like.new_zeros(()))
+
+
+class GaussianStore(nn.Module):
+    """n Gaussians as a dict of equally long tensors: some are trained, others (triangle ids, ...) ride along.
+
+    `select` and `append` replace the tensors: hold names, not tensors, across density control. The moments of trained
+    tensors live here too and follow every change; new Gaussians start with zero moments.
+    """
+
+    def __init__(self, trained: Mapping[str, Tensor], fixed: Mapping[str, Tensor] | None = None):
+        super().__init__()
+        self.trained = nn.ParameterDict(
+            {name: nn.Parameter(tensor.detach().clone()) for name, tensor in trained.items()}
+        )
+        self.fixed_names = tuple(fixed or ())
+        for name, tensor in (fixed or {}).items():
+            self.register_buffer(name, tensor.detach().clone())
+        self.moments: dict[str, Moments] = {}
+        lengths = {name: self[name].shape[0] for name in self.names()}
+        assert len(set(lengths.values())) == 1, f"per-Gaussian tensors differ in length: {lengths}"
+
+    def __len__(self) -> int:
+        """The number of Gaussians, n."""
+        return self[self.names()[0]].shape[0]
+
+    def __getitem__(self, name: str) -> Tensor:
+        """One per-Gaussian tensor, first axis n; a trained one is a leaf of the autograd graph."""
+        return self.trained[name] if name in self.trained else self.get_buffer(name)
+
+    def names(self) -> tuple[str, ...]:
+        """Names of all tensors, trained ones first."""
+        return (*self.trained.keys(), *self.fixed_names)
+
+    def select(self, kept: Tensor) -> None:
+        """Keep only the Gaussians where a bool mask [n] holds, or those at the given indices, in that order."""
+        kept = kept.nonzero()[:, 0] if kept.dtype == torch.bool else kept
+        self._replace({name: self[name].detach()[kept] for name in self.names()})
+        for state in self.moments.values():
+            state.first, state.second = state.first[kept], state.second[kept]
+
+    def append(self, parents: Tensor, overrides: Mapping[str, Tensor] | None = None) -> None:
+        """Add one child for each index in `parents` [c]: a copy of its parent but for the tensors in `overrides`."""
+        overrides = overrides or {}
+        unknown = set(overrides) - set(self.names())
+        assert not unknown, f"no such per-Gaussian tensors: {unknown}"
+        grown = {}
+        for name in self.names():
+            own = self[name].detach()
+            grown[name] = torch.cat([own, overrides[name].detach().to(own) if name in overrides else own[parents]])
+        self._replace(grown)
+        for state in self.moments.values():
+            new = state.first.new_zeros((parents.shape[0], *state.first.shape[1:]))
+            state.first, state.second = torch.cat([state.first, new]), torch.cat([state.second, new])
+
+    def assign(self, name: str, value: Tensor) -> None:
+        """Overwrite a tensor from outside the optimiser (an opacity reset); its moments restart from zero."""
+        with torch.no_grad():
+            self[name].copy_(value)
+        if name in self.moments:
+            state = self.moments[name]
+            state.first, state.second = torch.zeros_like(state.first), torch.zeros_like(state.second)
+
+    def resize(self, length: int) -> None:
+        """Make room for `length` Gaussians whose values are about to be loaded; moments are dropped."""
+        self.moments = {}
+        self.select(torch.zeros(length, dtype=torch.long, device=self[self.names()[0]].device))
+
+    def _replace(self, tensors: dict[str, Tensor]) -> None:
+        for name, tensor in tensors.items():
+            if name in self.trained:
+                self.trained[name] = nn.Parameter(tensor)
+            else:
+                self.register_buffer(name, tensor)

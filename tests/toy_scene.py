@@ -1,0 +1,118 @@
+"""A face model of about a hundred vertices, and a tiny capture of it that was never filmed: for fast training tests."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.capture.capture import Capture
+from mien.face import FaceModel, FaceParams
+from mien.tracking.tracking import Tracking
+
+
+def toy_face_model(rings: int = 9, around: int = 12) -> FaceModel:
+    """An ellipsoid head with two expressions (the lower half drops, the front swells), a neck and a derived jaw."""
+    template, faces = _sphere(rings, around)
+    template = template * torch.tensor([0.08, 0.11, 0.09])
+    v = len(template)
+    low = torch.sigmoid((-template[:, 1] - 0.02) * 80)
+    front = torch.sigmoid((template[:, 2] - 0.03) * 80)
+    expression = torch.zeros(2, v, 3)
+    expression[0, :, 1] = -0.03 * low
+    expression[1, :, 2] = 0.02 * front
+    weights = torch.zeros(v, 3)
+    weights[:, 2] = low * front
+    weights[:, 1] = 0.5 * low * (1 - front)
+    weights[:, 0] = 1 - weights[:, 1] - weights[:, 2]
+    identity = torch.zeros(2, v, 3)
+    identity[0, :, 0] = 0.1 * template[:, 0]
+    identity[1, :, 1] = 0.1 * template[:, 1]
+    rotation = torch.zeros(2, 3, 3)
+    rotation[0, 2, 0] = 0.2
+    return FaceModel(
+        name="toy", template=template, faces=faces, uv=torch.rand(v, 2), uv_faces=faces,
+        region_names=("skin",), face_regions=torch.zeros(len(faces), dtype=torch.long),
+        identity_basis=identity, expression_basis=expression, expression_names=("drop", "swell"),
+        expression_bounds=torch.tensor([[0.0, 1.0], [0.0, 1.0]]),
+        joint_names=("head", "neck", "jaw"), joint_parents=(-1, 0, 0), joint_free=(False, True, False),
+        joint_template=torch.tensor([[0.0, 0, 0], [0, -0.08, -0.02], [0, -0.02, 0]]),
+        joint_identity_basis=torch.zeros(2, 3, 3), joint_rotation_basis=rotation,
+        joint_translation_basis=torch.zeros(2, 3, 3), skinning_weights=weights, landmarks={},
+    )  # fmt: skip
+
+
+def toy_face(timesteps: int) -> FaceParams:
+    """A head half a metre in front of the camera that talks, nods and turns a little."""
+    time = torch.linspace(0, 2 * math.pi, timesteps + 1)[:-1]
+    still = torch.zeros(timesteps)
+    return FaceParams(
+        identity=torch.tensor([0.5, -0.3]),
+        expression=torch.stack([0.5 + 0.5 * time.sin(), 0.5 - 0.5 * time.cos()], dim=-1),
+        joints=0.1 * torch.stack([time.cos(), still, still], dim=-1)[:, None],
+        head_rotation=torch.stack([0.1 * time.sin(), 0.2 * time.cos(), still], dim=-1),
+        head_translation=torch.stack([0.01 * time.cos(), 0.01 * time.sin(), still - 0.5], dim=-1),
+    )
+
+
+def toy_camera(size: int) -> Camera:
+    """The world is the camera's with y up and z backward; the head fills half of the picture."""
+    focal = 1.2 * size
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    return Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])), size, size)
+
+
+def toy_tracking(face_model: FaceModel, timesteps: int, size: int) -> Tracking:
+    """The exact tracking of the toy capture."""
+    return Tracking(
+        face_model=face_model.name, face_model_hash=face_model.content_hash, face=toy_face(timesteps),
+        valid=torch.ones(timesteps, dtype=torch.bool), cameras=(toy_camera(size),),
+        neck_lines=torch.tensor([0.0, -1.0, float(size)]).repeat(timesteps, 1, 1),
+        residuals=torch.zeros(timesteps, 1),
+    )  # fmt: skip
+
+
+def toy_capture(face_model: FaceModel, timesteps: int = 10, size: int = 64) -> tuple[Capture, np.ndarray]:
+    """Pictures of coloured blobs at the mesh's triangles, and their alpha as the scoring mask."""
+    camera, face = toy_camera(size), toy_face(timesteps)
+    vertices = face_model(face)
+    rows = torch.arange(size) + 0.5
+    colours = 0.5 + 0.5 * torch.sin(40 * face_model.template[face_model.faces].mean(1) + torch.tensor([0.0, 2.0, 4.0]))
+    images, mattes = [], []
+    for timestep in range(timesteps):
+        centres = vertices[timestep][face_model.faces].mean(1)
+        facing = _facing(vertices[timestep], face_model.faces)
+        pixels, _ = camera.project(centres)
+        squared = (rows[None, :, None] - pixels[:, 0]) ** 2 + (rows[:, None, None] - pixels[:, 1]) ** 2
+        weights = torch.exp(-squared / (2 * (size / 25) ** 2)) * facing
+        total = weights.sum(-1)
+        image = (weights[..., None] * colours).sum(-2) / total.clamp_min(1e-6)[..., None]
+        images.append((image * 255).to(torch.uint8))
+        mattes.append(((total * 2).clamp_max(1) * 255).to(torch.uint8))
+    pictures, alpha = torch.stack(images)[:, None].numpy(), torch.stack(mattes)[:, None].numpy()
+    capture = Capture(
+        name="toy", camera_ids=("front",), fps=25.0, timestamps=np.arange(timesteps) / 25, images=pictures,
+        mattes=alpha, landmarks=np.zeros((timesteps, 1, 478, 2), dtype=np.float32),
+        valid=np.ones((timesteps, 1), dtype=bool), principal_point=np.full((1, 2), size / 2, dtype=np.float32),
+        source={"file": "toy"},
+    )  # fmt: skip
+    return capture, alpha
+
+
+def _facing(vertices: Tensor, faces: Tensor) -> Tensor:
+    """1 for triangles whose outside the camera sees."""
+    v0, v1, v2 = vertices[faces].unbind(1)
+    normal = torch.linalg.cross(v1 - v0, v2 - v0)
+    return ((normal * (v0 + v1 + v2)).sum(-1) < 0).float()
+
+
+def _sphere(rings: int, around: int) -> tuple[Tensor, Tensor]:
+    polar = torch.linspace(0.15, math.pi - 0.15, rings)[:, None]
+    angle = torch.linspace(0, 2 * math.pi, around + 1)[:-1]
+    x, z = polar.sin() * angle.sin(), polar.sin() * angle.cos()
+    points = torch.stack([x, polar.cos().expand_as(x), z], dim=-1).reshape(-1, 3)
+    ring, column = torch.meshgrid(torch.arange(rings - 1), torch.arange(around), indexing="ij")
+    first, second = ring * around + column, ring * around + (column + 1) % around
+    quads = torch.stack([first, first + around, second + around, first, second + around, second], dim=-1)
+    return points, quads.reshape(-1, 3)
