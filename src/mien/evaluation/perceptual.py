@@ -21,7 +21,9 @@ Backbone = Literal["st-lpips-alex"]
 
 _WEIGHTS = {"st-lpips-alex": "weights/vST0.0/alex_shift_tolerant.pth"}
 _PACKAGE = "stlpips_pytorch"
-MINIMUM_SIZE = 16
+_BLUR = torch.tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])[None, None] / 16
+_STRIP = 16
+MINIMUM_SIZE = 32
 """Pixels: smaller pictures have no features left in the deepest layers."""
 
 
@@ -35,6 +37,8 @@ class PerceptualDistance(nn.Module):
 
     shift: Tensor
     scale: Tensor
+    weight0: Tensor
+    bias0: Tensor
 
     def __init__(self, state: dict[str, Tensor]) -> None:
         super().__init__()
@@ -50,7 +54,7 @@ class PerceptualDistance(nn.Module):
         """Five feature maps, of unit length at each pixel, of an image in 0..1: to be compared by `between`."""
         assert min(image.shape[:2]) >= MINIMUM_SIZE, f"{tuple(image.shape)} is too small to compare"
         values = ((image.permute(2, 0, 1)[None] * 2 - 1) - self.shift) / self.scale
-        maps = [torch.relu(_halve(self._convolve(0, values, padding=2)))]
+        maps = [torch.relu(self._first_map(values))]
         maps.append(torch.relu(self._convolve(1, _pool(maps[-1]), padding=2)))
         maps.append(torch.relu(self._convolve(2, _pool(maps[-1]), padding=1)))
         maps.append(torch.relu(self._convolve(3, maps[-1], padding=1)))
@@ -70,6 +74,24 @@ class PerceptualDistance(nn.Module):
         """The distance of two images in 0..1."""
         return self.between(self.features(image), self.features(target))
 
+    def _first_map(self, values: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "1 c y x"]:
+        """`_halve` of the first convolution, at a fifth of its cost: the two are one convolution inside the picture.
+
+        Mirroring the border is none. At the top and left it repeats the next sample; at the bottom and right the two
+        steps are done one after the other on narrow strips.
+        """
+
+        def stepwise(strip: Tensor) -> Tensor:
+            return _halve(self._convolve(0, strip, padding=2))
+
+        weight = torch.nn.functional.conv2d(self.weight0.flatten(0, 1)[:, None], _BLUR.to(values), padding=2)
+        weight = weight.reshape(*self.weight0.shape[:2], *weight.shape[-2:])
+        inside = torch.nn.functional.conv2d(values, weight, self.bias0, stride=2, padding=2)
+        height, width = (_STRIP + size % 2 for size in values.shape[2:])
+        right = stepwise(values[..., -width:])[:, :, 1:-1, -1:]
+        middle = torch.cat([inside[..., :1], inside, right], dim=3)
+        return torch.cat([middle[:, :, :1], middle, stepwise(values[:, :, -height:])[:, :, -1:]], dim=2)
+
     def _convolve(self, index: int, values: Tensor, padding: int) -> Tensor:
         weight, bias = getattr(self, f"weight{index}"), getattr(self, f"bias{index}")
         return torch.nn.functional.conv2d(values, weight, bias, padding=padding)
@@ -78,15 +100,16 @@ class PerceptualDistance(nn.Module):
 def _halve(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
     """Blur by (1, 2, 1) / 4 both ways and keep every second sample, with the border mirrored by two samples."""
     channels = values.shape[1]
-    line = torch.tensor([0.25, 0.5, 0.25], dtype=values.dtype, device=values.device)
-    kernel = torch.outer(line, line).expand(channels, 1, 3, 3)
+    kernel = _BLUR.to(values).expand(channels, 1, 3, 3)
     padded = torch.nn.functional.pad(values, (2, 2, 2, 2), mode="reflect")
     return torch.nn.functional.conv2d(padded, kernel, stride=2, groups=channels)
 
 
 def _pool(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
     """Anti-aliased pooling: the maximum of 3x3 at every pixel, then `_halve`."""
-    return _halve(torch.nn.functional.max_pool2d(values, kernel_size=3, stride=1))
+    # Five times as fast as max_pool2d with stride 1 on a CPU.
+    rows = torch.maximum(torch.maximum(values[:, :, :-2], values[:, :, 1:-1]), values[:, :, 2:])
+    return _halve(torch.maximum(torch.maximum(rows[..., :-2], rows[..., 1:-1]), rows[..., 2:]))
 
 
 @lru_cache(maxsize=1)
