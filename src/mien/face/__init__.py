@@ -1,6 +1,15 @@
 """Face models: parameters in, vertices out."""
 
+from mien.face.loading import FaceModelInfo, available_face_models, load_face_model
 from mien.face.model import FaceModel, Landmarks
 from mien.face.params import FaceParams, concatenate
 
-__all__ = ["FaceModel", "FaceParams", "Landmarks", "concatenate"]
+__all__ = [
+    "FaceModel",
+    "FaceModelInfo",
+    "FaceParams",
+    "Landmarks",
+    "available_face_models",
+    "concatenate",
+    "load_face_model",
+]

