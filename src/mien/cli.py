@@ -77,7 +77,7 @@ def _run(name: str, rest: list[str]) -> int:
 
 
 def _use_one_torch_thread() -> None:
-    """torch's thread pool and mien's native one stall each other: torch keeps one thread, native ops take the cores."""
+    """Torch's thread pool and mien's native one stall each other: torch keeps one thread, native ops take the cores."""
     import torch
 
     torch.set_num_threads(1)

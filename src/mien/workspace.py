@@ -55,7 +55,9 @@ def open_workspace(root: Path) -> Workspace:
     if not root.is_dir():
         raise UserError(f"{root}: no such folder; make a workspace with `mien create VIDEO --out {root}`")
     if not workspace.sequence_names() and not workspace.run_names():
-        raise UserError(f"{root}: not a mien workspace (no sequences/NAME/capture, no runs/NAME); see `mien create --help`")
+        raise UserError(
+            f"{root}: not a mien workspace (no sequences/NAME/capture, no runs/NAME); see `mien create --help`"
+        )
     return workspace
 
 
