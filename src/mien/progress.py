@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -16,6 +16,7 @@ console = Console(stderr=True, highlight=False)
 _PLAIN_INTERVAL_SECONDS = 10.0
 
 
+@runtime_checkable  # for beartype, which checks annotations during tests
 class Advance(Protocol):
     """Moves a progress bar on."""
 
