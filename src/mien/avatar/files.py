@@ -1,5 +1,6 @@
 """Avatars on disk: a folder with avatar.json, avatar.safetensors and, where its licence allows, the face model."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ from mien.avatar.baked import BakedAvatar
 from mien.avatar.methods import method_named, method_of
 from mien.config import decode, encode
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
+from mien.face import FaceModel, FaceParams, load_face_model
+from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.storage import read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
-_FACE_MODEL, _BAKED = "mien.face_model", "mien.baked"
+_BAKED = "mien.baked"
 NOT_CARRIED = frozenset({"flame"})
 """Face models whose licence does not allow them to be passed on inside an avatar."""
 
@@ -27,7 +29,7 @@ def write_avatar(folder: Path, avatar: Avatar) -> None:
     write_tensors(folder / "avatar.safetensors", tensors)
     carried = avatar.face_model.name not in NOT_CARRIED
     if carried:
-        write_tensor_dataclass(folder / "face_model", _FACE_MODEL, avatar.face_model)
+        write_face_model(folder / "face_model", avatar.face_model)
     content = {
         "kind": method_of(avatar.config),
         "config": encode(avatar.config),
@@ -125,10 +127,9 @@ def read_tensor_dataclass(stem: Path, format_name: str, hint: Any) -> Any:
 def _face_model_of(folder: Path, content: dict[str, Any]) -> FaceModel:
     name = content["face_model"]
     if content["face_model_carried"]:
-        face_model = read_tensor_dataclass(folder / "face_model", _FACE_MODEL, FaceModel)
+        bare = read_face_model(folder / "face_model")
+        face_model = replace(bare, landmarks=read_landmarks(name, bare))
     else:
-        from mien.face import load_face_model
-
         face_model = load_face_model(name)
     if face_model.content_hash != content["face_model_hash"]:
         raise UserError(

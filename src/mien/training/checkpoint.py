@@ -1,0 +1,91 @@
+"""Checkpoints: everything that the rest of a run depends on, one file each, written atomically."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mien.avatar import Avatar, Moments
+from mien.avatar.files import overwrite
+from mien.errors import UserError
+from mien.progress import say
+from mien.storage import read_tensors, write_tensors
+from mien.training.adam import Adam
+from mien.training.density import DensityStrategy
+from mien.training.face_track import FaceTrack
+
+_KEPT = 2
+
+
+@dataclass(eq=False)
+class TrainingState:
+    """What training changes. Random numbers are functions of the seed and the step, so no generator is part of it."""
+
+    avatar: Avatar
+    adam: Adam
+    density: DensityStrategy
+    track: FaceTrack
+    curves: dict[str, list[float]]
+    step: int = 0
+    """Steps done."""
+    seconds: float = 0.0
+    """Spent on them."""
+
+
+def write_checkpoint(folder: Path, state: TrainingState) -> None:
+    """Write a checkpoint into `folder` and delete all but the newest two."""
+    tensors = {f"avatar.{name}": tensor for name, tensor in state.avatar.state_dict().items()}
+    tensors |= {f"density.{name}": tensor for name, tensor in state.density.state().items()}
+    tensors |= {f"track.{name}": tensor for name, tensor in state.track.state().items()}
+    tensors |= {f"curves.{name}": torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
+    for owner, moments in (("store", state.avatar.gaussian_store().moments), ("adam", state.adam.state())):
+        for name, own in moments.items():
+            tensors |= {f"{owner}.{name}:{field}": getattr(own, field) for field in ("first", "second", "step")}
+    tensors |= {
+        "step": torch.tensor(state.step),
+        "seconds": torch.tensor(state.seconds, dtype=torch.float64),
+        "gaussians": torch.tensor(len(state.avatar.gaussian_store())),
+    }
+    write_tensors(folder / f"step_{state.step:07d}.safetensors", tensors, {"format": "mien.checkpoint", "version": "1"})
+    for old in checkpoint_files(folder)[:-_KEPT]:
+        old.unlink()
+
+
+def checkpoint_files(folder: Path) -> list[Path]:
+    """Checkpoints, oldest first."""
+    return sorted(folder.glob("step_*.safetensors"))
+
+
+def resume(folder: Path, state: TrainingState) -> None:
+    """Bring `state`, which is that of the run's start, to the newest checkpoint that can be read, if there is any.
+
+    Raises:
+        UserError: a checkpoint is of another method or other settings.
+    """
+    for path in reversed(checkpoint_files(folder)):
+        try:
+            tensors = read_tensors(path)
+        except UserError as error:
+            say(f"{error}; going on from an older one")
+            continue
+        _restore(path, state, tensors)
+        return
+
+
+def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> None:
+    def part(prefix: str) -> dict[str, Tensor]:
+        return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+    overwrite(state.avatar, part("avatar."), int(tensors["gaussians"]), path)
+    state.avatar.gaussian_store().moments.update(_moments(part("store.")))
+    state.adam.load_state(_moments(part("adam.")))
+    state.density.load_state(part("density."))
+    state.track.load_state(part("track."))
+    state.curves = {name: curve.tolist() for name, curve in part("curves.").items()}
+    state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
+
+
+def _moments(tensors: dict[str, Tensor]) -> dict[str, Moments]:
+    names = dict.fromkeys(key.rpartition(":")[0] for key in tensors)
+    return {name: Moments(*(tensors[f"{name}:{field}"] for field in ("first", "second", "step"))) for name in names}

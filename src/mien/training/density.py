@@ -1,0 +1,199 @@
+"""Density control: where Gaussians are added and removed.
+
+Strategies see a `GaussianStore`, what was posed and rendered, and the method's hooks; never the method. They keep
+statistics of one entry per Gaussian, which checkpoints save.
+"""
+
+from abc import ABC, abstractmethod
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.avatar import DensityControl, FixedDensity, GaussianStore, GradientDensity, Posed, Progress, RefillDensity
+from mien.render.rendering import Rendering
+
+
+class DensityStrategy(ABC):
+    """Watches every step, and changes the store in some."""
+
+    @abstractmethod
+    def observe(self, posed: Posed, rendering: Rendering) -> None:
+        """Take statistics after a step's backward pass; `posed` is of one timestep."""
+
+    @abstractmethod
+    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
+        """Change the store if it is time to, after the optimiser's step; True if it did."""
+
+    @abstractmethod
+    def state(self) -> dict[str, Tensor]:
+        """What a checkpoint has to keep."""
+
+    @abstractmethod
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Go on from what `state` returned."""
+
+
+def density_strategy(control: DensityControl, store: GaussianStore) -> DensityStrategy:
+    """The strategy that a method's description asks for."""
+    if isinstance(control, GradientDensity):
+        return GradientStrategy(control, len(store))
+    if isinstance(control, RefillDensity):
+        return RefillStrategy(control, len(store))
+    assert isinstance(control, FixedDensity)
+    return FixedStrategy()
+
+
+class GradientStrategy(DensityStrategy):
+    """Duplicate small and split large Gaussians whose centres pull; prune faint ones; lower opacities at times."""
+
+    def __init__(self, control: GradientDensity, gaussians: int):
+        self._control = control
+        self._restart(gaussians)
+
+    def observe(self, posed: Posed, rendering: Rendering) -> None:
+        """Add up gradients with respect to centres in normalised device coordinates, where visible."""
+        gradient = rendering.means2d_offset.grad
+        assert gradient is not None, "observe() needs the gradients of a backward pass"
+        height, width = rendering.image.shape[-3:-1]
+        # Pixels to normalised device coordinates, which span -1..1: the unit that thresholds are given in.
+        pull = torch.linalg.vector_norm(gradient * gradient.new_tensor([width / 2, height / 2]), dim=-1)
+        visible = rendering.radii > 0
+        # Culled Gaussians have no gradient, so the sum needs no mask.
+        self._pull += pull
+        self._seen += visible
+        torch.maximum(self._radius, rendering.radii, out=self._radius)
+        torch.maximum(self._opacity, posed.gaussians.opacities.detach().expand_as(pull), out=self._opacity)
+
+    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
+        """Grow and prune in rounds; reset opacities at their times."""
+        settings = self._control.settings
+        done = progress.step + 1
+        changed = done in _round_steps(settings.start, settings.stop, settings.rounds, progress.steps)
+        if changed:
+            self._grow_and_prune(store, posed, progress, random)
+            self._restart(len(store))
+        name = self._control.opacity_logits
+        if name is not None and done in {max(1, round(time * progress.steps)) for time in settings.opacity_resets}:
+            ceiling = torch.logit(torch.tensor(settings.reset_opacity))
+            store.assign(name, store[name].detach().clamp_max(float(ceiling)))
+        return changed
+
+    def state(self) -> dict[str, Tensor]:
+        """The statistics since the last round."""
+        return {"pull": self._pull, "seen": self._seen, "radius": self._radius, "opacity": self._opacity}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Go on from what `state` returned."""
+        self._pull, self._seen, self._radius, self._opacity = (
+            state[name].clone() for name in ("pull", "seen", "radius", "opacity")
+        )
+
+    def _restart(self, gaussians: int) -> None:
+        self._pull = torch.zeros(gaussians)
+        self._seen = torch.zeros(gaussians)
+        self._radius = torch.zeros(gaussians, dtype=torch.int32)
+        self._opacity = torch.zeros(gaussians)
+
+    def _grow_and_prune(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> None:
+        settings = self._control.settings
+        sizes = posed.gaussians.scales.detach().reshape(len(store), 3).amax(-1)
+        prune = self._control.may_prune(store, self._to_prune(store, sizes, progress))
+        grow = self._to_grow(~prune, budget=settings.max_gaussians - int((~prune).sum()))
+        split = grow & (sizes > settings.split_size)
+        parents = (grow & ~split).nonzero()[:, 0]
+        store.append(parents)
+        # Both children of a split replace their parent.
+        parents = split.nonzero()[:, 0].repeat(2)
+        noise = torch.randn(len(parents), 3, generator=random)
+        store.append(parents, self._control.split(store, parents, noise))
+        kept = torch.ones(len(store), dtype=torch.bool)
+        kept[: len(prune)] = ~(prune | split)
+        store.select(kept)
+
+    def _to_prune(self, store: GaussianStore, sizes: Float[Tensor, " n"], progress: Progress) -> Bool[Tensor, " n"]:
+        settings = self._control.settings
+        prune = self._control.judged_opacities(store, self._opacity) < settings.prune_opacity
+        later_resets = [time for time in settings.opacity_resets if time > settings.start]
+        if later_resets and progress.fraction > min(later_resets):
+            prune = prune | (sizes > settings.prune_size)
+            if settings.prune_radius > 0:
+                prune = prune | (self._radius > settings.prune_radius)
+        return prune
+
+    def _to_grow(self, candidates: Bool[Tensor, " n"], budget: int) -> Bool[Tensor, " n"]:
+        """Those above the threshold; if there are more than the budget allows, those that pull most."""
+        pull = torch.where(candidates, self._pull / self._seen.clamp_min(1), -1.0)
+        grow = pull >= self._control.settings.grow_gradient
+        if int(grow.sum()) > budget:
+            strongest = pull.argsort(descending=True, stable=True)[: max(budget, 0)]
+            grow = torch.zeros_like(grow).index_fill(0, strongest, True)
+        return grow
+
+
+class RefillStrategy(DensityStrategy):
+    """Delete what no view has shown, then refill up to the target with children of random survivors."""
+
+    def __init__(self, control: RefillDensity, gaussians: int):
+        self._control = control
+        self._opacity = torch.zeros(gaussians)
+
+    def observe(self, posed: Posed, rendering: Rendering) -> None:
+        """Remember each Gaussian's highest opacity."""
+        torch.maximum(self._opacity, posed.gaussians.opacities.detach().expand_as(self._opacity), out=self._opacity)
+
+    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
+        """Prune and refill at the rounds' times."""
+        settings = self._control.settings
+        due = [
+            target
+            for time, target in zip(settings.times, settings.targets, strict=True)
+            if max(1, round(time * progress.steps)) == progress.step + 1
+        ]
+        if not due:
+            return False
+        unseen = self._control.judged_opacities(store, self._opacity) < settings.prune_opacity
+        kept = ~self._control.may_prune(store, unseen)
+        if not bool(kept.any()):
+            # An avatar of no Gaussians cannot be refilled: keep the one that was most visible.
+            kept[self._opacity.argmax()] = True
+        store.select(kept)
+        missing = due[-1] - len(store)
+        if missing > 0:
+            parents = torch.randint(len(store), (missing,), generator=random)
+            noise = torch.rand(missing, 3, generator=random) - 0.5
+            store.append(parents, self._control.refill(store, parents, noise, progress.fraction))
+        self._opacity = torch.zeros(len(store))
+        return True
+
+    def state(self) -> dict[str, Tensor]:
+        """The statistics since the last round."""
+        return {"opacity": self._opacity}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Go on from what `state` returned."""
+        self._opacity = state["opacity"].clone()
+
+
+class FixedStrategy(DensityStrategy):
+    """Changes nothing."""
+
+    def observe(self, posed: Posed, rendering: Rendering) -> None:
+        """Nothing to watch."""
+
+    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
+        """Never changes the store."""
+        return False
+
+    def state(self) -> dict[str, Tensor]:
+        """Nothing to keep."""
+        return {}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Nothing to load."""
+
+
+def _round_steps(start: float, stop: float, rounds: int, steps: int) -> set[int]:
+    """After how many steps each round happens, evenly from `start` to `stop` (fractions of the run)."""
+    gaps = max(rounds - 1, 1)
+    return {max(1, round((start + (stop - start) * index / gaps) * steps)) for index in range(rounds)}

@@ -1,0 +1,84 @@
+"""Which frame a step looks at: every draw is a function of the seed and the step, so that runs resume exactly."""
+
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from mien.errors import UserError
+from mien.training.sequence import Sequence
+from mien.training.settings import TrainSettings
+from mien.training.split import held_out
+
+_ORDER, _BACKGROUND, _DENSITY = range(3)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture to train on."""
+
+    sequence: int
+    """Index into the run's sequences."""
+    timestep: int
+    camera: int
+    track_index: int
+    """Of the timestep among those of all sequences in a row."""
+
+
+def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list[Frame]:
+    """All frames that are usable and not held out.
+
+    Raises:
+        UserError: there is none.
+    """
+    frames, start = [], 0
+    for index, sequence in enumerate(sequences):
+        usable = sequence.usable() & ~held_out(sequence.capture.timesteps, settings.split).numpy()[:, None]
+        cameras = [camera_id not in settings.held_out_cameras for camera_id in sequence.capture.camera_ids]
+        usable = usable & np.array(cameras)[None, :]
+        if sequence.name not in settings.held_out_sequences:
+            frames += [Frame(index, int(t), int(c), start + int(t)) for t, c in np.argwhere(usable)]
+        start += sequence.capture.timesteps
+    if not frames:
+        names = ", ".join(sequence.name for sequence in sequences)
+        raise UserError(f"{names}: no frame to train on with split {settings.split!r}; a longer clip, or --split none")
+    return frames
+
+
+class FrameOrder:
+    """Shuffled passes over the training frames."""
+
+    def __init__(self, frames: Items[Frame], seed: int):
+        self._frames = frames
+        self._seed = seed
+        self._epoch = -1
+        self._order: list[int] = []
+
+    def at(self, step: int) -> tuple[Frame, int]:
+        """The frame of a step and the number of passes completed before it."""
+        epoch = step // len(self._frames)
+        if epoch != self._epoch:
+            generator = random_at(self._seed, _ORDER, epoch)
+            self._order = torch.randperm(len(self._frames), generator=generator).tolist()
+            self._epoch = epoch
+        return self._frames[self._order[step % len(self._frames)]], epoch
+
+
+def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]:
+    """The background colour of a step."""
+    if settings.background == "white":
+        return np.full(3, 255, dtype=np.uint8)
+    generator = random_at(settings.seed, _BACKGROUND, step)
+    return torch.randint(256, (3,), generator=generator).numpy().astype(np.uint8)
+
+
+def density_random(settings: TrainSettings, step: int) -> torch.Generator:
+    """The random numbers of a step's density control."""
+    return random_at(settings.seed, _DENSITY, step)
+
+
+def random_at(seed: int, purpose: int, step: int) -> torch.Generator:
+    """A generator that depends on these three numbers only."""
+    return torch.Generator().manual_seed((seed * 8 + purpose) * 2**40 + step)

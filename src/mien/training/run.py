@@ -1,0 +1,143 @@
+"""A run's folder: config.json, avatar/, checkpoints/, curves.safetensors, face_track.safetensors, training.json."""
+
+import hashlib
+import json
+import resource
+import sys
+from collections.abc import Sequence as Items
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import mien
+from mien.avatar import MethodConfig, method_of, write_avatar
+from mien.camera import Camera
+from mien.config import encode
+from mien.errors import UserError
+from mien.storage import read_json, read_tensors, write_json, write_tensors
+from mien.training.checkpoint import TrainingState
+from mien.training.sequence import Sequence
+from mien.training.settings import TrainSettings
+
+_FORMAT, _VERSION = "mien.run", 1
+_SUMMARY = "mien.training"
+_FREE_TO_CHANGE = ("threads", "checkpoint_every")
+"""Settings that do not change the result: a run may go on with others."""
+
+
+def claim_run(run_dir: Path, sequences: Items[Sequence], method_config: MethodConfig, settings: TrainSettings) -> None:
+    """Write config.json, or find that the one there asks for the same run.
+
+    Raises:
+        UserError: the folder holds a run with other settings, method or data.
+    """
+    path = run_dir / "config.json"
+    content = {
+        "method": {**encode(method_config), "kind": method_of(method_config)},
+        "settings": encode(settings),
+        "data": [_fingerprint(sequence) for sequence in sequences],
+        "mien": mien.__version__,
+        "command_line": sys.argv,
+    }
+    if not path.is_file():
+        write_json(path, _FORMAT, _VERSION, content)
+        return
+    found = read_json(path, _FORMAT, _VERSION)
+    different = sorted(_differences(found, json.loads(json.dumps(content))))
+    if different:
+        raise UserError(
+            f"{run_dir}: holds a run with other {', '.join(different[:5])}; give this run another name or delete it"
+        )
+
+
+def read_run_config(run_dir: Path) -> dict[str, Any]:
+    """What config.json says: method, settings, data, mien (version) and command_line.
+
+    Raises:
+        UserError: it is missing or damaged.
+    """
+    return read_json(run_dir / "config.json", _FORMAT, _VERSION)
+
+
+def run_camera(run_dir: Path) -> Camera:
+    """The first camera that a run was trained with.
+
+    Raises:
+        UserError: config.json is missing or damaged.
+    """
+    stored = read_run_config(run_dir)["data"][0]["camera"]
+    K, viewmat = torch.tensor(stored["K"]), torch.tensor(stored["viewmat"])
+    return Camera(K, viewmat, stored["width"], stored["height"])
+
+
+def is_finished(run_dir: Path) -> bool:
+    """Whether the run was trained to its end."""
+    return (run_dir / "training.json").is_file()
+
+
+def write_results(run_dir: Path, state: TrainingState) -> None:
+    """Write everything that outlives training; training.json comes last and marks the run as finished."""
+    write_avatar(run_dir / "avatar", state.avatar)
+    write_tensors(run_dir / "face_track.safetensors", state.track.params().tensors())
+    curves = {name: torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
+    write_tensors(run_dir / "curves.safetensors", curves)
+    summary = {
+        "steps": state.step,
+        "seconds": round(state.seconds, 1),
+        "gaussians": len(state.avatar.gaussian_store()),
+        "step_ms_median": round(float(np.median(state.curves["step_ms"])), 3),
+        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+    }
+    write_json(run_dir / "training.json", _SUMMARY, _VERSION, summary)
+
+
+def read_training_summary(run_dir: Path) -> dict[str, Any]:
+    """`steps, seconds, gaussians, step_ms_median, peak_memory_mb` of a finished run.
+
+    Raises:
+        UserError: the run was not trained to its end.
+    """
+    content = read_json(run_dir / "training.json", _SUMMARY, _VERSION)
+    return {name: value for name, value in content.items() if name not in ("format", "version")}
+
+
+def read_curves(run_dir: Path) -> dict[str, np.ndarray]:
+    """Equally long curves of a finished run: step, loss, psnr, gaussians, step_ms, and each loss by name.
+
+    Raises:
+        UserError: they are missing or damaged.
+    """
+    return {name: curve.numpy() for name, curve in read_tensors(run_dir / "curves.safetensors").items()}
+
+
+def _fingerprint(sequence: Sequence) -> dict[str, Any]:
+    """What tells two sequences apart: their source and how they were tracked."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(sequence.tracking.face.tensors().items()):
+        digest.update(name.encode() + tensor.detach().numpy().tobytes())
+    first = sequence.tracking.cameras[0]
+    for camera in sequence.tracking.cameras:
+        digest.update(camera.K.numpy().tobytes() + camera.viewmat.numpy().tobytes())
+    return {
+        "sequence": sequence.name,
+        "timesteps": sequence.capture.timesteps,
+        "source": encode(sequence.capture.source),
+        "tracking": digest.hexdigest()[:16],
+        "camera": {
+            "K": first.K.tolist(),
+            "viewmat": first.viewmat.tolist(),
+            "width": first.width,
+            "height": first.height,
+        },
+    }
+
+
+def _differences(found: Any, wanted: Any, name: str = "") -> set[str]:
+    """Dotted names of what differs between two json values, apart from what may."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        ignored = {"format", "version", "mien", "command_line"} if not name else set(_FREE_TO_CHANGE)
+        names = (set(found) | set(wanted)) - ignored
+        return set().union(*(_differences(found.get(n), wanted.get(n), f"{name}.{n}".lstrip(".")) for n in names))
+    return set() if found == wanted else {name}

@@ -1,0 +1,96 @@
+"""Sequence: what training needs to know about one filmed sequence, and the pictures it is compared with."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.capture import Capture
+from mien.tracking.tracking import Tracking
+
+_CACHE_BYTES = 2 << 30
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """One sequence: pictures, the tracked face, and the frozen mask that says what is trained on and scored."""
+
+    name: str
+    capture: Capture
+    tracking: Tracking
+    scoring: UInt8[np.ndarray, "t c h w"]
+    """Opacity of what counts (the matte above the neck line), 255 = all."""
+
+    def usable(self) -> np.ndarray:
+        """Bool [t, c]: a face was found and tracked."""
+        return self.capture.valid & self.tracking.valid.numpy()[:, None]
+
+
+def composite(
+    image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"], background: UInt8[np.ndarray, " 3"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """`image` where the matte is opaque, over `background`; rounded to the nearest integer."""
+    alpha = matte[..., None].astype(np.uint16)
+    mixed = image * alpha + background.astype(np.uint16) * (255 - alpha)
+    # Division by 255, rounded, in integers: exact for 16 bits.
+    mixed += 128
+    return ((mixed + (mixed >> 8)) >> 8).astype(np.uint8)
+
+
+class Targets:
+    """The pictures of one sequence at training resolution, composited; those over a fixed background are kept."""
+
+    def __init__(self, sequence: Sequence, resolution: int):
+        self._sequence = sequence
+        longest = max(sequence.capture.width, sequence.capture.height)
+        scale = min(1.0, resolution / longest) if resolution > 0 else 1.0
+        self.width = max(1, round(sequence.capture.width * scale))
+        self.height = max(1, round(sequence.capture.height * scale))
+        self.cameras = tuple(camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
+        self._kept: dict[tuple[int, int, bytes], Tensor] = {}
+        self._room = _CACHE_BYTES // (self.width * self.height * 3)
+
+    def camera(self, camera: int) -> Camera:
+        """The camera of the training pictures."""
+        return self.cameras[camera]
+
+    def matte(self, timestep: int, camera: int) -> UInt8[Tensor, "h w"]:
+        """What counts, at training resolution."""
+        return torch.from_numpy(self._resize(self._sequence.scoring[timestep, camera]))
+
+    def picture(
+        self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool
+    ) -> UInt8[Tensor, "h w 3"]:
+        """The picture over a background; `keep` it if the same background will be asked for again."""
+        key = (timestep, camera, background.tobytes())
+        if key in self._kept:
+            return self._kept[key]
+        image = self._resize(self._sequence.capture.images[timestep, camera])
+        matte = self._resize(self._sequence.scoring[timestep, camera])
+        picture = torch.from_numpy(composite(image, matte, background))
+        if keep and len(self._kept) < self._room:
+            self._kept[key] = picture
+        return picture
+
+    def _resize(self, picture: np.ndarray) -> np.ndarray:
+        if picture.shape[:2] == (self.height, self.width):
+            return np.array(picture)
+        return cv2.resize(np.array(picture), (self.width, self.height), interpolation=cv2.INTER_AREA)
+
+
+def read_sequence(folder: Path) -> Sequence:
+    """The sequence in FOLDER/{capture,tracking,scoring}; its name is the folder's.
+
+    Raises:
+        UserError: a part is missing, damaged or of another version.
+    """
+    from mien.capture import read_capture
+    from mien.tracking import read_scoring, read_tracking
+
+    scoring = read_scoring(folder / "scoring")
+    return Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), scoring.alpha)

@@ -1,0 +1,39 @@
+"""TrainSettings: what a run is, apart from the method; presets are plain instances."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mien.training.split import Split
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Settings of a training run. The method's own (losses, rates, density control) are in its config."""
+
+    steps: int = 15_000
+    """Optimiser steps, one frame each; all schedules stretch with it."""
+    split: Split = "blocks"
+    """What is held out: every fifth block of 10 timesteps, the last 20 % (`tail`), or nothing."""
+    background: Literal["white", "random"] = "white"
+    """What pictures are composited on; a random colour each step keeps Gaussians from painting the background."""
+    resolution: int = 0
+    """Longer side of the training pictures in pixels; 0 for the capture's own."""
+    seed: int = 0
+    """Same seed, same settings, same data: same bytes (on a CPU)."""
+    threads: int = 0
+    """Threads of native operations; 0 for MIEN_THREADS or all cores. Results do not depend on it."""
+    checkpoint_every: int = 1_000
+    """Steps between checkpoints."""
+    record_every: int = 10
+    """Steps between entries of the curves."""
+    held_out_sequences: tuple[str, ...] = ()
+    """Whole sequences that are not trained on."""
+    held_out_cameras: tuple[str, ...] = ()
+    """Camera ids that are not trained on."""
+
+
+PRESETS = {
+    "draft": TrainSettings(steps=3_000),
+    "standard": TrainSettings(),
+}
+"""From quick to good."""

@@ -1,0 +1,25 @@
+"""Which timesteps are held out."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+Split = Literal["blocks", "tail", "none"]
+_BLOCK, _EVERY = 10, 5
+_TAIL_SHARE = 0.2
+
+
+def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
+    """Which of a sequence's timesteps are for testing.
+
+    `blocks`: every fifth block of 10, beginning with the fifth, so that poses and expressions of the test are about
+    those of training. `tail`: the last 20 %, which may show what was never seen. `none`: nothing.
+    """
+    index = torch.arange(timesteps)
+    if split == "blocks":
+        return index // _BLOCK % _EVERY == _EVERY - 1
+    if split == "tail":
+        return index >= timesteps - round(_TAIL_SHARE * timesteps)
+    return torch.zeros(timesteps, dtype=torch.bool)

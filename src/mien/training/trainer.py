@@ -1,0 +1,157 @@
+"""The training loop: one frame a step, whatever the method."""
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Items
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from mien.avatar import Avatar, MethodConfig, Progress, load_avatar, method_named, method_of
+from mien.errors import UserError
+from mien.face import FaceModel, concatenate
+from mien.progress import Advance, progress_bar
+from mien.render import rasterize
+from mien.training.adam import Adam
+from mien.training.checkpoint import TrainingState, resume, write_checkpoint
+from mien.training.density import density_strategy
+from mien.training.face_track import FaceTrack
+from mien.training.frames import FrameOrder, background_at, density_random, training_frames
+from mien.training.losses import picture_losses, train_psnr
+from mien.training.run import claim_run, is_finished, write_results
+from mien.training.sequence import Sequence, Targets
+from mien.training.settings import TrainSettings
+
+ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
+"""(title, total, completed) -> a context whose value moves the bar on."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """What training reads and never changes."""
+
+    order: FrameOrder
+    targets: tuple[Targets, ...]
+    """One a sequence."""
+
+
+def train(
+    sequences: Items[Sequence],
+    face_model: FaceModel,
+    method_config: MethodConfig,
+    settings: TrainSettings,
+    run_dir: Path,
+    progress: ProgressBar = progress_bar,
+) -> Avatar:
+    """Train an avatar on some sequences of one subject; the result is also in `run_dir`.
+
+    If `run_dir` holds a run with the same settings that was stopped, it goes on where that was and ends with the same
+    bytes as if it had never stopped; if that run is finished, its avatar is loaded.
+
+    Raises:
+        UserError: `run_dir` holds another run; the face model is not the one the sequences were tracked with; nothing
+            is left to train on.
+        KeyboardInterrupt: after Ctrl-C, when a checkpoint is safe.
+    """
+    for sequence in sequences:
+        if sequence.tracking.face_model_hash != face_model.content_hash:
+            raise UserError(
+                f"{sequence.name}: tracked with face model {sequence.tracking.face_model!r} "
+                f"{sequence.tracking.face_model_hash}, not {face_model.name!r} {face_model.content_hash}; track again"
+            )
+    order = FrameOrder(training_frames(sequences, settings), settings.seed)
+    claim_run(run_dir, sequences, method_config, settings)
+    if is_finished(run_dir):
+        return load_avatar(run_dir)
+    data = TrainingData(order, tuple(Targets(sequence, settings.resolution) for sequence in sequences))
+    state = start(sequences, face_model, method_config, settings)
+    resume(run_dir / "checkpoints", state)
+    with _one_torch_thread(), _deferred_interrupt() as interrupted:
+        with progress("training", settings.steps, state.step) as advance:
+            while state.step < settings.steps:
+                status = step(state, data, settings)
+                advance(1, status)
+                if state.step % settings.checkpoint_every == 0 or interrupted():
+                    write_checkpoint(run_dir / "checkpoints", state)
+                if interrupted():
+                    raise KeyboardInterrupt
+        write_results(run_dir, state)
+    return state.avatar
+
+
+def start(
+    sequences: Items[Sequence], face_model: FaceModel, method_config: MethodConfig, settings: TrainSettings
+) -> TrainingState:
+    """The state before the first step."""
+    face = concatenate([sequence.tracking.face for sequence in sequences])
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
+    density = density_strategy(avatar.density(), avatar.gaussian_store())
+    return TrainingState(avatar, Adam(), density, FaceTrack(face, method_config.face_tuning), {})
+
+
+def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
+    """One step of training: pose, render, compare, improve, grow and prune. Returns words for the progress bar."""
+    began = time.perf_counter()
+    frame, epoch = data.order.at(state.step)
+    progress = Progress(state.step, settings.steps, epoch)
+    background = background_at(settings, state.step)
+    targets = data.targets[frame.sequence]
+    target = targets.picture(frame.timestep, frame.camera, background, keep=settings.background == "white")
+    matte = targets.matte(frame.timestep, frame.camera)
+    avatar, weights = state.avatar, state.avatar.config.photometric
+
+    face = state.track.face(frame.track_index)
+    posed = avatar.pose(face, progress)
+    colour = torch.from_numpy(background) / 255
+    rendering = rasterize(posed.gaussians.timestep(0), targets.camera(frame.camera), background=colour)
+    losses = picture_losses(rendering, target, matte, weights) | avatar.regularizers(posed, rendering, progress)
+    loss = torch.stack(list(losses.values())).sum()
+    loss.backward()
+
+    groups = [*avatar.parameter_groups(), *state.track.parameter_groups(face, frame.track_index)]
+    state.density.observe(posed, rendering)
+    state.adam.step(groups, progress)
+    state.density.control(avatar.gaussian_store(), posed, progress, density_random(settings, state.step))
+
+    state.step += 1
+    elapsed = time.perf_counter() - began
+    state.seconds += elapsed
+    if state.step % settings.record_every != 0 and state.step != settings.steps:
+        return ""
+    entry = {name: float(value.detach()) for name, value in losses.items()}
+    entry |= {"step": state.step, "loss": float(loss.detach()), "psnr": train_psnr(rendering, target)}
+    entry |= {"gaussians": len(avatar.gaussian_store()), "step_ms": elapsed * 1000}
+    for name, value in entry.items():
+        state.curves.setdefault(name, []).append(value)
+    return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Keep torch on one thread: its pool and the native one would wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Turn Ctrl-C into a question that is asked between steps, so that no step is left half done."""
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: asked.set())
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
