@@ -1,0 +1,138 @@
+"""The decoded cache of a capture: valid while neither it nor the PNGs beside it change; rebuilt otherwise."""
+
+import hashlib
+import itertools
+import os
+import shutil
+import tempfile
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mien.capture.frame_files import CACHE, FRAMES, MATTES, CacheWriter, FrameLayout, read_png
+from mien.errors import UserError
+from mien.progress import progress_bar
+from mien.storage import read_json, write_json
+
+_FORMAT, _VERSION = "mien.capture_cache", 1
+_THREADS = 2
+_IN_FLIGHT = 16
+_SCRATCH_PREFIX = "mien-capture-"
+
+
+def stamp_cache(layout: FrameLayout, capture_hash: str) -> None:
+    """Declare the cache complete and in step with the PNGs."""
+    write_json(
+        layout.folder / CACHE / "stamp.json",
+        _FORMAT,
+        _VERSION,
+        {"capture_hash": capture_hash, "fingerprint": _fingerprint(layout)},
+    )
+
+
+def map_frames(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Memory maps of all frames [t, c, h, w, 3] and mattes [t, c, h, w]; decodes them first where the cache is stale.
+
+    Raises:
+        UserError: a frame or matte is missing or damaged.
+    """
+    _check_present(layout)
+    if not _is_valid(layout, capture_hash):
+        layout = _rebuild(layout, capture_hash, digests)
+    images, mattes = (np.memmap(layout.raw(kind), np.uint8, "r", shape=layout.shape(kind)) for kind in (FRAMES, MATTES))
+    if layout.folder.name.startswith(_SCRATCH_PREFIX):
+        # The maps keep the pages; nobody else needs the names.
+        shutil.rmtree(layout.folder, ignore_errors=True)
+    return images, mattes
+
+
+def _check_present(layout: FrameLayout) -> None:
+    expected = {f"{timestep:06d}.png" for timestep in range(layout.timesteps)}
+    for kind, camera_id in itertools.product((FRAMES, MATTES), layout.camera_ids):
+        folder = layout.folder / kind / camera_id
+        found = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
+        missing = sorted(expected - found)
+        if missing:
+            raise UserError(
+                f"{folder / missing[0]}: missing ({len(missing)} of {layout.timesteps} are); "
+                "delete the capture's folder and capture again"
+            )
+
+
+def _is_valid(layout: FrameLayout, capture_hash: str) -> bool:
+    try:
+        stamp = read_json(layout.folder / CACHE / "stamp.json", _FORMAT, _VERSION)
+        sizes = [layout.raw(kind).stat().st_size for kind in (FRAMES, MATTES)]
+    except (UserError, OSError):
+        return False
+    return (
+        stamp.get("capture_hash") == capture_hash
+        and sizes == [layout.raw_size(kind) for kind in (FRAMES, MATTES)]
+        and stamp.get("fingerprint") == _fingerprint(layout)
+    )
+
+
+def _fingerprint(layout: FrameLayout) -> str:
+    """Of sizes and times of change of the cache and of all PNGs: cheap, and changes when a file does."""
+    digest = hashlib.sha256()
+    for kind in (FRAMES, MATTES):
+        paths: list[Path] = [layout.raw(kind)]
+        for camera_id in layout.camera_ids:
+            folder = layout.folder / kind / camera_id
+            paths += [folder / f"{timestep:06d}.png" for timestep in range(layout.timesteps)]
+        for path in paths:
+            status = path.stat()
+            digest.update(f"{status.st_size} {status.st_mtime_ns};".encode())
+    return digest.hexdigest()
+
+
+def _rebuild(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarray]) -> FrameLayout:
+    """Decode everything into the cache, or into a scratch folder where the capture's own cannot be written."""
+    try:
+        _decode_all(layout, layout, digests)
+        stamp_cache(layout, capture_hash)
+        return layout
+    except OSError:
+        scratch = replace(layout, folder=Path(tempfile.mkdtemp(prefix=_SCRATCH_PREFIX)))
+        try:
+            _decode_all(layout, scratch, digests)
+        except BaseException as error:
+            shutil.rmtree(scratch.folder, ignore_errors=True)
+            if isinstance(error, OSError):
+                raise UserError(
+                    f"{layout.folder}: no room for the decoded frames ({error.strerror}); free some disk space"
+                ) from None
+            raise
+        return scratch
+
+
+def _decode_all(source: FrameLayout, target: FrameLayout, digests: dict[str, np.ndarray]) -> None:
+    (target.folder / CACHE / "stamp.json").unlink(missing_ok=True)
+    writer = CacheWriter(target)
+
+    def decode(kind: str, timestep: int, camera: int) -> None:
+        path = source.png(kind, timestep, camera)
+        picture = read_png(path, source.shape(kind)[2:], int(digests[kind][timestep, camera]))
+        writer.write(kind, timestep, camera, np.ascontiguousarray(picture))
+
+    cameras = range(len(source.camera_ids))
+    everything = itertools.product((FRAMES, MATTES), range(source.timesteps), cameras)
+    total = 2 * source.timesteps * len(cameras)
+    pending: deque[Future[None]] = deque()
+    threads = ThreadPoolExecutor(_THREADS)
+    try:
+        with progress_bar(f"decode {source.folder.name}", total) as advance:
+            for kind, timestep, camera in everything:
+                pending.append(threads.submit(decode, kind, timestep, camera))
+                if len(pending) >= _IN_FLIGHT:
+                    pending.popleft().result()
+                    advance()
+            while pending:
+                pending.popleft().result()
+                advance()
+    finally:
+        threads.shutdown(wait=True, cancel_futures=True)
+        writer.close()

@@ -1,0 +1,132 @@
+"""Faces in pictures: boxes of all faces (to choose the crop), then the landmarks of the one that is followed."""
+
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
+
+LANDMARKS = 478
+"""MediaPipe's face mesh with irises."""
+_MOST_FACES = 4
+_DETECTION_CONFIDENCE = 0.5
+_GAP_SECONDS = 1.0
+"""After so long without a face, the largest one is taken instead of the nearest."""
+
+
+class FaceFinder:
+    """Boxes of all faces in a picture: MediaPipe's detector for near faces, where it fails the one for far faces.
+
+    Use as a context manager.
+    """
+
+    def __enter__(self) -> Self:
+        module = load_solution("face_detection")
+        with quiet_mediapipe():
+            self._detectors = [
+                module.FaceDetection(model_selection=model, min_detection_confidence=_DETECTION_CONFIDENCE)
+                for model in (0, 1)
+            ]
+            blank = np.zeros((64, 64, 3), np.uint8)
+            for detector in self._detectors:
+                detector.process(blank)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for detector in self._detectors:
+            detector.close()
+
+    def find(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n 4"]:
+        """Left, top, right, bottom of each face, eyebrows to chin, as fractions of the picture's width and height."""
+        for detector in self._detectors:
+            found = detector.process(image).detections
+            if found:
+                boxes = [detection.location_data.relative_bounding_box for detection in found]
+                return np.array([(b.xmin, b.ymin, b.xmin + b.width, b.ymin + b.height) for b in boxes])
+        return np.zeros((0, 4))
+
+
+@dataclass
+class FaceFollower:
+    """Keeps to one face: the one nearest to the last; at first, and after a long gap, the largest."""
+
+    crowded: int = field(default=0, init=False)
+    """Frames in which there was a choice."""
+    _last: np.ndarray | None = field(default=None, init=False)
+    _last_seconds: float = field(default=0.0, init=False)
+
+    def choose(self, boxes: Float[np.ndarray, "n 4"], seconds: float) -> Float[np.ndarray, " 4"] | None:
+        """The box to follow, or none where there is no face."""
+        if len(boxes) == 0:
+            return None
+        self.crowded += len(boxes) > 1
+        if self._last is None or seconds - self._last_seconds > _GAP_SECONDS:
+            chosen = boxes[np.argmax((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1]))]
+        else:
+            # All four sides count: of two faces one behind the other, the one of the last size is meant.
+            chosen = boxes[np.argmin(np.abs(boxes - self._last).sum(axis=1))]
+        self._last, self._last_seconds = chosen, seconds
+        return chosen
+
+
+class LandmarkDetector:
+    """Face-mesh landmarks over consecutive pictures of one clip. Use as a context manager, one for each clip.
+
+    MediaPipe places its region of interest by the landmarks of the picture before, which is steadier than detecting
+    anew, but makes a result depend on some four pictures before it: show those first.
+    """
+
+    def __init__(self, several_faces: bool) -> None:
+        self._several_faces = several_faces
+
+    def __enter__(self) -> Self:
+        module = load_solution("face_mesh")
+        with quiet_mediapipe():
+            self._mesh = module.FaceMesh(max_num_faces=_MOST_FACES if self._several_faces else 1, refine_landmarks=True)
+        self._has_seen_face = False
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._mesh.close()
+
+    def detect(
+        self, image: UInt8[np.ndarray, "h w 3"], near: Float[np.ndarray, " 2"] | None = None
+    ) -> Float[np.ndarray, "l 2"] | None:
+        """The landmarks in pixels, or none where there is no face.
+
+        Args:
+            image: the next picture of the clip.
+            near: of several faces, take the one whose landmarks' mean is nearest to this pixel.
+        """
+        faces = self._process(image)
+        if not faces:
+            return None
+        height, width = image.shape[:2]
+        all_points = np.array([[(point.x, point.y) for point in face.landmark] for face in faces])
+        all_points *= (width, height)
+        if near is None or len(faces) == 1:
+            return all_points[0]
+        return all_points[np.argmin(np.linalg.norm(all_points.mean(axis=1) - near, axis=1))]
+
+    def _process(self, image: np.ndarray) -> Any:
+        if self._has_seen_face:
+            return self._mesh.process(image).multi_face_landmarks
+        # Its last warning comes with the first face.
+        with quiet_mediapipe():
+            faces = self._mesh.process(image).multi_face_landmarks
+        self._has_seen_face = bool(faces)
+        return faces
+
+
+def second_difference_jitter(landmarks: Float[np.ndarray, "t l 2"]) -> float:
+    """Median length in pixels of the landmarks' second difference over time; NaN for less than three frames."""
+    differences = landmarks[2:] - 2 * landmarks[1:-1] + landmarks[:-2]
+    lengths = np.linalg.norm(differences, axis=-1)
+    return float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else float("nan")

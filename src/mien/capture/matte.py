@@ -1,0 +1,108 @@
+"""Mattes: MediaPipe's selfie segmentation at 256x256, steadied over time, refined on the picture at full size."""
+
+from types import TracebackType
+from typing import Self
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
+
+_MODEL_SIZE = 256
+_STEADY = 0.7
+"""Weight of the mask before, where the picture has not changed at all."""
+_CHANGE = 0.03
+"""Colour difference (0..1) at which that weight has dropped to 1 / e."""
+_GUIDE_RADIUS = 1 / 48
+"""Of the guided filter's window, as a fraction of the picture's longer side."""
+_GUIDE_EPSILON = 1e-4
+"""Variance of colour (0..1) below which the guided filter smooths instead of following edges."""
+
+
+class Segmenter:
+    """Soft person masks of consecutive pictures of one clip. Use as a context manager."""
+
+    def __enter__(self) -> Self:
+        module = load_solution("selfie_segmentation")
+        with quiet_mediapipe():
+            self._model = module.SelfieSegmentation(model_selection=0)
+            self._model.process(np.zeros((_MODEL_SIZE, _MODEL_SIZE, 3), np.uint8))
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._model.close()
+
+    def segment(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "256 256"]:
+        """How surely each part of the picture is a person, 0..1, steadied by the picture before."""
+        small = cv2.resize(image, (_MODEL_SIZE, _MODEL_SIZE), interpolation=cv2.INTER_AREA)
+        mask = self._model.process(small).segmentation_mask.copy()
+        colours = cv2.blur(small, (5, 5)).astype(np.float32) / 255
+        if self._last is not None:
+            last_mask, last_colours = self._last
+            # Only where nothing moved: elsewhere the mask before would leave a ghost.
+            change = np.abs(colours - last_colours).max(axis=-1)
+            weight = _STEADY * np.exp(-np.square(change / _CHANGE))
+            mask = mask + weight * (last_mask - mask)
+        self._last = (mask, colours)
+        return mask
+
+
+def refine_matte(image: UInt8[np.ndarray, "h w 3"], mask: Float[np.ndarray, "256 256"]) -> UInt8[np.ndarray, "h w"]:
+    """The mask at the picture's size with its border moved onto the picture's edges, 255 = person."""
+    height, width = image.shape[:2]
+    coarse = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    radius = max(2, round(_GUIDE_RADIUS * max(width, height)))
+    alpha = guided_filter(image.astype(np.float32) / 255, coarse, radius, _GUIDE_EPSILON)
+    return np.rint(np.clip(alpha, 0, 1) * 255).astype(np.uint8)
+
+
+def guided_filter(
+    guide: Float[np.ndarray, "h w 3"], values: Float[np.ndarray, "h w"], radius: int, epsilon: float
+) -> Float[np.ndarray, "h w"]:
+    """`values` as a locally affine function of the guide's colour (He, Sun, Tang: Guided Image Filtering, eq. 19).
+
+    Solved on every second pixel and interpolated (He, Sun: Fast Guided Filter, arXiv:1505.00996).
+    """
+    height, width = values.shape
+    half = (max(1, width // 2), max(1, height // 2))
+    slope, offset = _affine_fit(
+        cv2.resize(guide, half, interpolation=cv2.INTER_AREA),
+        cv2.resize(values, half, interpolation=cv2.INTER_AREA),
+        max(1, radius // 2),
+        epsilon,
+    )
+    slope = cv2.resize(slope, (width, height), interpolation=cv2.INTER_LINEAR)
+    offset = cv2.resize(offset, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.einsum("hwc,hwc->hw", slope, guide) + offset
+
+
+def _affine_fit(
+    guide: np.ndarray, values: np.ndarray, radius: int, epsilon: float
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    def mean(image: np.ndarray) -> np.ndarray:
+        return cv2.blur(image, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_REFLECT)
+
+    red, green, blue = guide[..., 0], guide[..., 1], guide[..., 2]
+    mean_guide, mean_values = mean(guide), mean(values)
+    covariance = mean(guide * values[..., None]) - mean_guide * mean_values[..., None]
+    squares = mean(guide * guide) - mean_guide * mean_guide + epsilon
+    mixed = mean(np.stack([green * blue, red * blue, red * green], axis=-1))
+    mixed -= mean_guide[..., [1, 0, 0]] * mean_guide[..., [2, 2, 1]]
+    rr, gg, bb = squares[..., 0], squares[..., 1], squares[..., 2]
+    gb, rb, rg = mixed[..., 0], mixed[..., 1], mixed[..., 2]
+    # The inverse of the symmetric 3x3 matrix by its cofactors.
+    c_rr, c_rg, c_rb = gg * bb - gb * gb, rb * gb - rg * bb, rg * gb - rb * gg
+    c_gg, c_gb, c_bb = rr * bb - rb * rb, rg * rb - rr * gb, rr * gg - rg * rg
+    determinant = rr * c_rr + rg * c_rg + rb * c_rb
+    vr, vg, vb = covariance[..., 0], covariance[..., 1], covariance[..., 2]
+    slope = np.stack(
+        [c_rr * vr + c_rg * vg + c_rb * vb, c_rg * vr + c_gg * vg + c_gb * vb, c_rb * vr + c_gb * vg + c_bb * vb],
+        axis=-1,
+    )
+    slope /= determinant[..., None]
+    offset = mean_values - np.einsum("hwc,hwc->hw", slope, mean_guide)
+    return mean(slope), mean(offset)

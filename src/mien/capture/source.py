@@ -1,0 +1,169 @@
+"""Where frames come from: a video file or a folder of images, and which of its frames are taken."""
+
+import hashlib
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from mien.capture.video import probe_video, read_video_frames
+from mien.errors import UserError
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
+
+
+@dataclass(frozen=True)
+class FrameSelection:
+    """Which frames of a source are taken."""
+
+    start: float = 0.0
+    """Seconds to skip at the beginning."""
+    stride: int = 1
+    """Take every n-th frame."""
+    max_frames: int = 0
+    """Stop after so many frames; 0 takes all."""
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """A video file or a folder of images that can be read as often as needed, a frame at a time."""
+
+    path: Path
+    selection: FrameSelection
+    fps: float
+    """Of the frames taken, so after `stride`."""
+    expected_frames: int
+    """For progress bars; only reading tells the true number."""
+    content_hash: str
+    """Of the file, or of the names and contents of all images."""
+
+    def frames(self, longest_side: int = 0) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
+        """Times in seconds from the first frame taken, and pictures, shrunk to `longest_side` pixels unless that is 0.
+
+        Raises:
+            UserError: something cannot be decoded, or the selection leaves no frame.
+        """
+        if self.path.is_dir():
+            everything = _read_images(self.path, self.fps * self.selection.stride, longest_side)
+        else:
+            everything = read_video_frames(self.path, longest_side)
+        taken, first = 0, 0.0
+        candidates = 0
+        for seconds, image in everything:
+            if seconds < self.selection.start - 1e-6:
+                continue
+            candidates += 1
+            if (candidates - 1) % self.selection.stride:
+                continue
+            first = seconds if taken == 0 else first
+            yield seconds - first, image
+            taken += 1
+            if taken == self.selection.max_frames:
+                break
+        if taken == 0:
+            raise UserError(f"{self.path}: has no frame after {self.selection.start:g} s; choose an earlier start")
+
+
+def open_source(path: Path, selection: FrameSelection, fps: float) -> FrameSource:
+    """Look at a source without reading its frames.
+
+    Args:
+        path: a video file, or a folder with images, which are taken in the natural order of their names.
+        selection: which frames to take.
+        fps: frames a second of a folder of images; a video knows its own.
+
+    Raises:
+        UserError: the source is missing, is no video, or holds no images.
+    """
+    if selection.stride < 1 or selection.max_frames < 0 or selection.start < 0:
+        raise UserError(f"{selection}: start and max_frames must not be negative, and stride must be at least 1")
+    if path.is_dir():
+        if not fps > 0:
+            raise UserError(f"{fps} frames a second for {path}: must be above 0")
+        images = list_images(path)
+        total = len(images)
+        content_hash = _hash_files(images, with_names=True)
+    else:
+        info = probe_video(path)
+        fps, total = info.fps, info.frames
+        content_hash = _hash_files([path], with_names=False)
+    remaining = max(0, total - round(selection.start * fps))
+    expected = -(-remaining // selection.stride)
+    if selection.max_frames:
+        expected = min(expected, selection.max_frames) if total else selection.max_frames
+    return FrameSource(path, selection, fps / selection.stride, expected, content_hash)
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The images in a folder, `2.png` before `10.png`.
+
+    Raises:
+        UserError: there are none.
+    """
+    images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    if not images:
+        raise UserError(f"{folder}: holds no images; name a video or a folder of .png or .jpg files")
+    return sorted(images, key=lambda path: [int(part) if part.isdigit() else part for part in _parts(path.name)])
+
+
+def _parts(name: str) -> list[str]:
+    # Digits always land at odd places, so that numbers are only ever compared with numbers.
+    return re.split(r"([0-9]+)", name)
+
+
+def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """An 8-bit sRGB picture, turned by its EXIF orientation.
+
+    Raises:
+        UserError: it is missing or damaged.
+    """
+    try:
+        data = np.fromfile(path, np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
+    except (OSError, cv2.error):
+        image = None
+    if image is None:
+        raise UserError(f"{path}: cannot be read as an image; remove or replace it")
+    return image.astype(np.uint8, copy=False)
+
+
+def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[tuple[float, np.ndarray]]:
+    shape: tuple[int, ...] | None = None
+    for index, path in enumerate(list_images(folder)):
+        image = read_image(path)
+        shape = shape or image.shape
+        if image.shape != shape:
+            raise UserError(
+                f"{path}: is {image.shape[1]}x{image.shape[0]}, the images before it are {shape[1]}x{shape[0]}; "
+                "give images of one size"
+            )
+        yield index / fps, shrink_to(image, longest_side) if longest_side else image
+
+
+def shrink_to(image: UInt8[np.ndarray, "h w 3"], longest_side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """The picture with at most `longest_side` pixels a side, area-averaged; never enlarged."""
+    height, width = image.shape[:2]
+    width_out, height_out = shrunk_size(width, height, longest_side)
+    if (width_out, height_out) == (width, height):
+        return image
+    return cv2.resize(image, (width_out, height_out), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+
+
+def shrunk_size(width: int, height: int, longest_side: int) -> tuple[int, int]:
+    """Width and height after shrinking to `longest_side` with the same aspect; never enlarged."""
+    scale = min(1.0, longest_side / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _hash_files(paths: list[Path], with_names: bool) -> str:
+    digest = hashlib.sha256()
+    for path in paths:
+        if with_names:
+            digest.update(path.name.encode() + b"\0")
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()

@@ -1,0 +1,240 @@
+"""Captures on disk: `capture.json`, `landmarks.safetensors`, `frames/`, `mattes/`, and a `cache/` that may go."""
+
+import hashlib
+import math
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mien.capture.cache import map_frames, stamp_cache
+from mien.capture.capture import Capture
+from mien.capture.frame_files import CACHE, FRAMES, MATTES, FrameLayout, FrameWriter
+from mien.errors import UserError
+from mien.progress import progress_bar
+from mien.storage import read_arrays, read_json, write_arrays, write_json
+
+FORMAT, VERSION = "mien.capture", 1
+JSON_NAME, ARRAYS_NAME, REPORT_NAME = "capture.json", "landmarks.safetensors", "report.json"
+_OWN_NAMES = frozenset({JSON_NAME, ARRAYS_NAME, REPORT_NAME, FRAMES, MATTES, CACHE})
+_REMEDY = "delete the folder and capture again"
+_ARRAYS = {
+    "timestamps": ("t", np.float64),
+    "landmarks": ("tcl2", np.float32),
+    "valid": ("tc", np.bool_),
+    "principal_point": ("c2", np.float64),
+    "frame_digests": ("tc", np.uint64),
+    "matte_digests": ("tc", np.uint64),
+}
+"""Axes and type of every array in the safetensors file."""
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureData:
+    """A capture without its pictures, and where it came from."""
+
+    name: str
+    camera_ids: tuple[str, ...]
+    fps: float
+    timestamps: Float[np.ndarray, " t"]
+    landmarks: Float[np.ndarray, "t c l 2"]
+    valid: Bool[np.ndarray, "t c"]
+    principal_point: Float[np.ndarray, "c 2"]
+    source: dict[str, Any]
+
+
+def write_capture(path: Path, capture: Capture) -> str:
+    """Write a capture to a folder, atomically, and return its hash. What was a capture there before is replaced.
+
+    Raises:
+        UserError: the folder holds something else, or cannot be written.
+    """
+    partial = partial_folder(path)
+    try:
+        check_replaceable(path)
+        shutil.rmtree(partial, ignore_errors=True)
+        layout = FrameLayout(partial, capture.camera_ids, capture.timesteps, capture.height, capture.width)
+        with FrameWriter(layout) as writer, progress_bar(f"write {capture.name}", capture.timesteps) as advance:
+            for timestep in range(capture.timesteps):
+                images, mattes = capture.images[timestep], capture.mattes[timestep]
+                writer.submit(timestep, lambda images=images, mattes=mattes: (images, mattes))
+                advance()
+            writer.flush()
+        data = CaptureData(
+            name=capture.name,
+            camera_ids=capture.camera_ids,
+            fps=capture.fps,
+            timestamps=capture.timestamps,
+            landmarks=capture.landmarks,
+            valid=capture.valid,
+            principal_point=capture.principal_point,
+            source=capture.source,
+        )
+        return finish_capture(layout, path, data, writer.digests)
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def read_capture(path: Path) -> Capture:
+    """Read a capture; its images and mattes are memory maps of the decoded cache, which is rebuilt where it is stale.
+
+    Raises:
+        UserError: the folder is missing, damaged, incomplete, or of another version.
+    """
+    if not path.is_dir():
+        raise UserError(f"{path}: no capture there; run `mien capture` first, or check the path")
+    content = read_json(path / JSON_NAME, FORMAT, VERSION)
+    layout, data, digests = _checked(path, content, read_arrays(path / ARRAYS_NAME))
+    if content.get("capture_hash") != _hash(data, layout, digests):
+        raise UserError(f"{path / ARRAYS_NAME}: does not belong to the {JSON_NAME} beside it; {_REMEDY}")
+    images, mattes = map_frames(layout, content["capture_hash"], digests)
+    return Capture(
+        name=data.name,
+        camera_ids=data.camera_ids,
+        fps=data.fps,
+        timestamps=data.timestamps,
+        images=images,
+        mattes=mattes,
+        landmarks=data.landmarks,
+        valid=data.valid,
+        principal_point=data.principal_point,
+        source=data.source,
+    )
+
+
+def read_capture_hash(path: Path) -> str:
+    """The hash over pixels, mattes, landmarks, times and cameras of a capture on disk, without reading them.
+
+    Raises:
+        UserError: there is no capture, or one of another version.
+    """
+    return str(read_json(path / JSON_NAME, FORMAT, VERSION).get("capture_hash"))
+
+
+def partial_folder(path: Path) -> Path:
+    """Where a capture is written before it is complete: beside its place, so that a rename finishes it."""
+    return path.parent / f".{path.name}.partial"
+
+
+def check_replaceable(path: Path) -> None:
+    """Refuse to write over anything but an empty folder or a capture.
+
+    Raises:
+        UserError: something else is there.
+    """
+    if path.exists() and not path.is_dir():
+        raise UserError(f"{path}: is a file; choose a folder for the capture")
+    foreign = sorted(entry.name for entry in path.iterdir() if entry.name not in _OWN_NAMES) if path.is_dir() else []
+    if foreign:
+        raise UserError(f"{path}: holds something that is no capture ({foreign[0]}); choose an empty or a new folder")
+
+
+def finish_capture(
+    layout: FrameLayout,
+    path: Path,
+    data: CaptureData,
+    digests: dict[str, np.ndarray],
+    report: dict[str, Any] | None = None,
+) -> str:
+    """Add what belongs beside the frames, and rename the finished folder to `path`. Returns the capture's hash."""
+    folder = layout.folder
+    capture_hash = _hash(data, layout, digests)
+    write_arrays(folder / ARRAYS_NAME, _arrays(data, digests))
+    if report is not None:
+        write_json(folder / REPORT_NAME, "mien.capture_report", 1, report)
+    stamp_cache(layout, capture_hash)
+    content = {
+        "name": data.name,
+        "camera_ids": list(data.camera_ids),
+        "fps": data.fps,
+        "timesteps": layout.timesteps,
+        "width": layout.width,
+        "height": layout.height,
+        "capture_hash": capture_hash,
+        "source": data.source,
+    }
+    write_json(folder / JSON_NAME, FORMAT, VERSION, content)
+    old = path.parent / f".{path.name}.old"
+    shutil.rmtree(old, ignore_errors=True)
+    if path.exists():
+        path.rename(old)
+    folder.rename(path)
+    shutil.rmtree(old, ignore_errors=True)
+    return capture_hash
+
+
+def cannot_write(path: Path, error: OSError) -> UserError:
+    """What to tell when the place for a capture refuses."""
+    return UserError(f"{path}: cannot be written ({error.strerror or error}); choose another place or free disk space")
+
+
+def _arrays(data: CaptureData, digests: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    arrays = {
+        "timestamps": data.timestamps,
+        "landmarks": data.landmarks,
+        "valid": data.valid,
+        "principal_point": data.principal_point,
+        "frame_digests": digests[FRAMES],
+        "matte_digests": digests[MATTES],
+    }
+    return {name: array.astype(_ARRAYS[name][1]) for name, array in arrays.items()}
+
+
+def _hash(data: CaptureData, layout: FrameLayout, digests: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256(repr((data.camera_ids, data.fps, layout.height, layout.width)).encode())
+    for name, array in sorted(_arrays(data, digests).items()):
+        digest.update(f"{name} {array.shape};".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _checked(
+    path: Path, content: dict[str, Any], arrays: dict[str, np.ndarray]
+) -> tuple[FrameLayout, CaptureData, dict[str, np.ndarray]]:
+    """Everything but the pictures, after checks of every field's type, range and size."""
+    camera_ids: Any = content.get("camera_ids")
+    timesteps, height, width = (_positive_int(content.get(key)) for key in ("timesteps", "height", "width"))
+    name, fps, source = content.get("name"), content.get("fps"), content.get("source")
+    if not (
+        (isinstance(camera_ids, list) and camera_ids and all(map(is_file_name, camera_ids)))
+        and (timesteps and height and width)
+        and (isinstance(fps, int | float) and math.isfinite(fps) and fps > 0)
+        and (isinstance(name, str) and isinstance(source, dict))
+    ):
+        raise UserError(f"{path / JSON_NAME}: has missing or wrong entries; {_REMEDY}")
+    _check_arrays(path / ARRAYS_NAME, arrays, timesteps, len(camera_ids))
+    data = CaptureData(
+        name=name,
+        camera_ids=tuple(camera_ids),
+        fps=float(fps),
+        timestamps=arrays["timestamps"],
+        landmarks=arrays["landmarks"],
+        valid=arrays["valid"],
+        principal_point=arrays["principal_point"],
+        source=source,
+    )
+    layout = FrameLayout(path, data.camera_ids, timesteps, height, width)
+    return layout, data, {FRAMES: arrays["frame_digests"], MATTES: arrays["matte_digests"]}
+
+
+def _positive_int(value: object) -> int:
+    """The value, or 0 where it is no positive whole number."""
+    return value if isinstance(value, int) and not isinstance(value, bool) and value > 0 else 0
+
+
+def is_file_name(name: object) -> bool:
+    """Whether a camera's name can be a folder's."""
+    return isinstance(name, str) and name not in {"", ".", ".."} and not set(name) & set('/\\\0:*?"<>|')
+
+
+def _check_arrays(path: Path, arrays: dict[str, np.ndarray], timesteps: int, cameras: int) -> None:
+    landmarks = arrays["landmarks"].shape[2] if "landmarks" in arrays and arrays["landmarks"].ndim == 4 else 0
+    sizes = {"t": timesteps, "c": cameras, "l": landmarks, "2": 2}
+    for name, (axes, dtype) in _ARRAYS.items():
+        expected = tuple(sizes[axis] for axis in axes)
+        if name not in arrays or arrays[name].shape != expected or arrays[name].dtype != dtype:
+            found = f"{arrays[name].dtype} {arrays[name].shape}" if name in arrays else "missing"
+            raise UserError(f"{path}: {name} is {found}, expected {np.dtype(dtype)} {expected}; {_REMEDY}")
