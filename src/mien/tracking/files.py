@@ -1,0 +1,110 @@
+"""A tracking on disk: tracking.json (what it is) and tracking.safetensors (the numbers)."""
+
+import hashlib
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.errors import UserError
+from mien.face import FaceParams
+from mien.storage import read_json, read_tensors, write_json, write_tensors
+from mien.tracking.tracking import Tracking
+
+_FORMAT, _VERSION = "mien.tracking", 1
+_JSON, _TENSORS = "tracking.json", "tracking.safetensors"
+_FACE = ("identity", "expression", "joints", "head_rotation", "head_translation", "vertex_offsets")
+_AXES = {
+    "identity": "i", "expression": "te", "joints": "tj3", "head_rotation": "t3", "head_translation": "t3",
+    "vertex_offsets": "v3", "valid": "t", "neck_lines": "tc3", "residuals": "tc", "camera_K": "c33",
+    "camera_viewmats": "c44",
+}  # fmt: skip
+_REMEDY = "delete the folder and run `mien track` again"
+
+
+def write_tracking(path: Path, tracking: Tracking) -> None:
+    """Write a tracking into the folder `path`. The json goes last and vouches for the numbers by their hash."""
+    tensors = {
+        **tracking.face.tensors(),
+        "valid": tracking.valid.to(torch.uint8),
+        "neck_lines": tracking.neck_lines,
+        "residuals": tracking.residuals,
+        "camera_K": torch.stack([camera.K for camera in tracking.cameras]),
+        "camera_viewmats": torch.stack([camera.viewmat for camera in tracking.cameras]),
+    }
+    write_tensors(path / _TENSORS, tensors)
+    content = {
+        "face_model": tracking.face_model,
+        "face_model_hash": tracking.face_model_hash,
+        "timesteps": len(tracking.face),
+        "valid_timesteps": int(tracking.valid.sum()),
+        "cameras": [{"width": camera.width, "height": camera.height} for camera in tracking.cameras],
+        "residual": _residual_summary(tracking.residuals),
+        "settings": tracking.settings,
+        "tensors_sha256": _digest(path / _TENSORS),
+    }
+    write_json(path / _JSON, _FORMAT, _VERSION, content)
+
+
+def read_tracking(path: Path) -> Tracking:
+    """Read what `write_tracking` wrote.
+
+    Raises:
+        UserError: something is missing, damaged, of another version, or not finite.
+    """
+    content = read_json(path / _JSON, _FORMAT, _VERSION)
+    tensors = read_tensors(path / _TENSORS)
+    if _digest(path / _TENSORS) != content.get("tensors_sha256"):
+        raise UserError(f"{path / _TENSORS}: is not what {_JSON} was written with; {_REMEDY}")
+    _check_shapes(path, tensors)
+    try:
+        sizes = [(int(camera["width"]), int(camera["height"])) for camera in content["cameras"]]
+        cameras = tuple(
+            Camera(K, viewmat, width, height)
+            for K, viewmat, (width, height) in zip(tensors["camera_K"], tensors["camera_viewmats"], sizes, strict=True)
+        )
+        return Tracking(
+            face_model=str(content["face_model"]),
+            face_model_hash=str(content["face_model_hash"]),
+            face=FaceParams(**{name: tensors[name] for name in _FACE if name in tensors}),
+            valid=tensors["valid"].bool(),
+            cameras=cameras,
+            neck_lines=tensors["neck_lines"],
+            residuals=tensors["residuals"],
+            settings=dict(content["settings"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path / _JSON}: incomplete ({error}); {_REMEDY}") from None
+
+
+def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
+    """Every tensor is there, its axes agree with the others', and its numbers are finite."""
+    sizes: dict[str, int] = {"3": 3, "4": 4}
+    for name, axes in _AXES.items():
+        if name not in tensors:
+            if name == "vertex_offsets":
+                continue
+            raise UserError(f"{path / _TENSORS}: lacks {name!r}; {_REMEDY}")
+        shape = tuple(tensors[name].shape)
+        agrees = len(shape) == len(axes) and all(
+            sizes.setdefault(axis, size) == size for axis, size in zip(axes, shape, strict=True)
+        )
+        if not agrees:
+            raise UserError(f"{path / _TENSORS}: {name!r} has the shape {list(shape)}; {_REMEDY}")
+        finite = tensors[name].isfinite()
+        if name == "residuals":
+            finite |= tensors["valid"][:, None] == 0
+        if not finite.all():
+            raise UserError(f"{path / _TENSORS}: {name!r} holds numbers that are not finite; {_REMEDY}")
+
+
+def _residual_summary(residuals: Tensor) -> dict[str, float | None]:
+    known = residuals[residuals.isfinite()].double()
+    if len(known) == 0:
+        return {"median_px": None, "p95_px": None}
+    return {"median_px": float(known.median()), "p95_px": float(known.quantile(0.95))}
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,44 @@
+"""Which of MediaPipe's 478 landmarks show what, and how much a tracker trusts each."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+LANDMARKS = 478
+"""468 of the face mesh and 5 of each iris."""
+
+OVAL = (
+    10, 21, 54, 58, 67, 93, 103, 109, 127, 132, 136, 148, 149, 150, 152, 162, 172, 176, 234, 251, 284, 288, 297, 323,
+    332, 338, 356, 361, 365, 377, 378, 379, 389, 397, 400, 454,
+)  # fmt: skip
+"""The outline of the face: a silhouette that slides over the skin, little evidence for any point of it."""
+LIPS = (
+    0, 13, 14, 17, 37, 39, 40, 61, 78, 80, 81, 82, 84, 87, 88, 91, 95, 146, 178, 181, 185, 191, 267, 269, 270, 291, 308,
+    310, 311, 312, 314, 317, 318, 321, 324, 375, 402, 405, 409, 415,
+)  # fmt: skip
+LEFT_EYELIDS = (249, 263, 362, 373, 374, 380, 381, 382, 384, 385, 386, 387, 388, 390, 398, 466)
+RIGHT_EYELIDS = (7, 33, 133, 144, 145, 153, 154, 155, 157, 158, 159, 160, 161, 163, 173, 246)
+BROWS = (46, 52, 53, 55, 63, 65, 66, 70, 105, 107, 276, 282, 283, 285, 293, 295, 296, 300, 334, 336)
+NOSE = (1, 2, 4, 5, 6, 19, 45, 48, 64, 94, 97, 98, 115, 168, 195, 197, 220, 275, 278, 294, 326, 327, 344, 440)
+EYE_CORNERS = (33, 133, 263, 362)
+RIGHT_IRIS = (468, 469, 470, 471, 472)
+"""The centre, then the rim, of the subject's right iris."""
+LEFT_IRIS = (473, 474, 475, 476, 477)
+
+_WEIGHTS = ((OVAL, 0.15), (NOSE, 3.0), (LIPS, 3.0), (LEFT_EYELIDS + RIGHT_EYELIDS, 3.0), (LEFT_IRIS + RIGHT_IRIS, 4.0))
+
+
+def landmark_weights() -> Float[Tensor, " l"]:
+    """How much each landmark counts in a fit; the mean is 1."""
+    weights = torch.ones(LANDMARKS, dtype=torch.float64)
+    for group, weight in _WEIGHTS:
+        weights[list(group)] = weight
+    return weights / weights.mean()
+
+
+def rigid_weights() -> Float[Tensor, " l"]:
+    """The same for a fit of the head pose alone: only points that expressions hardly move, the mean is 1."""
+    weights = torch.zeros(LANDMARKS, dtype=torch.float64)
+    weights[list(NOSE + EYE_CORNERS)] = 1.0
+    weights[list(OVAL)] = 0.05
+    return weights / weights.mean()

@@ -1,0 +1,76 @@
+"""The neck line: where a tracked head ends in the picture, so that shoulders and clothes can be cut off."""
+
+from collections import defaultdict
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.face import FaceModel, FaceParams
+
+_CHUNK = 32
+"""Timesteps posed at once."""
+
+
+def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
+    """The vertices of the mesh's lowest open boundary: the base of the neck."""
+    faces = face_model.faces
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(dim=1).values
+    unique, counts = edges.unique(dim=0, return_counts=True)
+    loops = _connected(unique[counts == 1].tolist())
+    assert loops, f"face model {face_model.name!r} is closed: it has no base of the neck"
+    heights = [float(face_model.template[loop, 1].mean()) for loop in loops]
+    return torch.tensor(sorted(loops[heights.index(min(heights))]))
+
+
+def fit_neck_lines(face_model: FaceModel, face: FaceParams, cameras: tuple[Camera, ...]) -> Float[Tensor, "t c 3"]:
+    """Lines through the projected bottom vertices of every timestep in every camera (`Tracking.neck_lines`).
+
+    GaussianAvatars (arXiv:2312.02069), supplement A: a line fitted to the tracked mesh's bottom vertices.
+    """
+    bottom = bottom_vertices(face_model)
+    up = torch.tensor([0.0, 0.1, 0.0]).to(face.head_translation)
+    lines = []
+    for start in range(0, len(face), _CHUNK):
+        part = face[start : start + _CHUNK]
+        vertices = face_model(part)[:, bottom]
+        centre = vertices.mean(1)
+        above = centre + part.T_world_head[:, :3, :3] @ up
+        seen = [[camera.project(points)[0] for points in (vertices, centre, above)] for camera in cameras]
+        lines.append(torch.stack([_line(*projected) for projected in seen], dim=1))
+    return torch.cat(lines)
+
+
+def _line(
+    points: Float[Tensor, "b n 2"], inside: Float[Tensor, "b 2"], above: Float[Tensor, "b 2"]
+) -> Float[Tensor, "b 3"]:
+    """Total least squares lines (a, b, d), positive on the side of `above`."""
+    centre = points.mean(1)
+    centred = points - centre[:, None]
+    normal = torch.linalg.eigh(centred.mT @ centred).eigenvectors[..., 0]
+    upwards = ((above - inside) * normal).sum(-1, keepdim=True)
+    normal = torch.where(upwards < 0, -normal, normal)
+    return torch.cat([normal, -(normal * centre).sum(-1, keepdim=True)], dim=1)
+
+
+def _connected(edges: list[list[int]]) -> list[list[int]]:
+    """The vertices of each connected component."""
+    neighbours: dict[int, list[int]] = defaultdict(list)
+    for first, second in edges:
+        neighbours[first].append(second)
+        neighbours[second].append(first)
+    components, seen = [], set()
+    for start in neighbours:
+        if start in seen:
+            continue
+        component, pending = [], [start]
+        seen.add(start)
+        while pending:
+            vertex = pending.pop()
+            component.append(vertex)
+            fresh = [other for other in neighbours[vertex] if other not in seen]
+            seen.update(fresh)
+            pending += fresh
+        components.append(component)
+    return components

@@ -1,0 +1,118 @@
+"""The per-frame parameters of a fit as one vector: head pose, free expression coefficients, free joint angles."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mien.face import FaceModel, FaceParams
+
+_JOINT_SIGMAS = {"eye": (0.4, 0.4, 0.0), "neck": (0.0, 0.0, 0.0)}
+"""Priors (radians) of joints by a word in their name: eyes do not roll, and a face shows nothing of its neck."""
+_OTHER_JOINT_SIGMAS = (0.2, 0.2, 0.2)
+_EYES_ALIKE_SIGMA = (0.1, 0.03)
+"""How much the two eyes' angles (up-down, left-right) may differ, radians: they look at the same thing."""
+_EXPRESSION_SIGMAS = {"brow": 0.25, "cheek": 0.3, "nose": 0.3, "eyeLook": 0.3, "jaw": 0.5, "mouth": 0.4, "eye": 0.6}
+"""Priors of coefficients whose name begins with a word; brows are kept in, else they follow the head's pitch."""
+_OTHER_EXPRESSION_SIGMA = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterLayout:
+    """Which component of the vector is what: rotation (3), translation (3), expression, joint angles."""
+
+    names: tuple[str, ...]
+    expression_index: Int[Tensor, " n"]
+    """Columns of `FaceParams.expression` that the fit may move."""
+    joint_index: Int[Tensor, " m"]
+    """Components of the flattened `FaceParams.joints` that the fit may move."""
+    derived_expression: Int[Tensor, " d"]
+    """Expressions that move a joint."""
+    derived_column: Int[Tensor, " d"]
+    """Where they are among `expression_index`."""
+    expressions: int
+    """Of the face model."""
+    joints: int
+    """Free joints of the face model."""
+    lower: Float[Tensor, " p"]
+    upper: Float[Tensor, " p"]
+    precision: Float[Tensor, "p p"]
+    """Of the prior, whose mean is zero; zero for the head pose."""
+
+    @property
+    def size(self) -> int:
+        """The number of parameters a frame, p."""
+        return len(self.names)
+
+    @property
+    def expression_columns(self) -> slice:
+        """Where the expression is in the vector."""
+        return slice(6, 6 + len(self.expression_index))
+
+    @property
+    def joint_columns(self) -> slice:
+        """Where the joint angles are in the vector."""
+        return slice(6 + len(self.expression_index), self.size)
+
+    def face_params(self, state: Float[Tensor, "b p"], identity: Float[Tensor, " i"]) -> FaceParams:
+        """The vectors as face parameters; what the fit may not move is zero."""
+        expression = state.new_zeros(len(state), self.expressions)
+        expression[:, self.expression_index] = state[:, self.expression_columns]
+        joints = state.new_zeros(len(state), self.joints * 3)
+        joints[:, self.joint_index] = state[:, self.joint_columns]
+        return FaceParams(identity, expression, joints.reshape(-1, self.joints, 3), state[:, :3], state[:, 3:6])
+
+
+def layout_of(face_model: FaceModel) -> ParameterLayout:
+    """The free parameters of a face model with their bounds and priors."""
+    bounds = face_model.expression_bounds.double()
+    expression_index = (bounds[:, 0] < bounds[:, 1]).nonzero()[:, 0]
+    joint_names = face_model.free_joint_names
+    sigmas = torch.tensor([_joint_sigmas(name) for name in joint_names], dtype=torch.float64).reshape(-1)
+    joint_index = (sigmas > 0).nonzero()[:, 0]
+    moves = face_model.joint_rotation_basis.flatten(1).any(1) | face_model.joint_translation_basis.flatten(1).any(1)
+    derived_column = moves[expression_index].nonzero()[:, 0]
+
+    names = [f"rotation_{axis}" for axis in "xyz"] + [f"translation_{axis}" for axis in "xyz"]
+    names += [face_model.expression_names[index] for index in expression_index]
+    names += [f"{joint_names[index // 3]}_{'xyz'[index % 3]}" for index in joint_index.tolist()]
+    free = torch.full((len(names),), torch.inf, dtype=torch.float64)
+    lower, upper = -free, free.clone()
+    expression = slice(6, 6 + len(expression_index))
+    lower[expression], upper[expression] = bounds[expression_index].unbind(-1)
+    prior_sigmas = [_expression_sigma(name) for name in names[expression]] + sigmas[joint_index].tolist()
+    precision = torch.zeros(len(names), len(names), dtype=torch.float64)
+    precision.diagonal()[6:] = torch.tensor(prior_sigmas, dtype=torch.float64) ** -2
+    _tie_eyes(precision, names)
+    return ParameterLayout(
+        tuple(names), expression_index, joint_index, expression_index[derived_column], derived_column,
+        len(bounds), len(joint_names), lower, upper, precision,
+    )  # fmt: skip
+
+
+def _joint_sigmas(name: str) -> tuple[float, float, float]:
+    matches = [sigmas for word, sigmas in _JOINT_SIGMAS.items() if word in name.lower()]
+    return matches[0] if matches else _OTHER_JOINT_SIGMAS
+
+
+def _expression_sigma(name: str) -> float:
+    matches = [sigma for word, sigma in _EXPRESSION_SIGMAS.items() if name.startswith(word)]
+    return matches[0] if matches else _OTHER_EXPRESSION_SIGMA
+
+
+def _tie_eyes(precision: Float[Tensor, "p p"], names: list[str]) -> None:
+    for axis, sigma in zip("xy", _EYES_ALIKE_SIGMA, strict=True):
+        pair = [index for index, name in enumerate(names) if "eye" in name.lower() and name.endswith(f"_{axis}")]
+        if len(pair) == 2:
+            stiffness = torch.tensor([[1.0, -1.0], [-1.0, 1.0]], dtype=torch.float64) / sigma**2
+            precision[torch.tensor(pair)[:, None], torch.tensor(pair)] += stiffness
+
+
+def pose_only(layout: ParameterLayout) -> ParameterLayout:
+    """The layout of a fit that moves nothing but the head."""
+    none = torch.zeros(0, dtype=torch.long)
+    return ParameterLayout(
+        layout.names[:6], none, none, none, none, layout.expressions, layout.joints,
+        layout.lower[:6], layout.upper[:6], layout.precision[:6, :6],
+    )  # fmt: skip

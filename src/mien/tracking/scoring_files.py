@@ -1,0 +1,96 @@
+"""The scoring mask on disk: scoring.json, crops.safetensors, masks/CAMERA/000000.png. Written once, never changed."""
+
+import hashlib
+import shutil
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mien.errors import UserError
+from mien.storage import read_arrays, read_json, write_arrays, write_json
+from mien.tracking.scoring import Scoring
+
+_FORMAT, _VERSION = "mien.scoring", 1
+_REMEDY = "delete the folder and run `mien track` again (scores before and after will not compare)"
+
+
+def scoring_exists(path: Path) -> bool:
+    """Whether the folder `path` holds a scoring already."""
+    return (path / "scoring.json").is_file()
+
+
+def write_scoring(path: Path, scoring: Scoring) -> None:
+    """Write a scoring as the folder `path`, all or nothing. One that is there already stays as it is."""
+    if scoring_exists(path):
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    try:
+        _write_into(temporary, scoring)
+        temporary.chmod(0o755)
+        shutil.rmtree(path, ignore_errors=True)
+        temporary.rename(path)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+def read_scoring(path: Path) -> Scoring:
+    """Read what `write_scoring` wrote.
+
+    Raises:
+        UserError: something is missing, damaged or not what was written.
+    """
+    content = read_json(path / "scoring.json", _FORMAT, _VERSION)
+    try:
+        shape = tuple(int(content[name]) for name in ("timesteps", "cameras", "height", "width"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path / 'scoring.json'}: incomplete ({error}); {_REMEDY}") from None
+    crops = read_arrays(path / "crops.safetensors").get("crops")
+    if crops is None or crops.shape != (*shape[:2], 4):
+        raise UserError(f"{path / 'crops.safetensors'}: has not 4 numbers for each frame; {_REMEDY}")
+    masks = np.empty(shape, np.uint8)
+    for timestep, camera in np.ndindex(*shape[:2]):
+        masks[timestep, camera] = _read_mask(_mask_file(path, timestep, camera), shape[2:])
+    if _digest(masks, crops) != content.get("sha256"):
+        raise UserError(f"{path}: masks or crops are not those that were written; {_REMEDY}")
+    return Scoring(masks, crops.astype(np.int64))
+
+
+def _write_into(folder: Path, scoring: Scoring) -> None:
+    timesteps, cameras, height, width = scoring.masks.shape
+    for timestep, camera in np.ndindex(timesteps, cameras):
+        file = _mask_file(folder, timestep, camera)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        encoded, data = cv2.imencode(".png", scoring.masks[timestep, camera])
+        assert encoded
+        file.write_bytes(data.tobytes())
+    crops = scoring.crops.astype(np.int32)
+    write_arrays(folder / "crops.safetensors", {"crops": crops})
+    size = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width}
+    write_json(folder / "scoring.json", _FORMAT, _VERSION, {**size, "sha256": _digest(scoring.masks, crops)})
+
+
+def _read_mask(file: Path, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        data = np.frombuffer(file.read_bytes(), np.uint8)
+    except OSError:
+        raise UserError(f"{file}: missing; {_REMEDY}") from None
+    # libpng would print its complaint about a truncated file and return half a picture.
+    whole = data.tobytes().endswith(b"IEND\xaeB`\x82")
+    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if whole else None
+    if mask is None or mask.shape != shape:
+        raise UserError(f"{file}: damaged, or not of {shape[1]}x{shape[0]} pixels; {_REMEDY}")
+    return mask
+
+
+def _mask_file(folder: Path, timestep: int, camera: int) -> Path:
+    return folder / "masks" / f"{camera:02d}" / f"{timestep:06d}.png"
+
+
+def _digest(masks: np.ndarray, crops: np.ndarray) -> str:
+    digest = hashlib.sha256(masks.tobytes())
+    digest.update(crops.astype(np.int32).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,40 @@
+"""What a user may choose about tracking."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class SmoothnessSettings:
+    """Standard deviations of accelerations, a second squared: smaller is smoother. Infinite switches a term off."""
+
+    translation: float = 0.2
+    """Of the head across the line of sight, metres a second squared."""
+    depth: float = 0.4
+    """Of the head along the line of sight, which one camera sees least well."""
+    rotation: float = 3.0
+    """Of the head, radians a second squared."""
+    expression: float = 100.0
+    """Of expression coefficients except those of the eyelids, which blink too fast to be smoothed."""
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """How a capture is tracked from its landmarks."""
+
+    focal: float | None = None
+    """Focal length in pixels of the capture's pictures, if known. Otherwise 1.5 times the larger side of the source
+    picture, from where the fit may move it a little: landmarks of a face hardly tell it."""
+    keyframes: int = 20
+    """Frames from which identity is fitted, chosen for their spread of head poses."""
+    landmark_sigma: float = 0.0015
+    """Expected error of a landmark, metres on the face."""
+    independent_landmarks: float = 50.0
+    """What 478 landmarks are worth, whose errors go together: weighs them against priors and smoothness."""
+    outlier: float = 6.0
+    """Beyond this many sigmas a landmark's pull fades."""
+    identity_weight: float = 4.0
+    """Weight of the identity's unit-variance prior."""
+    bias_sigma: float = 0.003
+    """How far a landmark's point on the subject may lie from the model's, metres; one offset for the whole sequence."""
+    smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
+    """Over time."""

@@ -1,0 +1,218 @@
+"""Batched Levenberg-Marquardt: small dense problems side by side, tied by shared parameters or along time."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+_DAMPING_START, _DAMPING_LEAST, _DAMPING_MOST = 1e-3, 1e-7, 1e7
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Half the gradient and the Gauss-Newton half Hessian of b frames, with the cost they belong to."""
+
+    cost: Float[Tensor, " b"]
+    gradient: Float[Tensor, "b p"]
+    hessian: Float[Tensor, "b p p"]
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """Lower and upper bounds of each parameter, which may be infinite."""
+
+    lower: Float[Tensor, " p"]
+    upper: Float[Tensor, " p"]
+
+    def clip(self, state: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
+        """The nearest state within the bounds."""
+        return torch.minimum(torch.maximum(state, self.lower), self.upper)
+
+    def held(self, state: Float[Tensor, "b p"], gradient: Float[Tensor, "b p"]) -> Bool[Tensor, "b p"]:
+        """Parameters at a bound that the gradient's descent would push through it: the active set."""
+        return ((state <= self.lower) & (gradient > 0)) | ((state >= self.upper) & (gradient < 0))
+
+
+def minimize_frames(
+    equations_at: Callable[[Tensor], NormalEquations],
+    cost_at: Callable[[Tensor], Tensor],
+    start: Float[Tensor, "b p"],
+    box: Box,
+    iterations: int,
+) -> Float[Tensor, "b p"]:
+    """Levenberg-Marquardt within bounds on b independent frames, each with its own damping.
+
+    Parameters held by a bound are left out of the step (a projected Newton step), the rest is clipped.
+    """
+    state = box.clip(start)
+    damping = state.new_full((len(state),), _DAMPING_START)
+    for _ in range(iterations):
+        equations = equations_at(state)
+        held = box.held(state, equations.gradient)
+        step = _damped_step(equations, held, damping)
+        candidate = box.clip(state + step)
+        better = cost_at(candidate) < equations.cost
+        state = torch.where(better[:, None], candidate, state)
+        damping = torch.where(better, damping / 5, damping * 8).clamp(_DAMPING_LEAST, _DAMPING_MOST)
+    return state
+
+
+def _damped_step(
+    equations: NormalEquations, held: Bool[Tensor, "b p"], damping: Float[Tensor, " b"]
+) -> Float[Tensor, "b p"]:
+    moving = hold(equations, held)
+    diagonal = moving.hessian.diagonal(dim1=-2, dim2=-1)
+    damped = moving.hessian + torch.diag_embed(diagonal * damping[:, None] + 1e-12)
+    return -torch.cholesky_solve(moving.gradient[..., None], torch.linalg.cholesky(damped))[..., 0]
+
+
+def hold(equations: NormalEquations, held: Bool[Tensor, "b p"]) -> NormalEquations:
+    """The same equations with some parameters kept still: their rows and columns become the identity's."""
+    moving = (~held).to(equations.hessian)
+    kept = equations.hessian * moving[:, :, None] * moving[:, None, :]
+    return NormalEquations(equations.cost, equations.gradient * moving, kept + torch.diag_embed(1 - moving))
+
+
+def joined(parts: Sequence[NormalEquations]) -> NormalEquations:
+    """The equations of all parts' frames in a row."""
+    return NormalEquations(
+        torch.cat([part.cost for part in parts]),
+        torch.cat([part.gradient for part in parts]),
+        torch.cat([part.hessian for part in parts]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SharedEquations:
+    """Blocks of s parameters that b frames share."""
+
+    across: Float[Tensor, "b p s"]
+    """Half Hessian, mixed with each frame's own parameters."""
+    hessian: Float[Tensor, "s s"]
+    gradient: Float[Tensor, " s"]
+    """Half the gradient."""
+
+    def with_prior(self, precision: Float[Tensor, " s"], values: Float[Tensor, " s"]) -> "SharedEquations":
+        """Under a quadratic cost on the values."""
+        return SharedEquations(self.across, self.hessian + torch.diag(precision), self.gradient + precision * values)
+
+
+def joined_shared(parts: Sequence[SharedEquations]) -> SharedEquations:
+    """The blocks of all parts' frames."""
+    return SharedEquations(
+        torch.cat([part.across for part in parts]),
+        torch.stack([part.hessian for part in parts]).sum(0),
+        torch.stack([part.gradient for part in parts]).sum(0),
+    )
+
+
+def solve_arrow(
+    frames: NormalEquations, shared: SharedEquations, held: Bool[Tensor, "b p"], damping: float
+) -> tuple[Float[Tensor, "b p"], Float[Tensor, " s"]]:
+    """One damped step of b frames' parameters and of what they share, by the Schur complement."""
+    frames, across = hold(frames, held), shared.across * (~held)[:, :, None]
+    diagonal = frames.hessian.diagonal(dim1=-2, dim2=-1)
+    factor = torch.linalg.cholesky(frames.hessian + torch.diag_embed(diagonal * damping + 1e-12))
+    eliminated = torch.cholesky_solve(torch.cat([across, frames.gradient[..., None]], dim=-1), factor)
+    reduced = shared.hessian + torch.diag(shared.hessian.diagonal() * damping)
+    reduced = reduced - torch.einsum("bps,bpr->sr", across, eliminated[..., :-1])
+    right = shared.gradient - torch.einsum("bps,bp->s", across, eliminated[..., -1])
+    shared_step = -torch.linalg.solve(reduced, right)
+    return -eliminated[..., -1] - eliminated[..., :-1] @ shared_step, shared_step
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothness:
+    """Quadratic costs on the acceleration of each parameter: sum_t precision (x[t-1] - 2 x[t] + x[t+1])^2.
+
+    A second difference leaves steady motion alone, and the chain is solved as a whole, forward and backward in time:
+    it damps jitter without lag.
+    """
+
+    precision: Float[Tensor, " p"]
+    """Of each parameter's second difference."""
+    linked: Bool[Tensor, " t"]
+    """Whether the second difference centred at each timestep counts (False at the ends and beside missing frames)."""
+
+    def differences(self, state: Float[Tensor, "t p"]) -> Float[Tensor, "t p"]:
+        """Second differences where they count, else zero."""
+        second = torch.zeros_like(state)
+        second[1:-1] = state[:-2] - 2 * state[1:-1] + state[2:]
+        return second * self.linked[:, None]
+
+    def cost(self, state: Float[Tensor, "t p"]) -> Float[Tensor, ""]:
+        """The weighted sum of squares."""
+        return (self.differences(state) ** 2 * self.precision).sum()
+
+    def gradient(self, state: Float[Tensor, "t p"]) -> Float[Tensor, "t p"]:
+        """Half the gradient of the cost."""
+        weighted = self.differences(state) * self.precision
+        gradient = -2 * weighted
+        gradient[:-1] += weighted[1:]
+        gradient[1:] += weighted[:-1]
+        return gradient
+
+    def bands(self) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"], Float[Tensor, " t"]]:
+        """The matrix of the cost along time for unit precision: diagonal, first and second upper off-diagonal."""
+        count = self.linked.to(self.precision)
+        before, after = torch.zeros_like(count), torch.zeros_like(count)
+        before[1:], after[:-1] = count[:-1], count[1:]
+        first, second = torch.zeros_like(count), torch.zeros_like(count)
+        first[:-1] = -2 * (count[:-1] + count[1:])
+        second[:-2] = count[1:-1]
+        return 4 * count + before + after, first, second
+
+
+def solve_chain(
+    frames: NormalEquations, smoothness: Smoothness, state: Float[Tensor, "t p"], held: Bool[Tensor, "t p"]
+) -> Float[Tensor, "t p"]:
+    """The Gauss-Newton step of all frames under the smoothness cost; direct, by block-tridiagonal elimination.
+
+    Two frames make one block, so that second differences couple neighbouring blocks only.
+    """
+    t, p = state.shape
+    moving = (~held).to(state)
+    diagonal, first, second = (band[:, None] * smoothness.precision for band in smoothness.bands())
+    tied = NormalEquations(
+        frames.cost, frames.gradient + smoothness.gradient(state), frames.hessian + torch.diag_embed(diagonal + 1e-12)
+    )
+    tied = hold(tied, held)
+    hessian, gradient = tied.hessian, tied.gradient
+    first = first * moving * torch.cat([moving[1:], moving[:1]])
+    second = second * moving * torch.cat([moving[2:], moving[:2]])
+
+    blocks = (t + 1) // 2
+    if t % 2:
+        hessian = torch.cat([hessian, torch.eye(p).to(state)[None]])
+        gradient, first, second = (torch.cat([part, part.new_zeros(1, p)]) for part in (gradient, first, second))
+    own = state.new_zeros(blocks, 2 * p, 2 * p)
+    own[:, :p, :p], own[:, p:, p:] = hessian[0::2], hessian[1::2]
+    own[:, :p, p:] = own[:, p:, :p] = torch.diag_embed(first[0::2])
+    upper = state.new_zeros(blocks, 2 * p, 2 * p)
+    upper[:, :p, :p], upper[:, p:, p:] = torch.diag_embed(second[0::2]), torch.diag_embed(second[1::2])
+    upper[:, p:, :p] = torch.diag_embed(first[1::2])
+    return -_solve_tridiagonal(own, upper, gradient.reshape(blocks, 2 * p)).reshape(-1, p)[:t]
+
+
+def _solve_tridiagonal(
+    own: Float[Tensor, "n q q"], upper: Float[Tensor, "n q q"], right: Float[Tensor, "n q"]
+) -> Float[Tensor, "n q"]:
+    """Solve a symmetric positive definite block-tridiagonal system; `upper[i]` couples block i to block i + 1."""
+    factors: list[Tensor] = []
+    reduced: list[Tensor] = []
+    block, side = own[0], right[0]
+    for index in range(len(own)):
+        factors.append(torch.linalg.cholesky(block))
+        reduced.append(side)
+        if index + 1 < len(own):
+            solved = torch.cholesky_solve(torch.cat([upper[index], side[:, None]], dim=1), factors[index])
+            block = own[index + 1] - upper[index].T @ solved[:, :-1]
+            side = right[index + 1] - upper[index].T @ solved[:, -1]
+    solution = torch.cholesky_solve(reduced[-1][:, None], factors[-1])[:, 0]
+    solutions = [solution]
+    for index in range(len(own) - 2, -1, -1):
+        solution = torch.cholesky_solve((reduced[index] - upper[index] @ solution)[:, None], factors[index])[:, 0]
+        solutions.append(solution)
+    return torch.stack(solutions[::-1])
