@@ -16,3 +16,13 @@ def rasterize_mesh(
 def interpolate_mesh(
     face_index: Tensor, barycentric: Tensor, attributes: Tensor, corners: Tensor, out: Tensor
 ) -> None: ...
+
+# native/bind_photometric.cpp; target: float32 or uint8; box: left, top, width, height
+def photometric_loss(
+    image: Tensor,
+    target: Tensor,
+    box: tuple[int, int, int, int],
+    l1_weight: float,
+    ssim_weight: float,
+    gradient: Tensor | None,
+) -> float: ...

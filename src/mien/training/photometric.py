@@ -1,0 +1,116 @@
+"""The photometric loss of Gaussian splatting: L1 and SSIM (Wang et al. 2004; Kerbl et al. 2023, section 5)."""
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from mien import _native
+
+WINDOW_RADIUS = 5
+"""Pixels: the SSIM window is 11x11."""
+WINDOW_SIGMA = 1.5
+C1, C2 = 0.01**2, 0.03**2
+_NATIVE_MIN_WIDTH = 6
+
+Box = tuple[int, int, int, int]
+"""left, top, width, height in pixels."""
+
+
+def photometric_loss(
+    image: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"] | UInt8[Tensor, "h w 3"],
+    l1_weight: float = 0.8,
+    ssim_weight: float = 0.2,
+    box: Box | None = None,
+) -> Float[Tensor, ""]:
+    """`l1_weight` * mean |image - target| + `ssim_weight` * (1 - mean SSIM), fused and native on a CPU.
+
+    Differentiable in `image`. A uint8 `target` counts as 0..255. With a `box`, pixels outside count as equal in both
+    pictures (the windows of pixels inside still see them), and the means stay over the whole picture: the same value
+    and gradient in a fraction of the time where the pictures are equal beyond 5 pixels inside the box's edges.
+    """
+    assert image.shape == target.shape, (image.shape, target.shape)
+    assert not target.requires_grad
+    box = _clipped(box, image)
+    large_enough = image.shape[1] >= _NATIVE_MIN_WIDTH and 0 not in box[2:]
+    native_types = image.dtype == torch.float32 and target.dtype in (torch.float32, torch.uint8)
+    if not large_enough or not native_types or image.device.type != "cpu":
+        return photometric_loss_reference(image, target, l1_weight, ssim_weight, box)
+    if not (image.requires_grad and torch.is_grad_enabled()):
+        return image.new_tensor(_native_loss(image, target, box, (l1_weight, ssim_weight), None))
+    return _PhotometricLoss.apply(image, target, box, (l1_weight, ssim_weight))
+
+
+def photometric_loss_reference(
+    image: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"] | UInt8[Tensor, "h w 3"],
+    l1_weight: float = 0.8,
+    ssim_weight: float = 0.2,
+    box: Box | None = None,
+) -> Float[Tensor, ""]:
+    """`photometric_loss` in plain PyTorch, any dtype and device."""
+    target = target.to(image) / 255 if target.dtype == torch.uint8 else target
+    left, top, width, height = _clipped(box, image)
+    inside = (slice(top, top + height), slice(left, left + width))
+    difference = (image - target)[inside].abs()
+    unlikeness = 1 - ssim_map(image, target)[inside]
+    return (l1_weight * difference.sum() + ssim_weight * unlikeness.sum()) / image.numel()
+
+
+def ssim_map(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
+    """Structural similarity of two pictures (0..1) around every pixel, at most 1; zeros lie beyond the border."""
+    statistics = (image, target, image * image, target * target, image * target)
+    mean_x, mean_y, square_x, square_y, product = _blur(torch.stack(statistics))
+    variance_x, variance_y = square_x - mean_x * mean_x, square_y - mean_y * mean_y
+    covariance = product - mean_x * mean_y
+    numerator = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
+    return numerator / ((mean_x * mean_x + mean_y * mean_y + C1) * (variance_x + variance_y + C2))
+
+
+def ssim(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
+    """Mean of `ssim_map`: 1 for equal pictures."""
+    return ssim_map(image, target).mean()
+
+
+class _PhotometricLoss(torch.autograd.Function):
+    """Value and gradient come from one native pass; `backward` only scales the gradient."""
+
+    @staticmethod
+    def forward(ctx, image: Tensor, target: Tensor, box: Box, weights: tuple[float, float]) -> Tensor:
+        whole = box == (0, 0, image.shape[1], image.shape[0])
+        gradient = torch.empty(image.shape) if whole else torch.zeros(image.shape)
+        loss = _native_loss(image, target, box, weights, gradient)
+        ctx.save_for_backward(gradient)
+        return image.new_tensor(loss)
+
+    @staticmethod
+    def backward(ctx, grad_loss: Tensor):
+        (gradient,) = ctx.saved_tensors
+        return gradient if float(grad_loss) == 1 else gradient * grad_loss, None, None, None
+
+
+def _native_loss(
+    image: Tensor, target: Tensor, box: Box, weights: tuple[float, float], gradient: Tensor | None
+) -> float:
+    return _native.photometric_loss(image.detach().contiguous(), target.contiguous(), box, *weights, gradient)
+
+
+def _blur(images: Float[Tensor, "s h w c"]) -> Float[Tensor, "s h w c"]:
+    distances = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=images.dtype, device=images.device)
+    window = (-(distances**2) / (2 * WINDOW_SIGMA**2)).exp()
+    window = window / window.sum()
+    planes = images.movedim(-1, 1).flatten(0, 1)[:, None]
+    planes = conv2d(planes, window[None, None, :, None], padding=(WINDOW_RADIUS, 0))
+    planes = conv2d(planes, window[None, None, None, :], padding=(0, WINDOW_RADIUS))
+    return planes.view(len(images), -1, *images.shape[1:3]).movedim(1, -1)
+
+
+def _clipped(box: Box | None, image: Tensor) -> Box:
+    """The part of the box inside the picture; width or height 0 if there is none."""
+    height, width = image.shape[:2]
+    if box is None:
+        return 0, 0, width, height
+    left, top = max(box[0], 0), max(box[1], 0)
+    right, bottom = min(box[0] + box[2], width), min(box[1] + box[3], height)
+    return left, top, max(right - left, 0), max(bottom - top, 0)
