@@ -1,0 +1,132 @@
+"""Light: a soft key from one side, a fill, a rim and the room, as 9 spherical-harmonic coefficients; and its shadows."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from mien.camera import Camera, look_at
+from mien.render.mesh import rasterize_mesh, sh_basis
+
+# Clamped cosine in spherical harmonics, degrees 0, 1, 2 (Ramamoorthi and Hanrahan 2001, "An efficient representation
+# for irradiance environment maps").
+_CLAMPED_COSINE = np.array([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5, np.float32)
+_DIRECTIONS = 112
+_MAP_SIZE = 224
+_MAP_DISTANCE = 20.0  # metres: nearly parallel rays, and depths that float32 still tells apart
+
+
+@dataclass(frozen=True, eq=False)
+class Lamp:
+    """A distant soft light."""
+
+    direction: Float[np.ndarray, " 3"]
+    """Towards the lamp, unit, world space."""
+    color: Float[np.ndarray, " 3"]
+    """What a white surface that faces the lamp returns, linear."""
+    spread: float
+    """Concentration of the lobe it appears as in shadows and highlights; larger is smaller and harder."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lighting:
+    """All light of a scene; fixed in world space."""
+
+    lamps: tuple[Lamp, ...]
+    ambient: Float[np.ndarray, " 3"]
+    """What a white surface returns from the room's light, linear."""
+
+    @property
+    def sh_light(self) -> Float[np.ndarray, "9 3"]:
+        """For `mien.render.mesh.shade` over world-space normals."""
+        coefficients = np.zeros((9, 3), np.float32)
+        coefficients[0] = self.ambient * math.sqrt(4 * math.pi)
+        # The room is brighter above than below.
+        coefficients[1] += 0.35 * self.ambient / 0.4886
+        for lamp in self.lamps:
+            basis = sh_basis(torch.from_numpy(lamp.direction)).numpy()
+            coefficients += (_CLAMPED_COSINE * basis)[:, None] * lamp.color
+        return coefficients
+
+    def radiance(self, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """How bright each direction of world space is, in arbitrary units: lobes over the room."""
+        total = self.ambient * (1 + 0.5 * directions[:, 1:2]) / 4
+        for lamp in self.lamps:
+            lobe = np.exp(lamp.spread * (directions @ lamp.direction - 1)) * lamp.spread / (2 * math.pi)
+            total = total + lobe[:, None] * lamp.color
+        return total.astype(np.float32)
+
+
+def studio_lighting(seed: int) -> Lighting:
+    """A key from above one side, a weak fill, a rim from behind the other side."""
+    random = np.random.default_rng([seed, 2])
+    side = random.choice([-1.0, 1.0])
+    warm = random.uniform(-0.04, 0.06)
+    key = np.array([1 + warm, 1.0, 1 - 1.4 * warm])
+    return Lighting(
+        lamps=(
+            Lamp(_unit(0.75 * side, 0.62, 0.85), (0.88 * key).astype(np.float32), 9.0),
+            Lamp(_unit(-0.8 * side, 0.15, 0.75), np.array([0.15, 0.16, 0.18], np.float32), 4.0),
+            Lamp(_unit(-0.7 * side, 0.5, -0.75), np.array([0.30, 0.32, 0.36], np.float32), 8.0),
+        ),
+        ambient=np.array([0.20, 0.20, 0.21], np.float32),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """Which directions each vertex sees, past the whole scene at rest, in the head frame."""
+
+    directions: Float[np.ndarray, "d 3"]
+    transfer: Float[np.ndarray, "v d"]
+    """Visible share times the clamped cosine."""
+    unshadowed: Float[np.ndarray, "v d"]
+    """The clamped cosine alone."""
+
+    def shadow(self, lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "v 3"]:
+        """The share of the light, per colour channel, that reaches each vertex when the head is turned."""
+        radiance = lighting.radiance(self.directions @ R_world_head.T)
+        return (self.transfer @ radiance + 1e-4) / (self.unshadowed @ radiance + 1e-4)
+
+
+def compute_visibility(
+    points: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    occluders: tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]],
+) -> Visibility:
+    """Shadow maps from all around: a point is lit from where its depth is (within 2 mm) the first."""
+    index = np.arange(_DIRECTIONS) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * index / _DIRECTIONS), math.pi * (1 + 5**0.5) * index  # Fibonacci's spiral
+    directions = np.stack([np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth)], -1)
+    directions = directions.astype(np.float32)
+    unshadowed = np.clip(normals @ directions.T, 0, None)
+    visible = np.stack([_lit_share(points + 0.0015 * normals, direction, occluders) for direction in directions], -1)
+    return Visibility(directions, unshadowed * visible, unshadowed)
+
+
+def _lit_share(
+    points: np.ndarray, direction: np.ndarray, occluders: tuple[np.ndarray, np.ndarray]
+) -> Float[np.ndarray, " v"]:
+    centre = torch.from_numpy(occluders[0].mean(0))
+    radius = float(np.linalg.norm(occluders[0] - occluders[0].mean(0), axis=-1).max()) * 1.02
+    up = torch.tensor([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else torch.tensor([0.0, 0.0, 1.0])
+    focal = 0.5 * _MAP_SIZE * _MAP_DISTANCE / radius
+    K = torch.tensor([[focal, 0, _MAP_SIZE / 2], [0, focal, _MAP_SIZE / 2], [0, 0, 1]])
+    viewmat = look_at(centre + _MAP_DISTANCE * torch.from_numpy(direction), centre, up)
+    camera = Camera(K, viewmat, _MAP_SIZE, _MAP_SIZE)
+    depth_map = rasterize_mesh(torch.from_numpy(occluders[0]), torch.from_numpy(occluders[1]), camera).depth.numpy()
+    pixels, depth = (array.numpy() for array in camera.project(torch.from_numpy(points)))
+    lit = np.zeros(len(points), np.float32)
+    for dx in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            column = np.clip((pixels[:, 0] + dx).astype(np.int64), 0, _MAP_SIZE - 1)
+            row = np.clip((pixels[:, 1] + dy).astype(np.int64), 0, _MAP_SIZE - 1)
+            lit += depth < depth_map[row, column] + 0.002
+    return lit / 9
+
+
+def _unit(x: float, y: float, z: float) -> np.ndarray:
+    vector = np.array([x, y, z], np.float32)
+    return vector / np.linalg.norm(vector)

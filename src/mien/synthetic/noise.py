@@ -1,0 +1,49 @@
+"""Solid noise: random functions of a point in space, the same for the same seed."""
+
+import numpy as np
+from jaxtyping import Float
+
+_PERIOD = 32  # lattice cells after which the noise repeats; a power of two
+
+
+class SolidNoise:
+    """Smooth random functions of space with about zero mean and values in -1..1."""
+
+    def __init__(self, seed: int) -> None:
+        self._lattice = np.random.default_rng(seed).uniform(-1, 1, (_PERIOD,) * 3).astype(np.float32)
+
+    def __call__(self, points: Float[np.ndarray, "n 3"], wavelength: float) -> Float[np.ndarray, " n"]:
+        """Value noise whose lattice has this spacing, in the points' unit."""
+        scaled = points.astype(np.float64) / wavelength
+        cell = np.floor(scaled)
+        fraction = (scaled - cell).astype(np.float32)
+        fraction *= fraction * (3 - 2 * fraction)
+        index = cell.astype(np.int64) & (_PERIOD - 1)
+        above = (index + 1) & (_PERIOD - 1)
+        flat = self._lattice.reshape(-1)
+        corners = [
+            (index[:, axis] * _PERIOD ** (2 - axis), above[:, axis] * _PERIOD ** (2 - axis)) for axis in range(3)
+        ]
+        fx, fy, fz = fraction.T
+        planes = []
+        for x in corners[0]:
+            lines = []
+            for y in corners[1]:
+                start, end = flat[x + y + corners[2][0]], flat[x + y + corners[2][1]]
+                lines.append(start + fz * (end - start))
+            planes.append(lines[0] + fy * (lines[1] - lines[0]))
+        return planes[0] + fx * (planes[1] - planes[0])
+
+    def octaves(self, points: Float[np.ndarray, "n 3"], wavelength: float, count: int) -> Float[np.ndarray, " n"]:
+        """Sum of `count` noises, each with half the wavelength and half the strength of the one before."""
+        total = np.zeros(len(points), np.float32)
+        for octave in range(count):
+            shifted = points + 17.31 * wavelength * octave  # so that lattices of two octaves do not coincide
+            total += 0.5**octave * self(shifted, wavelength / 2**octave)
+        return total
+
+
+def smoothstep(low: float, high: float, value: np.ndarray) -> np.ndarray:
+    """0 below `low`, 1 above `high`, smooth between; falls where `low` > `high`."""
+    t = np.clip((value - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)

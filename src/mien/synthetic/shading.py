@@ -1,0 +1,194 @@
+"""What light does to each material of a synthetic person. Everything is in the head frame and in linear colour."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from mien.render.mesh import sample_texture, sh_basis
+from mien.synthetic.hair import Strands, unit
+from mien.synthetic.light import Lighting
+from mien.synthetic.noise import smoothstep
+
+
+@dataclass(frozen=True, eq=False)
+class LocalLight:
+    """A scene's light as the turned head sees it."""
+
+    sh_light: Float[np.ndarray, "9 3"]
+    """In world axes."""
+    R_world_head: Float[np.ndarray, "3 3"]
+    lamps: tuple[tuple[np.ndarray, np.ndarray], ...]
+    """Direction (head frame) and colour of each."""
+
+    def irradiance(self, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """What a white surface returns."""
+        basis = sh_basis(torch.from_numpy(normals @ self.R_world_head.T)).numpy()
+        return np.maximum(basis @ self.sh_light, 0)
+
+
+def turned(lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> LocalLight:
+    """The light for one head pose."""
+    lamps = tuple((R_world_head.T @ lamp.direction, lamp.color) for lamp in lighting.lamps)
+    return LocalLight(lighting.sh_light, R_world_head, lamps)
+
+
+def highlight(
+    normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], light: LocalLight, sharpness: float
+) -> Float[np.ndarray, "n 3"]:
+    """Mirror-like part of the lamps' light, normalised so that a sharper one is brighter and smaller."""
+    total = np.zeros_like(normals)
+    for direction, color in light.lamps:
+        half = unit(views + direction.astype(np.float32))
+        facing = np.clip(normals @ direction.astype(np.float32), 0, 1) > 0
+        fresnel = 0.028 + 0.97 * (1 - np.clip((views * half).sum(-1), 0, 1)) ** 5
+        strength = fresnel * np.exp(sharpness * ((normals * half).sum(-1) - 1)) * facing
+        total += (0.125 * sharpness * strength)[:, None] * color
+    return total
+
+
+def shade_skin(
+    channels: Float[np.ndarray, "n 7"],
+    normals: Float[np.ndarray, "n 3"],
+    shadow: Float[np.ndarray, "n 3"],
+    views: Float[np.ndarray, "n 3"],
+    light: LocalLight,
+) -> Float[np.ndarray, "n 3"]:
+    """Diffuse light that bleeds red into shadows, and an oily sheen."""
+    albedo, gradient, gloss = channels[:, :3], channels[:, 3:6], channels[:, 6:7]
+    normals = unit(unit(normals) - gradient)
+    diffuse = albedo * light.irradiance(normals) * shadow
+    grazing = 1 - np.clip((normals * views).sum(-1, keepdims=True), 0, 1)
+    sheen = 0.30 * highlight(normals, views, light, 26.0) + 0.12 * highlight(normals, views, light, 120.0)
+    return diffuse + shadow * gloss * (sheen + 0.06 * grazing**4)
+
+
+def shade_hair(strands: Strands, light: LocalLight, viewpoint: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "n s 3"]:
+    """Cylinders under lamps: bright where the light comes across them (Kajiya and Kay 1989), with two highlights."""
+    tangents, outwards = strands.tangents, strands.outwards
+    n, s = strands.widths.shape
+    room = light.irradiance(np.ascontiguousarray(outwards.reshape(-1, 3))).reshape(n, s, 3)
+    colors = 0.75 * strands.colors * room
+    views = unit(viewpoint - strands.points)
+    along_view = (tangents * views).sum(-1)
+    across_view = np.sqrt(np.maximum(1 - along_view**2, 0))
+    relative = strands.colors / (strands.colors.max(-1, keepdims=True) + 1e-6)
+    depth = np.clip(strands.colors.max(-1) / strands.colors.max(), 0, 1)  # hair below others is darker
+    for direction, color in light.lamps:
+        along = tangents @ direction
+        across = np.sqrt(np.maximum(1 - along**2, 0))
+        lit = np.clip(0.3 + 0.7 * (outwards @ direction), 0, 1)
+        aligned = across * across_view - along * along_view
+        first = np.clip(aligned, 0, 1) ** 48
+        second = np.clip(aligned - 0.06, 0, 1) ** 14
+        colors += (0.55 * lit * across)[..., None] * strands.colors * color
+        colors += (0.055 * lit * depth * first)[..., None] * color
+        colors += (0.05 * lit * depth * second)[..., None] * relative * color
+    return colors
+
+
+def shade_eye(
+    local: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    axis: Float[np.ndarray, " 3"],
+    under_lid: Float[np.ndarray, " n"],
+    views: Float[np.ndarray, "n 3"],
+    light: LocalLight,
+    iris: tuple[float, np.ndarray],
+) -> Float[np.ndarray, "n 3"]:
+    """White with veins towards the corners; iris with fibres, limbal ring and pupil; a wet cornea.
+
+    Args:
+        local: Directions from the eyeball's centre, +z along the line of sight.
+        normals: The same in the head frame.
+        axis: The line of sight.
+        under_lid: Metres below the upper lid's rim.
+        views: Towards the camera.
+        light: The scene's.
+        iris: Its size (sine of the angle to its rim) and its colour.
+    """
+    size, color = iris
+    radius = np.linalg.norm(local[:, :2], axis=-1)
+    q = radius / size
+    turn = np.arctan2(local[:, 1], local[:, 0])
+    fibres = _fibres(turn, q)
+    inner = smoothstep(0.95, 0.35, q)[:, None]
+    iris_albedo = color * (0.75 + 0.5 * fibres)[:, None] * (1 + inner * np.array([0.7, 0.35, 0.0], np.float32))
+    iris_albedo = iris_albedo * (1 - 0.75 * smoothstep(0.78, 1.0, q))[:, None]
+    iris_albedo = iris_albedo * smoothstep(0.34, 0.40, q)[:, None] + 0.004
+    veins = smoothstep(0.25, 0.05, np.abs(np.sin(9 * turn + 6 * np.sin(14 * radius) + 3 * local[:, 1])))
+    corner = smoothstep(0.45, 0.85, np.abs(local[:, 0]))
+    white = np.array([0.62, 0.58, 0.55], np.float32) * np.exp(
+        np.outer(corner * (0.3 + 0.35 * veins), [-0.25, -1.0, -0.95])
+    )
+    share = smoothstep(1.04, 0.94, q)[:, None]
+    albedo = white * (1 - share) + iris_albedo * share
+    # The lid's shadow, and that of the orbit: eyes are darker than a white ball.
+    shadow = (0.30 + 0.70 * smoothstep(-0.0005, 0.0045, under_lid))[:, None]
+    # Light that enters the cornea falls on the far side of the iris: its diffuse light is as of a bowl.
+    outward = normals - (normals @ axis)[:, None] * axis
+    bowl = unit(normals - 1.2 * share * outward)
+    diffuse = albedo * light.irradiance(bowl.astype(np.float32)) * shadow
+    cornea = unit(normals + 0.75 * outward * smoothstep(1.25, 0.9, q)[:, None])
+    wet = 0.5 * highlight(cornea, views, light, 900.0) + 0.10 * highlight(cornea, views, light, 60.0)
+    return diffuse + np.minimum(wet, 1.5) * (0.25 + 0.75 * shadow)
+
+
+def _fibres(turn: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Radial streaks, the same in every eye, -1..1."""
+    bend = turn + 0.15 * np.sin(5 * q)
+    waves = np.sin(23 * bend + 2 * np.sin(7 * turn)) + 0.7 * np.sin(41 * bend + 3 * np.cos(3 * turn) + 5 * q)
+    return 0.6 * waves + 0.3 * np.sin(71 * turn - 9 * q)
+
+
+def shade_teeth(
+    rest: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    depth: Float[np.ndarray, " n"],
+    views: Float[np.ndarray, "n 3"],
+    light: LocalLight,
+) -> Float[np.ndarray, "n 3"]:
+    """Off-white, with gaps every 8 mm along the arch; `depth` is metres behind the lips, where light gets scarce."""
+    along = rest[:, 0] / 0.0082
+    place = along - np.round(along - 0.5) - 0.5
+    gap = smoothstep(0.40, 0.5, np.abs(place))
+    rounded = normals + np.stack([0.5 * np.sign(place) * place**2 * 4, np.zeros_like(place), np.zeros_like(place)], -1)
+    rounded = unit(rounded).astype(np.float32)
+    albedo = np.array([0.70, 0.64, 0.52], np.float32) * (1 - 0.72 * gap)[:, None]
+    scarce = np.exp(-np.clip(depth - 0.004, 0, None) / 0.010)[:, None]
+    return (albedo * light.irradiance(rounded) * 0.75 + 0.35 * highlight(rounded, views, light, 150.0)) * scarce
+
+
+def shade_mouth(
+    normals: Float[np.ndarray, "n 3"],
+    depth: Float[np.ndarray, " n"],
+    views: Float[np.ndarray, "n 3"],
+    light: LocalLight,
+) -> Float[np.ndarray, "n 3"]:
+    """Wet dark flesh: gums, tongue, the inside of the cheeks."""
+    scarce = np.exp(-np.clip(depth - 0.002, 0, None) / 0.009)[:, None]
+    albedo = np.array([0.34, 0.085, 0.075], np.float32)
+    return (albedo * light.irradiance(normals) * 0.8 + 0.25 * highlight(normals, views, light, 80.0)) * scarce + 0.002
+
+
+def shade_frame(
+    normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], light: LocalLight
+) -> Float[np.ndarray, "n 3"]:
+    """Dark polished plastic."""
+    albedo = np.array([0.016, 0.011, 0.009], np.float32)
+    return albedo * light.irradiance(normals) + 0.9 * highlight(normals, views, light, 90.0)
+
+
+def lens_reflection(
+    normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], light: LocalLight
+) -> Float[np.ndarray, "n 3"]:
+    """What a coated lens adds to what is behind it."""
+    grazing = 1 - np.abs((normals * views).sum(-1, keepdims=True))
+    room = np.array([0.010, 0.013, 0.014], np.float32) * (1 + 8 * grazing**3)
+    return room + 0.20 * highlight(normals, views, light, 60.0)
+
+
+def look_up(channels: Float[np.ndarray, "s s c"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n c"]:
+    """Bilinear texture look-up."""
+    return sample_texture(torch.from_numpy(channels), torch.from_numpy(uv)[None])[0].numpy()

@@ -1,0 +1,254 @@
+"""A synthetic person: the face model's head, and all that it does not know, ready to be posed and drawn."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from mien.face import FaceModel, FaceParams
+from mien.render.mesh import vertex_normals
+from mien.synthetic.accessories import Glasses, Part, build_glasses, build_shirt
+from mien.synthetic.anatomy import CHIN, SIDES, Anatomy, measure
+from mien.synthetic.hair import SkinStrands, Strands, brow_strands, join, lash_strands, short_hair
+from mien.synthetic.light import Lighting, Visibility, compute_visibility, studio_lighting
+from mien.synthetic.motion import shoulder_rotation
+from mien.synthetic.recipe import SyntheticRecipe
+from mien.synthetic.skin import SkinTextures, paint_skin
+
+SKIN, EYE, TEETH, MOUTH, HAIR, SHIRT, FRAME = range(7)
+"""Materials."""
+
+_HAIR_COLORS = np.array(
+    [[0.018, 0.012, 0.009], [0.045, 0.026, 0.016], [0.10, 0.055, 0.028], [0.20, 0.12, 0.058], [0.13, 0.045, 0.02]],
+    np.float32,
+)
+_IRIS_COLORS = np.array(
+    [[0.10, 0.045, 0.018], [0.16, 0.085, 0.03], [0.10, 0.17, 0.24], [0.12, 0.16, 0.10], [0.17, 0.20, 0.22]], np.float32
+)
+_SHIRT_COLORS = np.array(
+    [[0.05, 0.08, 0.15], [0.25, 0.06, 0.06], [0.10, 0.16, 0.13], [0.35, 0.33, 0.30], [0.045, 0.045, 0.05]], np.float32
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Eye:
+    """One eyeball at rest."""
+
+    vertices: Int[np.ndarray, " e"]
+    local: Float[np.ndarray, "e 3"]
+    """Unit directions from the centre, +z along the line of sight."""
+    front: Int[np.ndarray, " i"]
+    """Vertices of the iris."""
+    iris_size: float
+    """Sine of the angle between the line of sight and the iris's rim."""
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """Everything of a person that does not move by itself; the head frame at rest."""
+
+    model: FaceModel
+    anatomy: Anatomy
+    textures: SkinTextures
+    lighting: Lighting
+    visibility: Visibility
+    eyes: tuple[Eye, ...]
+    iris_color: Float[np.ndarray, " 3"]
+    shirt_color: Float[np.ndarray, " 3"]
+    hair: Strands | None
+    brows: SkinStrands | None
+    lashes: bool
+    glasses: Glasses | None
+    shirt: Part | None
+    faces: Int[np.ndarray, "f 3"]
+    """Of everything that is opaque."""
+    materials: Int[np.ndarray, " f"]
+    model_faces: Int[np.ndarray, " m"]
+    """The face model's triangles among `faces`: the first ones, in this order."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSubject:
+    """A subject at one timestep, in the head frame."""
+
+    head: Float[np.ndarray, "v 3"]
+    """The face model's vertices."""
+    normals: Float[np.ndarray, "v 3"]
+    landmarks: Float[np.ndarray, "l 3"]
+    eye_centres: Float[np.ndarray, "2 3"]
+    brows: Strands | None
+    lashes: Strands | None
+    T_head_shoulders: Float[np.ndarray, "4 4"]
+    R_world_head: Float[np.ndarray, "3 3"]
+    viewpoint: Float[np.ndarray, " 3"]
+    """The camera."""
+
+
+def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRecipe, seed: int) -> Subject:
+    """A person from a seed: paints, grows hair, dresses, and finds what shades what."""
+    random = np.random.default_rng([seed, 6])
+    anatomy = measure(model, identity)
+    hair_color = _HAIR_COLORS[random.integers(len(_HAIR_COLORS))]
+    hair = short_hair(anatomy, hair_color, seed) if recipe.hair == "short" else None
+    glasses = build_glasses(anatomy) if recipe.glasses else None
+    collar, size = _collar(anatomy)
+    shirt = build_shirt(collar, size, seed) if recipe.clothes else None
+    brows = brow_strands(anatomy, 0.7 * hair_color, seed) if recipe.brows_and_lashes else None
+    kept = _uncovered_faces(anatomy, collar) if recipe.clothes else np.arange(len(anatomy.faces))
+    faces, materials = _all_faces(anatomy, kept, hair, brows, recipe.brows_and_lashes, glasses, shirt)
+    return Subject(
+        model=model,
+        anatomy=anatomy,
+        textures=paint_skin(anatomy, recipe, seed, 0.75 * hair_color),
+        lighting=studio_lighting(seed),
+        visibility=compute_visibility(anatomy.vertices, anatomy.normals, _occluders(anatomy, hair, glasses, shirt)),
+        eyes=tuple(_eye(anatomy, side) for side in SIDES),
+        iris_color=_IRIS_COLORS[random.integers(len(_IRIS_COLORS))],
+        shirt_color=_SHIRT_COLORS[random.integers(len(_SHIRT_COLORS))],
+        hair=hair,
+        brows=brows,
+        lashes=recipe.brows_and_lashes,
+        glasses=glasses,
+        shirt=shirt,
+        faces=faces,
+        materials=materials,
+        model_faces=kept,
+    )
+
+
+def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.ndarray, " 3"]) -> PosedSubject:
+    """The subject at one timestep (`face` has a batch of one)."""
+    model = subject.model
+    head = model.head_vertices(face)[0]
+    landmarks = model.landmark_positions(head, "mediapipe").numpy()
+    normals = vertex_normals(head, model.faces).numpy()
+    T_world_head = face.T_world_head[0].numpy()
+    R = T_world_head[:3, :3]
+    centres = np.stack([head.numpy()[eye.vertices].mean(0) for eye in subject.eyes])
+    return PosedSubject(
+        head=head.numpy(),
+        normals=normals,
+        landmarks=landmarks,
+        eye_centres=centres,
+        brows=subject.brows.posed(subject.anatomy, head.numpy(), normals) if subject.brows else None,
+        lashes=lash_strands(landmarks, centres) if subject.lashes else None,
+        T_head_shoulders=_shoulders(subject, face, R),
+        R_world_head=R,
+        viewpoint=R.T @ (camera_position - T_world_head[:3, 3]),
+    )
+
+
+def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, "w 3"]:
+    """Vertices of `subject.faces`, head frame."""
+    parts = [posed.head]
+    parts += [s.ribbon_vertices(posed.viewpoint) for s in (subject.hair, posed.brows, posed.lashes) if s is not None]
+    if subject.glasses is not None:
+        parts.append(subject.glasses.frame.vertices)
+    if subject.shirt is not None:
+        T = posed.T_head_shoulders
+        parts.append(subject.shirt.vertices @ T[:3, :3].T + T[:3, 3])
+    return np.concatenate(parts).astype(np.float32)
+
+
+def _shoulders(subject: Subject, face: FaceParams, R_world_head: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """The shoulders turn less than the head, about the neck's joint."""
+    from mien.synthetic.motion import neck_pivot
+
+    pivot = neck_pivot(subject.model, face.identity).numpy()
+    R = R_world_head.T @ shoulder_rotation(face.head_rotation)[0].numpy()
+    T = np.eye(4, dtype=np.float32)
+    T[:3, :3], T[:3, 3] = R, pivot - R @ pivot
+    return T
+
+
+def _eye(anatomy: Anatomy, side: str) -> Eye:
+    vertices = anatomy.eye_vertices(side)
+    iris = np.intersect1d(vertices, np.unique(anatomy.faces[anatomy.region("irises")]))
+    offsets = anatomy.vertices[vertices] - anatomy.vertices[vertices].mean(0)
+    directions = offsets / np.linalg.norm(offsets, axis=-1, keepdims=True)
+    axis = directions[np.isin(vertices, iris)].mean(0) if len(iris) else np.array([0, 0, 1.0])
+    axis = axis / np.linalg.norm(axis)
+    right = np.cross([0, 1, 0], axis)
+    right /= np.linalg.norm(right)
+    local = directions @ np.stack([right, np.cross(axis, right), axis]).T
+    rim = np.linalg.norm(local[np.isin(vertices, iris), :2], axis=-1).max() if len(iris) else 0.42
+    return Eye(vertices, local.astype(np.float32), iris, float(rim))
+
+
+def _collar(anatomy: Anatomy) -> tuple[Float[np.ndarray, " 3"], tuple[float, float]]:
+    """Middle, half width and half depth of the neck where a collar lies."""
+    y = float(anatomy.landmarks[CHIN, 1]) - 0.052
+    neck = anatomy.vertices[np.unique(anatomy.faces[anatomy.skin])]
+    ring = neck[np.abs(neck[:, 1] - y) < 0.012]
+    ring = ring[np.abs(ring[:, 0]) < 0.085]
+    half_width = float(np.quantile(np.abs(ring[:, 0]), 0.95))
+    front, back = np.quantile(ring[:, 2], 0.97), np.quantile(ring[:, 2], 0.03)
+    return np.array([0, y, 0.5 * (front + back)], np.float32), (half_width, 0.5 * float(front - back))
+
+
+def _uncovered_faces(anatomy: Anatomy, collar: Float[np.ndarray, " 3"]) -> Int[np.ndarray, " m"]:
+    """Triangles that are not well below the collar."""
+    return np.flatnonzero(anatomy.vertices[anatomy.faces].mean(1)[:, 1] > collar[1] - 0.035)
+
+
+def _occluders(
+    anatomy: Anatomy, hair: Strands | None, glasses: Glasses | None, shirt: Part | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What throws shadows: the head at rest, every fourth strand three times as wide, the rims, the shoulders."""
+    closed = ~anatomy.region("eyes", "irises", "teeth", "tongue", "mouth", "eye_sockets")
+    meshes = [(anatomy.vertices, anatomy.faces[closed])]
+    if hair is not None:
+        wide = Strands(hair.points[::4], 3.0 * hair.widths[::4], hair.colors[::4], hair.outwards[::4])
+        # Seen from far above its lie, a strand is as wide as it is on the skin.
+        meshes.append((wide.ribbon_vertices(anatomy.skull_centre), wide.ribbon_faces()))
+    meshes += [
+        (part.vertices, part.faces) for part in ([glasses.frame] if glasses else []) + ([shirt] if shirt else [])
+    ]
+    return _stack(meshes)
+
+
+def _stack(meshes: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in meshes])
+    vertices = np.concatenate([vertices for vertices, _ in meshes]).astype(np.float32)
+    return vertices, np.concatenate([faces + offset for (_, faces), offset in zip(meshes, offsets, strict=False)])
+
+
+def _all_faces(
+    anatomy: Anatomy,
+    kept: np.ndarray,
+    hair: Strands | None,
+    brows: SkinStrands | None,
+    lashes: bool,
+    glasses: Glasses | None,
+    shirt: Part | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of `opaque_vertices` and their materials."""
+    of_model = np.full(len(anatomy.faces), SKIN)
+    of_model[anatomy.region("eyes", "irises")] = EYE
+    of_model[anatomy.region("teeth")] = TEETH
+    of_model[anatomy.region("mouth", "tongue", "eye_sockets")] = MOUTH
+    faces, materials, start = [anatomy.faces[kept]], [of_model[kept]], len(anatomy.vertices)
+
+    def add(part_faces: np.ndarray, vertices: int, material: int) -> None:
+        nonlocal start
+        faces.append(part_faces + start)
+        materials.append(np.full(len(part_faces), material))
+        start += vertices
+
+    if hair is not None:
+        add(hair.ribbon_faces(), 2 * hair.widths.size, HAIR)
+    if brows is not None:
+        empty = np.zeros((*brows.widths.shape, 3), np.float32)
+        add(Strands(empty, brows.widths, empty, empty).ribbon_faces(), 2 * brows.widths.size, HAIR)
+    if lashes:
+        strands = lash_strands(anatomy.landmarks, np.zeros((2, 3)))
+        add(strands.ribbon_faces(), 2 * strands.widths.size, HAIR)
+    if glasses is not None:
+        add(glasses.frame.faces, len(glasses.frame.vertices), FRAME)
+    if shirt is not None:
+        add(shirt.faces, len(shirt.vertices), SHIRT)
+    return np.concatenate(faces), np.concatenate(materials)
+
+
+__all__ = ["PosedSubject", "Subject", "build_subject", "join", "opaque_vertices", "pose_subject"]
