@@ -59,8 +59,9 @@ void interpolate_mesh(const Array<const int32_t, nb::ndim<2>>& face_index,
 }  // namespace
 
 void bind_mesh(nb::module_& module) {
-  module.def("rasterize_mesh", &rasterize_mesh, "vertices"_a, "faces"_a, "K"_a, "viewmat"_a, "cull_backfaces"_a,
-             "face_index"_a, "barycentric"_a, "depth"_a);
-  module.def("interpolate_mesh", &interpolate_mesh, "face_index"_a, "barycentric"_a, "attributes"_a, "corners"_a,
-             "out"_a);
+  module.def("rasterize_mesh", &rasterize_mesh, "vertices"_a.noconvert(), "faces"_a.noconvert(), "K"_a.noconvert(),
+             "viewmat"_a.noconvert(), "cull_backfaces"_a, "face_index"_a.noconvert(), "barycentric"_a.noconvert(),
+             "depth"_a.noconvert());
+  module.def("interpolate_mesh", &interpolate_mesh, "face_index"_a.noconvert(), "barycentric"_a.noconvert(),
+             "attributes"_a.noconvert(), "corners"_a.noconvert(), "out"_a.noconvert());
 }

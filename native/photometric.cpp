@@ -1,0 +1,132 @@
+#include "photometric.h"
+
+#include <algorithm>
+#include <cmath>
+#include <string>
+#include <vector>
+
+#include "photometric_band.h"
+#include "pool.h"
+#include "rasterize.h"
+
+namespace mien {
+
+#if defined(__x86_64__)
+namespace avx512 {
+void photometric_band(const PhotometricBand& band);
+}
+namespace avx2 {
+void photometric_band(const PhotometricBand& band);
+}
+namespace sse4 {
+void photometric_band(const PhotometricBand& band);
+}
+#else
+namespace baseline {
+void photometric_band(const PhotometricBand& band);
+}
+#endif
+
+namespace {
+
+constexpr int kTaps = 2 * kPhotometricRadius + 1;
+
+// Compiled for the same instruction set as the rasterizer's kernels.
+PhotometricKernel choose_kernel() {
+#if defined(__x86_64__)
+  const std::string isa = rasterize_isa();
+  return isa == "avx512" ? avx512::photometric_band : isa == "avx2" ? avx2::photometric_band : sse4::photometric_band;
+#else
+  return baseline::photometric_band;
+#endif
+}
+
+struct Window {
+  float weights[kTaps];
+
+  Window() {
+    double exact[kTaps], sum = 0;
+    for (int i = 0; i < kTaps; ++i) {
+      const double distance = i - kPhotometricRadius;
+      sum += exact[i] = std::exp(-distance * distance / (2 * 1.5 * 1.5));
+    }
+    for (int i = 0; i < kTaps; ++i) weights[i] = static_cast<float>(exact[i] / sum);
+  }
+};
+
+// Kept between calls: fresh pages cost as much as the work.
+struct Workspace {
+  std::vector<float> target;
+  std::vector<double> sums;
+};
+
+void set_row_buffers(PhotometricBand& band) {
+  thread_local std::vector<float> storage;
+  const size_t row = static_cast<size_t>(band.limit - band.origin) + 2 * kPhotometricPad;
+  storage.assign(row * (4 + 3 * kPhotometricRing), 0.0f);
+  float* next = storage.data() + kPhotometricPad;
+  const auto take = [&](float*& buffer) { buffer = next, next += row; };
+  for (float*& buffer : band.rows) take(buffer);
+  for (auto& map : band.ring) {
+    for (float*& buffer : map) take(buffer);
+  }
+}
+
+}  // namespace
+
+double photometric_loss(const PhotometricTask& task) {
+  static const Window window;
+  const PhotometricKernel kernel = choose_kernel();
+  thread_local Workspace work;
+  const int stride = task.width * kPhotometricChannels;
+  const double count = static_cast<double>(stride) * task.height;
+  const int first_row = std::max(task.box.top - kPhotometricRadius, 0);
+  const int last_row = std::min(task.box.bottom + kPhotometricRadius, task.height);
+  work.sums.assign(2 * static_cast<size_t>(task.height), 0.0);
+
+  PhotometricBand whole{};
+  whole.image = task.image;
+  whole.target = task.target;
+  whole.gradient = task.gradient;
+  whole.stride = stride;
+  whole.height = task.height;
+  whole.top = task.box.top;
+  whole.bottom = task.box.bottom;
+  whole.left = task.box.left * kPhotometricChannels;
+  whole.right = task.box.right * kPhotometricChannels;
+  whole.origin = std::max(whole.left - kPhotometricReach, 0);
+  whole.limit = std::min(whole.right + kPhotometricReach, stride);
+  whole.l1_factor = static_cast<float>(task.l1_weight / count);
+  whole.ssim_factor = static_cast<float>(task.ssim_weight / count);
+  whole.weights = window.weights;
+  whole.l1_sums = work.sums.data();
+  whole.ssim_sums = work.sums.data() + task.height;
+  if (!task.target) {
+    work.target.resize(static_cast<size_t>(stride) * task.height);
+    const int64_t begin = static_cast<int64_t>(std::max(first_row - kPhotometricRadius, 0)) * stride;
+    const int64_t end = static_cast<int64_t>(std::min(last_row + kPhotometricRadius, task.height)) * stride;
+    for (int64_t i = begin; i < end; ++i) work.target[i] = task.target_bytes[i] * (1.0f / 255);
+    whole.target = work.target.data();
+  }
+
+  // Every row's numbers are the same in any division into bands, so there are as many bands as threads.
+  const int rows = last_row - first_row;
+  const int bands = std::clamp(rows / (2 * kTaps), 1, thread_count());
+  parallel_for(bands, [&](int64_t index) {
+    PhotometricBand band = whole;
+    band.begin = first_row + static_cast<int>(rows * index / bands);
+    band.end = first_row + static_cast<int>(rows * (index + 1) / bands);
+    set_row_buffers(band);
+    kernel(band);
+  });
+
+  double l1 = 0, ssim = 0;
+  for (int y = task.box.top; y < task.box.bottom; ++y) {
+    l1 += whole.l1_sums[y];
+    ssim += whole.ssim_sums[y];
+  }
+  const double inside = static_cast<double>(whole.right - whole.left) * (task.box.bottom - task.box.top);
+  return task.l1_weight * l1 / count + task.ssim_weight * (inside - ssim) / count;
+}
+
+}  // namespace mien

@@ -1,0 +1,39 @@
+// What the photometric loss hands to its kernel, which is compiled once per instruction set.
+#pragma once
+
+#include <cstdint>
+
+namespace mien {
+
+constexpr int kPhotometricRadius = 5;
+// Pictures stay interleaved: a pixel's neighbour is 3 floats away, and every step works on plain rows of floats.
+constexpr int kPhotometricChannels = 3;
+constexpr int kPhotometricReach = kPhotometricRadius * kPhotometricChannels;
+constexpr int kPhotometricRing = 16;  // rows of derivatives that stay in reach of the window; a power of two
+constexpr int kPhotometricPad = 64;   // room at both ends of a row buffer: the window's reach and whole vectors
+
+// Some rows of a picture. Columns count floats; `left..right` is the box and `origin..limit` the box grown by the
+// window's reach within the picture, which holds at least 16 floats. Row buffers begin at `origin`; beyond
+// `limit` and, for derivatives, beyond the box, they hold zeros.
+struct PhotometricBand {
+  const float* image;   // [h, stride]
+  const float* target;  // [h, stride]
+  float* gradient;      // [h, stride] or null
+  int64_t stride;
+  int height;
+  int top, bottom;                   // rows of the box
+  int begin, end;                    // rows whose gradient and sums this band owns
+  int left, right;                   // columns of the box
+  int origin, limit;                 // columns of the grown box
+  float l1_factor;                   // l1_weight / (h * stride)
+  float ssim_factor;                 // ssim_weight / (h * stride)
+  const float* weights;              // [11], the window
+  float* rows[4];                    // filtered along columns
+  float* ring[3][kPhotometricRing];  // derivatives of the map with respect to mean, square sum and product
+  double* l1_sums;                   // [h]
+  double* ssim_sums;                 // [h]
+};
+
+using PhotometricKernel = void (*)(const PhotometricBand&);
+
+}  // namespace mien
