@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.capture.capture import Capture
+from mien.capture import Capture
 from mien.face import FaceModel, FaceParams
-from mien.tracking.tracking import Tracking
+from mien.tracking import Tracking
+from mien.training import Sequence
 
 
 def toy_face_model(rings: int = 9, around: int = 12) -> FaceModel:
@@ -32,7 +33,7 @@ def toy_face_model(rings: int = 9, around: int = 12) -> FaceModel:
     rotation = torch.zeros(2, 3, 3)
     rotation[0, 2, 0] = 0.2
     return FaceModel(
-        name="toy", template=template, faces=faces, uv=torch.rand(v, 2), uv_faces=faces,
+        name="toy", template=template, faces=faces, uv=torch.zeros(v, 2), uv_faces=faces,
         region_names=("skin",), face_regions=torch.zeros(len(faces), dtype=torch.long),
         identity_basis=identity, expression_basis=expression, expression_names=("drop", "swell"),
         expression_bounds=torch.tensor([[0.0, 1.0], [0.0, 1.0]]),
@@ -98,6 +99,13 @@ def toy_capture(face_model: FaceModel, timesteps: int = 10, size: int = 64) -> t
         source={"file": "toy"},
     )  # fmt: skip
     return capture, alpha
+
+
+def toy_sequence(timesteps: int = 10, size: int = 48) -> tuple[FaceModel, Sequence]:
+    """The toy face model and its capture, tracked exactly."""
+    face_model = toy_face_model()
+    capture, alpha = toy_capture(face_model, timesteps, size)
+    return face_model, Sequence("toy", capture, toy_tracking(face_model, timesteps, size), alpha)
 
 
 def _facing(vertices: Tensor, faces: Tensor) -> Tensor:

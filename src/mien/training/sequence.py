@@ -10,8 +10,8 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.capture import Capture
-from mien.tracking.tracking import Tracking
+from mien.capture import Capture, read_capture
+from mien.tracking import Tracking, read_scoring, read_tracking
 
 _CACHE_BYTES = 2 << 30
 
@@ -89,8 +89,5 @@ def read_sequence(folder: Path) -> Sequence:
     Raises:
         UserError: a part is missing, damaged or of another version.
     """
-    from mien.capture import read_capture
-    from mien.tracking import read_scoring, read_tracking
-
-    scoring = read_scoring(folder / "scoring")
-    return Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), scoring.alpha)
+    masks = read_scoring(folder / "scoring").masks
+    return Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), masks)

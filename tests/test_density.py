@@ -1,0 +1,212 @@
+"""Density control on hand-made renderings: who grows, who goes, and where children are."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from mien.avatar import (
+    FixedDensity,
+    GaussianStore,
+    GradientDensity,
+    GradientSettings,
+    Posed,
+    Progress,
+    RefillDensity,
+    RefillSettings,
+)
+from mien.avatar.density import split_along_axes
+from mien.avatar.gaussian_avatars import never_empty_a_triangle
+from mien.gaussians import Gaussians
+from mien.render.rendering import Rendering
+from mien.rotation import matrix_from_quaternion
+from mien.training.density import GradientStrategy, RefillStrategy, density_strategy
+
+WIDTH, HEIGHT = 40, 20
+EVERY_STEP = GradientSettings(start=0.0, stop=1.0, rounds=101, split_size=0.0025, opacity_resets=())
+
+
+def make_store(scales: list[float], opacity: float = 0.5, faces: list[int] | None = None) -> GaussianStore:
+    n = len(scales)
+    return GaussianStore(
+        {
+            "means": torch.arange(3.0 * n).reshape(n, 3),
+            "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+            "log_scales": torch.tensor(scales).log()[:, None].repeat(1, 3),
+            "opacity_logits": torch.logit(torch.full((n,), opacity)),
+        },
+        {"face_index": torch.tensor(faces if faces else list(range(n)))},
+    )
+
+
+def pose(store: GaussianStore) -> Posed:
+    gaussians = Gaussians(
+        store["means"][None], store["quats"][None], store["log_scales"].exp()[None], store["opacity_logits"].sigmoid(),
+        torch.zeros(len(store), 1, 3),
+    )  # fmt: skip
+    return Posed(gaussians, {})
+
+
+def rendering(gradients: list[float], radii: list[int] | None = None) -> Rendering:
+    """A rendering whose centres pull with these gradients along x, in pixels."""
+    n = len(gradients)
+    offset = torch.zeros(n, 2, requires_grad=True)
+    offset.grad = torch.stack([torch.tensor(gradients), torch.zeros(n)], dim=-1)
+    size = torch.tensor(radii if radii else [3] * n, dtype=torch.int32)
+    return Rendering(torch.zeros(HEIGHT, WIDTH, 3), torch.zeros(HEIGHT, WIDTH), size, offset)
+
+
+def control(store: GaussianStore, settings: GradientSettings = EVERY_STEP, **hooks: object) -> GradientStrategy:
+    described = GradientDensity(
+        settings,
+        opacity_logits="opacity_logits",
+        judged_opacities=lambda store, seen: store["opacity_logits"].detach().sigmoid(),
+        **hooks,  # type: ignore[arg-type]
+    )
+    strategy = density_strategy(described, store)
+    assert isinstance(strategy, GradientStrategy)
+    return strategy
+
+
+def random() -> torch.Generator:
+    return torch.Generator().manual_seed(3)
+
+
+# In normalised device coordinates a gradient in pixels counts WIDTH / 2 = 20 times: the threshold is 1e-5 here.
+ABOVE, BELOW = 1.1e-5, 0.9e-5
+
+
+def test_small_ones_duplicate_and_large_ones_split() -> None:
+    store = make_store([0.001, 0.001, 0.004, 0.004])
+    strategy = control(store)
+    strategy.observe(pose(store), rendering([ABOVE, BELOW, ABOVE, BELOW]))
+    assert strategy.control(store, pose(store), Progress(0, 100), random())
+    # 0, 1 and 3 stay, a copy of 0, and two children that replace 2.
+    assert store["face_index"].tolist() == [0, 1, 3, 0, 2, 2]
+    assert torch.equal(store["means"][3], store["means"][0])
+    torch.testing.assert_close(store["log_scales"][4:].exp(), torch.full((2, 3), 0.004 / 1.6))
+    assert not torch.equal(store["means"][4], store["means"][5])
+
+
+def test_gradient_is_the_mean_over_the_steps_that_showed_the_gaussian() -> None:
+    store = make_store([0.001, 0.001])
+    strategy = control(store)
+    strategy.observe(pose(store), rendering([ABOVE, ABOVE]))
+    strategy.observe(pose(store), rendering([0.0, 0.0], radii=[0, 3]))
+    strategy.control(store, pose(store), Progress(0, 100), random())
+    assert store["face_index"].tolist() == [0, 1, 0]
+
+
+def test_faint_and_huge_ones_go() -> None:
+    store = make_store([0.001, 0.001, 0.2])
+    store.assign("opacity_logits", torch.logit(torch.tensor([0.004, 0.006, 0.5])))
+    settings = replace(EVERY_STEP, opacity_resets=(0.0, 0.5), reset_opacity=0.9)
+    early, late = make_store([1.0]), store
+    strategy = control(store, settings)
+    strategy.observe(pose(store), rendering([0.0] * 3))
+    strategy.control(late, pose(late), Progress(60, 100), random())
+    assert late["face_index"].tolist() == [1]
+    strategy = control(early, settings)
+    strategy.observe(pose(early), rendering([0.0]))
+    strategy.control(early, pose(early), Progress(10, 100), random())
+    assert len(early) == 1, "size is judged only after a reset that follows the start"
+
+
+def test_no_triangle_is_emptied() -> None:
+    store = make_store([0.001] * 5, faces=[7, 7, 8, 8, 8])
+    prune = torch.tensor([True, True, True, False, True])
+    assert never_empty_a_triangle(store, prune).tolist() == [False, False, True, False, True]
+    strategy = control(store, may_prune=never_empty_a_triangle)
+    store.assign("opacity_logits", torch.logit(torch.tensor([0.001, 0.001, 0.001, 0.5, 0.001])))
+    strategy.observe(pose(store), rendering([0.0] * 5))
+    strategy.control(store, pose(store), Progress(0, 100), random())
+    assert store["face_index"].tolist() == [7, 7, 8]
+
+
+def test_growth_stops_at_the_limit_with_those_that_pull_most() -> None:
+    store = make_store([0.001] * 4)
+    strategy = control(store, replace(EVERY_STEP, max_gaussians=5))
+    strategy.observe(pose(store), rendering([2e-5, 3e-5, 4e-5, 1e-6]))
+    strategy.control(store, pose(store), Progress(0, 100), random())
+    assert store["face_index"].tolist() == [0, 1, 2, 3, 2]
+
+
+def test_rounds_and_resets_happen_at_their_fractions() -> None:
+    settings = GradientSettings(start=0.2, stop=0.6, rounds=3, opacity_resets=(0.5,), reset_opacity=0.01)
+    store = make_store([0.001], opacity=0.5)
+    strategy = control(store, settings)
+    rounds, resets = [], []
+    for step in range(50):
+        strategy.observe(pose(store), rendering([0.0]))
+        before = float(store["opacity_logits"].detach().sigmoid())
+        if strategy.control(store, pose(store), Progress(step, 50), random()):
+            rounds.append(step + 1)
+        after = float(store["opacity_logits"].detach().sigmoid())
+        if after < before:
+            resets.append(step + 1)
+            assert after == pytest.approx(0.01)
+    assert rounds == [10, 20, 30]
+    assert resets == [25]
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.002])
+def test_split_children_are_samples_of_their_parent(scale: float) -> None:
+    """The published code samples with another frame's scale, which puts children almost on their parent."""
+    quat = torch.nn.functional.normalize(torch.tensor([0.9, 0.2, -0.3, 0.1]), dim=0)
+    store = make_store([scale])
+    store.assign("quats", quat[None])
+    store.assign("log_scales", torch.tensor([[scale, scale / 5, scale / 20]]).log())
+    count = 4000
+    noise = torch.randn(count, 3, generator=random())
+    children = split_along_axes(store, torch.zeros(count, dtype=torch.long), noise)
+    offsets = children["means"] - store["means"].detach()
+    along_axes = offsets @ matrix_from_quaternion(quat)
+    spread: Tensor = along_axes.std(0)
+    torch.testing.assert_close(spread, store["log_scales"].detach()[0].exp(), rtol=0.05, atol=0)
+
+
+def test_refill_deletes_the_unseen_and_reaches_its_target() -> None:
+    store = make_store([0.001] * 6, opacity=0.05)
+    settings = RefillSettings(times=(0.1, 0.5), targets=(10, 20))
+    described = RefillDensity(
+        settings, refill=lambda store, parents, noise, fraction: {"means": store["means"].detach()[parents] + noise}
+    )
+    strategy = density_strategy(described, store)
+    assert isinstance(strategy, RefillStrategy)
+    faint, bright = pose(store), pose(store)
+    bright = Posed(replace(bright.gaussians, opacities=torch.tensor([0.05, 0.2, 0.05, 0.05, 0.3, 0.05])), {})
+    strategy.observe(bright, rendering([0.0] * 6))
+    strategy.observe(faint, rendering([0.0] * 6))
+    assert not strategy.control(store, faint, Progress(0, 100), random())
+    assert strategy.control(store, faint, Progress(9, 100), random())
+    assert len(store) == 10
+    assert set(store["face_index"].tolist()) == {1, 4}
+    distance = (store["means"].detach() - 3 * store["face_index"][:, None] - torch.arange(3.0)).abs()
+    assert distance[2:].max() <= 0.5
+    assert distance[2:].min() > 0
+
+
+def test_refill_survives_when_nothing_was_seen() -> None:
+    store = make_store([0.001] * 3, opacity=0.01)
+    described = RefillDensity(RefillSettings((0.0,), (5,)), refill=lambda store, parents, noise, fraction: {})
+    strategy = density_strategy(described, store)
+    strategy.observe(pose(store), rendering([0.0] * 3))
+    strategy.control(store, pose(store), Progress(0, 10), random())
+    assert len(store) == 5
+
+
+def test_fixed_density_changes_nothing() -> None:
+    store = make_store([0.001] * 3)
+    strategy = density_strategy(FixedDensity(), store)
+    strategy.observe(pose(store), rendering([1.0] * 3))
+    assert not strategy.control(store, pose(store), Progress(0, 1), random())
+
+
+def test_statistics_survive_a_checkpoint() -> None:
+    store = make_store([0.001, 0.004])
+    strategy, other = control(store), control(store)
+    strategy.observe(pose(store), rendering([ABOVE, ABOVE]))
+    other.load_state(strategy.state())
+    for name, tensor in strategy.state().items():
+        assert torch.equal(tensor, other.state()[name]), name

@@ -1,0 +1,164 @@
+"""One suite over all methods, on a toy scene: what the seam promises."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from mien.avatar import (
+    METHODS,
+    TRAINED,
+    Avatar,
+    MethodConfig,
+    Progress,
+    load_avatar,
+    pose_baked,
+    read_baked,
+    write_avatar,
+)
+from mien.avatar.files import write_baked
+from mien.config import decode, encode
+from mien.progress import Advance
+from mien.render import rasterize
+from mien.training import TrainSettings
+from mien.training.density import density_strategy
+from mien.training.frames import FrameOrder, training_frames
+from mien.training.sequence import Targets
+from mien.training.trainer import TrainingData, start, step
+from toy_scene import toy_camera, toy_sequence
+
+SIZE = 32
+FIRST, LAST = slice(0, 5), slice(-5, None)
+SETTINGS = TrainSettings(steps=50, split="none", record_every=1, checkpoint_every=1000)
+method = pytest.mark.parametrize("method", METHODS)
+
+
+@contextmanager
+def silence(title: str, total: int, completed: int) -> Iterator[Advance]:
+    yield lambda amount=1, status="": None
+
+
+def config_of(method: str) -> MethodConfig:
+    return METHODS[method].config()
+
+
+def new_avatar(method: str) -> Avatar:
+    face_model, sequence = toy_sequence(5, SIZE)
+    torch.manual_seed(0)
+    return METHODS[method].avatar(config_of(method), face_model, sequence.tracking.face)
+
+
+@method
+def test_first_fifty_steps_lower_the_loss(method: str) -> None:
+    face_model, sequence = toy_sequence(5, SIZE)
+    settings = replace(SETTINGS, steps=3000)
+    state = start([sequence], face_model, config_of(method), settings)
+    data = TrainingData(FrameOrder(training_frames([sequence], settings), 0), (Targets(sequence, 0),))
+    for _ in range(50):
+        step(state, data, settings)
+    # One pass over the frames at the start and one at the end.
+    first, last = ({name: sum(curve[part]) / 5 for name, curve in state.curves.items()} for part in (FIRST, LAST))
+    assert last["loss"] < 0.8 * first["loss"]
+    assert last["psnr"] > first["psnr"] + 1
+
+
+@method
+def test_density_control_keeps_all_tensors_equally_long(method: str) -> None:
+    face_model, sequence = toy_sequence(5, SIZE)
+    state = start([sequence], face_model, config_of(method), SETTINGS)
+    data = TrainingData(FrameOrder(training_frames([sequence], SETTINGS), 0), (Targets(sequence, 0),))
+    counts = set()
+    while state.step < SETTINGS.steps:
+        step(state, data, SETTINGS)
+        store = state.avatar.gaussian_store()
+        lengths = {len(store[name]) for name in store.names()}
+        lengths |= {len(m.first) for m in store.moments.values()} | {len(m.second) for m in store.moments.values()}
+        lengths |= {len(tensor) for tensor in state.density.state().values()}
+        assert lengths == {len(store)}
+        counts.add(len(store))
+    assert len(counts) > 1, "density control never changed anything"
+
+
+@method
+def test_saved_avatar_renders_the_same_picture(method: str, tmp_path: Path) -> None:
+    avatar = new_avatar(method)
+    store = avatar.gaussian_store()
+    store.append(torch.arange(7))
+    write_avatar(tmp_path, avatar)
+    loaded = load_avatar(tmp_path)
+    face = toy_sequence(5, SIZE)[1].tracking.face[2]
+    pictures = [
+        rasterize(a.pose(face).gaussians.timestep(0), toy_camera(SIZE), torch.ones(3)).image for a in (avatar, loaded)
+    ]
+    assert torch.equal(*pictures)
+    assert loaded.config == avatar.config
+    assert loaded.face_model.content_hash == avatar.face_model.content_hash
+
+
+@method
+def test_baked_avatar_poses_as_the_avatar_does(method: str, tmp_path: Path) -> None:
+    avatar = new_avatar(method)
+    _disturb(avatar)
+    face = toy_sequence(5, SIZE)[1].tracking.face
+    expected = avatar.pose(face).gaussians
+    write_baked(tmp_path, avatar.bake())
+    got = pose_baked(read_baked(tmp_path), face)
+    for name in ("means", "scales", "opacities", "sh"):
+        ours, theirs = torch.broadcast_tensors(getattr(got, name), getattr(expected, name))
+        torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+    for index in range(len(face)):
+        pictures = [rasterize(g.timestep(index), toy_camera(SIZE), torch.ones(3)).image for g in (got, expected)]
+        torch.testing.assert_close(*pictures, atol=1e-3, rtol=0)
+
+
+@method
+def test_gradients_are_finite_and_reach_everything_that_is_trained(method: str) -> None:
+    avatar = new_avatar(method)
+    _disturb(avatar)
+    face = toy_sequence(5, SIZE)[1].tracking.face[1]
+    progress = Progress(25, 50)
+    posed = avatar.pose(face, progress)
+    rendering = rasterize(posed.gaussians.timestep(0), toy_camera(SIZE), torch.ones(3))
+    losses = avatar.regularizers(posed, rendering, progress)
+    ((rendering.image - 0.3).square().mean() + sum(losses.values())).backward()
+    assert rendering.means2d_offset.grad is not None
+    for group in avatar.parameter_groups():
+        for name, tensor in group.tensors.items():
+            assert tensor.grad is not None, f"{group.name}/{name} has no gradient"
+            assert tensor.grad.isfinite().all(), f"{group.name}/{name}"
+        assert any(bool((tensor.grad != 0).any()) for tensor in group.tensors.values()), f"{group.name} has no effect"
+
+
+@method
+def test_pose_depends_on_its_arguments_only(method: str) -> None:
+    avatar = new_avatar(method)
+    face = toy_sequence(5, SIZE)[1].tracking.face
+    first = avatar.pose(face[1]).gaussians.means
+    avatar.pose(face[3], Progress(1, 50))
+    assert torch.equal(first, avatar.pose(face[1]).gaussians.means)
+    together = avatar.pose(face, TRAINED).gaussians.timestep(1).means
+    torch.testing.assert_close(together, avatar.pose(face[1]).gaussians.timestep(0).means, atol=1e-6, rtol=1e-5)
+
+
+@method
+def test_config_survives_json(method: str) -> None:
+    config = replace(config_of(method), photometric=replace(config_of(method).photometric, alpha_weight=0.125))
+    assert decode(METHODS[method].config, encode(config)) == config
+
+
+@method
+def test_density_description_is_one_that_the_trainer_knows(method: str) -> None:
+    avatar = new_avatar(method)
+    strategy = density_strategy(avatar.density(), avatar.gaussian_store())
+    assert all(len(tensor) == len(avatar.gaussian_store()) for tensor in strategy.state().values())
+
+
+def _disturb(avatar: Avatar) -> None:
+    """Move all parameters away from the special values that they start with."""
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in avatar.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))

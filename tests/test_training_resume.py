@@ -1,0 +1,96 @@
+"""A run that is stopped at any moment and started again ends with the same bytes as one left alone."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import train_toy
+from mien.errors import UserError
+from mien.training import read_curves, read_training_summary, train
+from mien.training.checkpoint import checkpoint_files
+from toy_scene import toy_sequence
+
+STEPS = train_toy.SETTINGS.steps
+RESULTS = ("avatar/avatar.safetensors", "avatar/avatar.json", "face_track.safetensors")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run_dir = tmp_path_factory.mktemp("undisturbed")
+    train_toy.main(run_dir, STEPS)
+    return run_dir
+
+
+def train_until(run_dir: Path, signal_at_step: int, signal_number: int) -> tuple[int, int]:
+    """Start training in another process, send it a signal; returns its exit code and the step it began at."""
+    script = Path(train_toy.__file__)
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(run_dir), str(STEPS)], stdout=subprocess.PIPE, text=True, cwd=script.parent
+    )
+    assert process.stdout is not None
+    began = -1
+    with process.stdout:
+        for line in process.stdout:
+            word, number = line.split()
+            began = int(number) if word == "start" else began
+            if word == "step" and int(number) == signal_at_step:
+                process.send_signal(signal_number)
+    return process.wait(), began
+
+
+def assert_same_results(run_dir: Path, undisturbed: Path) -> None:
+    for name in RESULTS:
+        assert (run_dir / name).read_bytes() == (undisturbed / name).read_bytes(), f"{name} differs"
+    ours, theirs = read_curves(run_dir), read_curves(undisturbed)
+    for name in set(theirs) - {"step_ms"}:
+        assert ours[name].tolist() == theirs[name].tolist(), f"curve {name} differs"
+
+
+def test_killed_runs_end_with_the_same_bytes(tmp_path: Path, undisturbed: Path) -> None:
+    # Before the first checkpoint, in the middle of density control, and again after having resumed.
+    for kill_at in (2, 13, 22):
+        code, _ = train_until(tmp_path, kill_at, signal.SIGKILL)
+        assert code == -signal.SIGKILL
+    train_toy.main(tmp_path, STEPS)
+    assert_same_results(tmp_path, undisturbed)
+    assert len(checkpoint_files(tmp_path / "checkpoints")) == 2
+
+
+def test_interrupt_leaves_a_checkpoint_of_the_step_it_came_in(tmp_path: Path, undisturbed: Path) -> None:
+    code, _ = train_until(tmp_path, 6, signal.SIGINT)
+    assert code != 0
+    last = checkpoint_files(tmp_path / "checkpoints")[-1]
+    assert last.stem >= "step_0000006"
+    code, began = train_until(tmp_path, -1, signal.SIGKILL)
+    assert (code, began) == (0, int(last.stem.removeprefix("step_")))
+    assert_same_results(tmp_path, undisturbed)
+
+
+def test_goes_on_from_the_older_checkpoint_if_the_newest_is_damaged(tmp_path: Path, undisturbed: Path) -> None:
+    train_until(tmp_path, 18, signal.SIGKILL)
+    newest = checkpoint_files(tmp_path / "checkpoints")[-1]
+    newest.write_bytes(newest.read_bytes()[:1000])
+    train_toy.main(tmp_path, STEPS)
+    assert_same_results(tmp_path, undisturbed)
+
+
+def test_finished_run_is_loaded(undisturbed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (undisturbed / "training.json").read_bytes()
+    train_toy.main(undisturbed, STEPS)
+    assert "step" not in capsys.readouterr().out
+    assert (undisturbed / "training.json").read_bytes() == before
+    summary = read_training_summary(undisturbed)
+    assert summary["steps"] == STEPS
+    assert set(summary) == {"steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"}
+
+
+def test_other_settings_are_refused(undisturbed: Path) -> None:
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    with pytest.raises(UserError, match="settings.steps"):
+        train_toy.main(undisturbed, STEPS + 1)
+    other = train_toy.CONFIG.__class__(sh_degree=1)
+    with pytest.raises(UserError, match="method"):
+        train([sequence], face_model, other, train_toy.SETTINGS, undisturbed)

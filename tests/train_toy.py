@@ -1,0 +1,44 @@
+"""Trains the toy scene into the folder given as argument; a test kills this process at will."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from mien.avatar import FaceTuning, GaussianAvatarsConfig, GradientSettings
+from mien.progress import Advance
+from mien.training import TrainSettings, train
+from toy_scene import toy_sequence
+
+CONFIG = GaussianAvatarsConfig(
+    density=GradientSettings(start=0.2, stop=0.8, rounds=4, grow_gradient=1e-4, max_gaussians=400),
+    face_tuning=FaceTuning(enabled=True),
+)
+SETTINGS = TrainSettings(steps=30, split="none", background="random", checkpoint_every=4, record_every=3)
+
+
+@contextmanager
+def report_steps(title: str, total: int, completed: int) -> Iterator[Advance]:
+    """Print the number of every step that is done."""
+    print("start", completed, flush=True)
+    done = completed
+
+    def advance(amount: int = 1, status: str = "") -> None:
+        nonlocal done
+        done += amount
+        print("step", done, flush=True)
+
+    yield advance
+
+
+def main(run_dir: Path, steps: int) -> None:
+    torch.set_num_threads(1)
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    train([sequence], face_model, CONFIG, replace(SETTINGS, steps=steps), run_dir, report_steps)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]))
