@@ -55,13 +55,19 @@ def load_face_model(name: str = "anny") -> FaceModel:
     Raises:
         UserError: there is no such model, or its package is not installed.
     """
+    model = load_face_model_without_landmarks(name)
+    return replace(model, landmarks=read_landmarks(name, model))
+
+
+def load_face_model_without_landmarks(name: str) -> FaceModel:
+    """`load_face_model` for who makes the landmarks."""
     source = _source(name)
     stem = _cached_file(name, source)
     model = _read_if_sound(stem)
     if model is None:
         model = source.bake()
         write_face_model(stem, model)
-    return replace(model, landmarks=read_landmarks(name, model))
+    return model
 
 
 def available_face_models() -> list[FaceModelInfo]:

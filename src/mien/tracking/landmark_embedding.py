@@ -1,0 +1,255 @@
+"""Where MediaPipe's 478 landmarks lie on a face model: `python -m mien.tracking.landmark_embedding anny`.
+
+Works for any FaceModel: draw it with random identities, mild expressions, gazes and views, let the landmark detector
+look at the pictures, and take for each landmark the point of the surface that projects nearest to where it was found.
+The result ships with mien (src/mien/face/data), so that only who changes a face model's mesh has to run this.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien.camera import Camera, camera_from_fov
+from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams, Landmarks
+from mien.face.loading import LANDMARK_FORMAT, LANDMARK_VERSION, load_face_model_without_landmarks
+from mien.progress import say, track_progress
+from mien.render.mesh import Headlight, render_mesh
+from mien.rotation import rigid_transform
+from mien.storage import write_atomically
+from mien.tracking.landmark_groups import LANDMARKS, LEFT_IRIS, RIGHT_IRIS
+
+IBUG68 = (
+    127, 234, 93, 58, 172, 136, 149, 148, 152, 377, 378, 365, 397, 288, 323, 454, 356,  # contour, right to left ear
+    70, 63, 105, 66, 107, 336, 296, 334, 293, 300,  # brows
+    168, 197, 5, 4, 98, 97, 2, 326, 327,  # nose
+    33, 160, 158, 133, 153, 144, 362, 385, 387, 263, 373, 380,  # eyes
+    61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181,  # outer lips
+    78, 82, 13, 312, 308, 317, 14, 87,  # inner lips
+)  # fmt: skip
+"""MediaPipe's landmark for each of 300-W's 68 points. The first 17 are the silhouette there, and fixed points here."""
+
+_FACE_REGIONS = ("skin", "face", "lips", "eyelids", "brows", "nose", "scalp", "ears")
+_EYE_REGIONS = ("eyes", "irises")
+_SCALP_FRONT = 0.06
+"""Metres ahead of the head frame's origin: only there landmarks may be on the scalp."""
+_SUBDIVISIONS = 12
+"""Points tried along a triangle's side."""
+_NEAR_VERTICES = 6
+"""Triangles around so many of the best vertices are searched."""
+
+
+@dataclass(frozen=True)
+class EmbeddingSettings:
+    """Pictures that the embedding is fitted to."""
+
+    pictures: int = 240
+    """How many are drawn; the detector fails on some."""
+    size: int = 512
+    """Pixels."""
+    yaw: float = 0.45
+    """Largest turn to either side, radians."""
+    pitch: float = 0.2
+    """Largest turn up or down, radians."""
+    gaze: float = 0.2
+    """Largest turn of the eyes either way, radians."""
+    identity: float = 0.8
+    """Standard deviation of identity coefficients."""
+    clamp: float = 10.0
+    """An error in pixels counts at most so much: detections fail now and then."""
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """What the landmarks of one face model look like in n pictures."""
+
+    vertices: Float[Tensor, "n v 2"]
+    """Projected vertices, pixels."""
+    inverse_depth: Float[Tensor, "n v"]
+    """1 / metres: perspective needs it between vertices."""
+    detected: Float[Tensor, "n l 2"]
+    """Pixels."""
+
+
+def embed_landmarks(
+    model: FaceModel, settings: EmbeddingSettings | None = None
+) -> tuple[dict[str, Landmarks], Float[Tensor, " l"]]:
+    """The `mediapipe` and `ibug68` landmark sets of a face model, and each MediaPipe landmark's median error in pixels.
+
+    Raises:
+        UserError: the detector finds no face in most pictures.
+    """
+    settings = settings or EmbeddingSettings()
+    views = _draw_and_detect(model, settings)
+    faces, barycentric = torch.empty(LANDMARKS, dtype=torch.long), torch.empty(LANDMARKS, 3)
+    errors = torch.empty(LANDMARKS)
+    on_eyes = _allowed(model, _EYE_REGIONS)
+    on_face = _allowed(model, _FACE_REGIONS)
+    for landmark in track_progress(range(LANDMARKS), "Placing landmarks", LANDMARKS):
+        allowed = on_eyes if landmark in LEFT_IRIS + RIGHT_IRIS else on_face
+        faces[landmark], barycentric[landmark], errors[landmark] = _best_point(
+            views, model.faces, allowed, landmark, settings.clamp
+        )
+    mediapipe = Landmarks(faces, barycentric)
+    subset = torch.tensor(IBUG68)
+    return {"mediapipe": mediapipe, "ibug68": Landmarks(faces[subset], barycentric[subset])}, errors
+
+
+def write_landmarks(path: Path, model: FaceModel, landmarks: dict[str, Landmarks], error: float) -> None:
+    """Write landmark sets as `mien.face.loading.read_landmarks` reads them; `error` is their median, pixels."""
+    content = {
+        "format": LANDMARK_FORMAT,
+        "version": LANDMARK_VERSION,
+        "face_model": model.name,
+        "topology_hash": model.topology_hash,
+        "content_hash": model.content_hash,
+        "command": f"python -m mien.tracking.landmark_embedding {model.name}",
+        "median_error_px": round(error, 3),
+        "landmarks": {
+            name: {"faces": marks.faces.tolist(), "barycentric": np.round(marks.barycentric.tolist(), 4).tolist()}
+            for name, marks in landmarks.items()
+        },
+    }
+    text = json.dumps(content, separators=(",", ":")).replace(',"', ',\n"') + "\n"
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8") and None)
+
+
+def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.Generator) -> FaceParams:
+    """One timestep of a random person with a mild expression, turned a little, at the world's origin."""
+
+    def uniform(*shape: int) -> Tensor:
+        return 2 * torch.rand(*shape, generator=generator) - 1
+
+    neutral = model.neutral()
+    active = torch.rand(neutral.expression.shape, generator=generator) < 0.12
+    strength = 0.35 * torch.rand(neutral.expression.shape, generator=generator)
+    expression = (active * strength).clamp(model.expression_bounds[:, 0], model.expression_bounds[:, 1])
+    joints = neutral.joints.clone()
+    gaze = settings.gaze * uniform(3) * torch.tensor([0.6, 1.0, 0.0])
+    for index, name in enumerate(model.free_joint_names):
+        if name in ("left_eye", "right_eye"):
+            joints[:, index] = gaze
+    limits = torch.tensor([settings.pitch, settings.yaw, 0.1])
+    return replace(
+        neutral,
+        identity=settings.identity * torch.randn(neutral.identity.shape, generator=generator),
+        expression=expression,
+        joints=joints,
+        head_rotation=uniform(1, 3) * limits,
+    )
+
+
+def paint(model: FaceModel, generator: torch.Generator) -> Float[Tensor, "f 3 3"]:
+    """A plain albedo of every triangle's corners by region, with a random skin tone."""
+    skin = torch.tensor([0.85, 0.65, 0.55]) * (0.55 + 0.45 * torch.rand(1, generator=generator))
+    tint = torch.tensor([1.0, 1.0, 1.0])
+    tones = {
+        "lips": skin * torch.tensor([0.95, 0.6, 0.62]),
+        "brows": skin * 0.3,
+        "eyes": 0.92 * tint,
+        "irises": torch.tensor([0.22, 0.15, 0.10]),
+        "teeth": 0.9 * tint,
+        "tongue": torch.tensor([0.6, 0.25, 0.25]),
+        "mouth": torch.tensor([0.25, 0.08, 0.08]),
+        "eyelids": skin * 0.8,
+        "scalp": skin * 0.35,
+    }
+    by_region = torch.stack([tones.get(name, skin) for name in model.region_names])
+    return by_region[model.face_regions][:, None].expand(-1, 3, 3).contiguous()
+
+
+def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> Views:
+    generator = torch.Generator().manual_seed(settings.seed)
+    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    module = load_solution("face_mesh")
+    with quiet_mediapipe(), module.FaceMesh(static_image_mode=True, max_num_faces=1, refine_landmarks=True) as mesh:
+        mesh.process(np.zeros((64, 64, 3), np.uint8))
+        for _ in track_progress(range(settings.pictures), "Drawing and detecting", settings.pictures):
+            vertices = model(random_face(model, settings, generator))[0]
+            camera = _random_camera(settings, generator)
+            side, up = torch.rand(2, generator=generator).tolist()
+            lamp = Headlight(direction=(side - 0.5, -0.3 - 0.5 * up, -1.0), ambient=0.45)
+            picture, _ = render_mesh(
+                vertices, model.faces, camera, paint(model, generator), light=lamp, background=(0.6,) * 3, supersample=2
+            )
+            faces = mesh.process((255 * picture.clamp(0, 1)).to(torch.uint8).numpy()).multi_face_landmarks
+            if faces:
+                points = torch.tensor([(point.x, point.y) for point in faces[0].landmark]) * settings.size
+                pixels, depth = camera.project(vertices)
+                found.append((pixels, 1 / depth, points))
+    if len(found) < settings.pictures // 2:
+        raise UserError(
+            f"the landmark detector found a face in {len(found)} of {settings.pictures} pictures of {model.name}: look "
+            "at them; its regions or its head frame may be wrong"
+        )
+    return Views(*(torch.stack(parts) for parts in zip(*found, strict=True)))
+
+
+def _random_camera(settings: EmbeddingSettings, generator: torch.Generator) -> Camera:
+    """In front of the head, which fills half of the picture."""
+    distance = 0.6 + 0.6 * float(torch.rand((), generator=generator))
+    turned = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    viewmat = rigid_transform(turned, torch.tensor([0.0, -0.01, distance]))
+    return camera_from_fov(2 * float(np.arctan(0.17 / (distance - 0.08))), settings.size, settings.size, viewmat)
+
+
+def _allowed(model: FaceModel, regions: Sequence[str]) -> Bool[Tensor, " f"]:
+    mask = model.region_mask(*regions)
+    assert mask.any(), f"{model.name} has none of the regions {', '.join(regions)}"
+    return mask & (~model.region_mask("scalp") | (model.template[model.faces].mean(1)[:, 2] > _SCALP_FRONT))
+
+
+def _best_point(
+    views: Views, faces: Int[Tensor, "f 3"], allowed: Bool[Tensor, " f"], landmark: int, clamp: float
+) -> tuple[Tensor, Float[Tensor, " 3"], Tensor]:
+    """Triangle, barycentric weights and median error of the point with the least sum of clamped pixel errors."""
+    target = views.detected[:, landmark]
+    candidates = torch.unique(faces[allowed])
+    distance = (views.vertices[:, candidates] - target[:, None]).norm(dim=-1).clamp_max(4 * clamp).sum(0)
+    nearest = candidates[distance.topk(min(_NEAR_VERTICES, len(candidates)), largest=False).indices]
+    triangles = (allowed & torch.isin(faces, nearest).any(1)).nonzero()[:, 0]
+    weights = _triangle_grid(_SUBDIVISIONS)
+    corners = faces[triangles]
+    # Straight lines in space project to straight lines, but their points shift by the corners' depths.
+    scaled = weights[None, None] * views.inverse_depth[:, corners][:, :, None]
+    scaled = scaled / scaled.sum(-1, keepdim=True)
+    points = scaled @ views.vertices[:, corners]
+    error = (points - target[:, None, None]).norm(dim=-1)
+    best = int(error.clamp_max(clamp).sum(0).argmin())
+    triangle, point = divmod(best, len(weights))
+    return triangles[triangle], weights[point], error[:, triangle, point].median()
+
+
+def _triangle_grid(subdivisions: int) -> Float[Tensor, "p 3"]:
+    """Barycentric weights evenly over a triangle."""
+    steps = [(i, j, subdivisions - i - j) for i in range(subdivisions + 1) for j in range(subdivisions + 1 - i)]
+    return torch.tensor(steps, dtype=torch.float32) / subdivisions
+
+
+def main(name: tyro.conf.Positional[str] = "anny", pictures: int = EmbeddingSettings.pictures) -> None:
+    """Place the landmarks of a face model and write them into the package's data.
+
+    Args:
+        name: The face model.
+        pictures: How many to draw; 240 take about two minutes.
+    """
+    model = load_face_model_without_landmarks(name)
+    landmarks, errors = embed_landmarks(model, EmbeddingSettings(pictures=pictures))
+    median = float(errors.median())
+    path = Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
+    write_landmarks(path, model, landmarks, median)
+    say(f"{path}: median error {median:.2f} px, largest {float(errors.max()):.2f} px (landmark {int(errors.argmax())})")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
