@@ -1,5 +1,6 @@
 """Which frame a step looks at: every draw is a function of the seed and the step, so that runs resume exactly."""
 
+import hashlib
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
 
@@ -81,4 +82,6 @@ def density_random(settings: TrainSettings, step: int) -> torch.Generator:
 
 def random_at(seed: int, purpose: int, step: int) -> torch.Generator:
     """A generator that depends on these three numbers only."""
-    return torch.Generator().manual_seed((seed * 8 + purpose) * 2**40 + step)
+    # torch's CPU generator looks at the low 32 bits of its seed only, so the three have to be mixed into them.
+    digest = hashlib.blake2b(f"{seed} {purpose} {step}".encode(), digest_size=4).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest, "little"))

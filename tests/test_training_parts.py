@@ -1,0 +1,170 @@
+"""Splits, frame order, targets, the optimiser and the face track."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mien.avatar import FaceTuning, GaussianStore, Moments, ParameterGroup, Progress, Rate, store_group
+from mien.errors import UserError
+from mien.training import TrainSettings, held_out
+from mien.training.adam import Adam
+from mien.training.face_track import FaceTrack
+from mien.training.frames import FrameOrder, background_at, density_random, training_frames
+from mien.training.sequence import Targets, composite
+from toy_scene import toy_face, toy_sequence
+
+
+def test_blocks_hold_out_every_fifth_block_of_ten() -> None:
+    held = held_out(120, "blocks").nonzero()[:, 0].tolist()
+    assert held == [*range(40, 50), *range(90, 100)]
+
+
+def test_tail_holds_out_the_last_fifth() -> None:
+    assert held_out(101, "tail").nonzero()[:, 0].tolist() == list(range(81, 101))
+    assert not held_out(101, "none").any()
+
+
+def test_frames_leave_out_what_is_invalid_or_held_out() -> None:
+    _, sequence = toy_sequence(60, 16)
+    valid = np.ones((60, 1), dtype=bool)
+    valid[3] = False
+    second = replace(sequence, name="other", capture=replace(sequence.capture, valid=valid))
+    frames = training_frames([sequence, second], TrainSettings(split="blocks"))
+    assert len(frames) == 50 + 49
+    assert {frame.timestep for frame in frames if frame.sequence == 1} == set(range(60)) - {3} - set(range(40, 50))
+    assert all(frame.track_index == frame.timestep + 60 * frame.sequence for frame in frames)
+    only = training_frames([sequence, second], TrainSettings(split="none", held_out_sequences=("toy",)))
+    assert {frame.sequence for frame in only} == {1}
+
+
+def test_nothing_to_train_on_is_the_users_to_mend() -> None:
+    _, sequence = toy_sequence(5, 16)
+    with pytest.raises(UserError, match="no frame to train on"):
+        training_frames([sequence], TrainSettings(held_out_cameras=("front",)))
+
+
+def test_order_shows_each_frame_once_a_pass_and_depends_on_the_step_only() -> None:
+    _, sequence = toy_sequence(12, 16)
+    frames = training_frames([sequence], TrainSettings(split="none"))
+    order = FrameOrder(frames, seed=5)
+    passes = [[order.at(step)[0] for step in range(start, start + 12)] for start in (0, 12)]
+    assert all(sorted(f.timestep for f in one) == list(range(12)) for one in passes)
+    assert passes[0] != passes[1]
+    assert FrameOrder(frames, seed=5).at(17) == (passes[1][5], 1)
+    assert [FrameOrder(frames, seed=6).at(step)[0] for step in range(12)] != passes[0]
+
+
+def test_random_backgrounds_and_density_draws_depend_on_seed_and_step() -> None:
+    settings = TrainSettings(background="random", seed=1)
+    assert background_at(settings, 3).tolist() == background_at(settings, 3).tolist()
+    assert background_at(settings, 3).tolist() != background_at(settings, 4).tolist()
+    assert background_at(TrainSettings(), 3).tolist() == [255, 255, 255]
+    draws = [torch.rand(4, generator=density_random(replace(settings, seed=seed), 3)) for seed in (1, 1, 2)]
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+
+
+@given(st.integers(0, 2**31 - 1))
+def test_composite_is_exact(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    image = random.integers(0, 256, (5, 7, 3), dtype=np.uint8)
+    matte = random.integers(0, 256, (5, 7), dtype=np.uint8)
+    background = random.integers(0, 256, 3, dtype=np.uint8)
+    alpha = matte[..., None] / 255
+    expected = np.floor(image * alpha + background * (1 - alpha) + 0.5)
+    got = composite(image, matte, background)
+    assert got.dtype == np.uint8
+    # Ties of rounding may fall either way in floating point.
+    assert np.abs(got - expected).max() <= (0 if np.ptp(alpha) == 0 else 1)
+    assert np.abs(got - (image * alpha + background * (1 - alpha))).max() <= 0.5 + 1e-9
+
+
+def test_targets_at_half_resolution_show_the_same_view() -> None:
+    _, sequence = toy_sequence(3, 32)
+    full, half = Targets(sequence, 0), Targets(sequence, 16)
+    assert (half.width, half.height) == (16, 16)
+    point = torch.tensor([[0.02, 0.03, -0.45]])
+    torch.testing.assert_close(half.camera(0).project(point)[0] * 2, full.camera(0).project(point)[0])
+    white = np.full(3, 255, dtype=np.uint8)
+    large, small = (targets.picture(1, 0, white, keep=True).float() for targets in (full, half))
+    averaged = large.reshape(16, 2, 16, 2, 3).mean((1, 3))
+    assert (averaged - small).abs().mean() < 2
+    assert Targets(sequence, 4096).width == 32, "pictures are never enlarged"
+
+
+def test_fixed_background_pictures_are_kept() -> None:
+    _, sequence = toy_sequence(3, 16)
+    targets, white = Targets(sequence, 0), np.full(3, 255, dtype=np.uint8)
+    assert targets.picture(1, 0, white, keep=True) is targets.picture(1, 0, white, keep=True)
+    grey = np.full(3, 99, dtype=np.uint8)
+    assert targets.picture(1, 0, grey, keep=False) is not targets.picture(1, 0, grey, keep=False)
+
+
+def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:
+    store = GaussianStore({"means": torch.linspace(-1, 1, 12).reshape(4, 3)})
+    network = torch.nn.Linear(3, 2)
+    twins = [torch.nn.Parameter(tensor.detach().clone()) for tensor in (store["means"], *network.parameters())]
+    reference = torch.optim.Adam(
+        [{"params": twins[:1], "lr": 0.1}, {"params": twins[1:], "lr": 0.02}], eps=1e-15, foreach=False
+    )
+    adam = Adam()
+    for step in range(5):
+        groups = [
+            store_group(store, "means", Rate(0.1)),
+            ParameterGroup("network", dict(network.named_parameters()), Rate(0.02)),
+        ]
+        network(store["means"]).square().sum().backward()
+        (twins[0] @ twins[1].T + twins[2]).square().sum().backward()
+        adam.step(groups, Progress(step, 5))
+        reference.step()
+        reference.zero_grad()
+    for ours, theirs in zip((store["means"], *network.parameters()), twins, strict=True):
+        torch.testing.assert_close(ours, theirs)
+    assert store.moments["means"].step == 5
+    assert set(adam.state()) == {"network/weight", "network/bias"}
+    assert store["means"].grad is None
+
+
+def test_rates() -> None:
+    assert Rate(1.0, 0.01).at(Progress(50, 100)) == pytest.approx(0.1)
+    assert Rate(1.0, 0.01).at(Progress(100, 100)) == pytest.approx(0.01)
+    assert Rate(0.3).at(Progress(70, 100)) == 0.3
+    late = Rate(1.0, 0.01, begin=0.5)
+    assert (late.at(Progress(49, 100)), late.at(Progress(50, 100))) == (0.0, 1.0)
+    assert late.at(Progress(75, 100)) == pytest.approx(0.1)
+
+
+def test_face_track_moves_only_the_timestep_that_was_used() -> None:
+    start, adam = toy_face(6), Adam()
+    track = FaceTrack(start, FaceTuning(enabled=True, expression=Rate(0.01)))
+    for step in range(4):
+        face = track.face(2)
+        (face.expression.sum() + face.head_translation.sum()).backward()
+        adam.step(track.parameter_groups(face, 2), Progress(step, 10))
+    tuned = track.params()
+    # Adam moves by its rate in each step while the gradient keeps its sign.
+    torch.testing.assert_close(tuned.expression[2], start.expression[2] - 0.04)
+    others = torch.tensor([0, 1, 3, 4, 5])
+    assert torch.equal(tuned.expression[others], start.expression[others])
+    assert torch.equal(tuned.joints, start.joints), "what has no gradient does not move"
+    resumed = FaceTrack(start, FaceTuning(enabled=True))
+    resumed.load_state(track.state())
+    assert torch.equal(resumed.params().expression, tuned.expression)
+
+
+def test_face_track_is_still_where_tuning_is_off() -> None:
+    track = FaceTrack(toy_face(6), FaceTuning())
+    face = track.face(2)
+    assert not face.expression.requires_grad
+    assert track.parameter_groups(face, 2) == []
+    assert track.state() == {}
+
+
+def test_moments_begin_at_zero() -> None:
+    moments = Moments.zeros(torch.ones(3))
+    assert moments.first.eq(0).all()
+    assert moments.step == 0
