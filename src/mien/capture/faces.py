@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -23,7 +23,7 @@ class FaceFinder:
     Use as a context manager.
     """
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "FaceFinder":
         module = load_solution("face_detection")
         with quiet_mediapipe():
             self._detectors = [
@@ -84,7 +84,7 @@ class LandmarkDetector:
     def __init__(self, several_faces: bool) -> None:
         self._several_faces = several_faces
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "LandmarkDetector":
         module = load_solution("face_mesh")
         with quiet_mediapipe():
             self._mesh = module.FaceMesh(max_num_faces=_MOST_FACES if self._several_faces else 1, refine_landmarks=True)

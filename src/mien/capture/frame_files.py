@@ -8,7 +8,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
 
 import cv2
 import numpy as np
@@ -96,7 +95,7 @@ class FrameWriter:
         """Of each picture written so far."""
         self._pending: deque[Future[None]] = deque()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "FrameWriter":
         for kind in (FRAMES, MATTES):
             for camera_id in self.layout.camera_ids:
                 (self.layout.folder / kind / camera_id).mkdir(parents=True, exist_ok=True)

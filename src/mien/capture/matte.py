@@ -1,7 +1,6 @@
 """Mattes: MediaPipe's selfie segmentation at 256x256, steadied over time, refined on the picture at full size."""
 
 from types import TracebackType
-from typing import Self
 
 import cv2
 import numpy as np
@@ -18,12 +17,16 @@ _GUIDE_RADIUS = 1 / 48
 """Of the guided filter's window, as a fraction of the picture's longer side."""
 _GUIDE_EPSILON = 1e-4
 """Variance of colour (0..1) below which the guided filter smooths instead of following edges."""
+_MASK_LEVELS = (0.2, 0.8)
+"""Mask values taken as sure background and sure person. The filter smooths enough; a soft mask would leave a halo."""
+_ALPHA_LEVELS = (0.08, 0.92)
+"""Filtered values that become 0 and 1: the filter's overshoot would leave a veil and holes."""
 
 
 class Segmenter:
     """Soft person masks of consecutive pictures of one clip. Use as a context manager."""
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Segmenter":
         module = load_solution("selfie_segmentation")
         with quiet_mediapipe():
             self._model = module.SelfieSegmentation(model_selection=0)
@@ -55,9 +58,16 @@ def refine_matte(image: UInt8[np.ndarray, "h w 3"], mask: Float[np.ndarray, "256
     """The mask at the picture's size with its border moved onto the picture's edges, 255 = person."""
     height, width = image.shape[:2]
     coarse = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    ramp = _stretch(coarse, _MASK_LEVELS)
     radius = max(2, round(_GUIDE_RADIUS * max(width, height)))
-    alpha = guided_filter(image.astype(np.float32) / 255, coarse, radius, _GUIDE_EPSILON)
-    return np.rint(np.clip(alpha, 0, 1) * 255).astype(np.uint8)
+    # A smooth step keeps the border in its place.
+    alpha = guided_filter(image.astype(np.float32) / 255, ramp * ramp * (3 - 2 * ramp), radius, _GUIDE_EPSILON)
+    return np.rint(_stretch(alpha, _ALPHA_LEVELS) * 255).astype(np.uint8)
+
+
+def _stretch(values: Float[np.ndarray, "h w"], levels: tuple[float, float]) -> Float[np.ndarray, "h w"]:
+    """Map the levels to 0 and 1, and clip."""
+    return np.clip((values - levels[0]) / (levels[1] - levels[0]), 0, 1)
 
 
 def guided_filter(

@@ -49,13 +49,11 @@ class FrameProcessor:
         """What came before; before the first frame, the next ones backwards."""
 
     def skip(self, count: int) -> None:
-        """Pass over frames that are done; must come before any chunk."""
-        if count:
-            self._recent.extend(itertools.islice(self._stream, count))
-        else:
-            ahead = list(itertools.islice(self._stream, _LEAD_IN + 1))
-            self._recent.extend(ahead[:0:-1])
-            self._stream = itertools.chain(ahead, self._stream)
+        """Pass over the first `count` frames, which are done; to be called once, before any chunk."""
+        ahead = list(itertools.islice(self._stream, _LEAD_IN + 1))
+        self._recent.extend(ahead[:0:-1])
+        self._stream = itertools.chain(ahead, self._stream)
+        self._recent.extend(itertools.islice(self._stream, count))
 
     def process(self, start: int, count: int, writer: FrameWriter, advance: Advance) -> Chunk:
         """The next `count` frames, the first of which is number `start`."""

@@ -86,7 +86,7 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
             yield latest, _to_rgb(frame, reformatter, longest_side)
 
 
-def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], fps: float, crf: int = 18) -> None:
+def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], fps: int | float, crf: int = 18) -> None:
     """Write sRGB frames as H.264 (yuv420p, BT.709), atomically; odd sizes get a repeated last row or column.
 
     Args:
@@ -108,7 +108,7 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], fps: f
         raise UserError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from None
 
 
-def _encode(path: Path, frames: Iterable[np.ndarray], shape: tuple[int, ...], fps: float, crf: int) -> None:
+def _encode(path: Path, frames: Iterable[np.ndarray], shape: tuple[int, ...], fps: int | float, crf: int) -> None:
     height, width = shape[:2]
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001), options={"crf": str(crf)})

@@ -1,0 +1,210 @@
+"""Video to capture: the whole way, on a scanned face's texture and on footage."""
+
+import json
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from capture_helpers import assert_same_capture, scan_texture, tree_bytes, write_face_clip, write_gradient_video
+from mien.capture import CaptureSettings, capture_video, process, read_capture
+from mien.capture.video import write_video
+from mien.errors import UserError
+
+
+@pytest.fixture(scope="session")
+def face_clip(test_data, tmp_path_factory):
+    path = tmp_path_factory.mktemp("clips") / "wandering.mp4"
+    return path, write_face_clip(path, test_data)
+
+
+@pytest.fixture(scope="session")
+def face_capture(face_clip, tmp_path_factory):
+    path = tmp_path_factory.mktemp("captures") / "whole"
+    return path, capture_video(face_clip[0], path, CaptureSettings(size=200))
+
+
+def test_head_is_cropped_steadily_and_landmarks_follow(face_clip, face_capture):
+    _, centres = face_clip
+    path, capture = face_capture
+    crop = capture.source["crop"]
+    assert crop["width"] == crop["height"] < 360
+    assert capture.images.shape == (12, 1, 200, 200, 3)
+    assert capture.valid.all()
+    assert capture.fps == 25.0
+    scale = 200 / crop["width"]
+    expected_centre = (np.array([320, 180]) - [crop["left"], crop["top"]]) * scale
+    np.testing.assert_allclose(capture.principal_point, expected_centre[None])
+    # The texture moves by 4 source pixels a frame, and so must every landmark.
+    moved = np.diff(capture.landmarks[:, 0].mean(axis=1), axis=0)
+    np.testing.assert_allclose(moved, np.tile([4 * scale, 0], (11, 1)), atol=0.6)
+    in_texture = capture.landmarks[:, 0] / scale + [crop["left"], crop["top"]] - centres[:, None] + 120
+    nose = in_texture[:, 1] / 240
+    np.testing.assert_allclose(nose, np.tile([0.5, 0.42], (12, 1)), atol=0.03)
+    report = json.loads((path / "report.json").read_text())
+    assert report["frames"] == 12
+    assert report["frames_without_face"] == 0
+    assert report["landmark_jitter_px"] < 1
+
+
+def test_face_is_foreground_and_corners_are_not(face_capture):
+    _, capture = face_capture
+    hull = np.zeros(capture.mattes.shape[2:], np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(capture.landmarks[6, 0].astype(np.float32)).astype(np.int32), 1)
+    assert capture.mattes[6, 0][hull == 1].mean() > 250
+    assert capture.mattes[:, 0, :4, :4].max() < 20
+
+
+def test_captured_again_it_is_read_back(face_clip, face_capture, monkeypatch):
+    path, capture = face_capture
+    before = tree_bytes(path)
+    monkeypatch.setattr("mien.capture.from_video.survey_faces", None)  # any work would call it
+    assert_same_capture(capture, capture_video(face_clip[0], path, CaptureSettings(size=200)))
+    assert tree_bytes(path) == before
+
+
+def test_other_settings_replace_the_capture(face_clip, tmp_path):
+    out = tmp_path / "capture"
+    capture_video(face_clip[0], out, CaptureSettings(size=64, max_frames=4))
+    capture = capture_video(face_clip[0], out, CaptureSettings(size=96, max_frames=2, stride=3, start=0.04))
+    assert capture.images.shape[:3] == (2, 1, 96)
+    np.testing.assert_allclose(capture.timestamps, [0, 0.12], atol=1e-6)
+    assert capture.fps == pytest.approx(25 / 3)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["capture"]
+
+
+def test_interrupted_capture_goes_on_to_the_same_bytes(face_clip, tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "_CHUNK", 5)
+    settings = CaptureSettings(size=96)
+    capture_video(face_clip[0], tmp_path / "straight" / "capture", settings)
+    out = tmp_path / "interrupted" / "capture"
+    original = process.FrameProcessor.process
+    starts = []
+
+    def stop_at_the_second(self, start, count, writer, advance):
+        starts.append(start)
+        if len(starts) == 2:
+            raise KeyboardInterrupt
+        return original(self, start, count, writer, advance)
+
+    monkeypatch.setattr(process.FrameProcessor, "process", stop_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        capture_video(face_clip[0], out, settings)
+    with pytest.raises(UserError, match="no capture there"):
+        read_capture(out)
+    capture_video(face_clip[0], out, settings)
+    assert starts == [0, 5, 5, 10]
+    assert tree_bytes(out) == tree_bytes(tmp_path / "straight" / "capture")
+    assert [entry.name for entry in out.parent.iterdir()] == ["capture"]
+
+
+def test_folder_of_images_in_natural_order(test_data, tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    face = cv2.resize(scan_texture(test_data), (128, 128), interpolation=cv2.INTER_AREA)
+    for number in (2, 10, 1):
+        picture = face.copy()
+        picture[:8, :8] = number
+        cv2.imwrite(str(folder / f"{number}.png"), picture[..., ::-1])
+    capture = capture_video(folder, tmp_path / "capture", CaptureSettings(fps=10.0, crop="none"))
+    assert capture.name == "pictures"
+    assert capture.images[:, 0, 0, 0, 0].tolist() == [1, 2, 10]
+    np.testing.assert_allclose(capture.timestamps, [0, 0.1, 0.2])
+    assert capture.images.shape[2:4] == (128, 128)  # not enlarged
+    cv2.imwrite(str(folder / "3.png"), face[:100])
+    with pytest.raises(UserError, match="3.png: is 128x100"):
+        capture_video(folder, tmp_path / "other")
+    (folder / "3.png").write_bytes(b"no image")
+    with pytest.raises(UserError, match="3.png: cannot be read as an image"):
+        capture_video(folder, tmp_path / "other")
+
+
+def test_frames_without_a_face_are_marked(test_data, tmp_path):
+    face = cv2.resize(scan_texture(test_data), (160, 160), interpolation=cv2.INTER_AREA)
+    blank = np.full_like(face, 190)
+    path = tmp_path / "gone.mp4"
+    write_video(path, [face] * 4 + [blank] * 3 + [face] * 4, 25)
+    capture = capture_video(path, tmp_path / "capture")
+    assert capture.valid[:, 0].tolist() == [True] * 4 + [False] * 3 + [True] * 4
+    assert np.isnan(capture.landmarks[4:7]).all()
+
+
+def test_of_several_faces_the_largest_is_followed(test_data, tmp_path, capsys):
+    texture = scan_texture(test_data)
+    picture = np.full((360, 640, 3), 190, np.uint8)
+    picture[60:300, 40:280] = cv2.resize(texture, (240, 240), interpolation=cv2.INTER_AREA)
+    picture[20:340, 300:620] = cv2.resize(texture, (320, 320), interpolation=cv2.INTER_AREA)
+    path = tmp_path / "two.mp4"
+    write_video(path, [picture] * 4, 25)
+    capture = capture_video(path, tmp_path / "capture", CaptureSettings(crop="none"))
+    scale = 512 / 640
+    nose = capture.landmarks[:, 0, 1] / scale
+    np.testing.assert_allclose(nose, np.tile([460, 20 + 0.42 * 320], (4, 1)), atol=12)
+    assert "several faces in 4 of 4 frames" in capsys.readouterr().err
+
+
+def test_nobody_there_is_said(tmp_path):
+    path = tmp_path / "nobody.mp4"
+    write_gradient_video(path)
+    with pytest.raises(UserError, match="no face found in any of its 5 frames") as error:
+        capture_video(path, tmp_path / "capture")
+    assert str(path) in str(error.value)
+    assert not (tmp_path / "capture").exists()
+
+
+def test_bad_requests_are_refused(face_clip, tmp_path):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    blocked = tmp_path / "file"
+    blocked.touch()
+    settings = CaptureSettings()
+    cases = [
+        (tmp_path / "missing.mp4", tmp_path / "out", settings, "no such file"),
+        (empty, tmp_path / "out", settings, "holds no images"),
+        (face_clip[0], blocked, settings, "is a file"),
+        (face_clip[0], blocked / "out", settings, "cannot be written"),
+        (face_clip[0], face_clip[0].parent, settings, "holds something that is no capture"),
+        (face_clip[0], tmp_path / "out", replace(settings, start=60.0), "no frame after 60 s"),
+        (face_clip[0], tmp_path / "out", replace(settings, stride=0), "stride must be at least 1"),
+        (face_clip[0], tmp_path / "out", replace(settings, size=4), "size 4: too small"),
+    ]
+    for source, out, case_settings, message in cases:
+        with pytest.raises(UserError, match=message) as error:
+            capture_video(source, out, case_settings)
+        assert "\n" not in str(error.value)
+
+
+def test_detectors_say_nothing(face_clip, tmp_path):
+    """Their native code writes to the file descriptor, so another process has to listen."""
+    code = (
+        "import sys, pathlib; from mien.capture import capture_video, CaptureSettings;"
+        "capture_video(pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), CaptureSettings(size=64, max_frames=3))"
+    )
+    command = [sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning", "-c", code]
+    done = subprocess.run([*command, face_clip[0], tmp_path / "out"], capture_output=True, text=True, check=True)
+    lines = done.stderr.splitlines()
+    assert done.stdout == ""
+    assert all(line.startswith(("find the face", "capture wandering")) for line in lines), lines
+
+
+@pytest.mark.footage
+def test_real_clip(test_data, tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        capture = capture_video(
+            test_data / "footage" / "wojtek.mp4", tmp_path / "capture", CaptureSettings(max_frames=40)
+        )
+    assert capture.images.shape == (40, 1, 512, 512, 3)
+    assert capture.valid.all()
+    assert capture.source["crop"] == {"left": 0, "top": 0, "width": 512, "height": 512}
+    report = json.loads((tmp_path / "capture" / "report.json").read_text())
+    assert report["landmark_jitter_px"] < 1.2
+    # The wall behind is plain, so that a matte's mistakes are holes in the middle and a veil at the sides.
+    assert capture.mattes[:, 0, :60].max() < 8
+    assert capture.mattes[:, 0, 260:380, 200:300].min() > 245
+    flicker = np.abs(np.diff(capture.mattes[:, 0].astype(float), axis=0)).mean()
+    assert flicker < 0.6

@@ -1,0 +1,160 @@
+"""Captures on disk: round trip, cache, damage."""
+
+import dataclasses
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from capture_helpers import assert_same_capture, random_capture, tree_bytes
+from mien.capture import read_capture, read_capture_hash, write_capture
+from mien.errors import UserError
+
+
+@pytest.fixture
+def stored(tmp_path):
+    path = tmp_path / "capture"
+    write_capture(path, random_capture())
+    return path
+
+
+def test_round_trip_is_exact_and_maps_memory(tmp_path):
+    capture = random_capture()
+    capture_hash = write_capture(tmp_path / "capture", capture)
+    read = read_capture(tmp_path / "capture")
+    assert_same_capture(capture, read)
+    assert isinstance(read.images, np.memmap)
+    assert isinstance(read.mattes, np.memmap)
+    assert read_capture_hash(tmp_path / "capture") == capture_hash
+    assert [entry.name for entry in tmp_path.iterdir()] == ["capture"]
+
+
+def test_hash_follows_content(tmp_path):
+    capture = random_capture()
+    hashes = {write_capture(tmp_path / "same", capture), write_capture(tmp_path / "again", capture)}
+    assert len(hashes) == 1
+    for field in ("images", "mattes", "landmarks", "timestamps"):
+        changed = getattr(capture, field).copy()
+        changed.flat[0] += 1
+        hashes.add(write_capture(tmp_path / field, dataclasses.replace(capture, **{field: changed})))
+    assert len(hashes) == 5
+
+
+@pytest.mark.parametrize("damage", ["deleted", "shortened", "changed", "stampless", "frame touched"])
+def test_stale_cache_is_rebuilt(stored, damage):
+    before = tree_bytes(stored)
+    raw = stored / "cache" / "frames.u8"
+    if damage == "deleted":
+        shutil.rmtree(stored / "cache")
+    elif damage == "shortened":
+        os.truncate(raw, 100)
+    elif damage == "changed":
+        content = bytearray(raw.read_bytes())
+        content[7] ^= 255
+        raw.write_bytes(content)
+    elif damage == "stampless":
+        (stored / "cache" / "stamp.json").unlink()
+        raw.write_bytes(bytes(raw.stat().st_size))
+    else:
+        os.utime(stored / "frames" / "camera0" / "000001.png", ns=(1, 1))
+    assert_same_capture(random_capture(), read_capture(stored))
+    assert tree_bytes(stored) == before
+
+
+def test_cache_that_cannot_be_written_is_made_elsewhere(stored):
+    shutil.rmtree(stored / "cache")
+    (stored / "cache").touch()  # a file in the way, as a read-only disk would be for a user
+    assert_same_capture(random_capture(), read_capture(stored))
+
+
+def test_every_damage_is_named(stored, tmp_path):
+    def edit(content):
+        def change(path):
+            entries = json.loads((path / "capture.json").read_text())
+            entries.update(content)
+            (path / "capture.json").write_text(json.dumps(entries))
+
+        return change
+
+    def truncate(name, keep):
+        return lambda path: os.truncate(path / name, keep)
+
+    def swap(path):
+        (path / "frames/camera0/000000.png").write_bytes((path / "frames/camera1/000001.png").read_bytes())
+
+    cases = {
+        "no json": (lambda path: (path / "capture.json").unlink(), "capture.json: missing"),
+        "broken json": (truncate("capture.json", 30), "cannot be read as json"),
+        "foreign version": (edit({"version": 2}), "version 2, expected"),
+        "foreign format": (edit({"format": "mien.tracking"}), "expected 'mien.capture'"),
+        "entries": (edit({"camera_ids": "0"}), "missing or wrong entries"),
+        "escape": (edit({"camera_ids": ["../x", "y"]}), "missing or wrong entries"),
+        "count": (edit({"timesteps": 2}), "landmarks.safetensors: timestamps is"),
+        "rate": (edit({"fps": 0}), "missing or wrong entries"),
+        "other rate": (edit({"fps": 25.0}), "does not belong"),
+        "arrays": (truncate("landmarks.safetensors", 50), "damaged safetensors"),
+        "no arrays": (lambda path: (path / "landmarks.safetensors").unlink(), "landmarks.safetensors: missing"),
+        "frame": (lambda path: (path / "frames/camera1/000002.png").unlink(), "000002.png: missing"),
+        "camera": (lambda path: shutil.rmtree(path / "mattes/camera1"), "missing .3 of 3 are"),
+        "cut png": (truncate("mattes/camera0/000001.png", 200), "000001.png: truncated"),
+        "empty png": (truncate("frames/camera0/000001.png", 0), "000001.png: truncated"),
+        "swapped png": (swap, "000000.png: has other pixels"),
+    }
+    for name, (damage, message) in cases.items():
+        path = tmp_path / name / "capture"
+        shutil.copytree(stored, path)
+        damage(path)
+        with pytest.raises(UserError, match=message) as error:
+            read_capture(path)
+        assert str(path) in str(error.value), name
+        assert "\n" not in str(error.value), name
+    with pytest.raises(UserError, match="no capture there"):
+        read_capture(tmp_path / "nowhere")
+
+
+def test_flipped_bits_never_go_unseen(stored, tmp_path):
+    truth = random_capture()
+    random = np.random.default_rng(1)
+    files = [path for path in sorted(stored.rglob("*")) if path.is_file()]
+    for trial in range(40):
+        path = tmp_path / str(trial)
+        shutil.copytree(stored, path)  # keeps times of change, so the cache stays valid
+        target = path / files[trial % len(files)].relative_to(stored)
+        content = bytearray(target.read_bytes())
+        content[random.integers(len(content))] ^= 1 << random.integers(8)
+        target.write_bytes(content)
+        try:
+            read = read_capture(path)
+        except UserError:
+            continue
+        for field in ("images", "mattes", "landmarks", "timestamps"):
+            np.testing.assert_array_equal(getattr(truth, field), getattr(read, field), err_msg=str(target))
+
+
+def test_only_captures_are_replaced(stored, tmp_path):
+    replacement = random_capture(seed=1)
+    write_capture(stored, replacement)
+    assert_same_capture(replacement, read_capture(stored))
+    foreign = tmp_path / "thesis"
+    foreign.mkdir()
+    (foreign / "chapter1.txt").write_text("do not delete")
+    with pytest.raises(UserError, match="no capture"):
+        write_capture(foreign, replacement)
+    assert (foreign / "chapter1.txt").read_text() == "do not delete"
+    with pytest.raises(UserError, match="is a file"):
+        write_capture(foreign / "chapter1.txt", replacement)
+    with pytest.raises(UserError, match="cannot be written"):
+        write_capture(foreign / "chapter1.txt" / "below", replacement)
+
+
+def test_interrupted_writing_leaves_the_old_capture(stored, monkeypatch):
+    def full_disk(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mien.capture.frame_files._write_png", full_disk)
+    with pytest.raises(UserError, match="No space left"):
+        write_capture(stored, random_capture(seed=1))
+    monkeypatch.undo()
+    assert_same_capture(random_capture(), read_capture(stored))
