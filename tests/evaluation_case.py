@@ -1,0 +1,99 @@
+"""An experiment in which the truth is an avatar's own rendering of a small head, so that figures are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
+from mien.camera import Camera, camera_from_fov
+from mien.capture.capture import Capture
+from mien.evaluation.experiment import Experiment, Frame
+from mien.evaluation.pictures import to_uint8
+from mien.face import FaceParams
+from mien.gaussians import sh_from_rgb
+from mien.render import rasterize
+from mien.tracking import Scoring, Tracking
+from mien.training.sequence import Sequence
+from mien.training.split import held_out
+from small_face_model import make_small_face_model
+
+SIZE = 72
+
+
+def make_experiment(timesteps: int = 50, split: str = "blocks", seed: int = 0) -> Experiment:
+    """A head that turns and moves its face; every pixel that the avatar covers is scored."""
+    torch.manual_seed(seed)
+    face_model = make_small_face_model()
+    face = _motion(face_model.neutral(timesteps))
+    avatar = GaussianAvatars(GaussianAvatarsConfig(), face_model, face)
+    _paint(avatar)
+    camera = camera_from_fov(0.6, SIZE, SIZE, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+    sequence = _sequence(avatar, face, camera)
+    test = held_out(timesteps, split).tolist()
+    frames = [Frame(0, t, 0) for t in range(timesteps)]
+    crops = np.tile(np.array([16, 8, 40, 56], np.int64), (timesteps, 1, 1))
+    return Experiment(
+        avatar=avatar,
+        sequences=(sequence,),
+        faces=(face,),
+        face_source="as_tracked",
+        scorings=(Scoring(sequence.scoring, crops),),
+        training_frames=tuple(f for f in frames if not test[f.timestep]),
+        held_out_frames=tuple(f for f in frames if test[f.timestep]),
+        split=split,
+    )
+
+
+def _motion(face: FaceParams) -> FaceParams:
+    along = torch.linspace(0, 6.0, len(face))
+    still = torch.zeros_like(along)
+    return replace(
+        face,
+        expression=0.5 + 0.5 * torch.sin(along[:, None] + torch.arange(face.expression.shape[1])),
+        head_rotation=torch.stack([0.1 * along.cos(), 0.4 * along.sin(), still], dim=-1),
+        head_translation=torch.stack([0.01 * along.sin(), still, still - 0.5], dim=-1),
+    )
+
+
+def _paint(avatar: GaussianAvatars) -> None:
+    """Opaque, small Gaussians; colours follow the place on the head."""
+    model, store = avatar.face_model, avatar.gaussian_store()
+    middle = model.template[model.faces].mean(1)
+    rgb = (middle / middle.abs().max() * 0.5 + 0.5).clamp(0.05, 0.95)
+    with torch.no_grad():
+        store["opacity_logits"].fill_(4.0)
+        # Thin along the triangle's normal, so that the outline is the mesh's.
+        store["log_scales"].copy_(torch.tensor([-1.1, -4.0, -1.1]))
+        store["sh_constant"].copy_(sh_from_rgb(rgb)[:, None])
+
+
+def _sequence(avatar: GaussianAvatars, face: FaceParams, camera: Camera) -> Sequence:
+    images = np.zeros((len(face), 1, SIZE, SIZE, 3), np.uint8)
+    alphas = np.zeros((len(face), 1, SIZE, SIZE), np.uint8)
+    with torch.no_grad():
+        for t in range(len(face)):
+            rendering = rasterize(avatar.pose(face[t]).gaussians.timestep(0), camera, torch.zeros(3))
+            alphas[t, 0] = (rendering.alpha * 255).round().numpy()
+            images[t, 0] = to_uint8(rendering.image / rendering.alpha.clamp_min(1e-3)[..., None])
+    capture = Capture(
+        name="clip",
+        camera_ids=("0",),
+        fps=25.0,
+        timestamps=np.arange(len(face)) / 25.0,
+        images=images,
+        mattes=alphas,
+        landmarks=np.zeros((len(face), 1, 478, 2), np.float32),
+        valid=np.ones((len(face), 1), bool),
+        principal_point=np.full((1, 2), SIZE / 2),
+        source={"file": "clip.mp4"},
+    )
+    tracking = Tracking(
+        face_model="small",
+        face_model_hash=avatar.face_model.content_hash,
+        face=face,
+        valid=torch.ones(len(face), dtype=torch.bool),
+        cameras=(camera,),
+        neck_lines=torch.tensor([0.0, -1.0, 1000.0]).expand(len(face), 1, 3),
+        residuals=torch.linspace(0.5, 2.0, len(face))[:, None],
+    )
+    return Sequence("clip", capture, tracking, alphas)
