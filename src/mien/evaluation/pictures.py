@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 WHITE = 255
-_HEAT_STOPS = ((0, 0, 4), (66, 10, 104), (147, 38, 103), (221, 81, 58), (252, 165, 10), (252, 255, 164))
+HEAT_STOPS = ((0, 0, 4), (66, 10, 104), (147, 38, 103), (221, 81, 58), (252, 165, 10), (252, 255, 164))
 """Colours of the heat scale from 0 to its limit: matplotlib's `inferno` at six even steps."""
 
 
@@ -21,7 +21,7 @@ def to_uint8(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
 
 def heat_colors(values: Float[np.ndarray, "*s"]) -> UInt8[np.ndarray, "*s 3"]:
     """Colours from black over red to pale yellow for values from 0 to 1, clamped."""
-    stops = np.array(_HEAT_STOPS, dtype=np.float32)
+    stops = np.array(HEAT_STOPS, dtype=np.float32)
     position = np.clip(values, 0, 1).astype(np.float32) * (len(stops) - 1)
     below = np.minimum(position.astype(np.int64), len(stops) - 2)
     along = (position - below)[..., None]

@@ -1,0 +1,130 @@
+"""What an avatar has to beat: the mean training picture, and the tracked mesh with the person's colours on it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import grid_sample, normalize
+
+from mien.evaluation.experiment import Experiment, Frame, scoring_alpha, target_image
+from mien.render.mesh import rasterize_mesh, render_mesh, vertex_normals
+
+_COLOUR_FRAMES = 60
+"""Training frames, evenly spread, that vertex colours are averaged over: more change nothing that can be seen."""
+_DEPTH_TOLERANCE = 0.004
+"""Metres: a vertex this little behind what the depth picture shows still counts as seen."""
+_SMOOTHING_ROUNDS = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Baselines:
+    """Both baselines, ready to draw any frame."""
+
+    mean_frames: dict[tuple[str, int, int], Float[Tensor, "h w 3"]]
+    """The mean training target of each camera, by `_camera_key`."""
+    vertex_colors: Float[Tensor, "v 3"]
+    """0..1."""
+
+    def mean_frame_image(self, experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
+        """The mean of the training targets of this frame's camera (of any camera of its size, where that has none)."""
+        key = _camera_key(experiment, frame)
+        same_size = [mean for other, mean in self.mean_frames.items() if other[1:] == key[1:]]
+        if key in self.mean_frames:
+            return self.mean_frames[key]
+        return same_size[0] if same_size else torch.ones(key[2], key[1], 3)
+
+    def mesh_image(self, experiment: Experiment, frame: Frame, supersample: int = 2) -> Float[Tensor, "h w 3"]:
+        """The face model posed as in a frame, with the mean vertex colours, unlit, over white."""
+        face_model = experiment.avatar.face_model
+        vertices = face_model(experiment.face(frame))[0]
+        image, _ = render_mesh(
+            vertices, face_model.faces, experiment.camera(frame), self.vertex_colors, supersample=supersample
+        )
+        return image.clamp(0, 1)
+
+
+@torch.no_grad()
+def make_baselines(experiment: Experiment) -> Baselines:
+    """Both baselines, from training frames only."""
+    return Baselines(_mean_frames(experiment), _vertex_colors(experiment))
+
+
+def _camera_key(experiment: Experiment, frame: Frame) -> tuple[str, int, int]:
+    camera = experiment.camera(frame)
+    return experiment.camera_id(frame), camera.width, camera.height
+
+
+def _mean_frames(experiment: Experiment) -> dict[tuple[str, int, int], Float[Tensor, "h w 3"]]:
+    sums: dict[tuple[str, int, int], Tensor] = {}
+    counts: dict[tuple[str, int, int], int] = {}
+    for frame in experiment.training_frames:
+        key, target = _camera_key(experiment, frame), target_image(experiment, frame)
+        sums[key] = sums[key].add_(target) if key in sums else target
+        counts[key] = counts.get(key, 0) + 1
+    return {key: total / counts[key] for key, total in sums.items()}
+
+
+def _vertex_colors(experiment: Experiment) -> Float[Tensor, "v 3"]:
+    """Colours of vertices: the mean of what training frames show where a vertex is seen, weighted by how squarely.
+
+    Vertices never seen (the back of the head, the inside of the mouth) take the mean of their neighbours' colours.
+    """
+    face_model = experiment.avatar.face_model
+    count = len(face_model.template)
+    colors, weights = torch.zeros(count, 3), torch.zeros(count)
+    frames = experiment.training_frames
+    step = max(1, len(frames) // _COLOUR_FRAMES)
+    for frame in frames[::step]:
+        vertices = face_model(experiment.face(frame))[0]
+        seen, weight = _seen_colors(experiment, frame, vertices, face_model.faces)
+        colors += weight[:, None] * seen
+        weights += weight
+    known = weights > 1e-3
+    colors[known] /= weights[known, None]
+    colors[~known] = colors[known].mean(0) if bool(known.any()) else 0.5
+    return _spread(colors, known, face_model.faces)
+
+
+def _seen_colors(
+    experiment: Experiment, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
+) -> tuple[Float[Tensor, "v 3"], Float[Tensor, " v"]]:
+    """What one frame shows at each vertex, and how much that counts: 0 where hidden, cut away or outside."""
+    camera = experiment.camera(frame)
+    pixels, depth = camera.project(vertices)
+    grid = pixels / torch.tensor([camera.width, camera.height]) * 2 - 1
+    sequence = experiment.sequences[frame.sequence]
+    image = torch.from_numpy(sequence.capture.images[frame[1:]].astype(np.float32)) / 255
+    mask = scoring_alpha(experiment, frame)[..., None]
+    nearest = rasterize_mesh(vertices, faces, camera).depth[..., None]
+    colors, alpha = (_sample(picture, grid, "bilinear") for picture in (image, mask))
+    front = _sample(nearest.nan_to_num(posinf=1e3), grid, "nearest")[:, 0]
+    to_camera = normalize(camera.position - vertices, dim=-1)
+    facing = (vertex_normals(vertices, faces) * to_camera).sum(-1).clamp_min(0)
+    inside = (grid.abs() < 1).all(-1) & (depth > 0)
+    seen = inside & (depth < front + _DEPTH_TOLERANCE) & (alpha[:, 0] > 0.9)
+    return colors, torch.where(seen, facing**2, torch.zeros_like(facing))
+
+
+def _sample(picture: Float[Tensor, "h w c"], grid: Float[Tensor, "v 2"], mode: str) -> Float[Tensor, "v c"]:
+    """Values of a picture at points from -1 to 1."""
+    safe = grid.nan_to_num(2.0).clamp(-2, 2)[None, None]
+    values = grid_sample(picture.permute(2, 0, 1)[None], safe, mode=mode, padding_mode="border", align_corners=False)
+    return values[0, :, 0].T
+
+
+def _spread(
+    colors: Float[Tensor, "v 3"], known: Tensor, faces: Int[Tensor, "f 3"], rounds: int = _SMOOTHING_ROUNDS
+) -> Float[Tensor, "v 3"]:
+    """Colours where the unknown ones are smooth continuations of the known ones along the mesh's edges."""
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).long()
+    edges = torch.cat([edges, edges.flip(1)])
+    edges = edges[~known[edges[:, 0]]]
+    degree = torch.zeros(len(colors)).index_add(0, edges[:, 0], torch.ones(len(edges))).clamp_min(1)
+    unknown = torch.zeros(len(colors), dtype=torch.bool)
+    unknown[edges[:, 0]] = True
+    for _ in range(rounds):
+        means = torch.zeros_like(colors).index_add(0, edges[:, 0], colors[edges[:, 1]]) / degree[:, None]
+        colors = torch.where(unknown[:, None], means, colors)
+    return colors

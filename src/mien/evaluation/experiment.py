@@ -1,0 +1,83 @@
+"""What is evaluated: an avatar, the sequences it was trained on, and which frames it has never seen."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.avatar.avatar import Avatar
+from mien.camera import Camera
+from mien.evaluation.metrics import Box
+from mien.face import FaceParams
+from mien.render import rasterize
+from mien.tracking import Scoring
+from mien.training.sequence import Sequence
+
+FaceSource = Literal["as_tracked", "refined"]
+"""Whether held-out frames are posed as the tracker left them, or after training refined them on their own pixels."""
+
+
+class Frame(NamedTuple):
+    """One picture: a timestep of a sequence seen by a camera; indices."""
+
+    sequence: int
+    timestep: int
+    camera: int
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """All that an evaluation reads."""
+
+    avatar: Avatar
+    sequences: tuple[Sequence, ...]
+    faces: tuple[FaceParams, ...]
+    """One a sequence, all its timesteps: what the avatar is posed with."""
+    face_source: FaceSource
+    scorings: tuple[Scoring, ...]
+    """One a sequence: the frozen masks and head crops."""
+    training_frames: tuple[Frame, ...]
+    held_out_frames: tuple[Frame, ...]
+    split: str
+    """Name of the split: `blocks`, `tail`, ..."""
+
+    def camera(self, frame: Frame) -> Camera:
+        """The camera of a frame."""
+        return self.sequences[frame.sequence].tracking.cameras[frame.camera]
+
+    def camera_id(self, frame: Frame) -> str:
+        """The name of a frame's camera."""
+        return self.sequences[frame.sequence].capture.camera_ids[frame.camera]
+
+    def crop(self, frame: Frame) -> Box:
+        """The head crop that was frozen with the scoring mask."""
+        left, top, width, height = (int(value) for value in self.scorings[frame.sequence].crops[frame[1:]])
+        return left, top, width, height
+
+    def face(self, frame: Frame) -> FaceParams:
+        """One timestep of face parameters."""
+        return self.faces[frame.sequence][frame.timestep]
+
+
+def target_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
+    """What a rendering should equal: the picture where the frozen scoring mask keeps it, white elsewhere."""
+    sequence = experiment.sequences[frame.sequence]
+    image = torch.from_numpy(sequence.capture.images[frame[1:]].astype(np.float32)) / 255
+    alpha = scoring_alpha(experiment, frame)[..., None]
+    return image * alpha + (1 - alpha)
+
+
+def scoring_alpha(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w"]:
+    """The frozen scoring mask of a frame, 0..1."""
+    return torch.from_numpy(experiment.scorings[frame.sequence].masks[frame[1:]].astype(np.float32)) / 255
+
+
+@torch.no_grad()
+def avatar_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
+    """The avatar posed and seen as in a frame, over white, clamped to 0..1."""
+    gaussians = experiment.avatar.pose(experiment.face(frame)).gaussians.timestep(0)
+    white = torch.ones(3).to(gaussians.means)
+    return rasterize(gaussians, experiment.camera(frame), white).image.clamp(0, 1).cpu()

@@ -1,0 +1,154 @@
+"""Line charts as inline SVG: no scripts, no fonts, colours from the page's CSS, so that they follow light and dark."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from jaxtyping import Float
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 46, 12, 10, 34
+_MOST_POINTS = 400
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One line or one cloud of points."""
+
+    label: str
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+    """NaN breaks the line."""
+    style: str = "main"
+    """CSS class of its colour: `main`, `second`, `quiet`."""
+    points: bool = False
+    """Dots with tooltips instead of a line."""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """What a chart is of."""
+
+    x_label: str
+    y_label: str
+    width: int = 420
+    """Of the drawing's own units; the page scales it."""
+    height: int = 220
+    from_zero: bool = False
+    """Whether the y axis begins at 0."""
+    shaded: tuple[tuple[float, float], ...] = ()
+    """Spans of x with a tinted background."""
+
+
+def line_chart(series: Sequence[Series], axes: Axes) -> str:
+    """An <svg> of some series over common axes; series without a finite value are left out."""
+    drawn = [one for one in series if np.isfinite(one.y).any()]
+    if not drawn:
+        return '<p class="note">Nothing to draw.</p>'
+    x_range = _range(np.concatenate([one.x for one in drawn]))
+    y_range = _padded(_range(np.concatenate([one.y for one in drawn])), axes.from_zero)
+    plot = _Plot(axes, x_range, y_range)
+    bands = "".join(plot.band(span) for span in axes.shaded)
+    grid = "".join(plot.grid_line(tick) for tick in _ticks(*y_range, 5))
+    labels = "".join(plot.x_tick(tick) for tick in _ticks(*x_range, 6))
+    lines = "".join(plot.dots(one) if one.points else plot.line(one) for one in drawn)
+    described = f"{axes.y_label} over {axes.x_label}: " + ", ".join(one.label for one in drawn)
+    return (
+        f'<svg class="chart" viewBox="0 0 {axes.width} {axes.height}" role="img" aria-label="{escape(described)}">'
+        f"{bands}{grid}{labels}{lines}"
+        f'<text class="axis" x="{_LEFT}" y="{axes.height - 4}">{escape(axes.x_label)}</text></svg>' + _legend(drawn)
+    )
+
+
+def thinned(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
+    """A long curve as the means of at most some hundred bins, for a small file and a calm line."""
+    if len(x) <= _MOST_POINTS:
+        return x, y
+    bins = np.array_split(np.arange(len(x)), _MOST_POINTS)
+    return np.array([x[b].mean() for b in bins]), np.array([y[b].mean() for b in bins])
+
+
+class _Plot:
+    """From values to places in the drawing."""
+
+    def __init__(self, axes: Axes, x_range: tuple[float, float], y_range: tuple[float, float]) -> None:
+        self._axes, self._x_range, self._y_range = axes, x_range, y_range
+
+    def _x(self, value: float) -> float:
+        low, high = self._x_range
+        return _LEFT + (value - low) / (high - low) * (self._axes.width - _LEFT - _RIGHT)
+
+    def _y(self, value: float) -> float:
+        low, high = self._y_range
+        return self._axes.height - _BOTTOM - (value - low) / (high - low) * (self._axes.height - _TOP - _BOTTOM)
+
+    def band(self, span: tuple[float, float]) -> str:
+        left, right = (self._x(min(max(value, self._x_range[0]), self._x_range[1])) for value in span)
+        height = self._axes.height - _TOP - _BOTTOM
+        return f'<rect class="band" x="{left:.1f}" y="{_TOP}" width="{max(right - left, 1):.1f}" height="{height}"/>'
+
+    def grid_line(self, value: float) -> str:
+        y, right = self._y(value), self._axes.width - _RIGHT
+        return (
+            f'<line class="grid" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            f'<text class="tick end" x="{_LEFT - 6}" y="{y + 3.5:.1f}">{_number(value)}</text>'
+        )
+
+    def x_tick(self, value: float) -> str:
+        x, y = self._x(value), self._axes.height - _BOTTOM + 14
+        return f'<text class="tick middle" x="{x:.1f}" y="{y}">{_number(value)}</text>'
+
+    def line(self, series: Series) -> str:
+        x, y = thinned(series.x, series.y)
+        parts, pen = [], "M"
+        for a, b in zip(x.tolist(), y.tolist(), strict=True):
+            if not math.isfinite(b):
+                pen = "M"
+                continue
+            parts.append(f"{pen}{self._x(a):.1f} {self._y(b):.1f}")
+            pen = "L"
+        return f'<path class="line {series.style}" d="{"".join(parts)}"><title>{escape(series.label)}</title></path>'
+
+    def dots(self, series: Series) -> str:
+        return "".join(
+            f'<circle class="dot {series.style}" cx="{self._x(a):.1f}" cy="{self._y(b):.1f}" r="2.4">'
+            f"<title>{escape(series.label)}, {_number(a)}: {b:.2f}</title></circle>"
+            for a, b in zip(series.x.tolist(), series.y.tolist(), strict=True)
+            if math.isfinite(b)
+        )
+
+
+def _legend(series: Sequence[Series]) -> str:
+    """Names beside colours; a single series needs none."""
+    if len(series) < 2:
+        return ""
+    entries = "".join(f'<span><i class="{one.style}"></i>{escape(one.label)}</span>' for one in series)
+    return f'<p class="legend">{entries}</p>'
+
+
+def _range(values: np.ndarray) -> tuple[float, float]:
+    finite = values[np.isfinite(values)]
+    low, high = float(finite.min()), float(finite.max())
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def _padded(limits: tuple[float, float], from_zero: bool) -> tuple[float, float]:
+    low, high = limits
+    margin = 0.06 * (high - low)
+    return (min(0.0, low), high + margin) if from_zero else (low - margin, high + margin)
+
+
+def _ticks(low: float, high: float, about: int) -> list[float]:
+    """Round numbers between two limits: steps of 1, 2 or 5 times a power of ten."""
+    rough = (high - low) / about
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = min((factor * power for factor in (1, 2, 5, 10)), key=lambda size: abs(size - rough))
+    return [index * step for index in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+
+
+def _number(value: float) -> str:
+    """A tick's text, short: 1200 as 1.2k, no trailing zeros."""
+    if abs(value) >= 1000:
+        return f"{value / 1000:g}k"
+    return f"{value:.4g}"

@@ -1,0 +1,192 @@
+"""report.html: one file to send around; no network, no scripts, light, dark and on paper."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mien.evaluation import report_sections as sections
+from mien.evaluation.experiment import Experiment
+from mien.evaluation.protocols import Evaluation
+from mien.evaluation.report_words import GLOSSARY
+from mien.storage import write_atomically
+
+_TITLES = {
+    "self_reenactment": "Self-reenactment",
+    "self_reenactment_tail": "Self-reenactment, last part of the sequence",
+    "novel_view": "Novel views",
+}
+_ROWS = {"avatar": "Avatar", "mesh": "Tracked mesh with its colours", "mean_frame": "Mean training picture"}
+_METRICS = (("psnr", "PSNR, dB ↑", 2), ("ssim", "SSIM ↑", 3), ("l1", "L1 ↓", 4), ("perceptual", "ST-LPIPS ↓", 3))
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """What a run's folder says about itself."""
+
+    name: str
+    config: Mapping[str, Any]
+    """config.json: method, settings, data, mien, command_line."""
+    summary: Mapping[str, Any]
+    """training.json: steps, seconds, gaussians, step_ms_median, peak_memory_mb."""
+    curves: Mapping[str, np.ndarray]
+
+
+def write_report(
+    path: Path,
+    run: RunRecord,
+    protocols: Mapping[str, Any],
+    results: Mapping[str, tuple[Experiment, Evaluation]],
+) -> None:
+    """Write the page of a run.
+
+    Args:
+        path: Of the .html.
+        run: The run's own record.
+        protocols: `protocols` of metrics.json.
+        results: What was evaluated and every frame's figures, by protocol.
+    """
+    text = report_html(run, protocols, results)
+
+    def write(temporary: Path) -> None:
+        temporary.write_text(text, encoding="utf-8")
+
+    write_atomically(path, write)
+
+
+def report_html(
+    run: RunRecord, protocols: Mapping[str, Any], results: Mapping[str, tuple[Experiment, Evaluation]]
+) -> str:
+    """The page as text."""
+    style = files("mien.evaluation").joinpath("report.css").read_text(encoding="utf-8")
+    title = f"{', '.join(entry['sequence'] for entry in run.config['data'])} · {run.config['method']['kind']}"
+    body = [_heading(title, run), _tiles(run, protocols)]
+    body += ["<h2>Figures</h2>", _table(protocols), _how_to_read(protocols)]
+    for name, (experiment, evaluation) in results.items():
+        heading = escape(_TITLES.get(name, name))
+        body += [f"<h2>{heading}: held-out frames</h2>", sections.comparison(experiment, evaluation)]
+        body += [f"<h2>{heading}: over time</h2>", sections.over_time(experiment, evaluation)]
+        body += ["<h2>Baselines</h2>", sections.baseline_pictures(experiment, evaluation)]
+    body += ["<h2>Training</h2>", sections.training_curves(run.curves)]
+    first = next(iter(results.values()), None)
+    if first is not None:
+        body += ["<h2>Tracking</h2>", sections.tracking_overlays(first[0])]
+    body.append(_settings(run))
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>mien: {escape(title)}</title>\n<style>\n{style}</style></head>\n"
+        f"<body><main>\n{chr(10).join(body)}\n</main></body></html>\n"
+    )
+
+
+def _heading(title: str, run: RunRecord) -> str:
+    command = " ".join(_shortened(run.config["command_line"]))
+    version = escape(str(run.config["mien"]))
+    return (
+        f"<h1>{escape(title)}</h1>"
+        f'<p class="sub">Run {escape(run.name)} · mien {version} · <code>{escape(command)}</code></p>'
+    )
+
+
+def _shortened(command_line: Sequence[str]) -> list[str]:
+    """The command as typed, without the folder that the program lies in."""
+    return [Path(command_line[0]).name, *command_line[1:]] if command_line else []
+
+
+def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> str:
+    """The few figures to look at first."""
+    tiles: list[tuple[str, str]] = []
+    for name, entry in protocols.items():
+        where = "" if len(protocols) == 1 else f", {_TITLES.get(name, name).lower()}"
+        tiles.append((f"{entry['psnr']:.2f} dB", f"PSNR, whole frame{where}"))
+        tiles.append((f"{entry['head']['psnr']:.2f} dB", f"PSNR, head crop{where}"))
+        if entry["head"]["perceptual"] is not None and len(protocols) == 1:
+            tiles.append((f"{entry['head']['perceptual']:.3f}", "ST-LPIPS, head crop"))
+    summary = run.summary
+    tiles.append((f"{summary['gaussians']:,}", "Gaussians"))
+    tiles.append((_duration(summary["seconds"]), f"training, {summary['steps']:,} steps"))
+    tiles.append((f"{summary['step_ms_median']:.1f} ms", "a step, median"))
+    content = "".join(f'<div class="tile"><b>{value}</b><span>{name}</span></div>' for value, name in tiles)
+    return f'<div class="tiles">{content}</div>'
+
+
+def _table(protocols: Mapping[str, Any]) -> str:
+    """Every metric of the avatar and of both baselines, whole frame and head crop."""
+    parts = []
+    for name, entry in protocols.items():
+        subjects = {"avatar": entry, **entry["baselines"]}
+        rows = "".join(
+            f'<tr class="{"own" if key == "avatar" else ""}"><td>{label}</td>{_cells(key, subjects)}</tr>'
+            for key, label in _ROWS.items()
+            if key in subjects
+        )
+        caption = (
+            f"{_TITLES.get(name, name)} · {entry['frames']} frames held out ({entry['split']}) · face parameters "
+            f"{entry['face_params'].replace('_', ' ')} · PSNR on frames trained on: "
+            f"{entry['training_frames']['psnr']:.2f}, head {entry['training_frames']['head']['psnr']:.2f} dB"
+        )
+        parts.append(
+            f'<div class="card table"><div class="scroll"><table>{_table_head()}<tbody>{rows}</tbody></table></div>'
+            f'<p class="note">{escape(caption)}</p></div>'
+        )
+    return "".join(parts) or '<p class="note">Nothing was held out, so nothing was scored.</p>'
+
+
+def _table_head() -> str:
+    names = "".join(f"<th>{label}</th>" for _, label, _ in _METRICS)
+    groups = '<th class="group" colspan="4">Whole frame</th><th class="group head" colspan="4">Head crop</th>'
+    head_names = names.replace("<th>", '<th class="head">', 1)
+    return f"<thead><tr><th></th>{groups}</tr><tr><th></th>{names}{head_names}</tr></thead>"
+
+
+def _cells(key: str, subjects: Mapping[str, Any]) -> str:
+    """One row's figures; the avatar's PSNR with its lead over the better baseline."""
+    cells = []
+    for part in (None, "head"):
+        for index, (metric, _, digits) in enumerate(_METRICS):
+            value = _figure(subjects[key], part, metric)
+            text = "–" if value is None else f"{value:.{digits}f}"
+            others = [_figure(entry, part, metric) for name, entry in subjects.items() if name != "avatar"]
+            known = [other for other in others if other is not None]
+            if key == "avatar" and metric == "psnr" and value is not None and known:
+                text += f" <small>{value - max(known):+.1f}</small>"
+            cells.append(f"<td{' class=head' if part and index == 0 else ''}>{text}</td>")
+    return "".join(cells)
+
+
+def _figure(entry: Mapping[str, Any], part: str | None, metric: str) -> float | None:
+    value = (entry if part is None else entry[part])[metric]
+    return None if value is None or not math.isfinite(value) else value
+
+
+def _how_to_read(protocols: Mapping[str, Any]) -> str:
+    backbones = {entry["perceptual_backbone"] for entry in protocols.values()} - {None}
+    texts = {**GLOSSARY, "ST-LPIPS": f"{GLOSSARY['ST-LPIPS']} Here: {', '.join(sorted(backbones)) or 'not computed'}."}
+    entries = "".join(f"<dt>{term}</dt><dd>{escape(text)}</dd>" for term, text in texts.items())
+    return f'<details class="card"><summary>How to read this</summary><dl>{entries}</dl></details>'
+
+
+def _settings(run: RunRecord) -> str:
+    text = json.dumps(dict(run.config), indent=1)
+    memory = run.summary["peak_memory_mb"]
+    return (
+        f'<h2>Settings</h2><p class="note">Peak memory {memory:,.0f} MB.</p>'
+        f"<details class='card'><summary>config.json</summary><pre><code>{escape(text)}</code></pre></details>"
+    )
+
+
+def _duration(seconds: float) -> str:
+    """Short words for a time: 45 s, 3 min 20 s, 2 h 5 min."""
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    if seconds < 600:
+        return f"{int(seconds) // 60} min {int(seconds) % 60} s"
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"

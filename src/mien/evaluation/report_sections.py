@@ -1,0 +1,180 @@
+"""The parts of report.html with pictures and charts; every function returns a piece of HTML."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+
+import numpy as np
+import torch
+
+from mien.evaluation.experiment import Experiment, Frame, avatar_image, target_image
+from mien.evaluation.pictures import HEAT_STOPS, data_uri, error_heat, shrunk, to_uint8
+from mien.evaluation.plots import Axes, Series, line_chart
+from mien.evaluation.protocols import AVATAR, MESH, Evaluation
+from mien.render.mesh import render_mesh
+
+_PICTURE_SIZE = 400
+_OVERLAY_SIZE = 300
+_HEAT_LIMIT = 0.25
+_ROWS = 6
+_OVERLAYS = 6
+
+
+def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
+    """Truth, render and error of the best, the median and the worst held-out frame, and of some between."""
+    ranked = evaluation.ranked()
+    places = np.unique(np.linspace(0, len(ranked) - 1, min(_ROWS, len(ranked))).round().astype(int))[::-1]
+    middle = len(ranked) // 2
+    places = sorted({*places.tolist(), middle} - _nearest_to(places, middle), reverse=True)
+    names = {len(ranked) - 1: "best", middle: "median", 0: "worst"}
+    rows = [_comparison_row(experiment, evaluation, ranked[place], names.get(place, "")) for place in places]
+    stops = ", ".join(f"rgb{stop}" for stop in HEAT_STOPS)
+    scale = (
+        f'<span class="scale">0 <i style="background:linear-gradient(90deg,{stops})"></i> '
+        f"{_HEAT_LIMIT * 255:.0f} of 255 and more</span>"
+    )
+    labels = f'<div class="labels"><span>Truth</span><span>Render</span><span>Error {scale}</span></div>'
+    return labels + "".join(rows)
+
+
+def _nearest_to(places: np.ndarray, middle: int) -> set[int]:
+    """The inner place that the median frame takes over, so that the number of rows stays."""
+    inner = [int(place) for place in places[1:-1]]
+    return {min(inner, key=lambda place: abs(place - middle))} if inner else set()
+
+
+def _comparison_row(experiment: Experiment, evaluation: Evaluation, index: int, name: str) -> str:
+    frame, scores = evaluation.frames[index], evaluation.scores[AVATAR][index]
+    target, image = target_image(experiment, frame), avatar_image(experiment, frame)
+    pictures = (to_uint8(target), to_uint8(image), error_heat(image, target, _HEAT_LIMIT))
+    figures = f"PSNR {scores['psnr']:.2f} dB, head {scores['head_psnr']:.2f} dB, SSIM {scores['ssim']:.3f}"
+    if "perceptual" in scores:
+        figures += f", ST-LPIPS {scores['perceptual']:.3f}"
+    tag = f"<strong>{name}</strong> · " if name else ""
+    images = "".join(map(_image, pictures, ("truth", "render", "error")))
+    return (
+        f'<figure class="row"><div class="triple">{images}</div>'
+        f"<figcaption>{tag}{escape(frame_name(experiment, frame))} · {figures}</figcaption></figure>"
+    )
+
+
+def over_time(experiment: Experiment, evaluation: Evaluation) -> str:
+    """PSNR of the head crop over the timesteps of each sequence and camera, held-out spans shaded."""
+    pairs = sorted({(frame.sequence, frame.camera) for frame in evaluation.frames})
+    charts = []
+    for sequence, camera in pairs[:4]:
+        here = [f for f in evaluation.training_psnr if (f.sequence, f.camera) == (sequence, camera)]
+        there = [i for i, f in enumerate(evaluation.frames) if (f.sequence, f.camera) == (sequence, camera)]
+        timesteps = [evaluation.frames[i].timestep for i in there]
+        seen = [evaluation.training_psnr[f][1] for f in here]
+        series = [_series("trained on", [f.timestep for f in here], seen, "quiet")]
+        for subject, label, style in ((AVATAR, "held out", "main"), (MESH, "coloured mesh, held out", "second")):
+            if subject in evaluation.scores:
+                series.append(
+                    _series(label, timesteps, [evaluation.scores[subject][i]["head_psnr"] for i in there], style)
+                )
+        axes = Axes("timestep", "PSNR, head crop, dB", 1080, 260, shaded=spans(timesteps))
+        title = escape(frame_name(experiment, Frame(sequence, -1, camera)))
+        charts.append(_card(f"PSNR on the head crop, dB · {title}", line_chart(series, axes)))
+    return "".join(charts)
+
+
+def spans(timesteps: Sequence[int]) -> tuple[tuple[float, float], ...]:
+    """Runs of consecutive timesteps as intervals that reach half a step over their ends."""
+    found: list[tuple[float, float]] = []
+    for timestep in sorted(timesteps):
+        if found and timestep - 0.5 == found[-1][1]:
+            found[-1] = (found[-1][0], timestep + 0.5)
+        else:
+            found.append((timestep - 0.5, timestep + 0.5))
+    return tuple(found)
+
+
+def training_curves(curves: Mapping[str, np.ndarray]) -> str:
+    """Loss, PSNR, number of Gaussians and step time over the steps of training."""
+    steps = np.asarray(curves["step"], dtype=np.float64)
+    kinds = (
+        ("loss", "Loss", True),
+        ("psnr", "PSNR of the training picture, dB", False),
+        ("gaussians", "Gaussians", True),
+        ("step_ms", "Step time, ms", True),
+    )
+    cards = []
+    for name, title, from_zero in kinds:
+        values = np.asarray(curves[name], dtype=np.float64)
+        if name == "step_ms":
+            # The first step pays for caches; one late outlier would flatten the rest.
+            values = np.minimum(values, np.percentile(values, 99))
+        chart = line_chart([Series(title, steps, values)], Axes("step", title, from_zero=from_zero))
+        cards.append(_card(title, chart))
+    return f'<div class="grid2">{"".join(cards)}</div>'
+
+
+@torch.no_grad()
+def tracking_overlays(experiment: Experiment) -> str:
+    """The tracked mesh over evenly spread frames, and the landmark residuals over time."""
+    parts = []
+    for index, sequence in enumerate(experiment.sequences):
+        usable = np.argwhere(sequence.usable())
+        chosen = usable[np.linspace(0, len(usable) - 1, min(_OVERLAYS, len(usable))).round().astype(int)]
+        figures = "".join(_overlay(experiment, Frame(index, int(t), int(c))) for t, c in chosen)
+        parts.append(f'<div class="strip">{figures}</div>')
+        residuals = sequence.tracking.residuals.double().numpy()
+        timesteps = np.arange(len(residuals), dtype=np.float64)
+        lines = [Series("residual", timesteps, np.ascontiguousarray(residuals[:, 0]))]
+        median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else float("nan")
+        title = f"Landmark residual, median of each frame, pixels · {escape(sequence.name)} · median {median:.2f} px"
+        chart = line_chart(lines, Axes("timestep", "residual, pixels", 1080, 200, from_zero=True))
+        parts.append(_card(title, chart))
+    return "".join(parts)
+
+
+def _overlay(experiment: Experiment, frame: Frame) -> str:
+    sequence, camera = experiment.sequences[frame.sequence], experiment.camera(frame)
+    picture = torch.from_numpy(sequence.capture.images[frame[1:]].astype(np.float32)) / 255
+    face_model = experiment.avatar.face_model
+    vertices = face_model(sequence.tracking.face[frame.timestep])[0]
+    mesh, alpha = render_mesh(vertices, face_model.faces, camera, supersample=2)
+    blended = picture * (1 - 0.6 * alpha[..., None]) + 0.6 * alpha[..., None] * mesh
+    image = _image(shrunk(to_uint8(blended), _OVERLAY_SIZE), "tracked mesh over the frame")
+    return f"<figure>{image}<figcaption>timestep {frame.timestep}</figcaption></figure>"
+
+
+def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> str:
+    """The median held-out frame as truth, mean training picture, coloured mesh and avatar."""
+    if evaluation.baselines is None:
+        return '<p class="note">Not scored in this evaluation.</p>'
+    frame = evaluation.frames[evaluation.ranked()[len(evaluation.frames) // 2]]
+    pictures = {
+        "truth": target_image(experiment, frame),
+        "mean training picture": evaluation.baselines.mean_frame_image(experiment, frame),
+        "tracked mesh with its colours": evaluation.baselines.mesh_image(experiment, frame),
+        "avatar": avatar_image(experiment, frame),
+    }
+    figures = (
+        f"<figure>{_image(shrunk(to_uint8(picture), _PICTURE_SIZE), name)}<figcaption>{name}</figcaption></figure>"
+        for name, picture in pictures.items()
+    )
+    return f'<div class="strip">{"".join(figures)}</div>'
+
+
+def frame_name(experiment: Experiment, frame: Frame) -> str:
+    """Words for a frame; a timestep below 0 stands for all, the camera is named where there are several."""
+    sequence = experiment.sequences[frame.sequence]
+    parts = [sequence.name]
+    if len(sequence.capture.camera_ids) > 1:
+        parts.append(f"camera {experiment.camera_id(frame)}")
+    if frame.timestep >= 0:
+        parts.append(f"timestep {frame.timestep}")
+    return ", ".join(parts)
+
+
+def _series(label: str, x: Sequence[int], y: Sequence[float], style: str) -> Series:
+    return Series(label, np.array(x, dtype=np.float64), np.array(y, dtype=np.float64), style, points=True)
+
+
+def _image(picture: np.ndarray, what: str) -> str:
+    return f'<img alt="{escape(what)}" src="{data_uri(shrunk(picture, _PICTURE_SIZE))}">'
+
+
+def _card(title: str, content: str) -> str:
+    return f'<div class="card wide"><h3>{title}</h3>{content}</div>'

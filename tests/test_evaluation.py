@@ -1,0 +1,166 @@
+"""Protocols on a case whose truth is the avatar itself: it must win, and the baselines must be what they claim."""
+
+import json
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+
+from evaluation_case import make_experiment
+from mien.evaluation.baselines import make_baselines
+from mien.evaluation.experiment import Experiment, avatar_image, target_image
+from mien.evaluation.metrics import psnr
+from mien.evaluation.plots import Axes, Series, line_chart
+from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
+from mien.evaluation.report import RunRecord, report_html
+from mien.evaluation.report_sections import spans
+
+
+@pytest.fixture(scope="module")
+def experiment() -> Experiment:
+    return make_experiment()
+
+
+@pytest.fixture(scope="module")
+def evaluation(experiment: Experiment) -> Evaluation:
+    return evaluate_frames(experiment, EvaluationSettings())
+
+
+def test_target_is_the_picture_inside_the_mask_over_white(experiment: Experiment) -> None:
+    frame = experiment.held_out_frames[0]
+    target = target_image(experiment, frame)
+    alpha = experiment.scorings[0].masks[frame[1:]]
+    assert torch.equal(target[torch.from_numpy(alpha == 0)], torch.ones(int((alpha == 0).sum()), 3))
+    image = torch.from_numpy(experiment.sequences[0].capture.images[frame[1:]]).float() / 255
+    torch.testing.assert_close(target[torch.from_numpy(alpha == 255)], image[torch.from_numpy(alpha == 255)])
+
+
+def test_avatar_that_made_the_truth_is_nearly_perfect(experiment: Experiment) -> None:
+    frame = experiment.held_out_frames[3]
+    assert psnr(avatar_image(experiment, frame), target_image(experiment, frame)) > 45
+
+
+def test_mean_frame_is_the_mean_of_training_targets_only(experiment: Experiment) -> None:
+    baselines = make_baselines(experiment)
+    stack = torch.stack([target_image(experiment, frame) for frame in experiment.training_frames])
+    mean = baselines.mean_frame_image(experiment, experiment.held_out_frames[0])
+    torch.testing.assert_close(mean, stack.mean(0), atol=1e-5, rtol=0)
+
+
+def test_mesh_baseline_wears_the_colours_it_saw(experiment: Experiment) -> None:
+    """Vertex colours equal the paint where the camera looks; the hidden back continues them without a jump."""
+    baselines = make_baselines(experiment)
+    template = experiment.avatar.face_model.template
+    paint = (template / template[experiment.avatar.face_model.faces].mean(1).abs().max() * 0.5 + 0.5).clamp(0, 1)
+    front = (template[:, 2] > 0.05) & (template[:, 0].abs() < 0.04)
+    assert float((baselines.vertex_colors - paint)[front].abs().mean()) < 0.05
+    assert bool(torch.isfinite(baselines.vertex_colors).all())
+    frame = experiment.held_out_frames[0]
+    target = target_image(experiment, frame)
+    mesh = psnr(baselines.mesh_image(experiment, frame), target)
+    assert mesh > psnr(baselines.mean_frame_image(experiment, frame), target) + 3
+
+
+def test_metrics_have_the_documented_layout_and_order(experiment: Experiment, evaluation: Evaluation) -> None:
+    settings = EvaluationSettings()
+    content = json.loads(json.dumps(protocol_content(experiment, evaluation, settings), allow_nan=False))
+    assert content["frames"] == 10 == len(content["per_frame"]["psnr"])
+    assert content["per_frame"]["timestep"] == list(range(40, 50))
+    assert (content["split"], content["face_params"]) == ("blocks", "as_tracked")
+    assert content["perceptual_backbone"] == "st-lpips-alex"
+    for entry in (content, content["head"], *content["baselines"].values()):
+        assert {"psnr", "ssim", "l1", "perceptual"} <= set(entry)
+    own, mean, mesh = content, content["baselines"]["mean_frame"], content["baselines"]["mesh"]
+    for part in (own, own["head"]):
+        assert part["psnr"] > 40
+    assert own["psnr"] > own["head"]["psnr"], "the white border must raise the whole frame's figure"
+    assert own["psnr"] > mesh["psnr"] > mean["psnr"]
+    assert own["perceptual"] < mesh["perceptual"] < mean["perceptual"]
+    assert content["psnr"] == pytest.approx(np.mean(content["per_frame"]["psnr"]), abs=1e-4)
+    ranked = [evaluation.scores["avatar"][i]["head_psnr"] for i in evaluation.ranked()]
+    assert ranked == sorted(ranked)
+
+
+def test_figures_do_not_depend_on_threads_or_on_other_subjects(experiment: Experiment) -> None:
+    few = replace(experiment, held_out_frames=experiment.held_out_frames[:5])
+    alone = evaluate_frames(few, EvaluationSettings(perceptual=False, baselines=False, threads=1))
+    together = evaluate_frames(few, EvaluationSettings(perceptual=False, threads=3))
+    assert alone.scores["avatar"] == together.scores["avatar"]
+    assert set(alone.scores) == {"avatar"}
+    content = protocol_content(few, alone, EvaluationSettings(perceptual=False, baselines=False))
+    assert content["perceptual"] is None
+    assert content["perceptual_backbone"] is None
+
+
+def _run_record() -> RunRecord:
+    steps = np.arange(1.0, 301.0)
+    return RunRecord(
+        name="first",
+        config={
+            "method": {"kind": "gaussian_avatars"},
+            "settings": {"kind": "TrainSettings"},
+            "data": [{"sequence": "clip"}],
+            "mien": "0.1.0",
+            "command_line": ["/somewhere/bin/mien", "create", "<clip>.mp4"],
+        },
+        summary={"steps": 300, "seconds": 71.0, "gaussians": 1234, "step_ms_median": 5.25, "peak_memory_mb": 900.0},
+        curves={
+            "step": steps, "loss": 1 / steps, "psnr": 20 + np.log(steps), "gaussians": 1000 + steps,
+            "step_ms": np.where(steps == 1, 900.0, 5 + np.sin(steps)),
+        },
+    )  # fmt: skip
+
+
+def test_report_stands_alone_and_shows_everything(experiment: Experiment, evaluation: Evaluation) -> None:
+    protocols = {"self_reenactment": protocol_content(experiment, evaluation, EvaluationSettings())}
+    page = report_html(_run_record(), protocols, {"self_reenactment": (experiment, evaluation)})
+    for forbidden in ("http://", "https://", "<script", "<link", "url(", "/somewhere"):
+        assert forbidden not in page
+    assert "mien create &lt;clip&gt;.mp4" in page, "the command must be there, escaped"
+    for wanted in ("Held out", "best", "median", "worst", "Mean training picture", "Gaussians", "1 min 11 s"):
+        assert wanted in page
+    figures = _Tags()
+    figures.feed(page)
+    assert not figures.open, f"unclosed tags: {figures.open}"
+    assert figures.count["img"] == 3 * 6 + 4 + 6
+    assert figures.count["svg"] == 1 + 4 + 1
+    assert f"{protocols['self_reenactment']['head']['psnr']:.2f}" in page
+
+
+class _Tags(HTMLParser):
+    """Counts tags and checks that they nest."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.count: Counter[str] = Counter()
+
+    def handle_starttag(self, tag: str, attrs: list) -> None:
+        self.count[tag] += 1
+        if tag not in ("meta", "img", "line", "rect", "circle", "path"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list) -> None:
+        self.count[tag] += 1
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag != "path":
+            assert self.open.pop() == tag
+
+
+def test_spans_join_neighbours() -> None:
+    assert spans([]) == ()
+    assert spans([3, 4, 5, 9]) == ((2.5, 5.5), (8.5, 9.5))
+
+
+def test_charts_survive_gaps_and_flat_lines() -> None:
+    x = np.arange(4.0)
+    flat = line_chart([Series("flat", x, np.ones(4))], Axes("step", "loss"))
+    gap = line_chart([Series("gap", x, np.array([1.0, np.nan, 2.0, 3.0]))], Axes("step", "loss"))
+    assert flat.count("L") == 3
+    assert gap.count("M") == 2
+    assert "nan" not in flat + gap
+    assert "Nothing to draw" in line_chart([Series("none", x, np.full(4, np.nan))], Axes("step", "loss"))
