@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.camera import Camera
@@ -27,7 +27,7 @@ class Linearization:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkModel:
-    """The l landmarks of a face model with k joints, in float64.
+    """The l landmarks of a face model and the k joints that move them, in float64.
 
     Skinning is linear in the vertices, and landmarks are fixed mixtures of vertices. So a landmark is
     sum_k R_k y_k + W_k t_k, where y_k, the weighted sum of its vertices' rest positions for joint k, is linear in
@@ -41,6 +41,20 @@ class LandmarkModel:
     expression_basis: Float[Tensor, "e k l 3"]
     pose_basis: Float[Tensor, "q k l 3"] | None
     joint_weights: Float[Tensor, "k l"]
+    joints: Int[Tensor, " k"]
+    """Which of the face model's joints these are: those that move a landmark."""
+
+    def at(self, landmarks: Int[Tensor, " n"], layout: ParameterLayout) -> "LandmarkModel":
+        """Some of the landmarks, under other free parameters."""
+        return replace(
+            self,
+            layout=layout,
+            rest=self.rest[:, landmarks],
+            identity_basis=self.identity_basis[:, :, landmarks],
+            expression_basis=self.expression_basis[:, :, landmarks],
+            pose_basis=None if self.pose_basis is None else self.pose_basis[:, :, landmarks],
+            joint_weights=self.joint_weights[:, landmarks],
+        )
 
     def head_points(
         self, face: FaceParams, bias: Float[Tensor, "l 3"]
@@ -53,7 +67,7 @@ class LandmarkModel:
         if self.pose_basis is not None:
             turned = matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)
             shaped = shaped + torch.einsum("bq,qklc->bklc", turned.flatten(1), self.pose_basis)
-        transforms = self.face_model.joint_transforms(face)
+        transforms = self._joint_transforms(face)
         moved = torch.einsum("bkrc,bklc->blr", transforms[:, :, :3, :3], shaped)
         return moved + torch.einsum("kl,bkc->blc", self.joint_weights, transforms[:, :, :3, 3]), shaped, transforms
 
@@ -86,12 +100,9 @@ class LandmarkModel:
         by_rotation = torch.linalg.cross(turned[:, :, None].expand_as(by_world), by_world)
         by_rotation = torch.einsum("blxc,bcd->blxd", by_rotation, _left_jacobian(face.head_rotation))
         by_expression = _contract(by_joint, self.expression_basis[self.layout.expression_index])
-        by_transform = self._by_joint_motion(by_head, by_joint, shaped, face)
-        by_frame = torch.cat([by_rotation, by_world, by_expression, by_transform[..., self.layout.joint_index]], dim=-1)
-        moving = len(self.layout.derived_expression)
-        if moving:
-            columns = 6 + self.layout.derived_column
-            by_frame[..., columns] += by_transform[..., -moving:]
+        by_angles, by_derived = self._by_joint_motion(by_head, by_joint, shaped, face)
+        by_expression[..., self.layout.derived_column] += by_derived
+        by_frame = torch.cat([by_rotation, by_world, by_expression, by_angles], dim=-1)
         by_identity = self._by_identity(by_head, by_joint, face) if with_identity else None
         by_bias = torch.einsum("blxkc,kl->blxc", by_joint, self.joint_weights)
         return Linearization(pixels, by_frame, by_identity, by_log_focal, by_bias)
@@ -102,37 +113,38 @@ class LandmarkModel:
         by_joint: Float[Tensor, "b l 2 k 3"],
         shaped: Float[Tensor, "b k l 3"],
         face: FaceParams,
-    ) -> Float[Tensor, "b l 2 m"]:
-        """Through the joints: first by all components of the free ones, then by expressions that move a joint."""
-        joints = face.joints.shape[1] * 3
-        derived = self.layout.derived_expression
+    ) -> tuple[Float[Tensor, "b l 2 m"], Float[Tensor, "b l 2 d"]]:
+        """Through the joints: by the components of free ones that may move, and by expressions that move a joint."""
+        free, derived = self.layout.joint_index, self.layout.derived_expression
+        count, angles = len(free), face.joints.flatten(1)
+        at = torch.cat([angles[:, free], face.expression[:, derived]], dim=1)
+        if at.shape[1] == 0:
+            nothing = by_head.new_zeros(*by_head.shape[:3], 0)
+            return nothing, nothing
+
+        def joints(parameters: Tensor) -> Tensor:
+            return angles.index_copy(1, free, parameters[:, :count]).reshape(face.joints.shape)
 
         def transforms(parameters: Tensor) -> Tensor:
-            turned = parameters[:, :joints].reshape(face.joints.shape)
-            expression = face.expression.index_copy(1, derived, parameters[:, joints:])
-            return self.face_model.joint_transforms(replace(face, joints=turned, expression=expression))[:, :, :3]
+            expression = face.expression.index_copy(1, derived, parameters[:, count:])
+            return self._joint_transforms(replace(face, joints=joints(parameters), expression=expression))[:, :, :3]
 
-        at = torch.cat([face.joints.flatten(1), face.expression[:, derived]], dim=1)
-        if at.shape[1] == 0:
-            return shaped.new_zeros(*by_head.shape[:3], 0)
         by_parameter = _derivatives(transforms, at)
         motion = torch.einsum("mbkrc,bklc->blrm", by_parameter[..., :3], shaped)
-        motion = motion + torch.einsum("mbkr,kl->blrm", by_parameter[..., 3], self.joint_weights)
-        by_parameters = by_head @ motion
+        motion = by_head @ (motion + torch.einsum("mbkr,kl->blrm", by_parameter[..., 3], self.joint_weights))
         if self.pose_basis is not None:
-            turns = _derivatives(
-                lambda angles: matrix_from_axis_angle(angles.reshape(face.joints.shape)).flatten(1),
-                face.joints.flatten(1),
-            )
-            by_correctives = _contract(by_joint, self.pose_basis)
-            by_parameters[..., :joints] += torch.einsum("blxq,mbq->blxm", by_correctives, turns)
-        return by_parameters
+            turns = _derivatives(lambda moved: matrix_from_axis_angle(joints(moved)).flatten(1), at)
+            motion = motion + torch.einsum("blxq,mbq->blxm", _contract(by_joint, self.pose_basis), turns)
+        return motion[..., :count], motion[..., count:]
+
+    def _joint_transforms(self, face: FaceParams) -> Float[Tensor, "b k 4 4"]:
+        return self.face_model.joint_transforms(face)[:, self.joints]
 
     def _by_identity(
         self, by_head: Float[Tensor, "b l 2 3"], by_joint: Float[Tensor, "b l 2 k 3"], face: FaceParams
     ) -> Float[Tensor, "b l 2 i"]:
         def shifts(identity: Tensor) -> Tensor:
-            return self.face_model.joint_transforms(replace(face, identity=identity))[:, :, :3, 3]
+            return self._joint_transforms(replace(face, identity=identity))[:, :, :3, 3]
 
         by_identity = _contract(by_joint, self.identity_basis)
         if self.face_model.joint_identity_basis.any():
@@ -147,13 +159,22 @@ def reduce_face_model(face_model: FaceModel, layout: ParameterLayout) -> Landmar
     marks = model.landmarks["mediapipe"]
     corners = model.faces[marks.faces]
     share = marks.barycentric[:, :, None] * model.skinning_weights[corners]
+    joints = share.sum((0, 1)).nonzero()[:, 0]
+    share = share[:, :, joints]
 
     def gather(positions: Tensor) -> Tensor:
         return torch.einsum("...lnc,lnk->...klc", positions[..., corners, :], share)
 
-    pose_basis = None if model.pose_basis is None else gather(model.pose_basis)
-    rest, identity, expression = gather(model.template), gather(model.identity_basis), gather(model.expression_basis)
-    return LandmarkModel(model, layout, rest, identity, expression, pose_basis, share.sum(1).T.contiguous())
+    return LandmarkModel(
+        face_model=model,
+        layout=layout,
+        rest=gather(model.template),
+        identity_basis=gather(model.identity_basis),
+        expression_basis=gather(model.expression_basis),
+        pose_basis=None if model.pose_basis is None else gather(model.pose_basis),
+        joint_weights=share.sum(1).T.contiguous(),
+        joints=joints,
+    )
 
 
 def _project_with_derivatives(

@@ -28,7 +28,7 @@ class ParameterLayout:
     joint_index: Int[Tensor, " m"]
     """Components of the flattened `FaceParams.joints` that the fit may move."""
     derived_expression: Int[Tensor, " d"]
-    """Expressions that move a joint."""
+    """Expressions that move a joint, and with it landmarks."""
     derived_column: Int[Tensor, " d"]
     """Where they are among `expression_index`."""
     expressions: int
@@ -71,7 +71,9 @@ def layout_of(face_model: FaceModel) -> ParameterLayout:
     joint_names = face_model.free_joint_names
     sigmas = torch.tensor([_joint_sigmas(name) for name in joint_names], dtype=torch.float64).reshape(-1)
     joint_index = (sigmas > 0).nonzero()[:, 0]
-    moves = face_model.joint_rotation_basis.flatten(1).any(1) | face_model.joint_translation_basis.flatten(1).any(1)
+    relevant = _joints_behind_landmarks(face_model)
+    turns, shifts = face_model.joint_rotation_basis[:, relevant], face_model.joint_translation_basis[:, relevant]
+    moves = turns.flatten(1).any(1) | shifts.flatten(1).any(1)
     derived_column = moves[expression_index].nonzero()[:, 0]
 
     names = [f"rotation_{axis}" for axis in "xyz"] + [f"translation_{axis}" for axis in "xyz"]
@@ -89,6 +91,16 @@ def layout_of(face_model: FaceModel) -> ParameterLayout:
         tuple(names), expression_index, joint_index, expression_index[derived_column], derived_column,
         len(bounds), len(joint_names), lower, upper, precision,
     )  # fmt: skip
+
+
+def _joints_behind_landmarks(face_model: FaceModel) -> list[int]:
+    """Joints that move landmarks, and those that move these joints."""
+    corners = face_model.faces[face_model.landmarks["mediapipe"].faces]
+    relevant = set(face_model.skinning_weights[corners].sum((0, 1)).nonzero()[:, 0].tolist())
+    for index in reversed(range(len(face_model.joint_names))):
+        if index in relevant and face_model.joint_parents[index] >= 0:
+            relevant.add(face_model.joint_parents[index])
+    return sorted(relevant)
 
 
 def _joint_sigmas(name: str) -> tuple[float, float, float]:

@@ -16,6 +16,8 @@ from mien.tracking.settings import SmoothnessSettings, TrackingSettings
 from mien.tracking.solver import Box, Smoothness, joined, joined_shared, minimize_frames, solve_arrow, solve_chain
 
 _RIGID_ITERATIONS = 15
+_RIGID_OUTLIER = 40.0
+"""Sigmas: a head that is turned away lies far from the frontal start."""
 _KEYFRAME_ROUNDS, _KEYFRAME_ITERATIONS = 4, 6
 _FRAME_ITERATIONS = 12
 _SEQUENCE_ROUNDS, _SEQUENCE_ITERATIONS = 2, 5
@@ -37,23 +39,31 @@ def fit_head_pose(
     model: LandmarkModel, detected: Float[Tensor, "v l 2"], subject: Subject, settings: TrackingSettings
 ) -> Float[Tensor, "v 6"]:
     """Head rotation and translation of every frame alone, from points that expressions hardly move."""
-    rigid_model = replace(model, layout=pose_only(model.layout))
-    points = model.head_points(model.layout.face_params(detected.new_zeros(1, model.layout.size), subject.identity),
-                               subject.bias)[0][0]  # fmt: skip
-    camera = subject.camera
+    weights = rigid_weights()
+    rigid = (weights > 0).nonzero()[:, 0]
+    model = model.at(rigid, pose_only(model.layout))
+    detected, subject = detected[:, rigid], replace(subject, bias=subject.bias[rigid])
+    at_rest = model.layout.face_params(detected.new_zeros(1, 6), subject.identity)
+    points = model.head_points(at_rest, subject.bias)[0][0]
+    start = _facing_the_camera(points, detected, subject.camera)
+    term = replace(landmark_term(model, detected, weights[rigid], start, subject, settings), outlier=_RIGID_OUTLIER)
+    return minimize_frames(
+        lambda state: term.equations(state, subject), lambda state: term.cost(state, subject),
+        start, _box(model.layout), _RIGID_ITERATIONS,
+    )  # fmt: skip
+
+
+def _facing_the_camera(
+    points: Float[Tensor, "l 3"], detected: Float[Tensor, "v l 2"], camera: Camera
+) -> Float[Tensor, "v 6"]:
+    """Head poses without rotation whose size and place are those of the detected points."""
     centre = detected.mean(1)
     spread = (detected - centre[:, None]).norm(dim=-1).mean(1)
-    # Seen from the front, sizes go with 1 / depth; turned heads look smaller, which the fit mends.
     depth = camera.K[0, 0] * (points - points.mean(0))[:, :2].norm(dim=-1).mean() / spread
     across = (centre - camera.K[:2, 2]) / camera.K[0, 0] * depth[:, None]
     in_camera = torch.cat([across, depth[:, None]], dim=1)
     in_world = (in_camera - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-    start = torch.cat([torch.zeros_like(in_world), in_world - points.mean(0)], dim=1)
-    term = landmark_term(rigid_model, detected, rigid_weights(), start, subject, settings)
-    return minimize_frames(
-        lambda state: term.equations(state, subject), lambda state: term.cost(state, subject),
-        start, _box(rigid_model.layout), _RIGID_ITERATIONS,
-    )  # fmt: skip
+    return torch.cat([torch.zeros_like(in_world), in_world - points.mean(0)], dim=1)
 
 
 def landmark_term(
@@ -68,8 +78,8 @@ def landmark_term(
     camera = subject.camera
     depth = (state[:, 3:6] @ camera.viewmat[2, :3] + camera.viewmat[2, 3]).median()
     sigma = settings.landmark_sigma * float(camera.K[0, 0] / depth)
-    share = settings.independent_landmarks / len(weights)
-    return LandmarkTerm(model, detected, weights * share, sigma, settings.outlier)
+    weights = weights * (settings.independent_landmarks / weights.sum())
+    return LandmarkTerm(model, detected, weights, sigma, settings.outlier)
 
 
 def choose_keyframes(pose: Float[Tensor, "v 6"], count: int) -> Int[Tensor, " k"]:
