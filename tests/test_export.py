@@ -8,10 +8,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mien.camera import camera_from_fov
 from mien.errors import UserError
-from mien.export import read_ply, write_ply
+from mien.export import in_world, read_ply, write_ply
 from mien.export.ply import property_names
 from mien.gaussians import Gaussians
+from mien.render import rasterize
+from mien.rotation import matrix_from_axis_angle, rigid_transform
 
 
 def _gaussians(n: int, coefficients: int, seed: int = 0) -> Gaussians:
@@ -113,6 +116,21 @@ def test_local_frame_is_kept(tmp_path: Path) -> None:
     assert read.T_world_local is not None
     assert torch.equal(read.T_world_local, pose)
     assert torch.equal(read.means, local.means)
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 16])
+def test_in_world_looks_the_same(coefficients: int) -> None:
+    """Positions, rotations and colours that depend on the view: one picture with the frame, one without it."""
+    pose = rigid_transform(matrix_from_axis_angle(torch.tensor([0.4, -0.9, 0.2])), torch.tensor([0.05, 0.02, -0.5]))
+    local = _gaussians(40, coefficients)
+    local = Gaussians(0.05 * local.means, local.quats, 0.3 * local.scales, local.opacities, 0.3 * local.sh, pose)
+    camera = camera_from_fov(0.6, 48, 40, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+    moved = in_world(local)
+    assert moved.T_world_local is None
+    with torch.no_grad():
+        pictures = [rasterize(one, camera, torch.ones(3), backend="reference").image for one in (local, moved)]
+    assert float(pictures[0].std()) > 0.05
+    torch.testing.assert_close(*pictures, atol=1e-4, rtol=0)
 
 
 def test_damaged_and_foreign_files(tmp_path: Path) -> None:

@@ -8,8 +8,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from mien.errors import UserError
-from mien.gaussians import Gaussians, world_means
-from mien.rotation import multiply_quaternions, quaternion_from_matrix
+from mien.gaussians import Gaussians
 from mien.storage import write_atomically
 
 _HEADER_LIMIT = 65536
@@ -79,19 +78,6 @@ def read_ply(path: Path) -> Gaussians:
         raise UserError(f"{path}: truncated, {len(body)} of {expected} bytes of vertices; copy or export it again")
     values = np.frombuffer(body, dtype="<f4", count=count * len(names)).reshape(count, len(names))
     return _activated({name: values[:, i] for i, name in enumerate(names)}, _pose_of(path, lines), path)
-
-
-def in_world(gaussians: Gaussians) -> Gaussians:
-    """The same unbatched Gaussians in world space, for programs that know no local frame.
-
-    Colours that depend on the view direction keep their coefficients: SH of degree 1 and more then belong to a head
-    that is not turned, which shows as slightly wrong highlights.
-    """
-    if gaussians.T_world_local is None:
-        return gaussians
-    turn = quaternion_from_matrix(gaussians.T_world_local[:3, :3])
-    quats = multiply_quaternions(turn.expand_as(gaussians.quats), gaussians.quats)
-    return Gaussians(world_means(gaussians), quats, gaussians.scales, gaussians.opacities, gaussians.sh)
 
 
 def _raw_rows(gaussians: Gaussians) -> Float32[np.ndarray, "n p"]:
