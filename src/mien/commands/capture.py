@@ -12,7 +12,7 @@ from mien.workspace import Workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Turn a video into frames, mattes and landmarks: OUT/sequences/NAME/capture. Runs again only if something changed."""
+    """Turn a video into frames, mattes and landmarks: OUT/sequences/NAME/capture."""
 
     video: Annotated[Path, tyro.conf.Positional]
     """A video file, or a folder of pictures in order."""

@@ -63,7 +63,8 @@ class Command:
             gaussians = avatar.pose(face).gaussians.timestep(0)
             if self.out.suffix == ".png":
                 image = to_uint8(rasterize(gaussians, camera, white).image)
-                write_atomically(self.out, lambda path: cv2.imwrite(str(path), image[:, :, ::-1]) and None)
+                encoded = cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()
+                write_atomically(self.out, lambda path: path.write_bytes(encoded) and None)
             else:
                 cameras = turntable(camera, face.head_translation[0], self.frames, math.radians(self.span))
                 pictures = (to_uint8(rasterize(gaussians, view, white).image) for view in cameras)

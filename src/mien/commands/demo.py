@@ -1,0 +1,38 @@
+"""`mien demo`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mien.commands.create import Command as Create
+from mien.commands.options import Preset, TrainOptions
+
+
+@dataclass(frozen=True)
+class Command:
+    """The whole path on a synthetic head: draw a video, capture, track, train, evaluate, report."""
+
+    out: Path = Path("out/demo")
+    """Workspace folder; the video lies in it."""
+    preset: Preset = "draft"
+    """As for `mien create`."""
+    steps: int = 0
+    """As for `mien create`."""
+    seconds: float = 0.0
+    """Length of the video; 0 for the recipe's."""
+    seed: int = 0
+    """Another head, another motion."""
+
+    def run(self) -> None:
+        """Write the video unless it is there, then create."""
+        from dataclasses import replace
+
+        from mien.synthetic import RECIPES, write_synthetic_video
+
+        recipe = RECIPES["demo"]
+        if self.seconds > 0:
+            recipe = replace(recipe, seconds=self.seconds)
+        video = self.out / f"synthetic-{self.seed}-{recipe.seconds:g}s.mp4"
+        if not video.is_file():
+            write_synthetic_video(recipe, video, self.seed)
+        options = TrainOptions(preset=self.preset, steps=self.steps)
+        Create(video=video, out=self.out, name="synthetic", options=options).run()

@@ -1,0 +1,46 @@
+"""What several sub-commands ask: which method, how thorough, which settings in detail."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from mien.avatar import MethodConfig, method_named
+from mien.errors import UserError
+from mien.training import PRESETS, TrainSettings
+from mien.training.split import Split
+
+Preset = Literal["draft", "standard"]
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """The dials of training; everything else is the preset's and the method's own."""
+
+    method: str = "gaussian_avatars"
+    """gaussian_avatars, headgas or mono_gaussian_avatar."""
+    preset: Preset = "standard"
+    """draft: minutes; standard: the figures of docs/results.md."""
+    split: Split = "blocks"
+    """What is held out for scoring: every fifth block of 10 frames, the last 20 % (tail), or nothing (none)."""
+    steps: int = 0
+    """Optimiser steps instead of the preset's (schedules stretch with it); 0 for the preset's."""
+    seed: int = 0
+    """Same seed, same data, same settings: the same bytes."""
+
+    def settings(self) -> TrainSettings:
+        """The preset with these changes.
+
+        Raises:
+            UserError: the number of steps is negative.
+        """
+        if self.steps < 0:
+            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's")
+        preset = PRESETS[self.preset]
+        return replace(preset, split=self.split, seed=self.seed, steps=self.steps or preset.steps)
+
+    def method_config(self) -> MethodConfig:
+        """The method's settings.
+
+        Raises:
+            UserError: there is no such method.
+        """
+        return method_named(self.method).config()
