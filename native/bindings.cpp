@@ -2,8 +2,15 @@
 #include <nanobind/nanobind.h>
 
 void bind_mesh(nanobind::module_& module);
+void bind_photometric(nanobind::module_& module);
+void bind_rig(nanobind::module_& module);
+void bind_rasterize(nanobind::module_& module);
 
 NB_MODULE(_native, module) {
+  nanobind::set_leak_warnings(false);  // a picture that lives until the interpreter ends is no leak
   module.doc() = "mien's native core. Private: only the autograd functions in mien.render and mien.avatar call it.";
   bind_mesh(module);
+  bind_photometric(module);
+  bind_rig(module);
+  bind_rasterize(module);
 }

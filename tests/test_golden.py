@@ -13,7 +13,7 @@ from mien.render import rasterize
 from mien.render.rasterize import Backend
 
 
-@pytest.mark.parametrize("backend", ["reference"])
+@pytest.mark.parametrize("backend", ["reference", "native"])
 def test_tiny_case_matches_the_picture_that_gsplat_made(test_data: Path, backend: Backend) -> None:
     stored = load_file(test_data / "golden" / "tiny_case.safetensors")
     viewmat = torch.eye(4)

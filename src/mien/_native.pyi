@@ -26,3 +26,76 @@ def photometric_loss(
     ssim_weight: float,
     gradient: Tensor | None,
 ) -> float: ...
+
+# native/bind_rasterize.cpp; radii: int32
+class RasterizeFrame: ...
+
+def rasterize_forward(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    background: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    image: Tensor,
+    alpha: Tensor,
+    radii: Tensor,
+) -> RasterizeFrame | None: ...
+def rasterize_backward(
+    frame: RasterizeFrame,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    image: Tensor,
+    alpha: Tensor,
+    grad_image: Tensor,
+    grad_alpha: Tensor | None,
+    grad_means: Tensor,
+    grad_quats: Tensor,
+    grad_scales: Tensor,
+    grad_opacities: Tensor,
+    grad_sh: Tensor,
+    grad_means2d: Tensor,
+    grad_view: Tensor,
+) -> None: ...
+def thread_count() -> int: ...
+def set_thread_count(count: int) -> None: ...
+def rasterize_isa() -> str: ...
+def set_rasterize_isa(name: str) -> bool: ...
+
+# native/bind_rig.cpp; faces, face_index: int64; b timesteps first in vertices, frames and what is in world space
+TRIANGLE_FRAME_FLOATS: int
+
+def rig_forward(
+    vertices: Tensor,
+    faces: Tensor,
+    face_index: Tensor,
+    local_means: Tensor,
+    local_quats: Tensor,
+    log_scales: Tensor,
+    frames: Tensor,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+) -> None: ...
+def rig_backward(
+    vertices: Tensor,
+    faces: Tensor,
+    face_index: Tensor,
+    local_means: Tensor,
+    local_quats: Tensor,
+    log_scales: Tensor,
+    frames: Tensor,
+    scales: Tensor,
+    grad_means: Tensor,
+    grad_quats: Tensor,
+    grad_scales: Tensor,
+    grad_local_means: Tensor,
+    grad_local_quats: Tensor,
+    grad_log_scales: Tensor,
+    grad_vertices: Tensor | None,
+) -> None: ...

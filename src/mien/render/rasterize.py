@@ -11,6 +11,7 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.gaussians import Gaussians
 from mien.render.gsplat_backend import render_gsplat
+from mien.render.native import render_native
 from mien.render.reference import render_reference
 from mien.render.rendering import Rendering
 from mien.render.validation import check_shapes
@@ -20,6 +21,7 @@ RenderView = Callable[[Gaussians, Camera, Tensor, Tensor], Rendering]
 """One view of unbatched Gaussians given in the camera's world, over a background, with offsets of the 2D centres."""
 
 _BACKENDS: dict[str, RenderView] = {
+    "native": render_native,
     "gsplat": render_gsplat,
     "reference": render_reference,
 }
@@ -48,7 +50,9 @@ def rasterize(
     if background is None:
         background = gaussians.means.new_zeros(3)
     check_shapes(gaussians, background)
-    render_view = _BACKENDS[choose_backend(gaussians.means) if backend == "auto" else backend]
+    render_view = _BACKENDS.get(choose_backend(gaussians.means) if backend == "auto" else backend)
+    if render_view is None:
+        raise ValueError(f"rasterize: unknown backend {backend!r}, expected auto, {', '.join(_BACKENDS)}")
     views = _views(gaussians, camera)
     shape = (len(gaussians), 2) if views is None else (len(views), len(gaussians), 2)
     offset = gaussians.means.new_zeros(shape).requires_grad_(torch.is_grad_enabled())
@@ -72,7 +76,7 @@ def choose_backend(like: Tensor) -> Literal["native", "gsplat", "reference"]:
     """The back end for tensors with this dtype and device."""
     if like.is_cuda:
         return "gsplat"
-    return "reference"
+    return "native" if like.dtype == torch.float32 else "reference"
 
 
 def _views(gaussians: Gaussians, camera: Camera | Sequence[Camera]) -> list[tuple[Gaussians, Camera]] | None:

@@ -1,0 +1,161 @@
+#include "pool.h"
+
+#include <pthread.h>
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdlib>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace mien {
+namespace {
+
+constexpr std::chrono::microseconds kSpin{100};  // waking a parked thread costs about 50 us
+
+void relax() {
+#if defined(__x86_64__)
+  __builtin_ia32_pause();
+#else
+  std::this_thread::yield();
+#endif
+}
+
+// Waits until `done()`, spinning for kSpin; false if it was not done by then.
+template <typename Done>
+bool spin_until(Done&& done) {
+  const auto end = std::chrono::steady_clock::now() + kSpin;
+  while (std::chrono::steady_clock::now() < end) {
+    for (int i = 0; i < 32; ++i) {
+      if (done()) return true;
+      relax();
+    }
+  }
+  return done();
+}
+
+class Pool {
+ public:
+  explicit Pool(int threads) {
+    for (int i = 1; i < threads; ++i) workers_.emplace_back([this] { serve(); });
+  }
+
+  ~Pool() {
+    stop_ = true;
+    announce();
+    for (auto& worker : workers_) worker.join();
+  }
+
+  int threads() const { return static_cast<int>(workers_.size()) + 1; }
+
+  void run(int64_t count, detail::LoopBody body, void* context) {
+    const std::unique_lock<std::mutex> lock(busy_, std::try_to_lock);
+    if (!lock.owns_lock() || workers_.empty()) {
+      for (int64_t index = 0; index < count; ++index) body(context, index);
+      return;
+    }
+    body_ = body;
+    context_ = context;
+    count_ = count;
+    next_.store(0, std::memory_order_relaxed);
+    state_.store(kOpen, std::memory_order_release);
+    announce();
+    work();
+    // From here on no worker enters; wait for those inside.
+    state_.fetch_and(~kOpen, std::memory_order_acq_rel);
+    const auto left = [this] { return state_.load(std::memory_order_acquire) == 0; };
+    while (!spin_until(left)) std::this_thread::yield();
+  }
+
+ private:
+  static constexpr uint32_t kOpen = 1u << 31;  // the other bits of state_ count the workers inside the loop
+
+  void announce() {
+    signal_.fetch_add(1, std::memory_order_release);
+    signal_.notify_all();
+  }
+
+  void work() {
+    for (int64_t index; (index = next_.fetch_add(1, std::memory_order_relaxed)) < count_;) body_(context_, index);
+  }
+
+  bool enter() {
+    uint32_t state = state_.load(std::memory_order_acquire);
+    while (state & kOpen) {
+      if (state_.compare_exchange_weak(state, state + 1, std::memory_order_acq_rel)) return true;
+    }
+    return false;
+  }
+
+  void serve() {
+    uint32_t seen = 0;
+    while (!stop_) {
+      const auto announced = [this, seen] { return signal_.load(std::memory_order_acquire) != seen; };
+      if (!spin_until(announced)) signal_.wait(seen, std::memory_order_acquire);
+      seen = signal_.load(std::memory_order_acquire);
+      if (stop_) return;
+      if (enter()) {
+        work();
+        state_.fetch_sub(1, std::memory_order_acq_rel);
+      }
+    }
+  }
+
+  std::vector<std::thread> workers_;
+  std::mutex busy_;
+  detail::LoopBody body_ = nullptr;
+  void* context_ = nullptr;
+  int64_t count_ = 0;
+  alignas(64) std::atomic<int64_t> next_{0};
+  alignas(64) std::atomic<uint32_t> state_{0};
+  alignas(64) std::atomic<uint32_t> signal_{0};
+  std::atomic<bool> stop_{false};
+};
+
+// Never destroyed: the threads end with the process. A forked child has no workers, so it forgets its parent's pool.
+std::atomic<Pool*> g_pool{nullptr};
+std::mutex* g_creation = new std::mutex;
+
+void forget_pool() {
+  g_pool = nullptr;
+  g_creation = new std::mutex;
+}
+
+int default_threads() {
+  const char* text = std::getenv("MIEN_THREADS");
+  const int wanted = text ? std::atoi(text) : 0;
+  return wanted > 0 ? wanted : std::max(1, static_cast<int>(std::thread::hardware_concurrency()));
+}
+
+Pool& pool() {
+  if (Pool* existing = g_pool.load(std::memory_order_acquire)) return *existing;
+  const std::lock_guard<std::mutex> lock(*g_creation);
+  if (!g_pool) {
+    static const int registered = pthread_atfork(nullptr, nullptr, forget_pool);
+    static_cast<void>(registered);
+    g_pool = new Pool(default_threads());
+  }
+  return *g_pool;
+}
+
+}  // namespace
+
+int thread_count() { return pool().threads(); }
+
+void set_thread_count(int count) {
+  pool();
+  const std::lock_guard<std::mutex> lock(*g_creation);
+  delete g_pool.exchange(new Pool(count > 0 ? count : default_threads()));
+}
+
+void detail::run_loop(int64_t count, LoopBody body, void* context) {
+  if (count <= 1) {
+    if (count == 1) body(context, 0);
+    return;
+  }
+  pool().run(count, body, context);
+}
+
+}  // namespace mien

@@ -1,0 +1,143 @@
+// The two passes: who runs which kernel on what, in parallel.
+#include "rasterize.h"
+
+#include <atomic>
+#include <cstring>
+#include <mutex>
+#include <vector>
+
+#include "pool.h"
+#include "rasterize_frame.h"
+
+namespace mien {
+
+#if defined(__x86_64__)
+extern const Kernels kernels_avx512, kernels_avx2, kernels_sse4;
+#else
+extern const Kernels kernels_baseline;
+#endif
+
+namespace {
+
+struct Isa {
+  const char* name;
+  const Kernels* kernels;
+  bool here;
+};
+
+// Best first.
+const std::vector<Isa>& isas() {
+#if defined(__x86_64__)
+  static const std::vector<Isa> all = {
+      {"avx512", &kernels_avx512, __builtin_cpu_supports("x86-64-v4") != 0},
+      {"avx2", &kernels_avx2, __builtin_cpu_supports("x86-64-v3") != 0},
+      {"sse4", &kernels_sse4, true},
+  };
+#else
+  static const std::vector<Isa> all = {{"baseline", &kernels_baseline, true}};
+#endif
+  return all;
+}
+
+std::atomic<const Isa*> g_isa{nullptr};
+
+const Isa& isa() {
+  if (!g_isa) {
+    for (const Isa& one : isas()) {
+      if (one.here) {
+        g_isa = &one;
+        break;
+      }
+    }
+  }
+  return *g_isa;
+}
+
+// Frames that nobody uses. Never destroyed, since arrays may outlive static destructors.
+constexpr size_t kSpareFrames = 4;
+std::mutex& spare_mutex() {
+  static auto* mutex = new std::mutex;
+  return *mutex;
+}
+std::vector<Frame*>& spare_frames() {
+  static auto* frames = new std::vector<Frame*>;
+  return *frames;
+}
+
+FramePtr take_frame() {
+  const std::lock_guard<std::mutex> lock(spare_mutex());
+  if (spare_frames().empty()) return FramePtr(new Frame);
+  Frame* frame = spare_frames().back();
+  spare_frames().pop_back();
+  return FramePtr(frame);
+}
+
+int64_t groups(int64_t count) { return (count + kGroup - 1) / kGroup; }
+
+}  // namespace
+
+void ReturnFrame::operator()(Frame* frame) const {
+  const std::lock_guard<std::mutex> lock(spare_mutex());
+  if (spare_frames().size() < kSpareFrames) {
+    spare_frames().push_back(frame);
+  } else {
+    delete frame;
+  }
+}
+
+const char* rasterize_isa() { return isa().name; }
+
+bool set_rasterize_isa(const char* name) {
+  for (const Isa& one : isas()) {
+    if (one.here && std::strcmp(one.name, name) == 0) {
+      g_isa = &one;
+      return true;
+    }
+  }
+  return false;
+}
+
+FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, const Picture& picture) {
+  const Kernels& kernels = *isa().kernels;
+  FramePtr frame = take_frame();
+  const int64_t count = gaussians.count;
+  Splat* splats = frame->splats.reserve(count);
+  uint32_t* depth_keys = frame->depth_keys.reserve(count);
+  std::atomic<bool> finite{true};
+  parallel_for(groups(count), [&](int64_t group) {
+    const int64_t first = group * kGroup, last = std::min(first + kGroup, count);
+    if (!kernels.project(gaussians, view, first, last, splats, depth_keys, picture.radii)) finite = false;
+  });
+  if (!finite) return nullptr;
+  sort_by_depth(*frame, count);
+  bin_into_tiles(*frame, kernels, count, view.width, view.height);
+  const TileLists lists = frame->lists();
+  parallel_for(static_cast<int64_t>(lists.columns) * lists.rows, [&](int64_t tile) {
+    kernels.blend(splats, lists, view, static_cast<int>(tile), picture.image, picture.alpha);
+  });
+  return frame;
+}
+
+void rasterize_backward(Frame& frame, const GaussianArrays& gaussians, const View& view, const PictureGradient& picture,
+                        const GaussianGradients& gradients, float* view_gradient) {
+  const Kernels& kernels = *isa().kernels;
+  const TileLists lists = frame.lists();
+  Moments* slots = frame.slots.reserve(frame.pairs);
+  parallel_for(static_cast<int64_t>(lists.columns) * lists.rows, [&](int64_t tile) {
+    kernels.blend_backward(frame.splats.data(), lists, view, static_cast<int>(tile), picture, slots);
+  });
+  const int64_t count = gaussians.count, parts = groups(count);
+  float* view_gradients = frame.view_gradients.reserve(parts * kViewGradients);
+  parallel_for(parts, [&](int64_t group) {
+    const int64_t first = group * kGroup, last = std::min(first + kGroup, count);
+    kernels.project_backward(gaussians, view, first, last, frame.slot_begins.data(), frame.slot_ends.data(), slots,
+                             gradients, view_gradients + group * kViewGradients);
+  });
+  // In the order of the Gaussians, whoever computed which part.
+  std::memset(view_gradient, 0, sizeof(float) * kViewGradients);
+  for (int64_t group = 0; group < parts; ++group) {
+    for (int j = 0; j < kViewGradients; ++j) view_gradient[j] += view_gradients[group * kViewGradients + j];
+  }
+}
+
+}  // namespace mien

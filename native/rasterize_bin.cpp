@@ -1,0 +1,166 @@
+// Depth order and tile lists: one sort of the Gaussians, then a counting sort of (Gaussian, tile) pairs by tile.
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+#include "pool.h"
+#include "rasterize_frame.h"
+
+namespace mien {
+namespace {
+
+constexpr int kDigit = 11;  // bits per pass of the radix sort
+
+void radix_pass(const uint32_t* keys, const uint32_t* values, int64_t count, int shift, uint32_t* sorted_keys,
+                uint32_t* sorted_values) {
+  uint32_t starts[1 << kDigit] = {};
+  const uint32_t digit_mask = (1 << kDigit) - 1;
+  for (int64_t i = 0; i < count; ++i) ++starts[keys[i] >> shift & digit_mask];
+  uint32_t total = 0;
+  for (uint32_t& start : starts) {
+    const uint32_t here = start;
+    start = total;
+    total += here;
+  }
+  for (int64_t i = 0; i < count; ++i) {
+    const uint32_t to = starts[keys[i] >> shift & digit_mask]++;
+    sorted_keys[to] = keys[i];
+    sorted_values[to] = values[i];
+  }
+}
+
+// The tiles of a splat in one row of tiles (the scalar twin of columns_touched in rasterize_project.h).
+void row_span(const Splat& s, int row, int columns, int* low, int* high) {
+  const float top = row * kTile + 0.5f - s.y, bottom = top + (kTile - 1);
+  if (top > s.half_height || bottom < -s.half_height) {
+    *low = 0;
+    *high = -1;
+    return;
+  }
+  const auto half = [&s](float y) {
+    const float t = y / s.half_height;
+    return std::sqrt(std::max(s.width2 * (1 - t * t), 0.0f));
+  };
+  const float right_y = std::clamp(s.y_rightmost, top, bottom), left_y = std::clamp(-s.y_rightmost, top, bottom);
+  const float right = s.x + s.slope * right_y + half(right_y), left = s.x + s.slope * left_y - half(left_y);
+  *low = static_cast<int>(std::clamp(std::ceil((left - (kTile - 0.5f)) / kTile), 0.0f, static_cast<float>(columns)));
+  *high = static_cast<int>(std::clamp(std::floor((right - 0.5f) / kTile), -1.0f, static_cast<float>(columns - 1)));
+}
+
+void find_pairs(BinChunk& chunk, Frame& frame, const Kernels& kernels) {
+  const int64_t count = chunk.last - chunk.first;
+  const uint32_t* order = frame.order.data() + chunk.first;
+  TileSpan* spans = chunk.spans.reserve(count);
+  kernels.find_tiles(frame.splats.data(), order, count, frame.columns, frame.rows, spans);
+  Buffer<Pair>& pairs = chunk.pairs;
+  pairs.clear();
+  for (int64_t i = 0; i < count; ++i) {
+    const uint32_t gaussian = order[i];
+    const TileSpan& span = spans[i];
+    frame.slot_begins[gaussian] = static_cast<uint32_t>(pairs.size());
+    for (int row = 0; row < span.row_count; ++row) {
+      int low, high;
+      if (row < 2) {
+        low = span.low[row];
+        high = span.high[row];
+      } else {
+        row_span(frame.splats[gaussian], span.first_row + row, frame.columns, &low, &high);
+      }
+      const int first = (span.first_row + row) * frame.columns;
+      for (int column = low; column <= high; ++column) {
+        pairs.push_back({gaussian, static_cast<uint32_t>(first + column)});
+      }
+    }
+    frame.slot_ends[gaussian] = static_cast<uint32_t>(pairs.size());
+  }
+  const int tiles = frame.columns * frame.rows;
+  int32_t* counts = chunk.counts.reserve(tiles);
+  std::memset(counts, 0, sizeof(int32_t) * tiles);
+  for (int64_t i = 0; i < pairs.size(); ++i) ++counts[pairs[i].tile];
+}
+
+// Where each chunk's entries go, tile by tile and within a tile in depth order.
+void place_chunks(Frame& frame) {
+  const int tiles = frame.columns * frame.rows;
+  int32_t* begins = frame.tile_begins.reserve(tiles + 1);
+  frame.tile_ends.reserve(tiles);
+  int32_t total = 0;
+  for (int tile = 0; tile < tiles; ++tile) {
+    begins[tile] = total;
+    for (BinChunk& chunk : frame.chunks) {
+      const int32_t here = chunk.counts[tile];
+      chunk.counts[tile] = total;
+      total += here;
+    }
+  }
+  begins[tiles] = total;
+  frame.pairs = total;
+  int64_t base = 0;
+  for (BinChunk& chunk : frame.chunks) {
+    chunk.base = base;
+    base += chunk.pairs.size();
+  }
+}
+
+void fill_lists(BinChunk& chunk, Frame& frame) {
+  Entry* entries = frame.entries.data();
+  const uint32_t base = static_cast<uint32_t>(chunk.base);
+  for (int64_t i = 0; i < chunk.pairs.size(); ++i) {
+    const Pair pair = chunk.pairs[i];
+    entries[chunk.counts[pair.tile]++] = {pair.gaussian, base + static_cast<uint32_t>(i)};
+  }
+  for (int64_t rank = chunk.first; rank < chunk.last; ++rank) {
+    frame.slot_begins[frame.order[rank]] += base;
+    frame.slot_ends[frame.order[rank]] += base;
+  }
+}
+
+}  // namespace
+
+void sort_by_depth(Frame& frame, int64_t count) {
+  uint32_t* keys = frame.sorted_keys.reserve(count);
+  uint32_t* values = frame.order.reserve(count);
+  frame.scratch_keys.reserve(count);
+  frame.scratch_order.reserve(count);
+  int64_t drawn = 0;
+  uint32_t least = UINT32_MAX, greatest = 0;
+  for (int64_t i = 0; i < count; ++i) {
+    const uint32_t key = frame.depth_keys[i];
+    keys[drawn] = key;
+    values[drawn] = static_cast<uint32_t>(i);
+    const bool there = key != UINT32_MAX;
+    drawn += there;
+    least = std::min(least, key);
+    greatest = std::max(greatest, there ? key : 0);
+  }
+  frame.drawn = drawn;
+  // Depths of a head differ in few bits: sorting the differences to the nearest saves a pass.
+  for (int64_t i = 0; i < drawn; ++i) keys[i] -= least;
+  for (int shift = 0; shift < 32 && drawn > 0 && (greatest - least) >> shift; shift += kDigit) {
+    radix_pass(frame.sorted_keys.data(), frame.order.data(), drawn, shift, frame.scratch_keys.data(),
+               frame.scratch_order.data());
+    frame.sorted_keys.swap(frame.scratch_keys);
+    frame.order.swap(frame.scratch_order);
+  }
+}
+
+void bin_into_tiles(Frame& frame, const Kernels& kernels, int64_t count, int width, int height) {
+  frame.columns = (width + kTile - 1) / kTile;
+  frame.rows = (height + kTile - 1) / kTile;
+  std::memset(frame.slot_begins.reserve(count), 0, sizeof(uint32_t) * count);
+  std::memset(frame.slot_ends.reserve(count), 0, sizeof(uint32_t) * count);
+  const int64_t chunks = std::clamp<int64_t>(frame.drawn / 1024, 1, thread_count());
+  while (static_cast<int64_t>(frame.chunks.size()) < chunks) frame.chunks.emplace_back();
+  while (static_cast<int64_t>(frame.chunks.size()) > chunks) frame.chunks.pop_back();
+  for (int64_t c = 0; c < chunks; ++c) {
+    frame.chunks[c].first = frame.drawn * c / chunks;
+    frame.chunks[c].last = frame.drawn * (c + 1) / chunks;
+  }
+  parallel_for(chunks, [&](int64_t c) { find_pairs(frame.chunks[c], frame, kernels); });
+  place_chunks(frame);
+  frame.entries.reserve(frame.pairs);
+  frame.masks.reserve(frame.pairs);
+  parallel_for(chunks, [&](int64_t c) { fill_lists(frame.chunks[c], frame); });
+}
+
+}  // namespace mien

@@ -1,0 +1,200 @@
+// Forward: one tile of the picture, front to back.
+#pragma once
+
+#include "rasterize_project.h"
+
+namespace {
+
+constexpr int kVectors = kBlock * kBlock / W;  // vectors per block
+constexpr int kBlocks = kTileBlocks * kTileBlocks;
+constexpr int kChunk = 128;  // entries handled at a time: their splats stay in the L1 cache
+
+// Pixel centres of vector `v` of a block, relative to the block's first pixel centre.
+MIEN_INLINE F lane_x() {
+  F x;
+  for (int lane = 0; lane < W; ++lane) x[lane] = (float)(lane % kBlock);
+  return x;
+}
+MIEN_INLINE F lane_y(int v) {
+  F y;
+  for (int lane = 0; lane < W; ++lane) y[lane] = (float)(lane / kBlock + v * (W / kBlock));
+  return y;
+}
+
+// 2^k for integers k >= 0.
+MIEN_INLINE F power_of_two(F k) { return from_bits((truncate(k) + 127) << 23); }
+
+// One bit per block of the tile at (left, top) pixels that the ellipse of a splat touches, for `count` entries.
+MIEN_INLINE void block_masks(const Splat* splats, const Entry* entries, int count, float left, float top,
+                             uint64_t* masks) {
+  for (int i = 0; i < count; i += W) {
+    const int valid = count - i < W ? count - i : W;
+    const Splat* chosen[W];
+    for (int lane = 0; lane < W; ++lane) chosen[lane] = &splats[entries[i + (lane < valid ? lane : 0)].gaussian];
+    const SplatShape s = gather_shapes(chosen);
+    alignas(64) int32_t halves[kTileBlocks / 2][W];
+    for (int row = 0; row < kTileBlocks; row += 2) {
+      F both_rows{};
+      for (int part = 0; part < 2; ++part) {
+        const F first_y = (top + 0.5f + kBlock * (row + part)) - s.y;
+        const Columns c = columns_touched(s, first_y, first_y + (kBlock - 1.0f), (left + 0.5f) - s.x, kBlock);
+        const F low = clamp(c.low, F{}, set1(kTileBlocks)), high = clamp(c.high, set1(-1.0f), set1(kTileBlocks - 1));
+        const F row_bits = maximum(power_of_two(high + 1.0f) - power_of_two(low), F{});
+        both_rows = both_rows + row_bits * (part ? (float)(1 << kTileBlocks) : 1.0f);
+      }
+      store(halves[row / 2], truncate(both_rows));
+    }
+    for (int lane = 0; lane < valid; ++lane) {
+      uint64_t mask = 0;
+      for (int half = 0; half < kTileBlocks / 2; ++half)
+        mask |= (uint64_t)(uint32_t)halves[half][lane] << (2 * kTileBlocks * half);
+      masks[i + lane] = mask;
+    }
+  }
+}
+
+struct TilePixels {
+  alignas(64) float transmittance[kBlocks][kBlock * kBlock];
+  alignas(64) float open[kBlocks][kBlock * kBlock];  // transmittance too, but 0 once the pixel has ended
+  alignas(64) float color[3][kBlocks][kBlock * kBlock];
+};
+
+// Blends `count` entries of one chunk into vector `v` of a block. Returns how many were looked at; fewer than `count`
+// means that all pixels of the vector have ended.
+MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const uint8_t* chosen, int count, float x,
+                             float y, int block, int v, TilePixels& pixels) {
+  F transmittance = load(pixels.transmittance[block] + v * W), open = load(pixels.open[block] + v * W);
+  F red = load(pixels.color[0][block] + v * W), green = load(pixels.color[1][block] + v * W);
+  F blue = load(pixels.color[2][block] + v * W);
+  const F px = lane_x() + x, py = lane_y(v) + y;
+  int i = 0;
+  for (; i < count; ++i) {
+    const Splat& s = splats[entries[chosen[i]].gaussian];
+    const F dx = px - s.x, dy = py - s.y;
+    const F power = s.log2_opacity - (dx * (s.xx * dx + 2.0f * s.xy * dy) + s.yy * (dy * dy));
+    const F alpha = minimum(exp2_fast(maximum(power, set1(-20.0f))), set1(kAlphaMax));
+    const F next = open - open * alpha;
+    const M seen = less_equal(set1(kLog2AlphaMin), power);
+    const M blended = both(seen, less(set1(kTransmittanceMin), next));
+    const F weight = keep(blended, open * alpha);
+    red = red + weight * s.red;
+    green = green + weight * s.green;
+    blue = blue + weight * s.blue;
+    transmittance = transmittance - weight;
+    open = select(seen, keep(blended, next), open);
+    if (!any(less(F{}, open))) {
+      ++i;
+      break;
+    }
+  }
+  store(pixels.transmittance[block] + v * W, transmittance);
+  store(pixels.open[block] + v * W, open);
+  store(pixels.color[0][block] + v * W, red);
+  store(pixels.color[1][block] + v * W, green);
+  store(pixels.color[2][block] + v * W, blue);
+  return i;
+}
+
+// Blends one chunk into all blocks in `live`; takes ended blocks out of the later entries' masks; returns what is live.
+MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, uint64_t* masks, int count, float left,
+                                 float top, uint64_t live, TilePixels& pixels) {
+  uint8_t chosen[kBlocks][kChunk];
+  int lengths[kBlocks];
+  for (int block = 0; block < kBlocks; ++block) lengths[block] = 0;
+  for (int i = 0; i < count; ++i) {
+    masks[i] &= live;
+    for (uint64_t mask = masks[i]; mask; mask &= mask - 1) {
+      const int block = __builtin_ctzll(mask);
+      chosen[block][lengths[block]++] = (uint8_t)i;
+    }
+  }
+  for (uint64_t blocks = live; blocks; blocks &= blocks - 1) {
+    const int block = __builtin_ctzll(blocks);
+    const float x = left + 0.5f + kBlock * (block % kTileBlocks), y = top + 0.5f + kBlock * (block / kTileBlocks);
+    int looked_at = 0;
+    M open = no_lanes();
+    for (int v = 0; v < kVectors; ++v) {
+      const int here = blend_vector(splats, entries, chosen[block], lengths[block], x, y, block, v, pixels);
+      looked_at = looked_at < here ? here : looked_at;
+      open = either(open, less(F{}, load(pixels.open[block] + v * W)));
+    }
+    if (any(open)) continue;
+    live &= ~(1ull << block);
+    for (int i = looked_at; i < lengths[block]; ++i) masks[chosen[block][i]] &= ~(1ull << block);
+  }
+  return live;
+}
+
+MIEN_INLINE void write_block(const TilePixels& pixels, int block, const View& view, int left, int top, float* image,
+                             float* alpha) {
+  const int rows = view.height - top < kBlock ? view.height - top : kBlock;
+  const int columns = view.width - left < kBlock ? view.width - left : kBlock;
+  for (int row = 0; row < rows; ++row) {
+    const int64_t pixel = (int64_t)(top + row) * view.width + left;
+    for (int column = 0; column < columns; ++column) {
+      const int lane = row * kBlock + column;
+      const float remaining = pixels.transmittance[block][lane];
+      for (int channel = 0; channel < 3; ++channel)
+        image[3 * (pixel + column) + channel] =
+            pixels.color[channel][block][lane] + remaining * view.background[channel];
+      alpha[pixel + column] = 1.0f - remaining;
+    }
+  }
+}
+
+// A tile without splats.
+void fill_background(const View& view, int left, int top, float* image, float* alpha) {
+  const int bottom = top + kTile < view.height ? top + kTile : view.height;
+  const int columns = view.width - left < kTile ? view.width - left : kTile;
+  for (int y = top; y < bottom; ++y) {
+    float* row = image + 3 * ((int64_t)y * view.width + left);
+    for (int x = 0; x < columns; ++x)
+      for (int channel = 0; channel < 3; ++channel) row[3 * x + channel] = view.background[channel];
+    memset(alpha + (int64_t)y * view.width + left, 0, sizeof(float) * columns);
+  }
+}
+
+// The blocks of a tile that lie (partly) in the picture.
+MIEN_INLINE uint64_t blocks_in_picture(const View& view, int left, int top) {
+  uint64_t inside = 0;
+  for (int block = 0; block < kBlocks; ++block) {
+    const int x = left + kBlock * (block % kTileBlocks), y = top + kBlock * (block / kTileBlocks);
+    if (x < view.width && y < view.height) inside |= 1ull << block;
+  }
+  return inside;
+}
+
+void blend(const Splat* splats, const TileLists& lists, const View& view, int tile, float* image, float* alpha) {
+  const int left = tile % lists.columns * kTile, top = tile / lists.columns * kTile;
+  const int begin = lists.begins[tile], end = lists.begins[tile + 1];
+  if (begin == end) {
+    lists.ends[tile] = end;
+    fill_background(view, left, top, image, alpha);
+    return;
+  }
+  TilePixels pixels;
+  memset(pixels.color, 0, sizeof pixels.color);
+  for (int block = 0; block < kBlocks; ++block) {
+    for (int v = 0; v < kVectors; ++v) {
+      store(pixels.transmittance[block] + v * W, set1(1.0f));
+      store(pixels.open[block] + v * W, set1(1.0f));
+    }
+  }
+  const uint64_t inside = blocks_in_picture(view, left, top);
+  uint64_t live = inside;
+  int i = begin;
+  while (i < end && live) {
+    const int count = end - i < kChunk ? end - i : kChunk;
+    block_masks(splats, lists.entries + i, count, (float)left, (float)top, lists.masks + i);
+    live = blend_chunk(splats, lists.entries + i, lists.masks + i, count, (float)left, (float)top, live, pixels);
+    i += count;
+  }
+  lists.ends[tile] = i;
+  for (uint64_t blocks = inside; blocks; blocks &= blocks - 1) {
+    const int block = __builtin_ctzll(blocks);
+    write_block(pixels, block, view, left + kBlock * (block % kTileBlocks), top + kBlock * (block / kTileBlocks), image,
+                alpha);
+  }
+}
+
+}  // namespace

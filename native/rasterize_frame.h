@@ -1,0 +1,102 @@
+// The buffers of one forward pass, and the steps on them that need no vector instructions.
+#pragma once
+
+#include <algorithm>
+#include <cstdlib>
+#include <deque>
+#include <new>
+#include <utility>
+
+#include "rasterize_kernels.h"
+
+namespace mien {
+
+// An array that only grows and is never cleared: page faults on fresh memory cost as much as the work.
+template <typename T>
+class Buffer {
+ public:
+  Buffer() = default;
+  Buffer(const Buffer&) = delete;
+  Buffer& operator=(const Buffer&) = delete;
+  ~Buffer() { std::free(data_); }
+
+  // At least `count` elements; what they held may be lost.
+  T* reserve(int64_t count) {
+    if (count > capacity_) {
+      std::free(data_);
+      capacity_ = count + count / 4 + 64;
+      const size_t bytes = (sizeof(T) * static_cast<size_t>(capacity_) + 63) / 64 * 64;
+      data_ = static_cast<T*>(std::aligned_alloc(64, bytes));
+      if (!data_) {
+        capacity_ = 0;
+        throw std::bad_alloc();
+      }
+    }
+    return data_;
+  }
+  // Keeps what is there.
+  void push_back(const T& value) {
+    if (size_ == capacity_) grow();
+    data_[size_++] = value;
+  }
+  void clear() { size_ = 0; }
+  void swap(Buffer& other) {
+    std::swap(data_, other.data_);
+    std::swap(capacity_, other.capacity_);
+    std::swap(size_, other.size_);
+  }
+  int64_t size() const { return size_; }
+  T* data() { return data_; }
+  const T* data() const { return data_; }
+  T& operator[](int64_t index) { return data_[index]; }
+
+ private:
+  void grow() {
+    Buffer larger;
+    larger.reserve(2 * capacity_ + 1024);
+    std::copy(data_, data_ + size_, larger.data_);
+    std::swap(data_, larger.data_);
+    std::swap(capacity_, larger.capacity_);
+  }
+
+  T* data_ = nullptr;
+  int64_t capacity_ = 0, size_ = 0;
+};
+
+// A (Gaussian, tile) pair before it is sorted into its tile's list.
+struct Pair {
+  uint32_t gaussian, tile;
+};
+
+// A part of the depth order that one thread bins.
+struct BinChunk {
+  int64_t first, last;  // ranks in depth order
+  int64_t base;         // pairs in the chunks before
+  Buffer<TileSpan> spans;
+  Buffer<Pair> pairs;
+  Buffer<int32_t> counts;  // per tile; then where the chunk's next entry of that tile goes
+};
+
+struct Frame {
+  Buffer<Splat> splats;
+  Buffer<uint32_t> depth_keys, sorted_keys, order, scratch_keys, scratch_order;
+  Buffer<uint32_t> slot_begins, slot_ends;  // per Gaussian
+  Buffer<Entry> entries;
+  Buffer<uint64_t> masks;
+  Buffer<int32_t> tile_begins, tile_ends;
+  Buffer<Moments> slots;
+  Buffer<float> view_gradients;  // per group of Gaussians
+  std::deque<BinChunk> chunks;
+  int64_t drawn = 0, pairs = 0;
+  int columns = 0, rows = 0;
+
+  TileLists lists() { return {entries.data(), masks.data(), tile_begins.data(), tile_ends.data(), columns, rows}; }
+};
+
+// Fills frame.order with the drawn Gaussians, nearest first; equal depths stay in the order of their indices.
+void sort_by_depth(Frame& frame, int64_t count);
+
+// Fills the tiles' lists and the Gaussians' slots. The result does not depend on the number of threads.
+void bin_into_tiles(Frame& frame, const Kernels& kernels, int64_t count, int width, int height);
+
+}  // namespace mien

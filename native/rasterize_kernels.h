@@ -1,0 +1,74 @@
+// What rasterize.cpp hands to the kernels, which are compiled once per instruction set (rasterize_kernels.cpp).
+#pragma once
+
+#include <cstdint>
+
+#include "rasterize.h"
+
+namespace mien {
+
+constexpr int kBlock = 4;       // a block is 4x4 pixels: the unit of work of the blend kernels
+constexpr int kTileBlocks = 8;  // a tile is 8x8 blocks, 32x32 pixels: one bit of a 64-bit mask per block
+constexpr int kTile = kBlock * kTileBlocks;
+constexpr int kGroup = 256;  // Gaussians a project kernel handles at a time
+
+constexpr float kNear = 0.01f;
+constexpr float kDilation = 0.3f;
+constexpr float kAlphaMax = 0.999f;
+constexpr float kTransmittanceMin = 1e-4f;
+constexpr float kFovMargin = 0.3f;
+constexpr float kLog2AlphaMin = -7.994353437f;  // log2(1 / 255)
+
+// A projected Gaussian: one cache line. alpha(dx, dy) = 2^(log2_opacity - (xx dx^2 + 2 xy dx dy + yy dy^2)).
+struct alignas(64) Splat {
+  float x, y;        // centre, pixels
+  float xx, xy, yy;  // the inverse covariance times log2(e) / 2
+  float log2_opacity;
+  float red, green, blue;
+  // The ellipse where alpha is 1/255: at height dy it spans slope * dy +- sqrt(width2 * (1 - (dy / half_height)^2)).
+  float slope, width2;
+  float half_width, half_height;
+  float y_rightmost;  // dy of the point that is farthest right; the leftmost is opposite
+  float depth;        // camera z
+  float unused;
+};
+
+// A (Gaussian, tile) pair in a tile's list, front to back.
+struct Entry {
+  uint32_t gaussian;
+  uint32_t slot;  // where its gradient goes; the slots of a Gaussian are consecutive
+};
+
+// The sums over one tile's pixels, v = dL/dalpha * alpha: colours, then v times 1, dx, dy, dx^2, dx dy, dy^2.
+struct Moments {
+  float red, green, blue, one, x, y, xx, xy, yy, unused[3];
+};
+
+struct TileLists {
+  const Entry* entries;
+  uint64_t* masks;        // per entry: the blocks it is blended in (written by the forward pass)
+  const int32_t* begins;  // [tiles + 1]
+  int32_t* ends;          // [tiles]: entries after this one changed no pixel (written by the forward pass)
+  int columns, rows;
+};
+
+// Tiles per row of tiles that a splat touches, for the first two rows (most splats touch no more).
+struct TileSpan {
+  int16_t first_row, row_count;
+  int16_t low[2], high[2];  // columns, inclusive; empty where high < low
+};
+
+struct Kernels {
+  // Gaussians first .. last - 1; radii[i] and depth_keys[i] (all ones: not drawn) too. False on NaN or infinity.
+  bool (*project)(const GaussianArrays&, const View&, int64_t first, int64_t last, Splat*, uint32_t* depth_keys,
+                  int32_t* radii);
+  // The tiles of the splats order[0 .. count - 1].
+  void (*find_tiles)(const Splat*, const uint32_t* order, int64_t count, int columns, int rows, TileSpan*);
+  void (*blend)(const Splat*, const TileLists&, const View&, int tile, float* image, float* alpha);
+  void (*blend_backward)(const Splat*, const TileLists&, const View&, int tile, const PictureGradient&, Moments*);
+  // Gaussians first .. last - 1; view_gradient gets their share.
+  void (*project_backward)(const GaussianArrays&, const View&, int64_t first, int64_t last, const uint32_t* slot_begins,
+                           const uint32_t* slot_ends, const Moments*, const GaussianGradients&, float* view_gradient);
+};
+
+}  // namespace mien

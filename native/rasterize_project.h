@@ -1,0 +1,190 @@
+// Forward projection, and which tiles a splat touches.
+#pragma once
+
+#include "rasterize_geometry.h"
+
+namespace {
+
+MIEN_INLINE M not_finite(const F* values, int count) {
+  F total{};
+  for (int j = 0; j < count; ++j) total = total + (values[j] - values[j]);  // 0, or NaN for NaN and infinity
+  return but_not(less_equal(F{}, set1(0.0f)), less_equal(total, set1(0.0f)));
+}
+
+// Colours of W Gaussians; sets `bad` where a coefficient is not finite.
+template <int COUNT>
+MIEN_INLINE V3 colors_of(const float* sh, int valid, V3 direction, M* bad) {
+  F coefficients[3 * COUNT], basis[COUNT];
+  load_columns<3 * COUNT>(sh, 3 * COUNT, valid, coefficients);
+  sh_basis<COUNT>(direction, basis);
+  F c[3] = {set1(0.5f), set1(0.5f), set1(0.5f)};
+  for (int j = 0; j < COUNT; ++j)
+    for (int channel = 0; channel < 3; ++channel) c[channel] = c[channel] + basis[j] * coefficients[3 * j + channel];
+  *bad = not_finite(c, 3);
+  return {maximum(c[0], F{}), maximum(c[1], F{}), maximum(c[2], F{})};
+}
+
+MIEN_INLINE V3 colors_of(int count, const float* sh, int valid, V3 direction, M* bad) {
+  if (count == 1) return colors_of<1>(sh, valid, direction, bad);
+  if (count == 4) return colors_of<4>(sh, valid, direction, bad);
+  if (count == 9) return colors_of<9>(sh, valid, direction, bad);
+  return colors_of<16>(sh, valid, direction, bad);
+}
+
+struct Outline {
+  F cutoff2;  // the squared Mahalanobis distance where alpha is 1/255
+  F half_width, half_height;
+  M drawn;
+};
+
+MIEN_INLINE Outline outline_of(const Projection& p, const View& view, F log2_opacity) {
+  Outline o;
+  o.cutoff2 = maximum((log2_opacity - kLog2AlphaMin) * 1.3862943611f, F{});  // 2 ln 2
+  o.half_width = square_root(o.cutoff2 * p.xx);
+  o.half_height = square_root(o.cutoff2 * p.yy);
+  const M across = both(less(F{}, p.x + o.half_width), less(p.x - o.half_width, set1((float)view.width)));
+  const M along = both(less(F{}, p.y + o.half_height), less(p.y - o.half_height, set1((float)view.height)));
+  const F huge = set1(1e30f);  // a covariance that overflows cannot be drawn
+  const M sane = both(less(p.xx, huge), both(less(p.yy, huge), less(p.determinant, huge)));
+  o.drawn = both(both(p.in_front, sane), both(across, along));
+  o.drawn = both(o.drawn, less_equal(set1(kLog2AlphaMin), log2_opacity));
+  return o;
+}
+
+MIEN_INLINE void store_radii(const Projection& p, M drawn, int valid, int32_t* radii) {
+  const F middle = 0.5f * (p.xx + p.yy), half = 0.5f * (p.xx - p.yy);
+  const F radius = 3.0f * square_root(middle + square_root(half * half + p.xy * p.xy));
+  const F rounded = -round_down(-minimum(radius, set1(1e9f)));
+  alignas(64) int32_t lanes[W];
+  store(lanes, truncate(keep(drawn, rounded)));
+  for (int lane = 0; lane < valid; ++lane) radii[lane] = lanes[lane];
+}
+
+// Returns the lanes with a NaN or an infinity.
+MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i, int valid, Splat* splats,
+                            uint32_t* depth_keys, int32_t* radii) {
+  F in[11];
+  load_columns<3>(g.means + 3 * i, 3, valid, in);
+  load_columns<4>(g.quats + 4 * i, 4, valid, in + 3);
+  load_columns<3>(g.scales + 3 * i, 3, valid, in + 7);
+  load_columns<1>(g.opacities + i, 1, valid, in + 10);
+  M bad = not_finite(in, 11);
+  const Projection p = project_lanes(view, in, in + 3, in + 7);
+  const F log2_opacity = log2_precise(maximum(in[10], set1(1e-30f)));
+  const Outline o = outline_of(p, view, log2_opacity);
+  F inverse_distance;
+  V3 color{F{}, F{}, F{}};
+  if (any(o.drawn)) {
+    M bad_color;
+    color = colors_of(g.sh_count, g.sh + 3 * g.sh_count * i, valid, view_direction(view, in, &inverse_distance),
+                      &bad_color);
+    bad = either(bad, both(bad_color, o.drawn));
+  }
+  const F inverse = 1.0f / p.determinant, conic_scale = 0.72134752044f * inverse;  // log2(e) / 2
+  const F inverse_yy = 1.0f / p.yy;
+  const F columns[16] = {p.x,
+                         p.y,
+                         p.yy * conic_scale,
+                         -p.xy * conic_scale,
+                         p.xx * conic_scale,
+                         log2_opacity,
+                         color.x,
+                         color.y,
+                         color.z,
+                         p.xy * inverse_yy,
+                         o.cutoff2 * p.determinant * inverse_yy,
+                         o.half_width,
+                         o.half_height,
+                         p.xy * square_root(o.cutoff2 / p.xx),
+                         p.camera.z,
+                         F{}};
+  store_columns<16>(&splats[i].x, 16, valid, columns);
+  store_radii(p, o.drawn, valid, radii + i);
+  const uint32_t drawn = lane_bits(o.drawn);
+  for (int lane = 0; lane < valid; ++lane) {
+    uint32_t key;
+    memcpy(&key, &splats[i + lane].depth, 4);  // positive floats sort as their bits
+    depth_keys[i + lane] = drawn >> lane & 1 ? key : UINT32_MAX;
+  }
+  return bad;
+}
+
+bool project(const GaussianArrays& g, const View& view, int64_t first, int64_t last, Splat* splats,
+             uint32_t* depth_keys, int32_t* radii) {
+  M bad = no_lanes();
+  for (int64_t i = first; i < last; i += W) {
+    const int valid = last - i < W ? (int)(last - i) : W;
+    bad = either(bad, project_group(g, view, i, valid, splats, depth_keys, radii));
+  }
+  return !any(bad);
+}
+
+struct SplatShape {
+  F x, y, slope, width2, half_height, y_rightmost;
+};
+
+MIEN_INLINE SplatShape gather_shapes(const Splat* const* splats) {
+  alignas(64) float buffer[6][W];
+  for (int lane = 0; lane < W; ++lane) {
+    const Splat& splat = *splats[lane];
+    buffer[0][lane] = splat.x;
+    buffer[1][lane] = splat.y;
+    buffer[2][lane] = splat.slope;
+    buffer[3][lane] = splat.width2;
+    buffer[4][lane] = splat.half_height;
+    buffer[5][lane] = splat.y_rightmost;
+  }
+  return {load(buffer[0]), load(buffer[1]), load(buffer[2]), load(buffer[3]), load(buffer[4]), load(buffer[5])};
+}
+
+// The columns of pixel groups of `size` pixels that the ellipse touches in the rows of pixel centres top..bottom (both
+// relative to the centre): exact, because within a strip the ellipse is widest at its rightmost point or, if that lies
+// outside, at the edge nearer to it. `first` is the first group's first pixel centre relative to the splat's.
+struct Columns {
+  F low, high;  // not clamped; high < low where the ellipse misses the strip
+};
+
+MIEN_INLINE Columns columns_touched(const SplatShape& s, F top, F bottom, F first, float size) {
+  const F right_y = clamp(s.y_rightmost, top, bottom), left_y = clamp(-s.y_rightmost, top, bottom);
+  const F inverse = 1.0f / s.half_height;
+  const F right_t = right_y * inverse, left_t = left_y * inverse;
+  const F right = s.slope * right_y + square_root(maximum(s.width2 * (1.0f - right_t * right_t), F{}));
+  const F left = s.slope * left_y - square_root(maximum(s.width2 * (1.0f - left_t * left_t), F{}));
+  const M hit = both(less_equal(top, s.half_height), less_equal(-s.half_height, bottom));
+  const float per_group = 1.0f / size;
+  const F low = -round_down((first + (size - 1.0f) - left) * per_group);
+  const F high = round_down((right - first) * per_group);
+  return {low, select(hit, high, set1(-1e6f))};
+}
+
+void find_tiles(const Splat* splats, const uint32_t* order, int64_t count, int columns, int rows, TileSpan* spans) {
+  for (int64_t i = 0; i < count; i += W) {
+    const int valid = count - i < W ? (int)(count - i) : W;
+    const Splat* chosen[W];
+    for (int lane = 0; lane < W; ++lane) chosen[lane] = &splats[order[i + (lane < valid ? lane : 0)]];
+    const SplatShape s = gather_shapes(chosen);
+    const F last_row = set1((float)(rows - 1)), last_column = set1((float)(columns - 1));
+    const F first_row = clamp(round_down((s.y - s.half_height - 0.5f) * (1.0f / kTile)), F{}, last_row);
+    const F end_row = clamp(round_down((s.y + s.half_height - 0.5f) * (1.0f / kTile)), F{}, last_row);
+    alignas(64) int32_t ints[6][W];
+    store(ints[0], truncate(first_row));
+    store(ints[1], truncate(end_row));
+    for (int row = 0; row < 2; ++row) {
+      const F top = (first_row + (float)row) * (float)kTile + 0.5f - s.y;
+      const Columns c = columns_touched(s, top, top + (kTile - 1.0f), 0.5f - s.x, kTile);
+      store(ints[2 + 2 * row], truncate(clamp(c.low, F{}, last_column + 1.0f)));
+      store(ints[3 + 2 * row], truncate(clamp(c.high, set1(-1.0f), last_column)));
+    }
+    for (int lane = 0; lane < valid; ++lane) {
+      TileSpan& span = spans[i + lane];
+      span.first_row = (int16_t)ints[0][lane];
+      span.row_count = (int16_t)(ints[1][lane] - ints[0][lane] + 1);
+      for (int row = 0; row < 2; ++row) {
+        span.low[row] = (int16_t)ints[2 + 2 * row][lane];
+        span.high[row] = (int16_t)ints[3 + 2 * row][lane];
+      }
+    }
+  }
+}
+
+}  // namespace

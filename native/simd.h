@@ -1,0 +1,184 @@
+// The few vector operations that the kernels need, at the native width of the instruction set this file is compiled
+// for: 16 floats with AVX-512, 8 with AVX2, 4 otherwise (SSE4.2, NEON, WebAssembly). `F`, `I` and `M` are a float, an
+// int32 and a mask vector; + - * / & | << on them are the compiler's own, a * b + c becomes a fused multiply-add.
+//
+// Everything lives in an unnamed namespace: kernel files are compiled once per instruction set, and no function
+// compiled for a newer one may be picked by the linker for an older one. For the same reason: no std templates here.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
+
+#define MIEN_INLINE inline __attribute__((always_inline))
+
+namespace {
+
+#if defined(__AVX512F__)
+constexpr int W = 16;
+#elif defined(__AVX2__)
+constexpr int W = 8;
+#else
+constexpr int W = 4;
+#endif
+
+typedef float F __attribute__((vector_size(4 * W)));
+typedef int32_t I __attribute__((vector_size(4 * W)));
+typedef float F4 __attribute__((vector_size(16)));
+
+MIEN_INLINE F set1(float value) { return value - F{}; }
+MIEN_INLINE I set1i(int32_t value) { return value - I{}; }
+MIEN_INLINE F load(const float* from) {
+  F value;
+  memcpy(&value, from, sizeof value);
+  return value;
+}
+MIEN_INLINE void store(float* to, F value) { memcpy(to, &value, sizeof value); }
+MIEN_INLINE void store(int32_t* to, I value) { memcpy(to, &value, sizeof value); }
+MIEN_INLINE I bits(F value) { return (I)value; }
+MIEN_INLINE F from_bits(I value) { return (F)value; }
+MIEN_INLINE F to_float(I value) { return __builtin_convertvector(value, F); }
+MIEN_INLINE I truncate(F value) { return __builtin_convertvector(value, I); }
+
+// 0, 1, 2, ...
+MIEN_INLINE F iota() {
+  F value;
+  for (int lane = 0; lane < W; ++lane) value[lane] = (float)lane;
+  return value;
+}
+
+#if defined(__AVX512F__)
+
+typedef __mmask16 M;
+MIEN_INLINE M less(F a, F b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
+MIEN_INLINE M less_equal(F a, F b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
+MIEN_INLINE M both(M a, M b) { return (M)(a & b); }
+MIEN_INLINE M either(M a, M b) { return (M)(a | b); }
+MIEN_INLINE M but_not(M a, M b) { return (M)(a & ~b); }
+MIEN_INLINE M no_lanes() { return 0; }
+MIEN_INLINE F select(M mask, F yes, F no) { return _mm512_mask_blend_ps(mask, no, yes); }
+MIEN_INLINE F keep(M mask, F value) { return _mm512_maskz_mov_ps(mask, value); }
+MIEN_INLINE bool any(M mask) { return mask != 0; }
+MIEN_INLINE uint32_t lane_bits(M mask) { return mask; }
+MIEN_INLINE F minimum(F a, F b) { return _mm512_min_ps(a, b); }
+MIEN_INLINE F maximum(F a, F b) { return _mm512_max_ps(a, b); }
+MIEN_INLINE F square_root(F a) { return _mm512_sqrt_ps(a); }
+MIEN_INLINE F reciprocal_estimate(F a) { return _mm512_rcp14_ps(a); }
+MIEN_INLINE F round_down(F a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
+
+#else
+
+typedef I M;
+MIEN_INLINE M less(F a, F b) { return a < b; }
+MIEN_INLINE M less_equal(F a, F b) { return a <= b; }
+MIEN_INLINE M both(M a, M b) { return a & b; }
+MIEN_INLINE M either(M a, M b) { return a | b; }
+MIEN_INLINE M but_not(M a, M b) { return a & ~b; }
+MIEN_INLINE M no_lanes() { return M{}; }
+MIEN_INLINE F keep(M mask, F value) { return (F)(mask & (I)value); }
+
+#if defined(__AVX2__)
+MIEN_INLINE F select(M mask, F yes, F no) { return _mm256_blendv_ps(no, yes, (F)mask); }
+MIEN_INLINE uint32_t lane_bits(M mask) { return (uint32_t)_mm256_movemask_ps((F)mask); }
+MIEN_INLINE F minimum(F a, F b) { return _mm256_min_ps(a, b); }
+MIEN_INLINE F maximum(F a, F b) { return _mm256_max_ps(a, b); }
+MIEN_INLINE F square_root(F a) { return _mm256_sqrt_ps(a); }
+MIEN_INLINE F reciprocal_estimate(F a) { return _mm256_rcp_ps(a); }
+MIEN_INLINE F round_down(F a) { return _mm256_floor_ps(a); }
+#elif defined(__SSE4_1__)
+MIEN_INLINE F select(M mask, F yes, F no) { return _mm_blendv_ps(no, yes, (F)mask); }
+MIEN_INLINE uint32_t lane_bits(M mask) { return (uint32_t)_mm_movemask_ps((F)mask); }
+MIEN_INLINE F minimum(F a, F b) { return _mm_min_ps(a, b); }
+MIEN_INLINE F maximum(F a, F b) { return _mm_max_ps(a, b); }
+MIEN_INLINE F square_root(F a) { return _mm_sqrt_ps(a); }
+MIEN_INLINE F reciprocal_estimate(F a) { return _mm_rcp_ps(a); }
+MIEN_INLINE F round_down(F a) { return _mm_floor_ps(a); }
+#else
+MIEN_INLINE F select(M mask, F yes, F no) { return (F)((mask & (I)yes) | (~mask & (I)no)); }
+MIEN_INLINE uint32_t lane_bits(M mask) {
+  uint32_t result = 0;
+  for (int lane = 0; lane < W; ++lane) result |= (uint32_t)(mask[lane] & (1 << lane));
+  return result;
+}
+MIEN_INLINE F minimum(F a, F b) { return select(a < b, a, b); }
+MIEN_INLINE F maximum(F a, F b) { return select(a > b, a, b); }
+MIEN_INLINE F square_root(F a) {
+  for (int lane = 0; lane < W; ++lane) a[lane] = __builtin_sqrtf(a[lane]);
+  return a;
+}
+MIEN_INLINE F reciprocal_estimate(F a) { return 1.0f / a; }
+MIEN_INLINE F round_down(F a) {
+  const F truncated = to_float(truncate(a));
+  return truncated - keep(a < truncated, set1(1.0f));
+}
+#endif
+MIEN_INLINE bool any(M mask) { return lane_bits(mask) != 0; }
+
+#endif
+
+MIEN_INLINE F clamp(F value, F low, F high) { return minimum(maximum(value, low), high); }
+
+// 1 / a to about 2e-7 (relative): the estimate and one Newton step.
+MIEN_INLINE F reciprocal(F a) {
+  const F estimate = reciprocal_estimate(a);
+  return estimate * (2.0f - a * estimate);
+}
+
+// 2^a to 2e-7 (relative) for -100 < a < 100. Adding 1.5 * 2^23 leaves round(a) in the low bits of the sum; the
+// polynomial is the minimax one for 2^f on -0.5..0.5, and the integer part goes straight into the exponent.
+MIEN_INLINE F exp2_fast(F a) {
+  const F shifted = a + 12582912.0f;
+  const F f = a - (shifted - 12582912.0f);
+  F power = set1(1.3276471979e-3f);
+  power = power * f + 9.6755413342e-3f;
+  power = power * f + 5.5507132735e-2f;
+  power = power * f + 2.4022119724e-1f;
+  power = power * f + 6.9314696706e-1f;
+  power = power * f + 1.0000000717f;
+  return from_bits(bits(power) + (bits(shifted) << 23));
+}
+
+// log2(a) to 1e-7 (absolute, near 1; relative elsewhere) for positive normal a: with a = m 2^e, m in 0.7..1.4 and
+// t = (m - 1) / (m + 1), log2(m) = 2 / ln 2 * atanh(t).
+MIEN_INLINE F log2_precise(F a) {
+  const I offset = (bits(a) - 0x3f3504f3) >> 23;  // 0x3f3504f3 is sqrt(1 / 2)
+  const F m = from_bits(bits(a) - (offset << 23));
+  const F t = (m - 1.0f) / (m + 1.0f), t2 = t * t;
+  F series = set1(1.0f / 9);
+  series = series * t2 + 1.0f / 7;
+  series = series * t2 + 1.0f / 5;
+  series = series * t2 + 1.0f / 3;
+  series = series * t2 + 1.0f;
+  return to_float(offset) + 2.8853900818f * t * series;
+}
+
+MIEN_INLINE float sum(F value) {
+  float total = 0;
+  for (int lane = 0; lane < W; ++lane) total += value[lane];
+  return total;
+}
+
+// out[j][lane] = rows[lane][j] for W rows that are `stride` floats apart; rows from `valid` on repeat the last one.
+template <int COUNT>
+MIEN_INLINE void load_columns(const float* rows, int64_t stride, int valid, F* out) {
+  alignas(64) float buffer[COUNT][W];
+  for (int lane = 0; lane < W; ++lane) {
+    const float* row = rows + (lane < valid ? lane : valid - 1) * stride;
+    for (int j = 0; j < COUNT; ++j) buffer[j][lane] = row[j];
+  }
+  for (int j = 0; j < COUNT; ++j) out[j] = load(buffer[j]);
+}
+
+// rows[lane][j] = columns[j][lane] for the first `valid` rows.
+template <int COUNT>
+MIEN_INLINE void store_columns(float* rows, int64_t stride, int valid, const F* columns) {
+  alignas(64) float buffer[COUNT][W];
+  for (int j = 0; j < COUNT; ++j) store(buffer[j], columns[j]);
+  for (int lane = 0; lane < valid; ++lane)
+    for (int j = 0; j < COUNT; ++j) rows[lane * stride + j] = buffer[j][lane];
+}
+
+}  // namespace
