@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from mien import _native
 from mien.avatar.rig import DEGENERATE_LENGTH, bind_to_world, frames_to_world, triangle_frames
 from mien.rotation import matrix_from_axis_angle, matrix_from_quaternion
 
@@ -20,6 +21,14 @@ def random_rig(
     quats = torch.randn(100, 4, generator=generator, dtype=dtype)
     log_scales = torch.randn(100, 3, generator=generator, dtype=dtype)
     return vertices, faces, face_index, means, quats, log_scales
+
+
+def gradients(outputs: tuple[Tensor, ...], inputs: list[Tensor]) -> tuple[Tensor, ...]:
+    """Of a loss that weighs every number of the outputs differently."""
+    generator = torch.Generator().manual_seed(9)
+    loss = sum((o * torch.randn(o.shape, generator=generator, dtype=torch.float64).to(o)).sum() for o in outputs)
+    assert isinstance(loss, Tensor)
+    return torch.autograd.grad(loss, inputs)
 
 
 def test_frame_of_a_known_triangle():
@@ -91,3 +100,71 @@ def test_degenerate_triangles_stay_finite(dtype: torch.dtype):
         assert tensor.isfinite().all()
     assert vertices.grad is not None
     assert vertices.grad[5].abs().sum() > 0
+
+
+@pytest.mark.parametrize("timesteps", [(), (3,), (2, 2), (0,)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_native_equals_the_float64_reference(timesteps: tuple[int, ...], seed: int):
+    vertices, faces, face_index, *local = random_rig(seed, timesteps)
+    # Turned in every way, so that each of the four quaternion formulas is used; quaternions of any length.
+    inputs = [tensor.requires_grad_() for tensor in (vertices, *local)]
+    expected = bind_to_world(vertices, faces, face_index, *local)
+    single = [tensor.detach().float().requires_grad_() for tensor in inputs]
+    native = bind_to_world(single[0], faces, face_index, *single[1:])
+    for value, reference in zip(native, expected, strict=True):
+        assert value.dtype == torch.float32
+        torch.testing.assert_close(value.double(), reference, atol=1e-6, rtol=2e-6)
+    for value, reference in zip(gradients(native, single), gradients(expected, inputs), strict=True):
+        error = (value.double() - reference).norm()
+        assert error <= 2e-5 * reference.norm()  # 20 vertices carry 100 Gaussians: sums of many float32 terms
+
+
+def test_native_uses_every_quaternion_formula():
+    _, faces, *_ = random_rig()
+    vertices = random_rig()[0]
+    largest = triangle_frames(vertices, faces).R
+    from_native = bind_to_world(
+        vertices.float(), faces, torch.arange(30), torch.zeros(30, 3), torch.tensor([1.0, 0, 0, 0]).expand(30, 4),
+        torch.zeros(30, 3),
+    )[1]  # fmt: skip
+    assert set(from_native.abs().argmax(-1).tolist()) == {0, 1, 2, 3}
+    torch.testing.assert_close(matrix_from_quaternion(from_native).double(), largest, atol=2e-6, rtol=0)
+
+
+def test_gradients_go_only_where_they_are_wanted():
+    vertices, faces, face_index, *local = random_rig(dtype=torch.float32)
+    local[0].requires_grad_()
+    means, quats, scales = bind_to_world(vertices, faces, face_index, *local)
+    quats.sum().backward(retain_graph=True)
+    assert local[0].grad is not None
+    assert local[0].grad.abs().max() == 0
+    (means.sum() + scales.sum()).backward()
+    assert local[0].grad.abs().min() > 0
+    assert vertices.grad is None
+
+
+def test_indices_are_checked():
+    vertices, faces, face_index, *local = random_rig(dtype=torch.float32)
+    with pytest.raises(IndexError, match="vertex"):
+        bind_to_world(vertices, faces + 1, face_index, *local)
+    with pytest.raises(IndexError, match="face"):
+        bind_to_world(vertices, faces, face_index - 1, *local)
+
+
+def test_threads_do_not_change_a_bit():
+    generator = torch.Generator().manual_seed(0)
+    vertices, faces, *_ = random_rig(dtype=torch.float32)
+    face_index = torch.randint(0, 30, (9000,), generator=generator)
+    inputs = [vertices] + [torch.randn(9000, width, generator=generator) for width in (3, 4, 3)]
+    for tensor in inputs:
+        tensor.requires_grad_()
+    results = []
+    try:
+        for threads in (1, 2, 3):
+            _native.set_thread_count(threads)
+            world = bind_to_world(inputs[0], faces, face_index, *inputs[1:])
+            results.append((*world, *gradients(world, inputs)))
+    finally:
+        _native.set_thread_count(0)
+    for result in results[1:]:
+        assert all(torch.equal(one, other) for one, other in zip(result, results[0], strict=True))

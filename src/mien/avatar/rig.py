@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from mien import _native
 from mien.rotation import multiply_quaternions, quaternion_from_matrix
 
 DEGENERATE_LENGTH = 1e-7
@@ -70,11 +71,40 @@ def bind_to_world(
     local_quats: Float[Tensor, "n 4"],
     log_scales: Float[Tensor, "n 3"],
 ) -> tuple[Float[Tensor, "*b n 3"], Float[Tensor, "*b n 4"], Float[Tensor, "*b n 3"]]:
-    """`frames_to_world` of the `triangle_frames` of a posed mesh; differentiable in all but the indices.
+    """`frames_to_world` of the `triangle_frames` of a posed mesh; native for float32 on a CPU.
 
-    Gaussian i rides on triangle `face_index[i]`. Leading axes of `vertices` are timesteps.
+    Gaussian i rides on triangle `face_index[i]`. Leading axes of `vertices` are timesteps. Differentiable in all but
+    the indices.
     """
-    return frames_to_world(triangle_frames(vertices, faces), face_index, local_means, local_quats, log_scales)
+    floats = (vertices, local_means, local_quats, log_scales)
+    if any(tensor.device.type != "cpu" or tensor.dtype != torch.float32 for tensor in floats):
+        return frames_to_world(triangle_frames(vertices, faces), face_index, local_means, local_quats, log_scales)
+    flat = vertices.reshape(-1, *vertices.shape[-2:])
+    bound = _BindToWorld.apply(flat, faces, face_index, local_means, local_quats, log_scales)
+    means, quats, scales = (output.view(*vertices.shape[:-2], *output.shape[1:]) for output in bound)
+    return means, quats, scales
+
+
+class _BindToWorld(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, vertices: Tensor, faces: Tensor, *gaussians: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        inputs = tuple(tensor.detach().contiguous() for tensor in (vertices, faces, *gaussians))
+        batch, count = len(vertices), len(gaussians[0])
+        frames = torch.empty(batch, len(faces), _native.TRIANGLE_FRAME_FLOATS)
+        means, quats, scales = (torch.empty(batch, count, width) for width in (3, 4, 3))
+        _native.rig_forward(*inputs, frames, means, quats, scales)
+        ctx.save_for_backward(*inputs, frames, scales)
+        return means, quats, scales
+
+    @staticmethod
+    def backward(ctx, *world_gradients: Tensor):
+        *inputs, frames, scales = ctx.saved_tensors
+        vertices, _, _, *local = inputs
+        local_gradients = [torch.zeros_like(tensor) for tensor in local]
+        vertex_gradient = torch.zeros_like(vertices) if ctx.needs_input_grad[0] else None
+        world_gradients = tuple(gradient.contiguous() for gradient in world_gradients)
+        _native.rig_backward(*inputs, frames, scales, *world_gradients, *local_gradients, vertex_gradient)
+        return vertex_gradient, None, None, *local_gradients
 
 
 def _usable_edges(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:

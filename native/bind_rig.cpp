@@ -1,0 +1,117 @@
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+
+#include <algorithm>
+#include <optional>
+#include <stdexcept>
+
+#include "rig.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+template <typename T, typename... Shape>
+using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
+using Faces = Array<const int64_t, nb::shape<-1, 3>>;
+using FaceIndex = Array<const int64_t, nb::ndim<1>>;
+using Rows3 = Array<const float, nb::shape<-1, 3>>;
+using Rows4 = Array<const float, nb::shape<-1, 4>>;
+using Frames = nb::shape<-1, -1, mien::kTriangleFrameFloats>;
+
+void check_range(const int64_t* begin, size_t size, size_t count, const char* message) {
+  const auto outside = [count](int64_t index) { return index < 0 || index >= static_cast<int64_t>(count); };
+  if (std::any_of(begin, begin + size, outside)) throw std::out_of_range(message);
+}
+
+mien::RigArrays rig_arrays(const Array<const float, nb::shape<-1, -1, 3>>& vertices, const Faces& faces,
+                           const FaceIndex& face_index, const Rows3& local_means, const Rows4& local_quats,
+                           const Rows3& log_scales) {
+  const size_t count = face_index.shape(0);
+  if (local_means.shape(0) != count || local_quats.shape(0) != count || log_scales.shape(0) != count) {
+    throw std::invalid_argument("one row of every parameter a Gaussian");
+  }
+  check_range(faces.data(), faces.size(), vertices.shape(1), "a face names a vertex that does not exist");
+  check_range(face_index.data(), count, faces.shape(0), "a Gaussian names a face that does not exist");
+  return {vertices.data(),    static_cast<int64_t>(vertices.shape(1)),
+          faces.data(),       static_cast<int64_t>(faces.shape(0)),
+          face_index.data(),  static_cast<int64_t>(count),
+          local_means.data(), local_quats.data(),
+          log_scales.data()};
+}
+
+template <typename A>
+void check_batch(const A& array, size_t batch, size_t rows) {
+  if (array.shape(0) != batch || array.shape(1) != rows) throw std::invalid_argument("arrays of different rigs");
+}
+
+void rig_forward(const Array<const float, nb::shape<-1, -1, 3>>& vertices, const Faces& faces,
+                 const FaceIndex& face_index, const Rows3& local_means, const Rows4& local_quats,
+                 const Rows3& log_scales, const Array<float, Frames>& frames,
+                 const Array<float, nb::shape<-1, -1, 3>>& means, const Array<float, nb::shape<-1, -1, 4>>& quats,
+                 const Array<float, nb::shape<-1, -1, 3>>& scales) {
+  const nb::gil_scoped_release release;
+  mien::RigArrays rig = rig_arrays(vertices, faces, face_index, local_means, local_quats, log_scales);
+  const size_t batch = vertices.shape(0);
+  check_batch(frames, batch, rig.face_count);
+  check_batch(means, batch, rig.count);
+  check_batch(quats, batch, rig.count);
+  check_batch(scales, batch, rig.count);
+  for (size_t b = 0; b < batch; ++b) {
+    mien::rig_forward(
+        rig, reinterpret_cast<mien::TriangleFrame*>(frames.data()) + b * rig.face_count,
+        {means.data() + b * rig.count * 3, quats.data() + b * rig.count * 4, scales.data() + b * rig.count * 3});
+    rig.vertices += rig.vertex_count * 3;
+  }
+}
+
+void rig_backward(const Array<const float, nb::shape<-1, -1, 3>>& vertices, const Faces& faces,
+                  const FaceIndex& face_index, const Rows3& local_means, const Rows4& local_quats,
+                  const Rows3& log_scales, const Array<const float, Frames>& frames,
+                  const Array<const float, nb::shape<-1, -1, 3>>& scales,
+                  const Array<const float, nb::shape<-1, -1, 3>>& grad_means,
+                  const Array<const float, nb::shape<-1, -1, 4>>& grad_quats,
+                  const Array<const float, nb::shape<-1, -1, 3>>& grad_scales,
+                  const Array<float, nb::shape<-1, 3>>& grad_local_means,
+                  const Array<float, nb::shape<-1, 4>>& grad_local_quats,
+                  const Array<float, nb::shape<-1, 3>>& grad_log_scales,
+                  const std::optional<Array<float, nb::shape<-1, -1, 3>>>& grad_vertices) {
+  const nb::gil_scoped_release release;
+  mien::RigArrays rig = rig_arrays(vertices, faces, face_index, local_means, local_quats, log_scales);
+  const size_t batch = vertices.shape(0), count = face_index.shape(0);
+  check_batch(frames, batch, rig.face_count);
+  for (const auto& array : {scales, grad_means, grad_scales}) check_batch(array, batch, count);
+  check_batch(grad_quats, batch, count);
+  if (grad_vertices) check_batch(*grad_vertices, batch, rig.vertex_count);
+  if (grad_local_means.shape(0) != count || grad_local_quats.shape(0) != count || grad_log_scales.shape(0) != count) {
+    throw std::invalid_argument("one row of every gradient a Gaussian");
+  }
+  for (size_t b = 0; b < batch; ++b) {
+    const mien::RigGradients gradients{grad_means.data() + b * count * 3,
+                                       grad_quats.data() + b * count * 4,
+                                       grad_scales.data() + b * count * 3,
+                                       grad_local_means.data(),
+                                       grad_local_quats.data(),
+                                       grad_log_scales.data(),
+                                       grad_vertices ? grad_vertices->data() + b * rig.vertex_count * 3 : nullptr};
+    mien::rig_backward(rig, reinterpret_cast<const mien::TriangleFrame*>(frames.data()) + b * rig.face_count,
+                       scales.data() + b * count * 3, gradients);
+    rig.vertices += rig.vertex_count * 3;
+  }
+}
+
+}  // namespace
+
+void bind_rig(nb::module_& module) {
+  module.attr("TRIANGLE_FRAME_FLOATS") = mien::kTriangleFrameFloats;
+  module.def("rig_forward", &rig_forward, "vertices"_a.noconvert(), "faces"_a.noconvert(), "face_index"_a.noconvert(),
+             "local_means"_a.noconvert(), "local_quats"_a.noconvert(), "log_scales"_a.noconvert(),
+             "frames"_a.noconvert(), "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert());
+  module.def("rig_backward", &rig_backward, "vertices"_a.noconvert(), "faces"_a.noconvert(), "face_index"_a.noconvert(),
+             "local_means"_a.noconvert(), "local_quats"_a.noconvert(), "log_scales"_a.noconvert(),
+             "frames"_a.noconvert(), "scales"_a.noconvert(), "grad_means"_a.noconvert(), "grad_quats"_a.noconvert(),
+             "grad_scales"_a.noconvert(), "grad_local_means"_a.noconvert(), "grad_local_quats"_a.noconvert(),
+             "grad_log_scales"_a.noconvert(), "grad_vertices"_a.noconvert().none());
+}

@@ -1,0 +1,113 @@
+#include "rig.h"
+
+#include <algorithm>
+#include <string>
+#include <vector>
+
+#include "pool.h"
+#include "rasterize.h"
+#include "rig_kernels.h"
+
+namespace mien {
+
+#if defined(__x86_64__)
+namespace avx512 {
+extern const RigKernels rig_kernels;
+}
+namespace avx2 {
+extern const RigKernels rig_kernels;
+}
+namespace sse4 {
+extern const RigKernels rig_kernels;
+}
+#else
+namespace baseline {
+extern const RigKernels rig_kernels;
+}
+#endif
+
+namespace {
+
+constexpr int64_t kGrain = 2048;  // triangles or Gaussians that are worth a piece of the pool's work
+
+// Compiled for the same instruction set as the rasterizer's kernels.
+const RigKernels& kernels() {
+#if defined(__x86_64__)
+  const std::string isa = rasterize_isa();
+  return isa == "avx512" ? avx512::rig_kernels : isa == "avx2" ? avx2::rig_kernels : sse4::rig_kernels;
+#else
+  return baseline::rig_kernels;
+#endif
+}
+
+template <typename Body>
+void in_pieces(int64_t count, Body&& body) {
+  parallel_for((count + kGrain - 1) / kGrain,
+               [&](int64_t piece) { body(piece * kGrain, std::min((piece + 1) * kGrain, count)); });
+}
+
+struct Vec {
+  float x, y, z;
+};
+Vec operator+(Vec a, Vec b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+Vec operator*(float s, Vec a) { return {s * a.x, s * a.y, s * a.z}; }
+void add(float* to, Vec a) { to[0] += a.x, to[1] += a.y, to[2] += a.z; }
+
+// With e1 = v1 - v0 = L a0 and e2 = v2 - v0 = p a0 - h a2, a motion of the edges turns the frame by omega, where
+// omega . a0 = (a1 . de2 - p / L a1 . de1) / h,  omega . a1 = -(a2 . de1) / L,  omega . a2 = (a1 . de1) / L,
+// and changes the lengths by dL = a0 . de1, dh = p / L a2 . de1 - a2 . de2.
+void frame_to_vertices(const TriangleFrame& frame, const FrameGradient& gradient, const int64_t* face,
+                       float* vertices) {
+  const Vec third = (1.0f / 3) * Vec{gradient.T[0], gradient.T[1], gradient.T[2]};
+  Vec by_edge1{}, by_edge2{};
+  if (frame.edge_length > 0) {
+    const float* R = frame.R;
+    const Vec a0{R[0], R[3], R[6]}, a1{R[1], R[4], R[7]}, a2{R[2], R[5], R[8]};
+    const auto torque = [&](const Vec& axis) {
+      return gradient.torque[0] * axis.x + gradient.torque[1] * axis.y + gradient.torque[2] * axis.z;
+    };
+    const float slant = frame.along / frame.edge_length, half = 0.5f * gradient.k;
+    const float about_edge = torque(a0) / frame.height;
+    by_edge1 = (torque(a2) / frame.edge_length - about_edge * slant) * a1 + half * a0 +
+               (half * slant - torque(a1) / frame.edge_length) * a2;
+    by_edge2 = about_edge * a1 + -half * a2;
+  }
+  add(vertices + 3 * face[0], third + -1.0f * (by_edge1 + by_edge2));
+  add(vertices + 3 * face[1], third + by_edge1);
+  add(vertices + 3 * face[2], third + by_edge2);
+}
+
+}  // namespace
+
+void rig_forward(const RigArrays& rig, TriangleFrame* frames, const RigWorld& world) {
+  const RigKernels& kernel = kernels();
+  in_pieces(rig.face_count, [&](int64_t first, int64_t last) { kernel.frames(rig, first, last, frames); });
+  in_pieces(rig.count, [&](int64_t first, int64_t last) { kernel.to_world(rig, first, last, frames, world); });
+}
+
+void rig_backward(const RigArrays& rig, const TriangleFrame* frames, const float* scales,
+                  const RigGradients& gradients) {
+  // Kept between calls: fresh pages cost as much as the work.
+  thread_local std::vector<FrameGradient> per_gaussian, per_face;
+  per_gaussian.resize(rig.count);
+  FrameGradient* const shares = per_gaussian.data();
+  const RigKernels& kernel = kernels();
+  in_pieces(rig.count,
+            [&](int64_t first, int64_t last) { kernel.to_local(rig, first, last, frames, scales, gradients, shares); });
+  if (!gradients.vertices) return;
+  // In the order of Gaussians, then of triangles: the same sums for any number of threads.
+  per_face.assign(rig.face_count, FrameGradient{});
+  for (int64_t i = 0; i < rig.count; ++i) {
+    FrameGradient& sum = per_face[rig.face_index[i]];
+    for (int axis = 0; axis < 3; ++axis) {
+      sum.T[axis] += shares[i].T[axis];
+      sum.torque[axis] += shares[i].torque[axis];
+    }
+    sum.k += shares[i].k;
+  }
+  for (int64_t face = 0; face < rig.face_count; ++face) {
+    frame_to_vertices(frames[face], per_face[face], rig.faces + 3 * face, gradients.vertices);
+  }
+}
+
+}  // namespace mien

@@ -1,0 +1,57 @@
+// Gaussians that ride on triangles, from their triangle's frame to world space (GaussianAvatars, CVPR 2024), and back.
+#pragma once
+
+#include <cstdint>
+
+namespace mien {
+
+struct RigArrays {
+  const float* vertices;  // [v,3], metres
+  int64_t vertex_count;
+  const int64_t* faces;  // [f,3], each in 0..v-1 (the caller checks)
+  int64_t face_count;
+  const int64_t* face_index;  // [n], each in 0..f-1 (the caller checks)
+  int64_t count;              // n
+  const float* local_means;   // [n,3], in units of k
+  const float* local_quats;   // [n,4], wxyz, of any length
+  const float* log_scales;    // [n,3], in units of k
+};
+
+// world = k R local + T. R's columns: a0 along the first edge, a1 the normal, a2 = a0 x a1.
+struct TriangleFrame {
+  float R[9];  // row-major
+  float T[3];
+  float k;     // (edge_length + height) / 2
+  float q[4];  // R as a unit quaternion
+  float edge_length;
+  float height;
+  float along;  // a0 . (v2 - v0)
+  // A degenerate triangle, whose first edge or height is below 1e-7 m, has a fixed R, k = 1e-7 and all three 0.
+};
+constexpr int kTriangleFrameFloats = sizeof(TriangleFrame) / sizeof(float);
+
+struct RigWorld {
+  float* means;   // [n,3]
+  float* quats;   // [n,4], unit
+  float* scales;  // [n,3]
+};
+
+struct RigGradients {
+  const float* means;  // d loss / d RigWorld
+  const float* quats;
+  const float* scales;
+  // Added to, not overwritten.
+  float* local_means;
+  float* local_quats;
+  float* log_scales;
+  float* vertices;  // or null
+};
+
+// Fills frames [f] and the Gaussians in world space. Runs on the pool.
+void rig_forward(const RigArrays& rig, TriangleFrame* frames, const RigWorld& world);
+
+// From the frames and scales of the forward pass. The result does not depend on the number of threads.
+void rig_backward(const RigArrays& rig, const TriangleFrame* frames, const float* scales,
+                  const RigGradients& gradients);
+
+}  // namespace mien

@@ -1,0 +1,26 @@
+// What rig.cpp hands to its kernels, which are compiled once per instruction set.
+#pragma once
+
+#include "rig.h"
+
+namespace mien {
+
+// What a Gaussian passes to its triangle: d loss / d T, the torque d loss / d (small world rotation of R), d loss / d
+// k.
+struct FrameGradient {
+  float T[3];
+  float torque[3];
+  float k;
+  float unused;
+};
+
+struct RigKernels {
+  // Triangles, then Gaussians, first .. last - 1.
+  void (*frames)(const RigArrays&, int64_t first, int64_t last, TriangleFrame*);
+  void (*to_world)(const RigArrays&, int64_t first, int64_t last, const TriangleFrame*, const RigWorld&);
+  // Adds to the gradients of the Gaussians' own parameters; writes one FrameGradient a Gaussian.
+  void (*to_local)(const RigArrays&, int64_t first, int64_t last, const TriangleFrame*, const float* scales,
+                   const RigGradients&, FrameGradient*);
+};
+
+}  // namespace mien

@@ -1,0 +1,128 @@
+"""The fused L1 + SSIM loss against its plain PyTorch reference."""
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, interpolate
+
+from mien import _native
+from mien.training.photometric import Box, photometric_loss, photometric_loss_reference, ssim, ssim_map
+
+WHOLE_AND_PARTS = [
+    (64, 48, None),
+    (37, 53, (5, 7, 20, 11)),
+    (200, 101, (90, 150, 100, 100)),  # reaches beyond the picture
+    (40, 40, (-3, 8, 10, 20)),
+    (40, 64, (60, 39, 1, 1)),
+    (120, 6, None),
+    (3, 300, None),
+    (5, 3, None),  # too narrow for the native path
+]
+
+
+def smooth_picture(height: int, width: int, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.rand(1, 3, height // 8 + 2, width // 8 + 2, generator=generator)
+    return interpolate(coarse, (height, width), mode="bilinear")[0].permute(1, 2, 0).contiguous()
+
+
+def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """A noisy picture and another one; both have a white part, where SSIM's variances vanish."""
+    noise = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(2))
+    image, target = smooth_picture(height, width, 0) + 0.05 * noise, smooth_picture(height, width, 1)
+    image[: height // 3], target[: height // 3] = 1, 1
+    return image, target
+
+
+def exact(image: Tensor, target: Tensor, weights: tuple[float, float], box: Box | None) -> tuple[Tensor, Tensor]:
+    """Value and gradient in float64."""
+    image = image.double().requires_grad_()
+    loss = photometric_loss_reference(image, target.double(), *weights, box)
+    return loss.detach(), torch.autograd.grad(loss, image)[0]
+
+
+def relative_error(value: Tensor, expected: Tensor) -> float:
+    return float((value.double() - expected).norm() / expected.norm().clamp_min(1e-12))
+
+
+@pytest.mark.parametrize(("height", "width", "box"), WHOLE_AND_PARTS)
+@pytest.mark.parametrize("weights", [(0.8, 0.2), (1.0, 0.0), (0.0, 1.0)])
+def test_value_and_gradient_equal_the_float64_reference(
+    height: int, width: int, box: Box | None, weights: tuple[float, float]
+):
+    image, target = pair(height, width)
+    value, gradient = exact(image, target, weights, box)
+    image.requires_grad_()
+    loss = photometric_loss(image, target, *weights, box)
+    (3 * loss).backward()
+    assert image.grad is not None
+    torch.testing.assert_close(loss.detach().double(), value, atol=1e-6, rtol=1e-6)
+    # In the white part float32 leaves about 1e-4 of the variances' floor C2; PyTorch's own float32 does no better.
+    assert relative_error(image.grad, 3 * gradient) < 5e-5
+    with torch.no_grad():
+        assert photometric_loss(image, target, *weights, box) == loss
+
+
+def test_bytes_count_as_0_to_255():
+    image, target = pair(50, 70)
+    target_bytes = (target * 255).round().to(torch.uint8)
+    torch.testing.assert_close(
+        photometric_loss(image, target_bytes, box=(10, 5, 30, 40)),
+        photometric_loss(image, target_bytes / 255, box=(10, 5, 30, 40)),
+    )
+    value, _ = exact(image, target_bytes / 255, (0.8, 0.2), None)
+    torch.testing.assert_close(photometric_loss_reference(image, target_bytes).double(), value, atol=1e-6, rtol=1e-6)
+
+
+def test_a_box_around_all_differences_changes_nothing():
+    _, target = pair(60, 80)
+    image = target.clone()
+    image[25:35, 30:50] += 0.1 * torch.randn(10, 20, 3, generator=torch.Generator().manual_seed(3))
+    image.requires_grad_()
+    box = (25, 20, 30, 20)  # 5 pixels of margin
+    whole, part = photometric_loss(image, target), photometric_loss(image, target, box=box)
+    torch.testing.assert_close(whole, part, atol=1e-7, rtol=1e-6)
+    differences = torch.autograd.grad(whole, image)[0] - torch.autograd.grad(part, image)[0]
+    assert differences.abs().max() < 1e-7
+
+
+def test_equal_pictures_lose_nothing():
+    image, _ = pair(40, 40)
+    assert ssim(image, image) == 1
+    assert abs(float(photometric_loss(image, image))) < 1e-6
+    assert photometric_loss(image, image, box=(50, 50, 10, 10)) == 0  # a box outside the picture
+
+
+def test_ssim_follows_its_formula():
+    """One pixel by hand: a 2D window in one piece, statistics about the means."""
+    image, target = (picture.double() for picture in pair(30, 30))
+    distances = torch.arange(11).double() - 5
+    window = (-(distances[:, None] ** 2 + distances**2) / 4.5).exp()
+    window /= window.sum()
+    x, y = image[12:23, 9:20, 1], target[12:23, 9:20, 1]
+    mean_x, mean_y = (window * x).sum(), (window * y).sum()
+    variance_x, variance_y = (window * (x - mean_x) ** 2).sum(), (window * (y - mean_y) ** 2).sum()
+    covariance = (window * (x - mean_x) * (y - mean_y)).sum()
+    expected = (2 * mean_x * mean_y + 1e-4) * (2 * covariance + 9e-4)
+    expected /= (mean_x**2 + mean_y**2 + 1e-4) * (variance_x + variance_y + 9e-4)
+    torch.testing.assert_close(ssim_map(image, target)[17, 14, 1], expected)
+    # Zeros beyond the border.
+    mean_at_corner = conv2d(image[None, None, :, :, 0], window[None, None], padding=5)[0, 0, 0, 0]
+    black = torch.zeros_like(image)
+    assert ssim_map(image, black)[0, 0, 0] < 1e-4 / (mean_at_corner**2 + 1e-4)
+
+
+def test_threads_do_not_change_a_bit():
+    image, target = pair(150, 90)
+    image.requires_grad_()
+    results = []
+    try:
+        for threads in (1, 2, 3):
+            _native.set_thread_count(threads)
+            loss = photometric_loss(image, target)
+            results.append((loss, torch.autograd.grad(loss, image)[0]))
+    finally:
+        _native.set_thread_count(0)
+    for loss, gradient in results[1:]:
+        assert torch.equal(loss, results[0][0])
+        assert torch.equal(gradient, results[0][1])
