@@ -174,7 +174,8 @@ def _how_to_read(protocols: Mapping[str, Any]) -> str:
 
 
 def _settings(run: RunRecord) -> str:
-    text = json.dumps(dict(run.config), indent=1)
+    shown = {**run.config, "command_line": _shortened(run.config["command_line"])}
+    text = json.dumps(shown, indent=1)
     memory = run.summary["peak_memory_mb"]
     return (
         f'<h2>Settings</h2><p class="note">Peak memory {memory:,.0f} MB.</p>'

@@ -22,9 +22,8 @@ _OVERLAYS = 6
 def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
     """Truth, render and error of the best, the median and the worst held-out frame, and of some between."""
     ranked = evaluation.ranked()
-    places = np.unique(np.linspace(0, len(ranked) - 1, min(_ROWS, len(ranked))).round().astype(int))[::-1]
     middle = len(ranked) // 2
-    places = sorted({*places.tolist(), middle} - _nearest_to(places, middle), reverse=True)
+    places = _places(len(ranked), middle)
     names = {len(ranked) - 1: "best", middle: "median", 0: "worst"}
     rows = [_comparison_row(experiment, evaluation, ranked[place], names.get(place, "")) for place in places]
     stops = ", ".join(f"rgb{stop}" for stop in HEAT_STOPS)
@@ -36,10 +35,13 @@ def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
     return labels + "".join(rows)
 
 
-def _nearest_to(places: np.ndarray, middle: int) -> set[int]:
-    """The inner place that the median frame takes over, so that the number of rows stays."""
-    inner = [int(place) for place in places[1:-1]]
-    return {min(inner, key=lambda place: abs(place - middle))} if inner else set()
+def _places(count: int, middle: int) -> list[int]:
+    """Evenly spread ranks from the last to the first; the inner one nearest to the median becomes the median."""
+    places = sorted(set(np.linspace(0, count - 1, min(_ROWS, count)).round().astype(int).tolist()))
+    if len(places) > 2:
+        nearest = min(range(1, len(places) - 1), key=lambda index: abs(places[index] - middle))
+        places[nearest] = middle
+    return places[::-1]
 
 
 def _comparison_row(experiment: Experiment, evaluation: Evaluation, index: int, name: str) -> str:

@@ -1,0 +1,94 @@
+"""From a run's folder to metrics.json and report.html, through the files that the stages before write."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from evaluation_case import make_experiment
+from mien.avatar import GaussianAvatarsConfig
+from mien.capture import write_capture
+from mien.errors import UserError
+from mien.evaluation import EvaluationSettings, evaluate, read_metrics
+from mien.evaluation.load import load_experiments
+from mien.evaluation.protocols import METRICS
+from mien.storage import read_tensors, write_tensors
+from mien.tracking import write_scoring, write_tracking
+from mien.training import TrainSettings, read_sequence, train
+
+STEPS = 30
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A sequence and a run that was trained on it for a few steps."""
+    root = tmp_path_factory.mktemp("workspace")
+    folder, run_dir = root / "sequences" / "clip", root / "runs" / "first"
+    experiment = make_experiment()
+    sequence = experiment.sequences[0]
+    write_capture(folder / "capture", sequence.capture)
+    write_tracking(folder / "tracking", sequence.tracking)
+    write_scoring(folder / "scoring", experiment.scorings[0])
+    settings = TrainSettings(steps=STEPS, record_every=1, checkpoint_every=STEPS)
+    train([read_sequence(folder)], experiment.avatar.face_model, GaussianAvatarsConfig(), settings, run_dir)
+    return folder, run_dir
+
+
+def test_evaluate_writes_metrics_and_report(workspace: tuple[Path, Path]) -> None:
+    folder, run_dir = workspace
+    returned = evaluate(run_dir, [folder])
+    stored = json.loads((run_dir / "metrics.json").read_text())
+    assert (stored["format"], stored["version"]) == ("mien.metrics", 1)
+    assert read_metrics(run_dir) == json.loads(json.dumps(returned))
+    entry = stored["protocols"]["self_reenactment"]
+    assert set(METRICS) <= set(entry)
+    assert set(entry["head"]) == set(METRICS)
+    assert set(entry["baselines"]) == {"mean_frame", "mesh"}
+    assert (entry["split"], entry["frames"], entry["face_params"]) == ("blocks", 10, "as_tracked")
+    wanted = {"steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"}
+    assert wanted <= set(stored["training"])
+    assert stored["training"]["steps"] == STEPS
+    page = (run_dir / "report.html").read_text()
+    assert page.count("<img") == 28
+    assert f"{entry['psnr']:.2f} dB" in page
+
+
+def test_held_out_frames_are_those_training_left_out(workspace: tuple[Path, Path]) -> None:
+    experiment = load_experiments(workspace[1], [workspace[0]])["self_reenactment"]
+    assert [frame.timestep for frame in experiment.held_out_frames] == list(range(40, 50))
+    assert [frame.timestep for frame in experiment.training_frames] == list(range(40))
+
+
+def test_refined_held_out_frames_are_said_to_be_so(workspace: tuple[Path, Path]) -> None:
+    folder, run_dir = workspace
+    path = run_dir / "face_track.safetensors"
+    before = read_tensors(path)
+    try:
+        for timestep, wanted in ((3, "as_tracked"), (45, "refined")):
+            changed = {name: tensor.clone() for name, tensor in before.items()}
+            changed["expression"][timestep] += 0.1
+            write_tensors(path, changed)
+            experiment = load_experiments(run_dir, [folder])["self_reenactment"]
+            assert experiment.face_source == wanted
+            torch.testing.assert_close(experiment.faces[0].expression, changed["expression"])
+    finally:
+        write_tensors(path, before)
+
+
+def test_wrong_sequences_and_unfinished_runs(workspace: tuple[Path, Path], tmp_path: Path) -> None:
+    folder, run_dir = workspace
+    with pytest.raises(UserError, match="was trained on clip"):
+        evaluate(run_dir, [folder.with_name("other")])
+    with pytest.raises(UserError, match="missing"):
+        evaluate(tmp_path, [folder])
+    with pytest.raises(UserError, match="missing"):
+        read_metrics(tmp_path)
+
+
+def test_without_perceptual_metric_and_baselines(workspace: tuple[Path, Path]) -> None:
+    folder, run_dir = workspace
+    entry = evaluate(run_dir, [folder], EvaluationSettings(perceptual=False, baselines=False))["protocols"]
+    assert entry["self_reenactment"]["perceptual"] is None
+    assert entry["self_reenactment"]["baselines"] == {}
+    assert "Not scored in this evaluation" in (run_dir / "report.html").read_text()
