@@ -1,7 +1,9 @@
 """The face model fitted to a capture: tracking, its files, the neck line and the frozen scoring mask."""
 
 from mien.tracking.files import read_tracking, write_tracking
+from mien.tracking.overlay import draw_overlay, write_overlay
 from mien.tracking.pipeline import track
+from mien.tracking.report import residual_report, write_residual_report
 from mien.tracking.scoring import Scoring, make_scoring
 from mien.tracking.scoring_files import read_scoring, scoring_exists, write_scoring
 from mien.tracking.settings import SmoothnessSettings, TrackingSettings
@@ -12,11 +14,15 @@ __all__ = [
     "SmoothnessSettings",
     "Tracking",
     "TrackingSettings",
+    "draw_overlay",
     "make_scoring",
     "read_scoring",
     "read_tracking",
+    "residual_report",
     "scoring_exists",
     "track",
+    "write_overlay",
+    "write_residual_report",
     "write_scoring",
     "write_tracking",
 ]

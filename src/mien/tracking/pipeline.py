@@ -63,9 +63,9 @@ def track(capture: Capture, face_model: FaceModel, settings: TrackingSettings = 
 
 def initial_camera(capture: Capture, settings: TrackingSettings) -> Camera:
     """The camera of the captured pictures, float64, with a given or assumed focal length."""
-    focal = settings.focal or _DEFAULT_FOCAL * _source_side(capture)
+    focal_x, focal_y = _source_focal(capture) if settings.focal is None else (settings.focal, settings.focal)
     x, y = (float(value) for value in capture.principal_point[0])
-    K = torch.tensor([[focal, 0, x], [0, focal, y], [0, 0, 1]], dtype=torch.float64)
+    K = torch.tensor([[focal_x, 0, x], [0, focal_y, y], [0, 0, 1]], dtype=torch.float64)
     viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     return Camera(K, viewmat, capture.width, capture.height)
 
@@ -138,11 +138,14 @@ def _check(capture: Capture, face_model: FaceModel) -> None:
         )
 
 
-def _source_side(capture: Capture) -> float:
-    """The larger side of the source picture, in pixels of the captured pictures."""
-    return float(max(capture.width, capture.height))
+def _source_focal(capture: Capture) -> tuple[float, float]:
+    """The assumed focal lengths along x and y in pixels of the capture: it may be a shrunk crop of what was filmed."""
+    crop = capture.source.get("crop", {"width": capture.width, "height": capture.height})
+    side = max(capture.source.get("picture_size", (crop["width"], crop["height"])))
+    assumed = _DEFAULT_FOCAL * float(side)
+    return assumed * capture.width / crop["width"], assumed * capture.height / crop["height"]
 
 
-def _jsonable(value: object) -> dict:
-    """Settings as json holds them: infinities become strings."""
-    return json.loads(json.dumps(value, allow_nan=False, default=str))
+def _jsonable(settings: dict) -> dict:
+    """Settings as json holds them: it has no infinity."""
+    return json.loads(json.dumps(settings).replace("Infinity", '"inf"'))

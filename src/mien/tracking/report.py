@@ -1,0 +1,161 @@
+"""The residual report: figures and a plot that tell whether a tracking can be trusted."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.capture.capture import Capture
+from mien.face import FaceModel
+from mien.rotation import matrix_from_axis_angle
+from mien.storage import write_atomically, write_json
+from mien.tracking.landmark_groups import (
+    BROWS,
+    LEFT_EYELIDS,
+    LEFT_IRIS,
+    LIPS,
+    NOSE,
+    OVAL,
+    RIGHT_EYELIDS,
+    RIGHT_IRIS,
+)
+from mien.tracking.tracking import Tracking
+
+_FORMAT, _VERSION = "mien.residual_report", 1
+_GROUPS = {
+    "oval": OVAL, "brows": BROWS, "nose": NOSE, "lips": LIPS, "eyelids": LEFT_EYELIDS + RIGHT_EYELIDS,
+    "irises": LEFT_IRIS + RIGHT_IRIS,
+}  # fmt: skip
+_NEAR_FRONTAL = 0.26
+"""Radians of yaw: 15 degrees."""
+_MOVED = 0.03
+"""Standard deviation from which a coefficient counts as used."""
+_CHUNK = 32
+
+
+def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel) -> dict:
+    """Figures about a tracking with one camera: residuals, jitter, constancy of the iris distance, leaks of pose.
+
+    `mesh_distance_px` is from landmarks to the mesh itself; `residual` allows every landmark its static offset.
+    `iris_distance` is the distance of the detected irises in metres at the tracked depth, which should be constant.
+    """
+    valid = tracking.valid
+    marks = _landmarks(face_model, tracking)
+    pixels, depth = tracking.cameras[0].project(marks)
+    detected = torch.from_numpy(np.asarray(capture.landmarks[:, 0], dtype=np.float32))
+    distance = (pixels - detected).norm(dim=-1)[valid]
+    residuals = tracking.residuals[:, 0]
+    iris = iris_distances(tracking, detected, depth)
+    return {
+        "frames": len(valid),
+        "frames_without_face": (~valid).nonzero()[:, 0].tolist(),
+        "flagged_frames": flagged_frames(residuals).nonzero()[:, 0].tolist(),
+        "residual_px": _summary(residuals[valid]),
+        "mesh_distance_px": {name: float(distance[:, list(group)].median()) for name, group in _GROUPS.items()},
+        "jitter": {
+            "detected_px": _jitter(detected, valid),
+            "fitted_px": _jitter(pixels, valid),
+            "fitted_m": _jitter(marks, valid),
+        },
+        "iris_distance": _constancy(iris[valid & (_yaw(tracking).abs() < _NEAR_FRONTAL)]),
+        "focal_px": float(tracking.cameras[0].K[0, 0]),
+        "depth_m": _summary(-tracking.face.head_translation[valid, 2]),
+        "correlation_with_pitch": _correlations(tracking, face_model, tracking.face.head_rotation[:, 0]),
+        "correlation_with_yaw": _correlations(tracking, face_model, tracking.face.head_rotation[:, 1]),
+    }
+
+
+def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
+    """Write residuals.json and residuals.png into `folder`."""
+    report = residual_report(capture, tracking, face_model)
+    write_json(folder / "residuals.json", _FORMAT, _VERSION, report)
+    write_atomically(folder / "residuals.png", lambda path: _plot(path, capture, tracking, face_model, report))
+
+
+def iris_distances(
+    tracking: Tracking, detected: Float[Tensor, "t l 2"], depth: Float[Tensor, "t l"]
+) -> Float[Tensor, " t"]:
+    """Distance of the detected iris centres, metres at the tracked depth; foreshortening by head turns is undone."""
+    right, left = RIGHT_IRIS[0], LEFT_IRIS[0]
+    apart = (detected[:, left] - detected[:, right]).norm(dim=-1)
+    focal = tracking.cameras[0].K[0, 0]
+    across = matrix_from_axis_angle(tracking.face.head_rotation)[:, :2, 0].norm(dim=-1)
+    return apart * (depth[:, left] + depth[:, right]) / 2 / focal / across
+
+
+def flagged_frames(residuals: Float[Tensor, " t"]) -> Bool[Tensor, " t"]:
+    """Frames whose residual stands out: above median + 4 robust standard deviations; missing frames are not flagged."""
+    known = residuals[residuals.isfinite()]
+    if len(known) == 0:
+        return torch.zeros_like(residuals, dtype=torch.bool)
+    median = known.median()
+    spread = 1.4826 * (known - median).abs().median()
+    return residuals > median + 4 * spread + 0.1
+
+
+def _landmarks(face_model: FaceModel, tracking: Tracking) -> Float[Tensor, "t l 3"]:
+    with torch.no_grad():
+        parts = [tracking.face[start : start + _CHUNK] for start in range(0, len(tracking.face), _CHUNK)]
+        return torch.cat([face_model.landmark_positions(face_model(part), "mediapipe") for part in parts])
+
+
+def _yaw(tracking: Tracking) -> Float[Tensor, " t"]:
+    return tracking.face.head_rotation[:, 1]
+
+
+def _jitter(points: Float[Tensor, "t l d"], valid: Bool[Tensor, " t"]) -> float | None:
+    """Median size of second differences over time, inside the face (the oval's points slide)."""
+    inner = [index for index in range(points.shape[1]) if index not in OVAL]
+    second = (points[2:] - 2 * points[1:-1] + points[:-2])[:, inner].norm(dim=-1)
+    known = second[valid[2:] & valid[1:-1] & valid[:-2]]
+    return float(known.median()) if known.numel() else None
+
+
+def _constancy(distances: Float[Tensor, " n"]) -> dict[str, float | None]:
+    if len(distances) < 2:
+        return {"mean_m": None, "deviation_percent": None}
+    return {"mean_m": float(distances.mean()), "deviation_percent": float(100 * distances.std() / distances.mean())}
+
+
+def _correlations(tracking: Tracking, face_model: FaceModel, angle: Float[Tensor, " t"]) -> dict[str, float]:
+    """Pearson's r of every expression coefficient in use with an angle."""
+    expression, angle = tracking.face.expression[tracking.valid], angle[tracking.valid]
+    moved = (expression.std(0) > _MOVED).nonzero()[:, 0].tolist()
+    return {face_model.expression_names[i]: float(torch.corrcoef(torch.stack([expression[:, i], angle]))[0, 1])
+            for i in moved}  # fmt: skip
+
+
+def _summary(values: Float[Tensor, " n"]) -> dict[str, float]:
+    values = values.double()
+    return {"median": float(values.median()), "p95": float(values.quantile(0.95)), "max": float(values.max())}
+
+
+def _plot(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict) -> None:
+    from matplotlib.figure import Figure  # slow to import, and only needed here
+
+    time = np.asarray(capture.timestamps)
+    detected = torch.from_numpy(np.asarray(capture.landmarks[:, 0], dtype=np.float32))
+    depth = tracking.cameras[0].project(_landmarks(face_model, tracking))[1]
+    iris = iris_distances(tracking, detected, depth)
+    figure = Figure(figsize=(9, 9), layout="constrained")
+    axes = figure.subplots(4, 1, sharex=True)
+    axes[0].plot(time, tracking.residuals[:, 0].numpy(), label="median residual")
+    flagged = report["flagged_frames"]
+    axes[0].plot(time[flagged], tracking.residuals[flagged, 0].numpy(), "rx", label="flagged")
+    axes[0].set_ylabel("residual, px")
+    axes[0].legend(loc="upper right")
+    axes[1].plot(time, tracking.face.head_rotation.rad2deg().numpy(), label=["pitch", "yaw", "roll"])
+    axes[1].set_ylabel("head rotation, degrees")
+    axes[1].legend(loc="upper right")
+    axes[2].plot(time, -tracking.face.head_translation[:, 2].numpy())
+    axes[2].set_ylabel("depth, m")
+    axes[3].plot(time, 1e3 * iris.numpy())
+    axes[3].set_ylabel("iris distance, mm")
+    axes[3].set_xlabel("time, s")
+    for axis in axes:
+        for missing in report["frames_without_face"]:
+            axis.axvspan(time[missing], time[min(missing + 1, len(time) - 1)], color="0.85")
+    figure.suptitle(f"{capture.name}: landmarks against the tracked {tracking.face_model} head")
+    figure.savefig(path, dpi=100)
