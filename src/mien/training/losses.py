@@ -6,7 +6,7 @@ from torch import Tensor
 
 from mien.avatar import Photometric
 from mien.render.rendering import Rendering
-from mien.training.photometric import photometric_loss_reference as photometric_loss
+from mien.training.photometric import photometric_loss
 
 
 def picture_losses(
