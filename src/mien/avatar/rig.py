@@ -92,7 +92,7 @@ class _BindToWorld(torch.autograd.Function):
         batch, count = len(vertices), len(gaussians[0])
         frames = torch.empty(batch, len(faces), _native.TRIANGLE_FRAME_FLOATS)
         means, quats, scales = (torch.empty(batch, count, width) for width in (3, 4, 3))
-        _native.rig_forward(*inputs, frames, means, quats, scales)
+        _native.rig_forward(*inputs, frames=frames, means=means, quats=quats, scales=scales)
         ctx.save_for_backward(*inputs, frames, scales)
         return means, quats, scales
 
@@ -102,8 +102,9 @@ class _BindToWorld(torch.autograd.Function):
         vertices, _, _, *local = inputs
         local_gradients = [torch.zeros_like(tensor) for tensor in local]
         vertex_gradient = torch.zeros_like(vertices) if ctx.needs_input_grad[0] else None
-        world_gradients = tuple(gradient.contiguous() for gradient in world_gradients)
-        _native.rig_backward(*inputs, frames, scales, *world_gradients, *local_gradients, vertex_gradient)
+        world = [gradient.contiguous() for gradient in world_gradients]
+        arguments = (*inputs, frames, scales, *world, *local_gradients)
+        _native.rig_backward(*arguments, grad_vertices=vertex_gradient)
         return vertex_gradient, None, None, *local_gradients
 
 
