@@ -45,7 +45,7 @@ class Anatomy:
     @cached_property
     def skin(self) -> Bool[np.ndarray, " f"]:
         """Triangles of the outer skin, lips and lids included."""
-        return ~self.region("eyes", "teeth", "tongue", "mouth")
+        return ~self.region("eyes", "irises", "eye_sockets", "teeth", "tongue", "mouth")
 
     def region(self, *names: str) -> Bool[np.ndarray, " f"]:
         """Triangles of the named regions."""
@@ -53,7 +53,7 @@ class Anatomy:
 
     def eye_vertices(self, side: str) -> Int[np.ndarray, " e"]:
         """Vertices of one eyeball."""
-        members = np.unique(self.faces[self.region("eyes")])
+        members = np.unique(self.faces[self.region("eyes", "irises")])
         return members[(self.vertices[members, 0] > 0) == (side == "left")]
 
     def curve(self, indices: tuple[int, ...], points: int) -> Float[np.ndarray, "p 3"]:
@@ -143,7 +143,7 @@ def _cells(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class FrontView:
     """A parallel view of the face from the front, to paint on and to find skin points by (x, y)."""
 
-    def __init__(self, left: float, bottom: float, width: float, height: float, texels_per_metre: float = 8000) -> None:
+    def __init__(self, left: float, bottom: float, width: float, height: float, texels_per_metre: float = 5000) -> None:
         self._origin = np.array([left, bottom], np.float32)
         self._scale = texels_per_metre
         self.shape = (round(height * texels_per_metre), round(width * texels_per_metre))

@@ -67,11 +67,11 @@ def studio_lighting(seed: int) -> Lighting:
     key = np.array([1 + warm, 1.0, 1 - 1.4 * warm])
     return Lighting(
         lamps=(
-            Lamp(_unit(0.75 * side, 0.62, 0.85), (0.88 * key).astype(np.float32), 9.0),
-            Lamp(_unit(-0.8 * side, 0.15, 0.75), np.array([0.15, 0.16, 0.18], np.float32), 4.0),
-            Lamp(_unit(-0.7 * side, 0.5, -0.75), np.array([0.30, 0.32, 0.36], np.float32), 8.0),
+            Lamp(_unit(0.75 * side, 0.62, 0.85), (1.2 * key).astype(np.float32), 9.0),
+            Lamp(_unit(-0.8 * side, 0.15, 0.75), np.array([0.10, 0.11, 0.125], np.float32), 4.0),
+            Lamp(_unit(-0.7 * side, 0.5, -0.75), np.array([0.40, 0.43, 0.48], np.float32), 8.0),
         ),
-        ambient=np.array([0.20, 0.20, 0.21], np.float32),
+        ambient=np.array([0.155, 0.16, 0.17], np.float32),
     )
 
 

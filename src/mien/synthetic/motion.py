@@ -16,9 +16,9 @@ Tracks = dict[str, np.ndarray]
 
 _VISEMES: dict[str, Mapping[str, float]] = {
     "rest": {},
-    "a": {"jawOpen": 0.42, "mouthLowerDown": 0.25, "mouthUpperUp": 0.1},
-    "e": {"jawOpen": 0.2, "mouthStretch": 0.35, "mouthSmile": 0.15, "mouthLowerDown": 0.25, "mouthUpperUp": 0.12},
-    "i": {"jawOpen": 0.1, "mouthSmile": 0.3, "mouthStretch": 0.3, "mouthLowerDown": 0.25, "mouthUpperUp": 0.15},
+    "a": {"jawOpen": 0.4, "mouthLowerDown": 0.3, "mouthUpperUp": 0.3},
+    "e": {"jawOpen": 0.2, "mouthStretch": 0.35, "mouthSmile": 0.15, "mouthLowerDown": 0.3, "mouthUpperUp": 0.3},
+    "i": {"jawOpen": 0.1, "mouthSmile": 0.3, "mouthStretch": 0.3, "mouthLowerDown": 0.3, "mouthUpperUp": 0.35},
     "o": {"jawOpen": 0.3, "mouthFunnel": 0.5},
     "u": {"jawOpen": 0.12, "mouthPucker": 0.55, "mouthFunnel": 0.2},
     "m": {"mouthClose": 0.03, "mouthPress": 0.35, "mouthRollLower": 0.15, "mouthRollUpper": 0.15},
@@ -26,7 +26,14 @@ _VISEMES: dict[str, Mapping[str, float]] = {
     "s": {"jawOpen": 0.06, "mouthStretch": 0.2, "mouthLowerDown": 0.25, "mouthUpperUp": 0.1},
 }
 _GESTURES: dict[str, Mapping[str, float]] = {
-    "smile": {"mouthSmile": 0.7, "cheekSquint": 0.45, "eyeSquint": 0.3, "mouthUpperUp": 0.15, "mouthDimple": 0.2},
+    "smile": {
+        "mouthSmile": 0.7,
+        "cheekSquint": 0.45,
+        "eyeSquint": 0.3,
+        "mouthUpperUp": 0.3,
+        "mouthLowerDown": 0.1,
+        "mouthDimple": 0.2,
+    },
     "raise": {"browInnerUp": 0.7, "browOuterUp": 0.7, "eyeWide": 0.3},
     "frown": {"browDown": 0.7, "eyeSquint": 0.25, "mouthFrown": 0.2},
     "worry": {"browInnerUp": 0.75, "mouthFrown": 0.35},

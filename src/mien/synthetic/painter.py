@@ -90,10 +90,11 @@ class _Canvas:
     def views(self, pixels: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Unit directions from the surface towards the camera."""
         K, R = self.camera.K.numpy(), self.camera.viewmat[:3, :3].numpy()
-        x = (pixels % self.camera.width + 0.5 - K[0, 2]) / K[0, 0]
-        y = (pixels // self.camera.width + 0.5 - K[1, 2]) / K[1, 1]
-        rays = np.stack([x, y, np.ones_like(x)], -1).astype(np.float32) @ R
-        return -unit(rays)
+        small = pixels.astype(np.int32)
+        row = small // np.int32(self.camera.width)
+        x = ((small - row * np.int32(self.camera.width)).astype(np.float32) + (0.5 - K[0, 2])) / -K[0, 0]
+        y = (row.astype(np.float32) + (0.5 - K[1, 2])) / -K[1, 1]
+        return unit(np.stack([x * R[0, i] + y * R[1, i] - R[2, i] for i in range(3)], -1))
 
 
 def _model_faces(canvas: _Canvas) -> np.ndarray:
@@ -142,8 +143,8 @@ def _paint_mouth(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
     values = canvas.interpolate(rows, attributes, _model_faces(canvas))
     normals, points, rest = unit(values[:, :3]), values[:, 3:6], values[:, 6:]
     lips = posed.landmarks[list(LIPS_OUTER)]
-    lips = lips[np.argsort(lips[:, 0])]
-    depth = np.interp(points[:, 0], lips[:, 0], lips[:, 2]).astype(np.float32) - points[:, 2]
+    bend = np.polyfit(lips[:, 0], lips[:, 2], 2)
+    depth = np.polyval(bend, points[:, 0]).astype(np.float32) - points[:, 2]
     views = canvas.views(canvas.pixels[rows])
     normals = np.where((normals * views).sum(-1, keepdims=True) < 0, -normals, normals)
     if canvas.material[rows[0]] == TEETH:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 
 from mien.render.mesh import sample_texture, sh_basis
-from mien.synthetic.hair import Strands, unit
+from mien.synthetic.hair import Strands, dot, unit
 from mien.synthetic.light import Lighting
 from mien.synthetic.noise import smoothstep
 
@@ -16,35 +16,56 @@ from mien.synthetic.noise import smoothstep
 class LocalLight:
     """A scene's light as the turned head sees it."""
 
-    sh_light: Float[np.ndarray, "9 3"]
-    """In world axes."""
-    R_world_head: Float[np.ndarray, "3 3"]
+    quadratic: Float[np.ndarray, "10 3"]
+    """Irradiance as a polynomial of the normal: factors of xx, yy, zz, xy, yz, xz, x, y, z, 1."""
     lamps: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Direction (head frame) and colour of each."""
 
     def irradiance(self, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """What a white surface returns."""
-        basis = sh_basis(torch.from_numpy(normals @ self.R_world_head.T)).numpy()
-        return np.maximum(basis @ self.sh_light, 0)
+        x, y, z = np.ascontiguousarray(normals.T)
+        out = np.empty((len(x), 3), np.float32)
+        for channel, (xx, yy, zz, xy, yz, xz, fx, fy, fz, one) in enumerate(self.quadratic.T):
+            total = x * (xx * x + xy * y + xz * z + fx)
+            total += y * (yy * y + yz * z + fy)
+            total += z * (zz * z + fz)
+            total += one
+            np.maximum(total, 0, out=out[:, channel])
+        return out
 
 
 def turned(lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> LocalLight:
     """The light for one head pose."""
-    lamps = tuple((R_world_head.T @ lamp.direction, lamp.color) for lamp in lighting.lamps)
-    return LocalLight(lighting.sh_light, R_world_head, lamps)
+    # Nine directions and more decide the ten factors, up to xx + yy + zz = 1, which least squares shares out.
+    directions = unit(np.random.default_rng(0).standard_normal((40, 3)))
+    world = torch.from_numpy((directions @ R_world_head.T).astype(np.float32))
+    values = sh_basis(world).numpy() @ lighting.sh_light
+    x, y, z = directions.T
+    monomials = np.stack([x * x, y * y, z * z, x * y, y * z, x * z, x, y, z, np.ones_like(x)], -1)
+    quadratic = np.linalg.lstsq(monomials, values.astype(np.float64), rcond=None)[0].astype(np.float32)
+    lamps = tuple(((R_world_head.T @ lamp.direction).astype(np.float32), lamp.color) for lamp in lighting.lamps)
+    return LocalLight(quadratic, lamps)
 
 
 def highlight(
-    normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], light: LocalLight, sharpness: float
+    normals: Float[np.ndarray, "n 3"],
+    views: Float[np.ndarray, "n 3"],
+    light: LocalLight,
+    lobes: tuple[tuple[float, float], ...],
 ) -> Float[np.ndarray, "n 3"]:
-    """Mirror-like part of the lamps' light, normalised so that a sharper one is brighter and smaller."""
+    """Mirror-like part of the lamps' light.
+
+    Each lobe has a weight and a sharpness; it is normalised so that a sharper one is brighter and smaller.
+    """
     total = np.zeros_like(normals)
     for direction, color in light.lamps:
-        half = unit(views + direction.astype(np.float32))
-        facing = np.clip(normals @ direction.astype(np.float32), 0, 1) > 0
-        fresnel = 0.028 + 0.97 * (1 - np.clip((views * half).sum(-1), 0, 1)) ** 5
-        strength = fresnel * np.exp(sharpness * ((normals * half).sum(-1) - 1)) * facing
-        total += (0.125 * sharpness * strength)[:, None] * color
+        half = unit(views + direction)
+        fresnel = 0.028 + 0.97 * (1 - np.clip(dot(views, half), 0, 1)) ** 5
+        away = dot(normals, half) - 1
+        strength = sum((0.125 * weight * sharpness) * np.exp(sharpness * away) for weight, sharpness in lobes)
+        strength = strength * fresnel * (normals @ direction > 0)
+        for channel in range(3):
+            total[:, channel] += strength * color[channel]
     return total
 
 
@@ -59,8 +80,8 @@ def shade_skin(
     albedo, gradient, gloss = channels[:, :3], channels[:, 3:6], channels[:, 6:7]
     normals = unit(unit(normals) - gradient)
     diffuse = albedo * light.irradiance(normals) * shadow
-    grazing = 1 - np.clip((normals * views).sum(-1, keepdims=True), 0, 1)
-    sheen = 0.30 * highlight(normals, views, light, 26.0) + 0.12 * highlight(normals, views, light, 120.0)
+    grazing = 1 - np.clip(dot(normals, views), 0, 1)[:, None]
+    sheen = highlight(normals, views, light, ((0.30, 26.0), (0.12, 120.0)))
     return diffuse + shadow * gloss * (sheen + 0.06 * grazing**4)
 
 
@@ -71,7 +92,7 @@ def shade_hair(strands: Strands, light: LocalLight, viewpoint: Float[np.ndarray,
     room = light.irradiance(np.ascontiguousarray(outwards.reshape(-1, 3))).reshape(n, s, 3)
     colors = 0.75 * strands.colors * room
     views = unit(viewpoint - strands.points)
-    along_view = (tangents * views).sum(-1)
+    along_view = dot(tangents, views)
     across_view = np.sqrt(np.maximum(1 - along_view**2, 0))
     relative = strands.colors / (strands.colors.max(-1, keepdims=True) + 1e-6)
     depth = np.clip(strands.colors.max(-1) / strands.colors.max(), 0, 1)  # hair below others is darker
@@ -80,8 +101,8 @@ def shade_hair(strands: Strands, light: LocalLight, viewpoint: Float[np.ndarray,
         across = np.sqrt(np.maximum(1 - along**2, 0))
         lit = np.clip(0.3 + 0.7 * (outwards @ direction), 0, 1)
         aligned = across * across_view - along * along_view
-        first = np.clip(aligned, 0, 1) ** 48
-        second = np.clip(aligned - 0.06, 0, 1) ** 14
+        first = np.exp(52 * (aligned - 1))
+        second = np.exp(16 * (aligned - 1.05))
         colors += (0.55 * lit * across)[..., None] * strands.colors * color
         colors += (0.055 * lit * depth * first)[..., None] * color
         colors += (0.05 * lit * depth * second)[..., None] * relative * color
@@ -131,7 +152,7 @@ def shade_eye(
     bowl = unit(normals - 1.2 * share * outward)
     diffuse = albedo * light.irradiance(bowl.astype(np.float32)) * shadow
     cornea = unit(normals + 0.75 * outward * smoothstep(1.25, 0.9, q)[:, None])
-    wet = 0.5 * highlight(cornea, views, light, 900.0) + 0.10 * highlight(cornea, views, light, 60.0)
+    wet = highlight(cornea, views, light, ((0.5, 900.0), (0.1, 60.0)))
     return diffuse + np.minimum(wet, 1.5) * (0.25 + 0.75 * shadow)
 
 
@@ -152,12 +173,12 @@ def shade_teeth(
     """Off-white, with gaps every 8 mm along the arch; `depth` is metres behind the lips, where light gets scarce."""
     along = rest[:, 0] / 0.0082
     place = along - np.round(along - 0.5) - 0.5
-    gap = smoothstep(0.40, 0.5, np.abs(place))
+    gap = smoothstep(0.42, 0.5, np.abs(place))
     rounded = normals + np.stack([0.5 * np.sign(place) * place**2 * 4, np.zeros_like(place), np.zeros_like(place)], -1)
     rounded = unit(rounded).astype(np.float32)
-    albedo = np.array([0.70, 0.64, 0.52], np.float32) * (1 - 0.72 * gap)[:, None]
-    scarce = np.exp(-np.clip(depth - 0.004, 0, None) / 0.010)[:, None]
-    return (albedo * light.irradiance(rounded) * 0.75 + 0.35 * highlight(rounded, views, light, 150.0)) * scarce
+    albedo = np.array([0.70, 0.64, 0.52], np.float32) * (1 - 0.5 * gap)[:, None]
+    scarce = np.exp(-np.clip(depth - 0.008, 0, None) / 0.016)[:, None]
+    return (albedo * light.irradiance(rounded) * 0.8 + highlight(rounded, views, light, ((0.35, 150.0),))) * scarce
 
 
 def shade_mouth(
@@ -167,9 +188,11 @@ def shade_mouth(
     light: LocalLight,
 ) -> Float[np.ndarray, "n 3"]:
     """Wet dark flesh: gums, tongue, the inside of the cheeks."""
-    scarce = np.exp(-np.clip(depth - 0.002, 0, None) / 0.009)[:, None]
+    scarce = np.exp(-np.clip(depth - 0.006, 0, None) / 0.012)[:, None]
     albedo = np.array([0.34, 0.085, 0.075], np.float32)
-    return (albedo * light.irradiance(normals) * 0.8 + 0.25 * highlight(normals, views, light, 80.0)) * scarce + 0.002
+    # Lit from the opening alone: by the room's light on what faces it, whatever the surface's own direction.
+    opening = light.irradiance(np.array([[0.0, 0.1, 0.995]], np.float32))
+    return (albedo * opening * 0.8 + 0.5 * scarce * highlight(normals, views, light, ((0.2, 40.0),))) * scarce + 0.002
 
 
 def shade_frame(
@@ -177,16 +200,16 @@ def shade_frame(
 ) -> Float[np.ndarray, "n 3"]:
     """Dark polished plastic."""
     albedo = np.array([0.016, 0.011, 0.009], np.float32)
-    return albedo * light.irradiance(normals) + 0.9 * highlight(normals, views, light, 90.0)
+    return albedo * light.irradiance(normals) + highlight(normals, views, light, ((0.9, 90.0),))
 
 
 def lens_reflection(
     normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], light: LocalLight
 ) -> Float[np.ndarray, "n 3"]:
     """What a coated lens adds to what is behind it."""
-    grazing = 1 - np.abs((normals * views).sum(-1, keepdims=True))
+    grazing = 1 - np.abs(dot(normals, views))[:, None]
     room = np.array([0.010, 0.013, 0.014], np.float32) * (1 + 8 * grazing**3)
-    return room + 0.20 * highlight(normals, views, light, 60.0)
+    return room + highlight(normals, views, light, ((0.2, 60.0),))
 
 
 def look_up(channels: Float[np.ndarray, "s s c"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n c"]:

@@ -118,8 +118,8 @@ def _paint_zones(canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise) -> None:
     points, marks = canvas.points, anatomy.landmarks
     red = 0.75 * canvas.ears
     for index, radius, strength in (
-        *((cheek, 0.019, 0.9) for cheek in places.CHEEKS),
-        (places.NOSE_TIP, 0.011, 0.9),
+        *((cheek, 0.021, 0.62) for cheek in places.CHEEKS),
+        (places.NOSE_TIP, 0.011, 0.75),
         *((wing, 0.008, 0.7) for wing in places.NOSE_WINGS),
         (places.CHIN, 0.014, 0.4),
     ):
@@ -146,7 +146,7 @@ def _paint_detail(canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise, random: 
         canvas.height[:] += 0.0002 * mole
     oily = _near(points, marks[places.NOSE_TIP], 0.016) + 0.7 * _near(points, marks[9], 0.03)
     cheeks = sum(_near(points, marks[index], 0.025) for index in places.CHEEKS)
-    canvas.gloss[:] = (0.5 + 0.6 * oily + 0.15 * cheeks) * (1 + 0.35 * fine + 0.2 * noise(points, 0.012))
+    canvas.gloss[:] = (0.7 + 0.8 * oily + 0.15 * cheeks) * (1 + 0.35 * fine + 0.2 * noise(points, 0.012))
     canvas.height[:] += 0.00004 * fine + 0.00003 * tiny * (1 + cheeks)
     brow = _near(points, 0.5 * (marks[places.FOREHEAD_TOP] + marks[9]), 0.024)
     folds = noise(points * np.array([0.22, 1.0, 0.22], np.float32) + 3.1, 0.0045)
@@ -178,7 +178,7 @@ def _paint_lips(canvas: _Canvas, anatomy: Anatomy, view: FrontView, noise: Solid
     mask = view.look_up(view.polygon(anatomy.landmarks[list(places.LIPS_OUTER)], 0.0007), points) * in_front
     soft = view.look_up(view.polygon(anatomy.landmarks[list(places.LIPS_OUTER)], 0.0025), points) * in_front
     lines = noise(points * np.array([1.0, 0.16, 0.5], np.float32) + 9.0, 0.0013)
-    color = tone * np.array([0.80, 0.44, 0.46], np.float32)
+    color = tone * np.array([0.78, 0.40, 0.45], np.float32)
     painted = color * np.exp(0.12 * lines + 0.10 * noise(points, 0.004))[:, None]
     # The vermilion border: a slightly lighter line around.
     canvas.albedo[:] *= 1 + 0.25 * (soft * (1 - mask))[:, None]

@@ -37,9 +37,11 @@ class Eye:
 
     vertices: Int[np.ndarray, " e"]
     local: Float[np.ndarray, "e 3"]
-    """Unit directions from the centre, +z along the line of sight."""
+    """Metres from the centre, +z along the line of sight; interpolated, then scaled to length 1, exact directions."""
     front: Int[np.ndarray, " i"]
     """Vertices of the iris."""
+    radius: float
+    """Metres."""
     iris_size: float
     """Sine of the angle between the line of sight and the iris's rim."""
 
@@ -95,7 +97,7 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
     collar, size = _collar(anatomy)
     shirt = build_shirt(collar, size, seed) if recipe.clothes else None
     brows = brow_strands(anatomy, 0.7 * hair_color, seed) if recipe.brows_and_lashes else None
-    kept = _uncovered_faces(anatomy, collar) if recipe.clothes else np.arange(len(anatomy.faces))
+    kept = _uncovered_faces(anatomy, collar, size) if recipe.clothes else np.arange(len(anatomy.faces))
     faces, materials = _all_faces(anatomy, kept, hair, brows, recipe.brows_and_lashes, glasses, shirt)
     return Subject(
         model=model,
@@ -132,7 +134,7 @@ def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.n
         landmarks=landmarks,
         eye_centres=centres,
         brows=subject.brows.posed(subject.anatomy, head.numpy(), normals) if subject.brows else None,
-        lashes=lash_strands(landmarks, centres) if subject.lashes else None,
+        lashes=lash_strands(landmarks, centres, subject.eyes[0].radius) if subject.lashes else None,
         T_head_shoulders=_shoulders(subject, face, R),
         R_world_head=R,
         viewpoint=R.T @ (camera_position - T_world_head[:3, 3]),
@@ -171,9 +173,10 @@ def _eye(anatomy: Anatomy, side: str) -> Eye:
     axis = axis / np.linalg.norm(axis)
     right = np.cross([0, 1, 0], axis)
     right /= np.linalg.norm(right)
-    local = directions @ np.stack([right, np.cross(axis, right), axis]).T
-    rim = np.linalg.norm(local[np.isin(vertices, iris), :2], axis=-1).max() if len(iris) else 0.42
-    return Eye(vertices, local.astype(np.float32), iris, float(rim))
+    basis = np.stack([right, np.cross(axis, right), axis]).T
+    rim = np.linalg.norm((directions @ basis)[np.isin(vertices, iris), :2], axis=-1).max() if len(iris) else 0.42
+    radius = float(np.linalg.norm(offsets, axis=-1).mean())
+    return Eye(vertices, (offsets @ basis).astype(np.float32), iris, radius, float(rim))
 
 
 def _collar(anatomy: Anatomy) -> tuple[Float[np.ndarray, " 3"], tuple[float, float]]:
@@ -187,9 +190,13 @@ def _collar(anatomy: Anatomy) -> tuple[Float[np.ndarray, " 3"], tuple[float, flo
     return np.array([0, y, 0.5 * (front + back)], np.float32), (half_width, 0.5 * float(front - back))
 
 
-def _uncovered_faces(anatomy: Anatomy, collar: Float[np.ndarray, " 3"]) -> Int[np.ndarray, " m"]:
-    """Triangles that are not well below the collar."""
-    return np.flatnonzero(anatomy.vertices[anatomy.faces].mean(1)[:, 1] > collar[1] - 0.035)
+def _uncovered_faces(
+    anatomy: Anatomy, collar: Float[np.ndarray, " 3"], size: tuple[float, float]
+) -> Int[np.ndarray, " m"]:
+    """Triangles that are not under the shirt: above the collar or, a little below it, of the neck."""
+    centres = anatomy.vertices[anatomy.faces].mean(1) - collar
+    inside = np.abs(centres[:, 0]) < 1.12 * size[0]
+    return np.flatnonzero((centres[:, 1] > 0.045) | ((centres[:, 1] > -0.035) & inside))
 
 
 def _occluders(
@@ -242,7 +249,7 @@ def _all_faces(
         empty = np.zeros((*brows.widths.shape, 3), np.float32)
         add(Strands(empty, brows.widths, empty, empty).ribbon_faces(), 2 * brows.widths.size, HAIR)
     if lashes:
-        strands = lash_strands(anatomy.landmarks, np.zeros((2, 3)))
+        strands = lash_strands(anatomy.landmarks, np.zeros((2, 3)), 0.017)
         add(strands.ribbon_faces(), 2 * strands.widths.size, HAIR)
     if glasses is not None:
         add(glasses.frame.faces, len(glasses.frame.vertices), FRAME)
