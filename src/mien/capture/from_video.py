@@ -34,7 +34,7 @@ from mien.progress import say
 from mien.storage import read_json, write_json
 
 CAMERA_ID = "0"
-_RECIPE = 1
+_RECIPE = 2
 """Raised whenever the same video would give another capture, so that old ones are not taken for current."""
 _SMALLEST_SIZE = 32
 _RATE_TOLERANCE = 0.01
