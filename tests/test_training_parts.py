@@ -2,19 +2,23 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mien.avatar import FaceTuning, GaussianStore, Moments, ParameterGroup, Progress, Rate, store_group
+from mien.avatar import FaceTuning, GaussianStore, Moments, ParameterGroup, Photometric, Progress, Rate, store_group
 from mien.errors import UserError
+from mien.render.rendering import Rendering
 from mien.training import TrainSettings, held_out
 from mien.training.adam import Adam
 from mien.training.face_track import FaceTrack
 from mien.training.frames import FrameOrder, background_at, density_random, training_frames
-from mien.training.sequence import Targets, composite
+from mien.training.losses import picture_losses
+from mien.training.photometric import photometric_loss
+from mien.training.sequence import Target, Targets, composite
 from toy_scene import toy_face, toy_sequence
 
 
@@ -90,7 +94,7 @@ def test_targets_at_half_resolution_show_the_same_view() -> None:
     point = torch.tensor([[0.02, 0.03, -0.45]])
     torch.testing.assert_close(half.camera(0).project(point)[0] * 2, full.camera(0).project(point)[0])
     white = np.full(3, 255, dtype=np.uint8)
-    large, small = (targets.picture(1, 0, white, keep=True).float() for targets in (full, half))
+    large, small = (targets.target(1, 0, white, keep=True).picture.float() for targets in (full, half))
     averaged = large.reshape(16, 2, 16, 2, 3).mean((1, 3))
     assert (averaged - small).abs().mean() < 2
     assert Targets(sequence, 4096).width == 32, "pictures are never enlarged"
@@ -99,9 +103,28 @@ def test_targets_at_half_resolution_show_the_same_view() -> None:
 def test_fixed_background_pictures_are_kept() -> None:
     _, sequence = toy_sequence(3, 16)
     targets, white = Targets(sequence, 0), np.full(3, 255, dtype=np.uint8)
-    assert targets.picture(1, 0, white, keep=True) is targets.picture(1, 0, white, keep=True)
+    assert targets.target(1, 0, white, keep=True) is targets.target(1, 0, white, keep=True)
     grey = np.full(3, 99, dtype=np.uint8)
-    assert targets.picture(1, 0, grey, keep=False) is not targets.picture(1, 0, grey, keep=False)
+    assert targets.target(1, 0, grey, keep=False) is not targets.target(1, 0, grey, keep=False)
+
+
+@pytest.mark.parametrize(("drawn", "matte"), [((3, 5), (20, 26)), ((30, 31), None), (None, (8, 9)), (None, None)])
+def test_loss_inside_the_box_of_difference_is_that_of_the_whole_picture(
+    drawn: tuple[int, int] | None, matte: tuple[int, int] | None
+) -> None:
+    image, alpha = torch.full((40, 40, 3), 1.0), torch.zeros(40, 40)
+    mask, picture = np.zeros((40, 40), dtype=np.uint8), torch.full((40, 40, 3), 255, dtype=torch.uint8)
+    if drawn is not None:
+        image[drawn[0], drawn[1]], alpha[drawn[0], drawn[1]] = 0.25, 0.9
+    if matte is not None:
+        picture[matte[0], matte[1]], mask[matte[0], matte[1]] = 10, 255
+    rendering = Rendering(image, alpha, torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
+    left, top, width, height = cv2.boundingRect(mask)
+    target = Target(picture, torch.from_numpy(mask), (left, top, width, height))
+    loss = picture_losses(rendering, target, Photometric(alpha_weight=0.5))
+    torch.testing.assert_close(loss["photometric"], photometric_loss(image, picture, 0.8, 0.2))
+    expected = 0.5 * ((drawn is not None) * 0.9 + (matte is not None)) / 1600
+    assert loss["alpha"].item() == pytest.approx(expected)
 
 
 def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:

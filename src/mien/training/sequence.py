@@ -12,6 +12,7 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.capture import Capture, read_capture
 from mien.tracking import Tracking, read_scoring, read_tracking
+from mien.training.photometric import Box
 
 _CACHE_BYTES = 2 << 30
 
@@ -42,6 +43,18 @@ def composite(
     return ((mixed + (mixed >> 8)) >> 8).astype(np.uint8)
 
 
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What a rendering is compared with."""
+
+    picture: UInt8[Tensor, "h w 3"]
+    """Composited on the background that the rendering has."""
+    matte: UInt8[Tensor, "h w"]
+    """Opacity of what counts."""
+    box: Box
+    """Left, top, width and height, pixels, outside of which there is only background."""
+
+
 class Targets:
     """The pictures of one sequence at training resolution, composited; those over a fixed background are kept."""
 
@@ -52,20 +65,14 @@ class Targets:
         self.width = max(1, round(sequence.capture.width * scale))
         self.height = max(1, round(sequence.capture.height * scale))
         self.cameras = tuple(camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
-        self._kept: dict[tuple[int, int, bytes], Tensor] = {}
-        self._room = _CACHE_BYTES // (self.width * self.height * 3)
+        self._kept: dict[tuple[int, int, bytes], Target] = {}
+        self._room = _CACHE_BYTES // (self.width * self.height * 4)
 
     def camera(self, camera: int) -> Camera:
         """The camera of the training pictures."""
         return self.cameras[camera]
 
-    def matte(self, timestep: int, camera: int) -> UInt8[Tensor, "h w"]:
-        """What counts, at training resolution."""
-        return torch.from_numpy(self._resize(self._sequence.scoring[timestep, camera]))
-
-    def picture(
-        self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool
-    ) -> UInt8[Tensor, "h w 3"]:
+    def target(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool) -> Target:
         """The picture over a background; `keep` it if the same background will be asked for again."""
         key = (timestep, camera, background.tobytes())
         if key in self._kept:
@@ -73,9 +80,11 @@ class Targets:
         image = self._resize(self._sequence.capture.images[timestep, camera])
         matte = self._resize(self._sequence.scoring[timestep, camera])
         picture = torch.from_numpy(composite(image, matte, background))
+        left, top, width, height = cv2.boundingRect(matte)
+        target = Target(picture, torch.from_numpy(matte), (left, top, width, height))
         if keep and len(self._kept) < self._room:
-            self._kept[key] = picture
-        return picture
+            self._kept[key] = target
+        return target
 
     def _resize(self, picture: np.ndarray) -> np.ndarray:
         if picture.shape[:2] == (self.height, self.width):

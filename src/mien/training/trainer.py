@@ -102,15 +102,14 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     progress = Progress(state.step, settings.steps, epoch)
     background = background_at(settings, state.step)
     targets = data.targets[frame.sequence]
-    target = targets.picture(frame.timestep, frame.camera, background, keep=settings.background == "white")
-    matte = targets.matte(frame.timestep, frame.camera)
+    target = targets.target(frame.timestep, frame.camera, background, keep=settings.background == "white")
     avatar, weights = state.avatar, state.avatar.config.photometric
 
     face = state.track.face(frame.track_index)
     posed = avatar.pose(face, progress)
     colour = torch.from_numpy(background) / 255
     rendering = rasterize(posed.gaussians.timestep(0), targets.camera(frame.camera), background=colour)
-    losses = picture_losses(rendering, target, matte, weights) | avatar.regularizers(posed, rendering, progress)
+    losses = picture_losses(rendering, target, weights) | avatar.regularizers(posed, rendering, progress)
     loss = torch.stack(list(losses.values())).sum()
     loss.backward()
 
