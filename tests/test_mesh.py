@@ -130,6 +130,11 @@ def test_a_triangle_through_the_near_plane_is_cut_there():
     depth = focal / (row - 32)
     assert (fragments.face_index[:32] == -1).all()
     torch.testing.assert_close(fragments.depth[34:], depth[:, None].expand(-1, 64), rtol=1e-4, atol=0)
+    # A wall on the plane z = 0.01 + x, which meets the near plane on the optical axis: only its right half is left.
+    wall = torch.tensor([[-1.0, -9, -0.99], [1, -9, 1.01], [1, 9, 1.01], [-1, 9, -0.99]])
+    seen = rasterize_mesh(wall, torch.tensor([[0, 1, 2], [0, 2, 3]]), camera_from_fov(2.0, 64, 64)).face_index >= 0
+    assert not seen[:, :32].any()
+    assert seen[:, 32:50].all()
     beyond = rasterize_mesh(vertices - torch.tensor([0, 0, 2000.0]), torch.tensor([[0, 1, 2]]), camera)
     assert (beyond.face_index == -1).all()
     close = torch.tensor([[-1.0, -1, 0.009], [1, -1, 0.009], [0, 1, 0.009]])
