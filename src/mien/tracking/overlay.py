@@ -45,7 +45,7 @@ def draw_overlay(
         marks = camera.project(face_model.landmark_positions(vertices, "mediapipe"))[0].numpy()
     opacity = _MESH_OPACITY * alpha.numpy()[..., None]
     blended = image * (1 - opacity) + mesh.clamp(0, 1).numpy() * 255 * opacity
-    left = np.ascontiguousarray(image)
+    left = image.copy()  # a capture read from disk is read-only
     if tracking.valid[timestep]:
         _draw_points(left, capture.landmarks[timestep, camera_index], _GREEN)
     _draw_points(left, marks, _RED)
