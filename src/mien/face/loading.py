@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -104,9 +105,9 @@ def read_face_model(stem: Path) -> FaceModel:
     content = read_json(_json_file(stem), FORMAT, VERSION)
     tensors = read_tensors(_tensor_file(stem))
     try:
-        lists = {name: tuple(content[name]) for name in _LISTS}
-        fields = {name: _widened(tensors[name]) for name in _TENSORS if name in tensors}
-        model = FaceModel(name=content["name"], landmarks={}, **lists, **fields)
+        values: dict[str, Any] = {name: tuple(content[name]) for name in _LISTS}
+        values.update({name: _widened(tensors[name]) for name in _TENSORS if name in tensors})
+        model = FaceModel(name=content["name"], landmarks={}, **values)
     except (KeyError, TypeError) as error:
         raise UserError(f"{stem}: incomplete face model ({error}); delete it and load the model again") from None
     if model.content_hash != content.get("content_hash"):

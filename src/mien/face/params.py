@@ -21,7 +21,7 @@ class FaceParams:
     joints: Float[Tensor, "b j 3"]
     """Axis-angle, radians, of the model's free joints (`FaceModel.free_joint_names`), zero at rest."""
     head_rotation: Float[Tensor, "b 3"]
-    """Axis-angle of the head frame in world space, radians. The head frame: +x to the subject's left, +y up, +z ahead."""
+    """Axis-angle of the head frame (+x to the subject's left, +y up, +z ahead) in world space, radians."""
     head_translation: Float[Tensor, "b 3"]
     """Origin of the head frame in world space, metres."""
     vertex_offsets: Float[Tensor, "v 3"] | None = None

@@ -42,10 +42,11 @@ _FACE_REGIONS = ("skin", "face", "lips", "eyelids", "brows", "nose", "scalp", "e
 _EYE_REGIONS = ("eyes", "irises")
 _SCALP_FRONT = 0.06
 """Metres ahead of the head frame's origin: only there landmarks may be on the scalp."""
+_WALL = (0.6, 0.6, 0.6)
 _SUBDIVISIONS = 12
-"""Points tried along a triangle's side."""
-_NEAR_VERTICES = 6
-"""Triangles around so many of the best vertices are searched."""
+"""Steps along a triangle's side at which points are tried."""
+_COARSE_VIEWS, _COARSE_SUBDIVISIONS, _BEST_TRIANGLES = 16, 3, 16
+"""The search over all triangles uses so many views and points, and passes on so many triangles."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,8 @@ class Views:
 
     vertices: Float[Tensor, "n v 2"]
     """Projected vertices, pixels."""
-    inverse_depth: Float[Tensor, "n v"]
-    """1 / metres: perspective needs it between vertices."""
+    depth: Float[Tensor, "n v"]
+    """Metres: perspective needs it between vertices."""
     detected: Float[Tensor, "n l 2"]
     """Pixels."""
 
@@ -121,7 +122,11 @@ def write_landmarks(path: Path, model: FaceModel, landmarks: dict[str, Landmarks
         },
     }
     text = json.dumps(content, separators=(",", ":")).replace(',"', ',\n"') + "\n"
-    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8") and None)
+
+    def write(temporary: Path) -> None:
+        temporary.write_text(text, encoding="utf-8")
+
+    write_atomically(path, write)
 
 
 def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.Generator) -> FaceParams:
@@ -180,13 +185,13 @@ def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> Views:
             side, up = torch.rand(2, generator=generator).tolist()
             lamp = Headlight(direction=(side - 0.5, -0.3 - 0.5 * up, -1.0), ambient=0.45)
             picture, _ = render_mesh(
-                vertices, model.faces, camera, paint(model, generator), light=lamp, background=(0.6,) * 3, supersample=2
+                vertices, model.faces, camera, paint(model, generator), light=lamp, background=_WALL, supersample=2
             )
             faces = mesh.process((255 * picture.clamp(0, 1)).to(torch.uint8).numpy()).multi_face_landmarks
             if faces:
                 points = torch.tensor([(point.x, point.y) for point in faces[0].landmark]) * settings.size
                 pixels, depth = camera.project(vertices)
-                found.append((pixels, 1 / depth, points))
+                found.append((pixels, depth, points))
     if len(found) < settings.pictures // 2:
         raise UserError(
             f"the landmark detector found a face in {len(found)} of {settings.pictures} pictures of {model.name}: look "
@@ -213,21 +218,30 @@ def _best_point(
     views: Views, faces: Int[Tensor, "f 3"], allowed: Bool[Tensor, " f"], landmark: int, clamp: float
 ) -> tuple[Tensor, Float[Tensor, " 3"], Tensor]:
     """Triangle, barycentric weights and median error of the point with the least sum of clamped pixel errors."""
-    target = views.detected[:, landmark]
-    candidates = torch.unique(faces[allowed])
-    distance = (views.vertices[:, candidates] - target[:, None]).norm(dim=-1).clamp_max(4 * clamp).sum(0)
-    nearest = candidates[distance.topk(min(_NEAR_VERTICES, len(candidates)), largest=False).indices]
-    triangles = (allowed & torch.isin(faces, nearest).any(1)).nonzero()[:, 0]
+    # First all triangles with few points in some of the views, then the best triangles with all.
+    some = Views(
+        *(part[:: max(1, len(part) // _COARSE_VIEWS)] for part in (views.vertices, views.depth, views.detected))
+    )
+    everywhere = allowed.nonzero()[:, 0]
+    rough = _errors(some, faces[everywhere], _triangle_grid(_COARSE_SUBDIVISIONS), landmark)
+    scores = rough.clamp_max(4 * clamp).sum(0).amin(1)
+    triangles = everywhere[scores.topk(min(_BEST_TRIANGLES, len(scores)), largest=False).indices]
     weights = _triangle_grid(_SUBDIVISIONS)
-    corners = faces[triangles]
-    # Straight lines in space project to straight lines, but their points shift by the corners' depths.
-    scaled = weights[None, None] * views.inverse_depth[:, corners][:, :, None]
-    scaled = scaled / scaled.sum(-1, keepdim=True)
-    points = scaled @ views.vertices[:, corners]
-    error = (points - target[:, None, None]).norm(dim=-1)
+    error = _errors(views, faces[triangles], weights, landmark)
     best = int(error.clamp_max(clamp).sum(0).argmin())
     triangle, point = divmod(best, len(weights))
     return triangles[triangle], weights[point], error[:, triangle, point].median()
+
+
+def _errors(
+    views: Views, corners: Int[Tensor, "t 3"], weights: Float[Tensor, "p 3"], landmark: int
+) -> Float[Tensor, "n t p"]:
+    """How far, in pixels, points of triangles are from where a landmark was found in each view."""
+    # Straight lines in space project to straight lines, on which the farther corner pulls a point more.
+    scaled = weights * views.depth[:, corners][:, :, None]
+    scaled = scaled / scaled.sum(-1, keepdim=True)
+    points = scaled @ views.vertices[:, corners]
+    return (points - views.detected[:, landmark, None, None]).norm(dim=-1)
 
 
 def _triangle_grid(subdivisions: int) -> Float[Tensor, "p 3"]:

