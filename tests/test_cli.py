@@ -1,0 +1,109 @@
+"""The command line: help, exit codes and one-line messages; a real run lies in test_end_to_end.py."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mien.capture.video import write_video
+from mien.cli import COMMANDS, main
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Run a command that must fail by the user's mistake; returns its one line."""
+    assert main(arguments) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+@pytest.fixture
+def faceless_video(tmp_path: Path) -> Path:
+    frame = np.random.default_rng(0).integers(0, 255, (96, 96, 3), dtype=np.uint8)
+    path = tmp_path / "wall.mp4"
+    write_video(path, [frame] * 5, 25.0)
+    return path
+
+
+def test_overview_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert all(f"  {name} " in shown for name in COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_every_command(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        main([name, "--help"])
+    assert exit_info.value.code == 0
+    assert f"usage: mien {name}" in capsys.readouterr().out
+
+
+def test_help_is_quick_and_needs_no_torch() -> None:
+    code = "import sys, mien.cli; mien.cli.main(['--help']); assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "no sub-command 'crate'" in complaint(capsys, "crate")
+
+
+def test_unknown_option_is_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        main(["export", "--nonsense", "1"])
+    assert exit_info.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_missing_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = complaint(capsys, "create", str(tmp_path / "none.mp4"), "--out", str(tmp_path / "out"))
+    assert "none.mp4" in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_file_that_is_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "letter.mp4"
+    path.write_text("Dear reader")
+    assert "letter.mp4" in complaint(capsys, "create", str(path), "--out", str(tmp_path / "out"))
+
+
+def test_video_without_a_face(faceless_video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = complaint(capsys, "create", str(faceless_video), "--out", str(tmp_path / "out"))
+    assert "wall.mp4" in message
+    assert "face" in message
+
+
+@pytest.mark.parametrize("command", ["track", "train", "evaluate", "export", "render"])
+def test_workspace_that_is_not_there(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = {"export": ["--out", "a.ply"], "render": ["--out", "a.mp4"]}.get(command, [])
+    assert "no such folder" in complaint(capsys, command, str(tmp_path / "gone"), *out)
+    (tmp_path / "empty").mkdir()
+    assert "not a mien workspace" in complaint(capsys, command, str(tmp_path / "empty"), *out)
+
+
+def test_damaged_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = tmp_path / "out" / "sequences" / "clip" / "capture"
+    capture.mkdir(parents=True)
+    (capture / "capture.json").write_text('{"format": "mien.capture", "ver')
+    assert "capture.json" in complaint(capsys, "track", str(tmp_path / "out"))
+
+
+def test_options_are_checked_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["create", str(tmp_path / "none.mp4"), "--out", str(tmp_path / "out")]
+    assert "no method 'nerf'" in complaint(capsys, *arguments, "--method", "nerf")
+    assert "--steps -3" in complaint(capsys, *arguments, "--steps", "-3")
+
+
+def test_a_bug_keeps_its_traceback_in_a_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.setattr("mien.workspace.Workspace.sequence_names", lambda self: 1 / 0)
+    assert main(["track", str(tmp_path)]) == 1
+    shown = capsys.readouterr().err
+    assert "bug in mien" in shown
+    assert "Traceback" not in shown
+    assert "ZeroDivisionError" in next(tmp_path.glob("mien-crash-*.log")).read_text()
