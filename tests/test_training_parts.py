@@ -100,6 +100,18 @@ def test_targets_at_half_resolution_show_the_same_view() -> None:
     assert Targets(sequence, 4096).width == 32, "pictures are never enlarged"
 
 
+def test_target_is_the_composite_of_the_whole_picture() -> None:
+    _, sequence = toy_sequence(3, 32)
+    background = np.array([10, 200, 99], dtype=np.uint8)
+    target = Targets(sequence, 0).target(2, 0, background, keep=False)
+    whole = composite(sequence.capture.images[2, 0], sequence.scoring[2, 0], background)
+    assert np.array_equal(target.picture.numpy(), whole)
+    assert np.array_equal(target.matte.numpy(), sequence.scoring[2, 0])
+    left, top, width, height = target.box
+    assert sequence.scoring[2, 0][top : top + height, left : left + width].sum() == sequence.scoring[2, 0].sum()
+    assert width < 32
+
+
 def test_fixed_background_pictures_are_kept() -> None:
     _, sequence = toy_sequence(3, 16)
     targets, white = Targets(sequence, 0), np.full(3, 255, dtype=np.uint8)

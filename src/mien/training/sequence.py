@@ -79,9 +79,12 @@ class Targets:
             return self._kept[key]
         image = self._resize(self._sequence.capture.images[timestep, camera])
         matte = self._resize(self._sequence.scoring[timestep, camera])
-        picture = torch.from_numpy(composite(image, matte, background))
         left, top, width, height = cv2.boundingRect(matte)
-        target = Target(picture, torch.from_numpy(matte), (left, top, width, height))
+        inside = (slice(top, top + height), slice(left, left + width))
+        picture = np.empty_like(image)
+        picture[:] = background
+        picture[inside] = composite(image[inside], matte[inside], background)
+        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), (left, top, width, height))
         if keep and len(self._kept) < self._room:
             self._kept[key] = target
         return target
