@@ -11,6 +11,7 @@ from mien.avatar.avatar import (
     Progress,
     Rate,
     network_group,
+    neutral_of,
     store_group,
 )
 from mien.avatar.baked import BakedAvatar, pose_baked
@@ -54,6 +55,7 @@ __all__ = [
     "method_named",
     "method_of",
     "network_group",
+    "neutral_of",
     "pose_baked",
     "read_baked",
     "store_group",

@@ -6,7 +6,7 @@ A new method is one file with a config dataclass and an `Avatar`, and one line i
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -17,6 +17,10 @@ from mien.avatar.store import GaussianStore, Moments
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
+
+
+_CALM_SHARE = 0.1
+"""Of the timesteps that count as at rest."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +151,7 @@ class Avatar(nn.Module, ABC):
         self.config = config
         self.face_model = face_model
         self.subject = neutral_of(face)
-        """One timestep: this person's identity and offsets, and the median expression and pose of all frames."""
+        """One timestep: this person's identity and offsets, and how it looks at rest."""
 
     @abstractmethod
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
@@ -175,12 +179,19 @@ class Avatar(nn.Module, ABC):
 
 
 def neutral_of(face: FaceParams) -> FaceParams:
-    """One timestep with the identity and offsets of `face` and the median of its expressions and poses."""
-    return FaceParams(
-        identity=face.identity.detach(),
-        expression=face.expression.detach().median(0, keepdim=True).values,
-        joints=face.joints.detach().median(0, keepdim=True).values,
-        head_rotation=face.head_rotation.detach().median(0, keepdim=True).values,
-        head_translation=face.head_translation.detach().median(0, keepdim=True).values,
-        vertex_offsets=None if face.vertex_offsets is None else face.vertex_offsets.detach(),
+    """The person of `face` at rest, as one timestep: an estimate that a few bad frames do not move.
+
+    Expression: the median over the tenth of the timesteps with the smallest expression coefficients (their Euclidean
+    norm); what stays there, such as brows that the tracker always sees raised, is the person's own. Joints and head
+    pose: the median over all timesteps, because people mostly look where the camera is.
+    """
+    face = face.detach()
+    activity = face.expression.norm(dim=-1)
+    calm = activity.argsort(stable=True)[: max(1, round(_CALM_SHARE * len(face)))]
+    return replace(
+        face,
+        expression=face.expression[calm].median(0, keepdim=True).values,
+        joints=face.joints.median(0, keepdim=True).values,
+        head_rotation=face.head_rotation.median(0, keepdim=True).values,
+        head_translation=face.head_translation.median(0, keepdim=True).values,
     )
