@@ -18,7 +18,6 @@ from mien.face import FaceModel, FaceParams
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 
-
 _CALM_SHARE = 0.1
 """Of the timesteps that count as at rest."""
 
