@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -36,18 +37,18 @@ def build_glasses(anatomy: Anatomy) -> Glasses:
     half_width, half_height = 0.026, 0.0195
     tubes, lenses = [], []
     for x in pupils[:, 0]:
-        side = np.sign(x)
+        side = float(np.sign(x))
         centre = np.array([x * 1.04, middle[1] - 0.003, front])
         turn = np.linspace(0, 2 * np.pi, 56, endpoint=False)
         shape = np.stack([_power(np.cos(turn), 0.62) * half_width, _power(np.sin(turn), 0.62) * half_height], -1)
         shape[:, 0] += 0.0025 * side * np.sin(turn)  # wider above, towards the temples
         # Wraps around the face, and leans forward at the top.
-        depth = -0.25 * ((centre[0] + shape[:, 0]) ** 2 - 0) / 0.06 + 0.12 * shape[:, 1]
+        depth = -0.25 * (centre[0] + shape[:, 0]) ** 2 / 0.06 + 0.12 * shape[:, 1]
         rim = np.stack([centre[0] + shape[:, 0], centre[1] + shape[:, 1], front + depth + 0.004], -1)
         tubes.append(_tube(rim, 0.00165, closed=True))
         lenses.append(_lens(rim, side))
         tubes.append(_tube(_temple(anatomy, rim, side), 0.0016, closed=False))
-    inner = [part for part in (pupils[:, 0] * 1.04 - np.sign(pupils[:, 0]) * half_width)]
+    inner = pupils[:, 0] * 1.04 - np.sign(pupils[:, 0]) * half_width
     across = np.linspace(inner[0], inner[1], 12)
     arch = 1 - ((across - np.mean(inner)) / (0.5 * (inner[1] - inner[0]))) ** 2
     bridge = np.stack([across, middle[1] + 0.004 + 0.0035 * arch, front + 0.0035 + 0.002 * arch], -1)
@@ -55,7 +56,7 @@ def build_glasses(anatomy: Anatomy) -> Glasses:
     return Glasses(_join(tubes), _join(lenses))
 
 
-def _power(values: np.ndarray, exponent: float) -> np.ndarray:
+def _power(values: np.ndarray, exponent: float | np.ndarray) -> np.ndarray:
     return np.sign(values) * np.abs(values) ** exponent
 
 
@@ -100,8 +101,20 @@ def _lens(rim: Float[np.ndarray, "p 3"], side: float) -> Part:
     return Part(vertices.astype(np.float32), normals.astype(np.float32), faces.astype(np.int64))
 
 
-def build_shirt(neck: Float[np.ndarray, " 3"], neck_size: tuple[float, float], seed: int) -> Part:
-    """Shoulders in a shirt with a round collar around a neck with this middle, half width and half depth."""
+def build_shirt(
+    neck: Float[np.ndarray, " 3"],
+    neck_size: tuple[float, float],
+    shoulder_points: Float[np.ndarray, "p 3"],
+    seed: int,
+) -> Part:
+    """Shoulders in a shirt with a round collar.
+
+    Args:
+        neck: Middle of the neck where the collar lies.
+        neck_size: Its half width and half depth there.
+        shoulder_points: Skin beside the neck that the shirt covers.
+        seed: Of the folds.
+    """
     wide_neck, deep_neck = neck_size
     noise = SolidNoise(seed + 77)
     turn = np.linspace(0, 2 * np.pi, 96, endpoint=False)
@@ -126,7 +139,8 @@ def build_shirt(neck: Float[np.ndarray, " 3"], neck_size: tuple[float, float], s
     z = ahead + deep * _power(sine, power)
     # The collar is lower in front than at the nape.
     y = height - 0.13 * np.clip(z, -0.06, 0.06) * smoothstep(-0.12, 0.0, height)
-    vertices = (neck + np.stack(np.broadcast_arrays(x, y, z), -1)).reshape(-1, 3)
+    grid = neck + np.stack(np.broadcast_arrays(x, y, z), -1)
+    vertices = _laid_over(grid, shoulder_points).reshape(-1, 3)
     folds = noise.octaves(vertices * np.array([1, 0.5, 1]), 0.06, 3) * smoothstep(
         -0.02, -0.08, vertices[:, 1] - neck[1]
     )
@@ -141,6 +155,22 @@ def build_shirt(neck: Float[np.ndarray, " 3"], neck_size: tuple[float, float], s
     normals = unit(normals)
     normals *= np.sign((normals * (vertices - vertices.mean(0))).sum(-1).sum() or 1.0)
     return Part(vertices, normals.astype(np.float32), faces)
+
+
+def _laid_over(grid: Float[np.ndarray, "r c 3"], points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "r c 3"]:
+    """The cloth lifted, smoothly, to where it is 5 mm above all points under it."""
+    flat = grid.reshape(-1, 3)
+    lift = np.zeros(len(flat))
+    for start in range(0, len(flat), 256):
+        part = flat[start : start + 256]
+        away = np.hypot(part[:, None, 0] - points[:, 0], part[:, None, 2] - points[:, 2])
+        above = np.where(away < 0.009, points[:, 1] + 0.005 - part[:, 1, None], 0)
+        lift[start : start + 256] = np.clip(above.max(1, initial=0), 0, 0.05)
+    smooth = lift.reshape(grid.shape[:2]).astype(np.float32)
+    for _ in range(3):
+        wrapped = np.concatenate([smooth[:, -6:], smooth, smooth[:, :6]], axis=1)
+        smooth = np.maximum(cv2.blur(wrapped, (7, 7))[:, 6:-6], 0.97 * smooth)
+    return grid + smooth[..., None] * np.array([0.0, 1.0, 0.0])
 
 
 def _grid_faces(rows: int, columns: int, *, closed_rows: bool) -> Int[np.ndarray, "f 3"]:

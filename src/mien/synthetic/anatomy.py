@@ -107,8 +107,8 @@ class Anatomy:
         nose, mouth, top = (self.landmarks[i, 1] for i in (NOSE_BASE, MOUTH_TOP, FOREHEAD_TOP))
         line = {
             0: top + 0.004, 25: top + 0.003, 42: top - 0.006, 55: eye + 0.040, 64: eye + 0.012, 70: eye - 0.005,
-            76: nose + 0.016, 84: nose + 0.016, 90: eye + 0.014, 104: eye + 0.014, 118: nose + 0.01, 140: mouth + 0.01,
-            180: mouth,
+            76: nose + 0.016, 84: nose + 0.016, 90: eye + 0.014, 104: eye + 0.014, 118: nose + 0.018, 140: nose + 0.002,
+            180: mouth + 0.012,
         }  # fmt: skip
         threshold = np.interp(around, list(line), list(line.values()))
         return np.clip((points[:, 1] - threshold) / 0.004 + 0.5, 0, 1).astype(np.float32)
@@ -143,9 +143,12 @@ def _cells(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class FrontView:
     """A parallel view of the face from the front, to paint on and to find skin points by (x, y)."""
 
-    def __init__(self, left: float, bottom: float, width: float, height: float, texels_per_metre: float = 5000) -> None:
-        self._origin = np.array([left, bottom], np.float32)
+    def __init__(
+        self, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"], texels_per_metre: float = 5000.0
+    ) -> None:
+        self._origin = low.astype(np.float32)
         self._scale = texels_per_metre
+        width, height = (float(extent) for extent in high - low)
         self.shape = (round(height * texels_per_metre), round(width * texels_per_metre))
 
     def pixels(self, points: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n 2"]:
@@ -182,4 +185,4 @@ class FrontView:
 def face_view(anatomy: Anatomy) -> FrontView:
     """A front view that holds the whole face."""
     low, high = anatomy.landmarks.min(0) - 0.01, anatomy.landmarks.max(0) + 0.02
-    return FrontView(low[0], low[1], high[0] - low[0], high[1] - low[1])
+    return FrontView(low[:2], high[:2])

@@ -51,7 +51,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors * (1 / np.sqrt(dot(vectors, vectors) + 1e-20))[..., None]
 
 
-def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray | np.floating:
     """Scalar products over the last axis; several times faster than multiplying and summing."""
     return np.einsum("...i,...i->...", first, second)
 

@@ -1,4 +1,4 @@
-"""Light: a soft key from one side, a fill, a rim and the room, as 9 spherical-harmonic coefficients; and its shadows."""
+"""Light: a soft key from one side, a fill, a rim and the room, as 9 spherical-harmonic coefficients; and shadows."""
 
 import math
 from dataclasses import dataclass

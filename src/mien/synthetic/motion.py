@@ -27,17 +27,13 @@ _VISEMES: dict[str, Mapping[str, float]] = {
 }
 _GESTURES: dict[str, Mapping[str, float]] = {
     "smile": {
-        "mouthSmile": 0.7,
-        "cheekSquint": 0.45,
-        "eyeSquint": 0.3,
-        "mouthUpperUp": 0.3,
-        "mouthLowerDown": 0.1,
+        "mouthSmile": 0.7, "cheekSquint": 0.45, "eyeSquint": 0.3, "mouthUpperUp": 0.3, "mouthLowerDown": 0.1,
         "mouthDimple": 0.2,
     },
     "raise": {"browInnerUp": 0.7, "browOuterUp": 0.7, "eyeWide": 0.3},
     "frown": {"browDown": 0.7, "eyeSquint": 0.25, "mouthFrown": 0.2},
     "worry": {"browInnerUp": 0.75, "mouthFrown": 0.35},
-}
+}  # fmt: skip
 _MAX_GAZE = 0.42  # radians; further, the head turns
 
 

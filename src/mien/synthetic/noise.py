@@ -43,7 +43,7 @@ class SolidNoise:
         return total
 
 
-def smoothstep(low: float, high: float, value: np.ndarray) -> np.ndarray:
+def smoothstep(low: float | np.floating, high: float | np.floating, value: np.ndarray) -> np.ndarray:
     """0 below `low`, 1 above `high`, smooth between; falls where `low` > `high`."""
     t = np.clip((value - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)

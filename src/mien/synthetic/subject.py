@@ -95,9 +95,9 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
     hair = short_hair(anatomy, hair_color, seed) if recipe.hair == "short" else None
     glasses = build_glasses(anatomy) if recipe.glasses else None
     collar, size = _collar(anatomy)
-    shirt = build_shirt(collar, size, seed) if recipe.clothes else None
+    shirt = build_shirt(collar, size, _shoulder_points(anatomy, collar, size), seed) if recipe.clothes else None
     brows = brow_strands(anatomy, 0.7 * hair_color, seed) if recipe.brows_and_lashes else None
-    kept = _uncovered_faces(anatomy, collar, size) if recipe.clothes else np.arange(len(anatomy.faces))
+    kept = _uncovered_faces(anatomy, collar) if recipe.clothes else np.arange(len(anatomy.faces))
     faces, materials = _all_faces(anatomy, kept, hair, brows, recipe.brows_and_lashes, glasses, shirt)
     return Subject(
         model=model,
@@ -190,13 +190,21 @@ def _collar(anatomy: Anatomy) -> tuple[Float[np.ndarray, " 3"], tuple[float, flo
     return np.array([0, y, 0.5 * (front + back)], np.float32), (half_width, 0.5 * float(front - back))
 
 
-def _uncovered_faces(
+def _uncovered_faces(anatomy: Anatomy, collar: Float[np.ndarray, " 3"]) -> Int[np.ndarray, " m"]:
+    """Triangles that are not deep under the shirt."""
+    return np.flatnonzero(anatomy.vertices[anatomy.faces].mean(1)[:, 1] > collar[1] - 0.065)
+
+
+def _shoulder_points(
     anatomy: Anatomy, collar: Float[np.ndarray, " 3"], size: tuple[float, float]
-) -> Int[np.ndarray, " m"]:
-    """Triangles that are not under the shirt: above the collar or, a little below it, of the neck."""
-    centres = anatomy.vertices[anatomy.faces].mean(1) - collar
-    inside = np.abs(centres[:, 0]) < 1.12 * size[0]
-    return np.flatnonzero((centres[:, 1] > 0.045) | ((centres[:, 1] > -0.035) & inside))
+) -> Float[np.ndarray, "p 3"]:
+    """Dense points of the model's skin that a shirt has to cover: low and beside the neck."""
+    faces = anatomy.faces[anatomy.skin]
+    centres = anatomy.vertices[faces].mean(1) - collar
+    beside = (centres[:, 1] < 0.02) & (centres[:, 1] > -0.06) & (np.abs(centres[:, 0]) > 1.02 * size[0])
+    weights = np.random.default_rng(0).dirichlet((1, 1, 1), (beside.sum(), 40)).astype(np.float32)
+    corners = anatomy.vertices[faces[beside]]
+    return np.concatenate([np.einsum("fsk,fkc->fsc", weights, corners).reshape(-1, 3), corners.reshape(-1, 3)])
 
 
 def _occluders(

@@ -1,0 +1,164 @@
+"""Synthetic captures: the same bytes from the same seed, and a truth that is true."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mien.capture.video import read_video_frames
+from mien.synthetic import RECIPES, SyntheticScene, synthesize, write_synthetic_video
+from mien.synthetic.motion import head_motion
+from mien.tracking.neck_line import bottom_vertices
+
+SMALL = replace(RECIPES["demo"], width=192, height=192, seconds=0.6, fps=10.0, texture_size=256, noise=0.0)
+PLAIN = replace(SMALL, hair="none", glasses=False, brows_and_lashes=False)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return SyntheticScene(SMALL, seed=3)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return SyntheticScene(PLAIN, seed=3)
+
+
+def test_recipe_and_seed_decide_every_byte(scene):
+    again = SyntheticScene(replace(SMALL, seconds=0.6), seed=3)
+    for timestep in (0, 4):
+        np.testing.assert_array_equal(scene.frame(timestep).image, again.frame(timestep).image)
+        np.testing.assert_array_equal(scene.frame(timestep).matte, again.frame(timestep).matte)
+    other = SyntheticScene(SMALL, seed=4)
+    assert not torch.equal(other.identity, scene.identity)
+    assert scene.source["content_hash"] == again.source["content_hash"] != other.source["content_hash"]
+
+
+def test_noise_is_the_only_difference_that_noise_makes(scene):
+    noisy = SyntheticScene(replace(SMALL, noise=0.01), seed=3)
+    difference = noisy.frame(2).image.astype(float) - scene.frame(2).image
+    assert 0.006 * 255 < difference.std() < 0.014 * 255
+    np.testing.assert_array_equal(noisy.frame(2).image, noisy.frame(2).image)
+
+
+def test_capture_and_truth_keep_their_contracts(monkeypatch):
+    monkeypatch.setenv("MIEN_THREADS", "2")
+    capture, truth = synthesize(SMALL, seed=3)
+    assert capture.images.shape == (6, 1, 192, 192, 3)
+    assert capture.mattes.shape == (6, 1, 192, 192)
+    assert capture.landmarks.shape == (6, 1, 478, 2)
+    assert capture.valid.all()
+    assert (len(truth.face), len(truth.valid), truth.neck_lines.shape) == (6, 6, (6, 1, 3))
+    scene = SyntheticScene(SMALL, seed=3)
+    assert truth.face_model_hash == scene.model.content_hash
+    # Frames come in order whatever the threads do, and a timestep drawn again is the same.
+    for timestep in (1, 5):
+        np.testing.assert_array_equal(capture.images[timestep, 0], scene.frame(timestep).image)
+
+
+def test_landmarks_are_the_projected_mesh(plain):
+    """Pictures and parameters agree: irises are dark or coloured where the truth puts them, beside white."""
+    open_eyed = int((plain.face.expression[:, plain.model.expression_names.index("eyeBlinkLeft")] < 0.05).nonzero()[0])
+    big = SyntheticScene(replace(PLAIN, width=512, height=512), seed=3)
+    image, marks = big.frame(open_eyed).image.astype(float), big.landmarks()[open_eyed]
+    vertices = big.vertices(open_eyed)
+    torch.testing.assert_close(vertices, big.model(big.face[open_eyed])[0])
+    for eye in big.subject.eyes:
+        iris = vertices[torch.from_numpy(eye.front)].mean(0)
+        white = vertices[torch.from_numpy(eye.vertices)]
+        pixel = big.camera.project(iris[None])[0][0].numpy()
+        assert len(white)
+        brightness = [_brightness(image, pixel), _brightness(image, marks[1])]  # pupil, tip of the nose
+        assert brightness[0] < 0.5 * brightness[1]
+    lips = np.mean([_patch(image, marks[index]) for index in (17, 405, 181)], axis=0)
+    cheek = np.mean([_patch(image, marks[index]) for index in (50, 280)], axis=0)
+    assert lips[0] / lips[1] > cheek[0] / cheek[1]
+
+
+def test_matte_is_the_coverage(scene):
+    """Where the matte is 0 the wall is seen unchanged; where it is 255 no wall is."""
+    frame = scene.frame(3)
+    darker = SyntheticScene(SMALL, seed=3)
+    darker.__dict__["subject"] = scene.subject
+    darker.__dict__["background"] = np.zeros_like(scene.background)
+    black = darker.frame(3)
+    np.testing.assert_array_equal(black.matte, frame.matte)
+    assert (black.image[frame.matte == 0] == 0).all()
+    np.testing.assert_array_equal(black.image[frame.matte == 255], frame.image[frame.matte == 255])
+    assert 0.15 < (frame.matte > 127).mean() < 0.8
+
+
+def test_the_face_model_lies_inside_the_matte(scene):
+    for timestep in (0, 5):
+        pixels = scene.camera.project(scene.vertices(timestep))[0].numpy()
+        matte = scene.frame(timestep).matte
+        inside = matte[tuple(np.clip(pixels[:, ::-1].astype(int), 0, 191).T)]
+        assert (inside > 0).mean() > 0.99
+
+
+def test_hair_and_glasses_are_not_the_face_models(scene, plain):
+    """They cover pixels that the same head without them leaves free."""
+    assert (scene.frame(0).matte.astype(int) - plain.frame(0).matte).clip(0).sum() > 255 * 300
+    assert torch.equal(scene.vertices(0), plain.vertices(0))
+
+
+def test_motion_is_bounded_smooth_and_blinks():
+    recipe = replace(RECIPES["demo"], seconds=9.0)
+    scene = SyntheticScene(recipe, seed=5)
+    face = scene.face
+    degrees = torch.rad2deg(face.head_rotation)
+    assert 15 < float(degrees[:, 1].abs().max()) < 30
+    assert float(degrees[:, 0].abs().max()) < 17
+    assert float((degrees[1:] - degrees[:-1]).norm(dim=-1).max()) < 4  # a frame, 40 ms
+    bounds = scene.model.expression_bounds
+    assert bool(((face.expression >= bounds[:, 0]) & (face.expression <= bounds[:, 1])).all())
+    closed = face.expression[:, scene.model.expression_names.index("eyeBlinkLeft")] > 0.8
+    blinks = int((closed[1:] & ~closed[:-1]).sum())
+    assert 2 <= blinks <= 9
+    assert torch.equal(head_motion(scene.model, scene.identity, recipe, 5).expression, face.expression)
+
+
+def test_shoulders_hold_still_while_the_head_turns():
+    scene = SyntheticScene(replace(RECIPES["demo"], translation=(0.0, 0.0, 0.0)), seed=2)
+    bottom = bottom_vertices(scene.model)
+    moved = torch.stack([scene.vertices(timestep)[bottom] for timestep in range(0, 200, 20)])
+    travel = (moved - moved.mean(0)).norm(dim=-1).amax()
+    assert float(travel) < 0.03
+
+
+def test_neck_lines_cut_below_the_chin(scene):
+    chin = scene.landmarks()[:, 152]
+    lines = scene.tracking().neck_lines[:, 0].numpy()
+    assert ((chin * lines[:, :2]).sum(-1) + lines[:, 2] > 0).all()
+
+
+def test_video_is_written_frame_by_frame(tmp_path, scene):
+    path = tmp_path / "clip.mp4"
+    write_synthetic_video(SMALL, path, seed=3)
+    frames = [image for _, image in read_video_frames(path)]
+    assert len(frames) == SMALL.timesteps
+    error = frames[2].astype(float) - scene.frame(2).image
+    assert np.sqrt((error**2).mean()) < 6
+
+
+def test_a_detector_finds_the_face():
+    """MediaPipe, which has only seen people, finds the head in every frame, and its landmarks where the truth is."""
+    mediapipe = pytest.importorskip("mediapipe")
+    clip = SyntheticScene(replace(RECIPES["demo"], width=384, height=384, fps=1.0, texture_size=512), seed=1)
+    truth = clip.landmarks()
+    with mediapipe.solutions.face_mesh.FaceMesh(static_image_mode=True, refine_landmarks=True) as detector:
+        for timestep, frame in enumerate(clip.frames()):
+            found = detector.process(frame.image).multi_face_landmarks
+            assert found, f"no face at timestep {timestep}"
+            points = np.array([[p.x, p.y] for p in found[0].landmark]) * 384
+            assert np.median(np.linalg.norm(points - truth[timestep], axis=-1)) < 5
+
+
+def _patch(image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    column, row = pixel.astype(int)
+    return image[row - 2 : row + 3, column - 2 : column + 3].mean((0, 1))
+
+
+def _brightness(image: np.ndarray, pixel: np.ndarray) -> float:
+    return float(_patch(image, pixel).mean())
