@@ -92,6 +92,7 @@ def test_figures_do_not_depend_on_threads_or_on_other_subjects(experiment: Exper
     assert set(alone.scores) == {"avatar"}
     content = protocol_content(few, alone, EvaluationSettings(perceptual=False, baselines=False))
     assert content["perceptual"] is None
+    assert content["perceptual_frames"] == 0
     assert content["perceptual_backbone"] is None
 
 
@@ -148,6 +149,17 @@ class _Tags(HTMLParser):
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
+
+
+def test_perceptual_metric_on_some_frames_only(experiment: Experiment, evaluation: Evaluation) -> None:
+    settings = EvaluationSettings(perceptual_frames=3, baselines=False)
+    some = evaluate_frames(experiment, settings)
+    content = protocol_content(experiment, some, settings)
+    figures = content["per_frame"]["perceptual"]
+    assert [figure is not None for figure in figures] == [True, False, False, False] * 2 + [True, False]
+    assert content["perceptual_frames"] == 3
+    known = [row["perceptual"] for row in evaluation.scores["avatar"]]
+    assert content["perceptual"] == pytest.approx((known[0] + known[4] + known[8]) / 3)
 
 
 def test_spans_join_neighbours() -> None:

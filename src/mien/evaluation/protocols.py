@@ -36,7 +36,9 @@ class EvaluationSettings:
     """How to evaluate; the figures do not depend on `threads`."""
 
     perceptual: bool = True
-    """ST-LPIPS takes most of the time: about a second a frame and thread at 512x512."""
+    """Whether to compute ST-LPIPS, which takes most of the time."""
+    perceptual_frames: int = 32
+    """ST-LPIPS is computed on at most this many held-out frames, evenly spread: 3 s each at 512x512; 0 for all."""
     baselines: bool = True
     """Also score the mean training picture and the coloured mesh."""
     threads: int = 2
@@ -59,8 +61,8 @@ class Evaluation:
     """Whole frame and head crop of some training frames, evenly spread: how much worse the held-out ones are."""
 
     def mean(self, subject: str, name: str) -> float:
-        """The mean of one figure over the frames."""
-        return fmean(entry[name] for entry in self.scores[subject])
+        """The mean of one figure over the frames that have it."""
+        return fmean(entry[name] for entry in self.scores[subject] if name in entry)
 
     def ranked(self) -> list[int]:
         """Indices into `frames` from the worst PSNR of the avatar on the head crop to the best."""
@@ -74,6 +76,8 @@ def evaluate_frames(experiment: Experiment, settings: EvaluationSettings) -> Eva
     metric = load_perceptual(settings.backbone) if settings.perceptual else None
     baselines = make_baselines(experiment) if settings.baselines else None
     seconds: list[float] = []
+    frames = experiment.held_out_frames
+    judged = _evenly_spread(frames, settings.perceptual_frames)
 
     def pictures(frame: Frame) -> dict[str, Tensor]:
         start = time.perf_counter()
@@ -86,9 +90,10 @@ def evaluate_frames(experiment: Experiment, settings: EvaluationSettings) -> Eva
 
     def score(job: tuple[Frame, dict[str, Tensor]]) -> dict[str, Scores]:
         frame, drawn = job
-        return score_pictures(drawn, target_image(experiment, frame), experiment.crop(frame), metric)
+        return score_pictures(
+            drawn, target_image(experiment, frame), experiment.crop(frame), metric if frame in judged else None
+        )
 
-    frames = experiment.held_out_frames
     rows: list[dict[str, Scores]] = []
     with progress_bar("evaluate", len(frames)) as advance:
         jobs = ((frame, pictures(frame)) for frame in frames)
@@ -102,9 +107,8 @@ def evaluate_frames(experiment: Experiment, settings: EvaluationSettings) -> Eva
 
 def _training_psnr(experiment: Experiment) -> dict[Frame, tuple[float, float]]:
     """PSNR on the whole frame and on the head crop of at most `_TRAINING_FRAMES` frames that were trained on."""
-    step = max(1, -(-len(experiment.training_frames) // _TRAINING_FRAMES))
     figures = {}
-    for frame in experiment.training_frames[::step]:
+    for frame in sorted(_evenly_spread(experiment.training_frames, _TRAINING_FRAMES)):
         image, target = avatar_image(experiment, frame), target_image(experiment, frame)
         figures[frame] = (psnr(image, target), psnr(image, target, experiment.crop(frame)))
     return figures
@@ -138,6 +142,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
     return {
         **_means(evaluation, AVATAR),
         "perceptual_backbone": settings.backbone if settings.perceptual else None,
+        "perceptual_frames": sum("perceptual" in row for row in own_rows),
         "split": experiment.split,
         "mask": _MASK,
         "crop": _CROP,
@@ -151,7 +156,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
             "sequence": [experiment.sequences[frame.sequence].name for frame in evaluation.frames],
             "timestep": [frame.timestep for frame in evaluation.frames],
             "camera_id": [experiment.camera_id(frame) for frame in evaluation.frames],
-            **{name: [round(row[name], 5) for row in own_rows] for name in own_rows[0]},
+            **{name: [_rounded(row.get(name)) for row in own_rows] for name in own_rows[0]},
         },
     }
 
@@ -164,13 +169,23 @@ def _training_means(evaluation: Evaluation) -> dict[str, Any]:
 
 def _means(evaluation: Evaluation, subject: str) -> dict[str, Any]:
     """Mean figures; None for a metric that was left out."""
-    known = evaluation.scores[subject][0]
+    known = set().union(*evaluation.scores[subject])
 
     def means(prefix: str) -> dict[str, float | None]:
         names = {name: prefix + name for name in METRICS}
         return {name: evaluation.mean(subject, key) if key in known else None for name, key in names.items()}
 
     return {**means(""), "head": means("head_")}
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 5)
+
+
+def _evenly_spread(frames: tuple[Frame, ...], most: int) -> set[Frame]:
+    """At most `most` of the frames, the first always among them; 0 for all."""
+    step = max(1, -(-len(frames) // most)) if most else 1
+    return set(frames[::step])
 
 
 def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
