@@ -25,6 +25,7 @@ from mien.avatar.density import (
 )
 from mien.avatar.files import load_avatar, read_baked, write_avatar, write_baked
 from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
+from mien.avatar.headgas import HeadGas, HeadGasConfig
 from mien.avatar.methods import METHODS, Method, method_named, method_of
 from mien.avatar.store import GaussianStore, Moments
 
@@ -41,6 +42,8 @@ __all__ = [
     "GaussianStore",
     "GradientDensity",
     "GradientSettings",
+    "HeadGas",
+    "HeadGasConfig",
     "Method",
     "MethodConfig",
     "Moments",

@@ -62,7 +62,8 @@ class AttributeNetwork:
     """A small network, the same for all Gaussians, whose outputs are added to the raw values.
 
     Its input is a row of `base` (and, behind it, what `input` names): `features` adds the expression's combination of
-    `basis` to the first f columns of `base`; `displacement` appends the centre's motion from rest, in metres.
+    `basis`, and the free joints' of `joint_basis`, to the first f columns of `base`; `displacement` appends the
+    centre's motion from the rig's template, in metres.
     """
 
     input: Literal["features", "displacement"]
@@ -75,6 +76,8 @@ class AttributeNetwork:
     """Between layers; leaky slope 0.01."""
     outputs: tuple[str, ...]
     """Of quats, log_scales, opacity_logits, sh: in the order of the last layer's columns."""
+    joint_basis: Float[Tensor, "j n f"] | None = None
+    """Three for each free joint: what a radian of its axis-angle's components adds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +121,8 @@ class Static:
     """Metres."""
     attributes: Attributes
     expression_names: tuple[str, ...]
+    joint_names: tuple[str, ...] = ()
+    """Free joints, in the order of the network's `joint_basis`."""
     bases: LinearBases | None = None
     network: AttributeNetwork | None = None
 
@@ -169,7 +174,7 @@ def pose_baked(baked: BakedAvatar, face: FaceParams) -> Gaussians:
         return _pose_mesh_bound(baked, face)
     if isinstance(baked, BlendSkinned):
         centres = rig_points(baked.rig, face)
-        raw = _raw_values(baked.attributes, baked.bases, baked.network, centres - baked.rig.template, face.expression)
+        raw = _raw_values(baked.attributes, baked.bases, baked.network, centres - baked.rig.template, face)
         if baked.scale_activation == "sigmoid":
             scales = baked.scale_gain * raw["log_scales"].sigmoid() + baked.scale_offset
         else:
@@ -177,7 +182,7 @@ def pose_baked(baked: BakedAvatar, face: FaceParams) -> Gaussians:
         sh = sh_from_rgb(raw["sh"].sigmoid()) if baked.colour_activation == "sigmoid" else raw["sh"]
         return Gaussians(centres, raw["quats"], scales, raw["opacity_logits"].sigmoid(), sh, face.T_world_head)
     still = baked.means.expand(len(face), -1, -1)
-    raw = _raw_values(baked.attributes, baked.bases, baked.network, torch.zeros_like(still), face.expression)
+    raw = _raw_values(baked.attributes, baked.bases, baked.network, torch.zeros_like(still), face)
     scales, opacities = raw["log_scales"].exp(), raw["opacity_logits"].sigmoid()
     return Gaussians(still + raw["means"], raw["quats"], scales, opacities, raw["sh"], face.T_world_head)
 
@@ -198,19 +203,19 @@ def _raw_values(
     bases: LinearBases | None,
     network: AttributeNetwork | None,
     displacement: Float[Tensor, "b n 3"],
-    expression: Float[Tensor, "b e"],
+    face: FaceParams,
 ) -> dict[str, Tensor]:
     """Raw values of some timesteps: constants, plus linear bases, plus the network's outputs."""
-    batch = expression.shape[0]
+    batch = len(face)
     raw = {f.name: (value := getattr(attributes, f.name)).expand(batch, *value.shape) for f in fields(Attributes)}
     raw["means"] = torch.zeros_like(displacement)
     if bases is not None:
         for f in fields(LinearBases):
             basis = getattr(bases, f.name)
             if basis is not None:
-                raw[f.name] = raw[f.name] + torch.einsum("be,e...->b...", expression, basis)
+                raw[f.name] = raw[f.name] + torch.einsum("be,e...->b...", face.expression, basis)
     if network is not None:
-        outputs = run_network(network, displacement, expression)
+        outputs = run_network(network, displacement, face)
         widths = [raw[name][0, 0].numel() for name in network.outputs]
         for name, part in zip(network.outputs, outputs.split(widths, dim=-1), strict=True):
             raw[name] = raw[name] + part.reshape(raw[name].shape)
@@ -218,13 +223,14 @@ def _raw_values(
 
 
 def run_network(
-    network: AttributeNetwork, displacement: Float[Tensor, "b n 3"], expression: Float[Tensor, "b e"]
+    network: AttributeNetwork, displacement: Float[Tensor, "b n 3"], face: FaceParams
 ) -> Float[Tensor, "b n out"]:
     """The outputs of an attribute network for some timesteps."""
-    batch = expression.shape[0]
-    values = network.base.expand(batch, -1, -1)
+    values = network.base.expand(len(face), -1, -1)
     if network.input == "features":
-        blended = torch.einsum("be,enf->bnf", expression, network.basis)
+        blended = torch.einsum("be,enf->bnf", face.expression, network.basis)
+        if network.joint_basis is not None:
+            blended = blended + torch.einsum("bj,jnf->bnf", face.joints.flatten(1), network.joint_basis)
         f = blended.shape[-1]
         values = torch.cat([values[..., :f] + blended, values[..., f:]], dim=-1)
     else:

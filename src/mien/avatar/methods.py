@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from mien.avatar.avatar import Avatar, MethodConfig
 from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
+from mien.avatar.headgas import HeadGas, HeadGasConfig
 from mien.errors import UserError
 
 
@@ -17,6 +18,7 @@ class Method:
 
 METHODS = {
     "gaussian_avatars": Method(GaussianAvatarsConfig, GaussianAvatars),
+    "headgas": Method(HeadGasConfig, HeadGas),
 }
 
 

@@ -63,7 +63,7 @@ class GradientStrategy(DensityStrategy):
         self._pull += pull
         self._seen += visible
         torch.maximum(self._radius, rendering.radii, out=self._radius)
-        torch.maximum(self._opacity, posed.gaussians.opacities.detach().expand_as(pull), out=self._opacity)
+        torch.maximum(self._opacity, posed.gaussians.opacities.detach().reshape(-1), out=self._opacity)
 
     def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
         """Grow and prune in rounds; reset opacities at their times."""
@@ -140,7 +140,7 @@ class RefillStrategy(DensityStrategy):
 
     def observe(self, posed: Posed, rendering: Rendering) -> None:
         """Remember each Gaussian's highest opacity."""
-        torch.maximum(self._opacity, posed.gaussians.opacities.detach().expand_as(self._opacity), out=self._opacity)
+        torch.maximum(self._opacity, posed.gaussians.opacities.detach().reshape(-1), out=self._opacity)
 
     def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
         """Prune and refill at the rounds' times."""

@@ -1,0 +1,197 @@
+"""HeadGaS (Dhamo et al., ECCV 2024): Gaussians that stay in the head frame; the expression changes how they look.
+
+No code was published: written from the paper's supplement and its equations. Each Gaussian blends a basis of latent
+features by the expression, and one small network turns the result into colour and opacity, so that lips fade where
+teeth appear. What the paper leaves open and was decided here: joints that no expression drives join the expression
+vector (nothing else would move the gaze), rates, the encoding's bands and lengths, and by which opacity to prune.
+Not there yet: the perceptual loss.
+"""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mien.avatar.avatar import (
+    TRAINED,
+    Avatar,
+    MethodConfig,
+    ParameterGroup,
+    Posed,
+    Progress,
+    Rate,
+    network_group,
+    store_group,
+)
+from mien.avatar.baked import AttributeNetwork, Attributes, Static
+from mien.avatar.density import GradientDensity, GradientSettings
+from mien.avatar.encoding import positional_encoding
+from mien.avatar.store import GaussianStore
+from mien.face import FaceModel, FaceParams
+from mien.gaussians import Gaussians
+from mien.render.rendering import Rendering
+
+_CHUNK = 512
+
+
+@dataclass(frozen=True)
+class HeadGasConfig(MethodConfig):
+    """Settings of HeadGaS; defaults suit a CPU and runs of some thousand steps."""
+
+    points: int = 2500
+    """Gaussians to begin with, sampled on the subject's mesh."""
+    features: int = 16
+    """Latent features of each Gaussian (paper: 32); memory and time of a step grow with it."""
+    hidden: int = 64
+    """Width of the network's one hidden layer."""
+    encoding_bands: int = 4
+    """Octaves of the positional encoding."""
+    encoding_length: float = 0.05
+    """Metres that count as one unit in the positional encoding."""
+    sh_degree: int = 0
+    """0..3 (paper: 3). With one camera, colours that depend on the view absorb the head's pose."""
+    means_rate: Rate = Rate(1e-4, 1e-6)
+    """Of centres, metres."""
+    log_scales_rate: Rate = Rate(5e-3)
+    """Of log scales."""
+    quats_rate: Rate = Rate(1e-3)
+    """Of rotations."""
+    features_rate: Rate = Rate(2.5e-3)
+    """Of feature bases and neutral features."""
+    network_rate: Rate = Rate(2e-3, 2e-4)
+    """Of the network."""
+    density: GradientSettings = field(default_factory=lambda: GradientSettings(opacity_resets=(), max_gaussians=8_000))
+    """When and what to grow and prune. Opacities come from the network: there is nothing to reset."""
+
+
+class HeadGas(Avatar):
+    """Static Gaussians in the head frame whose blended features become colour and opacity."""
+
+    config: HeadGasConfig
+
+    def __init__(self, config: HeadGasConfig, face_model: FaceModel, face: FaceParams):
+        super().__init__(config, face_model, face)
+        n, width = config.points, config.features
+        means = sample_surface(face_model.head_vertices(self.subject)[0], face_model.faces, n)
+        inputs = face.expression.shape[1] + face.joints[0].numel()
+        trained = {
+            "means": means,
+            "quats": means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            "log_scales": neighbour_distances(means).clamp_min(1e-6).log()[:, None].repeat(1, 3),
+            # Zero bases as in the paper. With the inputs last, blending is one matrix-vector product.
+            "feature_bases": means.new_zeros(n, width, inputs),
+            "neutral_features": means.new_zeros(n, width),
+        }
+        self.store = GaussianStore(trained)
+        self.network = nn.Sequential(
+            nn.Linear(width + 3 + 6 * config.encoding_bands, config.hidden),
+            nn.LeakyReLU(0.01),
+            nn.Linear(config.hidden, 3 * self._coefficients + 1),
+        ).to(means)
+        with torch.no_grad():
+            # Grey and faint, as 3D Gaussian Splatting starts.
+            self._last_layer.bias.zero_()
+            self._last_layer.bias[-1] = torch.logit(torch.tensor(0.1))
+
+    def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
+        """The Gaussians in the head frame, one batch entry a timestep; only colours and opacities differ."""
+        store = self.store
+        features = blend_features(store["feature_bases"], store["neutral_features"], face)
+        encoding = self._encoding().expand(len(face), -1, -1)
+        output = self.network(torch.cat([features, encoding], dim=-1))
+        sh = output[..., :-1].unflatten(-1, (self._coefficients, 3))
+        opacities = output[..., -1].sigmoid()
+        gaussians = Gaussians(
+            store["means"], store["quats"], store["log_scales"].exp(), opacities, sh, face.T_world_head
+        )
+        return Posed(gaussians, {})
+
+    def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
+        """None."""
+        return {}
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """One group a tensor, one for the network."""
+        config = self.config
+        rates = {"means": config.means_rate, "log_scales": config.log_scales_rate, "quats": config.quats_rate}
+        rates |= {"feature_bases": config.features_rate, "neutral_features": config.features_rate}
+        groups = [store_group(self.store, name, rate) for name, rate in rates.items()]
+        return [*groups, network_group("network", self.network, config.network_rate)]
+
+    def gaussian_store(self) -> GaussianStore:
+        """Every per-Gaussian tensor."""
+        return self.store
+
+    def density(self) -> GradientDensity:
+        """Gradient-based; children copy features. A Gaussian counts by its highest opacity since the last round."""
+        return GradientDensity(self.config.density, opacity_logits=None)
+
+    def bake(self) -> Static:
+        """Static points, with the features' bases and the network."""
+        store = {name: self.store[name].detach() for name in self.store.names()}
+        n = len(self.store)
+        bases = store["feature_bases"].permute(2, 0, 1)
+        e = self.subject.expression.shape[1]
+        first, last = self.network[0], self._last_layer
+        assert isinstance(first, nn.Linear)
+        network = AttributeNetwork(
+            input="features",
+            base=torch.cat([store["neutral_features"], self._encoding()], dim=-1),
+            basis=bases[:e],
+            joint_basis=bases[e:],
+            weights=(first.weight.detach(), last.weight.detach()),
+            biases=(first.bias.detach(), last.bias.detach()),
+            activation="leaky_relu",
+            outputs=("sh", "opacity_logits"),
+        )
+        none = store["means"].new_zeros(n)
+        attributes = Attributes(store["quats"], store["log_scales"], none, none.new_zeros(n, self._coefficients, 3))
+        names, free = self.face_model.expression_names, self.face_model.free_joint_names
+        return Static(store["means"], attributes, names, free, network=network)
+
+    @property
+    def _coefficients(self) -> int:
+        return (self.config.sh_degree + 1) ** 2
+
+    @property
+    def _last_layer(self) -> nn.Linear:
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        return last
+
+    def _encoding(self) -> Float[Tensor, "n c"]:
+        # Detached: centres follow what the picture says about where they are, not what the network makes of it.
+        points = self.store["means"].detach() / self.config.encoding_length
+        return positional_encoding(points, self.config.encoding_bands)
+
+
+def blend_features(
+    bases: Float[Tensor, "n f i"], neutral: Float[Tensor, "n f"], face: FaceParams
+) -> Float[Tensor, "b n f"]:
+    """F = F^T e + f0, where e is the expression and then the free joints' axis-angles, radians."""
+    inputs = torch.cat([face.expression, face.joints.flatten(1)], dim=-1)
+    blended = bases.flatten(0, 1) @ inputs.T
+    return neutral + blended.T.unflatten(-1, tuple(neutral.shape))
+
+
+def sample_surface(vertices: Float[Tensor, "v 3"], faces: Tensor, count: int) -> Float[Tensor, "n 3"]:
+    """Random points on a mesh, evenly by area; from torch's default generator."""
+    corners = vertices[faces]
+    v0, v1, v2 = corners.unbind(1)
+    areas = torch.linalg.cross(v1 - v0, v2 - v0).norm(dim=-1)
+    chosen = torch.multinomial(areas, count, replacement=True)
+    # The square root spreads points evenly over a triangle.
+    along, across = torch.rand(2, count, 1).to(vertices)
+    along = along.sqrt()
+    weights = torch.cat([1 - along, along * (1 - across), along * across], dim=-1)
+    return (weights[:, :, None] * corners[chosen]).sum(1)
+
+
+def neighbour_distances(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Mean distance to the three nearest other points: 3D Gaussian Splatting's scales to begin with."""
+    nearest = [
+        torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist").topk(4, largest=False).values[:, 1:]
+        for part in points.split(_CHUNK)
+    ]
+    return torch.cat(nearest).mean(-1)

@@ -1,0 +1,133 @@
+"""HeadGaS's formulas."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mien.avatar import HeadGas, HeadGasConfig, pose_baked
+from mien.avatar.encoding import positional_encoding
+from mien.avatar.headgas import blend_features, neighbour_distances, sample_surface
+from mien.face import FaceModel, FaceParams
+from toy_scene import toy_face, toy_face_model
+
+SMALL = HeadGasConfig(points=40, features=5, sh_degree=1)
+
+
+def new_avatar(config: HeadGasConfig = SMALL, face_model: FaceModel | None = None) -> HeadGas:
+    torch.manual_seed(0)
+    return HeadGas(config, face_model or toy_face_model(), toy_face(5))
+
+
+def fill(tensor: Tensor, seed: int = 1) -> None:
+    with torch.no_grad():
+        tensor.copy_(torch.randn(tensor.shape, generator=torch.Generator().manual_seed(seed)))
+
+
+def inputs_of(face: FaceParams) -> Tensor:
+    return torch.cat([face.expression, face.joints.reshape(len(face), -1)], dim=-1)
+
+
+def test_features_blend_linearly() -> None:
+    avatar, face = new_avatar(), toy_face(5)
+    fill(avatar.store["feature_bases"])
+    fill(avatar.store["neutral_features"], 2)
+    F, f0 = avatar.store["feature_bases"].detach(), avatar.store["neutral_features"].detach()
+    e = inputs_of(face)
+    for timestep in range(5):
+        for index in (0, 17):
+            expected = f0[index] + sum(e[timestep, k] * F[index, :, k] for k in range(e.shape[1]))
+            torch.testing.assert_close(blend_features(F, f0, face)[timestep, index], expected)
+
+
+def test_zero_expression_gives_the_neutral_features() -> None:
+    face_model = toy_face_model()
+    F, f0 = torch.randn(7, 4, 5), torch.randn(7, 4)
+    assert torch.equal(blend_features(F, f0, face_model.neutral(2)), f0.expand(2, 7, 4))
+
+
+def test_colour_and_opacity_are_the_networks_of_features_and_place() -> None:
+    avatar, face = new_avatar(), toy_face(5)[2]
+    fill(avatar.store["feature_bases"])
+    gaussians = avatar.pose(face).gaussians
+    first, _, last = avatar.network
+    points = avatar.store["means"].detach() / SMALL.encoding_length
+    features = (avatar.store["feature_bases"] @ inputs_of(face)[0]) + avatar.store["neutral_features"]
+    values = torch.cat([features, positional_encoding(points, SMALL.encoding_bands)], dim=-1) @ first.weight.T
+    values = values + first.bias
+    values = torch.where(values < 0, 0.01 * values, values) @ last.weight.T + last.bias
+    torch.testing.assert_close(gaussians.sh[0], values[:, :12].reshape(40, 4, 3))
+    torch.testing.assert_close(gaussians.opacities[0], values[:, 12].sigmoid())
+
+
+def test_nothing_moves_in_the_head_frame() -> None:
+    avatar, face = new_avatar(), toy_face(5)
+    fill(avatar.store["feature_bases"])
+    gaussians = avatar.pose(face).gaussians
+    assert gaussians.means.shape == gaussians.scales.shape == (40, 3)
+    assert gaussians.T_world_local is not None
+    assert torch.equal(gaussians.T_world_local, face.T_world_head)
+    still = replace(face, head_rotation=0 * face.head_rotation, head_translation=0 * face.head_translation)
+    assert torch.equal(avatar.pose(still).gaussians.sh, gaussians.sh)
+
+
+def test_starts_grey_faint_and_the_same_for_all_expressions() -> None:
+    gaussians = new_avatar().pose(toy_face(5)).gaussians
+    assert (gaussians.opacities - 0.1).abs().max() < 0.1
+    assert torch.equal(gaussians.sh[0], gaussians.sh[3])
+
+
+def test_joints_change_colours_also_when_baked() -> None:
+    avatar, face = new_avatar(), toy_face(5)
+    fill(avatar.store["feature_bases"])
+    turned = replace(face, joints=face.joints + 0.2)
+    ours, theirs = avatar.pose(turned).gaussians, pose_baked(avatar.bake(), turned)
+    assert not torch.allclose(ours.sh, avatar.pose(face).gaussians.sh)
+    torch.testing.assert_close(ours.sh, theirs.sh)
+    torch.testing.assert_close(ours.opacities, theirs.opacities)
+
+
+def test_children_of_a_split_copy_features() -> None:
+    avatar = new_avatar()
+    fill(avatar.store["feature_bases"])
+    fill(avatar.store["neutral_features"])
+    parents = torch.tensor([3, 3, 9])
+    avatar.store.append(parents, avatar.density().split(avatar.store, parents, torch.randn(3, 3)))
+    for name in ("feature_bases", "neutral_features"):
+        assert torch.equal(avatar.store[name][-3:], avatar.store[name][parents])
+    assert not torch.equal(avatar.store["means"][-3:], avatar.store["means"][parents])
+
+
+def test_opacity_has_no_reset_and_counts_by_the_highest_seen() -> None:
+    avatar = new_avatar()
+    density = avatar.density()
+    assert density.opacity_logits is None
+    assert density.settings.opacity_resets == ()
+    seen = torch.rand(40)
+    assert torch.equal(density.judged_opacities(avatar.store, seen), seen)
+
+
+def test_points_are_on_the_mesh_evenly_by_area() -> None:
+    # A large triangle in z = 0 and one with a ninth of its area in z = 1.
+    vertices = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]])
+    torch.manual_seed(0)
+    points = sample_surface(vertices, torch.tensor([[0, 1, 2], [3, 4, 5]]), 4000)
+    large = points[:, 2] == 0
+    assert abs(large.float().mean() - 0.9) < 0.02
+    assert (points[:, :2] >= 0).all()
+    assert (points[large, :2].sum(-1) <= 3.0001).all()
+    torch.testing.assert_close(points[large, :2].mean(0), torch.ones(2), atol=0.05, rtol=0)
+
+
+def test_neighbour_distances_are_means_over_three() -> None:
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [10, 0, 0]])
+    expected = torch.tensor([2.0, (9 + 10 + 104**0.5) / 3])
+    torch.testing.assert_close(neighbour_distances(points)[[0, 4]], expected)
+
+
+def test_positional_encoding_is_sines_and_cosines_of_octaves() -> None:
+    point = torch.tensor([0.1, -0.2, 0.3])
+    expected = [point]
+    for octave in (1, 2, 4):
+        expected += [(octave * point).sin(), (octave * point).cos()]
+    torch.testing.assert_close(positional_encoding(point, 3), torch.cat(expected))
