@@ -32,7 +32,7 @@ from toy_scene import toy_camera, toy_sequence
 
 SIZE = 32
 FIRST, LAST = slice(0, 5), slice(-5, None)
-SETTINGS = TrainSettings(steps=50, split="none", record_every=1, checkpoint_every=1000)
+SETTINGS = TrainSettings(steps=50, split="none", background="white", record_every=1, checkpoint_every=1000)
 method = pytest.mark.parametrize("method", METHODS)
 
 

@@ -41,8 +41,8 @@ class GradientSettings:
     """When opacities are lowered to `reset_opacity`."""
     reset_opacity: float = 0.01
     """The ceiling at a reset."""
-    max_gaussians: int = 100_000
-    """Growth pauses for rounds that would pass this number."""
+    max_gaussians: int = 40_000
+    """Growth stops here; what pulls most grows first."""
 
 
 def keep_all_prunes(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
