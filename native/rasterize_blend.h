@@ -7,6 +7,7 @@ namespace {
 
 constexpr int kVectors = kBlock * kBlock / W;  // vectors per block
 constexpr int kBlocks = kTileBlocks * kTileBlocks;
+constexpr int kAhead = 8;    // entries: how far ahead their splats are fetched into the cache
 constexpr int kChunk = 128;  // entries handled at a time: their splats stay in the L1 cache
 
 // Pixel centres of vector `v` of a block, relative to the block's first pixel centre.
@@ -55,7 +56,9 @@ MIEN_INLINE void block_masks(const Splat* splats, const Entry* entries, int coun
 
 struct TilePixels {
   alignas(64) float transmittance[kBlocks][kBlock * kBlock];
-  alignas(64) float open[kBlocks][kBlock * kBlock];  // transmittance too, but 0 once the pixel has ended
+  // Goes on falling where transmittance stays: at kTransmittanceMin the pixel ends. That keeps the dependence of each
+  // splat on the one before it to one multiplication.
+  alignas(64) float product[kBlocks][kBlock * kBlock];
   alignas(64) float color[3][kBlocks][kBlock * kBlock];
 };
 
@@ -63,7 +66,7 @@ struct TilePixels {
 // means that all pixels of the vector have ended.
 MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const uint8_t* chosen, int count, float x,
                              float y, int block, int v, TilePixels& pixels) {
-  F transmittance = load(pixels.transmittance[block] + v * W), open = load(pixels.open[block] + v * W);
+  F transmittance = load(pixels.transmittance[block] + v * W), product = load(pixels.product[block] + v * W);
   F red = load(pixels.color[0][block] + v * W), green = load(pixels.color[1][block] + v * W);
   F blue = load(pixels.color[2][block] + v * W);
   const F px = lane_x() + x, py = lane_y(v) + y;
@@ -71,24 +74,24 @@ MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const ui
   for (; i < count; ++i) {
     const Splat& s = splats[entries[chosen[i]].gaussian];
     const F dx = px - s.x, dy = py - s.y;
-    const F power = s.log2_opacity - (dx * (s.xx * dx + 2.0f * s.xy * dy) + s.yy * (dy * dy));
-    const F alpha = minimum(exp2_fast(maximum(power, set1(-20.0f))), set1(kAlphaMax));
-    const F next = open - open * alpha;
+    const F power = s.log2_opacity - (dx * (s.xx * dx + s.two_xy * dy) + s.yy * (dy * dy));
     const M seen = less_equal(set1(kLog2AlphaMin), power);
-    const M blended = both(seen, less(set1(kTransmittanceMin), next));
-    const F weight = keep(blended, open * alpha);
+    const F alpha = keep(seen, minimum(exp2_fast(power), set1(kAlphaMax)));
+    const F next = maximum(product - product * alpha, set1(1e-20f));  // no denormals
+    const M open = less(set1(kTransmittanceMin), next);
+    const F weight = keep(open, product * alpha);
     red = red + weight * s.red;
     green = green + weight * s.green;
     blue = blue + weight * s.blue;
-    transmittance = transmittance - weight;
-    open = select(seen, keep(blended, next), open);
-    if (!any(less(F{}, open))) {
+    transmittance = select(open, next, transmittance);
+    product = next;
+    if (!any(open)) {
       ++i;
       break;
     }
   }
   store(pixels.transmittance[block] + v * W, transmittance);
-  store(pixels.open[block] + v * W, open);
+  store(pixels.product[block] + v * W, product);
   store(pixels.color[0][block] + v * W, red);
   store(pixels.color[1][block] + v * W, green);
   store(pixels.color[2][block] + v * W, blue);
@@ -116,7 +119,7 @@ MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, uint
     for (int v = 0; v < kVectors; ++v) {
       const int here = blend_vector(splats, entries, chosen[block], lengths[block], x, y, block, v, pixels);
       looked_at = looked_at < here ? here : looked_at;
-      open = either(open, less(F{}, load(pixels.open[block] + v * W)));
+      open = either(open, less(set1(kTransmittanceMin), load(pixels.product[block] + v * W)));
     }
     if (any(open)) continue;
     live &= ~(1ull << block);
@@ -129,6 +132,18 @@ MIEN_INLINE void write_block(const TilePixels& pixels, int block, const View& vi
                              float* alpha) {
   const int rows = view.height - top < kBlock ? view.height - top : kBlock;
   const int columns = view.width - left < kBlock ? view.width - left : kBlock;
+  if (rows == kBlock && columns == kBlock) {
+    for (int row = 0; row < kBlock; ++row) {
+      const int64_t pixel = (int64_t)(top + row) * view.width + left;
+      const F4 remaining = load4(&pixels.transmittance[block][row * kBlock]);
+      F4 color[3];
+      for (int channel = 0; channel < 3; ++channel)
+        color[channel] = load4(&pixels.color[channel][block][row * kBlock]) + remaining * view.background[channel];
+      join3(image + 3 * pixel, color[0], color[1], color[2]);
+      store4(alpha + pixel, 1.0f - remaining);
+    }
+    return;
+  }
   for (int row = 0; row < rows; ++row) {
     const int64_t pixel = (int64_t)(top + row) * view.width + left;
     for (int column = 0; column < columns; ++column) {
@@ -172,12 +187,13 @@ void blend(const Splat* splats, const TileLists& lists, const View& view, int ti
     fill_background(view, left, top, image, alpha);
     return;
   }
+  for (int i = begin; i < end && i < begin + kChunk; ++i) __builtin_prefetch(&splats[lists.entries[i].gaussian]);
   TilePixels pixels;
   memset(pixels.color, 0, sizeof pixels.color);
   for (int block = 0; block < kBlocks; ++block) {
     for (int v = 0; v < kVectors; ++v) {
       store(pixels.transmittance[block] + v * W, set1(1.0f));
-      store(pixels.open[block] + v * W, set1(1.0f));
+      store(pixels.product[block] + v * W, set1(1.0f));
     }
   }
   const uint64_t inside = blocks_in_picture(view, left, top);

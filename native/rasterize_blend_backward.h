@@ -7,35 +7,66 @@
 namespace {
 
 struct TileGradients {
-  alignas(64) float open[kBlocks][kBlock * kBlock];      // transmittance, 0 once the pixel has ended
+  alignas(64) float product[kBlocks][kBlock * kBlock];   // as in the forward pass
   alignas(64) float behind[kBlocks][kBlock * kBlock];    // gradient . (colour behind what has been blended)
   alignas(64) float color[3][kBlocks][kBlock * kBlock];  // dL / d image
 };
 
+// One pixel's gradients; returns their absolute sum.
+MIEN_INLINE float load_pixel(const PictureGradient& p, int64_t pixel, int block, int lane, TileGradients& t) {
+  const float grad_alpha = p.grad_alpha ? p.grad_alpha[pixel] : 0.0f;
+  float behind = -grad_alpha * (1.0f - p.alpha[pixel]), size = __builtin_fabsf(grad_alpha);
+  for (int channel = 0; channel < 3; ++channel) {
+    const float gradient = p.grad_image[3 * pixel + channel];
+    t.color[channel][block][lane] = gradient;
+    behind += gradient * p.image[3 * pixel + channel];
+    size += __builtin_fabsf(gradient);
+  }
+  t.behind[block][lane] = behind;
+  return size;
+}
+
+MIEN_INLINE F4 magnitude(F4 value) {
+  typedef int32_t I4 __attribute__((vector_size(16)));
+  return (F4)((I4)value & 0x7fffffff);
+}
+
+// Four pixels in a row, from the first lane of a block's row on.
+MIEN_INLINE F4 load_four(const PictureGradient& p, int64_t pixel, int block, int lane, TileGradients& t) {
+  F4 gradient[3], color[3];
+  split3(p.grad_image + 3 * pixel, gradient);
+  split3(p.image + 3 * pixel, color);
+  const F4 grad_alpha = p.grad_alpha ? load4(p.grad_alpha + pixel) : F4{};
+  F4 behind = -grad_alpha * (1.0f - load4(p.alpha + pixel)), size = magnitude(grad_alpha);
+  for (int channel = 0; channel < 3; ++channel) {
+    store4(&t.color[channel][block][lane], gradient[channel]);
+    behind = behind + gradient[channel] * color[channel];
+    size = size + magnitude(gradient[channel]);
+  }
+  store4(&t.behind[block][lane], behind);
+  return size;
+}
+
 // Loads the gradients of a tile; false if all are zero.
 MIEN_INLINE bool load_gradients(const PictureGradient& p, const View& view, int left, int top, TileGradients& t) {
-  memset(&t, 0, sizeof t);
   const int rows = view.height - top < kTile ? view.height - top : kTile;
   const int columns = view.width - left < kTile ? view.width - left : kTile;
-  float largest = 0;
-  for (int y = 0; y < rows; ++y) {
-    for (int x = 0; x < columns; ++x) {
-      const int64_t pixel = (int64_t)(top + y) * view.width + left + x;
-      const int block = y / kBlock * kTileBlocks + x / kBlock, lane = y % kBlock * kBlock + x % kBlock;
-      float behind = p.grad_alpha ? -p.grad_alpha[pixel] * (1.0f - p.alpha[pixel]) : 0.0f;
-      float size = p.grad_alpha ? __builtin_fabsf(p.grad_alpha[pixel]) : 0.0f;
-      for (int channel = 0; channel < 3; ++channel) {
-        const float gradient = p.grad_image[3 * pixel + channel];
-        t.color[channel][block][lane] = gradient;
-        behind += gradient * p.image[3 * pixel + channel];
-        size += __builtin_fabsf(gradient);
-      }
-      t.open[block][lane] = 1.0f;
-      t.behind[block][lane] = behind;
-      largest += size;
-    }
+  for (int block = 0; block < kBlocks; ++block)
+    for (int v = 0; v < kVectors; ++v) store(t.product[block] + v * W, set1(1.0f));
+  if (rows < kTile || columns < kTile) {
+    memset(t.behind, 0, sizeof t.behind);
+    memset(t.color, 0, sizeof t.color);
   }
-  return !(largest == 0.0f);
+  F4 size{};
+  for (int y = 0; y < rows; ++y) {
+    const int64_t pixel = (int64_t)(top + y) * view.width + left;
+    const int first_block = y / kBlock * kTileBlocks, first_lane = y % kBlock * kBlock;
+    int x = 0;
+    for (; x + kBlock <= columns; x += kBlock)
+      size = size + load_four(p, pixel + x, first_block + x / kBlock, first_lane, t);
+    for (; x < columns; ++x) size[0] += load_pixel(p, pixel + x, first_block + x / kBlock, first_lane + x % kBlock, t);
+  }
+  return !(size[0] + size[1] + size[2] + size[3] == 0.0f);
 }
 
 struct Sums {
@@ -43,22 +74,22 @@ struct Sums {
 };
 
 MIEN_INLINE void add_vector(const Splat& s, F px, F py, int block, int v, TileGradients& t, Sums& sums) {
-  F open = load(t.open[block] + v * W), behind = load(t.behind[block] + v * W);
+  const F product = load(t.product[block] + v * W), before = load(t.behind[block] + v * W);
   const F red = load(t.color[0][block] + v * W), green = load(t.color[1][block] + v * W);
   const F blue = load(t.color[2][block] + v * W);
   const F dx = px - s.x, dy = py - s.y;
-  const F power = s.log2_opacity - (dx * (s.xx * dx + 2.0f * s.xy * dy) + s.yy * (dy * dy));
-  const F raw = exp2_fast(maximum(power, set1(-20.0f)));
-  const F alpha = minimum(raw, set1(kAlphaMax));
-  const F next = open - open * alpha;
+  const F power = s.log2_opacity - (dx * (s.xx * dx + s.two_xy * dy) + s.yy * (dy * dy));
   const M seen = less_equal(set1(kLog2AlphaMin), power);
-  const M blended = both(seen, less(set1(kTransmittanceMin), next));
-  const F weight = keep(blended, open * alpha);
+  const F raw = exp2_fast(power);
+  const F alpha = keep(seen, minimum(raw, set1(kAlphaMax)));
+  const F next = maximum(product - product * alpha, set1(1e-20f));
+  const M open = less(set1(kTransmittanceMin), next);
+  const F weight = keep(open, product * alpha);
   const F own = weight * (s.red * red + s.green * green + s.blue * blue);
-  behind = behind - own;
-  const M sensitive = both(blended, less_equal(raw, set1(kAlphaMax)));
+  const F behind = before - own;
+  const M sensitive = both(open, less_equal(raw, set1(kAlphaMax)));
   const F value = keep(sensitive, own - behind * alpha * reciprocal(1.0f - alpha));
-  store(t.open[block] + v * W, select(seen, keep(blended, next), open));
+  store(t.product[block] + v * W, next);
   store(t.behind[block] + v * W, behind);
   sums.red = sums.red + weight * red;
   sums.green = sums.green + weight * green;
@@ -72,6 +103,14 @@ MIEN_INLINE void add_vector(const Splat& s, F px, F py, int block, int v, TileGr
   sums.yy = sums.yy + value_y * dy;
 }
 
+MIEN_INLINE void store_moments(const Sums& s, Moments& slot) {
+  const F4 first = sums_of_four(s.red, s.green, s.blue, s.one), second = sums_of_four(s.x, s.y, s.xx, s.xy);
+  const F4 third = sums_of_four(s.yy, F{}, F{}, F{});
+  memcpy(&slot.red, &first, sizeof first);
+  memcpy(&slot.x, &second, sizeof second);
+  memcpy(&slot.yy, &third, sizeof third);
+}
+
 void blend_backward(const Splat* splats, const TileLists& lists, const View& view, int tile,
                     const PictureGradient& picture, Moments* slots) {
   const int left = tile % lists.columns * kTile, top = tile / lists.columns * kTile;
@@ -79,20 +118,24 @@ void blend_backward(const Splat* splats, const TileLists& lists, const View& vie
   if (begin == end) return;
   TileGradients gradients;
   const bool needed = load_gradients(picture, view, left, top, gradients);
+  F px[kTileBlocks], py[kTileBlocks][kVectors];
+  for (int i = 0; i < kTileBlocks; ++i) {
+    px[i] = lane_x() + (left + 0.5f + kBlock * i);
+    for (int v = 0; v < kVectors; ++v) py[i][v] = lane_y(v) + (top + 0.5f + kBlock * i);
+  }
   const int last = needed ? lists.ends[tile] : begin;
   for (int i = begin; i < last; ++i) {
     const Splat& s = splats[lists.entries[i].gaussian];
+    const Entry& ahead = lists.entries[i + kAhead < last ? i + kAhead : i];
+    __builtin_prefetch(&splats[ahead.gaussian]);
+    __builtin_prefetch(&slots[ahead.slot], 1);
     Sums sums{};
     for (uint64_t mask = lists.masks[i]; mask; mask &= mask - 1) {
       const int block = __builtin_ctzll(mask);
-      const F px = lane_x() + (left + 0.5f + kBlock * (block % kTileBlocks));
-      for (int v = 0; v < kVectors; ++v) {
-        const F py = lane_y(v) + (top + 0.5f + kBlock * (block / kTileBlocks));
-        add_vector(s, px, py, block, v, gradients, sums);
-      }
+      for (int v = 0; v < kVectors; ++v)
+        add_vector(s, px[block % kTileBlocks], py[block / kTileBlocks][v], block, v, gradients, sums);
     }
-    slots[lists.entries[i].slot] = {sum(sums.red), sum(sums.green), sum(sums.blue), sum(sums.one), sum(sums.x),
-                                    sum(sums.y),   sum(sums.xx),    sum(sums.xy),   sum(sums.yy),  {}};
+    store_moments(sums, slots[lists.entries[i].slot]);
   }
   for (int i = last; i < end; ++i) memset(&slots[lists.entries[i].slot], 0, sizeof(Moments));
 }

@@ -19,18 +19,17 @@ constexpr float kTransmittanceMin = 1e-4f;
 constexpr float kFovMargin = 0.3f;
 constexpr float kLog2AlphaMin = -7.994353437f;  // log2(1 / 255)
 
-// A projected Gaussian: one cache line. alpha(dx, dy) = 2^(log2_opacity - (xx dx^2 + 2 xy dx dy + yy dy^2)).
+// A projected Gaussian: one cache line. alpha(dx, dy) = 2^(log2_opacity - (xx dx^2 + two_xy dx dy + yy dy^2)).
 struct alignas(64) Splat {
-  float x, y;        // centre, pixels
-  float xx, xy, yy;  // the inverse covariance times log2(e) / 2
-  float log2_opacity;
-  float red, green, blue;
+  float x, y;  // centre, pixels
   // The ellipse where alpha is 1/255: at height dy it spans slope * dy +- sqrt(width2 * (1 - (dy / half_height)^2)).
   float slope, width2;
-  float half_width, half_height;
-  float y_rightmost;  // dy of the point that is farthest right; the leftmost is opposite
-  float depth;        // camera z
-  float unused;
+  float half_height;
+  float y_rightmost;     // dy of the point that is farthest right; the leftmost is opposite
+  float depth, unused;   // camera z
+  float xx, two_xy, yy;  // the inverse covariance times log2(e) / 2
+  float log2_opacity;
+  float red, green, blue, unused2;
 };
 
 // A (Gaussian, tile) pair in a tile's list, front to back.

@@ -84,19 +84,19 @@ MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i
   const F inverse_yy = 1.0f / p.yy;
   const F columns[16] = {p.x,
                          p.y,
+                         p.xy * inverse_yy,
+                         o.cutoff2 * p.determinant * inverse_yy,
+                         o.half_height,
+                         p.xy * square_root(o.cutoff2 / p.xx),
+                         p.camera.z,
+                         F{},
                          p.yy * conic_scale,
-                         -p.xy * conic_scale,
+                         -2.0f * p.xy * conic_scale,
                          p.xx * conic_scale,
                          log2_opacity,
                          color.x,
                          color.y,
                          color.z,
-                         p.xy * inverse_yy,
-                         o.cutoff2 * p.determinant * inverse_yy,
-                         o.half_width,
-                         o.half_height,
-                         p.xy * square_root(o.cutoff2 / p.xx),
-                         p.camera.z,
                          F{}};
   store_columns<16>(&splats[i].x, 16, valid, columns);
   store_radii(p, o.drawn, valid, radii + i);
@@ -124,17 +124,11 @@ struct SplatShape {
 };
 
 MIEN_INLINE SplatShape gather_shapes(const Splat* const* splats) {
-  alignas(64) float buffer[6][W];
-  for (int lane = 0; lane < W; ++lane) {
-    const Splat& splat = *splats[lane];
-    buffer[0][lane] = splat.x;
-    buffer[1][lane] = splat.y;
-    buffer[2][lane] = splat.slope;
-    buffer[3][lane] = splat.width2;
-    buffer[4][lane] = splat.half_height;
-    buffer[5][lane] = splat.y_rightmost;
-  }
-  return {load(buffer[0]), load(buffer[1]), load(buffer[2]), load(buffer[3]), load(buffer[4]), load(buffer[5])};
+  const float* rows[W];
+  for (int lane = 0; lane < W; ++lane) rows[lane] = &splats[lane]->x;
+  F v[6];
+  gather_columns<6>(rows, v);
+  return {v[0], v[1], v[2], v[3], v[4], v[5]};
 }
 
 // The columns of pixel groups of `size` pixels that the ellipse touches in the rows of pixel centres top..bottom (both
@@ -148,8 +142,8 @@ MIEN_INLINE Columns columns_touched(const SplatShape& s, F top, F bottom, F firs
   const F right_y = clamp(s.y_rightmost, top, bottom), left_y = clamp(-s.y_rightmost, top, bottom);
   const F inverse = 1.0f / s.half_height;
   const F right_t = right_y * inverse, left_t = left_y * inverse;
-  const F right = s.slope * right_y + square_root(maximum(s.width2 * (1.0f - right_t * right_t), F{}));
-  const F left = s.slope * left_y - square_root(maximum(s.width2 * (1.0f - left_t * left_t), F{}));
+  const F right = s.slope * right_y + root_bound(s.width2 * (1.0f - right_t * right_t));
+  const F left = s.slope * left_y - root_bound(s.width2 * (1.0f - left_t * left_t));
   const M hit = both(less_equal(top, s.half_height), less_equal(-s.half_height, bottom));
   const float per_group = 1.0f / size;
   const F low = -round_down((first + (size - 1.0f) - left) * per_group);

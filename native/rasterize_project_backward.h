@@ -126,22 +126,21 @@ MIEN_INLINE void color_gradient(const GaussianArrays& g, const View& view, int64
 // Sums the moments of each lane's slots, in their order; false if there are none.
 MIEN_INLINE bool gather_moments(int64_t i, int valid, const uint32_t* begins, const uint32_t* ends,
                                 const Moments* slots, F* moments) {
-  alignas(64) float buffer[9][W];
-  memset(buffer, 0, sizeof buffer);
-  float size = 0;
-  for (int lane = 0; lane < valid; ++lane) {
-    float total[12] = {};
-    for (uint32_t slot = begins[i + lane]; slot < ends[i + lane]; ++slot) {
-      const float* from = &slots[slot].red;
-      for (int j = 0; j < 12; ++j) total[j] += from[j];
+  alignas(64) float buffer[W][12];
+  F4 size{};
+  for (int lane = 0; lane < valid; ++lane) __builtin_prefetch(&slots[begins[i + lane]]);
+  for (int lane = 0; lane < W; ++lane) {
+    F4 total[3] = {};
+    for (uint32_t slot = lane < valid ? begins[i + lane] : 0; slot < (lane < valid ? ends[i + lane] : 0); ++slot) {
+      F4 from[3];
+      memcpy(from, &slots[slot], sizeof from);
+      for (int j = 0; j < 3; ++j) total[j] = total[j] + from[j];
     }
-    for (int j = 0; j < 9; ++j) {
-      buffer[j][lane] = total[j];
-      size += __builtin_fabsf(total[j]);
-    }
+    memcpy(buffer[lane], total, sizeof total);
+    for (int j = 0; j < 3; ++j) size = size + total[j] * total[j];
   }
-  for (int j = 0; j < 9; ++j) moments[j] = load(buffer[j]);
-  return !(size == 0.0f);
+  load_columns<9>(buffer[0], 12, W, moments);
+  return !(size[0] + size[1] + size[2] + size[3] == 0.0f);
 }
 
 MIEN_INLINE void clear_group(const GaussianGradients& out, int sh_count, int64_t i, int valid) {
