@@ -27,6 +27,7 @@ from mien.avatar.files import load_avatar, read_baked, write_avatar, write_baked
 from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
 from mien.avatar.headgas import HeadGas, HeadGasConfig
 from mien.avatar.methods import METHODS, Method, method_named, method_of
+from mien.avatar.mono_gaussian_avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig
 from mien.avatar.store import GaussianStore, Moments
 
 __all__ = [
@@ -47,6 +48,8 @@ __all__ = [
     "Method",
     "MethodConfig",
     "Moments",
+    "MonoGaussianAvatar",
+    "MonoGaussianAvatarConfig",
     "ParameterGroup",
     "Photometric",
     "Posed",

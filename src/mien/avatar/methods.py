@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from mien.avatar.avatar import Avatar, MethodConfig
 from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
 from mien.avatar.headgas import HeadGas, HeadGasConfig
+from mien.avatar.mono_gaussian_avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig
 from mien.errors import UserError
 
 
@@ -19,6 +20,7 @@ class Method:
 METHODS = {
     "gaussian_avatars": Method(GaussianAvatarsConfig, GaussianAvatars),
     "headgas": Method(HeadGasConfig, HeadGas),
+    "mono_gaussian_avatar": Method(MonoGaussianAvatarConfig, MonoGaussianAvatar),
 }
 
 
