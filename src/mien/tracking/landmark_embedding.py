@@ -130,7 +130,11 @@ def write_landmarks(path: Path, model: FaceModel, landmarks: dict[str, Landmarks
 
 
 def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.Generator) -> FaceParams:
-    """One timestep of a random person with a mild expression, turned a little, at the world's origin."""
+    """One timestep of a random person with a mild expression, turned a little, at the world's origin.
+
+    Half of them open the mouth, a third close the eyes: on closed lips or open lids alone a point of the upper one
+    cannot be told from its neighbour on the lower one.
+    """
 
     def uniform(*shape: int) -> Tensor:
         return 2 * torch.rand(*shape, generator=generator) - 1
@@ -138,12 +142,21 @@ def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.
     neutral = model.neutral()
     active = torch.rand(neutral.expression.shape, generator=generator) < 0.12
     strength = 0.35 * torch.rand(neutral.expression.shape, generator=generator)
-    expression = (active * strength).clamp(model.expression_bounds[:, 0], model.expression_bounds[:, 1])
+    expression = active * strength
+    opening, blink = _sometimes(0.5, generator), _sometimes(0.35, generator)
+    for index, name in enumerate(model.expression_names):
+        if name == "jawOpen":
+            expression[:, index] = 0.6 * opening
+        elif name.startswith("eyeBlink"):
+            expression[:, index] = blink
+    expression = expression.clamp(model.expression_bounds[:, 0], model.expression_bounds[:, 1])
     joints = neutral.joints.clone()
     gaze = settings.gaze * uniform(3) * torch.tensor([0.6, 1.0, 0.0])
     for index, name in enumerate(model.free_joint_names):
         if name in ("left_eye", "right_eye"):
             joints[:, index] = gaze
+        elif name == "jaw":
+            joints[:, index, 0] = 0.25 * opening
     limits = torch.tensor([settings.pitch, settings.yaw, 0.1])
     return replace(
         neutral,
@@ -152,6 +165,12 @@ def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.
         joints=joints,
         head_rotation=uniform(1, 3) * limits,
     )
+
+
+def _sometimes(share: float, generator: torch.Generator) -> float:
+    """0, or in a share of the cases a random number up to 1."""
+    chance, amount = torch.rand(2, generator=generator).tolist()
+    return amount if chance < share else 0.0
 
 
 def paint(model: FaceModel, generator: torch.Generator) -> Float[Tensor, "f 3 3"]:
