@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from mien.evaluation.experiment import Experiment, Frame, scoring_alpha, target_image
+from mien.evaluation.experiment import Experiment, Frame, target_image
 from mien.render.mesh import rasterize_mesh, render_mesh, vertex_normals
 
 _COLOUR_FRAMES = 60
@@ -90,15 +90,17 @@ def _vertex_colors(experiment: Experiment) -> Float[Tensor, "v 3"]:
 def _seen_colors(
     experiment: Experiment, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
 ) -> tuple[Float[Tensor, "v 3"], Float[Tensor, " v"]]:
-    """What one frame shows at each vertex, and how much that counts: 0 where hidden, cut away or outside."""
+    """What one frame's target shows at each vertex, and how much that counts: 0 where hidden or beside the person.
+
+    What the scoring mask cuts off the person, below the neck line, is white in the target and so on the mesh.
+    """
     camera = experiment.camera(frame)
     pixels, depth = camera.project(vertices)
     grid = pixels / torch.tensor([camera.width, camera.height]) * 2 - 1
     sequence = experiment.sequences[frame.sequence]
-    image = torch.from_numpy(sequence.capture.images[frame[1:]].astype(np.float32)) / 255
-    mask = scoring_alpha(experiment, frame)[..., None]
+    person = torch.from_numpy(sequence.capture.mattes[frame[1:]].astype(np.float32))[..., None] / 255
     nearest = rasterize_mesh(vertices, faces, camera).depth[..., None]
-    colors, alpha = (_sample(picture, grid, "bilinear") for picture in (image, mask))
+    colors, alpha = (_sample(picture, grid, "bilinear") for picture in (target_image(experiment, frame), person))
     front = _sample(nearest.nan_to_num(posinf=1e3), grid, "nearest")[:, 0]
     to_camera = normalize(camera.position - vertices, dim=-1)
     facing = (vertex_normals(vertices, faces) * to_camera).sum(-1).clamp_min(0)

@@ -131,6 +131,7 @@ def _table(protocols: Mapping[str, Any]) -> str:
             f"{_TITLES.get(name, name)} · {entry['frames']} frames held out ({entry['split']}) · face parameters "
             f"{entry['face_params'].replace('_', ' ')} · PSNR on frames trained on: "
             f"{entry['training_frames']['psnr']:.2f}, head {entry['training_frames']['head']['psnr']:.2f} dB"
+            f" · ST-LPIPS on {entry['perceptual_frames']} frames, evenly spread"
         )
         parts.append(
             f'<div class="card table"><div class="scroll"><table>{_table_head()}<tbody>{rows}</tbody></table></div>'
@@ -143,7 +144,7 @@ def _table_head() -> str:
     names = "".join(f"<th>{label}</th>" for _, label, _ in _METRICS)
     groups = '<th class="group" colspan="4">Whole frame</th><th class="group head" colspan="4">Head crop</th>'
     head_names = names.replace("<th>", '<th class="head">', 1)
-    return f"<thead><tr><th></th>{groups}</tr><tr><th></th>{names}{head_names}</tr></thead>"
+    return f'<thead><tr><th class="blank"></th>{groups}</tr><tr><th></th>{names}{head_names}</tr></thead>'
 
 
 def _cells(key: str, subjects: Mapping[str, Any]) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from mien.evaluation.experiment import Experiment, Frame, avatar_image, target_image
+from mien.evaluation.metrics import Box, crop_to
 from mien.evaluation.pictures import HEAT_STOPS, data_uri, error_heat, shrunk, to_uint8
 from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import AVATAR, MESH, Evaluation
@@ -17,6 +18,8 @@ _OVERLAY_SIZE = 300
 _HEAT_LIMIT = 0.25
 _ROWS = 6
 _OVERLAYS = 6
+_MARGIN = 0.05
+_SMOOTHING = 15
 
 
 def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
@@ -25,7 +28,8 @@ def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
     middle = len(ranked) // 2
     places = _places(len(ranked), middle)
     names = {len(ranked) - 1: "best", middle: "median", 0: "worst"}
-    rows = [_comparison_row(experiment, evaluation, ranked[place], names.get(place, "")) for place in places]
+    box = _head_box(experiment, [evaluation.frames[ranked[place]] for place in places])
+    rows = [_comparison_row(experiment, evaluation, ranked[place], names.get(place, ""), box) for place in places]
     stops = ", ".join(f"rgb{stop}" for stop in HEAT_STOPS)
     scale = (
         f'<span class="scale">0 <i style="background:linear-gradient(90deg,{stops})"></i> '
@@ -44,10 +48,20 @@ def _places(count: int, middle: int) -> list[int]:
     return places[::-1]
 
 
-def _comparison_row(experiment: Experiment, evaluation: Evaluation, index: int, name: str) -> str:
+def _head_box(experiment: Experiment, frames: Sequence[Frame]) -> Box:
+    """A box around the head crops of some frames, with a margin: one cut for all, so that motion can be seen."""
+    crops = np.array([experiment.crop(frame) for frame in frames])
+    left, top = crops[:, :2].min(0)
+    right, bottom = (crops[:, :2] + crops[:, 2:]).max(0)
+    margin = int(_MARGIN * max(right - left, bottom - top))
+    return int(left) - margin, int(top) - margin, int(right - left) + 2 * margin, int(bottom - top) + 2 * margin
+
+
+def _comparison_row(experiment: Experiment, evaluation: Evaluation, index: int, name: str, box: Box) -> str:
     frame, scores = evaluation.frames[index], evaluation.scores[AVATAR][index]
     target, image = target_image(experiment, frame), avatar_image(experiment, frame)
-    pictures = (to_uint8(target), to_uint8(image), error_heat(image, target, _HEAT_LIMIT))
+    whole = (to_uint8(target), to_uint8(image), error_heat(image, target, _HEAT_LIMIT))
+    pictures = [crop_to(torch.from_numpy(picture), box).numpy() for picture in whole]
     figures = f"PSNR {scores['psnr']:.2f} dB, head {scores['head_psnr']:.2f} dB, SSIM {scores['ssim']:.3f}"
     if "perceptual" in scores:
         figures += f", ST-LPIPS {scores['perceptual']:.3f}"
@@ -106,9 +120,19 @@ def training_curves(curves: Mapping[str, np.ndarray]) -> str:
         if name == "step_ms":
             # The first step pays for caches; one late outlier would flatten the rest.
             values = np.minimum(values, np.percentile(values, 99))
-        chart = line_chart([Series(title, steps, values)], Axes("step", title, from_zero=from_zero))
+        series = [Series(title, steps, values)]
+        if name in ("loss", "psnr"):
+            series = [Series("one frame each", steps, values, "quiet"), Series("mean", *_smooth(steps, values))]
+        chart = line_chart(series, Axes("step", title, from_zero=from_zero))
         cards.append(_card(title, chart))
     return f'<div class="grid2">{"".join(cards)}</div>'
+
+
+def _smooth(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mean of a sliding window of a fifteenth of the curve."""
+    width = max(1, len(y) // _SMOOTHING)
+    window = np.full(width, 1 / width)
+    return np.convolve(x, window, "valid"), np.convolve(y, window, "valid")
 
 
 @torch.no_grad()
