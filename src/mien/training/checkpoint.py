@@ -48,7 +48,8 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
         "gaussians": torch.tensor(len(state.avatar.gaussian_store())),
     }
     write_tensors(folder / f"step_{state.step:07d}.safetensors", tensors, {"format": "mien.checkpoint", "version": "1"})
-    for old in checkpoint_files(folder)[:-_KEPT]:
+    # Besides old checkpoints: what writing left behind when it was killed.
+    for old in (*checkpoint_files(folder)[:-_KEPT], *folder.glob(".step_*")):
         old.unlink()
 
 
