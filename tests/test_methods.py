@@ -24,6 +24,7 @@ from mien.config import decode, encode
 from mien.progress import Advance
 from mien.render import rasterize
 from mien.training import TrainSettings
+from mien.training.checkpoint import resume, write_checkpoint
 from mien.training.density import density_strategy
 from mien.training.frames import FrameOrder, training_frames
 from mien.training.sequence import Targets
@@ -141,6 +142,26 @@ def test_pose_depends_on_its_arguments_only(method: str) -> None:
     assert torch.equal(first, avatar.pose(face[1]).gaussians.means)
     together = avatar.pose(face, TRAINED).gaussians.timestep(1).means
     torch.testing.assert_close(together, avatar.pose(face[1]).gaussians.timestep(0).means, atol=1e-6, rtol=1e-5)
+
+
+@method
+def test_training_goes_on_from_a_checkpoint_as_if_it_had_never_stopped(method: str, tmp_path: Path) -> None:
+    face_model, sequence = toy_sequence(5, SIZE)
+    settings = replace(SETTINGS, steps=24)
+    data = TrainingData(FrameOrder(training_frames([sequence], settings), 0), (Targets(sequence, 0),))
+    undisturbed = start([sequence], face_model, config_of(method), settings)
+    for _ in range(settings.steps):
+        step(undisturbed, data, settings)
+        if undisturbed.step == 11:
+            write_checkpoint(tmp_path, undisturbed)
+    resumed = start([sequence], face_model, config_of(method), settings)
+    resume(tmp_path, resumed)
+    assert resumed.step == 11
+    while resumed.step < settings.steps:
+        step(resumed, data, settings)
+    expected = undisturbed.avatar.state_dict()
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in resumed.avatar.state_dict().items())
+    assert resumed.curves["loss"] == undisturbed.curves["loss"]
 
 
 @method

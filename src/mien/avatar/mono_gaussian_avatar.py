@@ -67,7 +67,7 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Gaussians to begin with, on a sphere."""
     sphere_radius: float = 0.125
     """Metres: of that sphere about the head frame's origin."""
-    max_points: int = 8_000
+    max_points: int = 6_000
     """Growth ends here (paper: 100,000)."""
     rounds: int = 50
     """How often points are pruned and refilled (paper: 100, once an epoch)."""
@@ -77,6 +77,8 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Of the attribute network (paper: 7)."""
     deformation_width: int = 64
     """Of the deformation network (paper: 128)."""
+    change_width: int = 32
+    """Of the network that changes attributes with motion (paper: 64)."""
     scale_gain: float = 0.00625
     """Metres: the networks' largest scale (paper: 0.0025 for pictures of 1024x1024)."""
     means_rate: Rate = Rate(1e-4, 1e-5)
@@ -103,7 +105,7 @@ class MonoGaussianAvatar(Avatar):
         e, k = face.expression.shape[1], len(face_model.joint_names)
         self.attributes = AttributeNet(config.attribute_width, config.attribute_layers).to(like)
         self.deformation = DeformationNet(config.deformation_width, e, 9 * face.joints.shape[1], k).to(like)
-        self.change = AttributeChangeNet(64).to(like)
+        self.change = AttributeChangeNet(config.change_width).to(like)
         self.register_buffer("canonical_expression", face.expression.detach().mean(0))
         self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
 
@@ -236,9 +238,8 @@ def blend_directions(
 ) -> Float[Tensor, "b n 3"]:
     """E psi + P (R - I): what expression and free joints add before skinning."""
     turned = matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)
-    inputs = torch.cat([face.expression, turned.flatten(1)], dim=-1)
-    directions = torch.cat([expression, pose], dim=-1)
-    return (directions.flatten(0, 1) @ inputs.T).T.unflatten(-1, (-1, 3))
+    added = expression.flatten(0, 1) @ face.expression.T + pose.flatten(0, 1) @ turned.flatten(1).T
+    return added.T.unflatten(-1, (-1, 3))
 
 
 def blend_transforms(weights: Float[Tensor, "n k"], transforms: Float[Tensor, "b k 4 4"]) -> Float[Tensor, "b n 3 4"]:
