@@ -37,6 +37,7 @@ def test_recipe_and_seed_decide_every_byte(scene):
 
 def test_noise_is_the_only_difference_that_noise_makes(scene):
     noisy = SyntheticScene(replace(SMALL, noise=0.01), seed=3)
+    noisy.__dict__["subject"] = scene.subject
     difference = noisy.frame(2).image.astype(float) - scene.frame(2).image
     assert 0.006 * 255 < difference.std() < 0.014 * 255
     np.testing.assert_array_equal(noisy.frame(2).image, noisy.frame(2).image)
@@ -64,11 +65,10 @@ def test_landmarks_are_the_projected_mesh(plain):
     image, marks = big.frame(open_eyed).image.astype(float), big.landmarks()[open_eyed]
     vertices = big.vertices(open_eyed)
     torch.testing.assert_close(vertices, big.model(big.face[open_eyed])[0])
-    for eye in big.subject.eyes:
+    for eye, mark in zip(big.subject.eyes, (468, 473), strict=True):
         iris = vertices[torch.from_numpy(eye.front)].mean(0)
-        white = vertices[torch.from_numpy(eye.vertices)]
         pixel = big.camera.project(iris[None])[0][0].numpy()
-        assert len(white)
+        assert np.linalg.norm(marks[mark] - pixel) < 6
         brightness = [_brightness(image, pixel), _brightness(image, marks[1])]  # pupil, tip of the nose
         assert brightness[0] < 0.5 * brightness[1]
     lips = np.mean([_patch(image, marks[index]) for index in (17, 405, 181)], axis=0)
@@ -80,7 +80,7 @@ def test_matte_is_the_coverage(scene):
     """Where the matte is 0 the wall is seen unchanged; where it is 255 no wall is."""
     frame = scene.frame(3)
     darker = SyntheticScene(SMALL, seed=3)
-    darker.__dict__["subject"] = scene.subject
+    darker.__dict__["subject"] = scene.subject  # the same person, not built again
     darker.__dict__["background"] = np.zeros_like(scene.background)
     black = darker.frame(3)
     np.testing.assert_array_equal(black.matte, frame.matte)
@@ -123,8 +123,8 @@ def test_shoulders_hold_still_while_the_head_turns():
     scene = SyntheticScene(replace(RECIPES["demo"], translation=(0.0, 0.0, 0.0)), seed=2)
     bottom = bottom_vertices(scene.model)
     moved = torch.stack([scene.vertices(timestep)[bottom] for timestep in range(0, 200, 20)])
-    travel = (moved - moved.mean(0)).norm(dim=-1).amax()
-    assert float(travel) < 0.03
+    middle = moved.mean(1)  # the shoulders turn a little, about the middle of the neck
+    assert float((middle - middle.mean(0)).norm(dim=-1).amax()) < 0.006
 
 
 def test_neck_lines_cut_below_the_chin(scene):

@@ -178,8 +178,8 @@ class FrontView:
         rows = -(-len(place) // 4096)
         padded = np.full((rows * 4096, 2), -1e4, np.float32)
         padded[: len(place)] = place - 0.5
-        grid = padded.reshape(rows, 4096, 2)
-        return cv2.remap(image, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT).reshape(-1)[: len(place)]
+        x, y = (np.ascontiguousarray(padded[:, axis]).reshape(rows, 4096) for axis in range(2))
+        return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT).reshape(-1)[: len(place)]
 
 
 def face_view(anatomy: Anatomy) -> FrontView:

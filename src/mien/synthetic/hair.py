@@ -1,6 +1,7 @@
 """Strands: hair on the scalp, brows and lashes. Curves with a width, drawn as ribbons that face the camera."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,7 +23,7 @@ class Strands:
     outwards: Float[np.ndarray, "n s 3"]
     """Unit directions away from what the hair lies on."""
 
-    @property
+    @cached_property
     def tangents(self) -> Float[np.ndarray, "n s 3"]:
         """Unit directions along the strands."""
         return unit(np.gradient(self.points, axis=1).astype(np.float32))
@@ -54,11 +55,6 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray | np.floating:
     """Scalar products over the last axis; several times faster than multiplying and summing."""
     return np.einsum("...i,...i->...", first, second)
-
-
-def join(parts: list[Strands]) -> Strands:
-    """All strands in one; they need the same number of points."""
-    return Strands(*(np.concatenate([getattr(part, f) for part in parts]) for f in Strands.__dataclass_fields__))
 
 
 def short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, count: int = 9000) -> Strands:

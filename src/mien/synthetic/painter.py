@@ -148,7 +148,8 @@ def _paint_mouth(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
     views = canvas.views(canvas.pixels[rows])
     normals = np.where((normals * views).sum(-1, keepdims=True) < 0, -normals, normals)
     if canvas.material[rows[0]] == TEETH:
-        return shading.shade_teeth(rest, normals, depth, views, canvas.light)
+        teeth = posed.head[np.unique(subject.anatomy.faces[subject.anatomy.region("teeth")]), 2]
+        return shading.shade_teeth(rest, normals, teeth.max() - points[:, 2], views, canvas.light)
     return shading.shade_mouth(normals, depth, views, canvas.light)
 
 
@@ -195,22 +196,29 @@ def _add_lenses(canvas: _Canvas, image: Float[np.ndarray, "p 3"]) -> None:
     """Lenses over what is behind them; only samples that already see the person."""
     glasses = canvas.subject.glasses
     assert glasses is not None
-    lenses = glasses.lenses
-    faces = torch.from_numpy(lenses.faces)
-    fragments = rasterize_mesh(torch.from_numpy(lenses.vertices), faces, canvas.camera)
-    in_front = fragments.depth < canvas.fragments.depth
-    pixels = np.flatnonzero((in_front & (canvas.fragments.face_index >= 0)).numpy().reshape(-1))
-    if not len(pixels):
+    lenses, camera = glasses.lenses, canvas.camera
+    projected = camera.project(torch.from_numpy(lenses.vertices))[0].numpy()
+    size = (camera.width, camera.height)
+    left, top = (int(v) for v in np.clip(np.floor(projected.min(0)), 0, size))
+    right, bottom = (int(v) for v in np.clip(np.ceil(projected.max(0)), 0, size))
+    if left >= right or top >= bottom:
         return
-    index = torch.from_numpy(pixels)
+    faces = torch.from_numpy(lenses.faces)
+    window = camera.cropped(float(left), float(top), right - left, bottom - top)
+    fragments = rasterize_mesh(torch.from_numpy(lenses.vertices), faces, window)
+    behind, seen = (t[top:bottom, left:right] for t in (canvas.fragments.depth, canvas.fragments.face_index))
+    index = ((fragments.depth < behind) & (seen >= 0)).flatten().nonzero()[:, 0]
+    if not len(index):
+        return
     part = MeshFragments(
         fragments.face_index.reshape(-1).index_select(0, index)[None],
         fragments.barycentric.reshape(-1, 3).index_select(0, index)[None],
         fragments.depth.reshape(-1).index_select(0, index)[None],
     )
     normals = unit(interpolate(part, torch.from_numpy(lenses.normals), faces)[0].numpy())
-    views = canvas.views(pixels)
-    image[pixels] = 0.93 * image[pixels] + shading.lens_reflection(normals, views, canvas.light)
+    row, column = np.divmod(index.numpy(), right - left)
+    pixels = (row + top) * camera.width + column + left
+    image[pixels] = 0.93 * image[pixels] + shading.lens_reflection(normals, canvas.views(pixels), canvas.light)
 
 
 def develop(

@@ -20,7 +20,7 @@ class SyntheticRecipe:
     """Length of the clip."""
     fps: float = 25.0
     """Frames a second."""
-    focal: float = 2.1
+    focal: float = 2.35
     """Focal length in picture widths."""
     distance: float = 1.0
     """From the camera to the head, metres."""

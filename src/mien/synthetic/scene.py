@@ -115,7 +115,14 @@ class SyntheticScene:
 
     @property
     def source(self) -> dict:
-        """For `Capture.source`: names recipe and seed, and their hash together with the face model's."""
-        content = {"recipe": asdict(self.recipe), "seed": self.seed, "face_model": self.model.content_hash}
+        """For `Capture.source`: names recipe and seed, and a hash of all that decides the pictures but the code."""
+        marks = self.model.landmarks["mediapipe"]  # paint and strands are placed by them
+        embedding = marks.faces.numpy().tobytes() + marks.barycentric.numpy().tobytes()
+        content = {
+            "recipe": asdict(self.recipe),
+            "seed": self.seed,
+            "face_model": self.model.content_hash,
+            "landmarks": hashlib.sha256(embedding).hexdigest()[:16],
+        }
         digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
         return {"kind": "synthetic", "content_hash": digest, **content}

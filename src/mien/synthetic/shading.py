@@ -11,6 +11,9 @@ from mien.synthetic.hair import Strands, dot, unit
 from mien.synthetic.light import Lighting
 from mien.synthetic.noise import smoothstep
 
+_HIGHLIGHT = 0.2
+"""Lamps that are weaker show in diffuse light only."""
+
 
 @dataclass(frozen=True, eq=False)
 class LocalLight:
@@ -19,7 +22,7 @@ class LocalLight:
     quadratic: Float[np.ndarray, "10 3"]
     """Irradiance as a polynomial of the normal: factors of xx, yy, zz, xy, yz, xz, x, y, z, 1."""
     lamps: tuple[tuple[np.ndarray, np.ndarray], ...]
-    """Direction (head frame) and colour of each."""
+    """Direction (head frame) and colour of each that is bright enough for highlights."""
 
     def irradiance(self, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """What a white surface returns."""
@@ -43,7 +46,8 @@ def turned(lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> LocalL
     x, y, z = directions.T
     monomials = np.stack([x * x, y * y, z * z, x * y, y * z, x * z, x, y, z, np.ones_like(x)], -1)
     quadratic = np.linalg.lstsq(monomials, values.astype(np.float64), rcond=None)[0].astype(np.float32)
-    lamps = tuple(((R_world_head.T @ lamp.direction).astype(np.float32), lamp.color) for lamp in lighting.lamps)
+    bright = [lamp for lamp in lighting.lamps if lamp.color.max() > _HIGHLIGHT]
+    lamps = tuple(((R_world_head.T @ lamp.direction).astype(np.float32), lamp.color) for lamp in bright)
     return LocalLight(quadratic, lamps)
 
 
@@ -140,7 +144,7 @@ def shade_eye(
     iris_albedo = iris_albedo * smoothstep(0.34, 0.40, q)[:, None] + 0.004
     veins = smoothstep(0.25, 0.05, np.abs(np.sin(9 * turn + 6 * np.sin(14 * radius) + 3 * local[:, 1])))
     corner = smoothstep(0.45, 0.85, np.abs(local[:, 0]))
-    white = np.array([0.62, 0.58, 0.55], np.float32) * np.exp(
+    white = np.array([0.50, 0.46, 0.43], np.float32) * np.exp(
         np.outer(corner * (0.3 + 0.35 * veins), [-0.25, -1.0, -0.95])
     )
     share = smoothstep(1.04, 0.94, q)[:, None]
@@ -170,14 +174,14 @@ def shade_teeth(
     views: Float[np.ndarray, "n 3"],
     light: LocalLight,
 ) -> Float[np.ndarray, "n 3"]:
-    """Off-white, with gaps every 8 mm along the arch; `depth` is metres behind the lips, where light gets scarce."""
+    """Off-white, with gaps every 8 mm along the arch; `depth` is metres behind the first of them: light gets scarce."""
     along = rest[:, 0] / 0.0082
     place = along - np.round(along - 0.5) - 0.5
     gap = smoothstep(0.42, 0.5, np.abs(place))
     rounded = normals + np.stack([0.5 * np.sign(place) * place**2 * 4, np.zeros_like(place), np.zeros_like(place)], -1)
     rounded = unit(rounded).astype(np.float32)
     albedo = np.array([0.70, 0.64, 0.52], np.float32) * (1 - 0.5 * gap)[:, None]
-    scarce = np.exp(-np.clip(depth - 0.008, 0, None) / 0.016)[:, None]
+    scarce = 0.9 * np.exp(-np.clip(depth - 0.005, 0, None) / 0.010)[:, None]
     return (albedo * light.irradiance(rounded) * 0.8 + highlight(rounded, views, light, ((0.35, 150.0),))) * scarce
 
 

@@ -137,8 +137,8 @@ def _paint_detail(canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise, random: 
     canvas.albedo[:] *= np.exp(0.05 * fine + 0.05 * tiny + 0.05 * noise.octaves(points, 0.03, 2))[:, None]
     middle = 0.5 * (marks[places.CHEEKS[0]] + marks[places.CHEEKS[1]])
     freckled = np.clip(_near(points, middle + [0, 0.01, 0], 0.04) * 1.3, 0, 1) * random.uniform(0.25, 1.0)
-    spots = smoothstep(0.42, 0.62, noise(points + 1.7, 0.0031) + 0.25 * tiny) * freckled
-    canvas.albedo[:] *= np.exp(np.outer(spots, [-0.22, -0.42, -0.5]))
+    spots = smoothstep(0.48, 0.68, noise(points + 1.7, 0.0025) + 0.3 * tiny) * freckled
+    canvas.albedo[:] *= np.exp(np.outer(spots, [-0.18, -0.34, -0.4]))
     for _ in range(random.integers(5, 10)):
         spot = points[random.integers(len(points))]
         mole = smoothstep(1.0, 0.6, np.linalg.norm(points - spot, axis=-1) / random.uniform(0.0009, 0.0019))

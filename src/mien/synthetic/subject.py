@@ -10,9 +10,9 @@ from mien.face import FaceModel, FaceParams
 from mien.render.mesh import vertex_normals
 from mien.synthetic.accessories import Glasses, Part, build_glasses, build_shirt
 from mien.synthetic.anatomy import CHIN, SIDES, Anatomy, measure
-from mien.synthetic.hair import SkinStrands, Strands, brow_strands, join, lash_strands, short_hair
+from mien.synthetic.hair import SkinStrands, Strands, brow_strands, lash_strands, short_hair
 from mien.synthetic.light import Lighting, Visibility, compute_visibility, studio_lighting
-from mien.synthetic.motion import shoulder_rotation
+from mien.synthetic.motion import neck_pivot, shoulder_rotation
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.skin import SkinTextures, paint_skin
 
@@ -155,8 +155,6 @@ def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, 
 
 def _shoulders(subject: Subject, face: FaceParams, R_world_head: np.ndarray) -> Float[np.ndarray, "4 4"]:
     """The shoulders turn less than the head, about the neck's joint."""
-    from mien.synthetic.motion import neck_pivot
-
     pivot = neck_pivot(subject.model, face.identity).numpy()
     R = R_world_head.T @ shoulder_rotation(face.head_rotation)[0].numpy()
     T = np.eye(4, dtype=np.float32)
@@ -264,6 +262,3 @@ def _all_faces(
     if shirt is not None:
         add(shirt.faces, len(shirt.vertices), SHIRT)
     return np.concatenate(faces), np.concatenate(materials)
-
-
-__all__ = ["PosedSubject", "Subject", "build_subject", "join", "opaque_vertices", "pose_subject"]
