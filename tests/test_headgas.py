@@ -49,6 +49,7 @@ def test_zero_expression_gives_the_neutral_features() -> None:
 def test_colour_and_opacity_are_the_networks_of_features_and_place() -> None:
     avatar, face = new_avatar(), toy_face(5)[2]
     fill(avatar.store["feature_bases"])
+    fill(avatar.store["neutral_features"], 2)
     gaussians = avatar.pose(face).gaussians
     first, _, last = avatar.network
     points = avatar.store["means"].detach() / SMALL.encoding_length
