@@ -1,6 +1,6 @@
 """`mien export`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -28,13 +28,19 @@ class Command:
 
         from mien.avatar import load_avatar
         from mien.commands.expression import with_expression
-        from mien.export import write_ply
+        from mien.export import in_world, write_ply
         from mien.progress import say
 
         workspace = open_workspace(self.workspace)
         avatar = load_avatar(workspace.run_dir(workspace.pick_run(self.run_name)))
         face = with_expression(avatar.subject, avatar.face_model, self.set)
+        # Viewers turn around the origin, so the head goes there: +y up, +z out of the face.
+        face = replace(
+            face,
+            head_rotation=torch.zeros_like(face.head_rotation),
+            head_translation=torch.zeros_like(face.head_translation),
+        )
         with torch.no_grad():
             gaussians = avatar.pose(face).gaussians.timestep(0)
-        write_ply(self.out, gaussians)
+        write_ply(self.out, in_world(gaussians))
         say(f"{self.out}: {len(gaussians):,} Gaussians")
