@@ -32,7 +32,7 @@ def build_glasses(anatomy: Anatomy) -> Glasses:
     """Rims around both eyes, a bridge over the nose, temples to the ears."""
     pupils = np.stack([anatomy.landmarks[468], anatomy.landmarks[473]])
     middle = pupils.mean(0)
-    front = float(anatomy.landmarks[[33, 133, 362, 263, 159, 386], 2].max()) + 0.007
+    front = float(anatomy.landmarks[[33, 133, 362, 263, 159, 386], 2].max()) + 0.010
     front = max(front, float(anatomy.landmarks[NOSE_BRIDGE, 2]) + 0.002)
     half_width, half_height = 0.026, 0.0195
     tubes, lenses = [], []
@@ -41,7 +41,7 @@ def build_glasses(anatomy: Anatomy) -> Glasses:
         centre = np.array([x * 1.04, middle[1] - 0.003, front])
         turn = np.linspace(0, 2 * np.pi, 56, endpoint=False)
         shape = np.stack([_power(np.cos(turn), 0.62) * half_width, _power(np.sin(turn), 0.62) * half_height], -1)
-        shape[:, 0] += 0.0025 * side * np.sin(turn)  # wider above, towards the temples
+        shape[:, 0] += 0.003 * side * np.abs(np.sin(turn))  # leaves room for the nose
         # Wraps around the face, and leans forward at the top.
         depth = -0.25 * (centre[0] + shape[:, 0]) ** 2 / 0.06 + 0.12 * shape[:, 1]
         rim = np.stack([centre[0] + shape[:, 0], centre[1] + shape[:, 1], front + depth + 0.004], -1)

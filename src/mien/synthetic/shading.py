@@ -178,7 +178,9 @@ def shade_teeth(
     along = rest[:, 0] / 0.0082
     place = along - np.round(along - 0.5) - 0.5
     gap = smoothstep(0.42, 0.5, np.abs(place))
-    rounded = normals + np.stack([0.5 * np.sign(place) * place**2 * 4, np.zeros_like(place), np.zeros_like(place)], -1)
+    # Out of the arch rather than the coarse mesh's own direction, and rounded over each tooth.
+    across = rest[:, 0] / 0.032 + 2.0 * np.sign(place) * place**2
+    rounded = 0.3 * normals + np.stack([across, np.full_like(place, 0.1), np.ones_like(place)], -1)
     rounded = unit(rounded).astype(np.float32)
     albedo = np.array([0.70, 0.64, 0.52], np.float32) * (1 - 0.5 * gap)[:, None]
     scarce = 0.9 * np.exp(-np.clip(depth - 0.005, 0, None) / 0.010)[:, None]
