@@ -2,6 +2,7 @@
 #include "rasterize.h"
 
 #include <atomic>
+#include <cmath>
 #include <cstring>
 #include <mutex>
 #include <vector>
@@ -72,6 +73,14 @@ FramePtr take_frame() {
   return FramePtr(frame);
 }
 
+bool is_finite(const View& view) {
+  float total = view.fx + view.fy + view.cx + view.cy;
+  for (float value : view.rotation) total += value;
+  for (float value : view.translation) total += value;
+  for (float value : view.background) total += value;
+  return std::isfinite(total);
+}
+
 int64_t groups(int64_t count) { return (count + kGroup - 1) / kGroup; }
 
 }  // namespace
@@ -98,6 +107,7 @@ bool set_rasterize_isa(const char* name) {
 }
 
 FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, const Picture& picture) {
+  if (!is_finite(view)) return nullptr;
   const Kernels& kernels = *isa().kernels;
   FramePtr frame = take_frame();
   const int64_t count = gaussians.count;

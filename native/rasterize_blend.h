@@ -73,8 +73,8 @@ MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const ui
   int i = 0;
   for (; i < count; ++i) {
     const Splat& s = splats[entries[chosen[i]].gaussian];
-    const F dx = px - s.x, dy = py - s.y;
-    const F power = s.log2_opacity - (dx * (s.xx * dx + s.two_xy * dy) + s.yy * (dy * dy));
+    const F dy = py - s.y, across = (px - s.x) - s.slope * dy;
+    const F power = (s.log2_opacity - (s.sharpness * across) * across) - (s.falloff * dy) * dy;
     const M seen = less_equal(set1(kLog2AlphaMin), power);
     const F alpha = keep(seen, minimum(exp2_fast(power), set1(kAlphaMax)));
     const F next = maximum(product - product * alpha, set1(1e-20f));  // no denormals

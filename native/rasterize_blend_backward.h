@@ -77,8 +77,8 @@ MIEN_INLINE void add_vector(const Splat& s, F px, F py, int block, int v, TileGr
   const F product = load(t.product[block] + v * W), before = load(t.behind[block] + v * W);
   const F red = load(t.color[0][block] + v * W), green = load(t.color[1][block] + v * W);
   const F blue = load(t.color[2][block] + v * W);
-  const F dx = px - s.x, dy = py - s.y;
-  const F power = s.log2_opacity - (dx * (s.xx * dx + s.two_xy * dy) + s.yy * (dy * dy));
+  const F dy = py - s.y, across = (px - s.x) - s.slope * dy;
+  const F power = (s.log2_opacity - (s.sharpness * across) * across) - (s.falloff * dy) * dy;
   const M seen = less_equal(set1(kLog2AlphaMin), power);
   const F raw = exp2_fast(power);
   const F alpha = keep(seen, minimum(raw, set1(kAlphaMax)));
@@ -94,11 +94,11 @@ MIEN_INLINE void add_vector(const Splat& s, F px, F py, int block, int v, TileGr
   sums.red = sums.red + weight * red;
   sums.green = sums.green + weight * green;
   sums.blue = sums.blue + weight * blue;
-  const F value_x = value * dx, value_y = value * dy;
+  const F value_x = value * across, value_y = value * dy;
   sums.one = sums.one + value;
   sums.x = sums.x + value_x;
   sums.y = sums.y + value_y;
-  sums.xx = sums.xx + value_x * dx;
+  sums.xx = sums.xx + value_x * across;
   sums.xy = sums.xy + value_x * dy;
   sums.yy = sums.yy + value_y * dy;
 }

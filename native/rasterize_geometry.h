@@ -2,7 +2,7 @@
 #pragma once
 
 #include "rasterize_kernels.h"
-#include "simd.h"
+#include "simd_columns.h"
 
 namespace {
 

@@ -19,17 +19,19 @@ constexpr float kTransmittanceMin = 1e-4f;
 constexpr float kFovMargin = 0.3f;
 constexpr float kLog2AlphaMin = -7.994353437f;  // log2(1 / 255)
 
-// A projected Gaussian: one cache line. alpha(dx, dy) = 2^(log2_opacity - (xx dx^2 + two_xy dx dy + yy dy^2)).
+// A projected Gaussian: one cache line. At (dx, dy) pixels from its centre and with across = dx - slope * dy,
+// alpha = 2^(log2_opacity - (sharpness * across^2 + falloff * dy^2)). This is the usual inverse covariance with the
+// square completed: it does not cancel for needles, is never negative and takes an operation less.
 struct alignas(64) Splat {
   float x, y;  // centre, pixels
-  // The ellipse where alpha is 1/255: at height dy it spans slope * dy +- sqrt(width2 * (1 - (dy / half_height)^2)).
+  // Where alpha is 1/255: at height dy the ellipse spans slope * dy +- sqrt(width2 * (1 - (dy / half_height)^2)).
   float slope, width2;
   float half_height;
-  float y_rightmost;     // dy of the point that is farthest right; the leftmost is opposite
-  float depth, unused;   // camera z
-  float xx, two_xy, yy;  // the inverse covariance times log2(e) / 2
+  float y_rightmost;         // dy of the point that is farthest right; the leftmost is opposite
+  float depth, unused;       // camera z
+  float sharpness, falloff;  // log2(e) / 2 times 1 / variance of x given y, and times 1 / variance of y
   float log2_opacity;
-  float red, green, blue, unused2;
+  float red, green, blue, unused2[2];
 };
 
 // A (Gaussian, tile) pair in a tile's list, front to back.
@@ -38,7 +40,8 @@ struct Entry {
   uint32_t slot;  // where its gradient goes; the slots of a Gaussian are consecutive
 };
 
-// The sums over one tile's pixels, v = dL/dalpha * alpha: colours, then v times 1, dx, dy, dx^2, dx dy, dy^2.
+// The sums over one tile's pixels, with v = dL/dalpha * alpha: the colours' gradients, then v times 1, across, dy,
+// across^2, across * dy and dy^2.
 struct Moments {
   float red, green, blue, one, x, y, xx, xy, yy, unused[3];
 };

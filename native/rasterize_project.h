@@ -31,6 +31,8 @@ MIEN_INLINE V3 colors_of(int count, const float* sh, int valid, V3 direction, M*
   return colors_of<16>(sh, valid, direction, bad);
 }
 
+constexpr float kHalfLog2E = 0.72134752044f;
+
 struct Outline {
   F cutoff2;  // the squared Mahalanobis distance where alpha is 1/255
   F half_width, half_height;
@@ -80,8 +82,7 @@ MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i
                       &bad_color);
     bad = either(bad, both(bad_color, o.drawn));
   }
-  const F inverse = 1.0f / p.determinant, conic_scale = 0.72134752044f * inverse;  // log2(e) / 2
-  const F inverse_yy = 1.0f / p.yy;
+  const F inverse = 1.0f / p.determinant, inverse_yy = 1.0f / p.yy;
   const F columns[16] = {p.x,
                          p.y,
                          p.xy * inverse_yy,
@@ -90,13 +91,13 @@ MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i
                          p.xy * square_root(o.cutoff2 / p.xx),
                          p.camera.z,
                          F{},
-                         p.yy * conic_scale,
-                         -2.0f * p.xy * conic_scale,
-                         p.xx * conic_scale,
+                         p.yy * inverse * kHalfLog2E,
+                         inverse_yy * kHalfLog2E,
                          log2_opacity,
                          color.x,
                          color.y,
                          color.z,
+                         F{},
                          F{}};
   store_columns<16>(&splats[i].x, 16, valid, columns);
   store_radii(p, o.drawn, valid, radii + i);

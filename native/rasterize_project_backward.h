@@ -9,19 +9,24 @@ struct GaussianGrad {
   F mean[3], quat[4], scale[3], opacity, mean2d[2], color[3];
 };
 
-// The 2D part: gradients of the centre and of the covariance (H: dL/dxx, dL/dxy / 2, dL/dyy).
+// The 2D part. With the variance V of x given y, the slope m and the variance C of y: dL/dV, dL/dm / C and dL/dC where
+// V and m are held.
 struct ScreenGrad {
-  F x, y, hxx, hxy, hyy;
+  F x, y, slope;
+  F variance_across, slope_over_yy, variance_y;
 };
 
 MIEN_INLINE ScreenGrad screen_gradient(const Projection& p, const F* moments) {
-  const F inverse = 1.0f / p.determinant;
-  const F a = p.yy * inverse, b = -p.xy * inverse, c = p.xx * inverse;  // the inverse covariance Q
+  const F inverse_yy = 1.0f / p.yy, sharpness = p.yy / p.determinant;
   const F mx = moments[4], my = moments[5], mxx = moments[6], mxy = moments[7], myy = moments[8];
-  // H = Q M Q / 2, since dL/dQ = -M / 2 and dQ = -Q dC Q.
-  const F pxx = a * mxx + b * mxy, pxy = a * mxy + b * myy, pyx = b * mxx + c * mxy, pyy = b * mxy + c * myy;
-  return {a * mx + b * my, b * mx + c * my, 0.5f * (pxx * a + pxy * b), 0.5f * (pxx * b + pxy * c),
-          0.5f * (pyx * b + pyy * c)};
+  ScreenGrad s;
+  s.slope = p.xy * inverse_yy;
+  s.x = sharpness * mx;
+  s.y = inverse_yy * my - s.slope * s.x;
+  s.variance_across = 0.5f * sharpness * sharpness * mxx;
+  s.slope_over_yy = inverse_yy * sharpness * mxy;
+  s.variance_y = 0.5f * inverse_yy * inverse_yy * myy;
+  return s;
 }
 
 MIEN_INLINE void quaternion_gradient(const Rotation& r, const F* g, F* out) {
@@ -39,10 +44,12 @@ MIEN_INLINE void quaternion_gradient(const Rotation& r, const F* g, F* out) {
 // Adds to out.mean (camera part rotated back), out.quat, out.scale and the view's sums.
 MIEN_INLINE void geometry_gradient(const Projection& p, const View& view, const F* mean, const F* scale,
                                    const ScreenGrad& s, GaussianGrad& out, F* view_sums) {
-  F du[6], dn[6] = {}, dr[9];  // dU = 2 H U
+  F du[6], dn[6] = {}, dr[9];
   for (int column = 0; column < 3; ++column) {
-    du[column] = 2.0f * (s.hxx * p.u[column] + s.hxy * p.u[3 + column]);
-    du[3 + column] = 2.0f * (s.hxy * p.u[column] + s.hyy * p.u[3 + column]);
+    // The rows of U are x and y; V = |x|^2 - m (x . y) up to the dilation, and m = x . y / C.
+    const F y = p.u[3 + column], across = p.u[column] - s.slope * y;
+    du[column] = 2.0f * s.variance_across * across + s.slope_over_yy * y;
+    du[3 + column] = 2.0f * s.variance_y * y + s.slope_over_yy * across - s.slope * du[column];
   }
   const F* r = p.rotation.m;
   for (int column = 0; column < 3; ++column) {

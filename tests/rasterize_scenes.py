@@ -1,0 +1,102 @@
+"""Random scenes for the rasterizer's tests, and which of their pixels can be compared."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.gaussians import Gaussians
+from mien.render import Rendering, rasterize
+from mien.render.rasterize import Backend
+from mien.rotation import matrix_from_axis_angle, rigid_transform
+
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh", "T_world_local")
+
+
+@dataclass(frozen=True)
+class Scene:
+    gaussians: Gaussians
+    camera: Camera
+    background: Tensor
+
+    def to(self, dtype: torch.dtype) -> "Scene":
+        like = torch.zeros((), dtype=dtype)
+        return Scene(self.gaussians.to(like), self.camera.to(like), self.background.to(like))
+
+
+def random_scene(seed: int, count: int = 200, coefficients: int = 4, width: int = 61, height: int = 45) -> Scene:
+    """Gaussians of all shapes around a camera that looks at them askew; some behind it, outside or transparent."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    pose = rigid_transform(matrix_from_axis_angle(0.3 * normal(3)), 0.1 * normal(3))
+    gaussians = Gaussians(
+        means=normal(count, 3) * torch.tensor([0.5, 0.5, 0.4]),
+        quats=normal(count, 4),
+        scales=0.02 * torch.exp(normal(count, 3)),
+        opacities=torch.rand(count, generator=generator),
+        sh=0.4 * normal(count, coefficients, 3),
+        T_world_local=pose,
+    )
+    viewmat = rigid_transform(matrix_from_axis_angle(0.2 * normal(3)), torch.tensor([0.05, -0.02, 0.9]))
+    focal = 1.1 * width
+    K = torch.tensor([[focal, 0, 0.48 * width], [0, 1.2 * focal, 0.55 * height], [0, 0, 1]])
+    return Scene(gaussians, Camera(K, viewmat, width, height), torch.rand(3, generator=generator))
+
+
+def comparable_pixels(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Tensor:
+    """The pixels [h, w] that do not change when the two cutoffs move a little.
+
+    At the others one Gaussian's alpha or one transmittance is so close to its cutoff that rounding decides.
+    """
+    pictures = []
+    for factor in (1 - 1e-4, 1 + 1e-4):
+        with monkeypatch.context() as patch:
+            patch.setattr("mien.render.reference.ALPHA_MIN", factor / 255)
+            patch.setattr("mien.render.reference.TRANSMITTANCE_MIN", factor * 1e-4)
+            picture = rasterize(scene.gaussians, scene.camera, scene.background, backend="reference")
+            pictures.append(picture.image.detach())
+    return ((pictures[0] - pictures[1]).abs() < 1e-7).all(-1)
+
+
+def leaves(scene: Scene) -> dict[str, Tensor]:
+    """Copies of everything that a rendering is differentiable in, as leaves."""
+    tensors = {name: getattr(scene.gaussians, name) for name in PARAMETERS}
+    tensors |= {"background": scene.background, "viewmat": scene.camera.viewmat, "K": scene.camera.K}
+    return {name: tensor.detach().clone().requires_grad_() for name, tensor in tensors.items()}
+
+
+def render(scene: Scene, tensors: dict[str, Tensor], backend: Backend) -> Rendering:
+    """The scene with its tensors replaced."""
+    gaussians = Gaussians(**{name: tensors[name] for name in PARAMETERS})
+    camera = Camera(tensors["K"], tensors["viewmat"], scene.camera.width, scene.camera.height)
+    return rasterize(gaussians, camera, tensors["background"], backend)
+
+
+def gradients(
+    scene: Scene, backend: Backend, loss: Callable[[Rendering], Tensor]
+) -> tuple[Rendering, dict[str, Tensor]]:
+    """The rendering, and the gradients of a loss on it."""
+    tensors = leaves(scene)
+    rendering = render(scene, tensors, backend)
+    loss(rendering).backward()
+    found = {}
+    for name, tensor in [*tensors.items(), ("means2d", rendering.means2d_offset)]:
+        assert tensor.grad is not None, name
+        found[name] = tensor.grad
+    # What no back end reads: the last row of transforms, the constant entries of K.
+    for name, entries in {"T_world_local": (3,), "viewmat": (3,), "K": (2,)}.items():
+        found[name][entries] = 0
+    found["K"][0, 1] = found["K"][1, 0] = 0
+    return rendering, found
+
+
+def relative_error(value: Tensor, truth: Tensor) -> float:
+    """Relative L2."""
+    value, truth = value.detach().double(), truth.detach().double()
+    return float((value - truth).norm() / truth.norm().clamp_min(1e-12))

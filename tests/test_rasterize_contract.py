@@ -1,0 +1,276 @@
+"""What `rasterize` promises besides the right colours: batches, frames, edge cases and clear refusals."""
+
+import multiprocessing
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mien import _native
+from mien.camera import Camera
+from mien.errors import UserError
+from mien.gaussians import Gaussians, sh_from_rgb
+from mien.render import rasterize
+from mien.render.rasterize import Backend, choose_backend
+from rasterize_scenes import Scene, random_scene, relative_error
+
+BACKENDS: list[Backend] = ["native", "reference"]
+
+
+def one_gaussian(depth: float = 1.0, opacity: float = 0.8, scale: float = 0.02) -> Gaussians:
+    """An orange ball on the optical axis."""
+    return Gaussians(
+        means=torch.tensor([[0.0, 0.0, float(depth)]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), scale),
+        opacities=torch.tensor([float(opacity)]),
+        sh=sh_from_rgb(torch.tensor([[[1.0, 0.5, 0.1]]])),
+    )
+
+
+def front_camera(width: int = 21, height: int = 15) -> Camera:
+    K = torch.tensor([[60.0, 0, width / 2], [0, 60.0, height / 2], [0, 0, 1]])
+    return Camera(K, torch.eye(4), width, height)
+
+
+def stacked(scenes: list[Scene]) -> Gaussians:
+    names = ("means", "quats", "scales", "opacities", "sh", "T_world_local")
+    return Gaussians(**{name: torch.stack([getattr(s.gaussians, name) for s in scenes]) for name in names})
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_ball_on_the_axis_shows_its_colour_at_the_centre(backend: Backend) -> None:
+    rendering = rasterize(one_gaussian(), front_camera(), torch.zeros(3), backend)
+    assert rendering.alpha[7, 10].item() == pytest.approx(0.8, abs=1e-4)
+    torch.testing.assert_close(rendering.image[7, 10], 0.8 * torch.tensor([1.0, 0.5, 0.1]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(rendering.image, rendering.image.flip(0).flip(1), atol=1e-5, rtol=0)
+    variance = (60 * 0.02) ** 2 + 0.3
+    falloff = 0.8 * torch.exp(torch.tensor(-0.5 * 2**2 / variance))
+    assert rendering.alpha[7, 12].item() == pytest.approx(falloff.item(), abs=1e-5)
+    assert rendering.radii.tolist() == [int(torch.ceil(torch.tensor(3 * variance**0.5)))]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_nearer_hides_farther_and_ties_go_by_index(backend: Backend) -> None:
+    three = one_gaussian().select(torch.tensor([0, 0, 0]))
+    means = torch.tensor([[0.0, 0, 1.1], [0, 0, 1], [0, 0, 1]])
+    gaussians = replace(three, means=means, sh=sh_from_rgb(torch.eye(3))[:, None])
+    seen = rasterize(gaussians, front_camera(), torch.zeros(3), backend).image[7, 10]
+    torch.testing.assert_close(seen, torch.tensor([0.8 * 0.04, 0.8, 0.8 * 0.2]), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_local_frame_moves_the_camera(backend: Backend) -> None:
+    """Spherical harmonics are evaluated in the local frame, so a posed head keeps its colours."""
+    scene = random_scene(0, coefficients=9)
+    pose = scene.gaussians.T_world_local
+    assert pose is not None
+    local = replace(scene.gaussians, T_world_local=None)
+    moved = replace(scene.camera, viewmat=scene.camera.viewmat @ pose)
+    expected = rasterize(local, moved, scene.background, backend)
+    found = rasterize(scene.gaussians, scene.camera, scene.background, backend)
+    assert torch.equal(found.image, expected.image)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_batches_equal_their_single_pictures(backend: Backend) -> None:
+    scenes = [random_scene(seed, count=50) for seed in range(3)]
+    cameras = [scene.camera for scene in scenes]
+    background = scenes[0].background
+    singles = [rasterize(s.gaussians, s.camera, background, backend) for s in scenes]
+    batch = rasterize(stacked(scenes), cameras, background, backend)
+    assert torch.equal(batch.image, torch.stack([single.image for single in singles]))
+    assert torch.equal(batch.radii, torch.stack([single.radii for single in singles]))
+    assert batch.alpha.shape == (3, 45, 61)
+    one_camera = rasterize(stacked(scenes), cameras[1], background, backend)
+    assert torch.equal(one_camera.image[1], singles[1].image)
+    one_scene = rasterize(scenes[1].gaussians, cameras, background, backend)
+    assert torch.equal(one_scene.image[1], singles[1].image)
+    assert rasterize(scenes[1].gaussians, cameras[:1], background, backend).image.shape == (1, 45, 61, 3)
+
+
+def test_shared_tensors_of_a_batch_gather_all_gradients() -> None:
+    scenes = [random_scene(seed, count=50) for seed in range(3)]
+    means = torch.stack([scene.gaussians.means for scene in scenes]).requires_grad_()
+    opacities = scenes[0].gaussians.opacities.clone().requires_grad_()
+    shared = replace(scenes[0].gaussians, means=means, opacities=opacities)
+    batch = rasterize(shared, scenes[0].camera, scenes[0].background)
+    (batch.image**2).sum().backward()
+    expected = torch.zeros_like(opacities)
+    for index in range(3):
+        own = scenes[0].gaussians.opacities.clone().requires_grad_()
+        single = replace(scenes[0].gaussians, means=means[index].detach(), opacities=own)
+        (rasterize(single, scenes[0].camera, scenes[0].background).image ** 2).sum().backward()
+        assert own.grad is not None
+        expected += own.grad
+    assert opacities.grad is not None
+    assert relative_error(opacities.grad, expected) < 1e-6
+    assert batch.means2d_offset.grad is not None
+    assert batch.means2d_offset.grad.shape == (3, 50, 2)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_means2d_gradient_is_per_pixel_of_motion(backend: Backend) -> None:
+    gaussians, camera = one_gaussian(), front_camera()
+    rendering = rasterize(gaussians, camera, torch.zeros(3), backend)
+    rendering.alpha[7, 12].backward()
+    gradient = rendering.means2d_offset.grad
+    assert gradient is not None
+    moved = replace(camera, K=camera.K + torch.tensor([[0, 0, 1e-2], [0, 0, 0], [0, 0, 0]]))
+    change = rasterize(gaussians, moved, torch.zeros(3), backend).alpha[7, 12] - rendering.alpha[7, 12]
+    assert gradient[0, 0].item() == pytest.approx(change.item() / 1e-2, rel=2e-2)
+    assert gradient[0, 1].abs() < 1e-6
+
+
+def test_no_gradients_without_grad_mode() -> None:
+    with torch.no_grad():
+        rendering = rasterize(one_gaussian(), front_camera())
+    assert not rendering.image.requires_grad
+    assert not rendering.means2d_offset.requires_grad
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "gaussians",
+    [
+        one_gaussian(depth=-1),
+        one_gaussian(depth=0.01),
+        one_gaussian(opacity=0),
+        one_gaussian(opacity=1 / 256),
+        replace(one_gaussian(), means=torch.tensor([[10.0, 0, 1]])),
+        one_gaussian().select(torch.zeros(1, dtype=torch.bool)),
+    ],
+    ids=["behind", "at the near plane", "transparent", "below 1/255", "beside the picture", "none"],
+)
+def test_nothing_to_see_is_background(backend: Backend, gaussians: Gaussians) -> None:
+    means = gaussians.means.clone().requires_grad_()
+    rendering = rasterize(replace(gaussians, means=means), front_camera(), torch.tensor([0.1, 0.2, 0.3]), backend)
+    assert torch.equal(rendering.image, torch.tensor([0.1, 0.2, 0.3]).expand(15, 21, 3))
+    assert not rendering.alpha.any()
+    assert not rendering.radii.any()
+    rendering.image.sum().backward()
+    assert means.grad is not None
+    assert not means.grad.any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"quats": torch.zeros(1, 4)},
+        {"scales": torch.zeros(1, 3)},
+        {"scales": torch.full((1, 3), 1e4)},
+        {"scales": torch.tensor([[1e3, 1e-6, 1e-6]])},
+        {"opacities": torch.ones(1)},
+        {"opacities": torch.full((1,), 1 / 255)},
+        {"means": torch.tensor([[0.0, 0.0, 0.0101]])},
+        {"means": torch.tensor([[0.0, 0.0, 1e6]])},
+    ],
+    ids=["zero quaternion", "points", "huge", "needle", "opaque", "at the cutoff", "touching the camera", "far away"],
+)
+def test_extremes_stay_finite(backend: Backend, change: dict[str, torch.Tensor]) -> None:
+    gaussians = replace(one_gaussian(), **change)
+    means, quats, scales = (t.clone().requires_grad_() for t in (gaussians.means, gaussians.quats, gaussians.scales))
+    posed = replace(gaussians, means=means, quats=quats, scales=scales)
+    rendering = rasterize(posed, front_camera(70, 50), torch.zeros(3), backend)
+    rendering.image.sum().backward()
+    assert rendering.image.isfinite().all()
+    assert (rendering.alpha >= 0).all()
+    assert (rendering.alpha <= 1).all()
+    for tensor in (means, quats, scales):
+        assert tensor.grad is not None
+        assert tensor.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_what_is_not_finite_is_named(backend: Backend, name: str, value: float) -> None:
+    gaussians = random_scene(3, count=40).gaussians
+    gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view: the native kernel reads colours of no other
+    gaussians.opacities[17] = 0.5
+    getattr(gaussians, name).view(40, -1)[17, -1] = value
+    with pytest.raises(ValueError, match=rf"{name}\[17.* is -?(nan|inf)"):
+        rasterize(gaussians, random_scene(3).camera, torch.zeros(3), backend)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_camera_that_is_not_finite_is_named(backend: Backend) -> None:
+    camera = front_camera()
+    broken = replace(camera, viewmat=torch.full((4, 4), torch.nan))
+    with pytest.raises(ValueError, match=r"camera.viewmat\[0, 0\] is nan"):
+        rasterize(one_gaussian(), broken, torch.zeros(3), backend)
+    with pytest.raises(ValueError, match=r"background\[1\] is inf"):
+        rasterize(one_gaussian(), camera, torch.tensor([0, torch.inf, 0]), backend)
+
+
+def test_layouts_and_dtypes() -> None:
+    scene = random_scene(4)
+    spread = {name: getattr(scene.gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+    spread = {name: tensor.repeat_interleave(2, 0)[::2] for name, tensor in spread.items()}
+    assert not spread["means"].is_contiguous()
+    found = rasterize(replace(scene.gaussians, **spread), scene.camera, scene.background, "native")
+    assert torch.equal(found.image, rasterize(scene.gaussians, scene.camera, scene.background, "native").image)
+    double = scene.to(torch.float64)
+    assert rasterize(double.gaussians, scene.camera, double.background).image.dtype == torch.float64
+    with pytest.raises(ValueError, match="takes float32 CPU tensors, got torch.float64"):
+        rasterize(double.gaussians, double.camera, double.background, "native")
+    with pytest.raises(ValueError, match="quats is torch.float64"):
+        rasterize(replace(scene.gaussians, quats=double.gaussians.quats), scene.camera, scene.background)
+    assert choose_backend(scene.background) == "native"
+    assert choose_backend(double.background) == "reference"
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    scenes = [random_scene(seed) for seed in range(3)]
+    cameras = [scene.camera for scene in scenes]
+    background = torch.zeros(3)
+    with pytest.raises(ValueError, match="3 timesteps of Gaussians but 2 cameras"):
+        rasterize(stacked(scenes), cameras[:2], background)
+    with pytest.raises(ValueError, match="must have one size"):
+        rasterize(scenes[0].gaussians, [cameras[0], front_camera()], background)
+    with pytest.raises(ValueError, match="is empty"):
+        rasterize(scenes[0].gaussians, [], background)
+    with pytest.raises(ValueError, match="sh has shape"):
+        rasterize(random_scene(0, coefficients=5).gaussians, cameras[0], background)
+
+
+def _render_in_child(queue: "multiprocessing.Queue[list[float]]") -> None:
+    queue.put(rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist())
+
+
+def test_a_forked_child_renders() -> None:
+    """Threads do not survive a fork; the pool must notice."""
+    _native.set_thread_count(2)
+    scene = random_scene(0)
+    expected = rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist()
+    rasterize(scene.gaussians, scene.camera, scene.background, "native")
+    context = multiprocessing.get_context("fork")
+    queue: multiprocessing.Queue[list[float]] = context.Queue()
+    child = context.Process(target=_render_in_child, args=(queue,))
+    child.start()
+    assert queue.get(timeout=60) == expected
+    child.join(timeout=60)
+    _native.set_thread_count(0)
+
+
+def test_gsplat_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(UserError, match=r"pip install 'mien\[cuda\]'"):
+        rasterize(one_gaussian(), front_camera(), torch.zeros(3), "gsplat")
+
+
+@pytest.mark.gpu
+def test_gsplat_matches_reference() -> None:
+    scene = random_scene(2, coefficients=9)
+    like = torch.zeros((), device="cuda")
+    found = rasterize(scene.gaussians.to(like), scene.camera, scene.background.to(like))
+    expected = rasterize(scene.gaussians, scene.camera, scene.background, "reference")
+    assert relative_error(found.image.cpu(), expected.image) < 1e-3  # pixels at a cutoff are among them
+    (found.image**2).sum().backward()
+    (expected.image**2).sum().backward()
+    found_grad, expected_grad = found.means2d_offset.grad, expected.means2d_offset.grad
+    assert found_grad is not None
+    assert expected_grad is not None
+    assert relative_error(found_grad.cpu(), expected_grad) < 1e-2
