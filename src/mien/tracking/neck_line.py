@@ -11,6 +11,8 @@ from mien.face import FaceModel, FaceParams
 
 _CHUNK = 32
 """Timesteps posed at once."""
+_MIDDLE_OF_NECK = (0.4, 0.7)
+"""Part of the way from the base of the neck to its top."""
 
 
 def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
@@ -22,6 +24,22 @@ def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
     assert loops, f"face model {face_model.name!r} is closed: it has no base of the neck"
     heights = [float(face_model.template[loop, 1].mean()) for loop in loops]
     return torch.tensor(sorted(loops[heights.index(min(heights))]))
+
+
+def neck_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
+    """The vertices around the middle of the neck, where it is a column: its base spreads over the shoulders.
+
+    A face model without a region `neck` has its bottom vertices instead.
+    """
+    bottom = bottom_vertices(face_model)
+    neck = face_model.faces[face_model.region_mask("neck")].unique()
+    if len(neck) == 0:
+        return bottom
+    heights = face_model.template[neck, 1]
+    base = face_model.template[bottom, 1].mean()
+    low, high = (base + share * (heights.max() - base) for share in _MIDDLE_OF_NECK)
+    middle = neck[(heights >= low) & (heights <= high)]
+    return middle if len(middle) > 0 else bottom
 
 
 def fit_neck_lines(face_model: FaceModel, face: FaceParams, cameras: tuple[Camera, ...]) -> Float[Tensor, "t c 3"]:

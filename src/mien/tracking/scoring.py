@@ -11,13 +11,13 @@ from mien.capture.capture import Capture
 from mien.face import FaceModel
 from mien.progress import track_progress
 from mien.render.mesh import rasterize_mesh
-from mien.tracking.neck_line import bottom_vertices
+from mien.tracking.neck_line import neck_vertices
 from mien.tracking.tracking import Tracking
 
 _SILHOUETTE_MARGIN = 0.015
 """By how much the projected head is widened, in its own widths: tracking is not exact to the pixel."""
 _NECK_MARGIN = 1.15
-"""Beside the neck line's middle this many half widths of the neck are kept..."""
+"""Beside the neck's middle this many of its half widths are kept..."""
 _SLOPE = 1.0
 """...and this much more with every pixel above the line: hair stays, collars and shoulders go."""
 _FAINT = 32
@@ -43,12 +43,12 @@ def make_scoring(capture: Capture, tracking: Tracking, face_model: FaceModel) ->
     masks = np.zeros(capture.mattes.shape, np.uint8)
     crops = np.zeros((*masks.shape[:2], 4), np.int64)
     head_faces = face_model.faces[~face_model.region_mask("neck")]
-    bottom = bottom_vertices(face_model)
+    ring = neck_vertices(face_model)
     for timestep in track_progress(range(capture.timesteps), "Scoring masks", capture.timesteps):
         vertices = face_model(tracking.face[timestep])[0]
         for index, camera in enumerate(tracking.cameras):
             head = rasterize_mesh(vertices, head_faces, camera).face_index.numpy() >= 0
-            neck = camera.project(vertices[bottom])[0].numpy()
+            neck = camera.project(vertices[ring])[0].numpy()
             keep = above_neck_line(tracking.neck_lines[timestep, index].numpy(), neck, camera)
             mask = cut_matte(np.asarray(capture.mattes[timestep, index]), head, keep)
             masks[timestep, index], crops[timestep, index] = mask, head_crop(mask)
@@ -62,7 +62,7 @@ def above_neck_line(
 
     Args:
         line: as `Tracking.neck_lines`.
-        neck: pixels of the base of the neck, which tell where it is and how wide.
+        neck: pixels of the middle of the neck, which tell where it is and how wide.
         camera: whose picture it is.
     """
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
