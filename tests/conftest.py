@@ -5,8 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import settings
 
 torch.set_num_threads(1)
+# The same examples on every machine, however busy it is.
+settings.register_profile("mien", deadline=None, derandomize=True)
+settings.load_profile("mien")
 
 
 def _test_data() -> Path | None:
