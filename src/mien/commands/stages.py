@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from mien.avatar import MethodConfig, load_avatar
+from mien.avatar import MethodConfig, load_avatar, neutral_of
 from mien.capture import Capture, CaptureSettings, capture_video, read_capture, read_capture_hash
 from mien.capture.video import write_video
 from mien.errors import UserError
-from mien.evaluation.driving import drive, neutral_of
+from mien.evaluation.driving import drive
 from mien.evaluation.evaluate import evaluate
 from mien.evaluation.pictures import side_by_side, to_uint8
 from mien.face import FaceModel, load_face_model

@@ -1,8 +1,8 @@
 """Evaluation: figures and a report for a trained run, and driving avatars."""
 
 from mien.evaluation.cameras import orbit, turntable
-from mien.evaluation.driving import drive, neutral_of
+from mien.evaluation.driving import drive
 from mien.evaluation.evaluate import evaluate, read_metrics
 from mien.evaluation.protocols import EvaluationSettings
 
-__all__ = ["EvaluationSettings", "drive", "evaluate", "neutral_of", "orbit", "read_metrics", "turntable"]
+__all__ = ["EvaluationSettings", "drive", "evaluate", "orbit", "read_metrics", "turntable"]

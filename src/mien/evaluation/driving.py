@@ -9,28 +9,6 @@ from mien.errors import UserError
 from mien.face import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
-_CALM_SHARE = 0.1
-"""Of the timesteps that count as at rest."""
-
-
-def neutral_of(face: FaceParams) -> FaceParams:
-    """The person of `face` at rest, as one timestep: an estimate that a few bad frames do not move.
-
-    Expression: the median over the tenth of the timesteps with the smallest expression coefficients (their Euclidean
-    norm); what stays there, such as brows that the tracker always sees raised, is the person's own. Joints and head
-    pose: the median over all timesteps, because people mostly look where the camera is.
-    """
-    assert len(face) > 0, "no timesteps"
-    activity = face.expression.norm(dim=-1)
-    calm = activity.argsort(stable=True)[: max(1, round(_CALM_SHARE * len(face)))]
-    return replace(
-        face,
-        expression=face.expression[calm].median(0, keepdim=True).values,
-        joints=face.joints.median(0, keepdim=True).values,
-        head_rotation=face.head_rotation.median(0, keepdim=True).values,
-        head_translation=face.head_translation.median(0, keepdim=True).values,
-    )
-
 
 def drive(
     driver: FaceParams,
