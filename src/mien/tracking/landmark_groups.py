@@ -25,7 +25,7 @@ RIGHT_IRIS = (468, 469, 470, 471, 472)
 """The centre, then the rim, of the subject's right iris."""
 LEFT_IRIS = (473, 474, 475, 476, 477)
 
-_WEIGHTS = ((OVAL, 0.15), (NOSE, 3.0), (LIPS, 3.0), (LEFT_EYELIDS + RIGHT_EYELIDS, 3.0), (LEFT_IRIS + RIGHT_IRIS, 4.0))
+_WEIGHTS = ((OVAL, 0.15), (NOSE, 3.0), (LIPS, 3.0), (LEFT_EYELIDS + RIGHT_EYELIDS, 5.0), (LEFT_IRIS + RIGHT_IRIS, 4.0))
 
 
 def landmark_weights() -> Float[Tensor, " l"]:

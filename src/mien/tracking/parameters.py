@@ -13,7 +13,10 @@ _JOINT_SIGMAS = {"eye": (0.4, 0.4, 0.0), "neck": (0.0, 0.0, 0.0)}
 _OTHER_JOINT_SIGMAS = (0.2, 0.2, 0.2)
 _EYES_ALIKE_SIGMA = (0.1, 0.03)
 """How much the two eyes' angles (up-down, left-right) may differ, radians: they look at the same thing."""
-_EXPRESSION_SIGMAS = {"brow": 0.25, "cheek": 0.3, "nose": 0.3, "eyeLook": 0.3, "jaw": 0.5, "mouth": 0.4, "eye": 0.6}
+_EXPRESSION_SIGMAS = {
+    "brow": 0.25, "cheek": 0.3, "nose": 0.3, "jaw": 0.5, "mouth": 0.4, "eyeLook": 0.3, "eyeBlink": 2.0, "eyeWide": 1.0,
+    "eye": 0.5,
+}  # fmt: skip
 """Priors of coefficients whose name begins with a word; brows are kept in, else they follow the head's pitch."""
 _OTHER_EXPRESSION_SIGMA = 0.4
 

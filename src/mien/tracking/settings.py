@@ -11,7 +11,7 @@ class SmoothnessSettings:
     """Of the head across the line of sight, metres a second squared."""
     depth: float = 0.4
     """Of the head along the line of sight, which one camera sees least well."""
-    rotation: float = 3.0
+    rotation: float = 5.0
     """Of the head, radians a second squared."""
     expression: float = 100.0
     """Of expression coefficients except those of the eyelids, which blink too fast to be smoothed."""
@@ -28,7 +28,7 @@ class TrackingSettings:
     """Frames from which identity is fitted, chosen for their spread of head poses."""
     landmark_sigma: float = 0.0015
     """Expected error of a landmark, metres on the face."""
-    independent_landmarks: float = 50.0
+    independent_landmarks: float = 25.0
     """What 478 landmarks are worth, whose errors go together: weighs them against priors and smoothness."""
     outlier: float = 6.0
     """Beyond this many sigmas a landmark's pull fades."""

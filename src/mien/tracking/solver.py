@@ -125,16 +125,19 @@ def solve_arrow(
 
 @dataclass(frozen=True, eq=False)
 class Smoothness:
-    """Quadratic costs on the acceleration of each parameter: sum_t precision (x[t-1] - 2 x[t] + x[t+1])^2.
+    """Robust costs on the acceleration d[t] = x[t-1] - 2 x[t] + x[t+1] of each parameter.
 
     A second difference leaves steady motion alone, and the chain is solved as a whole, forward and backward in time:
-    it damps jitter without lag.
+    it damps jitter without lag. The cost of a parameter's s = precision d^2 is 2 c^2 (sqrt(1 + s / c^2) - 1): square
+    for jitter, but only linear (pseudo-Huber) from c sigmas on, so that a sudden turn keeps its speed.
     """
 
     precision: Float[Tensor, " p"]
     """Of each parameter's second difference."""
     linked: Bool[Tensor, " t"]
     """Whether the second difference centred at each timestep counts (False at the ends and beside missing frames)."""
+    outlier: float = 1.5
+    """c: sigmas from which the cost is about linear."""
 
     def differences(self, state: Float[Tensor, "t p"]) -> Float[Tensor, "t p"]:
         """Second differences where they count, else zero."""
@@ -143,26 +146,32 @@ class Smoothness:
         return second * self.linked[:, None]
 
     def cost(self, state: Float[Tensor, "t p"]) -> Float[Tensor, ""]:
-        """The weighted sum of squares."""
-        return (self.differences(state) ** 2 * self.precision).sum()
+        """Of all parameters over all time."""
+        square = self.outlier**2
+        relative = self.differences(state) ** 2 * self.precision / square
+        return 2 * square * ((1 + relative).sqrt() - 1).sum()
+
+    def weights(self, state: Float[Tensor, "t p"]) -> Float[Tensor, "t p"]:
+        """Of each squared second difference in the quadratic cost with the same gradient; 0 where none counts."""
+        relative = self.differences(state) ** 2 * self.precision / self.outlier**2
+        return self.linked[:, None] * self.precision / (1 + relative).sqrt()
 
     def gradient(self, state: Float[Tensor, "t p"]) -> Float[Tensor, "t p"]:
         """Half the gradient of the cost."""
-        weighted = self.differences(state) * self.precision
+        weighted = self.differences(state) * self.weights(state)
         gradient = -2 * weighted
         gradient[:-1] += weighted[1:]
         gradient[1:] += weighted[:-1]
         return gradient
 
-    def bands(self) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"], Float[Tensor, " t"]]:
-        """The matrix of the cost along time for unit precision: diagonal, first and second upper off-diagonal."""
-        count = self.linked.to(self.precision)
-        before, after = torch.zeros_like(count), torch.zeros_like(count)
-        before[1:], after[:-1] = count[:-1], count[1:]
-        first, second = torch.zeros_like(count), torch.zeros_like(count)
-        first[:-1] = -2 * (count[:-1] + count[1:])
-        second[:-2] = count[1:-1]
-        return 4 * count + before + after, first, second
+    def bands(self, state: Float[Tensor, "t p"]) -> tuple[Tensor, Tensor, Tensor]:
+        """The half Hessian of that quadratic cost along time: diagonal, first and second upper off-diagonal, [t, p]."""
+        weights = self.weights(state)
+        before, after, first, second = (torch.zeros_like(weights) for _ in range(4))
+        before[1:], after[:-1] = weights[:-1], weights[1:]
+        first[:-1] = -2 * (weights[:-1] + weights[1:])
+        second[:-2] = weights[1:-1]
+        return 4 * weights + before + after, first, second
 
 
 def solve_chain(
@@ -174,7 +183,7 @@ def solve_chain(
     """
     t, p = state.shape
     moving = (~held).to(state)
-    diagonal, first, second = (band[:, None] * smoothness.precision for band in smoothness.bands())
+    diagonal, first, second = smoothness.bands(state)
     tied = NormalEquations(
         frames.cost, frames.gradient + smoothness.gradient(state), frames.hessian + torch.diag_embed(diagonal + 1e-12)
     )

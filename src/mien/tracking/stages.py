@@ -8,7 +8,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.tracking.landmark_groups import LEFT_IRIS, RIGHT_IRIS, landmark_weights, rigid_weights
+from mien.tracking.landmark_groups import (
+    LEFT_EYELIDS,
+    LEFT_IRIS,
+    LIPS,
+    RIGHT_EYELIDS,
+    RIGHT_IRIS,
+    landmark_weights,
+    rigid_weights,
+)
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.parameters import ParameterLayout, pose_only
@@ -21,6 +29,8 @@ _RIGID_OUTLIER = 40.0
 _KEYFRAME_ROUNDS, _KEYFRAME_ITERATIONS = 4, 6
 _FRAME_ITERATIONS = 12
 _SEQUENCE_ROUNDS, _SEQUENCE_ITERATIONS = 2, 5
+_RIM_BIAS_SHARE = 0.25
+"""Of other landmarks' standard deviation of the static offset: for lids and lips."""
 _LINE_SEARCH = (1.0, 0.5, 0.25, 0.1)
 _FOCAL_SIGMA, _KNOWN_FOCAL_SIGMA = 0.03, 1e-6
 """Of the logarithm of the focal length."""
@@ -137,16 +147,17 @@ def _fit_jointly(term: LandmarkTerm, start: Fit, settings: TrackingSettings) -> 
 def fit_bias(term: LandmarkTerm, fit: Fit, settings: TrackingSettings) -> Fit:
     """The static offset of every landmark, all else fixed.
 
-    Irises get none (their place tells scale and gaze), and the offsets together hold no translation, rotation or
-    scaling, which belong to pose and identity.
+    Irises get none (their place tells scale and gaze), lids and lips little (closed is closed for everyone), and the
+    offsets together hold no translation, rotation or scaling, which belong to pose and identity.
     """
-    points = fit.subject.bias.shape[0]
-    hessian = torch.eye(3).to(fit.state).repeat(points, 1, 1) / settings.bias_sigma**2
-    gradient = fit.subject.bias / settings.bias_sigma**2
+    bias = fit.subject.bias
+    precision = torch.full((len(bias), 1), settings.bias_sigma**-2).to(bias)
+    precision[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS)] *= _RIM_BIAS_SHARE**-2
+    hessian, gradient = precision[..., None] * torch.eye(3).to(bias), precision * bias
     for part in term.linearizations(fit.state, fit.subject):
         part_hessian, part_gradient = part.bias_equations()
         hessian, gradient = hessian + part_hessian, gradient + part_gradient
-    bias = fit.subject.bias - torch.linalg.solve(hessian, gradient)
+    bias = bias - torch.linalg.solve(hessian, gradient)
     bias[list(LEFT_IRIS + RIGHT_IRIS)] = 0
     rest = term.model.layout.face_params(fit.state.new_zeros(1, term.model.layout.size), fit.subject.identity)
     positions = term.model.head_points(rest, torch.zeros_like(bias))[0][0]

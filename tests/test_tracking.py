@@ -1,0 +1,184 @@
+"""Tracking recovers what was projected: pose, expression, eyes; smooth without lag; gaps and bad input handled."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mien.errors import UserError
+from mien.face import load_face_model
+from mien.rotation import matrix_from_axis_angle
+from mien.tracking import TrackingSettings, residual_report, track
+from mien.tracking.pipeline import initial_camera
+from small_face_model import make_small_face_model
+from tracking_case import FOCAL, capture_of, make_tracking_case
+
+KNOWN_FOCAL = TrackingSettings(focal=FOCAL)
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    case = make_tracking_case(missing=(20, 21))
+    return case, track(case.capture, make_small_face_model(), KNOWN_FOCAL)
+
+
+def test_recovers_the_truth(tracked):
+    case, tracking = tracked
+    face = tracking.face.to(case.pixels)
+    turn = matrix_from_axis_angle(face.head_rotation) @ matrix_from_axis_angle(case.face.head_rotation).mT
+    angle = ((turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1).acos().rad2deg()
+    assert angle.median() < 0.3
+    # Landmarks without their noise, by the mesh itself and so without any static offset.
+    pixels = case.camera.project(case.model.landmark_positions(case.model(face), "mediapipe"))[0]
+    assert (pixels - case.pixels).norm(dim=-1).median() < 0.3
+    assert (face.expression - case.face.expression).abs().median() < 0.06
+    assert (face.joints - case.face.joints).abs().median() < 0.02
+    depth = face.head_translation[:, 2] / case.face.head_translation[:, 2]
+    assert depth.std() < 0.003
+    assert (depth.mean() - 1).abs() < 0.02
+
+
+def test_says_what_it_is(tracked):
+    case, tracking = tracked
+    assert tracking.face_model == "small"
+    assert tracking.face_model_hash == make_small_face_model().content_hash
+    assert len(tracking.face) == 60
+    assert tracking.neck_lines.shape == (60, 1, 3)
+    assert tracking.settings["focal"] == FOCAL
+    torch.testing.assert_close(tracking.cameras[0].K.double(), case.camera.K, atol=0.01, rtol=0)
+    # The median distance of points with 0.3 px of noise in each coordinate is 0.35 px.
+    assert 0.3 < tracking.residuals.nanmedian() < 0.45
+
+
+def test_missing_frames_are_marked_and_interpolated(tracked):
+    _, tracking = tracked
+    assert tracking.valid.logical_not().nonzero()[:, 0].tolist() == [20, 21]
+    assert tracking.residuals[20:22].isnan().all()
+    for field in (tracking.face.head_translation, tracking.face.expression, tracking.face.head_rotation):
+        between = field[19] + (field[22] - field[19]) / 3
+        torch.testing.assert_close(field[20], between)
+
+
+def test_is_deterministic(tracked):
+    case, tracking = tracked
+    again = track(case.capture, make_small_face_model(), KNOWN_FOCAL)
+    for name, tensor in tracking.face.tensors().items():
+        assert torch.equal(tensor, again.face.tensors()[name]), name
+
+
+def test_expression_stays_in_bounds():
+    case = make_tracking_case(timesteps=12)
+    model = make_small_face_model()
+    narrow = model.expression_bounds.clone()
+    narrow[:4, 1] = 0.2
+    tracking = track(case.capture, replace(model, expression_bounds=narrow), KNOWN_FOCAL)
+    assert (tracking.face.expression >= narrow[:, 0]).all()
+    assert (tracking.face.expression <= narrow[:, 1]).all()
+    assert (tracking.face.expression[:, -1] == 0).all()
+    assert (tracking.face.expression[:, 1] == 0.2).any()
+
+
+def _still_then_turn(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """True yaw, tracked yaw and tracked landmarks (metres) of a head that keeps still, then turns 0.4 rad in 0.3 s."""
+    case = make_tracking_case(timesteps=50, noise=0)
+    face = case.face[0]
+    yaw = 0.2 * torch.tanh((torch.arange(50, dtype=torch.float64) - 33) / 2.0)
+    rotation = torch.zeros(50, 3, dtype=torch.float64)
+    rotation[:, 1] = yaw
+    moving = replace(
+        face, expression=face.expression.expand(50, -1), joints=face.joints.expand(50, -1, -1),
+        head_rotation=rotation, head_translation=face.head_translation.expand(50, -1),
+    )  # fmt: skip
+    pixels = case.camera.project(case.model.landmark_positions(case.model(moving), "mediapipe"))[0]
+    generator = torch.Generator().manual_seed(5)
+    # What detectors do: neighbours err alike. A shift of the whole picture a frame, and a smaller error of each point.
+    shake = noise * torch.randn(50, 1, 2, generator=generator, dtype=torch.float64)
+    own = noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+    model = make_small_face_model()
+    tracking = track(capture_of(pixels + shake + own), model, KNOWN_FOCAL)
+    return yaw, tracking.face.head_rotation[:, 1], model.landmark_positions(model(tracking.face), "mediapipe")
+
+
+def test_fast_turns_neither_lag_nor_shrink():
+    yaw, tracked_yaw, _ = _still_then_turn(noise=0.0)
+    tracked_yaw = tracked_yaw.double()
+    range_ratio = (tracked_yaw.max() - tracked_yaw.min()) / (yaw.max() - yaw.min())
+    assert 0.95 < range_ratio < 1.05
+    # Where the yaw crosses the middle of its way: less than half a frame late or early.
+    centred = tracked_yaw - (tracked_yaw.max() + tracked_yaw.min()) / 2
+    crossing = int((centred > 0).nonzero()[0, 0])
+    exact = crossing - float(centred[crossing] / (centred[crossing] - centred[crossing - 1]))
+    assert abs(exact - 33) < 0.5
+    assert (tracked_yaw.diff().max() / yaw.diff().max()) > 0.85
+
+
+def test_smoothing_calms_a_still_head():
+    _, _, marks = _still_then_turn(noise=0.3)
+    still = marks[2:26]
+    shake = (still[2:] - 2 * still[1:-1] + still[:-2])[..., :2].norm(dim=-1).median()
+    # The shake of the whole picture alone is 0.3 px * sqrt(6) * sqrt(pi / 2) in second differences, or 1.06 mm.
+    assert shake < 0.0006
+
+
+def test_focal_follows_the_crop():
+    case = make_tracking_case(timesteps=3)
+    crop = {"left": 300, "top": 0, "width": 1024, "height": 1024}
+    capture = replace(case.capture, source={"picture_size": [1920, 1080], "crop": crop})
+    K = initial_camera(capture, TrackingSettings()).K
+    assert float(K[0, 0]) == 1.5 * 1920 * 512 / 1024
+    assert float(initial_camera(case.capture, TrackingSettings()).K[0, 0]) == 1.5 * 512
+
+
+def test_several_cameras_are_refused():
+    case = make_tracking_case(timesteps=3)
+    with pytest.raises(UserError, match="2 cameras"):
+        track(capture_of(case.pixels, cameras=2), make_small_face_model())
+
+
+def test_too_few_faces_are_refused():
+    case = make_tracking_case(timesteps=4, missing=(0, 1))
+    with pytest.raises(UserError, match="found in 2 frames"):
+        track(case.capture, make_small_face_model())
+
+
+def test_a_model_without_landmarks_is_refused():
+    case = make_tracking_case(timesteps=4)
+    with pytest.raises(UserError, match="no MediaPipe landmarks"):
+        track(case.capture, replace(make_small_face_model(), landmarks={}))
+
+
+def test_report(tracked):
+    case, tracking = tracked
+    report = residual_report(case.capture, tracking, make_small_face_model())
+    assert report["frames_without_face"] == [20, 21]
+    assert report["residual_px"]["median"] == pytest.approx(float(tracking.residuals.nanmedian()), abs=1e-6)
+    assert report["iris_distance"]["deviation_percent"] < 1.0
+    assert report["jitter"]["fitted_px"] < report["jitter"]["detected_px"]
+    assert report["flagged_frames"] == []
+
+
+def test_report_flags_a_bad_frame(tracked):
+    case, tracking = tracked
+    residuals = tracking.residuals.clone()
+    residuals[7] = 5.0
+    report = residual_report(case.capture, replace(tracking, residuals=residuals), make_small_face_model())
+    assert report["flagged_frames"] == [7]
+
+
+def test_anny_lips_and_lids_part():
+    """The embedding tells upper from lower lip and lid, without which no mouth would open in a tracking."""
+    model = load_face_model("anny")
+    face = model.neutral(3)
+    expression = face.expression.clone()
+    expression[1, model.expression_names.index("jawOpen")] = 0.6
+    for side in ("Left", "Right"):
+        expression[2, model.expression_names.index(f"eyeBlink{side}")] = 0.8
+    marks = model.landmark_positions(model(replace(face, expression=expression)), "mediapipe").numpy()
+    for upper, lower in ((13, 14), (82, 87), (312, 317)):
+        gap = np.linalg.norm(marks[:, upper] - marks[:, lower], axis=-1)
+        assert gap[0] < 0.004
+        assert gap[1] > 0.012
+    for upper, lower in ((159, 145), (386, 374)):
+        gap = np.linalg.norm(marks[:, upper] - marks[:, lower], axis=-1)
+        assert gap[2] < 0.6 * gap[0]
