@@ -46,8 +46,9 @@ def draw_overlay(
     opacity = _MESH_OPACITY * alpha.numpy()[..., None]
     blended = image * (1 - opacity) + mesh.clamp(0, 1).numpy() * 255 * opacity
     left = image.copy()  # a capture read from disk is read-only
-    if tracking.valid[timestep]:
-        _draw_points(left, capture.landmarks[timestep, camera_index], _GREEN)
+    detected = np.asarray(capture.landmarks[timestep, camera_index])
+    if np.isfinite(detected).all():
+        _draw_points(left, detected, _GREEN)
     _draw_points(left, marks, _RED)
     _draw_line(left, tracking.neck_lines[timestep, camera_index].numpy(), camera)
     residual = float(tracking.residuals[timestep, camera_index])

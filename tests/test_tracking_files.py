@@ -1,0 +1,152 @@
+"""Trackings and scoring masks on disk: round trips, damage, and that a scoring mask never changes."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mien.errors import UserError
+from mien.storage import read_tensors, write_tensors
+from mien.tracking import (
+    Scoring,
+    Tracking,
+    read_scoring,
+    read_tracking,
+    scoring_exists,
+    write_scoring,
+    write_tracking,
+)
+from small_face_model import make_small_face_model
+from tracking_case import still_camera
+
+
+def _tracking(offsets: bool = False) -> Tracking:
+    model = make_small_face_model()
+    face = model.neutral(4)
+    random = torch.Generator().manual_seed(0)
+    face = replace(
+        face,
+        head_rotation=torch.randn(4, 3, generator=random),
+        vertex_offsets=torch.randn(model.template.shape, generator=random) if offsets else None,
+    )
+    return Tracking(
+        face_model="small", face_model_hash="abc", face=face, valid=torch.tensor([True, False, True, True]),
+        cameras=(still_camera().to(torch.zeros(())),), neck_lines=torch.tensor([0.0, -1.0, 300.0]).expand(4, 1, 3),
+        residuals=torch.tensor([[0.5], [torch.nan], [0.7], [0.6]]), settings={"focal": None, "keyframes": 20},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("offsets", [False, True])
+def test_round_trip(tmp_path, offsets):
+    tracking = _tracking(offsets)
+    write_tracking(tmp_path / "tracking", tracking)
+    again = read_tracking(tmp_path / "tracking")
+    assert again.face.tensors().keys() == tracking.face.tensors().keys()
+    for name, tensor in tracking.face.tensors().items():
+        assert torch.equal(tensor, again.face.tensors()[name]), name
+    assert (again.face_model, again.face_model_hash, again.settings) == ("small", "abc", tracking.settings)
+    assert torch.equal(again.valid, tracking.valid)
+    assert torch.equal(again.neck_lines, tracking.neck_lines)
+    torch.testing.assert_close(again.residuals, tracking.residuals, equal_nan=True, atol=0, rtol=0)
+    camera, expected = again.cameras[0], tracking.cameras[0]
+    assert torch.equal(camera.K, expected.K)
+    assert torch.equal(camera.viewmat, expected.viewmat)
+    assert (camera.width, camera.height) == (expected.width, expected.height)
+    summary = json.loads((tmp_path / "tracking" / "tracking.json").read_text())["residual"]
+    assert summary["median_px"] == pytest.approx(0.6)
+
+
+def _rewrite(folder, change) -> None:
+    """Change the tensors and keep the json in step: what is then found wrong is the content, not the hash."""
+    import hashlib
+
+    file = folder / "tracking.safetensors"
+    tensors = read_tensors(file)
+    change(tensors)
+    write_tensors(file, tensors)
+    content = json.loads((folder / "tracking.json").read_text())
+    content["tensors_sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    (folder / "tracking.json").write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.pop("joints"), "lacks 'joints'"),
+        (lambda t: t.update(expression=t["expression"][:2]), "'head_rotation'|'joints'|'expression'"),
+        (lambda t: t.update(head_translation=torch.full((4, 3), torch.nan)), "'head_translation' holds numbers"),
+        (lambda t: t.update(residuals=torch.full((4, 1), torch.nan)), "'residuals' holds numbers"),
+        (lambda t: t.update(camera_K=torch.zeros(1, 2, 3)), "'camera_K' has the shape"),
+    ],
+)
+def test_wrong_content(tmp_path, change, message):
+    write_tracking(tmp_path, _tracking())
+    _rewrite(tmp_path, change)
+    with pytest.raises(UserError, match=message):
+        read_tracking(tmp_path)
+
+
+def test_damage(tmp_path):
+    with pytest.raises(UserError, match="missing"):
+        read_tracking(tmp_path)
+    write_tracking(tmp_path, _tracking())
+    tensors, text = tmp_path / "tracking.safetensors", (tmp_path / "tracking.json").read_text()
+    whole = tensors.read_bytes()
+    tensors.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    with pytest.raises(UserError, match="is not what tracking.json was written with"):
+        read_tracking(tmp_path)
+    tensors.write_bytes(whole[:100])
+    with pytest.raises(UserError, match="damaged"):
+        read_tracking(tmp_path)
+    tensors.write_bytes(whole)
+    (tmp_path / "tracking.json").write_text(text.replace('"version": 1', '"version": 7'))
+    with pytest.raises(UserError, match="version 7"):
+        read_tracking(tmp_path)
+    (tmp_path / "tracking.json").write_text(text.replace('"cameras"', '"lenses"'))
+    with pytest.raises(UserError, match="incomplete"):
+        read_tracking(tmp_path)
+
+
+def _scoring(value: int = 200) -> Scoring:
+    masks = np.zeros((2, 1, 8, 10), np.uint8)
+    masks[:, :, 2:6, 3:9] = value
+    return Scoring(masks, np.array([[[3, 2, 6, 4]], [[3, 2, 6, 4]]]))
+
+
+def test_scoring_round_trip_and_frozen(tmp_path):
+    folder = tmp_path / "scoring"
+    assert not scoring_exists(folder)
+    write_scoring(folder, _scoring())
+    assert scoring_exists(folder)
+    again = read_scoring(folder)
+    np.testing.assert_array_equal(again.masks, _scoring().masks)
+    np.testing.assert_array_equal(again.crops, _scoring().crops)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    write_scoring(folder, _scoring(value=100))
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert list(tmp_path.iterdir()) == [folder], "no scratch folder stays behind"
+
+
+def test_half_written_scoring_is_replaced(tmp_path):
+    folder = tmp_path / "scoring"
+    (folder / "masks").mkdir(parents=True)
+    write_scoring(folder, _scoring())
+    assert read_scoring(folder).masks.max() == 200
+
+
+def test_damaged_scoring(tmp_path):
+    write_scoring(tmp_path / "s", _scoring())
+    mask = tmp_path / "s" / "masks" / "00" / "000001.png"
+    whole = mask.read_bytes()
+    mask.write_bytes(whole[:-5])
+    with pytest.raises(UserError, match="damaged"):
+        read_scoring(tmp_path / "s")
+    mask.unlink()
+    with pytest.raises(UserError, match="missing"):
+        read_scoring(tmp_path / "s")
+    write_scoring(tmp_path / "other", _scoring(value=100))
+    mask.write_bytes((tmp_path / "other" / "masks" / "00" / "000001.png").read_bytes())
+    with pytest.raises(UserError, match="not those that were written"):
+        read_scoring(tmp_path / "s")
