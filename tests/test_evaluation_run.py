@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from evaluation_case import make_experiment
-from mien.avatar import GaussianAvatarsConfig
+from mien.avatar import FaceTuning, GaussianAvatarsConfig
 from mien.capture import write_capture
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, read_metrics
@@ -31,7 +31,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     write_tracking(folder / "tracking", sequence.tracking)
     write_scoring(folder / "scoring", experiment.scorings[0])
     settings = TrainSettings(steps=STEPS, record_every=1, checkpoint_every=STEPS)
-    train([read_sequence(folder)], experiment.avatar.face_model, GaussianAvatarsConfig(), settings, run_dir)
+    config = GaussianAvatarsConfig(face_tuning=FaceTuning(enabled=False))
+    train([read_sequence(folder)], experiment.avatar.face_model, config, settings, run_dir)
     return folder, run_dir
 
 
@@ -60,12 +61,12 @@ def test_held_out_frames_are_those_training_left_out(workspace: tuple[Path, Path
     assert [frame.timestep for frame in experiment.training_frames] == list(range(40))
 
 
-def test_refined_held_out_frames_are_said_to_be_so(workspace: tuple[Path, Path]) -> None:
+def test_corrected_held_out_frames_are_said_to_be_so(workspace: tuple[Path, Path]) -> None:
     folder, run_dir = workspace
     path = run_dir / "face_track.safetensors"
     before = read_tensors(path)
     try:
-        for timestep, wanted in ((3, "as_tracked"), (45, "refined")):
+        for timestep, wanted in ((3, "as_tracked"), (45, "corrected")):
             changed = {name: tensor.clone() for name, tensor in before.items()}
             changed["expression"][timestep] += 0.1
             write_tensors(path, changed)

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from mien.avatar import FaceTuning, GaussianStore, Moments, ParameterGroup, Photometric, Progress, Rate, store_group
 from mien.errors import UserError
+from mien.face import FaceParams
 from mien.render.rendering import Rendering
 from mien.training import TrainSettings, held_out
 from mien.training.adam import Adam
-from mien.training.face_track import FaceTrack
+from mien.training.face_track import FaceTrack, spread_corrections
 from mien.training.frames import FrameOrder, background_at, density_random, training_frames
 from mien.training.losses import picture_losses
 from mien.training.photometric import photometric_loss
@@ -183,8 +184,8 @@ def test_face_track_moves_only_the_timestep_that_was_used() -> None:
     tuned = track.params()
     # Adam moves by its rate in each step while the gradient keeps its sign.
     torch.testing.assert_close(tuned.expression[2], start.expression[2] - 0.04)
-    others = torch.tensor([0, 1, 3, 4, 5])
-    assert torch.equal(tuned.expression[others], start.expression[others])
+    for other in (0, 1, 3, 4, 5):
+        assert torch.equal(track.face(other).expression[0], start.expression[other])
     assert torch.equal(tuned.joints, start.joints), "what has no gradient does not move"
     resumed = FaceTrack(start, FaceTuning(enabled=True))
     resumed.load_state(track.state())
@@ -192,7 +193,7 @@ def test_face_track_moves_only_the_timestep_that_was_used() -> None:
 
 
 def test_face_track_is_still_where_tuning_is_off() -> None:
-    track = FaceTrack(toy_face(6), FaceTuning())
+    track = FaceTrack(toy_face(6), FaceTuning(enabled=False))
     face = track.face(2)
     assert not face.expression.requires_grad
     assert track.parameter_groups(face, 2) == []
@@ -203,3 +204,33 @@ def test_moments_begin_at_zero() -> None:
     moments = Moments.zeros(torch.ones(3))
     assert moments.first.eq(0).all()
     assert moments.step == 0
+
+
+def test_corrections_spread_to_timesteps_that_were_not_seen() -> None:
+    tracked = torch.arange(12.0).reshape(6, 2)
+    seen = torch.tensor([False, True, False, False, True, False])
+    correction = torch.tensor([[0.0, 0.0], [1.0, -2.0], [0.0, 0.0], [0.0, 0.0], [4.0, 1.0], [0.0, 0.0]])
+    tuned = tracked + correction
+    spread_corrections(tuned, tracked, seen)
+    expected = torch.tensor([[1.0, -2.0], [1.0, -2.0], [2.0, -1.0], [3.0, 0.0], [4.0, 1.0], [4.0, 1.0]])
+    torch.testing.assert_close(tuned - tracked, expected)
+
+
+def test_corrections_stay_within_their_sequence() -> None:
+    face = FaceParams(
+        identity=torch.zeros(1),
+        expression=torch.zeros(4, 1),
+        joints=torch.zeros(4, 1, 3),
+        head_rotation=torch.zeros(4, 3),
+        head_translation=torch.zeros(4, 3),
+    )
+    track = FaceTrack(face, FaceTuning(enabled=True), lengths=(2, 2))
+    one = track.face(0)
+    one.head_translation.grad = torch.ones(1, 3)
+    for name in ("expression", "joints", "head_rotation"):
+        getattr(one, name).grad = torch.zeros_like(getattr(one, name))
+    Adam().step(track.parameter_groups(one, 0), Progress(0, 10))
+    moved = track.params().head_translation
+    assert (moved[0] < 0).all()
+    torch.testing.assert_close(moved[1], moved[0])
+    torch.testing.assert_close(moved[2:], torch.zeros(2, 3))

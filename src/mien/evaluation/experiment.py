@@ -16,8 +16,9 @@ from mien.render import rasterize
 from mien.tracking import Scoring
 from mien.training.sequence import Sequence
 
-FaceSource = Literal["as_tracked", "refined"]
-"""Whether held-out frames are posed as the tracker left them, or after training refined them on their own pixels."""
+FaceSource = Literal["as_tracked", "corrected"]
+"""Whether held-out frames are posed as the tracker left them, or with what training corrected in the frames beside
+them (never with anything learnt from their own pixels)."""
 
 
 class Frame(NamedTuple):

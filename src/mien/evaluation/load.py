@@ -88,5 +88,5 @@ def _face_source(sequences: Items[Sequence], faces: Items[FaceParams], frames: I
         tracked, used = sequences[frame.sequence].tracking.face[frame.timestep], faces[frame.sequence][frame.timestep]
         names = ("expression", "joints", "head_rotation", "head_translation")
         if any(not getattr(tracked, name).equal(getattr(used, name)) for name in names):
-            return "refined"
+            return "corrected"
     return "as_tracked"

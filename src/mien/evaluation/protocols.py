@@ -4,7 +4,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any, TypeVar
 
@@ -18,7 +18,7 @@ from mien.evaluation.metrics import Box, crop_to, l1, psnr, ssim
 from mien.evaluation.perceptual import MINIMUM_SIZE, Backbone, PerceptualDistance, load_perceptual
 from mien.progress import progress_bar
 
-AVATAR, MEAN_FRAME, MESH = "avatar", "mean_frame", "mesh"
+AVATAR, AS_TRACKED, MEAN_FRAME, MESH = "avatar", "as_tracked", "mean_frame", "mesh"
 METRICS = ("psnr", "ssim", "l1", "perceptual")
 _TRAINING_FRAMES = 200
 _MASK = "frozen scoring mask: matte cut below the neck line, over white"
@@ -53,7 +53,8 @@ class Evaluation:
 
     frames: tuple[Frame, ...]
     scores: dict[str, tuple[Scores, ...]]
-    """By what was scored: `avatar`, and with baselines `mean_frame` and `mesh`; one entry a frame."""
+    """By what was scored: `avatar`; if its faces are not as tracked, `as_tracked` with those; and with baselines
+    `mean_frame` and `mesh`; one entry a frame."""
     seconds_per_frame: float
     """Posing and rendering the avatar, the median."""
     baselines: Baselines | None
@@ -75,6 +76,7 @@ def evaluate_frames(experiment: Experiment, settings: EvaluationSettings) -> Eva
     assert experiment.held_out_frames, "nothing is held out"
     metric = load_perceptual(settings.backbone) if settings.perceptual else None
     baselines = make_baselines(experiment) if settings.baselines else None
+    as_tracked = None if experiment.face_source == "as_tracked" else _as_tracked(experiment)
     seconds: list[float] = []
     frames = experiment.held_out_frames
     judged = _evenly_spread(frames, settings.perceptual_frames)
@@ -83,6 +85,8 @@ def evaluate_frames(experiment: Experiment, settings: EvaluationSettings) -> Eva
         start = time.perf_counter()
         drawn = {AVATAR: avatar_image(experiment, frame)}
         seconds.append(time.perf_counter() - start)
+        if as_tracked is not None:
+            drawn[AS_TRACKED] = avatar_image(as_tracked, frame)
         if baselines is not None:
             drawn[MEAN_FRAME] = baselines.mean_frame_image(experiment, frame)
             drawn[MESH] = baselines.mesh_image(experiment, frame)
@@ -103,6 +107,11 @@ def evaluate_frames(experiment: Experiment, settings: EvaluationSettings) -> Eva
     scores = {subject: tuple(row[subject] for row in rows) for subject in rows[0]}
     seen = _training_psnr(experiment)
     return Evaluation(frames, scores, sorted(seconds)[len(seconds) // 2], baselines, seen)
+
+
+def _as_tracked(experiment: Experiment) -> Experiment:
+    """The same with the faces that the tracker left."""
+    return replace(experiment, faces=tuple(sequence.tracking.face for sequence in experiment.sequences))
 
 
 def _training_psnr(experiment: Experiment) -> dict[Frame, tuple[float, float]]:
@@ -151,7 +160,8 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "frames": len(evaluation.frames),
         "seconds_per_frame": evaluation.seconds_per_frame,
         "training_frames": _training_means(evaluation),
-        "baselines": {name: _means(evaluation, name) for name in evaluation.scores if name != AVATAR},
+        "baselines": {name: _means(evaluation, name) for name in (MEAN_FRAME, MESH) if name in evaluation.scores},
+        "as_tracked": _means(evaluation, AS_TRACKED if AS_TRACKED in evaluation.scores else AVATAR),
         "per_frame": {
             "sequence": [experiment.sequences[frame.sequence].name for frame in evaluation.frames],
             "timestep": [frame.timestep for frame in evaluation.frames],

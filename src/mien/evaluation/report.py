@@ -22,7 +22,8 @@ _TITLES = {
     "self_reenactment_tail": "Self-reenactment, last part of the sequence",
     "novel_view": "Novel views",
 }
-_ROWS = {"avatar": "Avatar", "mesh": "Tracked mesh with its colours", "mean_frame": "Mean training picture"}
+_BASELINES = {"mesh": "Tracked mesh with its colours", "mean_frame": "Mean training picture"}
+_ROWS = {"avatar": "Avatar", "as_tracked": "Avatar, faces as tracked", **_BASELINES}
 _METRICS = (("psnr", "PSNR, dB ↑", 2), ("ssim", "SSIM ↑", 3), ("l1", "L1 ↓", 4), ("perceptual", "ST-LPIPS ↓", 3))
 
 
@@ -121,7 +122,8 @@ def _table(protocols: Mapping[str, Any]) -> str:
     """Every metric of the avatar and of both baselines, whole frame and head crop."""
     parts = []
     for name, entry in protocols.items():
-        subjects = {"avatar": entry, **entry["baselines"]}
+        corrected = {} if entry["face_params"] == "as_tracked" else {"as_tracked": entry["as_tracked"]}
+        subjects = {"avatar": entry, **corrected, **entry["baselines"]}
         rows = "".join(
             f'<tr class="{"own" if key == "avatar" else ""}"><td>{label}</td>{_cells(key, subjects)}</tr>'
             for key, label in _ROWS.items()
@@ -154,7 +156,7 @@ def _cells(key: str, subjects: Mapping[str, Any]) -> str:
         for index, (metric, _, digits) in enumerate(_METRICS):
             value = _figure(subjects[key], part, metric)
             text = "–" if value is None else f"{value:.{digits}f}"
-            others = [_figure(entry, part, metric) for name, entry in subjects.items() if name != "avatar"]
+            others = [_figure(entry, part, metric) for name, entry in subjects.items() if name in _BASELINES]
             known = [other for other in others if other is not None]
             if key == "avatar" and metric == "psnr" and value is not None and known:
                 text += f" <small>{value - max(known):+.1f}</small>"

@@ -18,8 +18,9 @@ GLOSSARY = {
         "training frames show on it. In green: its lead over the better one, dB."
     ),
     "Face parameters": (
-        "as tracked: held-out frames are posed by the tracker alone. refined: they were also fitted through the avatar "
-        "to their own pixels, which flatters."
+        "as tracked: held-out frames are posed by the tracker alone. corrected: training also improved the tracking of "
+        "the frames that it saw, and held-out frames get those corrections, interpolated over time; their own pixels "
+        "are never looked at."
     ),
     "PSNR, SSIM, L1": (
         "Images in 0..1, clamped; means over frames. SSIM: 11x11 Gaussian window, sigma 1.5, zeros beyond the border."

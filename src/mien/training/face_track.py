@@ -1,7 +1,9 @@
 """FaceTrack: the face parameters of all timesteps as training sees them, tuned frame by frame where asked for."""
 
+from collections.abc import Sequence as Items
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,10 +17,17 @@ class FaceTrack:
     """One tensor per field, indexed by timestep, that starts from the tracking; with the optimiser's state.
 
     Each timestep has its own moments and step counts, and only the timestep of a step moves.
+
+    Args:
+        face: All timesteps of all sequences in a row.
+        tuning: Whether and how fast they move.
+        lengths: Timesteps of each sequence; one sequence by default.
     """
 
-    def __init__(self, face: FaceParams, tuning: FaceTuning):
+    def __init__(self, face: FaceParams, tuning: FaceTuning, lengths: Items[int] = ()):
         self._start = face.detach()
+        self._lengths = tuple(lengths) or (len(face),)
+        assert sum(self._lengths) == len(face), "timesteps of the sequences"
         self._tuning = tuning
         self._fields = {name: getattr(self._start, name).clone() for name in _FIELDS}
         names = _FIELDS if tuning.enabled else ()
@@ -43,8 +52,20 @@ class FaceTrack:
         return groups
 
     def params(self) -> FaceParams:
-        """All timesteps as they are now."""
-        return replace(self._start, **{name: tensor.clone() for name, tensor in self._fields.items()})
+        """All timesteps as they are now; those that training never saw get what it corrected in their neighbours.
+
+        What tracking gets wrong (depth, a tilt of the head) changes slowly. So a held-out timestep gets its sequence's
+        corrections, linear between the nearest trained timesteps and constant beyond the last; no pixel of a held-out
+        frame is looked at. A sequence of which nothing was trained on stays as tracked.
+        """
+        fields = {name: tensor.clone() for name, tensor in self._fields.items()}
+        for name, state in self._moments.items():
+            start, first = getattr(self._start, name), 0
+            for length in self._lengths:
+                part = slice(first, first + length)
+                spread_corrections(fields[name][part], start[part], state.step[part] > 0)
+                first += length
+        return replace(self._start, **fields)
 
     def state(self) -> dict[str, Tensor]:
         """What a checkpoint has to keep; the tensors are the track's own."""
@@ -58,3 +79,20 @@ class FaceTrack:
         for name, own in self.state().items():
             with torch.no_grad():
                 own.copy_(state[name])
+
+
+def spread_corrections(tuned: Tensor, tracked: Tensor, seen: Tensor) -> None:
+    """Give timesteps that were not `seen` the interpolated corrections `tuned - tracked` of the others, in place.
+
+    Args:
+        tuned: [t, ...] parameters after training.
+        tracked: [t, ...] before training.
+        seen: bool [t].
+    """
+    if not bool(seen.any()) or bool(seen.all()) or tuned.numel() == 0:
+        return
+    known, unseen = seen.nonzero()[:, 0].numpy(), (~seen).nonzero()[:, 0].numpy()
+    corrections = (tuned - tracked).flatten(1).double().numpy()
+    columns = [np.interp(unseen, known, column[known]) for column in corrections.T]
+    spread = torch.from_numpy(np.stack(columns, axis=1)).to(tuned).reshape(-1, *tuned.shape[1:])
+    tuned[torch.from_numpy(unseen)] = tracked[torch.from_numpy(unseen)] + spread

@@ -92,7 +92,8 @@ def start(
         torch.manual_seed(settings.seed)
         avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
     density = density_strategy(avatar.density(), avatar.gaussian_store())
-    return TrainingState(avatar, Adam(), density, FaceTrack(face, method_config.face_tuning), {})
+    track = FaceTrack(face, method_config.face_tuning, [len(sequence.tracking.face) for sequence in sequences])
+    return TrainingState(avatar, Adam(), density, track, {})
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
