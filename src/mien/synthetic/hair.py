@@ -57,6 +57,12 @@ def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray | np.floating:
     return np.einsum("...i,...i->...", first, second)
 
 
+def along(vectors: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Scalar products with one direction, without the linear algebra library, whose threads would spin for it."""
+    x, y, z = direction.tolist()
+    return vectors[..., 0] * x + vectors[..., 1] * y + vectors[..., 2] * z
+
+
 def short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, count: int = 9000) -> Strands:
     """A side parting: long on top, short at the sides and the nape.
 

@@ -88,7 +88,11 @@ class Visibility:
     def shadow(self, lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "v 3"]:
         """The share of the light, per colour channel, that reaches each vertex when the head is turned."""
         radiance = lighting.radiance(self.directions @ R_world_head.T)
-        return (self.transfer @ radiance + 1e-4) / (self.unshadowed @ radiance + 1e-4)
+        # By torch, whose threads the caller has set; numpy's linear algebra would start its own in every frame.
+        lit, full = (
+            (torch.from_numpy(m) @ torch.from_numpy(radiance)).numpy() for m in (self.transfer, self.unshadowed)
+        )
+        return (lit + 1e-4) / (full + 1e-4)
 
 
 def compute_visibility(

@@ -1,5 +1,7 @@
 """Draws a posed subject as a camera sees it: picture and coverage."""
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import torch
@@ -24,6 +26,8 @@ from mien.synthetic.subject import (
     Subject,
     opaque_vertices,
 )  # fmt: skip
+
+_BLOCK = 32768  # samples
 
 
 def draw(
@@ -105,12 +109,21 @@ def _paint_skin(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
     subject, posed = canvas.subject, canvas.posed
     shadow = subject.visibility.shadow(subject.lighting, posed.R_world_head) ** np.array([0.8, 1.0, 1.05], np.float32)
     attributes = np.concatenate([posed.normals, shadow], -1)
-    values = canvas.interpolate(rows, attributes, _model_faces(canvas))
     uv_faces = subject.model.uv_faces.numpy()[subject.model_faces]
-    uv = canvas.interpolate(rows, subject.textures.uv, uv_faces)
-    channels = shading.look_up(subject.textures.channels, uv)
-    views = canvas.views(canvas.pixels[rows])
-    return shading.shade_skin(channels, values[:, :3], values[:, 3:], views, canvas.light)
+
+    def paint(block: np.ndarray) -> np.ndarray:
+        values = canvas.interpolate(block, attributes, _model_faces(canvas))
+        uv = canvas.interpolate(block, subject.textures.uv, uv_faces)
+        channels = shading.look_up(subject.textures.channels, uv)
+        views = canvas.views(canvas.pixels[block])
+        return shading.shade_skin(channels, values[:, :3], values[:, 3:], views, canvas.light)
+
+    return _in_blocks(rows, paint)
+
+
+def _in_blocks(rows: np.ndarray, paint: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Paints so few samples at a time that all intermediate arrays stay in a core's cache."""
+    return np.concatenate([paint(rows[start : start + _BLOCK]) for start in range(0, len(rows), _BLOCK)])
 
 
 def _paint_eyes(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
@@ -175,10 +188,15 @@ def _paint_shirt(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
     attributes[-len(subject.shirt.vertices) :, :3] = subject.shirt.normals @ R.T
     attributes[-len(subject.shirt.vertices) :, 3:] = subject.shirt.vertices
     values = canvas.interpolate(rows, attributes, subject.faces)
-    weave = SolidNoise(5)(values[:, 3:], 0.0016)
-    under_chin = np.clip(0.55 + 6 * np.abs(values[:, 3]), 0, 1)
-    albedo = subject.shirt_color * (1 + 0.16 * weave)[:, None] * under_chin[:, None]
-    return albedo * canvas.light.irradiance(unit(values[:, :3]))
+    noise = SolidNoise(5)
+
+    def paint(block: np.ndarray) -> np.ndarray:
+        part = values[block]
+        under_chin = np.clip(0.55 + 6 * np.abs(part[:, 3]), 0, 1)
+        weave = (1 + 0.16 * noise(part[:, 3:], 0.0016)) * under_chin
+        return subject.shirt_color * weave[:, None] * canvas.light.irradiance(unit(part[:, :3]))
+
+    return _in_blocks(np.arange(len(rows)), paint)
 
 
 def _paint_frame(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 
 from mien.render.mesh import sample_texture, sh_basis
-from mien.synthetic.hair import Strands, dot, unit
+from mien.synthetic.hair import Strands, along, dot, unit
 from mien.synthetic.light import Lighting
 from mien.synthetic.noise import smoothstep
 
@@ -67,7 +67,7 @@ def highlight(
         fresnel = 0.028 + 0.97 * (1 - np.clip(dot(views, half), 0, 1)) ** 5
         away = dot(normals, half) - 1
         strength = sum((0.125 * weight * sharpness) * np.exp(sharpness * away) for weight, sharpness in lobes)
-        strength = strength * fresnel * (normals @ direction > 0)
+        strength = strength * fresnel * (along(normals, direction) > 0)
         for channel in range(3):
             total[:, channel] += strength * color[channel]
     return total
@@ -101,10 +101,10 @@ def shade_hair(strands: Strands, light: LocalLight, viewpoint: Float[np.ndarray,
     relative = strands.colors / (strands.colors.max(-1, keepdims=True) + 1e-6)
     depth = np.clip(strands.colors.max(-1) / strands.colors.max(), 0, 1)  # hair below others is darker
     for direction, color in light.lamps:
-        along = tangents @ direction
-        across = np.sqrt(np.maximum(1 - along**2, 0))
-        lit = np.clip(0.3 + 0.7 * (outwards @ direction), 0, 1)
-        aligned = across * across_view - along * along_view
+        lengthwise = along(tangents, direction)
+        across = np.sqrt(np.maximum(1 - lengthwise**2, 0))
+        lit = np.clip(0.3 + 0.7 * along(outwards, direction), 0, 1)
+        aligned = across * across_view - lengthwise * along_view
         first = np.exp(52 * (aligned - 1))
         second = np.exp(16 * (aligned - 1.05))
         colors += (0.55 * lit * across)[..., None] * strands.colors * color
@@ -152,7 +152,7 @@ def shade_eye(
     # The lid's shadow, and that of the orbit: eyes are darker than a white ball.
     shadow = (0.30 + 0.70 * smoothstep(-0.0005, 0.0045, under_lid))[:, None]
     # Light that enters the cornea falls on the far side of the iris: its diffuse light is as of a bowl.
-    outward = normals - (normals @ axis)[:, None] * axis
+    outward = normals - along(normals, axis)[:, None] * axis
     bowl = unit(normals - 1.2 * share * outward)
     diffuse = albedo * light.irradiance(bowl.astype(np.float32)) * shadow
     cornea = unit(normals + 0.75 * outward * smoothstep(1.25, 0.9, q)[:, None])
