@@ -47,6 +47,23 @@ void row_span(const Splat& s, int row, int columns, int* low, int* high) {
   *high = static_cast<int>(std::clamp(std::floor((right - 0.5f) / kTile), -1.0f, static_cast<float>(columns - 1)));
 }
 
+// The pairs of a splat that touches more than two rows of tiles or more than two tiles in a row.
+void find_large(const Splat& splat, uint32_t gaussian, const TileSpan& span, int columns, Buffer<Pair>& pairs) {
+  for (int row = 0; row < span.row_count; ++row) {
+    int low, high;
+    if (row < 2) {
+      low = span.low[row];
+      high = span.high[row];
+    } else {
+      row_span(splat, span.first_row + row, columns, &low, &high);
+    }
+    const int first = (span.first_row + row) * columns;
+    Pair* out = pairs.extend(std::max(high - low + 1, 0));
+    for (int column = low; column <= high; ++column) *out++ = {gaussian, static_cast<uint32_t>(first + column)};
+    pairs.advance(std::max(high - low + 1, 0));
+  }
+}
+
 void find_pairs(BinChunk& chunk, Frame& frame, const Kernels& kernels) {
   const int64_t count = chunk.last - chunk.first;
   const uint32_t* order = frame.order.data() + chunk.first;
@@ -58,18 +75,20 @@ void find_pairs(BinChunk& chunk, Frame& frame, const Kernels& kernels) {
     const uint32_t gaussian = order[i];
     const TileSpan& span = spans[i];
     frame.slot_begins[gaussian] = static_cast<uint32_t>(pairs.size());
-    for (int row = 0; row < span.row_count; ++row) {
-      int low, high;
-      if (row < 2) {
-        low = span.low[row];
-        high = span.high[row];
-      } else {
-        row_span(frame.splats[gaussian], span.first_row + row, frame.columns, &low, &high);
-      }
-      const int first = (span.first_row + row) * frame.columns;
-      for (int column = low; column <= high; ++column) {
-        pairs.push_back({gaussian, static_cast<uint32_t>(first + column)});
-      }
+    const int above = std::max(span.high[0] - span.low[0] + 1, 0), below = std::max(span.high[1] - span.low[1] + 1, 0);
+    if (span.row_count <= 2 && above <= 2 && below <= 2) {
+      // Without a branch on the number of tiles, which is as good as random: both are written, those that count stay.
+      const uint32_t first = static_cast<uint32_t>(span.first_row * frame.columns);
+      const uint32_t upper = first + static_cast<uint32_t>(span.low[0]);
+      const uint32_t lower = first + static_cast<uint32_t>(frame.columns + span.low[1]);
+      Pair* out = pairs.extend(4);
+      out[0] = {gaussian, upper};
+      out[1] = {gaussian, upper + 1};
+      out[above] = {gaussian, lower};
+      out[above + 1] = {gaussian, lower + 1};
+      pairs.advance(above + below);
+    } else {
+      find_large(frame.splats[gaussian], gaussian, span, frame.columns, pairs);
     }
     frame.slot_ends[gaussian] = static_cast<uint32_t>(pairs.size());
   }

@@ -47,6 +47,14 @@ MIEN_INLINE F4 load_four(const PictureGradient& p, int64_t pixel, int block, int
   return size;
 }
 
+MIEN_INLINE void prefetch_row(const PictureGradient& p, int64_t pixel, int columns) {
+  for (int x = 0; x < 3 * columns; x += 16) {
+    __builtin_prefetch(p.grad_image + 3 * pixel + x);
+    __builtin_prefetch(p.image + 3 * pixel + x);
+  }
+  for (int x = 0; x < columns; x += 16) __builtin_prefetch(p.alpha + pixel + x);
+}
+
 // Loads the gradients of a tile; false if all are zero.
 MIEN_INLINE bool load_gradients(const PictureGradient& p, const View& view, int left, int top, TileGradients& t) {
   const int rows = view.height - top < kTile ? view.height - top : kTile;
@@ -61,6 +69,7 @@ MIEN_INLINE bool load_gradients(const PictureGradient& p, const View& view, int 
   for (int y = 0; y < rows; ++y) {
     const int64_t pixel = (int64_t)(top + y) * view.width + left;
     const int first_block = y / kBlock * kTileBlocks, first_lane = y % kBlock * kBlock;
+    prefetch_row(p, pixel + (int64_t)(y + 2 < rows ? 2 : 0) * view.width, columns);
     int x = 0;
     for (; x + kBlock <= columns; x += kBlock)
       size = size + load_four(p, pixel + x, first_block + x / kBlock, first_lane, t);

@@ -34,11 +34,12 @@ class Buffer {
     }
     return data_;
   }
-  // Keeps what is there.
-  void push_back(const T& value) {
-    if (size_ == capacity_) grow();
-    data_[size_++] = value;
+  // Where the next `count` elements go; keeps what is there. `advance` says how many of them were written.
+  T* extend(int64_t count) {
+    if (size_ + count > capacity_) grow(count);
+    return data_ + size_;
   }
+  void advance(int64_t count) { size_ += count; }
   void clear() { size_ = 0; }
   void swap(Buffer& other) {
     std::swap(data_, other.data_);
@@ -51,9 +52,9 @@ class Buffer {
   T& operator[](int64_t index) { return data_[index]; }
 
  private:
-  void grow() {
+  void grow(int64_t count) {
     Buffer larger;
-    larger.reserve(2 * capacity_ + 1024);
+    larger.reserve(2 * capacity_ + count + 1024);
     std::copy(data_, data_ + size_, larger.data_);
     std::swap(data_, larger.data_);
     std::swap(capacity_, larger.capacity_);

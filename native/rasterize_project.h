@@ -168,7 +168,8 @@ void find_tiles(const Splat* splats, const uint32_t* order, int64_t count, int c
       const F top = (first_row + (float)row) * (float)kTile + 0.5f - s.y;
       const Columns c = columns_touched(s, top, top + (kTile - 1.0f), 0.5f - s.x, kTile);
       store(ints[2 + 2 * row], truncate(clamp(c.low, F{}, last_column + 1.0f)));
-      store(ints[3 + 2 * row], truncate(clamp(c.high, set1(-1.0f), last_column)));
+      const F high = select(less_equal(first_row + (float)row, end_row), c.high, set1(-1.0f));
+      store(ints[3 + 2 * row], truncate(clamp(high, set1(-1.0f), last_column)));
     }
     for (int lane = 0; lane < valid; ++lane) {
       TileSpan& span = spans[i + lane];

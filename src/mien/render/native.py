@@ -73,15 +73,21 @@ class _Rasterize(torch.autograd.Function):
             ctx.frame, means, quats, scales, opacities, sh, image, alpha, grad_image, grad_alpha,
             grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, grad_means2d, grad_view,
         )  # fmt: skip
-        grad_background = torch.einsum("hwc,hw->c", grad_image, 1 - alpha) if ctx.needs_input_grad[7] else None
+        needs_background, needs_viewmat, needs_K = ctx.needs_input_grad[7:]
+        grad_background = torch.einsum("hwc,hw->c", grad_image, 1 - alpha) if needs_background else None
+        grad_viewmat = _viewmat_gradient(grad_view) if needs_viewmat else None
+        grad_K = _intrinsics_gradient(grad_view) if needs_K else None
         grad_parameters = (grad_means, grad_quats, grad_scales, grad_opacities, grad_sh)
-        return (None, grad_means2d, *grad_parameters, grad_background, *_camera_gradients(grad_view))
+        return (None, grad_means2d, *grad_parameters, grad_background, grad_viewmat, grad_K)
 
 
-def _camera_gradients(grad_view: Float[Tensor, " 16"]) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "3 3"]]:
-    """The gradients of viewmat and K from the kernel's rotation [9], translation [3], fx, fy, cx, cy."""
-    grad_viewmat, grad_K = grad_view.new_zeros(4, 4), grad_view.new_zeros(3, 3)
-    grad_viewmat[:3, :3] = grad_view[:9].reshape(3, 3)
-    grad_viewmat[:3, 3] = grad_view[9:12]
-    grad_K[0, 0], grad_K[1, 1], grad_K[0, 2], grad_K[1, 2] = grad_view[12:]
-    return grad_viewmat, grad_K
+# The kernel's gradient of the view: rotation [9], translation [3], fx, fy, cx, cy.
+def _viewmat_gradient(grad_view: Float[Tensor, " 16"]) -> Float[Tensor, "4 4"]:
+    top = torch.cat([grad_view[:9].reshape(3, 3), grad_view[9:12, None]], 1)
+    return torch.cat([top, torch.zeros_like(top[:1])])
+
+
+def _intrinsics_gradient(grad_view: Float[Tensor, " 16"]) -> Float[Tensor, "3 3"]:
+    grad_K = grad_view.new_zeros(3, 3)
+    grad_K[[0, 1, 0, 1], [0, 1, 2, 2]] = grad_view[12:]
+    return grad_K
