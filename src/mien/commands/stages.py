@@ -33,7 +33,7 @@ from mien.training import TrainSettings, read_run_config, read_sequence, read_tr
 from mien.training.run import run_camera
 from mien.workspace import Workspace
 
-_TRACKING_RECIPE = 1
+_TRACKING_RECIPE = 2
 """Raised whenever the same capture would be tracked otherwise, so that old trackings are not taken for current."""
 
 
