@@ -236,7 +236,19 @@ def test_what_does_not_fit_is_refused() -> None:
         rasterize(random_scene(0, coefficients=5).gaussians, cameras[0], background)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_clamped_alpha_has_no_gradient(backend: Backend) -> None:
+    opacities = torch.ones(1, requires_grad=True)
+    gaussians = replace(one_gaussian(scale=5.0), opacities=opacities)
+    alpha = rasterize(gaussians, front_camera(), torch.zeros(3), backend).alpha[7, 10]
+    assert alpha.item() == pytest.approx(0.999, abs=1e-6)
+    alpha.backward()
+    assert opacities.grad is not None
+    assert opacities.grad.item() == 0
+
+
 def _render_in_child(queue: "multiprocessing.Queue[list[float]]") -> None:
+    _native.set_thread_count(3)  # joins the threads of the pool before: hangs if that is still the parent's
     queue.put(rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist())
 
 
@@ -248,7 +260,7 @@ def test_a_forked_child_renders() -> None:
     rasterize(scene.gaussians, scene.camera, scene.background, "native")
     context = multiprocessing.get_context("fork")
     queue: multiprocessing.Queue[list[float]] = context.Queue()
-    child = context.Process(target=_render_in_child, args=(queue,))
+    child = context.Process(target=_render_in_child, args=(queue,), daemon=True)
     child.start()
     assert queue.get(timeout=60) == expected
     child.join(timeout=60)
