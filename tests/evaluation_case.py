@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+
 from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
 from mien.camera import Camera, camera_from_fov
 from mien.capture.capture import Capture

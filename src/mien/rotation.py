@@ -98,9 +98,7 @@ def multiply_quaternions(first: Float[Tensor, "*b 4"], second: Float[Tensor, "*b
     )
 
 
-def rigid_transform(
-    rotations: Float[Tensor, "*b 3 3"], translations: Float[Tensor, "*b 3"]
-) -> Float[Tensor, "*b 4 4"]:
+def rigid_transform(rotations: Float[Tensor, "*b 3 3"], translations: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
     """Homogeneous matrices that rotate, then translate."""
     top = torch.cat([rotations, translations[..., None]], dim=-1)
     bottom = torch.zeros_like(top[..., :1, :])

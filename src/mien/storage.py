@@ -47,7 +47,9 @@ def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
     except FileNotFoundError:
         raise UserError(f"{path}: missing; run the stage that writes it again") from None
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read as json ({error}); delete its folder and run the stage again") from None
+        raise UserError(
+            f"{path}: cannot be read as json ({error}); delete its folder and run the stage again"
+        ) from None
     found = (content.get("format"), content.get("version")) if isinstance(content, dict) else (None, None)
     if found != (format_name, version):
         raise UserError(

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 class SmoothnessSettings:
     """Standard deviations of accelerations, a second squared: smaller is smoother. Infinite switches a term off."""
 
-    translation: float = 0.2
+    translation: float = 0.1
     """Of the head across the line of sight, metres a second squared."""
-    depth: float = 0.4
+    depth: float = 0.2
     """Of the head along the line of sight, which one camera sees least well."""
-    rotation: float = 5.0
+    rotation: float = 2.0
     """Of the head, radians a second squared."""
     expression: float = 100.0
     """Of expression coefficients except those of the eyelids, which blink too fast to be smoothed."""
