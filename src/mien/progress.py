@@ -45,7 +45,9 @@ def progress_bar(title: str, total: int, completed: int = 0) -> Iterator[Advance
         task = bars.add_task(title, total=total, completed=completed, status="")
 
         def advance(amount: int = 1, status: str = "") -> None:
-            bars.update(task, advance=amount, **({"status": status} if status else {}))
+            bars.update(task, advance=amount)
+            if status:
+                bars.update(task, status=status)
 
         yield advance
 

@@ -64,7 +64,7 @@ class Command:
             if self.out.suffix == ".png":
                 image = to_uint8(rasterize(gaussians, camera, white).image)
                 encoded = cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()
-                write_atomically(self.out, lambda path: path.write_bytes(encoded) and None)
+                write_atomically(self.out, lambda path: path.write_bytes(encoded))
             else:
                 cameras = turntable(camera, face.head_translation[0], self.frames, math.radians(self.span))
                 pictures = (to_uint8(rasterize(gaussians, view, white).image) for view in cameras)
