@@ -14,7 +14,7 @@ class TrainSettings:
     """Optimiser steps, one frame each; all schedules stretch with it."""
     split: Split = "blocks"
     """What is held out: every fifth block of 10 timesteps, the last 20 % (`tail`), or nothing."""
-    background: Literal["white", "random"] = "random"
+    background: Literal["white", "random"] = "white"
     """What pictures are composited on. A random colour each step keeps Gaussians from painting the background, which
     shows as white needles in new poses; it costs about 0.1 dB over white."""
     resolution: int = 0
@@ -34,7 +34,7 @@ class TrainSettings:
 
 
 PRESETS = {
-    "draft": TrainSettings(steps=3_000),
+    "draft": TrainSettings(steps=8_000),
     "standard": TrainSettings(),
 }
 """From quick to good."""
