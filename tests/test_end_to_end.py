@@ -1,0 +1,75 @@
+"""The demo itself, shortened: video, capture, tracking, training, report; then every way to use the avatar."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mien.capture.video import probe_video
+from mien.cli import main
+from mien.export import read_ply
+
+DEMO = ("--seconds", "2", "--steps", "150")
+RUN = Path("runs/gaussian_avatars")
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo")
+    assert main(["demo", "--out", str(folder), *DEMO]) == 0
+    return folder
+
+
+@pytest.mark.slow
+def test_demo_beats_both_baselines(workspace: Path) -> None:
+    metrics = json.loads((workspace / RUN / "metrics.json").read_text())
+    assert (metrics["format"], metrics["version"]) == ("mien.metrics", 1)
+    entry = metrics["protocols"]["self_reenactment"]
+    assert entry["split"] == "blocks"
+    assert entry["frames"] == 10
+    best = max(baseline["head"]["psnr"] for baseline in entry["baselines"].values())
+    assert entry["head"]["psnr"] > best + 1
+    assert metrics["training"]["steps"] == 150
+
+
+@pytest.mark.slow
+def test_demo_leaves_what_people_look_at(workspace: Path) -> None:
+    page = (workspace / RUN / "report.html").read_text(encoding="utf-8")
+    assert "<h1>" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert probe_video(workspace / "sequences/synthetic/tracking/overlay.mp4").frames == 50
+
+
+@pytest.mark.slow
+def test_the_same_command_finds_everything_done(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    avatar = workspace / RUN / "avatar" / "avatar.safetensors"
+    before = avatar.stat().st_mtime_ns
+    assert main(["demo", "--out", str(workspace), *DEMO]) == 0
+    assert avatar.stat().st_mtime_ns == before
+    assert "Tracking:" not in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_using_the_avatar(workspace: Path, tmp_path: Path) -> None:
+    avatar = str(workspace)
+    assert main(["export", avatar, "--out", str(tmp_path / "open.ply"), "--set", "jawOpen=0.6"]) == 0
+    assert len(read_ply(tmp_path / "open.ply")) > 1000
+    assert main(["render", avatar, "--out", str(tmp_path / "still.png"), "--size", "64"]) == 0
+    assert main(["render", avatar, "--out", str(tmp_path / "turn.mp4"), "--size", "64", "--frames", "6"]) == 0
+    assert probe_video(tmp_path / "turn.mp4").frames == 6
+    assert main(["drive", avatar, "--by", avatar, "--out", str(tmp_path / "driven.mp4")]) == 0
+    assert probe_video(tmp_path / "driven.mp4").frames == 50
+
+
+@pytest.mark.slow
+def test_bad_requests_to_an_avatar(workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, part in (
+        (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawopen=1"], "no expression 'jawopen'"),
+        (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawOpen=wide"], "no number"),
+        (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--run", "other"], "no run 'other'"),
+        (["render", str(workspace), "--out", str(tmp_path / "a.gif")], "use .mp4 or .png"),
+        (["render", str(workspace), "--out", str(tmp_path / "a.png"), "--size", "100000"], "--size 100000"),
+    ):
+        assert main(arguments) == 2
+        assert part in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
