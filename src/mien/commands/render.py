@@ -29,8 +29,8 @@ class Command:
     """Of the turntable."""
     fps: float = 25.0
     """Of the turntable."""
-    span: float = 90.0
-    """Degrees that the camera swings through; 360 goes all the way round (one camera never saw the back)."""
+    span: float = 40.0
+    """Degrees that the camera swings through, 360 for all the way round; sides that were not filmed look broken."""
 
     def run(self) -> None:
         """Pose once, render from every camera."""
