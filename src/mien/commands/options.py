@@ -26,6 +26,9 @@ class TrainOptions:
     seed: int = 0
     """Same seed, same data, same settings: the same bytes."""
 
+    face_tuning: bool = True
+    """Whether training also corrects the tracking of the frames it sees (held-out frames get what lies beside them)."""
+
     def settings(self) -> TrainSettings:
         """The preset with these changes.
 
@@ -43,4 +46,5 @@ class TrainOptions:
         Raises:
             UserError: there is no such method.
         """
-        return method_named(self.method).config()
+        config = method_named(self.method).config()
+        return replace(config, face_tuning=replace(config.face_tuning, enabled=self.face_tuning))
