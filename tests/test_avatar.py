@@ -144,3 +144,13 @@ def test_face_models_that_may_not_be_passed_on_are_not(tmp_path: Path) -> None:
 def test_missing_baked_avatar(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="missing"):
         read_baked(tmp_path)
+
+
+def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:
+    write_avatar(tmp_path, new_avatar())
+    path = tmp_path / "avatar.safetensors"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"avatar\.safetensors: is not what was written"):
+        load_avatar(tmp_path)

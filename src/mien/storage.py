@@ -1,5 +1,6 @@
 """Files: atomic writes, json with format and version, safetensors. Nothing here knows what is stored."""
 
+import hashlib
 import json
 import os
 import tempfile
@@ -57,6 +58,12 @@ def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
             "run the stage that writes it again"
         )
     return content
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's bytes, as hex digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:

@@ -14,7 +14,7 @@ from mien.config import decode, encode
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
-from mien.storage import read_json, read_tensors, write_json, write_tensors
+from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
 _BAKED = "mien.baked"
@@ -37,6 +37,7 @@ def write_avatar(folder: Path, avatar: Avatar) -> None:
         "face_model": avatar.face_model.name,
         "face_model_hash": avatar.face_model.content_hash,
         "face_model_carried": carried,
+        "tensors_sha256": file_digest(folder / "avatar.safetensors"),
     }
     write_json(folder / "avatar.json", _AVATAR, _VERSION, content)
 
@@ -55,6 +56,8 @@ def load_avatar(folder: Path) -> Avatar:
     content = read_json(folder / "avatar.json", _AVATAR, _VERSION)
     method = method_named(content["kind"])
     tensors = read_tensors(folder / "avatar.safetensors")
+    if file_digest(folder / "avatar.safetensors") != content["tensors_sha256"]:
+        raise UserError(f"{folder / 'avatar.safetensors'}: is not what was written; train it again")
     face_model = _face_model_of(folder, content)
     config = decode(method.config, content["config"], str(folder / "avatar.json"))
     with torch.random.fork_rng(devices=[]):
