@@ -48,5 +48,8 @@ lock: .venv/.packages
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --custom-compile-command "make lock" \
 	  -o requirements/lock.txt
 
+bench: setup
+	$(BIN)/python -m mien.benchmarking.render
+
 clean:
 	rm -rf build out .venv

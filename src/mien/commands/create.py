@@ -33,12 +33,13 @@ class Command:
 
     def run(self) -> None:
         """All stages, each skipped if its result is current."""
-        from mien.commands.stages import capture_stage, evaluation_stage, tracking_stage, training_stage
+        from mien.commands.stages import capture_stage, evaluation_stage, sequence_name, tracking_stage, training_stage
         from mien.progress import say
 
         began = time.monotonic()
         method, settings = self.options.method_config(), self.options.settings()
         workspace, run = Workspace(self.out), self.run_name or self.options.method
+        sequence_name(self.video, run)
         name = capture_stage(workspace, self.video, self.name, self.capture)
         tracking_stage(workspace, name, self.face_model, self.tracking)
         training_stage(workspace, [name], run, method, settings)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,12 @@ _TRACKING_RECIPE = 2
 def capture_stage(workspace: Workspace, video: Path, name: str | None, settings: CaptureSettings) -> str:
     """Capture a video into the workspace; returns the sequence's name."""
     name = sequence_name(video, name)
-    capture = capture_video(video, workspace.sequence_dir(name) / "capture", settings, name)
+    folder = workspace.sequence_dir(name)
+    before = read_capture_hash(folder / "capture") if (folder / "capture" / "capture.json").is_file() else None
+    capture = capture_video(video, folder / "capture", settings, name)
+    if before not in (None, read_capture_hash(folder / "capture")) and scoring_exists(folder / "scoring"):
+        say(f"{name}: the pictures changed, so the scoring mask is made anew")
+        shutil.rmtree(folder / "scoring")
     found = int(capture.valid.any(axis=1).sum())
     say(f"{name}: {capture.timesteps} frames of {capture.width}x{capture.height}, a face in {found} of them")
     return name
@@ -54,7 +60,7 @@ def sequence_name(video: Path, name: str | None) -> str:
     """
     name = video.stem if name is None else name
     if not name or name in (".", "..") or "/" in name:
-        raise UserError(f"{name!r} cannot be a sequence's name; give one with --name NAME")
+        raise UserError(f"{name!r} cannot be the name of a folder; give another with --name or --run")
     return name
 
 
@@ -107,6 +113,7 @@ def training_stage(
     workspace: Workspace, sequences: list[str], run: str, method: MethodConfig, settings: TrainSettings
 ) -> None:
     """Train a run on some sequences of the workspace; a finished or interrupted one goes on where it was."""
+    sequence_name(Path(run), run)
     loaded = [read_sequence(workspace.sequence_dir(name)) for name in sequences]
     train(loaded, load_face_model(loaded[0].tracking.face_model), method, settings, workspace.run_dir(run))
     summary = read_training_summary(workspace.run_dir(run))
