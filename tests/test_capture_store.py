@@ -7,8 +7,10 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 
 from capture_helpers import assert_same_capture, random_capture, tree_bytes
+from mien.camera import camera_from_fov
 from mien.capture import read_capture, read_capture_hash, write_capture
 from mien.errors import UserError
 
@@ -29,6 +31,23 @@ def test_round_trip_is_exact_and_maps_memory(tmp_path):
     assert isinstance(read.mattes, np.memmap)
     assert read_capture_hash(tmp_path / "capture") == capture_hash
     assert [entry.name for entry in tmp_path.iterdir()] == ["capture"]
+
+
+def test_calibration_comes_back_and_belongs_to_the_hash(tmp_path):
+    capture = random_capture()
+    cameras = tuple(
+        camera_from_fov(0.5 + 0.1 * index, capture.width, capture.height) for index in range(len(capture.camera_ids))
+    )
+    calibrated = dataclasses.replace(capture, calibration=cameras)
+    plain, known = (write_capture(tmp_path / "plain", capture), write_capture(tmp_path / "known", calibrated))
+    assert plain != known
+    assert read_capture(tmp_path / "plain").calibration is None
+    read = read_capture(tmp_path / "known").calibration
+    assert read is not None
+    for expected, camera in zip(cameras, read, strict=True):
+        torch.testing.assert_close(camera.K, expected.K, rtol=0, atol=0)
+        torch.testing.assert_close(camera.viewmat, expected.viewmat, rtol=0, atol=0)
+        assert (camera.width, camera.height) == (capture.width, capture.height)
 
 
 def test_hash_follows_content(tmp_path):

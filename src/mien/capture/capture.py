@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from mien.camera import Camera
+
 
 @dataclass(frozen=True, eq=False)
 class Capture:
@@ -29,6 +31,8 @@ class Capture:
     """Where the source picture's centre lies, in pixels (a crop may move it off the centre)."""
     source: dict
     """Where it came from: file name, content hash, crop box, original size."""
+    calibration: tuple[Camera, ...] | None = None
+    """One calibrated camera a camera_id, in one world frame, for pictures of this size; None where it is unknown."""
 
     @property
     def timesteps(self) -> int:

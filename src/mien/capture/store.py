@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 
+from mien.camera import Camera
 from mien.capture.cache import map_frames, stamp_cache
 from mien.capture.capture import Capture
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, FrameLayout, FrameWriter
@@ -30,6 +32,8 @@ _ARRAYS = {
     "matte_digests": ("tc", np.uint64),
 }
 """Axes and type of every array in the safetensors file."""
+_CALIBRATION_ARRAYS = {"K": ("c33", np.float64), "viewmat": ("c44", np.float64)}
+"""Also there where the cameras are calibrated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,7 @@ class CaptureData:
     valid: Bool[np.ndarray, "t c"]
     principal_point: Float[np.ndarray, "c 2"]
     source: dict[str, Any]
+    calibration: tuple[Camera, ...] | None = None
 
 
 def write_capture(path: Path, capture: Capture) -> str:
@@ -72,6 +77,7 @@ def write_capture(path: Path, capture: Capture) -> str:
             valid=capture.valid,
             principal_point=capture.principal_point,
             source=capture.source,
+            calibration=capture.calibration,
         )
         return finish_capture(layout, path, data, writer.digests)
     except OSError as error:
@@ -102,6 +108,7 @@ def read_capture(path: Path) -> Capture:
         valid=data.valid,
         principal_point=data.principal_point,
         source=data.source,
+        calibration=data.calibration,
     )
 
 
@@ -180,7 +187,11 @@ def _arrays(data: CaptureData, digests: dict[str, np.ndarray]) -> dict[str, np.n
         "frame_digests": digests[FRAMES],
         "matte_digests": digests[MATTES],
     }
-    return {name: array.astype(_ARRAYS[name][1]) for name, array in arrays.items()}
+    if data.calibration is not None:
+        arrays["K"] = np.stack([camera.K.numpy() for camera in data.calibration])
+        arrays["viewmat"] = np.stack([camera.viewmat.numpy() for camera in data.calibration])
+    dtypes = _ARRAYS | _CALIBRATION_ARRAYS
+    return {name: array.astype(dtypes[name][1]) for name, array in arrays.items()}
 
 
 def _hash(data: CaptureData, layout: FrameLayout, digests: dict[str, np.ndarray]) -> str:
@@ -215,9 +226,19 @@ def _checked(
         valid=arrays["valid"],
         principal_point=arrays["principal_point"],
         source=source,
+        calibration=_calibration(path / ARRAYS_NAME, arrays, width, height),
     )
     layout = FrameLayout(path, data.camera_ids, timesteps, height, width)
     return layout, data, {FRAMES: arrays["frame_digests"], MATTES: arrays["matte_digests"]}
+
+
+def _calibration(path: Path, arrays: dict[str, np.ndarray], width: int, height: int) -> tuple[Camera, ...] | None:
+    if "K" not in arrays:
+        return None
+    if not all(np.isfinite(arrays[name]).all() for name in _CALIBRATION_ARRAYS):
+        raise UserError(f"{path}: the cameras' K or viewmat is not finite; {_REMEDY}")
+    pairs = zip(arrays["K"].astype(np.float32), arrays["viewmat"].astype(np.float32), strict=True)
+    return tuple(Camera(torch.from_numpy(K), torch.from_numpy(viewmat), width, height) for K, viewmat in pairs)
 
 
 def _positive_int(value: object) -> int:
@@ -232,8 +253,9 @@ def is_file_name(name: object) -> bool:
 
 def _check_arrays(path: Path, arrays: dict[str, np.ndarray], timesteps: int, cameras: int) -> None:
     landmarks = arrays["landmarks"].shape[2] if "landmarks" in arrays and arrays["landmarks"].ndim == 4 else 0
-    sizes = {"t": timesteps, "c": cameras, "l": landmarks, "2": 2}
-    for name, (axes, dtype) in _ARRAYS.items():
+    sizes = {"t": timesteps, "c": cameras, "l": landmarks, "2": 2, "3": 3, "4": 4}
+    calibrated = _CALIBRATION_ARRAYS if arrays.keys() & _CALIBRATION_ARRAYS.keys() else {}
+    for name, (axes, dtype) in (_ARRAYS | calibrated).items():
         expected = tuple(sizes[axis] for axis in axes)
         if name not in arrays or arrays[name].shape != expected or arrays[name].dtype != dtype:
             found = f"{arrays[name].dtype} {arrays[name].shape}" if name in arrays else "missing"

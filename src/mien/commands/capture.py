@@ -20,7 +20,7 @@ class Command:
     """Workspace folder (one subject)."""
     name: str | None = None
     """Name of the sequence (default: the video's name)."""
-    settings: CaptureSettings = field(default_factory=CaptureSettings)
+    settings: Annotated[CaptureSettings, tyro.conf.arg(name="capture")] = field(default_factory=CaptureSettings)
 
     def run(self) -> None:
         """Capture and say what was found."""

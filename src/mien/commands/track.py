@@ -22,7 +22,7 @@ class Command:
     """See `mien face-models`."""
     again: bool = False
     """Track again even if nothing changed. The scoring mask stays as it is."""
-    settings: TrackingSettings = field(default_factory=TrackingSettings)
+    settings: Annotated[TrackingSettings, tyro.conf.arg(name="tracking")] = field(default_factory=TrackingSettings)
 
     def run(self) -> None:
         """Track and write overlay and report."""
