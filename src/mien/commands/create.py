@@ -40,9 +40,10 @@ class Command:
         method, settings = self.options.method_config(), self.options.settings()
         workspace, run = Workspace(self.out), self.run_name or self.options.method
         sequence_name(self.video, run)
-        name = capture_stage(workspace, self.video, self.name, self.capture)
-        tracking_stage(workspace, name, self.face_model, self.tracking)
-        training_stage(workspace, [name], run, method, settings)
+        names = capture_stage(workspace, self.video, self.name, self.capture)
+        for name in names:
+            tracking_stage(workspace, name, self.face_model, self.tracking)
+        training_stage(workspace, names, run, method, settings)
         if settings.split != "none":
             evaluation_stage(workspace, run)
         say(f"Done in {time.monotonic() - began:.0f} s. Next: mien render {self.out} --out turntable.mp4")

@@ -12,8 +12,8 @@ from mien.tracking import (
 from mien.workspace import Workspace
 
 
-def capture_stage(workspace: Workspace, video: Path, name: str | None, settings: CaptureSettings) -> str:
-    """Capture a video into the workspace; returns the sequence's name."""
+def capture_stage(workspace: Workspace, video: Path, name: str | None, settings: CaptureSettings) -> list[str]:
+    """Capture a video into the workspace; returns the names of its sequences (one for each part)."""
     name = sequence_name(video, name)
     folder = workspace.sequence_dir(name)
     before = read_capture_hash(folder / "capture") if (folder / "capture" / "capture.json").is_file() else None
@@ -23,4 +23,4 @@ def capture_stage(workspace: Workspace, video: Path, name: str | None, settings:
         shutil.rmtree(folder / "scoring")
     found = int(capture.valid.any(axis=1).sum())
     say(f"{name}: {capture.timesteps} frames of {capture.width}x{capture.height}, a face in {found} of them")
-    return name
+    return [name]
