@@ -49,7 +49,7 @@ lock: .venv/.packages
 	  -o requirements/lock.txt
 
 bench: setup
-	$(BIN)/python -m mien.benchmarking.render
+	$(BIN)/mien bench render
 
 clean:
 	rm -rf build out .venv

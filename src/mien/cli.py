@@ -21,6 +21,7 @@ COMMANDS = {
     "drive": "avatar + another sequence's motion -> mp4",
     "export": "avatar at one expression -> standard 3D Gaussian .ply",
     "face-models": "list the face models and bake them ahead of time",
+    "bench": "timings of this machine; quality over reference captures with known truth",
     "demo": "the whole path on a synthetic head, in minutes: start here",
 }
 """Name -> summary; `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command` with `run()`."""

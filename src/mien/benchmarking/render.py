@@ -1,13 +1,11 @@
 """How fast the native rasterizer draws a synthetic head that fills half of the picture.
 
-Run as `python -m mien.benchmarking.render [--json]`.
+Run as `mien bench render [--json]`.
 """
 
-import json
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 
@@ -84,8 +82,8 @@ def _time(function: Callable[[], None], repetitions: int) -> tuple[float, float]
     return durations[0], durations[len(durations) // 2]
 
 
-def main() -> None:
-    """Print the table of docs/results.md, or its rows as JSON."""
+def benchmark_suite() -> list[BenchmarkRow]:
+    """The rows of docs/results.md: three counts, two sizes, one thread and all of them."""
     torch.set_num_threads(1)
     threads = _native.thread_count()
     rows: list[BenchmarkRow] = []
@@ -93,15 +91,12 @@ def main() -> None:
         for size in (512, 1024):
             for used in sorted({1, threads}):
                 rows += benchmark_render(count, size, used)
-    if "--json" in sys.argv:
-        print(json.dumps([asdict(row) for row in rows]))
-        return
-    for row in rows:
-        print(
-            f"{row.name:28} {row.gaussians:7} {row.width:5}x{row.height:<5} {row.threads:2} threads {row.isa:8} "
-            f"{row.min_ms:8.2f} min {row.median_ms:8.2f} median ms"
-        )
+    return rows
 
 
-if __name__ == "__main__":
-    main()
+def format_row(row: BenchmarkRow) -> str:
+    """One line of the table."""
+    return (
+        f"{row.name:28} {row.gaussians:7} {row.width:5}x{row.height:<5} {row.threads:2} threads {row.isa:8} "
+        f"{row.min_ms:8.2f} min {row.median_ms:8.2f} median ms"
+    )
