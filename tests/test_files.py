@@ -1,0 +1,67 @@
+"""Whether a path can be written is known before any work; long names; arrays without torch."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mien.errors import UserError
+from mien.files import check_writable, read_arrays, write_arrays, write_atomically
+
+
+def test_writable_places_leave_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / "there.png").write_bytes(b"old")
+    check_writable(tmp_path / "there.png")
+    check_writable(tmp_path / "new.png")
+    check_writable(tmp_path / "a" / "b" / "new.png")
+    check_writable(tmp_path, folder=True)
+    check_writable(tmp_path / "a" / "new", folder=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["there.png"]
+    assert (tmp_path / "there.png").read_bytes() == b"old"
+
+
+def test_places_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    os.mkfifo(tmp_path / "pipe")
+    for path, folder, reason in (
+        (tmp_path, False, "is a folder"),
+        (tmp_path / "file", True, "is a file"),
+        (tmp_path / "file" / "new.png", False, "is a file, not a folder|Not a directory"),
+        (tmp_path / "file" / "a" / "new.png", False, "is a file, not a folder|Not a directory"),
+        (tmp_path / "link" / "new.png", False, "link to nowhere"),
+        (tmp_path / "pipe", False, "no ordinary file"),
+        (Path("/dev/null"), False, "no ordinary file"),
+        (Path("/proc/new.png"), False, "cannot be written"),
+        (Path("/proc/new"), True, "cannot be written"),
+        (tmp_path / ("x" * 300), False, "cannot be written"),
+    ):
+        with pytest.raises(UserError, match=reason):
+            check_writable(path, folder=folder)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(UserError, match="Permission denied"):
+            check_writable(tmp_path / "new.png")
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_names_as_long_as_a_file_system_allows(tmp_path: Path) -> None:
+    path = tmp_path / ("n" * 250 + ".bin")
+    check_writable(path)
+    write_atomically(path, lambda temporary: temporary.write_bytes(b"1"))
+    assert path.read_bytes() == b"1"
+
+
+def test_arrays_and_their_metadata_need_no_torch(tmp_path: Path) -> None:
+    write_arrays(tmp_path / "a.safetensors", {"x": np.arange(3, dtype=np.float32)}, {"note": "hello"})
+    assert read_arrays(tmp_path / "a.safetensors")["x"].tolist() == [0, 1, 2]
+    code = "import sys, mien.files; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
