@@ -10,7 +10,7 @@ from mien.errors import UserError
 from mien.face import load_face_model
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import TrackingSettings, residual_report, track
-from mien.tracking.pipeline import initial_camera
+from mien.tracking.shot import initial_camera
 from small_face_model import make_small_face_model
 from tracking_case import FOCAL, capture_of, make_tracking_case
 
@@ -132,7 +132,7 @@ def test_focal_follows_the_crop():
 
 def test_several_cameras_are_refused():
     case = make_tracking_case(timesteps=3)
-    with pytest.raises(UserError, match="2 cameras"):
+    with pytest.raises(UserError, match="2 cameras without calibration"):
         track(capture_of(case.pixels, cameras=2), make_small_face_model())
 
 

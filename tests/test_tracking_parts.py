@@ -12,6 +12,7 @@ from mien.tracking.landmark_model import reduce_face_model
 from mien.tracking.parameters import layout_of
 from mien.tracking.solver import Box, NormalEquations, Smoothness, minimize_frames, solve_chain
 from mien.tracking.stages import smoothness_of
+from mien.tracking.views import batch_of
 from small_face_model import make_small_face_model
 from tracking_case import still_camera
 
@@ -39,7 +40,7 @@ def test_reduced_model_is_the_model():
     full = reduced.face_model
     vertices = full(layout.face_params(state, identity))
     expected = camera.project(full.landmark_positions(vertices, "mediapipe"))[0]
-    projected = reduced.project(state, identity, torch.zeros(478, 3, dtype=torch.float64), camera)
+    projected = reduced.project(state, identity, torch.zeros(478, 3, dtype=torch.float64), batch_of((camera,) * 3))
     torch.testing.assert_close(projected, expected, atol=1e-4, rtol=0)
 
 
@@ -56,9 +57,11 @@ def test_derivatives_match_finite_differences(which):
         values = {**at, **changed}
         K = camera.K.clone()
         K[[0, 1], [0, 1]] *= values["focal"].exp()
-        return reduced.project(values["state"], values["identity"], values["bias"], replace(camera, K=K))
+        return reduced.project(
+            values["state"], values["identity"], values["bias"], batch_of((replace(camera, K=K),) * 3)
+        )
 
-    linear = reduced.linearize(at["state"], at["identity"], at["bias"], camera, with_identity=True)
+    linear = reduced.linearize(at["state"], at["identity"], at["bias"], batch_of((camera,) * 3), with_identity=True)
     analytic = {"state": linear.by_frame, "identity": linear.by_identity, "bias": linear.by_bias,
                 "focal": linear.by_log_focal[..., None]}[which]  # fmt: skip
     step = 1e-6

@@ -2,7 +2,7 @@
 
 from mien.tracking.files import read_tracking, write_tracking
 from mien.tracking.overlay import draw_overlay, write_overlay
-from mien.tracking.pipeline import track
+from mien.tracking.pipeline import track, track_subject
 from mien.tracking.report import residual_report, write_residual_report
 from mien.tracking.scoring import Scoring, make_scoring
 from mien.tracking.scoring_files import read_scoring, scoring_exists, write_scoring
@@ -21,6 +21,7 @@ __all__ = [
     "residual_report",
     "scoring_exists",
     "track",
+    "track_subject",
     "write_overlay",
     "write_residual_report",
     "write_scoring",

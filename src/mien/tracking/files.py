@@ -94,7 +94,7 @@ def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
             raise UserError(f"{path / _TENSORS}: {name!r} has the shape {list(shape)}; {_REMEDY}")
         finite = tensors[name].isfinite()
         if name == "residuals":
-            finite |= tensors["valid"][:, None] == 0
+            finite |= tensors[name].isnan() & ((tensors["valid"][:, None] == 0) | finite.any(1, keepdim=True))
         if not finite.all():
             raise UserError(f"{path / _TENSORS}: {name!r} holds numbers that are not finite; {_REMEDY}")
 

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.camera import Camera
 from mien.face import FaceModel, FaceParams
 from mien.rotation import matrix_from_axis_angle, skew
 from mien.tracking.parameters import ParameterLayout
+from mien.tracking.views import CameraBatch
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,28 +72,32 @@ class LandmarkModel:
         return moved + torch.einsum("kl,bkc->blc", self.joint_weights, transforms[:, :, :3, 3]), shaped, transforms
 
     def project(
-        self, state: Float[Tensor, "b p"], identity: Float[Tensor, " i"], bias: Float[Tensor, "l 3"], camera: Camera
+        self,
+        state: Float[Tensor, "b p"],
+        identity: Float[Tensor, " i"],
+        bias: Float[Tensor, "l 3"],
+        cameras: CameraBatch,
     ) -> Float[Tensor, "b l 2"]:
-        """Landmarks in the picture, pixels."""
+        """Landmarks in b pictures, each with its own state and camera; pixels."""
         face = self.layout.face_params(state, identity)
         points, _, _ = self.head_points(face, bias)
         pose = face.T_world_head
-        return camera.project(points @ pose[:, :3, :3].transpose(-1, -2) + pose[:, None, :3, 3])[0]
+        return cameras.project(points @ pose[:, :3, :3].transpose(-1, -2) + pose[:, None, :3, 3])
 
     def linearize(
         self,
         state: Float[Tensor, "b p"],
         identity: Float[Tensor, " i"],
         bias: Float[Tensor, "l 3"],
-        camera: Camera,
+        cameras: CameraBatch,
         with_identity: bool = False,
     ) -> Linearization:
-        """Projected landmarks and their derivatives."""
+        """Landmarks in b pictures, each with its own state and camera, and their derivatives."""
         face = self.layout.face_params(state, identity)
         points, shaped, transforms = self.head_points(face, bias)
         rotation = matrix_from_axis_angle(face.head_rotation)
         turned = points @ rotation.transpose(-1, -2)
-        pixels, by_world, by_log_focal = _project_with_derivatives(turned + face.head_translation[:, None], camera)
+        pixels, by_world, by_log_focal = _project_with_derivatives(turned + face.head_translation[:, None], cameras)
         by_head = torch.einsum("blxc,bcd->blxd", by_world, rotation)
         by_joint = torch.einsum("blxc,bkcd->blxkd", by_head, transforms[:, :, :3, :3])
 
@@ -178,18 +182,19 @@ def reduce_face_model(face_model: FaceModel, layout: ParameterLayout) -> Landmar
 
 
 def _project_with_derivatives(
-    points: Float[Tensor, "b l 3"], camera: Camera
+    points: Float[Tensor, "b l 3"], cameras: CameraBatch
 ) -> tuple[Float[Tensor, "b l 2"], Float[Tensor, "b l 2 3"], Float[Tensor, "b l 2"]]:
     """Pixels of world-space points, and their derivatives by the point and by the logarithm of the focal length."""
-    in_camera = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    in_camera = points @ cameras.viewmat[:, :3, :3].mT + cameras.viewmat[:, None, :3, 3]
     inverse_depth = 1 / in_camera[..., 2]
-    by_log_focal = torch.stack([camera.K[0, 0], camera.K[1, 1]]) * in_camera[..., :2] * inverse_depth[..., None]
-    pixels = by_log_focal + camera.K[:2, 2]
+    focal = cameras.K[:, [0, 1], [0, 1]]
+    by_log_focal = focal[:, None] * in_camera[..., :2] * inverse_depth[..., None]
+    pixels = by_log_focal + cameras.K[:, None, :2, 2]
     scaled = torch.zeros(*points.shape[:2], 2, 3, dtype=points.dtype)
-    scaled[..., 0, 0] = camera.K[0, 0] * inverse_depth
-    scaled[..., 1, 1] = camera.K[1, 1] * inverse_depth
+    scaled[..., 0, 0] = focal[:, :1] * inverse_depth
+    scaled[..., 1, 1] = focal[:, 1:] * inverse_depth
     scaled[..., 2] = -by_log_focal * inverse_depth[..., None]
-    return pixels, scaled @ camera.viewmat[:3, :3], by_log_focal
+    return pixels, scaled @ cameras.viewmat[:, None, :3, :3], by_log_focal
 
 
 def _contract(by_joint: Float[Tensor, "b l 2 k 3"], basis: Float[Tensor, "e k l 3"]) -> Float[Tensor, "b l 2 e"]:

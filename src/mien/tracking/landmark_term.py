@@ -7,114 +7,146 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.camera import Camera
 from mien.tracking.landmark_model import LandmarkModel, Linearization
-from mien.tracking.solver import NormalEquations, SharedEquations, joined
+from mien.tracking.solver import NormalEquations, SharedEquations
+from mien.tracking.views import CameraBatch, Views
 
 _CHUNK = 48
-"""Timesteps linearised at once: bounds the memory to about 100 MB."""
+"""Pictures linearised at once: bounds the memory to about 100 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What does not change over the sequence."""
+    """What is the same in all sequences of a person."""
 
     identity: Float[Tensor, " i"]
     bias: Float[Tensor, "l 3"]
     """How far each landmark lies from where the model has it, at rest, in the head frame, metres: the detector means
     other points than the embedding, and no identity basis spans every face."""
-    camera: Camera
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkTerm:
-    """Costs of b frames: sum_l w_l rho(|r_l|^2 / sigma^2), plus the layout's prior.
+    """Costs of the v timesteps of one sequence.
 
+    A timestep's is the sum of w_l rho(|r_l|^2 / sigma^2) over its pictures and their landmarks, plus the prior's.
     rho(s) = c^2 s / (c^2 + s) (Geman and McClure): an outlier's pull fades.
     """
 
     model: LandmarkModel
-    detected: Float[Tensor, "b l 2"]
-    """Pixels."""
+    views: Views
     weights: Float[Tensor, " l"]
-    """They sum to the number of independent points that all landmarks are worth."""
-    sigma: float
-    """Expected distance, pixels."""
+    """They sum to the number of independent points that all landmarks of a picture are worth."""
+    sigma: Float[Tensor, " c"]
+    """Expected distance in each camera, pixels."""
     outlier: float
     """c: beyond this many sigmas a landmark hardly counts."""
 
-    def at(self, frames: Int[Tensor, " k"]) -> "LandmarkTerm":
-        """The same term over some of the frames."""
-        return replace(self, detected=self.detected[frames])
+    def at(self, rows: Int[Tensor, " k"]) -> "LandmarkTerm":
+        """The same term over some of the timesteps."""
+        return replace(self, views=self.views.at(rows))
 
-    def _robust(self, residual: Float[Tensor, "b l 2"]) -> tuple[Float[Tensor, " b"], Float[Tensor, "b l"]]:
-        squared = (residual**2).sum(-1) / self.sigma**2
+    def _robust(
+        self, residual: Float[Tensor, "n l 2"], camera: Int[Tensor, " n"]
+    ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n l"]]:
+        variance = self.sigma[camera][:, None] ** 2
+        squared = (residual**2).sum(-1) / variance
         least = self.outlier**2
         cost = (self.weights * least * squared / (least + squared)).sum(-1)
-        return cost, self.weights * (least / (least + squared)) ** 2 / self.sigma**2
+        return cost, self.weights * (least / (least + squared)) ** 2 / variance
 
-    def _prior(self, state: Float[Tensor, "b p"]) -> tuple[Float[Tensor, " b"], Float[Tensor, "b p"]]:
+    def _prior(self, state: Float[Tensor, "v p"]) -> tuple[Float[Tensor, " v"], Float[Tensor, "v p"]]:
         pull = state @ self.model.layout.precision
         return (state * pull).sum(-1), pull
 
-    def cost(self, state: Float[Tensor, "b p"], subject: Subject) -> Float[Tensor, " b"]:
-        """Of each frame."""
-        projected = self.model.project(state, subject.identity, subject.bias, subject.camera)
-        return self._robust(projected - self.detected)[0] + self._prior(state)[0]
+    def _offsets(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "n l 2"]:
+        views = self.views
+        return (
+            self.model.project(state[views.row], subject.identity, subject.bias, cameras[views.camera]) - views.detected
+        )
 
-    def residuals(self, state: Float[Tensor, "b p"], subject: Subject) -> Float[Tensor, "b l"]:
-        """Distances of detected from projected landmarks, pixels."""
-        projected = self.model.project(state, subject.identity, subject.bias, subject.camera)
-        return (projected - self.detected).norm(dim=-1)
+    def cost(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
+        """Of each timestep."""
+        of_pictures = self._robust(self._offsets(state, subject, cameras), self.views.camera)[0]
+        return self._prior(state)[0].index_add(0, self.views.row, of_pictures)
+
+    def residuals(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "n l"]:
+        """Distances of detected from projected landmarks in each picture, pixels."""
+        return self._offsets(state, subject, cameras).norm(dim=-1)
 
     def linearizations(
-        self, state: Float[Tensor, "b p"], subject: Subject, with_identity: bool = False
+        self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch, with_identity: bool = False
     ) -> "Iterator[WeightedLinearization]":
-        """Linearisations of all frames, a bounded number at a time."""
-        for start in range(0, len(state), _CHUNK):
+        """Linearisations of all pictures, a bounded number at a time."""
+        views = self.views
+        for start in range(0, len(views.row), _CHUNK):
             part = slice(start, start + _CHUNK)
-            at = self.model.linearize(state[part], subject.identity, subject.bias, subject.camera, with_identity)
-            residual = at.pixels - self.detected[part]
-            cost, weights = self._robust(residual)
-            prior_cost, pull = self._prior(state[part])
-            yield WeightedLinearization(at, residual, weights, cost + prior_cost, pull)
+            row, camera = views.row[part], views.camera[part]
+            at = self.model.linearize(state[row], subject.identity, subject.bias, cameras[camera], with_identity)
+            residual = at.pixels - views.detected[part]
+            cost, weights = self._robust(residual, camera)
+            yield WeightedLinearization(at, row, residual, weights, cost)
 
-    def equations(self, state: Float[Tensor, "b p"], subject: Subject) -> NormalEquations:
-        """Of each frame on its own, the shared parameters fixed."""
-        precision = self.model.layout.precision
-        return joined([part.frame_equations(precision) for part in self.linearizations(state, subject)])
+    def equations(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> NormalEquations:
+        """Of each timestep on its own, the shared parameters fixed."""
+        equations = self._prior_equations(state)
+        for part in self.linearizations(state, subject, cameras):
+            part.add_to(equations)
+        return equations
+
+    def joint_equations(
+        self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
+    ) -> tuple[NormalEquations, SharedEquations]:
+        """Of each timestep, and of what they share: identity, then the logarithm of the focal length."""
+        equations = self._prior_equations(state)
+        size = len(subject.identity) + 1
+        shared = SharedEquations(
+            state.new_zeros(*state.shape, size), state.new_zeros(size, size), state.new_zeros(size)
+        )
+        for part in self.linearizations(state, subject, cameras, with_identity=True):
+            part.add_to(equations)
+            part.add_to_shared(shared)
+        return equations, shared
+
+    def _prior_equations(self, state: Float[Tensor, "v p"]) -> NormalEquations:
+        cost, pull = self._prior(state)
+        return NormalEquations(cost, pull, self.model.layout.precision.repeat(len(state), 1, 1))
 
 
 @dataclass(frozen=True, eq=False)
 class WeightedLinearization:
-    """A linearisation with its residuals and their current robust weights."""
+    """A linearisation of n pictures with its residuals and their current robust weights."""
 
     at: Linearization
-    residual: Float[Tensor, "b l 2"]
-    weights: Float[Tensor, "b l"]
-    cost: Float[Tensor, " b"]
-    prior_pull: Float[Tensor, "b p"]
-    """Half the prior's gradient."""
+    row: Int[Tensor, " n"]
+    """The timestep of each picture."""
+    residual: Float[Tensor, "n l 2"]
+    weights: Float[Tensor, "n l"]
+    cost: Float[Tensor, " n"]
 
-    def _weighted(self, derivative: Float[Tensor, "b l 2 s"]) -> Float[Tensor, "b n s"]:
+    def _weighted(self, derivative: Float[Tensor, "n l 2 s"]) -> Float[Tensor, "n m s"]:
         return (derivative * self.weights.sqrt()[:, :, None, None]).flatten(1, 2)
 
-    def frame_equations(self, precision: Float[Tensor, "p p"]) -> NormalEquations:
-        """Half gradient and half Hessian by the frames' own parameters."""
+    def add_to(self, equations: NormalEquations) -> None:
+        """Add cost, half gradient and half Hessian by the timesteps' own parameters, in place."""
         jacobian = self._weighted(self.at.by_frame)
         gradient = jacobian.mT @ self._weighted(self.residual[..., None])
-        return NormalEquations(self.cost, gradient[..., 0] + self.prior_pull, jacobian.mT @ jacobian + precision)
+        equations.cost.index_add_(0, self.row, self.cost)
+        equations.gradient.index_add_(0, self.row, gradient[..., 0])
+        equations.hessian.index_add_(0, self.row, jacobian.mT @ jacobian)
 
-    def shared_equations(self) -> SharedEquations:
-        """Blocks of the shared parameters: identity, then the logarithm of the focal length."""
+    def add_to_shared(self, equations: SharedEquations) -> None:
+        """Add the blocks of the shared parameters, in place."""
         assert self.at.by_identity is not None
         shared = self._weighted(torch.cat([self.at.by_identity, self.at.by_log_focal[..., None]], dim=-1))
         own = self._weighted(self.at.by_frame)
         gradient = shared.mT @ self._weighted(self.residual[..., None])
-        return SharedEquations(own.mT @ shared, (shared.mT @ shared).sum(0), gradient[..., 0].sum(0))
+        equations.across.index_add_(0, self.row, own.mT @ shared)
+        equations.hessian.add_((shared.mT @ shared).sum(0))
+        equations.gradient.add_(gradient[..., 0].sum(0))
 
     def bias_equations(self) -> tuple[Float[Tensor, "l 3 3"], Float[Tensor, "l 3"]]:
         """Half Hessian and half gradient of every landmark's bias."""
         weighted = self.at.by_bias * self.weights[:, :, None, None]
-        hessian = torch.einsum("blxc,blxd->lcd", weighted, self.at.by_bias)
-        return hessian, torch.einsum("blxc,blx->lc", weighted, self.residual)
+        hessian = torch.einsum("nlxc,nlxd->lcd", weighted, self.at.by_bias)
+        return hessian, torch.einsum("nlxc,nlx->lc", weighted, self.residual)

@@ -1,19 +1,19 @@
-"""Capture -> Tracking: the stages in their order."""
+"""Captures -> Trackings: the stages in their order. What is the subject's is shared by all of its sequences."""
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.errors import UserError
-from mien.face import FaceModel
+from mien.face import FaceModel, FaceParams
 from mien.progress import progress_bar
+from mien.tracking.head_pose import fit_head_pose, relative_rotation
 from mien.tracking.interpolation import fill_gaps
 from mien.tracking.landmark_groups import LANDMARKS
 from mien.tracking.landmark_model import LandmarkModel, reduce_face_model
@@ -21,129 +21,128 @@ from mien.tracking.landmark_term import Subject
 from mien.tracking.neck_line import fit_neck_lines
 from mien.tracking.parameters import layout_of
 from mien.tracking.settings import TrackingSettings
+from mien.tracking.shared_fit import fit_shared
+from mien.tracking.shot import Shot, lenses_of, shot_of
 from mien.tracking.stages import (
     Fit,
+    SequenceFit,
     all_landmarks,
     choose_keyframes,
     fit_frames,
-    fit_head_pose,
-    fit_keyframes,
-    fit_sequence,
+    fit_sequences,
     smoothness_of,
     widen,
 )
 from mien.tracking.tracking import Tracking
 
 DEFAULTS = TrackingSettings()
-_LEAST_FRAMES = 3
-_DEFAULT_FOCAL = 1.5
-"""Times the larger side of the source picture: between a telephone's wide lens and a portrait lens."""
 
 
 def track(capture: Capture, face_model: FaceModel, settings: TrackingSettings = DEFAULTS) -> Tracking:
-    """The face model fitted to a capture's landmarks.
+    """The face model fitted to one capture: `track_subject` of a single sequence."""
+    return track_subject([capture], face_model, settings)[0]
 
-    Stages: head pose of every frame alone; identity (and focal length) from keyframes; every frame alone; all frames
-    together, smooth over time. Deterministic.
+
+def track_subject(
+    captures: Sequence[Capture], face_model: FaceModel, settings: TrackingSettings = DEFAULTS
+) -> list[Tracking]:
+    """The face model fitted to the landmarks of all sequences of one person, with one identity.
+
+    Stages: head pose of every timestep alone; identity (and unknown focal lengths) from keyframes of all sequences;
+    every timestep alone; all timesteps of each sequence together, smooth over time. Deterministic.
+
+    Sequences may differ in size, frame rate and number of cameras. Several cameras have to be calibrated
+    (`Capture.calibration`): they stay as they are, give the metric scale, and a camera that found no face at a timestep
+    adds nothing to it. With one uncalibrated camera, metric scale comes from the identity prior.
 
     Raises:
-        UserError: the capture has several cameras or too few frames with a face, or the model lacks the landmarks.
+        UserError: a capture has several cameras without calibration or too few timesteps with a face, or the model
+            lacks the landmarks.
     """
-    _check(capture, face_model)
-    valid = torch.from_numpy(np.asarray(capture.valid[:, 0], dtype=bool)).clone()
-    detected = torch.from_numpy(np.asarray(capture.landmarks[:, 0], dtype=np.float64))
-    valid &= detected.isfinite().all(-1).all(-1)
-    camera = initial_camera(capture, settings)
+    assert captures, "nothing to track"
+    if "mediapipe" not in face_model.landmarks:
+        raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; calibrate them for it first")
+    shots = [shot_of(capture, settings) for capture in captures]
     with torch.no_grad():
         model = reduce_face_model(face_model, layout_of(face_model))
-        fit = _fit_landmarks(model, detected[valid], valid, camera, capture.fps, settings)
-        # A photometric stage refines `fit` here.
-        return _as_tracking(capture, face_model, model, fit, valid, detected, settings)
-
-
-def initial_camera(capture: Capture, settings: TrackingSettings) -> Camera:
-    """The camera of the captured pictures, float64, with a given or assumed focal length."""
-    focal_x, focal_y = _source_focal(capture) if settings.focal is None else (settings.focal, settings.focal)
-    x, y = (float(value) for value in capture.principal_point[0])
-    K = torch.tensor([[focal_x, 0, x], [0, focal_y, y], [0, 0, 1]], dtype=torch.float64)
-    viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-    return Camera(K, viewmat, capture.width, capture.height)
+        fit = _fit_landmarks(model, shots, lenses_of(captures, settings), settings)
+        # A photometric stage refines `fit` here: `fit.subject` is shared, `fit.sequences` are each sequence's own.
+        return [
+            _as_tracking(shot, face_model, model, fit.subject, own, settings)
+            for shot, own in zip(shots, fit.sequences, strict=True)
+        ]
 
 
 def _fit_landmarks(
-    model: LandmarkModel,
-    detected: Float[Tensor, "v l 2"],
-    valid: Bool[Tensor, " t"],
-    camera: Camera,
-    fps: float,
-    settings: TrackingSettings,
+    model: LandmarkModel, shots: Sequence[Shot], lenses: Sequence[int | None], settings: TrackingSettings
 ) -> Fit:
-    subject = Subject(detected.new_zeros(len(model.identity_basis)), detected.new_zeros(LANDMARKS, 3), camera)
-    with progress_bar("Tracking", total=4) as advance:
-        pose = fit_head_pose(model, detected, subject, settings)
-        advance(status="head pose")
+    subject = Subject(torch.zeros(len(model.identity_basis)).double(), torch.zeros(LANDMARKS, 3).double())
+    with progress_bar("Tracking", total=3 * len(shots) + 1) as advance:
+        starts = []
+        for shot in shots:
+            pose = fit_head_pose(model, shot.views, shot.cameras, subject, settings)
+            starts.append(SequenceFit(shot.cameras, widen(pose, model.layout)))
+            advance(status="head pose")
 
-        fit = Fit(subject, widen(pose, model.layout))
-        keyframes = choose_keyframes(pose, settings.keyframes)
-        term = all_landmarks(model, detected, fit, settings)
-        subject = fit_keyframes(term.at(keyframes), replace(fit, state=fit.state[keyframes]), settings).subject
+        terms, keyframes = [], []
+        for shot, own in zip(shots, starts, strict=True):
+            chosen = choose_keyframes(own.state[:, :6], settings.keyframes)
+            terms.append(all_landmarks(model, shot.views, own, settings).at(chosen))
+            keyframes.append(replace(own, state=own.state[chosen]))
+        known = fit_shared(terms, Fit(subject, tuple(keyframes)), lenses, settings)
         advance(status="identity")
 
-        pose = fit_head_pose(model, detected, subject, settings)
-        fit = Fit(subject, widen(pose, model.layout))
-        term = all_landmarks(model, detected, fit, settings)
-        fit = fit_frames(term, fit)
-        advance(status="frames")
+        terms, sequences = [], []
+        for shot, key in zip(shots, known.sequences, strict=True):
+            pose = fit_head_pose(model, shot.views, key.cameras, known.subject, settings)
+            own = SequenceFit(key.cameras, widen(pose, model.layout))
+            terms.append(all_landmarks(model, shot.views, own, settings))
+            sequences.append(fit_frames(terms[-1], known.subject, own))
+            advance(status="frames")
 
-        fit = fit_sequence(term, fit, smoothness_of(model.layout, valid, fps, settings.smoothness), settings)
-        advance(status="sequence")
+        smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
+                      for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
+        fit = fit_sequences(terms, Fit(known.subject, tuple(sequences)), smoothness, settings)
+        advance(amount=len(shots), status="sequence")
     return fit
 
 
 def _as_tracking(
-    capture: Capture,
+    shot: Shot,
     face_model: FaceModel,
     model: LandmarkModel,
-    fit: Fit,
-    valid: Bool[Tensor, " t"],
-    detected: Float[Tensor, "t l 2"],
+    subject: Subject,
+    own: SequenceFit,
     settings: TrackingSettings,
 ) -> Tracking:
-    term = all_landmarks(model, detected[valid], fit, settings)
-    residuals = torch.full((len(valid), 1), torch.nan)
-    residuals[valid, 0] = term.residuals(fit.state, fit.subject).median(1).values.float()
-    face = fill_gaps(model.layout.face_params(fit.state, fit.subject.identity), valid).to(torch.zeros(()))
-    camera = fit.subject.camera.to(torch.zeros(()))
+    views = shot.views
+    residuals = torch.full((len(shot.valid), len(own.cameras)), torch.nan)
+    distances = all_landmarks(model, views, own, settings).residuals(own.state, subject, own.cameras)
+    residuals[shot.valid.nonzero()[views.row, 0], views.camera] = distances.median(1).values.float()
+    face = fill_gaps(model.layout.face_params(own.state, subject.identity), shot.valid)
+    face = _in_world(face, shot.T_world_fit).to(torch.zeros(()))
+    cameras = shot.cameras_in_world(own.cameras)
     return Tracking(
         face_model=face_model.name,
         face_model_hash=face_model.content_hash,
         face=face,
-        valid=valid,
-        cameras=(camera,),
-        neck_lines=fit_neck_lines(face_model, face, (camera,)),
+        valid=shot.valid,
+        cameras=cameras,
+        neck_lines=fit_neck_lines(face_model, face, cameras),
         residuals=residuals,
         settings=_jsonable(dataclasses.asdict(settings)),
     )
 
 
-def _check(capture: Capture, face_model: FaceModel) -> None:
-    if len(capture.camera_ids) != 1:
-        raise UserError(f"{capture.name}: has {len(capture.camera_ids)} cameras, tracking takes one; capture one video")
-    if "mediapipe" not in face_model.landmarks:
-        raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; calibrate them for it first")
-    found = int(np.asarray(capture.valid).sum())
-    if found < _LEAST_FRAMES:
-        raise UserError(
-            f"{capture.name}: a face was found in {found} frames, tracking needs {_LEAST_FRAMES}; film longer"
-        )
-
-
-def _source_focal(capture: Capture) -> tuple[float, float]:
-    """The assumed focal lengths along x and y in pixels of the capture: it may be a shrunk crop of what was filmed."""
-    crop = capture.source.get("crop", {"width": capture.width, "height": capture.height})
-    side = max(capture.source.get("picture_size", (crop["width"], crop["height"])))
-    assumed = _DEFAULT_FOCAL * float(side)
-    return assumed * capture.width / crop["width"], assumed * capture.height / crop["height"]
+def _in_world(face: FaceParams, T_world_fit: Float[Tensor, "4 4"] | None) -> FaceParams:
+    if T_world_fit is None:
+        return face
+    R_world_fit, origin = T_world_fit[:3, :3], T_world_fit[:3, 3]
+    return replace(
+        face,
+        head_rotation=relative_rotation(face.head_rotation, R_world_fit),
+        head_translation=face.head_translation @ R_world_fit.T + origin,
+    )
 
 
 def _jsonable(settings: dict) -> dict:

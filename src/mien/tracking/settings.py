@@ -23,9 +23,12 @@ class TrackingSettings:
 
     focal: float | None = None
     """Focal length in pixels of the capture's pictures, if known. Otherwise 1.5 times the larger side of the source
-    picture, from where the fit may move it a little: landmarks of a face hardly tell it."""
+    picture, from where the fit may move it a little: landmarks of a face hardly tell it. Calibrated cameras keep
+    their own."""
+    same_camera: bool = False
+    """Whether all sequences were filmed with the same camera and zoom, so that they share one focal length."""
     keyframes: int = 20
-    """Frames from which identity is fitted, chosen for their spread of head poses."""
+    """Frames of each sequence from which identity is fitted, chosen for their spread of head poses."""
     landmark_sigma: float = 0.0015
     """Expected error of a landmark, metres on the face."""
     independent_landmarks: float = 25.0
@@ -35,6 +38,6 @@ class TrackingSettings:
     identity_weight: float = 4.0
     """Weight of the identity's unit-variance prior."""
     bias_sigma: float = 0.003
-    """How far a landmark's point on the subject may lie from the model's, metres; one offset for the whole sequence."""
+    """How far a landmark's point on the subject may lie from the model's, metres; one offset for all sequences."""
     smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
     """Over time."""

@@ -13,8 +13,9 @@ from mien.face import FaceParams
 class Tracking:
     """Face parameters and cameras of one sequence of t timesteps and c cameras.
 
-    With one camera the world frame is the camera's with y up and z backward (viewmat = diag(1, -1, -1, 1)): a face that
-    looks into the camera has a head rotation of about zero.
+    With one camera of unknown place the world frame is the camera's with y up and z backward (viewmat =
+    diag(1, -1, -1, 1)): a face that looks into the camera has a head rotation of about zero. Calibrated cameras stay in
+    the world that they were given in.
     """
 
     face_model: str
@@ -24,11 +25,12 @@ class Tracking:
     face: FaceParams
     """All t timesteps; where `valid` is False, interpolated from the neighbours."""
     valid: Bool[Tensor, " t"]
+    """Some camera found a face."""
     cameras: tuple[Camera, ...]
     """One a camera_id, for pictures of the capture's size."""
     neck_lines: Float[Tensor, "t c 3"]
     """(a, b, d) with a^2 + b^2 = 1: pixels with a x + b y + d >= 0 are above the neck line, and kept."""
     residuals: Float[Tensor, "t c"]
-    """Median distance of landmarks from their fit, pixels; NaN where not valid."""
+    """Median distance of landmarks from their fit, pixels; NaN where the camera found no face."""
     settings: dict = field(default_factory=dict)
     """How it was made, for the report."""

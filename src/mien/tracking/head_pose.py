@@ -1,0 +1,136 @@
+"""The first stage of tracking: where the head is and how it is turned, of every timestep alone."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.tracking.landmark_groups import rigid_weights
+from mien.tracking.landmark_model import LandmarkModel
+from mien.tracking.landmark_term import LandmarkTerm, Subject
+from mien.tracking.parameters import pose_only
+from mien.tracking.settings import TrackingSettings
+from mien.tracking.solver import Box, minimize_frames
+from mien.tracking.views import CameraBatch, Views
+
+_ITERATIONS = 15
+_OUTLIER = 40.0
+"""Sigmas: a head that is turned away lies far from the frontal start."""
+
+
+def fit_head_pose(
+    model: LandmarkModel, views: Views, cameras: CameraBatch, subject: Subject, settings: TrackingSettings
+) -> Float[Tensor, "v 6"]:
+    """Head rotation and translation of every timestep alone, from points that expressions hardly move.
+
+    Every picture is fitted by itself first, from a head that faces its camera. Where several cameras see a timestep,
+    the one of these fits that suits all of them best is where their joint fit starts.
+    """
+    weights = rigid_weights()
+    rigid = (weights > 0).nonzero()[:, 0]
+    model = model.at(rigid, pose_only(model.layout))
+    views, weights = views.of_landmarks(rigid), weights[rigid]
+    subject = replace(subject, bias=subject.bias[rigid])
+    at_rest = model.layout.face_params(views.detected.new_zeros(1, 6), subject.identity)
+    points = model.head_points(at_rest, subject.bias)[0][0]
+    alone = views.apart()
+    start = _facing_the_cameras(points, alone.detected, cameras[alone.camera])
+    poses = _minimize(_wide(model, alone, weights, start, cameras, settings), start, subject, cameras)
+    if len(poses) == views.rows:
+        return poses
+    term = _wide(model, views, weights, poses[_first_picture(views)], cameras, settings)
+    return _minimize(term, _best_for_all(term, poses, subject, cameras), subject, cameras)
+
+
+def landmark_term(
+    model: LandmarkModel,
+    views: Views,
+    weights: Float[Tensor, " l"],
+    state: Float[Tensor, "v p"],
+    cameras: CameraBatch,
+    settings: TrackingSettings,
+) -> LandmarkTerm:
+    """The cost of landmarks whose errors are known in metres on a face at its median depth from each camera."""
+    towards, origin = cameras.viewmat[:, 2, :3], cameras.viewmat[:, 2, 3]
+    depth = (state[views.row, 3:6] * towards[views.camera]).sum(-1) + origin[views.camera]
+    sigma = torch.ones_like(origin)
+    for camera in views.camera.unique():
+        middle = depth[views.camera == camera].median()
+        sigma[camera] = settings.landmark_sigma * cameras.K[camera, 0, 0] / middle
+    weights = weights * (settings.independent_landmarks / weights.sum())
+    return LandmarkTerm(model, views, weights, sigma, settings.outlier)
+
+
+def _wide(
+    model: LandmarkModel,
+    views: Views,
+    weights: Float[Tensor, " l"],
+    state: Float[Tensor, "v 6"],
+    cameras: CameraBatch,
+    settings: TrackingSettings,
+) -> LandmarkTerm:
+    return replace(landmark_term(model, views, weights, state, cameras, settings), outlier=_OUTLIER)
+
+
+def _minimize(
+    term: LandmarkTerm, start: Float[Tensor, "v 6"], subject: Subject, cameras: CameraBatch
+) -> Float[Tensor, "v 6"]:
+    layout = term.model.layout
+    return minimize_frames(
+        lambda state: term.equations(state, subject, cameras), lambda state: term.cost(state, subject, cameras),
+        start, Box(layout.lower, layout.upper), _ITERATIONS,
+    )  # fmt: skip
+
+
+def _facing_the_cameras(
+    points: Float[Tensor, "l 3"], detected: Float[Tensor, "n l 2"], cameras: CameraBatch
+) -> Float[Tensor, "n 6"]:
+    """Heads that look straight into each picture's camera, with the size and place of the detected points."""
+    centre = detected.mean(1)
+    spread = (detected - centre[:, None]).norm(dim=-1).mean(1)
+    focal = cameras.K[:, 0, 0]
+    depth = focal * (points - points.mean(0))[:, :2].norm(dim=-1).mean() / spread
+    across = (centre - cameras.K[:, :2, 2]) / focal[:, None] * depth[:, None]
+    in_camera = torch.cat([across, depth[:, None]], dim=1)
+    R_world_camera = cameras.viewmat[:, :3, :3].mT
+    in_world = (R_world_camera @ (in_camera - cameras.viewmat[:, :3, 3])[..., None])[..., 0]
+    R_world_head = R_world_camera @ torch.diag(torch.tensor([1.0, -1.0, -1.0])).to(points)
+    return torch.cat([axis_angle_from_matrix(R_world_head), in_world - R_world_head @ points.mean(0)], dim=1)
+
+
+def _first_picture(views: Views) -> Tensor:
+    """The index of a picture of each timestep."""
+    first = torch.zeros(views.rows, dtype=torch.long)
+    first[views.row.flip(0)] = torch.arange(len(views.row) - 1, -1, -1)
+    return first
+
+
+def _best_for_all(
+    term: LandmarkTerm, poses: Float[Tensor, "n 6"], subject: Subject, cameras: CameraBatch
+) -> Float[Tensor, "v 6"]:
+    """For every timestep, that of its pictures' own poses which fits all of its pictures best."""
+    views = term.views
+    best = poses[_first_picture(views)]
+    lowest = term.cost(best, subject, cameras)
+    for camera in views.camera.unique():
+        own = views.camera == camera
+        candidate = best.clone()
+        candidate[views.row[own]] = poses[own]
+        cost = term.cost(candidate, subject, cameras)
+        better = cost < lowest
+        best, lowest = torch.where(better[:, None], candidate, best), torch.where(better, cost, lowest)
+    return best
+
+
+def relative_rotation(rotations: Float[Tensor, "t 3"], R_new_old: Float[Tensor, "3 3"]) -> Float[Tensor, "t 3"]:
+    """Rotation vectors in another frame, without jumps by whole turns from one timestep to the next."""
+    turned = axis_angle_from_matrix(R_new_old @ matrix_from_axis_angle(rotations))
+    for index in range(1, len(turned)):
+        angle = turned[index].norm()
+        if angle > 0:
+            other = turned[index] * (1 - 2 * torch.pi / angle)
+            nearer = (other - turned[index - 1]).norm() < (turned[index] - turned[index - 1]).norm()
+            turned[index] = other if nearer else turned[index]
+    return turned

@@ -1,0 +1,130 @@
+"""What the sequences of a subject share, fitted to keyframes of all of them: identity, landmark bias, focal lengths."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.tracking.landmark_term import LandmarkTerm, Subject
+from mien.tracking.settings import TrackingSettings
+from mien.tracking.solver import Box, NormalEquations, SharedEquations, joined, joined_shared, solve_arrow
+from mien.tracking.stages import Fit, SequenceFit, box_of, fit_bias
+
+_ROUNDS, _ITERATIONS = 4, 6
+_FOCAL_SIGMA = 0.03
+"""Of the logarithm of the focal length, every keyframe's word."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    """A candidate of the joint fit: timesteps of all sequences, identity, and the logarithms of the free focals."""
+
+    fit: Fit
+    log_focals: Float[Tensor, " g"]
+
+
+def fit_shared(
+    terms: Sequence[LandmarkTerm], fit: Fit, lenses: Sequence[int | None], settings: TrackingSettings
+) -> Fit:
+    """Identity, landmark bias and unknown focal lengths, jointly with the keyframes' own parameters.
+
+    Args:
+        terms: One a sequence, over its keyframes.
+        fit: The state at the keyframes.
+        lenses: The lens of each sequence; sequences with the same number have the same focal length but for their
+            pictures' size, and None is a known one, which stays.
+        settings: Weights of the priors.
+    """
+    for _ in range(_ROUNDS):
+        fit = _fit_jointly(terms, fit, lenses, settings)
+        fit = fit_bias(terms, fit, settings)
+    return fit
+
+
+def _fit_jointly(
+    terms: Sequence[LandmarkTerm], start: Fit, lenses: Sequence[int | None], settings: TrackingSettings
+) -> Fit:
+    box, damping = box_of(terms[0].model.layout), 1e-3
+    precision = _precision(start, lenses, settings)
+    free = len(precision) - len(start.subject.identity)
+
+    def cost(candidate: _Joint) -> float:
+        fit = candidate.fit
+        total = (precision * _shared_values(candidate) ** 2).sum()
+        for term, own in zip(terms, fit.sequences, strict=True):
+            total = total + term.cost(own.state, fit.subject, own.cameras).sum()
+        return float(total)
+
+    at = _Joint(start, start.subject.identity.new_zeros(free))
+    best = cost(at)
+    for _ in range(_ITERATIONS):
+        frames, shared = _equations(terms, at.fit, lenses, free)
+        shared = shared.with_prior(precision, _shared_values(at))
+        state = torch.cat([own.state for own in at.fit.sequences])
+        step, shared_step = solve_arrow(frames, shared, box.held(state, frames.gradient), damping)
+        candidate = _moved(at, step, shared_step, start, lenses, box)
+        candidate_cost = cost(candidate)
+        if candidate_cost < best:
+            at, best, damping = candidate, candidate_cost, damping / 5
+        else:
+            damping *= 10
+    return at.fit
+
+
+def _precision(fit: Fit, lenses: Sequence[int | None], settings: TrackingSettings) -> Float[Tensor, " s"]:
+    """Of the priors of identity and free focal lengths."""
+    identity = torch.full_like(fit.subject.identity, settings.identity_weight)
+    groups = sorted({lens for lens in lenses if lens is not None})
+    assert groups == list(range(len(groups))), "lenses are numbered from 0"
+    keyframes = [sum(len(own.state) for own, lens in zip(fit.sequences, lenses, strict=True) if lens == group)
+                 for group in groups]  # fmt: skip
+    return torch.cat([identity, identity.new_tensor(keyframes) * _FOCAL_SIGMA**-2])
+
+
+def _shared_values(at: _Joint) -> Float[Tensor, " s"]:
+    return torch.cat([at.fit.subject.identity, at.log_focals])
+
+
+def _equations(
+    terms: Sequence[LandmarkTerm], fit: Fit, lenses: Sequence[int | None], free: int
+) -> tuple[NormalEquations, SharedEquations]:
+    """Of the timesteps of all sequences in a row, and of identity and the free focal lengths."""
+    frames, shared = [], []
+    for term, own, lens in zip(terms, fit.sequences, lenses, strict=True):
+        own_frames, own_shared = term.joint_equations(own.state, fit.subject, own.cameras)
+        frames.append(own_frames)
+        shared.append(_placed(own_shared, lens, free))
+    return joined(frames), joined_shared(shared)
+
+
+def _placed(own: SharedEquations, lens: int | None, free: int) -> SharedEquations:
+    """A sequence's blocks (identity, its focal length) among those of all focal lengths; a known one falls away."""
+    identity = len(own.gradient) - 1
+    placing = own.gradient.new_zeros(identity + 1, identity + free)
+    placing[:identity, :identity] = torch.eye(identity)
+    if lens is not None:
+        placing[identity, identity + lens] = 1
+    return SharedEquations(own.across @ placing, placing.T @ own.hessian @ placing, own.gradient @ placing)
+
+
+def _moved(
+    at: _Joint,
+    step: Float[Tensor, "v p"],
+    shared_step: Float[Tensor, " s"],
+    start: Fit,
+    lenses: Sequence[int | None],
+    box: Box,
+) -> _Joint:
+    subject: Subject = at.fit.subject
+    identity = len(subject.identity)
+    log_focals = at.log_focals + shared_step[identity:]
+    steps = step.split([len(own.state) for own in at.fit.sequences])
+    sequences = []
+    for own, first, own_step, lens in zip(at.fit.sequences, start.sequences, steps, lenses, strict=True):
+        factor = 1.0 if lens is None else math.exp(float(log_focals[lens]))
+        sequences.append(SequenceFit(first.cameras.with_focal(factor), box.clip(own.state + own_step)))
+    subject = replace(subject, identity=subject.identity + shared_step[:identity])
+    return _Joint(Fit(subject, tuple(sequences)), log_focals)

@@ -1,0 +1,77 @@
+"""What a fit looks at: pictures in which a face was found, and the cameras that took them."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mien.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class CameraBatch:
+    """c pinhole cameras side by side, as tensors (docs/conventions.md)."""
+
+    K: Float[Tensor, "c 3 3"]
+    viewmat: Float[Tensor, "c 4 4"]
+
+    def __getitem__(self, index: Int[Tensor, " n"]) -> "CameraBatch":
+        """The cameras of n pictures."""
+        return CameraBatch(self.K[index], self.viewmat[index])
+
+    def __len__(self) -> int:
+        """The number of cameras, c."""
+        return len(self.K)
+
+    def project(self, points: Float[Tensor, "c l 3"]) -> Float[Tensor, "c l 2"]:
+        """Each camera's own world-space points in its picture, pixels."""
+        in_camera = points @ self.viewmat[:, :3, :3].mT + self.viewmat[:, None, :3, 3]
+        return (in_camera @ self.K.mT)[..., :2] / in_camera[..., 2:]
+
+    def with_focal(self, factor: float) -> "CameraBatch":
+        """The same cameras with longer (or shorter) lenses."""
+        K = self.K.clone()
+        K[:, 0, 0] *= factor
+        K[:, 1, 1] *= factor
+        return replace(self, K=K)
+
+
+def batch_of(cameras: tuple[Camera, ...]) -> CameraBatch:
+    """Cameras as a batch, float64."""
+    return CameraBatch(
+        torch.stack([camera.K.double() for camera in cameras]),
+        torch.stack([camera.viewmat.double() for camera in cameras]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """n pictures of v timesteps of one sequence: in each, one camera found the landmarks of the face."""
+
+    detected: Float[Tensor, "n l 2"]
+    """Pixels."""
+    row: Int[Tensor, " n"]
+    """Which of the v timesteps; every timestep has a picture at least."""
+    camera: Int[Tensor, " n"]
+    """Which of the sequence's cameras."""
+
+    @property
+    def rows(self) -> int:
+        """The number of timesteps, v."""
+        return int(self.row.max()) + 1
+
+    def at(self, rows: Int[Tensor, " k"]) -> "Views":
+        """The pictures of some of the timesteps, which are counted anew."""
+        new_row = torch.full((self.rows,), -1)
+        new_row[rows] = torch.arange(len(rows))
+        kept = new_row[self.row] >= 0
+        return Views(self.detected[kept], new_row[self.row[kept]], self.camera[kept])
+
+    def of_landmarks(self, landmarks: Int[Tensor, " k"]) -> "Views":
+        """The same pictures with some of the landmarks only."""
+        return replace(self, detected=self.detected[:, landmarks])
+
+    def apart(self) -> "Views":
+        """The same pictures, each as a timestep of its own."""
+        return replace(self, row=torch.arange(len(self.row)))
