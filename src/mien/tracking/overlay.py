@@ -1,5 +1,6 @@
 """The overlay video: does the tracked mesh sit on the picture?"""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,10 +26,15 @@ _SKIN = (0.8, 0.78, 0.75)
 _MESH_OPACITY = 0.6
 _GREEN, _RED, _BLUE, _WHITE, _BLACK = (60, 255, 60), (255, 60, 40), (60, 160, 255), (255, 255, 255), (0, 0, 0)
 _SUBPIXEL_BITS = 4
+_GRID_WIDTH = 1920
+"""Pixels."""
 
 
 def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
-    """Write a video: on the left detected (green) and mesh (red) landmarks and the neck line, on the right the mesh."""
+    """Write a video: on the left detected (green) and mesh (red) landmarks and the neck line, on the right the mesh.
+
+    Several cameras come as a grid, in the order of the capture, shrunk to at most 1920 pixels across.
+    """
     write_video(path, _pictures(capture, tracking, face_model), capture.fps)
 
 
@@ -52,10 +58,23 @@ def draw_overlay(
     _draw_points(left, marks, _RED)
     _draw_line(left, tracking.neck_lines[timestep, camera_index].numpy(), camera)
     residual = float(tracking.residuals[timestep, camera_index])
-    text = f"{timestep}: {residual:.2f} px" if np.isfinite(residual) else f"{timestep}: no face, interpolated"
+    missing = "no face found" if tracking.valid[timestep] else "no face, interpolated"
+    text = f"{timestep}: {residual:.2f} px" if np.isfinite(residual) else f"{timestep}: {missing}"
+    text = text if len(tracking.cameras) == 1 else f"{capture.camera_ids[camera_index]} {text}"
     for color, thickness in ((_BLACK, 3), (_WHITE, 1)):
         cv2.putText(left, text, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, thickness, cv2.LINE_AA)
     return np.concatenate([left, np.round(blended).astype(np.uint8)], axis=1)
+
+
+def frontal_camera(tracking: Tracking) -> int:
+    """The camera that the tracked face looks at most."""
+    ahead = tracking.face.T_world_head[tracking.valid][:, :3, 2]
+    origins = tracking.face.head_translation[tracking.valid]
+    facing = [
+        torch.nn.functional.cosine_similarity(ahead, camera.position - origins, dim=1).median()
+        for camera in tracking.cameras
+    ]
+    return int(torch.stack(facing).argmax())
 
 
 def region_colors(face_model: FaceModel) -> Float[torch.Tensor, "f 3 3"]:
@@ -64,9 +83,30 @@ def region_colors(face_model: FaceModel) -> Float[torch.Tensor, "f 3 3"]:
     return palette[face_model.face_regions.long()][:, None].expand(-1, 3, -1)
 
 
+def draw_overlay_grid(
+    capture: Capture, tracking: Tracking, face_model: FaceModel, timestep: int
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A timestep of the overlay video: the pictures of all cameras side by side, in about a square."""
+    cameras = len(tracking.cameras)
+    if cameras == 1:
+        return draw_overlay(capture, tracking, face_model, timestep)
+    columns = math.ceil(math.sqrt(cameras / 2))
+    rows = math.ceil(cameras / columns)
+    scale = min(1.0, _GRID_WIDTH / (columns * 2 * capture.width))
+    # Even sizes, as video codecs want them.
+    width, height = (max(2, round(side * scale / 2) * 2) for side in (2 * capture.width, capture.height))
+    grid = np.zeros((rows * height, columns * width, 3), np.uint8)
+    for index in range(cameras):
+        row, column = divmod(index, columns)
+        picture = draw_overlay(capture, tracking, face_model, timestep, index)
+        tile = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        grid[row * height : (row + 1) * height, column * width : (column + 1) * width] = tile
+    return grid
+
+
 def _pictures(capture: Capture, tracking: Tracking, face_model: FaceModel) -> Iterator[UInt8[np.ndarray, "h w2 3"]]:
     for timestep in track_progress(range(capture.timesteps), "Overlay", capture.timesteps):
-        yield draw_overlay(capture, tracking, face_model, timestep)
+        yield draw_overlay_grid(capture, tracking, face_model, timestep)
 
 
 def _draw_points(image: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "l 2"], color: tuple) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mien.capture.capture import Capture
 from mien.face import FaceModel
-from mien.rotation import matrix_from_axis_angle
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.storage import write_atomically, write_json
 from mien.tracking.landmark_groups import (
     BROWS,
@@ -21,6 +21,7 @@ from mien.tracking.landmark_groups import (
     RIGHT_EYELIDS,
     RIGHT_IRIS,
 )
+from mien.tracking.overlay import frontal_camera
 from mien.tracking.tracking import Tracking
 
 _FORMAT, _VERSION = "mien.residual_report", 1
@@ -36,35 +37,68 @@ _CHUNK = 32
 
 
 def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel) -> dict:
-    """Figures about a tracking with one camera: residuals, jitter, constancy of the iris distance, leaks of pose.
+    """Figures about a tracking: residuals, jitter, constancy of the iris distance, leaks of pose into expression.
 
     `mesh_distance_px` is from landmarks to the mesh itself; `residual` allows every landmark its static offset.
     `iris_distance` is the distance of the detected irises in metres at the tracked depth, which should be constant.
+    Where there are several cameras, jitter, irises, depth, pitch and yaw are those that the most frontal one sees, and
+    `cameras` has the residuals of each.
     """
-    valid = tracking.valid
+    valid, frontal = tracking.valid, frontal_camera(tracking)
     marks = _landmarks(face_model, tracking)
-    pixels, depth = tracking.cameras[0].project(marks)
-    detected = torch.from_numpy(np.asarray(capture.landmarks[:, 0], dtype=np.float32))
-    distance = (pixels - detected).norm(dim=-1)[valid]
-    residuals = tracking.residuals[:, 0]
-    iris = iris_distances(tracking, detected, depth)
+    detected = torch.from_numpy(np.asarray(capture.landmarks, dtype=np.float32))
+    distance = torch.stack(
+        [(camera.project(marks)[0] - detected[:, c]).norm(dim=-1) for c, camera in enumerate(tracking.cameras)], dim=1
+    )[tracking.residuals.isfinite()]
+    pixels, depth = tracking.cameras[frontal].project(marks)
+    seen = tracking.residuals[:, frontal].isfinite()
+    pitch, yaw, _ = seen_rotation(tracking, frontal).unbind(1)
+    iris = iris_distances(tracking, detected[:, frontal], depth, frontal)
     return {
         "frames": len(valid),
         "frames_without_face": (~valid).nonzero()[:, 0].tolist(),
-        "flagged_frames": flagged_frames(residuals).nonzero()[:, 0].tolist(),
-        "residual_px": _summary(residuals[valid]),
+        "flagged_frames": flagged_frames(_timestep_residuals(tracking)).nonzero()[:, 0].tolist(),
+        "residual_px": _summary(tracking.residuals),
+        "cameras": _of_cameras(capture, tracking),
+        "frontal_camera": capture.camera_ids[frontal],
         "mesh_distance_px": {name: float(distance[:, list(group)].median()) for name, group in _GROUPS.items()},
         "jitter": {
-            "detected_px": _jitter(detected, valid),
-            "fitted_px": _jitter(pixels, valid),
+            "detected_px": _jitter(detected[:, frontal], seen),
+            "fitted_px": _jitter(pixels, seen),
             "fitted_m": _jitter(marks, valid),
         },
-        "iris_distance": _constancy(iris[valid & (_yaw(tracking).abs() < _NEAR_FRONTAL)]),
-        "focal_px": float(tracking.cameras[0].K[0, 0]),
-        "depth_m": _summary(-tracking.face.head_translation[valid, 2]),
-        "correlation_with_pitch": _correlations(tracking, face_model, tracking.face.head_rotation[:, 0]),
-        "correlation_with_yaw": _correlations(tracking, face_model, tracking.face.head_rotation[:, 1]),
+        "iris_distance": _constancy(iris[seen & (yaw.abs() < _NEAR_FRONTAL)]),
+        "focal_px": float(tracking.cameras[frontal].K[0, 0]),
+        "depth_m": _summary(_depth(tracking, frontal)[valid]),
+        "correlation_with_pitch": _correlations(tracking, face_model, pitch),
+        "correlation_with_yaw": _correlations(tracking, face_model, yaw),
     }
+
+
+def seen_rotation(tracking: Tracking, camera: int) -> Float[Tensor, "t 3"]:
+    """Head rotations as a camera sees them, axis-angle in radians: zero for a head that looks straight into it."""
+    facing = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    R_seen_world = facing @ tracking.cameras[camera].viewmat[:3, :3]
+    return axis_angle_from_matrix(R_seen_world @ matrix_from_axis_angle(tracking.face.head_rotation))
+
+
+def _depth(tracking: Tracking, camera: int) -> Float[Tensor, " t"]:
+    return tracking.cameras[camera].project(tracking.face.head_translation)[1]
+
+
+def _of_cameras(capture: Capture, tracking: Tracking) -> dict[str, dict]:
+    rows = {}
+    for index, name in enumerate(capture.camera_ids):
+        found = tracking.residuals[:, index]
+        rows[name] = {"frames": int(found.isfinite().sum())}
+        if rows[name]["frames"]:
+            rows[name]["residual_px"] = _summary(found)
+    return rows
+
+
+def _timestep_residuals(tracking: Tracking) -> Float[Tensor, " t"]:
+    """The median over the cameras that found the face, pixels; NaN where none did."""
+    return tracking.residuals.nanmedian(1).values
 
 
 def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
@@ -75,13 +109,13 @@ def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, fa
 
 
 def iris_distances(
-    tracking: Tracking, detected: Float[Tensor, "t l 2"], depth: Float[Tensor, "t l"]
+    tracking: Tracking, detected: Float[Tensor, "t l 2"], depth: Float[Tensor, "t l"], camera: int = 0
 ) -> Float[Tensor, " t"]:
     """Distance of the detected iris centres, metres at the tracked depth; foreshortening by head turns is undone."""
     right, left = RIGHT_IRIS[0], LEFT_IRIS[0]
     apart = (detected[:, left] - detected[:, right]).norm(dim=-1)
-    focal = tracking.cameras[0].K[0, 0]
-    across = matrix_from_axis_angle(tracking.face.head_rotation)[:, :2, 0].norm(dim=-1)
+    focal = tracking.cameras[camera].K[0, 0]
+    across = matrix_from_axis_angle(seen_rotation(tracking, camera))[:, :2, 0].norm(dim=-1)
     return apart * (depth[:, left] + depth[:, right]) / 2 / focal / across
 
 
@@ -99,10 +133,6 @@ def _landmarks(face_model: FaceModel, tracking: Tracking) -> Float[Tensor, "t l 
     with torch.no_grad():
         parts = [tracking.face[start : start + _CHUNK] for start in range(0, len(tracking.face), _CHUNK)]
         return torch.cat([face_model.landmark_positions(face_model(part), "mediapipe") for part in parts])
-
-
-def _yaw(tracking: Tracking) -> Float[Tensor, " t"]:
-    return tracking.face.head_rotation[:, 1]
 
 
 def _jitter(points: Float[Tensor, "t l d"], valid: Bool[Tensor, " t"]) -> float | None:
@@ -127,8 +157,8 @@ def _correlations(tracking: Tracking, face_model: FaceModel, angle: Float[Tensor
             for i in moved}  # fmt: skip
 
 
-def _summary(values: Float[Tensor, " n"]) -> dict[str, float]:
-    values = values.double()
+def _summary(values: Float[Tensor, "*n"]) -> dict[str, float]:
+    values = values[values.isfinite()].double()
     return {"median": float(values.median()), "p95": float(values.quantile(0.95)), "max": float(values.max())}
 
 
@@ -136,20 +166,21 @@ def _plot(path: Path, capture: Capture, tracking: Tracking, face_model: FaceMode
     from matplotlib.figure import Figure  # slow to import, and only needed here
 
     time = np.asarray(capture.timestamps)
-    detected = torch.from_numpy(np.asarray(capture.landmarks[:, 0], dtype=np.float32))
-    depth = tracking.cameras[0].project(_landmarks(face_model, tracking))[1]
-    iris = iris_distances(tracking, detected, depth)
+    frontal, residuals = frontal_camera(tracking), _timestep_residuals(tracking)
+    detected = torch.from_numpy(np.asarray(capture.landmarks[:, frontal], dtype=np.float32))
+    depth = tracking.cameras[frontal].project(_landmarks(face_model, tracking))[1]
+    iris = iris_distances(tracking, detected, depth, frontal)
     figure = Figure(figsize=(9, 9), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
-    axes[0].plot(time, tracking.residuals[:, 0].numpy(), label="median residual")
+    axes[0].plot(time, residuals.numpy(), label="median residual")
     flagged = report["flagged_frames"]
-    axes[0].plot(time[flagged], tracking.residuals[flagged, 0].numpy(), "rx", label="flagged")
+    axes[0].plot(time[flagged], residuals[flagged].numpy(), "rx", label="flagged")
     axes[0].set_ylabel("residual, px")
     axes[0].legend(loc="upper right")
-    axes[1].plot(time, tracking.face.head_rotation.rad2deg().numpy(), label=["pitch", "yaw", "roll"])
+    axes[1].plot(time, seen_rotation(tracking, frontal).rad2deg().numpy(), label=["pitch", "yaw", "roll"])
     axes[1].set_ylabel("head rotation, degrees")
     axes[1].legend(loc="upper right")
-    axes[2].plot(time, -tracking.face.head_translation[:, 2].numpy())
+    axes[2].plot(time, _depth(tracking, frontal).numpy())
     axes[2].set_ylabel("depth, m")
     axes[3].plot(time, 1e3 * iris.numpy())
     axes[3].set_ylabel("iris distance, mm")
