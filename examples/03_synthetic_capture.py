@@ -1,0 +1,40 @@
+"""A capture with exact ground truth, written as a workspace that `mien train` and example 05 can use.
+
+python examples/03_synthetic_capture.py --out out/examples/subject
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from mien.capture import write_capture
+from mien.face import load_face_model
+from mien.synthetic import RECIPES, synthesize
+from mien.tracking import make_scoring, write_overlay, write_scoring, write_tracking
+from mien.workspace import Workspace
+
+
+def main() -> None:
+    """Draw the clip, write capture, true tracking and scoring masks, and an overlay to look at."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="workspace folder")
+    parser.add_argument("--seed", type=int, default=0, help="another seed is another person")
+    parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--size", type=int, default=256, help="pixels")
+    options = parser.parse_args()
+
+    recipe = replace(RECIPES["plain"], seconds=options.seconds, width=options.size, height=options.size)
+    capture, truth = synthesize(recipe, options.seed)
+    print(f"{capture.timesteps} frames of {capture.width}x{capture.height}, {len(capture.camera_ids)} camera(s)")
+
+    folder = Workspace(options.out).sequence_dir("synthetic")
+    face_model = load_face_model(truth.face_model)
+    write_capture(folder / "capture", capture)
+    write_tracking(folder / "tracking", truth)
+    write_scoring(folder / "scoring", make_scoring(capture, truth, face_model))  # what is trained on and scored
+    write_overlay(folder / "tracking" / "overlay.mp4", capture, truth, face_model)
+    print(f"wrote {folder}; look at tracking/overlay.mp4")
+
+
+if __name__ == "__main__":
+    main()

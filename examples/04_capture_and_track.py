@@ -1,0 +1,42 @@
+"""Your own video: frames, mattes and landmarks, then the face model fitted to them.
+
+python examples/04_capture_and_track.py my_video.mp4 --out out/examples/me
+"""
+
+import argparse
+import math
+from pathlib import Path
+
+from mien.capture import CaptureSettings, capture_video
+from mien.face import load_face_model
+from mien.tracking import make_scoring, track, write_overlay, write_scoring, write_tracking
+from mien.workspace import Workspace
+
+
+def main() -> None:
+    """What `mien capture` and `mien track` do, as function calls."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("video", type=Path)
+    parser.add_argument("--out", type=Path, required=True, help="workspace folder")
+    parser.add_argument("--max-frames", type=int, default=0, help="0 takes all")
+    options = parser.parse_args()
+
+    folder = Workspace(options.out).sequence_dir(options.video.stem)
+    capture = capture_video(options.video, folder / "capture", CaptureSettings(max_frames=options.max_frames))
+    print(f"a face in {int(capture.valid.any(1).sum())} of {capture.timesteps} frames")
+
+    face_model = load_face_model("anny")
+    tracking = track(capture, face_model)
+    yaw = tracking.face.head_rotation[:, 1] * 180 / math.pi
+    print(
+        f"landmark residual {tracking.residuals.nanmedian():.2f} pixels; yaw {yaw.min():.0f} to {yaw.max():.0f} degrees"
+    )
+
+    write_tracking(folder / "tracking", tracking)
+    write_scoring(folder / "scoring", make_scoring(capture, tracking, face_model))
+    write_overlay(folder / "tracking" / "overlay.mp4", capture, tracking, face_model)
+    print(f"look at {folder / 'tracking' / 'overlay.mp4'}, then train: mien train {options.out}")
+
+
+if __name__ == "__main__":
+    main()

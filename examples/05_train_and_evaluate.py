@@ -1,0 +1,45 @@
+"""Train an avatar with settings of your own, then score it on the frames it never saw.
+
+python examples/05_train_and_evaluate.py out/examples/subject --steps 3000
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from mien.avatar import GaussianAvatarsConfig, GradientSettings
+from mien.evaluation import evaluate
+from mien.face import load_face_model
+from mien.training import TrainSettings, read_sequence, train
+from mien.workspace import open_workspace
+
+
+def main() -> None:
+    """Stopped at any time, the same command goes on where it was."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("workspace", type=Path)
+    parser.add_argument("--run", default="example")
+    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--gaussians", type=int, default=20_000, help="most Gaussians")
+    options = parser.parse_args()
+
+    torch.set_num_threads(1)
+    workspace = open_workspace(options.workspace)
+    folders = [workspace.sequence_dir(name) for name in workspace.sequence_names()]
+    sequences = [read_sequence(folder) for folder in folders]
+    method = GaussianAvatarsConfig(density=GradientSettings(max_gaussians=options.gaussians))
+    settings = TrainSettings(steps=options.steps, split="blocks", seed=0)
+    run_dir = workspace.run_dir(options.run)
+    train(sequences, load_face_model(sequences[0].tracking.face_model), method, settings, run_dir)
+
+    metrics = evaluate(run_dir, folders)
+    for name, scores in metrics["protocols"].items():
+        print(f"{name}: PSNR {scores['psnr']:.2f} dB whole frame, {scores['head']['psnr']:.2f} dB head crop")
+        for baseline, values in scores["baselines"].items():
+            print(f"  baseline {baseline}: {values['psnr']:.2f} dB whole frame")
+    print(f"look at {run_dir / 'report.html'}")
+
+
+if __name__ == "__main__":
+    main()
