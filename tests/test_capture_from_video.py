@@ -62,7 +62,7 @@ def test_face_is_foreground_and_corners_are_not(face_capture):
 def test_captured_again_it_is_read_back(face_clip, face_capture, monkeypatch):
     path, capture = face_capture
     before = tree_bytes(path)
-    monkeypatch.setattr("mien.capture.from_video.survey_faces", None)  # any work would call it
+    monkeypatch.setattr("mien.capture.from_video.survey_source", None)  # any work would call it
     assert_same_capture(capture, capture_video(face_clip[0], path, CaptureSettings(size=200)))
     assert tree_bytes(path) == before
 
@@ -82,7 +82,7 @@ def test_interrupted_capture_goes_on_to_the_same_bytes(face_clip, tmp_path, monk
     settings = CaptureSettings(size=96)
     capture_video(face_clip[0], tmp_path / "straight" / "capture", settings)
     out = tmp_path / "interrupted" / "capture"
-    original = process.FrameProcessor.process
+    original = process.PartProcessor.process
     starts = []
 
     def stop_at_the_second(self, start, count, writer, advance):
@@ -91,7 +91,7 @@ def test_interrupted_capture_goes_on_to_the_same_bytes(face_clip, tmp_path, monk
             raise KeyboardInterrupt
         return original(self, start, count, writer, advance)
 
-    monkeypatch.setattr(process.FrameProcessor, "process", stop_at_the_second)
+    monkeypatch.setattr(process.PartProcessor, "process", stop_at_the_second)
     with pytest.raises(KeyboardInterrupt):
         capture_video(face_clip[0], out, settings)
     with pytest.raises(UserError, match="no capture there"):
@@ -169,8 +169,8 @@ def test_bad_requests_are_refused(face_clip, tmp_path):
         (face_clip[0], blocked / "out", settings, "cannot be written"),
         (face_clip[0], face_clip[0].parent, settings, "holds something that is no capture"),
         (face_clip[0], tmp_path / "out", replace(settings, start=60.0), "no frame after 60 s"),
-        (face_clip[0], tmp_path / "out", replace(settings, stride=0), "stride must be at least 1"),
-        (face_clip[0], tmp_path / "out", replace(settings, size=4), "size 4: too small"),
+        (face_clip[0], tmp_path / "out", replace(settings, stride=0), "--capture.stride 0: give 1 for every frame"),
+        (face_clip[0], tmp_path / "out", replace(settings, size=4), "--capture.size 4: too small"),
     ]
     for source, out, case_settings, message in cases:
         with pytest.raises(UserError, match=message) as error:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mien.capture.crop import choose_crop, whole_picture
-from mien.capture.faces import FaceFollower, second_difference_jitter
+from mien.capture.faces import second_difference_jitter
 from mien.capture.matte import guided_filter, refine_matte
 from mien.capture.source import list_images
 
@@ -59,16 +59,6 @@ def test_crop_maps_pixels_as_it_maps_pictures():
     rows, columns = np.mgrid[: cut.shape[0], : cut.shape[1]] + 0.5
     found = np.array([(cut * columns).sum(), (cut * rows).sum()]) / cut.sum()
     np.testing.assert_allclose(found, crop.to_output(np.array([208.0, 128.0])), atol=0.1)
-
-
-def test_follower_keeps_to_the_nearest_and_restarts_with_the_largest():
-    small, large = np.array([0.1, 0.1, 0.2, 0.2]), np.array([0.5, 0.1, 0.9, 0.5])
-    follower = FaceFollower()
-    assert follower.choose(np.zeros((0, 4)), 0.0) is None
-    np.testing.assert_array_equal(follower.choose(small[None], 0.1), small)
-    np.testing.assert_array_equal(follower.choose(np.stack([large, small + 0.01]), 0.2), small + 0.01)
-    assert follower.crowded == 1
-    np.testing.assert_array_equal(follower.choose(np.stack([small, large]), 2.0), large)
 
 
 def test_jitter_is_the_second_difference():

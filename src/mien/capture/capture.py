@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from mien.camera import Camera
+from mien.capture.quality import FrameQuality
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,13 @@ class Capture:
     """Where it came from: file name, content hash, crop box, original size."""
     calibration: tuple[Camera, ...] | None = None
     """One calibrated camera a camera_id, in one world frame, for pictures of this size; None where it is unknown."""
+    quality: FrameQuality | None = None
+    """How sharp and how well lit the face is; None where it was not measured."""
+
+    @property
+    def usable(self) -> Bool[np.ndarray, "t c"]:
+        """Frames fit to learn from: a face was found, and it is not blurred."""
+        return self.valid if self.quality is None else self.valid & ~self.quality.blurred
 
     @property
     def timesteps(self) -> int:

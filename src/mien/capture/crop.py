@@ -38,7 +38,7 @@ class Crop:
         """Source pixels as pixels of the output."""
         return (source_pixels - np.array([self.left, self.top])) * self.scale
 
-    def apply(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    def apply(self, image: UInt8[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h2 w2 *channels"]:
         """Cut out and shrink (area-averaged)."""
         part = image[self.top : self.top + self.crop_height, self.left : self.left + self.crop_width]
         if (self.crop_width, self.crop_height) == (self.width, self.height):

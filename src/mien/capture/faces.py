@@ -1,6 +1,5 @@
 """Faces in pictures: boxes of all faces (to choose the crop), then the landmarks of the one that is followed."""
 
-from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any
 
@@ -13,8 +12,6 @@ LANDMARKS = 478
 """MediaPipe's face mesh with irises."""
 _MOST_FACES = 4
 _DETECTION_CONFIDENCE = 0.5
-_GAP_SECONDS = 1.0
-"""After so long without a face, the largest one is taken instead of the nearest."""
 
 
 class FaceFinder:
@@ -51,29 +48,6 @@ class FaceFinder:
         return np.zeros((0, 4))
 
 
-@dataclass
-class FaceFollower:
-    """Keeps to one face: the one nearest to the last; at first, and after a long gap, the largest."""
-
-    crowded: int = field(default=0, init=False)
-    """Frames in which there was a choice."""
-    _last: np.ndarray | None = field(default=None, init=False)
-    _last_seconds: float = field(default=0.0, init=False)
-
-    def choose(self, boxes: Float[np.ndarray, "n 4"], seconds: float) -> Float[np.ndarray, " 4"] | None:
-        """The box to follow, or none where there is no face."""
-        if len(boxes) == 0:
-            return None
-        self.crowded += len(boxes) > 1
-        if self._last is None or seconds - self._last_seconds > _GAP_SECONDS:
-            chosen = boxes[np.argmax((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1]))]
-        else:
-            # All four sides count: of two faces one behind the other, the one of the last size is meant.
-            chosen = boxes[np.argmin(np.abs(boxes - self._last).sum(axis=1))]
-        self._last, self._last_seconds = chosen, seconds
-        return chosen
-
-
 class LandmarkDetector:
     """Face-mesh landmarks over consecutive pictures of one clip. Use as a context manager, one for each clip.
 
@@ -96,24 +70,13 @@ class LandmarkDetector:
     ) -> None:
         self._mesh.close()
 
-    def detect(
-        self, image: UInt8[np.ndarray, "h w 3"], near: Float[np.ndarray, " 2"] | None = None
-    ) -> Float[np.ndarray, "l 2"] | None:
-        """The landmarks in pixels, or none where there is no face.
-
-        Args:
-            image: the next picture of the clip.
-            near: of several faces, take the one whose landmarks' mean is nearest to this pixel.
-        """
+    def detect(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n l 2"]:
+        """The landmarks of all faces in the next picture of the clip, pixels."""
         faces = self._process(image)
         if not faces:
-            return None
+            return np.zeros((0, LANDMARKS, 2))
         height, width = image.shape[:2]
-        all_points = np.array([[(point.x, point.y) for point in face.landmark] for face in faces])
-        all_points *= (width, height)
-        if near is None or len(faces) == 1:
-            return all_points[0]
-        return all_points[np.argmin(np.linalg.norm(all_points.mean(axis=1) - near, axis=1))]
+        return np.array([[(point.x, point.y) for point in face.landmark] for face in faces]) * (width, height)
 
     def _process(self, image: np.ndarray) -> Any:
         if self._has_seen_face:

@@ -1,126 +1,231 @@
-"""Video in, capture out: the head cut out of every frame, landmarks, mattes; a few frames in memory at a time."""
+"""Video in, captures out: the head cut out of every frame, landmarks, mattes; a few frames in memory at a time."""
 
 import hashlib
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import cv2
-import numpy as np
-from jaxtyping import Float
 
 from mien.capture.capture import Capture
-from mien.capture.crop import Crop, choose_crop, whole_picture
-from mien.capture.faces import second_difference_jitter
-from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
-from mien.capture.process import Chunk, process_frames
-from mien.capture.source import FrameSelection, FrameSource, open_source
-from mien.capture.store import (
-    FORMAT,
-    JSON_NAME,
-    VERSION,
-    CaptureData,
-    cannot_write,
-    check_replaceable,
-    finish_capture,
-    partial_folder,
-    read_capture,
-)
-from mien.capture.survey import Survey, no_face, survey_faces
+from mien.capture.frame_files import FrameLayout
+from mien.capture.given import GivenMattes, check_mattes, read_landmarks
+from mien.capture.outcome import CAMERA_ID, Origin, finish_part
+from mien.capture.parts import find_parts, whole_part
+from mien.capture.process import Means, Part, Reel, process_part
+from mien.capture.settings import CaptureSettings
+from mien.capture.source import FrameSelection, FrameSource, open_source, read_image
+from mien.capture.store import FORMAT, JSON_NAME, VERSION, cannot_write, check_replaceable, partial_folder, read_capture
+from mien.capture.survey import Survey, survey_source
 from mien.errors import UserError
 from mien.progress import say
-from mien.storage import read_json, write_json
+from mien.storage import file_digest, read_json, write_json
 
-CAMERA_ID = "0"
-_RECIPE = 2
+_RECIPE = 3
 """Raised whenever the same video would give another capture, so that old ones are not taken for current."""
-_SMALLEST_SIZE = 32
-_RATE_TOLERANCE = 0.01
-_STATE, _SURVEY, _CHUNKS = "state.json", "survey.safetensors", "chunks"
+_STATE, _CHUNKS = "state.json", "chunks"
 
 
 @dataclass(frozen=True)
-class CaptureSettings:
-    """How a video becomes a capture."""
-
-    size: int = 512
-    """Longest side of the captured frames in pixels; smaller sources are not enlarged."""
-    crop: Literal["auto", "none"] = "auto"
-    """auto: one square around the head for the whole clip; none: the whole picture."""
-    start: float = 0.0
-    """Seconds to skip at the beginning."""
-    stride: int = 1
-    """Take every n-th frame."""
-    max_frames: int = 0
-    """Stop after so many frames; 0 takes all."""
-    fps: float = 25.0
-    """Frames a second of a folder of images; videos know their own."""
-
-
-@dataclass(frozen=True)
-class _Origin:
-    """What a capture is made from."""
+class _Job:
+    """What is asked for."""
 
     frames: FrameSource
-    crop: Crop
+    settings: CaptureSettings
     name: str
     key: str
+    replace: bool
 
 
-def capture_video(source: Path, out: Path, settings: CaptureSettings | None = None, name: str | None = None) -> Capture:
-    """Capture the head in a video, or in a folder of images, into the folder `out`.
+def capture_video(
+    source: Path, out: Path, settings: CaptureSettings | None = None, name: str | None = None, replace: bool = False
+) -> Capture:
+    """Capture the head in a video, or in a folder of images, into the folder `out`: one capture, cuts or not.
 
     An `out` made earlier from the same source with the same settings is read back. What an interrupted run has done is
     kept beside `out` and continued; the result does not depend on interruptions. Memory does not grow with the length.
 
     Args:
         source: video file or folder of images.
-        out: the capture's folder; a capture in it is replaced, anything else is refused.
+        out: the capture's folder; a capture of the same source in it is replaced, anything else is refused.
         settings: how; the defaults by default.
         name: of the sequence; by default the source's name without its ending.
+        replace: whether a capture of another source may be replaced, too.
 
     Raises:
         UserError: the source is no video or shows no face, or `out` cannot be written or is damaged.
     """
-    settings = settings or CaptureSettings()
-    if settings.size < _SMALLEST_SIZE:
-        raise UserError(f"size {settings.size}: too small for a face; give at least {_SMALLEST_SIZE}, better 512")
-    frames = open_source(source, FrameSelection(settings.start, settings.stride, settings.max_frames), settings.fps)
-    name = name or source.resolve().stem
-    key = _key(frames, settings, name)
-    if _is_finished(out, key):
-        return read_capture(out)
-    cv2.setNumThreads(1)  # one thread detects, another refines and writes; more would stand in their way
-    try:
-        check_replaceable(out)
-        work = _prepare(partial_folder(out), key)
-        survey = survey_faces(frames, work / _SURVEY)
-        crop = _choose_crop(survey, settings)
-        layout = FrameLayout(work, (CAMERA_ID,), len(survey.timestamps), crop.height, crop.width)
-        chunks = process_frames(frames, survey, crop, layout, work / _CHUNKS)
-        _finish(layout, out, chunks, survey, _Origin(frames, crop, name, key))
-    except OSError as error:
-        raise cannot_write(out, error) from None
+    job = _job(source, settings or CaptureSettings(), name, replace)
+    key = _part_key(job, 1, 1)
+    capture = _read_finished(out, key)
+    if capture is not None:
+        return capture
+    _check_place(out, job)
+    scratch = partial_folder(out).with_suffix(".survey")
+    with _tidy(out, scratch) as survey_folder:
+        means = _means(job)
+        survey = _survey(job, survey_folder, means)
+        part = whole_part(survey, job.settings, source, job.name)
+        _process(job, Reel(job.frames), part, (1, 1), means, out)
     return read_capture(out)
 
 
-def _key(frames: FrameSource, settings: CaptureSettings, name: str) -> str:
-    content = {"recipe": _RECIPE, "source": frames.content_hash, "name": name, "settings": asdict(settings)}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+def capture_video_parts(
+    source: Path,
+    sequences: Path,
+    settings: CaptureSettings | None = None,
+    name: str | None = None,
+    replace: bool = False,
+) -> list[Capture]:
+    """Capture a video into `sequences`/NAME/capture, or, where it has cuts, each shot into NAME-1, NAME-2, ...
+
+    As `capture_video`, for each part. The source is read twice in all, however many parts there are.
+
+    Args:
+        source: video file or folder of images.
+        sequences: folder of the subject's sequences.
+        settings: how; `cuts` tells whether to look for them.
+        name: NAME; by default the source's name without its ending.
+        replace: whether captures of another source may be replaced, too.
+
+    Returns:
+        The captures in the video's order; their `name` is their folder's.
+
+    Raises:
+        UserError: the source is no video or shows no face, or a folder cannot be written or is damaged.
+    """
+    job = _job(source, settings or CaptureSettings(), name, replace)
+    finished = _read_finished_parts(sequences, job)
+    if finished:
+        return finished
+    for first in (job.name, f"{job.name}-1"):
+        _check_place(_place(sequences, first), job)
+    with _tidy(_place(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
+        means = _means(job)
+        survey = _survey(job, survey_folder, means)
+        parts = find_parts(survey, job.settings, source, job.name)
+        for part in parts:
+            _check_place(_place(sequences, part.name), job)
+        reel = Reel(job.frames)
+        for number, part in enumerate(parts, 1):
+            _process(job, reel, part, (number, len(parts)), means, _place(sequences, part.name))
+    _tell_leftovers(sequences, job, {part.name for part in parts})
+    return [read_capture(_place(sequences, part.name)) for part in parts]
 
 
-def _is_finished(out: Path, key: str) -> bool:
+def _job(source: Path, settings: CaptureSettings, name: str | None, replace_others: bool) -> _Job:
+    settings.check()
+    frames = open_source(source, FrameSelection(settings.start, settings.stride, settings.max_frames), settings.fps)
+    name = name or source.resolve().stem
+    # Files count by what is in them.
+    contents = {
+        "clean_plate": file_digest(settings.clean_plate) if settings.clean_plate else None,
+        "landmarks": file_digest(settings.landmarks) if settings.landmarks else None,
+        "mattes": open_source(settings.mattes, FrameSelection(), 25.0).content_hash if settings.mattes else None,
+    }
+    content = {
+        "recipe": _RECIPE,
+        "source": frames.content_hash,
+        "name": name,
+        "settings": asdict(settings) | contents,
+    }
+    key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return _Job(frames, settings, name, key, replace_others)
+
+
+def _part_key(job: _Job, number: int, count: int) -> str:
+    return f"{job.key}-{number}-{count}"
+
+
+def _place(sequences: Path, name: str) -> Path:
+    return sequences / name / "capture"
+
+
+def _read_source(out: Path) -> dict[str, Any] | None:
+    """Where the capture in a folder came from; none where there is none, or none that can be read."""
     try:
         source = read_json(out / JSON_NAME, FORMAT, VERSION).get("source")
     except UserError:
-        return False
-    return isinstance(source, dict) and source.get("key") == key
+        return None
+    return source if isinstance(source, dict) else None
+
+
+def _read_finished(out: Path, key: str) -> Capture | None:
+    source = _read_source(out)
+    if source is None or source.get("key") != key:
+        return None
+    try:
+        return read_capture(out)
+    except UserError as error:
+        say(f"{error}: doing so now")
+        return None
+
+
+def _read_finished_parts(sequences: Path, job: _Job) -> list[Capture]:
+    """All parts, if all are finished; none otherwise."""
+    whole = _read_finished(_place(sequences, job.name), _part_key(job, 1, 1))
+    if whole is not None:
+        return [whole]
+    source = _read_source(_place(sequences, f"{job.name}-1")) or {}
+    part = source.get("part")
+    count = part.get("count") if isinstance(part, dict) else None
+    if not isinstance(count, int):
+        return []
+    keys = {f"{job.name}-{number}": _part_key(job, number, count) for number in range(1, count + 1)}
+    captures = [_read_finished(_place(sequences, name), key) for name, key in keys.items()]
+    found = [capture for capture in captures if capture is not None]
+    return found if len(found) == count else []
+
+
+def _check_place(out: Path, job: _Job) -> None:
+    """Refuse what must not be replaced.
+
+    Raises:
+        UserError: there is something else, or a capture of another source.
+    """
+    try:
+        check_replaceable(out)
+    except OSError as error:
+        raise cannot_write(out, error) from None
+    if job.replace or not (out / JSON_NAME).exists():
+        return
+    source = _read_source(out)
+    if source is None:
+        say(f"{out}: the capture in it is damaged or of another version; it is made again")
+    elif source.get("content_hash") != job.frames.content_hash:
+        raise UserError(
+            f"{out}: holds a capture of something else ({source.get('file', 'not made from a video')}); choose another "
+            "name with --name, or add --replace to `mien capture`"
+        )
+
+
+@contextmanager
+def _tidy(out: Path, survey_folder: Path) -> Iterator[Path]:
+    """The folder for the survey; it goes at the end, and after bad input no empty folders stay."""
+    missing = [folder for folder in (out.parent, *out.parent.parents) if not folder.exists()]
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # one thread detects, another refines and writes; more would stand in their way
+    try:
+        yield survey_folder
+    except OSError as error:
+        raise cannot_write(out, error) from None
+    except UserError:
+        shutil.rmtree(survey_folder, ignore_errors=True)
+        for folder in missing:
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+        raise
+    finally:
+        cv2.setNumThreads(threads)
+    shutil.rmtree(survey_folder, ignore_errors=True)
 
 
 def _prepare(work: Path, key: str) -> Path:
-    """The folder for unfinished work; what is in it is kept only if it belongs to the same key."""
+    """A folder for unfinished work; what is in it is kept only if it belongs to the same key."""
     try:
         kept = read_json(work / _STATE, "mien.capture_state", 1).get("key") == key
     except UserError:
@@ -132,57 +237,52 @@ def _prepare(work: Path, key: str) -> Path:
     return work
 
 
-def _choose_crop(survey: Survey, settings: CaptureSettings) -> Crop:
-    width, height = (int(side) for side in survey.picture_size)
-    if settings.crop == "none":
-        return whole_picture(width, height, settings.size)
-    return choose_crop(survey.boxes, width, height, settings.size)
+def _means(job: _Job) -> Means:
+    """Read and check what the user gave besides the source, before anything that takes long."""
+    settings, frames = job.settings, job.frames
+    if settings.clean_plate is None and settings.mattes is None and settings.landmarks is None:
+        return Means()
+    first = next(frames.frames())
+    height, width = first.picture().shape[:2]
+    plate, mattes, landmarks = None, None, None
+    if settings.clean_plate is not None:
+        plate = read_image(settings.clean_plate)
+        if plate.shape[:2] != (height, width):
+            raise UserError(
+                f"--capture.clean-plate {settings.clean_plate}: is {plate.shape[1]}x{plate.shape[0]}, the video's "
+                f"pictures are {width}x{height}; give a picture by the same camera in the same mode"
+            )
+    if settings.mattes is not None:
+        check_mattes(settings.mattes, frames)
+        GivenMattes(settings.mattes, (width, height)).check(first.number)
+        mattes = GivenMattes(settings.mattes, (width, height))
+    if settings.landmarks is not None:
+        landmarks = read_landmarks(settings.landmarks, frames.count())
+    return Means(plate, mattes, landmarks)
 
 
-def _finish(layout: FrameLayout, out: Path, chunks: list[Chunk], survey: Survey, origin: _Origin) -> None:
-    landmarks = np.concatenate([chunk.landmarks for chunk in chunks])
-    valid = np.concatenate([chunk.valid for chunk in chunks])
-    if not valid.any():
-        raise no_face(origin.frames.path, len(valid))
-    crop = origin.crop
-    data = CaptureData(
-        name=origin.name,
-        camera_ids=layout.camera_ids,
-        fps=_frame_rate(survey.timestamps, origin.frames.fps),
-        timestamps=survey.timestamps,
-        landmarks=landmarks[:, None],
-        valid=valid[:, None],
-        principal_point=crop.to_output(survey.picture_size / 2)[None],
-        source={
-            "key": origin.key,
-            "file": origin.frames.path.name,
-            "content_hash": origin.frames.content_hash,
-            "picture_size": survey.picture_size.astype(int).tolist(),
-            "crop": {"left": crop.left, "top": crop.top, "width": crop.crop_width, "height": crop.crop_height},
-        },
-    )
-    digests = {
-        FRAMES: np.concatenate([chunk.frame_digests for chunk in chunks]),
-        MATTES: np.concatenate([chunk.matte_digests for chunk in chunks]),
-    }
-    jitter = second_difference_jitter(landmarks)
-    report = {
-        "frames": len(valid),
-        "frames_without_face": int((~valid).sum()),
-        "frames_with_several_faces": int(survey.crowded[0]),
-        "landmark_jitter_px": jitter if np.isfinite(jitter) else None,
-    }
-    if not valid.all():
-        say(f"{origin.name}: no face in {report['frames_without_face']} of {len(valid)} frames; they are left out")
-    shutil.rmtree(layout.folder / _CHUNKS)
-    (layout.folder / _SURVEY).unlink()
-    (layout.folder / _STATE).unlink()
-    finish_capture(layout, out, data, digests, report)
+def _survey(job: _Job, folder: Path, means: Means) -> Survey:
+    if job.frames.hdr:
+        say(f"{job.frames.path}: HDR video ({job.frames.hdr}); its pictures are tone-mapped to sRGB")
+    return survey_source(job.frames, _prepare(folder, job.key), means.landmarks)
 
 
-def _frame_rate(timestamps: Float[np.ndarray, " t"], nominal: float) -> float:
-    """The rate that the file names, unless its times tell otherwise (variable frame rate, dropped frames)."""
-    if len(timestamps) < 2:
-        return nominal
-    measured = float((len(timestamps) - 1) / timestamps[-1])
-    return nominal if abs(measured - nominal) <= _RATE_TOLERANCE * nominal else measured
+def _process(job: _Job, reel: Reel, part: Part, place: tuple[int, int], means: Means, out: Path) -> None:
+    """Capture one part, unless that is done."""
+    key = _part_key(job, *place)
+    if (_read_source(out) or {}).get("key") == key:
+        return
+    work = _prepare(partial_folder(out), key)
+    layout = FrameLayout(work, (CAMERA_ID,), part.timesteps, part.crop.height, part.crop.width)
+    chunks = process_part(reel, part, means, layout, work / _CHUNKS)
+    finish_part(layout, out, chunks, part, Origin(job.frames, key, job.name, place), (_STATE, _CHUNKS))
+
+
+def _tell_leftovers(sequences: Path, job: _Job, names: set[str]) -> None:
+    """Name sequences that an earlier capture of the same video left under other numbers."""
+    for path in sorted(sequences.glob(f"*/capture/{JSON_NAME}")):
+        source = _read_source(path.parent) or {}
+        part = source.get("part")
+        is_ours = isinstance(part, dict) and part.get("of") == job.name
+        if is_ours and path.parent.parent.name not in names:
+            say(f"warning: {path.parent.parent}: left from an earlier capture of {job.name}; delete it unless needed")

@@ -1,20 +1,25 @@
-"""The second pass over a source: crop every frame, find its landmarks, cut its matte, write it."""
+"""The second pass over a source: crop every frame of a part, find its landmarks, cut its matte, write it."""
 
 import itertools
 from collections import deque
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt64
+from jaxtyping import Bool, Float, UInt8, UInt64
 
 from mien.capture.crop import Crop
 from mien.capture.faces import LANDMARKS, LandmarkDetector
+from mien.capture.follow import LandmarkFollower
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout, FrameWriter
-from mien.capture.matte import Segmenter, refine_matte
-from mien.capture.source import FrameSource
+from mien.capture.given import GivenMattes
+from mien.capture.matting import MakeMatte, choose_matting
+from mien.capture.people import Person
+from mien.capture.quality import measure_face
+from mien.capture.source import FrameSource, SourceFrame
 from mien.capture.survey import Survey
 from mien.errors import UserError
 from mien.progress import Advance, progress_bar
@@ -32,68 +37,127 @@ class Chunk:
 
     landmarks: Float[np.ndarray, "t l 2"]
     """Pixels of the cropped frames; NaN where there is no face."""
-    valid: Bool[np.ndarray, " t"]
+    quality: Float[np.ndarray, "t 3"]
+    """What `measure_face` gave; NaN where there is no face."""
     frame_digests: UInt64[np.ndarray, "t 1"]
     matte_digests: UInt64[np.ndarray, "t 1"]
 
+    @property
+    def valid(self) -> Bool[np.ndarray, " t"]:
+        """Where a face was found."""
+        return np.isfinite(self.landmarks[:, 0, 0])
 
-class FrameProcessor:
-    """Processes the cropped frames of one clip in order, a chunk at a time."""
 
-    def __init__(self, frames: FrameSource, survey: Survey, crop: Crop) -> None:
-        self._path = frames.path
-        self._survey = survey
-        self._crop = crop
-        self._stream = (crop.apply(image) for _, image in frames.frames())
-        self._recent: deque[np.ndarray] = deque(maxlen=_LEAD_IN)
-        """What came before; before the first frame, the next ones backwards."""
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Consecutive frames of a source that become one capture."""
 
-    def skip(self, count: int) -> None:
-        """Pass over the first `count` frames, which are done; to be called once, before any chunk."""
-        ahead = list(itertools.islice(self._stream, _LEAD_IN + 1))
-        self._recent.extend(ahead[:0:-1])
-        self._stream = itertools.chain(ahead, self._stream)
-        self._recent.extend(itertools.islice(self._stream, count))
+    name: str
+    """Of the sequence."""
+    start: int
+    """Of its first frame, among the frames taken."""
+    survey: Survey
+    """Of its frames only."""
+    person: Person
+    crop: Crop
+
+    @property
+    def timesteps(self) -> int:
+        """The number of frames."""
+        return len(self.survey.timestamps)
+
+
+@dataclass(frozen=True, eq=False)
+class Means:
+    """What the user gave besides the source."""
+
+    plate: UInt8[np.ndarray, "h w 3"] | None = None
+    mattes: GivenMattes | None = None
+    landmarks: Float[np.ndarray, "n l 2"] | None = None
+    """Pixels of the source's pictures, a row for each frame of the source."""
+
+
+class Reel:
+    """The frames of a source, read once and forwards."""
+
+    def __init__(self, frames: FrameSource) -> None:
+        self.path = frames.path
+        self._stream = frames.frames()
+        self._position = 0
+
+    def from_frame(self, start: int) -> Iterator[SourceFrame]:
+        """The frames from number `start` (of those taken) on, which must not have been read yet."""
+        assert start >= self._position, (start, self._position)
+        for _ in itertools.islice(self._stream, start - self._position):
+            self._position += 1
+        for frame in self._stream:
+            self._position += 1
+            yield frame
+
+
+class PartProcessor:
+    """Processes the frames of one part in order, a chunk at a time."""
+
+    def __init__(self, reel: Reel, part: Part, means: Means, done: int) -> None:
+        """Pass over the first `done` frames of the part."""
+        self._path, self._part, self._means = reel.path, part, means
+        begin = done - _LEAD_IN if done >= _LEAD_IN else 0
+        left = part.timesteps - begin
+        self._stream = itertools.islice(reel.from_frame(part.start + begin), left)
+        self._recent: deque[tuple[int, np.ndarray]] = deque(maxlen=_LEAD_IN)
+        """Timestep and picture of what came before; before the first frame, the next ones backwards."""
+        if begin == 0:
+            ahead = [self._cropped(frame) for frame in itertools.islice(self._stream, _LEAD_IN + 1)]
+            self._recent.extend((index, image) for index, (_, image) in reversed(list(enumerate(ahead))[1:]))
+            self._pictures = itertools.chain(ahead, map(self._cropped, self._stream))
+        else:
+            self._pictures = map(self._cropped, self._stream)
+        before = itertools.islice(self._pictures, done - begin)
+        self._recent.extend((begin + index, image) for index, (_, image) in enumerate(before))
 
     def process(self, start: int, count: int, writer: FrameWriter, advance: Advance) -> Chunk:
-        """The next `count` frames, the first of which is number `start`."""
-        several_faces = bool(self._survey.crowded[0])
+        """The next `count` frames, the first of which is the part's timestep `start`."""
+        part = self._part
         landmarks = np.full((count, LANDMARKS, 2), np.nan, np.float32)
+        quality = np.full((count, 3), np.nan, np.float32)
+        done = 0
         with ExitStack() as stack:
-            detector = stack.enter_context(LandmarkDetector(several_faces))
-            segmenter = stack.enter_context(Segmenter())
-            for image in self._recent:
-                detector.detect(image)
-                segmenter.segment(image)
-            done = 0
-            for index, image in enumerate(itertools.islice(self._stream, count)):
-                found = detector.detect(image, self._face_centre(start + index) if several_faces else None)
+            follower = None
+            if self._means.landmarks is None:
+                detector = stack.enter_context(LandmarkDetector(bool(part.person.crowded.any())))
+                follower = LandmarkFollower(detector, part.survey, part.person, part.crop)
+            matting = choose_matting(stack, part.crop, self._means.plate, self._means.mattes)
+            for timestep, image in self._recent:
+                if follower is not None:
+                    follower.find(timestep, image)
+                matting.look(image)
+            for index, (number, image) in enumerate(itertools.islice(self._pictures, count)):
+                timestep = start + index
+                found = self._given(timestep, number) if follower is None else follower.find(timestep, image)
                 if found is not None:
                     landmarks[index] = found
-                writer.submit(start + index, partial(_picture_and_matte, image, segmenter.segment(image)))
-                self._recent.append(image)
+                make = partial(_finish, image, matting.prepare(number, image), landmarks[index], quality[index])
+                writer.submit(timestep, make)
+                self._recent.append((timestep, image))
                 advance()
                 done += 1
             writer.flush()
         if done < count:
             raise UserError(f"{self._path}: gave fewer frames when it was read again; is it still being written?")
         span = slice(start, start + count)
-        return Chunk(
-            landmarks=landmarks,
-            valid=np.isfinite(landmarks[:, 0, 0]),
-            frame_digests=writer.digests[FRAMES][span],
-            matte_digests=writer.digests[MATTES][span],
-        )
+        return Chunk(landmarks, quality, writer.digests[FRAMES][span], writer.digests[MATTES][span])
 
-    def _face_centre(self, timestep: int) -> Float[np.ndarray, " 2"] | None:
-        """Where the survey saw the followed face, in pixels of the crop."""
-        left, top, right, bottom = self._survey.boxes[timestep]
-        centre = np.array([(left + right) / 2, (top + bottom) / 2])
-        return self._crop.to_output(centre * self._survey.picture_size) if np.isfinite(centre).all() else None
+    def _cropped(self, frame: SourceFrame) -> tuple[int, np.ndarray]:
+        return frame.number, self._part.crop.apply(frame.picture())
+
+    def _given(self, timestep: int, number: int) -> Float[np.ndarray, "l 2"] | None:
+        """The landmarks that the user gave, where the followed person is seen."""
+        assert self._means.landmarks is not None
+        return self._part.crop.to_output(self._means.landmarks[number]) if self._part.person.seen[timestep] else None
 
 
-def process_frames(frames: FrameSource, survey: Survey, crop: Crop, layout: FrameLayout, memory: Path) -> list[Chunk]:
-    """Process all frames; chunks whose results an earlier, interrupted call left in the folder `memory` are kept.
+def process_part(reel: Reel, part: Part, means: Means, layout: FrameLayout, memory: Path) -> list[Chunk]:
+    """Process all frames of a part; chunks that an earlier, interrupted call left in the folder `memory` are kept.
 
     Raises:
         UserError: the source cannot be decoded.
@@ -103,10 +167,10 @@ def process_frames(frames: FrameSource, survey: Survey, crop: Crop, layout: Fram
     paths = {start: memory / f"{start:06d}.safetensors" for start in range(0, layout.timesteps, _CHUNK)}
     chunks = [Chunk(**read_arrays(path)) for path in itertools.takewhile(Path.exists, paths.values())]
     done = sum(len(chunk.valid) for chunk in chunks)
-    processor = FrameProcessor(frames, survey, crop)
-    title = f"capture {frames.path.name}"
-    with FrameWriter(layout) as writer, progress_bar(title, layout.timesteps, done) as advance:
-        processor.skip(done)
+    if done == layout.timesteps:
+        return chunks
+    processor = PartProcessor(reel, part, means, done)
+    with FrameWriter(layout) as writer, progress_bar(f"capture {part.name}", layout.timesteps, done) as advance:
         for start, path in itertools.islice(paths.items(), len(chunks), None):
             chunk = processor.process(start, min(_CHUNK, layout.timesteps - start), writer, advance)
             write_arrays(path, vars(chunk))
@@ -114,5 +178,10 @@ def process_frames(frames: FrameSource, survey: Survey, crop: Crop, layout: Fram
     return chunks
 
 
-def _picture_and_matte(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return image[None], refine_matte(image, mask)[None]
+def _finish(
+    image: np.ndarray, make_matte: MakeMatte, landmarks: np.ndarray, quality: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Picture and matte for the disk; writes into `quality` what the picture is worth."""
+    if np.isfinite(landmarks[0, 0]):
+        quality[:] = measure_face(image, landmarks)
+    return image[None], make_matte()[None]

@@ -2,15 +2,17 @@
 
 import hashlib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.capture.video import probe_video, read_video_frames
+from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.errors import UserError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
@@ -28,6 +30,17 @@ class FrameSelection:
     """Stop after so many frames; 0 takes all."""
 
 
+class SourceFrame(NamedTuple):
+    """A frame that was taken."""
+
+    number: int
+    """Of the frame in the source, from 0, with those that the selection leaves out."""
+    seconds: float
+    """From the first frame taken."""
+    picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
+    """Makes the sRGB picture; the costly part, so ask only for what is needed."""
+
+
 @dataclass(frozen=True)
 class FrameSource:
     """A video file or a folder of images that can be read as often as needed, a frame at a time."""
@@ -40,9 +53,11 @@ class FrameSource:
     """For progress bars; only reading tells the true number."""
     content_hash: str
     """Of the file, or of the names and contents of all images."""
+    hdr: str = ""
+    """PQ, HLG, or empty for ordinary pictures."""
 
-    def frames(self, longest_side: int = 0) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
-        """Times in seconds from the first frame taken, and pictures, shrunk to `longest_side` pixels unless that is 0.
+    def frames(self, longest_side: int = 0) -> Iterator[SourceFrame]:
+        """The frames taken; pictures are shrunk to `longest_side` pixels unless that is 0.
 
         Raises:
             UserError: something cannot be decoded, or the selection leaves no frame.
@@ -50,22 +65,31 @@ class FrameSource:
         if self.path.is_dir():
             everything = _read_images(self.path, self.fps * self.selection.stride, longest_side)
         else:
-            everything = read_video_frames(self.path, longest_side)
-        taken, first = 0, 0.0
-        candidates = 0
-        for seconds, image in everything:
+            everything = read_lazily(self.path, longest_side)
+        taken, candidates, first = 0, 0, 0.0
+        for number, (seconds, picture) in enumerate(everything):
             if seconds < self.selection.start - 1e-6:
                 continue
             candidates += 1
             if (candidates - 1) % self.selection.stride:
                 continue
             first = seconds if taken == 0 else first
-            yield seconds - first, image
+            yield SourceFrame(number, seconds - first, picture)
             taken += 1
             if taken == self.selection.max_frames:
                 break
         if taken == 0:
-            raise UserError(f"{self.path}: has no frame after {self.selection.start:g} s; choose an earlier start")
+            raise UserError(
+                f"{self.path}: has no frame after {self.selection.start:g} s; choose an earlier --capture.start"
+            )
+
+    def count(self) -> int:
+        """The number of frames in the source, with those that the selection leaves out.
+
+        Raises:
+            UserError: the source is damaged.
+        """
+        return len(list_images(self.path)) if self.path.is_dir() else count_frames(self.path)
 
 
 def open_source(path: Path, selection: FrameSelection, fps: float) -> FrameSource:
@@ -79,23 +103,20 @@ def open_source(path: Path, selection: FrameSelection, fps: float) -> FrameSourc
     Raises:
         UserError: the source is missing, is no video, or holds no images.
     """
-    if selection.stride < 1 or selection.max_frames < 0 or selection.start < 0:
-        raise UserError(f"{selection}: start and max_frames must not be negative, and stride must be at least 1")
+    hdr = ""
     if path.is_dir():
-        if not fps > 0:
-            raise UserError(f"{fps} frames a second for {path}: must be above 0")
         images = list_images(path)
         total = len(images)
         content_hash = _hash_files(images, with_names=True)
     else:
         info = probe_video(path)
-        fps, total = info.fps, info.frames
+        fps, total, hdr = info.fps, info.frames, info.hdr
         content_hash = _hash_files([path], with_names=False)
     remaining = max(0, total - round(selection.start * fps))
     expected = -(-remaining // selection.stride)
     if selection.max_frames:
         expected = min(expected, selection.max_frames) if total else selection.max_frames
-    return FrameSource(path, selection, fps / selection.stride, expected, content_hash)
+    return FrameSource(path, selection, fps / selection.stride, expected, content_hash, hdr)
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -131,9 +152,11 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     return image.astype(np.uint8, copy=False)
 
 
-def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[tuple[float, np.ndarray]]:
+def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[LazyFrame]:
     shape: tuple[int, ...] | None = None
-    for index, path in enumerate(list_images(folder)):
+
+    def read(path: Path) -> np.ndarray:
+        nonlocal shape
         image = read_image(path)
         shape = shape or image.shape
         if image.shape != shape:
@@ -141,7 +164,10 @@ def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[tuple[
                 f"{path}: is {image.shape[1]}x{image.shape[0]}, the images before it are {shape[1]}x{shape[0]}; "
                 "give images of one size"
             )
-        yield index / fps, shrink_to(image, longest_side) if longest_side else image
+        return shrink_to(image, longest_side) if longest_side else image
+
+    for index, path in enumerate(list_images(folder)):
+        yield LazyFrame(index / fps, partial(read, path))
 
 
 def shrink_to(image: UInt8[np.ndarray, "h w 3"], longest_side: int) -> UInt8[np.ndarray, "h2 w2 3"]:

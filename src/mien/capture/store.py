@@ -15,6 +15,7 @@ from mien.camera import Camera
 from mien.capture.cache import map_frames, stamp_cache
 from mien.capture.capture import Capture
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, FrameLayout, FrameWriter
+from mien.capture.quality import FrameQuality
 from mien.errors import UserError
 from mien.progress import progress_bar
 from mien.storage import read_arrays, read_json, write_arrays, write_json
@@ -34,6 +35,9 @@ _ARRAYS = {
 """Axes and type of every array in the safetensors file."""
 _CALIBRATION_ARRAYS = {"K": ("c33", np.float64), "viewmat": ("c44", np.float64)}
 """Also there where the cameras are calibrated."""
+_QUALITY_ARRAYS = {"sharpness": ("tc", np.float32), "brightness": ("tc", np.float32), "clipped": ("tc", np.float32)}
+"""Also there where the faces were measured."""
+_OPTIONAL_ARRAYS = (_CALIBRATION_ARRAYS, _QUALITY_ARRAYS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +53,7 @@ class CaptureData:
     principal_point: Float[np.ndarray, "c 2"]
     source: dict[str, Any]
     calibration: tuple[Camera, ...] | None = None
+    quality: FrameQuality | None = None
 
 
 def write_capture(path: Path, capture: Capture) -> str:
@@ -78,6 +83,7 @@ def write_capture(path: Path, capture: Capture) -> str:
             principal_point=capture.principal_point,
             source=capture.source,
             calibration=capture.calibration,
+            quality=capture.quality,
         )
         return finish_capture(layout, path, data, writer.digests)
     except OSError as error:
@@ -109,6 +115,7 @@ def read_capture(path: Path) -> Capture:
         principal_point=data.principal_point,
         source=data.source,
         calibration=data.calibration,
+        quality=data.quality,
     )
 
 
@@ -190,7 +197,9 @@ def _arrays(data: CaptureData, digests: dict[str, np.ndarray]) -> dict[str, np.n
     if data.calibration is not None:
         arrays["K"] = np.stack([camera.K.numpy() for camera in data.calibration])
         arrays["viewmat"] = np.stack([camera.viewmat.numpy() for camera in data.calibration])
-    dtypes = _ARRAYS | _CALIBRATION_ARRAYS
+    if data.quality is not None:
+        arrays |= {name: getattr(data.quality, name) for name in _QUALITY_ARRAYS}
+    dtypes = _ARRAYS | _CALIBRATION_ARRAYS | _QUALITY_ARRAYS
     return {name: array.astype(dtypes[name][1]) for name, array in arrays.items()}
 
 
@@ -227,6 +236,7 @@ def _checked(
         principal_point=arrays["principal_point"],
         source=source,
         calibration=_calibration(path / ARRAYS_NAME, arrays, width, height),
+        quality=FrameQuality(*(arrays[name] for name in _QUALITY_ARRAYS)) if "sharpness" in arrays else None,
     )
     layout = FrameLayout(path, data.camera_ids, timesteps, height, width)
     return layout, data, {FRAMES: arrays["frame_digests"], MATTES: arrays["matte_digests"]}
@@ -254,8 +264,10 @@ def is_file_name(name: object) -> bool:
 def _check_arrays(path: Path, arrays: dict[str, np.ndarray], timesteps: int, cameras: int) -> None:
     landmarks = arrays["landmarks"].shape[2] if "landmarks" in arrays and arrays["landmarks"].ndim == 4 else 0
     sizes = {"t": timesteps, "c": cameras, "l": landmarks, "2": 2, "3": 3, "4": 4}
-    calibrated = _CALIBRATION_ARRAYS if arrays.keys() & _CALIBRATION_ARRAYS.keys() else {}
-    for name, (axes, dtype) in (_ARRAYS | calibrated).items():
+    wanted = dict(_ARRAYS)
+    for optional in _OPTIONAL_ARRAYS:
+        wanted |= optional if arrays.keys() & optional.keys() else {}
+    for name, (axes, dtype) in wanted.items():
         expected = tuple(sizes[axis] for axis in axes)
         if name not in arrays or arrays[name].shape != expected or arrays[name].dtype != dtype:
             found = f"{arrays[name].dtype} {arrays[name].shape}" if name in arrays else "missing"

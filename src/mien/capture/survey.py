@@ -1,71 +1,145 @@
-"""The first pass over a source: where the followed face is in every frame, and how many frames there are."""
+"""The first pass over a source: all faces in every frame, and a thumbnail in which cuts are found."""
 
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64, UInt8
 
-from mien.capture.faces import FaceFinder, FaceFollower
-from mien.capture.source import FrameSource
-from mien.errors import UserError
-from mien.progress import progress_bar, say
+from mien.capture.faces import FaceFinder
+from mien.capture.source import FrameSource, SourceFrame
+from mien.progress import Advance, progress_bar
 from mien.storage import read_arrays, write_arrays
 
+MOST_FACES = 4
+"""The largest so many faces of a frame are looked at."""
 _SURVEY_SIZE = 512
 """Longest side, pixels, of the pictures in which faces are searched: the detectors see 192 pixels at most."""
+_CHUNK = 1000
+"""Frames after which progress is kept."""
+_THUMBNAIL = (32, 18)
+"""Width and height, pixels, whatever the picture's shape."""
+_LOOK = 3
+"""A face's look is its mean colours on a grid of so many cells a side."""
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What the first pass found."""
+    """What the first pass found, in some or all frames."""
 
+    numbers: Int64[np.ndarray, " t"]
+    """Of the frames in the source."""
     timestamps: Float[np.ndarray, " t"]
-    """Seconds from the first frame."""
-    boxes: Float[np.ndarray, "t 4"]
-    """Left, top, right, bottom of the followed face as fractions of the picture; NaN where there is none."""
-    picture_size: Float[np.ndarray, " 2"]
+    """Seconds from the first frame taken."""
+    boxes: Float[np.ndarray, "t f 4"]
+    """Left, top, right, bottom of the faces as fractions of the picture, largest first; NaN where there are fewer."""
+    looks: Float[np.ndarray, "t f p"]
+    """Mean colours of each face, 0..1."""
+    thumbnails: UInt8[np.ndarray, "t h w 3"]
+    picture_size: Int64[np.ndarray, " 2"]
     """Width and height of the source, pixels."""
-    crowded: Float[np.ndarray, " 1"]
-    """The number of frames with several faces."""
 
 
-def survey_faces(frames: FrameSource, memory: Path) -> Survey:
-    """Look at all frames, or read from the file `memory` what an earlier call saw.
+def survey_source(frames: FrameSource, memory: Path, landmarks: Float[np.ndarray, "n l 2"] | None = None) -> Survey:
+    """Look at all frames; what an earlier call left in the folder `memory` is kept.
+
+    Args:
+        frames: the source.
+        memory: a folder for the results.
+        landmarks: where they are known for every frame of the source, faces are not searched; pixels, NaN for no face.
 
     Raises:
-        UserError: the source cannot be decoded, or shows no face.
+        UserError: the source cannot be decoded.
     """
-    if memory.exists():
-        return Survey(**read_arrays(memory))
-    timestamps: list[float] = []
-    boxes: list[np.ndarray] = []
-    follower = FaceFollower()
-    first_frame = next(frames.frames())[1]
+    memory.mkdir(parents=True, exist_ok=True)
+    whole, done = memory / "survey.safetensors", []
+    if whole.is_file():
+        return Survey(**read_arrays(whole))
+    for path in itertools.takewhile(Path.exists, (_chunk_path(memory, index) for index in itertools.count())):
+        done.append(Survey(**read_arrays(path)))
+    first = next(frames.frames()).picture()
+    size = np.array([first.shape[1], first.shape[0]], np.int64)
+    stream = itertools.islice(frames.frames(_SURVEY_SIZE), len(done) * _CHUNK, None)
     title = f"find the face in {frames.path.name}"
-    with FaceFinder() as finder, progress_bar(title, frames.expected_frames) as advance:
-        for seconds, image in frames.frames(_SURVEY_SIZE):
-            box = follower.choose(finder.find(image), seconds)
-            boxes.append(np.full(4, np.nan) if box is None else box)
-            timestamps.append(seconds)
-            advance()
-    if np.isnan(boxes).all():
-        raise no_face(frames.path, len(boxes))
-    if follower.crowded:
-        say(
-            f"warning: {frames.path}: several faces in {follower.crowded} of {len(boxes)} frames; "
-            "the one that is largest at first is followed"
-        )
-    survey = Survey(
-        timestamps=np.array(timestamps),
-        boxes=np.array(boxes),
-        picture_size=np.array([first_frame.shape[1], first_frame.shape[0]], float),
-        crowded=np.array([follower.crowded], float),
-    )
-    write_arrays(memory, vars(survey))
+    with ExitStack() as stack:
+        find = _search(stack.enter_context(FaceFinder())) if landmarks is None else _look_up(landmarks / size)
+        advance = stack.enter_context(progress_bar(title, frames.expected_frames, len(done) * _CHUNK))
+        while seen := _observe(itertools.islice(stream, _CHUNK), find, size, advance):
+            write_arrays(_chunk_path(memory, len(done)), vars(seen))
+            done.append(seen)
+    survey = _join(done)
+    write_arrays(whole, vars(survey))
+    for index in range(len(done)):
+        _chunk_path(memory, index).unlink()
     return survey
 
 
-def no_face(path: Path, frames: int) -> UserError:
-    """What to tell when nobody is seen."""
-    return UserError(f"{path}: no face found in any of its {frames} frames; give a video in which one is seen clearly")
+def slice_survey(survey: Survey, span: slice) -> Survey:
+    """Some consecutive frames; times stay those of the whole."""
+    parts = {field.name: getattr(survey, field.name)[span] for field in fields(survey) if field.name != "picture_size"}
+    return Survey(**parts, picture_size=survey.picture_size)
+
+
+_Find = Callable[[int, np.ndarray], np.ndarray]
+"""The boxes [n, 4] of the faces in a frame, by its number and its picture."""
+
+
+def _search(finder: FaceFinder) -> _Find:
+    return lambda number, image: finder.find(image)
+
+
+def _look_up(landmarks: Float[np.ndarray, "n l 2"]) -> _Find:
+    """Boxes around landmarks that are given as fractions of the picture."""
+
+    def find(number: int, image: np.ndarray) -> np.ndarray:
+        face = landmarks[number]
+        return (
+            np.concatenate([face.min(axis=0), face.max(axis=0)])[None] if np.isfinite(face).all() else np.zeros((0, 4))
+        )
+
+    return find
+
+
+def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advance: Advance) -> Survey | None:
+    """What is seen in the frames of a stream; none if it is at its end."""
+    rows: list[tuple[int, float, np.ndarray, np.ndarray, np.ndarray]] = []
+    for frame in stream:
+        image = frame.picture()
+        found = find(frame.number, image)
+        largest = np.argsort(-np.prod(found[:, 2:] - found[:, :2], axis=1))[:MOST_FACES]
+        boxes = np.full((MOST_FACES, 4), np.nan)
+        boxes[: len(largest)] = found[largest]
+        looks = np.stack([_look(image, box) for box in boxes])
+        thumbnail = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+        rows.append((frame.number, frame.seconds, boxes, looks, thumbnail))
+        advance()
+    if not rows:
+        return None
+    numbers, timestamps, boxes, looks, thumbnails = (np.array(column) for column in zip(*rows, strict=True))
+    return Survey(numbers.astype(np.int64), timestamps, boxes, looks, thumbnails, size)
+
+
+def _look(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:
+    """Mean colours of a face, NaN for none."""
+    if not np.isfinite(box).all():
+        return np.full(3 * _LOOK**2, np.nan)
+    height, width = image.shape[:2]
+    left, top, right, bottom = np.clip(box * [width, height, width, height], 0, [width, height, width, height])
+    # A box at the border, or a false one, may have no pixel inside.
+    left, top = min(int(left), width - 1), min(int(top), height - 1)
+    part = image[top : max(int(bottom), top + 1), left : max(int(right), left + 1)]
+    return cv2.resize(part, (_LOOK, _LOOK), interpolation=cv2.INTER_AREA).ravel() / 255.0
+
+
+def _chunk_path(memory: Path, index: int) -> Path:
+    return memory / f"survey-{index:04d}.safetensors"
+
+
+def _join(chunks: list[Survey]) -> Survey:
+    names = [field.name for field in fields(Survey) if field.name != "picture_size"]
+    joined = {name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in names}
+    return Survey(**joined, picture_size=chunks[0].picture_size)

@@ -1,32 +1,29 @@
 """Video files in and out, one frame at a time (PyAV; no system ffmpeg)."""
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import av
 import av.error
 import numpy as np
 from av.container import InputContainer
-from av.sidedata.sidedata import Type as SideDataType
-from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
+from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
+from mien.capture.display import ACCURATE, Display
+from mien.capture.tone import HLG, PQ
 from mien.errors import UserError
 from mien.progress import say
 from mien.storage import write_atomically
 
 _THREADS = 2
-_ACCURATE = Interpolation.BICUBIC | Interpolation.FULL_CHR_H_INT | Interpolation.ACCURATE_RND
-"""Without accurate rounding swscale is five times faster, but darkens pictures by a whole level."""
-_SHRINKING = Interpolation.AREA | Interpolation.ACCURATE_RND
-_UNSPECIFIED_COLORSPACE = 2
-_HIGH_DEFINITION_HEIGHT = 720
 _DEFAULT_FPS = 25.0
 
 
@@ -38,10 +35,21 @@ class VideoInfo:
     """Average frames a second."""
     frames: int
     """How many frames to expect; 0 where the file does not say."""
+    hdr: str
+    """PQ, HLG, or empty for ordinary video."""
+
+
+class LazyFrame(NamedTuple):
+    """A frame that was read; its picture is made only when asked for."""
+
+    seconds: float
+    """From the first frame."""
+    picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
+    """Makes the sRGB picture."""
 
 
 def probe_video(path: Path) -> VideoInfo:
-    """The frame rate and the expected number of frames.
+    """The frame rate, the expected number of frames, and whether it is HDR.
 
     Raises:
         UserError: the file is missing or is no video.
@@ -52,13 +60,28 @@ def probe_video(path: Path) -> VideoInfo:
             seconds = float(stream.duration * stream.time_base)
         else:
             seconds = (container.duration or 0) / av.time_base
-        return VideoInfo(fps, stream.frames or round(seconds * fps))
+        hdr = {PQ: "PQ", HLG: "HLG"}.get(int(stream.codec_context.color_trc), "")
+        return VideoInfo(fps, stream.frames or round(seconds * fps), hdr)
+
+
+def count_frames(path: Path) -> int:
+    """The number of frames in a video, by reading its packets without decoding them.
+
+    Raises:
+        UserError: the file is missing or is no video.
+    """
+    with _open_video(path) as (container, stream):
+        try:
+            return sum(packet.size > 0 for packet in container.demux(stream))
+        except av.error.FFmpegError as error:
+            raise UserError(f"{path}: is damaged ({error.strerror or error}); copy or record it again") from None
 
 
 def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
     """Every frame in the order of display: its time in seconds from the first frame, and its sRGB picture.
 
-    The file's rotation and mirror flags are applied. Damaged parts are skipped with a warning.
+    The file's rotation and mirror flags and its pixel aspect are applied; HDR is tone-mapped (`mien.capture.tone`).
+    Damaged parts are skipped with a warning.
 
     Args:
         path: of the video.
@@ -67,13 +90,20 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
     Raises:
         UserError: the file is missing, is no video, or no frame of it can be decoded.
     """
+    for frame in read_lazily(path, longest_side):
+        yield frame.seconds, frame.picture()
+
+
+def read_lazily(path: Path, longest_side: int = 0) -> Iterator[LazyFrame]:
+    """As `read_video_frames`, but pictures that nobody asks for are not converted, which is most of the work."""
     with _open_video(path) as (container, stream):
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = _THREADS
         interval = 1.0 / float(stream.average_rate or stream.guessed_rate or _DEFAULT_FPS)
         first: float | None = None
         latest = -interval
-        reformatter = VideoReformatter()
+        aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
+        display = Display(str(path), float(aspect) if aspect else 1.0, longest_side)
         for frame in _decode(path, container, stream):
             if frame.pts is None or frame.time_base is None:
                 seconds = latest + interval
@@ -83,7 +113,7 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
                 seconds = absolute - first
             # Times must increase for everything that differentiates over time; broken files repeat them.
             latest = seconds if seconds > latest else latest + interval
-            yield latest, _to_rgb(frame, reformatter, longest_side)
+            yield LazyFrame(latest, partial(display.show, frame))
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], fps: int | float, crf: int = 18) -> None:
@@ -128,7 +158,7 @@ def _encode(path: Path, frames: Iterable[np.ndarray], shape: tuple[int, ...], fp
                 format="yuv420p",
                 dst_colorspace=Colorspace.ITU709,
                 dst_color_range=ColorRange.MPEG,
-                interpolation=_ACCURATE,
+                interpolation=ACCURATE,
             )
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
@@ -178,35 +208,3 @@ def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Itera
         raise UserError(f"{path}: no frame of the video can be decoded; convert it to H.264 or record it again")
     if damaged:
         say(f"warning: {path}: {damaged} damaged parts of the video were skipped")
-
-
-def _to_rgb(frame: av.VideoFrame, reformatter: VideoReformatter, longest_side: int) -> UInt8[np.ndarray, "h w 3"]:
-    colorspace = frame.colorspace
-    if colorspace == _UNSPECIFIED_COLORSPACE:
-        # Files that do not say follow the custom of players: BT.709 from 720 lines up, BT.601 below.
-        colorspace = Colorspace.ITU709 if frame.height >= _HIGH_DEFINITION_HEIGHT else Colorspace.ITU601
-    scale = min(1.0, longest_side / max(frame.width, frame.height)) if longest_side else 1.0
-    converted = reformatter.reformat(
-        frame,
-        width=max(1, round(frame.width * scale)),
-        height=max(1, round(frame.height * scale)),
-        format="rgb24",
-        src_colorspace=colorspace,
-        interpolation=_ACCURATE if scale == 1.0 else _SHRINKING,
-    )
-    return _apply_display_matrix(converted.to_ndarray(), frame)
-
-
-def _apply_display_matrix(image: np.ndarray, frame: av.VideoFrame) -> np.ndarray:
-    """Rotate and mirror by the display matrix: x' = a x + c y, y' = b x + d y with entries of -1, 0, 1."""
-    side_data: Any = frame.side_data  # PyAV's stub types its keys as strings
-    data = side_data.get(SideDataType.DISPLAYMATRIX)
-    if data is None:
-        return image
-    a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
-    if abs(b) > abs(a):
-        image = image.swapaxes(0, 1)
-        flip_x, flip_y = c < 0, b < 0
-    else:
-        flip_x, flip_y = a < 0, d < 0
-    return np.ascontiguousarray(image[:: -1 if flip_y else 1, :: -1 if flip_x else 1])

@@ -12,7 +12,7 @@ from mien.workspace import Workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Turn a video into frames, mattes and landmarks: OUT/sequences/NAME/capture."""
+    """Turn a video into frames, mattes and landmarks: OUT/sequences/NAME/capture (NAME-1, NAME-2 if it cuts)."""
 
     video: Annotated[Path, tyro.conf.Positional]
     """A video file, or a folder of pictures in order."""
@@ -20,10 +20,12 @@ class Command:
     """Workspace folder (one subject)."""
     name: str | None = None
     """Name of the sequence (default: the video's name)."""
+    replace: bool = False
+    """Whether a sequence of that name may be replaced that was made from another video."""
     settings: Annotated[CaptureSettings, tyro.conf.arg(name="capture")] = field(default_factory=CaptureSettings)
 
     def run(self) -> None:
         """Capture and say what was found."""
         from mien.commands.stages import capture_stage
 
-        capture_stage(Workspace(self.out), self.video, self.name, self.settings)
+        capture_stage(Workspace(self.out), self.video, self.name, self.settings, self.replace)

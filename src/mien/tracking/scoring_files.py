@@ -16,19 +16,32 @@ _FORMAT, _VERSION = "mien.scoring", 1
 _REMEDY = "delete the folder and run `mien track` again (scores before and after will not compare)"
 
 
-def scoring_exists(path: Path) -> bool:
-    """Whether the folder `path` holds a scoring already."""
-    return (path / "scoring.json").is_file()
+def scoring_exists(path: Path, capture_hash: str | None = None) -> bool:
+    """Whether the folder `path` holds a scoring already: any, or one of the capture with this hash."""
+    file = path / "scoring.json"
+    if capture_hash is None or not file.is_file():
+        return file.is_file()
+    # Scorings of the first release do not say; they were removed whenever their capture changed.
+    return read_json(file, _FORMAT, _VERSION).get("capture_hash", capture_hash) == capture_hash
 
 
-def write_scoring(path: Path, scoring: Scoring) -> None:
-    """Write a scoring as the folder `path`, all or nothing. One that is there already stays as it is."""
-    if scoring_exists(path):
+def write_scoring(path: Path, scoring: Scoring, capture_hash: str | None = None) -> None:
+    """Write a scoring as the folder `path`, all or nothing. One of the same capture that is there stays as it is.
+
+    Args:
+        path: of the folder.
+        scoring: what to write.
+        capture_hash: of the capture that it belongs to.
+
+    Raises:
+        UserError: there is a scoring that cannot be read.
+    """
+    if scoring_exists(path, capture_hash):
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:
-        _write_into(temporary, scoring)
+        _write_into(temporary, scoring, capture_hash)
         temporary.chmod(0o755)
         shutil.rmtree(path, ignore_errors=True)
         temporary.rename(path)
@@ -59,7 +72,7 @@ def read_scoring(path: Path) -> Scoring:
     return Scoring(masks, crops.astype(np.int64))
 
 
-def _write_into(folder: Path, scoring: Scoring) -> None:
+def _write_into(folder: Path, scoring: Scoring, capture_hash: str | None) -> None:
     timesteps, cameras, height, width = scoring.masks.shape
     for timestep, camera in np.ndindex(timesteps, cameras):
         file = _mask_file(folder, timestep, camera)
@@ -70,7 +83,9 @@ def _write_into(folder: Path, scoring: Scoring) -> None:
     crops = scoring.crops.astype(np.int32)
     write_arrays(folder / "crops.safetensors", {"crops": crops})
     size = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width}
-    write_json(folder / "scoring.json", _FORMAT, _VERSION, {**size, "sha256": _digest(scoring.masks, crops)})
+    origin = {} if capture_hash is None else {"capture_hash": capture_hash}
+    digest = _digest(scoring.masks, crops)
+    write_json(folder / "scoring.json", _FORMAT, _VERSION, {**size, **origin, "sha256": digest})
 
 
 def _read_mask(file: Path, shape: tuple[int, ...]) -> np.ndarray:

@@ -30,7 +30,8 @@ def tracking_stage(
     """Track a sequence, write the overlay and, once for ever, the scoring mask; a current tracking is read back."""
     folder = workspace.sequence_dir(name)
     face_model = load_face_model(face_model_name)
-    fingerprint = _tracking_fingerprint(read_capture_hash(folder / "capture"), face_model, settings)
+    capture_hash = read_capture_hash(folder / "capture")
+    fingerprint = _tracking_fingerprint(capture_hash, face_model, settings)
     tracking = None if again else _current_tracking(folder / "tracking", fingerprint)
     if tracking is None:
         capture = read_capture(folder / "capture")
@@ -38,9 +39,11 @@ def tracking_stage(
         tracking = replace(tracking, settings={**tracking.settings, "fingerprint": fingerprint})
         write_tracking(folder / "tracking", tracking)
         say(f"{name}: tracked with a median landmark residual of {tracking.residuals.nanmedian():.2f} pixels")
-    if not scoring_exists(folder / "scoring"):
+    if not scoring_exists(folder / "scoring", capture_hash):
+        if scoring_exists(folder / "scoring"):
+            say(f"{name}: the pictures changed, so the scoring mask is made anew")
         capture = read_capture(folder / "capture")
-        write_scoring(folder / "scoring", make_scoring(capture, tracking, face_model))
+        write_scoring(folder / "scoring", make_scoring(capture, tracking, face_model), capture_hash)
     _show_tracking(folder, tracking, face_model)
     return tracking
 

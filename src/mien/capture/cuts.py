@@ -1,0 +1,48 @@
+"""Where a video cuts to another shot, seen in thumbnails."""
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+_REACH = 3
+"""Frames on either side that a cut keeps apart: a flash does not, for the picture before it comes back."""
+_NEIGHBOURS = 4
+"""Frames on either side in which the picture may change only a little: where it moves, it moves for a while."""
+_SMALLEST = 0.05
+"""Change at a cut at least, as a fraction of the mean brightness."""
+_CONTRAST = 3.0
+"""How much more the picture changes at a cut than beside it."""
+_BLOCKS = (3, 4)
+"""Rows and columns of blocks; the change is that of the quarter of them that changes most, as the head may be small."""
+
+
+def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"]) -> list[int]:
+    """Numbers of the frames that begin a new shot; 0 is not among them.
+
+    A cut is a change that stands out from the changes beside it and that the next frames do not take back. Thumbnails
+    are compared after division by their mean, so that a light that is switched on makes no cut.
+    """
+    pictures = thumbnails.astype(np.float32)
+    pictures /= np.maximum(pictures.mean(axis=(1, 2, 3), keepdims=True), 1.0)
+    changes = np.array([_difference(*pair) for pair in zip(pictures[:-1], pictures[1:], strict=True)])
+    cuts = []
+    for index in np.flatnonzero(changes > _SMALLEST).tolist():
+        beside = np.concatenate([changes[max(index - _NEIGHBOURS, 0) : index], changes[index + 1 :][:_NEIGHBOURS]])
+        # The largest neighbour may be the other half of a cut over a blended frame.
+        loudest = np.sort(beside)[-2] if len(beside) > 1 else 0.0
+        if changes[index] > _CONTRAST * loudest and _parted(pictures, index + 1) > 0.5 * changes[index]:
+            cuts.append(index + 1)
+    return cuts
+
+
+def _parted(pictures: Float[np.ndarray, "t h w 3"], start: int) -> float:
+    """The smallest difference between a picture shortly before `start` and one shortly after."""
+    before, after = pictures[max(start - _REACH, 0) : start], pictures[start : start + _REACH]
+    return min(_difference(one, other) for one in before for other in after)
+
+
+def _difference(one: Float[np.ndarray, "h w 3"], other: Float[np.ndarray, "h w 3"]) -> float:
+    rows, columns = _BLOCKS
+    height, width = one.shape[0] // rows, one.shape[1] // columns
+    difference = np.abs(one - other).mean(axis=-1)[: rows * height, : columns * width]
+    blocks = np.sort(difference.reshape(rows, height, columns, width).mean(axis=(1, 3)).ravel())
+    return float(blocks[-(rows * columns // 4) :].mean())

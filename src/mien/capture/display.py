@@ -1,0 +1,108 @@
+"""A decoded video frame as an sRGB screen shows it: matrix and range, HDR, pixel aspect, rotation."""
+
+from typing import Any
+
+import av
+import numpy as np
+from av.sidedata.sidedata import Type as SideDataType
+from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
+from jaxtyping import UInt8
+
+from mien.capture.tone import HLG, PQ, ToneMapper
+from mien.errors import UserError
+
+ACCURATE = Interpolation.BICUBIC | Interpolation.FULL_CHR_H_INT | Interpolation.ACCURATE_RND
+"""Without accurate rounding swscale is five times faster, but darkens pictures by a whole level."""
+_SHRINKING = Interpolation.AREA | Interpolation.ACCURATE_RND
+_UNSPECIFIED_COLORSPACE = 2
+_HIGH_DEFINITION_HEIGHT = 720
+_ASPECT_TOLERANCE = 0.01
+
+
+class Display:
+    """Converts the frames of one clip, which all get the size of the first."""
+
+    def __init__(self, name: str, pixel_aspect: float = 1.0, longest_side: int = 0) -> None:
+        """For one clip.
+
+        Args:
+            name: of the clip, for messages.
+            pixel_aspect: width of a pixel over its height; frames are stretched, never shrunk, to square pixels.
+            longest_side: shrink larger pictures to this many pixels, area-averaged; 0 keeps the size.
+        """
+        self._name = name
+        self._pixel_aspect = pixel_aspect
+        self._longest_side = longest_side
+        self._reformatter = VideoReformatter()
+        self._tone_mappers: dict[int, ToneMapper] = {}
+        self._stored_size = (0, 0)
+        self._size = (0, 0)
+
+    def show(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
+        """The frame's sRGB picture.
+
+        Raises:
+            UserError: the frame's shape differs from that of the frames before.
+        """
+        self._fit(frame)
+        is_hdr = frame.color_trc in (PQ, HLG)
+        same_size = self._size == (frame.width, frame.height)
+        shrinks = self._size[0] < frame.width or self._size[1] < frame.height
+        converted = self._reformatter.reformat(
+            frame,
+            width=self._size[0],
+            height=self._size[1],
+            format="rgb48le" if is_hdr else "rgb24",
+            src_colorspace=_colorspace(frame, is_hdr),
+            interpolation=_SHRINKING if shrinks and not same_size else ACCURATE,
+        ).to_ndarray()
+        if is_hdr:
+            transfer = int(frame.color_trc)
+            mapper = self._tone_mappers.setdefault(transfer, ToneMapper(transfer))
+            converted = mapper.to_srgb(converted)
+        return _apply_display_matrix(converted, frame)
+
+    def _fit(self, frame: av.VideoFrame) -> None:
+        """Choose the size at the first frame; later ones may have another resolution, but no other shape."""
+        stored = (frame.width, frame.height)
+        if stored == self._stored_size:
+            return
+        if self._stored_size == (0, 0):
+            self._stored_size = stored
+            self._size = _display_size(*stored, self._pixel_aspect, self._longest_side)
+        elif abs(stored[0] / stored[1] / (self._stored_size[0] / self._stored_size[1]) - 1) > _ASPECT_TOLERANCE:
+            before = f"{self._stored_size[0]}x{self._stored_size[1]}"
+            raise UserError(
+                f"{self._name}: the picture changes from {before} to {stored[0]}x{stored[1]}; "
+                "cut the video there and capture each piece"
+            )
+
+
+def _display_size(width: int, height: int, pixel_aspect: float, longest_side: int) -> tuple[int, int]:
+    square = (width * max(1.0, pixel_aspect), height / min(1.0, pixel_aspect))
+    scale = min(1.0, longest_side / max(square)) if longest_side else 1.0
+    return max(1, round(square[0] * scale)), max(1, round(square[1] * scale))
+
+
+def _colorspace(frame: av.VideoFrame, is_hdr: bool) -> int:
+    if frame.colorspace != _UNSPECIFIED_COLORSPACE:
+        return frame.colorspace
+    if is_hdr:
+        return Colorspace.BT2020
+    # Files that do not say follow the custom of players: BT.709 from 720 lines up, BT.601 below.
+    return Colorspace.ITU709 if frame.height >= _HIGH_DEFINITION_HEIGHT else Colorspace.ITU601
+
+
+def _apply_display_matrix(image: np.ndarray, frame: av.VideoFrame) -> np.ndarray:
+    """Rotate and mirror by the display matrix: x' = a x + c y, y' = b x + d y with entries of -1, 0, 1."""
+    side_data: Any = frame.side_data  # PyAV's stub types its keys as strings
+    data = side_data.get(SideDataType.DISPLAYMATRIX)
+    if data is None:
+        return image
+    a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
+    if abs(b) > abs(a):
+        image = image.swapaxes(0, 1)
+        flip_x, flip_y = c < 0, b < 0
+    else:
+        flip_x, flip_y = a < 0, d < 0
+    return np.ascontiguousarray(image[:: -1 if flip_y else 1, :: -1 if flip_x else 1])

@@ -1,0 +1,137 @@
+"""Mattes and landmarks that were made elsewhere, checked against the source they belong to."""
+
+import csv
+import itertools
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mien.capture.crop import Crop, whole_picture
+from mien.capture.faces import LANDMARKS
+from mien.capture.source import FrameSelection, FrameSource, list_images, open_source
+from mien.errors import UserError
+from mien.storage import read_arrays
+
+
+def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]:
+    """Landmarks in pixels of the source's pictures as they are shown, a row for each frame; NaN for no face.
+
+    Args:
+        path: a .safetensors file with `landmarks` [n, 478, 2], or a .csv file with n lines of x0, y0, x1, y1, ...
+            (956 numbers; a line of names before them is passed over; empty or nan: no face).
+        source_frames: n.
+
+    Raises:
+        UserError: the file is missing, damaged, or has other sizes.
+    """
+    if path.suffix == ".safetensors":
+        landmarks = read_arrays(path).get("landmarks")
+        if landmarks is None:
+            raise UserError(f"{path}: has no array `landmarks`; write [{source_frames}, {LANDMARKS}, 2] pixels as that")
+    elif path.suffix == ".csv":
+        landmarks = _read_csv(path)
+    else:
+        raise UserError(f"--capture.landmarks {path}: cannot be read; give a .csv or .safetensors file")
+    expected = (source_frames, LANDMARKS, 2)
+    if landmarks.shape != expected:
+        raise UserError(
+            f"{path}: has landmarks of shape {list(landmarks.shape)}, expected {list(expected)}: "
+            "a row for each frame of the source"
+        )
+    landmarks = landmarks.astype(np.float64)
+    if np.isinf(landmarks).any():
+        raise UserError(f"{path}: has infinite numbers; write nan where there is no face")
+    landmarks[~np.isfinite(landmarks).all(axis=(1, 2))] = np.nan
+    return landmarks
+
+
+def _read_csv(path: Path) -> np.ndarray:
+    rows: list[list[float]] = []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            for number, line in enumerate(csv.reader(file), 1):
+                if number == 1 and any(_is_name(cell) for cell in line):
+                    continue
+                if len(line) not in (0, 2 * LANDMARKS):
+                    raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {2 * LANDMARKS}")
+                rows.append([_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{path}: cannot be read as csv ({error}); write it again") from None
+    return np.array(rows).reshape(len(rows), LANDMARKS, 2)
+
+
+def _is_name(cell: str) -> bool:
+    return cell.strip()[:1].isalpha() and cell.strip().lower() != "nan"
+
+
+def _number(path: Path, line: int, cell: str) -> float:
+    try:
+        return float(cell) if cell.strip() else np.nan
+    except ValueError:
+        raise UserError(f"{path}: line {line}: {cell!r} is no number; write pixels, or nan for no face") from None
+
+
+class GivenMattes:
+    """Mattes of a source's frames, read once, forwards."""
+
+    def __init__(self, path: Path, picture_size: tuple[int, int]) -> None:
+        self._path = path
+        self._size = picture_size
+        self._files = list_images(path) if path.is_dir() else None
+        whole = FrameSelection()
+        self._stream = iter(()) if self._files else open_source(path, whole, 25.0).frames()
+
+    def check(self, number: int) -> None:
+        """Look at one matte, to find mistakes before anything that takes long; nothing can be read afterwards.
+
+        Raises:
+            UserError: it is missing, damaged or of another size than the picture.
+        """
+        self.matte(number, whole_picture(*self._size, max(self._size)))
+
+    def matte(self, number: int, crop: Crop) -> UInt8[np.ndarray, "h w"]:
+        """The matte of the source's frame `number`, cropped as its picture is; numbers must grow.
+
+        Raises:
+            UserError: it is missing, damaged or of another size than the picture.
+        """
+        if self._files:
+            name, matte = self._files[number], _read_matte(self._files[number])
+        else:
+            frame = next(itertools.dropwhile(lambda frame: frame.number < number, self._stream), None)
+            if frame is None:
+                raise UserError(f"{self._path}: ends before its frame {number}; give a matte for each frame")
+            name, matte = self._path, frame.picture()[..., 1]
+        if matte.shape[::-1] != self._size:
+            raise UserError(
+                f"{name}: is {matte.shape[1]}x{matte.shape[0]}, the source's pictures are "
+                f"{self._size[0]}x{self._size[1]}; give mattes of that size"
+            )
+        return crop.apply(matte)
+
+
+def check_mattes(path: Path, source: FrameSource) -> None:
+    """Refuse mattes that are not as many as the source's frames.
+
+    Raises:
+        UserError: there are more or fewer.
+    """
+    found = open_source(path, FrameSelection(), 25.0).count()
+    expected = source.count()
+    if found != expected:
+        raise UserError(f"{path}: has {found} mattes, {source.path} has {expected} frames; give one for each frame")
+
+
+def _read_matte(path: Path) -> UInt8[np.ndarray, "h w"]:
+    """A grey picture, or the alpha channel of one that has it, 8 bit."""
+    try:
+        matte = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, cv2.error):
+        matte = None
+    if matte is None or matte.dtype not in (np.uint8, np.uint16):
+        raise UserError(f"{path}: cannot be read as a matte; write a grey picture of 8 or 16 bit")
+    if matte.ndim == 3:
+        matte = matte[..., 3 if matte.shape[2] == 4 else 1]
+    return np.ascontiguousarray(matte if matte.dtype == np.uint8 else (matte // 257).astype(np.uint8))

@@ -1,0 +1,115 @@
+"""The end of a capture: what was found in all frames, written down beside them."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mien.capture.faces import second_difference_jitter
+from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
+from mien.capture.parts import no_face
+from mien.capture.process import Chunk, Part
+from mien.capture.quality import quality_report, relative_quality
+from mien.capture.source import FrameSource
+from mien.capture.store import CaptureData, finish_capture
+from mien.progress import say
+
+CAMERA_ID = "0"
+_RATE_TOLERANCE = 0.01
+_VARIABLE_RATE = 1.5
+"""Longest over usual time between frames from which a clip's rate is called variable."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a part came from."""
+
+    frames: FrameSource
+    key: str
+    name: str
+    """Of the whole, of which there may be several parts."""
+    place: tuple[int, int]
+    """The part's number, from 1, and how many there are."""
+
+
+def finish_part(
+    layout: FrameLayout, out: Path, chunks: list[Chunk], part: Part, origin: Origin, scaffolding: tuple[str, ...]
+) -> None:
+    """Write what belongs beside the frames, remove the scaffolding (names in the folder), rename the folder to `out`.
+
+    Raises:
+        UserError: no face was found in any frame.
+    """
+    landmarks = np.concatenate([chunk.landmarks for chunk in chunks])
+    valid = np.concatenate([chunk.valid for chunk in chunks])
+    if not valid.any():
+        shutil.rmtree(layout.folder)
+        raise no_face(origin.frames.path, len(valid))
+    survey, crop = part.survey, part.crop
+    timestamps = survey.timestamps - survey.timestamps[0]
+    quality = relative_quality(np.concatenate([chunk.quality for chunk in chunks]))
+    data = CaptureData(
+        name=part.name,
+        camera_ids=layout.camera_ids,
+        fps=_frame_rate(timestamps, origin.frames.fps),
+        timestamps=timestamps,
+        landmarks=landmarks[:, None],
+        valid=valid[:, None],
+        principal_point=crop.to_output(survey.picture_size / 2)[None],
+        source={
+            "key": origin.key,
+            "file": origin.frames.path.name,
+            "content_hash": origin.frames.content_hash,
+            "picture_size": survey.picture_size.tolist(),
+            "crop": {"left": crop.left, "top": crop.top, "width": crop.crop_width, "height": crop.crop_height},
+            "first_frame": int(survey.numbers[0]),
+            "part": {"of": origin.name, "number": origin.place[0], "count": origin.place[1]},
+        },
+        quality=quality,
+    )
+    digests = {
+        FRAMES: np.concatenate([chunk.frame_digests for chunk in chunks]),
+        MATTES: np.concatenate([chunk.matte_digests for chunk in chunks]),
+    }
+    jitter = second_difference_jitter(landmarks)
+    report = {
+        "frames": len(valid),
+        "frames_without_face": int((~valid).sum()),
+        "frames_with_several_faces": int(part.person.crowded.sum()),
+        "landmark_jitter_px": jitter if np.isfinite(jitter) else None,
+        "hdr": origin.frames.hdr or None,
+        **_pace(part.name, timestamps),
+    }
+    if not valid.all():
+        say(f"{part.name}: no face in {report['frames_without_face']} of {len(valid)} frames; they are left out")
+    report |= quality_report(part.name, quality)
+    for name in scaffolding:
+        path = layout.folder / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    finish_capture(layout, out, data, digests, report)
+
+
+def _pace(name: str, timestamps: Float[np.ndarray, " t"]) -> dict[str, Any]:
+    """The time between frames, for the report; says when it varies."""
+    if len(timestamps) < 3:
+        return {"frame_interval_ms": None, "variable_frame_rate": False}
+    intervals = 1000 * np.diff(timestamps)
+    least, usual, most = (round(float(value), 2) for value in (intervals.min(), np.median(intervals), intervals.max()))
+    is_variable = most > _VARIABLE_RATE * usual or least * _VARIABLE_RATE < usual
+    if is_variable:
+        say(f"{name}: frames {least:g} to {most:g} ms apart (variable rate); all are kept, each with its own time")
+    return {
+        "frame_interval_ms": {"least": least, "median": usual, "most": most},
+        "variable_frame_rate": is_variable,
+    }
+
+
+def _frame_rate(timestamps: Float[np.ndarray, " t"], nominal: float) -> float:
+    """The rate that the file names, unless its times tell otherwise (variable frame rate, dropped frames)."""
+    if len(timestamps) < 2:
+        return nominal
+    measured = float((len(timestamps) - 1) / timestamps[-1])
+    return nominal if abs(measured - nominal) <= _RATE_TOLERANCE * nominal else measured

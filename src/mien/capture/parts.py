@@ -1,0 +1,114 @@
+"""Which parts of a video become captures: one a shot, each with its person and its crop."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mien.capture.crop import Crop, choose_crop, whole_picture
+from mien.capture.cuts import find_cuts
+from mien.capture.people import Person, choose_person
+from mien.capture.process import Part
+from mien.capture.settings import CaptureSettings
+from mien.capture.survey import Survey, slice_survey
+from mien.errors import UserError
+from mien.progress import say
+
+
+def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str) -> Part:
+    """Everything as one part; says where the video has cuts, unless the settings tell not to look for them.
+
+    Raises:
+        UserError: no face is seen.
+    """
+    cuts = find_cuts(survey.thumbnails) if settings.cuts else []
+    if cuts:
+        say(f"warning: {path}: cuts to another shot at {_times(survey, cuts)}; tracking may stumble there")
+    part = _part(survey, 0, settings, name)
+    if part is None:
+        raise no_face(path, len(survey.timestamps))
+    _tell_people(path, part)
+    return part
+
+
+def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str) -> list[Part]:
+    """A part for each shot that is long enough and shows a face: `name` if there is one, else `name`-1, `name`-2, ...
+
+    Raises:
+        UserError: there is no such shot.
+    """
+    cuts = find_cuts(survey.thumbnails) if settings.cuts else []
+    bounds = [0, *cuts, len(survey.timestamps)]
+    interval = float(np.median(np.diff(survey.timestamps))) if len(survey.timestamps) > 1 else 0.0
+    short, faceless, found = [], [], []
+    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+        seconds = float(survey.timestamps[stop - 1] - survey.timestamps[start]) + interval
+        # Half a frame of tolerance: 25 frames at 25 a second are a second.
+        if cuts and seconds < settings.shortest_part - interval / 2:
+            short.append(start)
+            continue
+        part = _part(slice_survey(survey, slice(start, stop)), start, settings, name)
+        faceless.append(start) if part is None else found.append(part)
+    if short:
+        least = f"{settings.shortest_part:g} s"
+        say(f"{path}: {len(short)} parts shorter than {least} are left out, at {_times(survey, short)}")
+    if not found and short:
+        raise UserError(
+            f"{path}: cuts {len(cuts)} times, and shows a face in no part of {settings.shortest_part:g} s or more; "
+            "give a smaller --capture.shortest-part, or --capture.no-cuts to take it as one"
+        )
+    if not found:
+        raise no_face(path, len(survey.timestamps))
+    if faceless:
+        say(f"{path}: {len(faceless)} parts without a face are left out, at {_times(survey, faceless)}")
+    parts = _named(found, name)
+    if cuts:
+        say(f"{path}: cuts to another shot at {_times(survey, cuts)}: {', '.join(part.name for part in parts)}")
+    for part in parts:
+        _tell_people(path, part)
+    return parts
+
+
+def no_face(path: Path, frames: int) -> UserError:
+    """What to tell when nobody is seen."""
+    return UserError(f"{path}: no face found in any of its {frames} frames; give a video in which one is seen clearly")
+
+
+def _named(parts: list[Part], name: str) -> list[Part]:
+    if len(parts) == 1:
+        return parts
+    return [
+        Part(f"{name}-{number}", part.start, part.survey, part.person, part.crop)
+        for number, part in enumerate(parts, 1)
+    ]
+
+
+def _part(survey: Survey, start: int, settings: CaptureSettings, name: str) -> Part | None:
+    person = choose_person(survey)
+    if not person.seen.any():
+        return None
+    return Part(name, start, survey, person, _crop(survey, person, settings))
+
+
+def _crop(survey: Survey, person: Person, settings: CaptureSettings) -> Crop:
+    width, height = survey.picture_size.tolist()
+    if settings.crop == "none":
+        return whole_picture(width, height, settings.size)
+    return choose_crop(person.boxes, width, height, settings.size)
+
+
+def _tell_people(path: Path, part: Part) -> None:
+    crowded = part.person.crowded
+    if not crowded.any():
+        return
+    alone = int((crowded & ~part.person.seen).sum())
+    gone = f"; in {alone} of them the followed one is away, and they are left out" if alone else ""
+    say(
+        f"warning: {path}: several faces in {int(crowded.sum())} of {part.timesteps} frames; "
+        f"the one that fills the picture most is followed{gone}"
+    )
+
+
+def _times(survey: Survey, frames: list[int]) -> str:
+    """Up to five times of frames, for messages."""
+    listed = ", ".join(f"{survey.timestamps[frame]:.1f}" for frame in frames[:5])
+    return f"{listed}{', ...' if len(frames) > 5 else ''} s"

@@ -1,0 +1,112 @@
+"""Mattes with a clean plate: what differs from the scene without the person, where a person can be."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+_SURE_PERSON, _SURE_BACKGROUND = 0.9, 0.05
+"""Values of the person mask from which, and up to which, its word is taken, away from its border."""
+_CORE = 1 / 40
+"""Width of the border inside the sure person in which the plate is asked, as a fraction of the longer side."""
+_HALO = 1 / 12
+"""...and outside it: hair that the mask misses."""
+_LEVELS = (2.5, 7.0)
+"""Colour differences, in standard deviations of the background's, that become 0 and 1..."""
+_LEAST_NOISE = 0.008
+"""...which are at least this (0..1)."""
+_SHADOW, _DARKEST_SHADOW = 0.35, 0.5
+"""A difference that only darkens, down to half, counts this much: it may be the person's shadow on the wall."""
+_SHIFT_SIZE = 256
+_MOST_SHIFT = 8.0
+"""Pixels at that size, by which the camera may have been moved."""
+_SHIFT_GAIN = 0.9
+"""A shift is believed if it brings the background's difference below this part of what it was."""
+_DOUBT = (2.0, 0.25)
+"""By how much those levels are raised where the mask says background, and lowered where it says person."""
+_GAINS = (0.7, 1.4)
+"""Exposures between which the plate may be brought to the picture's."""
+
+
+def plate_matte(
+    image: UInt8[np.ndarray, "h w 3"], mask: Float[np.ndarray, "m m"], plate: UInt8[np.ndarray, "h w 3"]
+) -> UInt8[np.ndarray, "h w"]:
+    """The opacity of the person, 255 = person.
+
+    The mask decides inside the person and far away; between, the difference to the plate does, after the plate was
+    shifted and brought to the picture's exposure by what is sure background.
+
+    Args:
+        image: the picture.
+        mask: how surely each part of it is a person, 0..1, of any size.
+        plate: the same scene without the person.
+    """
+    height, width = image.shape[:2]
+    longer = max(height, width)
+    soft = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    near = _grow(soft > _SURE_BACKGROUND, _HALO * longer)
+    core = ~_grow(soft < _SURE_PERSON, _CORE * longer)
+    background = soft <= _SURE_BACKGROUND if near.all() else ~near
+    picture, scene = image.astype(np.float32) / 255, plate.astype(np.float32) / 255
+    noise = _LEAST_NOISE
+    if background.any():
+        scene = _match(picture, scene, background)
+        noise = max(noise, float(np.sqrt(np.mean(np.square(_difference(picture, scene)[background])))))
+    # Where the mask says person, little difference is enough; where it says background, it takes more.
+    levels = noise * (_DOUBT[0] + (_DOUBT[1] - _DOUBT[0]) * np.clip(soft, 0, 1))
+    low, high = _LEVELS
+    alpha = np.clip((_difference(picture, scene) / levels - low) / (high - low), 0, 1)
+    alpha = np.where(core, 1.0, np.where(near, alpha, 0.0))
+    return np.rint(alpha * 255).astype(np.uint8)
+
+
+def _grow(mask: Bool[np.ndarray, "h w"], distance: float) -> Bool[np.ndarray, "h w"]:
+    """Everything within so many pixels of the mask."""
+    if not mask.any():
+        return mask
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3) <= distance
+
+
+def _match(picture: np.ndarray, scene: np.ndarray, background: np.ndarray) -> Float[np.ndarray, "h w 3"]:
+    """The scene, moved and brightened to the picture as far as the background tells."""
+    scene = _expose(picture, scene, background)
+    shift = _shift(picture, scene, background)
+    if np.abs(shift).max() < 0.05:
+        return scene
+    height, width = scene.shape[:2]
+    matrix = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
+    moved = cv2.warpAffine(scene, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    before, after = (float(np.abs(picture - candidate)[background].mean()) for candidate in (scene, moved))
+    return _expose(picture, moved, background) if after < _SHIFT_GAIN * before else scene
+
+
+def _expose(picture: np.ndarray, scene: np.ndarray, background: np.ndarray) -> np.ndarray:
+    gain = picture[background].mean(axis=0) / np.maximum(scene[background].mean(axis=0), 1e-3)
+    return scene * np.clip(gain, *_GAINS).astype(np.float32)
+
+
+def _shift(picture: np.ndarray, scene: np.ndarray, background: np.ndarray) -> Float[np.ndarray, " 2"]:
+    """By how many pixels along x and y the picture's background is moved against the scene."""
+    height, width = background.shape
+    scale = min(1.0, _SHIFT_SIZE / max(height, width))
+    size = (max(8, round(width * scale)), max(8, round(height * scale)))
+    known = cv2.resize(background.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    # Both get the same hole where the person is, filled with grey: nothing in it speaks for any shift.
+    prepared = []
+    for image in (scene, picture):
+        grey = cv2.resize(image.mean(axis=-1), size, interpolation=cv2.INTER_AREA)
+        grey = grey - cv2.GaussianBlur(grey, (0, 0), 4.0)
+        prepared.append((grey * known).astype(np.float32))
+    window = cv2.createHanningWindow(size, cv2.CV_32F)
+    (x, y), _ = cv2.phaseCorrelate(prepared[0], prepared[1], window)
+    if max(abs(x), abs(y)) > _MOST_SHIFT:
+        return np.zeros(2)
+    return np.array([x * width / size[0], y * height / size[1]])
+
+
+def _difference(picture: np.ndarray, scene: np.ndarray) -> Float[np.ndarray, "h w"]:
+    """Of colours, slightly smoothed; what a shadow would do counts less."""
+    shade = (picture * scene).sum(axis=-1) / np.maximum(np.square(scene).sum(axis=-1), 1e-4)
+    shade = np.clip(shade, _DARKEST_SHADOW, 1)[..., None]
+    other = np.abs(picture - shade * scene).max(axis=-1)
+    darkening = (1 - shade[..., 0]) * scene.max(axis=-1)
+    return cv2.blur((other + _SHADOW * darkening).astype(np.float32), (3, 3))

@@ -1,0 +1,96 @@
+"""How sharp and how well lit the face is, frame by frame."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from mien.progress import say
+
+_SIDE = 128
+"""Pixels to which the face is brought, so that its distance hardly counts."""
+_BLURRED = 0.5
+"""Frames of less than this part of the clip's usual sharpness count as blurred."""
+_WHITE_LEVEL = 250
+"""A channel from this level on (of 255) has lost its colour."""
+_DARK = 0.18
+"""Mean level of the face (0..1, sRGB) below which a clip counts as dark."""
+_CLIPPED = 0.1
+"""Part of the face without colour above which a clip counts as over-exposed."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameQuality:
+    """Of the face in every frame of a capture; NaN where there is none."""
+
+    sharpness: Float[np.ndarray, "t c"]
+    """Of the face's fine detail, relative to the median over the clip: 1 as usual, 0 nothing left."""
+    brightness: Float[np.ndarray, "t c"]
+    """Mean level of the face, 0..1, sRGB."""
+    clipped: Float[np.ndarray, "t c"]
+    """Part of the face, 0..1, in which a channel is at its end."""
+
+    @property
+    def blurred(self) -> Bool[np.ndarray, "t c"]:
+        """Frames to leave out where sharp ones matter, as in training."""
+        return self.sharpness < _BLURRED  # NaN is not
+
+
+def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " 3"]:
+    """Sharpness (in units of its own), brightness and clipped part of a face; NaN where it is outside the picture."""
+    height, width = image.shape[:2]
+    left, top = np.clip(np.floor(landmarks.min(axis=0)), 0, [width, height]).astype(int)
+    right, bottom = np.clip(np.ceil(landmarks.max(axis=0)), 0, [width, height]).astype(int)
+    if right - left < 2 or bottom - top < 2:
+        return np.full(3, np.nan)
+    face = image[top:bottom, left:right]
+    grey = cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)
+    enlarges = min(grey.shape) < _SIDE
+    grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_LINEAR if enlarges else cv2.INTER_AREA)
+    # Noise is finer than a face's detail, and would pass for sharpness.
+    grey = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
+    detail = float(np.abs(cv2.Laplacian(grey, cv2.CV_32F)).mean())
+    clipped = float((face.max(axis=-1) >= _WHITE_LEVEL).mean())
+    return np.array([detail / (float(grey.std()) + 1), float(face.mean()) / 255, clipped])
+
+
+def relative_quality(measured: Float[np.ndarray, "t 3"]) -> FrameQuality:
+    """The quality of a clip's frames, with what `measure_face` gave for each."""
+    values = measured.astype(np.float32)
+    seen = np.isfinite(values[:, 0])
+    usual = float(np.median(values[seen, 0])) if seen.any() else 1.0
+    return FrameQuality(values[:, :1] / max(usual, 1e-6), values[:, 1:2], values[:, 2:])
+
+
+def quality_report(name: str, quality: FrameQuality) -> dict[str, Any]:
+    """Figures for the capture's report; says aloud what is wrong with the clip."""
+    seen = np.isfinite(quality.brightness)
+    brightness, clipped = (
+        float(np.median(values[seen])) if seen.any() else 0.0 for values in (quality.brightness, quality.clipped)
+    )
+    blurred = np.flatnonzero(quality.blurred.any(axis=1)).tolist()
+    is_dark, is_overexposed = brightness < _DARK, clipped > _CLIPPED
+    if is_dark:
+        say(
+            f"warning: {name}: the face is dark (mean level {brightness:.0%}); the avatar will be noisy, better record "
+            "it again with more light on the face"
+        )
+    if is_overexposed:
+        say(
+            f"warning: {name}: the face is over-exposed ({clipped:.0%} of it is white); what is white has no detail, "
+            "better record it again with less exposure"
+        )
+    if blurred:
+        say(
+            f"{name}: the face is blurred in {len(blurred)} of {len(quality.sharpness)} frames (report.json names them)"
+        )
+    return {
+        "frames_blurred": len(blurred),
+        "blurred_frames": blurred,
+        "face_brightness": round(brightness, 4),
+        "face_clipped": round(clipped, 4),
+        "dark": is_dark,
+        "overexposed": is_overexposed,
+    }

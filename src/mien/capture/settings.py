@@ -1,0 +1,68 @@
+"""What a user can ask of a capture."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from mien.errors import UserError
+
+_SMALLEST_SIZE, _LARGEST_SIZE = 32, 8192
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """How a video becomes a capture."""
+
+    size: int = 512
+    """Longest side of the captured frames in pixels; smaller sources are not enlarged."""
+    crop: Literal["auto", "none"] = "auto"
+    """auto: one square around the head for the whole clip; none: the whole picture."""
+    start: float = 0.0
+    """Seconds to skip at the beginning."""
+    stride: int = 1
+    """Take every n-th frame."""
+    max_frames: int = 0
+    """Stop after so many frames; 0 takes all."""
+    fps: float = 25.0
+    """Frames a second of a folder of images; videos know their own."""
+    cuts: bool = True
+    """Whether a video is parted where it cuts to another shot: NAME-1, NAME-2, ..."""
+    shortest_part: float = 1.0
+    """Seconds; what lies between two cuts and is shorter is left out."""
+    clean_plate: Path | None = None
+    """A picture of the scene without the person, from the same, still camera: gives better mattes."""
+    mattes: Path | None = None
+    """Mattes made elsewhere: a video or a folder of pictures, white = person, one for each frame of the source."""
+    landmarks: Path | None = None
+    """Landmarks made elsewhere, a row for each frame of the source: .csv or .safetensors (docs/conventions.md)."""
+
+    def check(self) -> None:
+        """Raise a UserError that names the first value that makes no sense."""
+        _require(
+            self.size >= _SMALLEST_SIZE, "size", self.size, f"too small; give {_SMALLEST_SIZE} or more, better 512"
+        )
+        _require(self.size <= _LARGEST_SIZE, "size", self.size, f"too large; give {_LARGEST_SIZE} or less")
+        _require(_is_at_least(self.start, 0), "start", self.start, "give the seconds to skip, 0 or more")
+        _require(self.stride >= 1, "stride", self.stride, "give 1 for every frame, 2 for every second one, ...")
+        _require(self.max_frames >= 0, "max-frames", self.max_frames, "give 0 for all frames, or a positive number")
+        _require(_is_at_least(self.fps, 0) and self.fps > 0, "fps", self.fps, "give frames a second, above 0")
+        _require(_is_at_least(self.shortest_part, 0), "shortest-part", self.shortest_part, "give seconds, 0 or more")
+        if self.mattes is not None and self.clean_plate is not None:
+            raise UserError("--capture.mattes and --capture.clean-plate: give one of them; ready mattes need no plate")
+        for option, path in (
+            ("clean-plate", self.clean_plate),
+            ("mattes", self.mattes),
+            ("landmarks", self.landmarks),
+        ):
+            if path is not None and not path.exists():
+                raise UserError(f"--capture.{option} {path}: no such file or folder; check the path")
+
+
+def _is_at_least(value: int | float, least: int | float) -> bool:
+    return math.isfinite(value) and value >= least
+
+
+def _require(holds: bool, option: str, value: int | float, remedy: str) -> None:
+    if not holds:
+        raise UserError(f"--capture.{option} {value:g}: {remedy}")
