@@ -1,5 +1,6 @@
 """GaussianAvatars' formulas, and avatars on disk."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import torch
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, load_avatar, read_baked, write_avatar
 from mien.errors import UserError
 from mien.face import FaceModel
-from mien.gaussians import rgb_from_sh
+from mien.gaussians import rgb_from_sh, world_means
 from mien.render import rasterize
 from mien.render.rendering import Rendering
 from toy_scene import toy_camera, toy_face, toy_face_model
@@ -30,7 +31,7 @@ def test_starts_with_one_grey_faint_gaussian_a_triangle() -> None:
     gaussians = avatar.pose(toy_face(5)).gaussians
     assert len(gaussians) == len(face_model.faces)
     centroids = face_model(toy_face(5))[:, face_model.faces].mean(-2)
-    torch.testing.assert_close(gaussians.means, centroids, atol=1e-6, rtol=0)
+    torch.testing.assert_close(world_means(gaussians), centroids, atol=1e-6, rtol=0)
     torch.testing.assert_close(gaussians.opacities, torch.full((len(gaussians),), 0.1))
     assert (rgb_from_sh(gaussians.sh) - 0.5).abs().max() < 0.002
 
@@ -124,6 +125,25 @@ def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "avatar.json").write_text(content.replace('"sh_degree": 0', '"sh_degree": 1'))
     with pytest.raises(UserError, match="does not fit its settings"):
         load_avatar(tmp_path)
+    for damage, part in (
+        ({"kind": None}, "missing \\['kind'\\]"),
+        ({"kind": 3}, "3 is not"),
+        ({"kind": ["gaussian_avatars"]}, "is not"),
+        ({"config": "default"}, "config"),
+        ({"config": None}, "config"),
+        ({"gaussians": "many"}, "gaussians"),
+        ({"gaussians": True}, "gaussians"),
+        ({"gaussians": -1}, "-1 Gaussians"),
+        ({"gaussians": 5}, "does not fit its settings"),
+        ({"gaussians": 10**12}, "does not fit its settings"),
+        ({"face_model": 7}, "face_model"),
+        ({"tensors_sha256": None}, "tensors_sha256"),
+        ({"surprise": 1}, "unknown \\['surprise'\\]"),
+    ):
+        damaged = {name: value for name, value in (json.loads(content) | damage).items() if value is not None}
+        (tmp_path / "avatar.json").write_text(json.dumps(damaged))
+        with pytest.raises(UserError, match=part):
+            load_avatar(tmp_path)
     hash_line = toy_face_model().content_hash
     (tmp_path / "avatar.json").write_text(content.replace(hash_line, "0" * 16))
     with pytest.raises(UserError, match="was trained with face model 'toy'"):
@@ -143,7 +163,7 @@ def test_face_models_that_may_not_be_passed_on_are_not(tmp_path: Path) -> None:
 
 def test_missing_baked_avatar(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="missing"):
-        read_baked(tmp_path)
+        read_baked(tmp_path / "none.mien")
 
 
 def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:

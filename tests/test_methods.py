@@ -15,14 +15,15 @@ from mien.avatar import (
     MethodConfig,
     Progress,
     load_avatar,
+    make_portable,
     pose_baked,
     read_baked,
     write_avatar,
 )
-from mien.avatar.files import write_baked
 from mien.config import decode, encode
 from mien.progress import Advance
 from mien.render import rasterize
+from mien.runtime import write_portable
 from mien.training import TrainSettings
 from mien.training.checkpoint import resume, write_checkpoint
 from mien.training.density import density_strategy
@@ -105,8 +106,8 @@ def test_baked_avatar_poses_as_the_avatar_does(method: str, tmp_path: Path) -> N
     _disturb(avatar)
     face = toy_sequence(5, SIZE)[1].tracking.face
     expected = avatar.pose(face).gaussians
-    write_baked(tmp_path, avatar.bake())
-    got = pose_baked(read_baked(tmp_path), face)
+    write_portable(tmp_path / "toy.mien", make_portable(avatar, toy_camera(SIZE), "toy"))
+    got = pose_baked(read_baked(tmp_path / "toy.mien"), face)
     for name in ("means", "scales", "opacities", "sh"):
         ours, theirs = torch.broadcast_tensors(getattr(got, name), getattr(expected, name))
         torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")

@@ -1,6 +1,9 @@
 """What native/bind_*.cpp defines. Arrays are contiguous, on the CPU, float32 unless said otherwise."""
 
-from torch import Tensor
+import numpy as np
+import torch
+
+Tensor = torch.Tensor | np.ndarray
 
 # native/bind_mesh.cpp; faces, corners: int64; face_index: int32
 def rasterize_mesh(

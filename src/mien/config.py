@@ -1,29 +1,22 @@
 """Settings as json: nested frozen dataclasses, with a `kind` wherever a field may hold one of several classes."""
 
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from torch import Tensor
-
 from mien.errors import UserError
 
 
-def encode(value: Any, stash: Callable[[Tensor], Any] | None = None) -> Any:
-    """Settings as what json can hold; every dataclass becomes an object with its class name as `kind`.
-
-    Tensors become what `stash` returns for them; without it they are not allowed.
-    """
+def encode(value: Any) -> Any:
+    """Settings as what json can hold; every dataclass becomes an object with its class name as `kind`."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {"kind": type(value).__name__, **{f.name: encode(getattr(value, f.name), stash) for f in fields(value)}}
+        return {"kind": type(value).__name__, **{f.name: encode(getattr(value, f.name)) for f in fields(value)}}
     if isinstance(value, (tuple, list)):
-        return [encode(item, stash) for item in value]
+        return [encode(item) for item in value]
     if isinstance(value, Mapping):
-        return {str(key): encode(item, stash) for key, item in value.items()}
-    if isinstance(value, Tensor) and stash is not None:
-        return stash(value)
+        return {str(key): encode(item) for key, item in value.items()}
     if isinstance(value, Path):
         return str(value)
     assert value is None or isinstance(value, (bool, int, float, str)), f"settings cannot hold {type(value)}"
@@ -31,12 +24,12 @@ def encode(value: Any, stash: Callable[[Tensor], Any] | None = None) -> Any:
 
 
 def decode(hint: Any, value: Any, where: str = "settings") -> Any:
-    """What `encode` encoded, as the type `hint`; fields that are missing get their defaults, tensors stay as they are.
+    """What `encode` encoded, as the type `hint`; fields that are missing get their defaults.
 
     Raises:
         UserError: a field is unknown, is missing without a default, or has a value of another type.
     """
-    if isinstance(value, Tensor):
+    if hint is Any:
         return value
     origin = get_origin(hint)
     if origin in (Union, types.UnionType):
@@ -46,6 +39,8 @@ def decode(hint: Any, value: Any, where: str = "settings") -> Any:
     if origin is tuple and isinstance(value, list):
         items = get_args(hint)
         kinds = [items[0]] * len(value) if len(items) == 2 and items[1] is Ellipsis else items
+        if len(kinds) != len(value):
+            raise UserError(f"{where}: {len(value)} entries instead of {len(kinds)}; make it again")
         return tuple(decode(kind, item, where) for kind, item in zip(kinds, value, strict=True))
     if origin is dict and isinstance(value, dict):
         return {key: decode(get_args(hint)[1], item, where) for key, item in value.items()}
@@ -55,14 +50,16 @@ def decode(hint: Any, value: Any, where: str = "settings") -> Any:
         return float(value)
     if hint is Path and isinstance(value, str):
         return Path(value)
-    if origin is None and isinstance(hint, type) and isinstance(value, hint):
+    # True is an int to Python, not to people.
+    alike = isinstance(value, bool) == (hint is bool)
+    if origin is None and isinstance(hint, type) and isinstance(value, hint) and alike:
         return value
-    raise UserError(f"{where}: {value!r} is not a {hint}; made by another version of mien? Make it again")
+    raise UserError(f"{where}: {_in_short(value)} is not a {hint}; made by another version of mien? Make it again")
 
 
 def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
-        raise UserError(f"{where}: {value!r} is not a {hint.__name__}; make the folder again")
+        raise UserError(f"{where}: {_in_short(value)} is not a {hint.__name__}; make it again")
     hints = get_type_hints(hint)
     known = {f.name: f for f in fields(hint)}
     unknown = set(value) - set(known) - {"kind"}
@@ -89,4 +86,16 @@ def _decode_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
             return decode(option, value, where)
         except UserError:
             continue
-    raise UserError(f"{where}: {value!r} is none of {options}; made by another version of mien? Make it again")
+    raise UserError(f"{where}: {_in_short(value)} is none of {options}; made by another version of mien? Make it again")
+
+
+def _in_short(value: Any) -> str:
+    """One line, whatever it is."""
+    shape = getattr(value, "shape", None)
+    if shape is not None:
+        return f"{value.dtype} {tuple(shape)}"
+    text = repr(value)
+    return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "..."
+
+
+_LONGEST_SHOWN = 80

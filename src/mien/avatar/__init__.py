@@ -23,11 +23,12 @@ from mien.avatar.density import (
     RefillDensity,
     RefillSettings,
 )
-from mien.avatar.files import load_avatar, read_baked, write_avatar, write_baked
+from mien.avatar.files import load_avatar, write_avatar
 from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
 from mien.avatar.headgas import HeadGas, HeadGasConfig
 from mien.avatar.methods import METHODS, Method, method_named, method_of
 from mien.avatar.mono_gaussian_avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig
+from mien.avatar.portable import make_portable, read_baked
 from mien.avatar.store import GaussianStore, Moments
 
 __all__ = [
@@ -58,6 +59,7 @@ __all__ = [
     "RefillDensity",
     "RefillSettings",
     "load_avatar",
+    "make_portable",
     "method_named",
     "method_of",
     "network_group",
@@ -66,5 +68,4 @@ __all__ = [
     "read_baked",
     "store_group",
     "write_avatar",
-    "write_baked",
 ]

@@ -1,6 +1,6 @@
 """Avatars on disk: a folder with avatar.json, avatar.safetensors and, where its licence allows, the face model."""
 
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar
-from mien.avatar.baked import BakedAvatar
 from mien.avatar.methods import method_named, method_of
 from mien.config import decode, encode
 from mien.errors import UserError
@@ -17,9 +16,22 @@ from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
-_BAKED = "mien.baked"
 NOT_CARRIED = frozenset({"flame"})
 """Face models whose licence does not allow them to be passed on inside an avatar."""
+
+
+@dataclass(frozen=True)
+class _Content:
+    """avatar.json."""
+
+    kind: str
+    """The method's name."""
+    config: dict[str, Any]
+    gaussians: int
+    face_model: str
+    face_model_hash: str
+    face_model_carried: bool
+    tensors_sha256: str
 
 
 def write_avatar(folder: Path, avatar: Avatar) -> None:
@@ -30,16 +42,16 @@ def write_avatar(folder: Path, avatar: Avatar) -> None:
     carried = avatar.face_model.name not in NOT_CARRIED
     if carried:
         write_face_model(folder / "face_model", avatar.face_model)
-    content = {
-        "kind": method_of(avatar.config),
-        "config": encode(avatar.config),
-        "gaussians": len(avatar.gaussian_store()),
-        "face_model": avatar.face_model.name,
-        "face_model_hash": avatar.face_model.content_hash,
-        "face_model_carried": carried,
-        "tensors_sha256": file_digest(folder / "avatar.safetensors"),
-    }
-    write_json(folder / "avatar.json", _AVATAR, _VERSION, content)
+    content = _Content(
+        kind=method_of(avatar.config),
+        config=encode(avatar.config),
+        gaussians=len(avatar.gaussian_store()),
+        face_model=avatar.face_model.name,
+        face_model_hash=avatar.face_model.content_hash,
+        face_model_carried=carried,
+        tensors_sha256=file_digest(folder / "avatar.safetensors"),
+    )
+    write_json(folder / "avatar.json", _AVATAR, _VERSION, asdict(content))
 
 
 def load_avatar(folder: Path) -> Avatar:
@@ -53,16 +65,26 @@ def load_avatar(folder: Path) -> Avatar:
         raise UserError(
             f"{folder}: holds no trained avatar (no avatar.json); train one with `mien train` or `mien create`"
         )
-    content = read_json(folder / "avatar.json", _AVATAR, _VERSION)
-    method = method_named(content["kind"])
+    where = str(folder / "avatar.json")
+    stored = read_json(folder / "avatar.json", _AVATAR, _VERSION)
+    named = {name: value for name, value in stored.items() if name not in ("format", "version")}
+    content: _Content = decode(_Content, named, where)
+    if content.gaussians < 0:
+        raise UserError(f"{where}: {content.gaussians} Gaussians; train it again")
+    method = method_named(content.kind)
     tensors = read_tensors(folder / "avatar.safetensors")
-    if file_digest(folder / "avatar.safetensors") != content["tensors_sha256"]:
+    if file_digest(folder / "avatar.safetensors") != content.tensors_sha256:
         raise UserError(f"{folder / 'avatar.safetensors'}: is not what was written; train it again")
     face_model = _face_model_of(folder, content)
-    config = decode(method.config, content["config"], str(folder / "avatar.json"))
+    config = decode(method.config, content.config, where)
+    subject = _with_prefix(tensors, "subject.")
     with torch.random.fork_rng(devices=[]):
-        avatar = method.avatar(config, face_model, FaceParams(**_with_prefix(tensors, "subject.")))
-    overwrite(avatar, _with_prefix(tensors, "avatar."), content["gaussians"], folder)
+        try:
+            face = FaceParams(**subject)
+        except TypeError as error:
+            raise UserError(f"{folder}: its subject is incomplete ({error}); train it again") from None
+        avatar = method.avatar(config, face_model, face)
+    overwrite(avatar, _with_prefix(tensors, "avatar."), content.gaussians, folder)
     return avatar
 
 
@@ -72,6 +94,8 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
     Raises:
         UserError: `state`, which came from `source`, is not of this method and config.
     """
+    if gaussians not in {len(tensor) for tensor in state.values() if tensor.ndim > 0}:
+        raise UserError(f"{source}: does not fit its settings ({gaussians} Gaussians, by no tensor); train it again")
     avatar.gaussian_store().resize(gaussians)
     try:
         avatar.load_state_dict(state)
@@ -79,64 +103,16 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
         raise UserError(f"{source}: does not fit its settings ({error}); train it again") from None
 
 
-def write_baked(folder: Path, baked: BakedAvatar) -> None:
-    """Write baked.json and baked.safetensors."""
-    write_tensor_dataclass(folder / "baked", _BAKED, baked)
-
-
-def read_baked(folder: Path) -> BakedAvatar:
-    """Read what `write_baked` wrote.
-
-    Raises:
-        UserError: files are missing, damaged or of another version.
-    """
-    return read_tensor_dataclass(folder / "baked", _BAKED, BakedAvatar)
-
-
-def write_tensor_dataclass(stem: Path, format_name: str, value: Any) -> None:
-    """Write nested dataclasses of tensors and plain values as STEM.safetensors and STEM.json."""
-    tensors: dict[str, Tensor] = {}
-
-    def stash(tensor: Tensor) -> dict[str, str]:
-        name = f"{len(tensors):03d}"
-        # Safetensors refuses tensors that share memory.
-        tensors[name] = tensor.detach().clone()
-        return {"tensor": name}
-
-    tree = encode(value, stash)
-    write_tensors(stem.with_suffix(".safetensors"), tensors)
-    write_json(stem.with_suffix(".json"), format_name, _VERSION, {"content": tree})
-
-
-def read_tensor_dataclass(stem: Path, format_name: str, hint: Any) -> Any:
-    """Read what `write_tensor_dataclass` wrote, as the dataclass (or union of them) `hint`.
-
-    Raises:
-        UserError: files are missing, damaged or of another version.
-    """
-    content = read_json(stem.with_suffix(".json"), format_name, _VERSION)["content"]
-    tensors = read_tensors(stem.with_suffix(".safetensors"))
-
-    def restore(node: Any) -> Any:
-        if isinstance(node, dict) and set(node) == {"tensor"}:
-            return tensors[node["tensor"]]
-        if isinstance(node, dict):
-            return {key: restore(item) for key, item in node.items()}
-        return [restore(item) for item in node] if isinstance(node, list) else node
-
-    return decode(hint, restore(content), str(stem))
-
-
-def _face_model_of(folder: Path, content: dict[str, Any]) -> FaceModel:
-    name = content["face_model"]
-    if content["face_model_carried"]:
+def _face_model_of(folder: Path, content: _Content) -> FaceModel:
+    name = content.face_model
+    if content.face_model_carried:
         bare = read_face_model(folder / "face_model")
         face_model = replace(bare, landmarks=read_landmarks(name, bare))
     else:
         face_model = load_face_model(name)
-    if face_model.content_hash != content["face_model_hash"]:
+    if face_model.content_hash != content.face_model_hash:
         raise UserError(
-            f"{folder}: was trained with face model {name!r} {content['face_model_hash']}, but the one here is "
+            f"{folder}: was trained with face model {name!r} {content.face_model_hash}, but the one here is "
             f"{face_model.content_hash}; install that version of the face model, or train again"
         )
     return face_model

@@ -74,8 +74,8 @@ class GaussianAvatars(Avatar):
         self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
-        """The Gaussians in world space (with `sh_frame="head"`, in the head frame), one batch entry a timestep."""
-        store, in_head = self.store, self.config.sh_frame == "head"
+        """The Gaussians in world space, or in the head frame (`_sh_frame`), one batch entry a timestep."""
+        store, in_head = self.store, self._sh_frame == "head"
         vertices = self.face_model.head_vertices(face) if in_head else self.face_model(face)
         means, quats, scales = bind_to_world(
             vertices,
@@ -134,9 +134,16 @@ class GaussianAvatars(Avatar):
             store["quats"], store["log_scales"], store["opacity_logits"], self._active_sh(TRAINED).detach()
         )
         rig = bake_rig(self.face_model, self.subject)
-        return MeshBound(
-            rig, self.face_model.faces, store["face_index"], store["means"], attributes, self.config.sh_frame
-        )
+        return MeshBound(rig, self.face_model.faces, store["face_index"], store["means"], attributes, self._sh_frame)
+
+    @property
+    def _sh_frame(self) -> Literal["world", "head"]:
+        """The frame that Gaussians are given in.
+
+        Colours that no view changes look the same from either. In the head frame, lengths of a decimetre keep three
+        bits more than a metre from the camera, which edges of a millimetre need: float32 turns triangles by 1e-4 there.
+        """
+        return "head" if self.config.sh_degree == 0 else self.config.sh_frame
 
     def _active_sh(self, progress: Progress) -> Float[Tensor, "n k 3"]:
         """SH coefficients up to the degree that is switched on."""

@@ -11,7 +11,7 @@ from mien.workspace import open_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Write an avatar at one expression as a standard 3D Gaussian .ply, which any splat viewer opens."""
+    """Write an avatar for other programs: .mien (all of it, for mien.runtime) or .ply (one expression, for splat viewers)."""
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""

@@ -1,0 +1,24 @@
+"""Avatars without torch: load a .mien file, pose it, render it, with numpy and the native core alone.
+
+from mien import runtime
+avatar = runtime.load("me.mien")
+image, alpha = avatar.render(avatar.pose({"jawOpen": 0.6}), avatar.camera.resized(512, 512))
+"""
+
+from mien.runtime.avatar import Avatar, load, render
+from mien.runtime.file import read_portable, write_portable
+from mien.runtime.model import Camera, PortableAvatar
+from mien.runtime.posing import Face, Gaussians, pose
+
+__all__ = [
+    "Avatar",
+    "Camera",
+    "Face",
+    "Gaussians",
+    "PortableAvatar",
+    "load",
+    "pose",
+    "read_portable",
+    "render",
+    "write_portable",
+]

@@ -1,0 +1,161 @@
+"""`load`, `Avatar` and `render`: the whole public face of the runtime."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from mien import _native
+from mien.runtime.file import read_portable
+from mien.runtime.model import Camera, PortableAvatar
+from mien.runtime.posing import Face, Gaussians, pose
+
+Vector = Sequence[float | int] | np.ndarray
+"""Three numbers."""
+
+
+class Avatar:
+    """An avatar that runs on numpy and the native core alone."""
+
+    def __init__(self, portable: PortableAvatar):
+        self.portable = portable
+        """All that the file holds, as plain arrays."""
+
+    @property
+    def expression_names(self) -> tuple[str, ...]:
+        """What `pose` knows by name, in the order of expression vectors."""
+        return self.portable.expression_names
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joints that turn by themselves; a jaw may follow an expression instead."""
+        return self.portable.joint_names
+
+    @property
+    def camera(self) -> Camera:
+        """The view the avatar was trained with."""
+        return self.portable.camera
+
+    def face(
+        self,
+        expression: Mapping[str, float | int] | np.ndarray | None = None,
+        joints: Mapping[str, Vector] | np.ndarray | None = None,
+        head_rotation: Vector | None = None,
+        head_translation: Vector | None = None,
+    ) -> Face:
+        """Face parameters: the person at rest, with what is given instead (see `pose`)."""
+        rest = self.portable.neutral
+        return Face(
+            _with_named(rest.expression, expression, self.expression_names, "expression"),
+            _with_named(rest.joints, joints, self.joint_names, "joint"),
+            _vector(rest.head_rotation, head_rotation, "head_rotation"),
+            _vector(rest.head_translation, head_translation, "head_translation"),
+        )
+
+    def pose(
+        self,
+        expression: Mapping[str, float | int] | np.ndarray | None = None,
+        joints: Mapping[str, Vector] | np.ndarray | None = None,
+        head_rotation: Vector | None = None,
+        head_translation: Vector | None = None,
+    ) -> Gaussians:
+        """The Gaussians of a face; what is not given is as the person is at rest.
+
+        Args:
+            expression: Coefficients by name (others stay at rest), or all of them in the order of `expression_names`.
+            joints: Axis-angle in radians by name, or all of them [j, 3] in the order of `joint_names`.
+            head_rotation: Axis-angle of the head in world space, radians.
+            head_translation: Where the head's origin is in world space, metres.
+
+        Raises:
+            ValueError: an unknown name, a wrong shape, or a number that is not finite.
+        """
+        return pose(self.portable.baked, self.face(expression, joints, head_rotation, head_translation))
+
+    def render(
+        self,
+        gaussians: Gaussians | None = None,
+        camera: Camera | None = None,
+        background: Vector = (1.0, 1.0, 1.0),
+    ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+        """A picture and its alpha, as `render` gives them; at rest and seen as in training unless said otherwise."""
+        gaussians = self.pose() if gaussians is None else gaussians
+        return render(gaussians, self.camera if camera is None else camera, background)
+
+
+def load(path: Path | str) -> Avatar:
+    """The avatar in a .mien file, as `mien export DIR --out NAME.mien` writes it.
+
+    Example:
+        >>> from mien import runtime
+        >>> avatar = runtime.load("me.mien")
+        >>> gaussians = avatar.pose({"jawOpen": 0.6}, head_rotation=(0, 0.3, 0))
+        >>> image, alpha = avatar.render(gaussians, avatar.camera.resized(512, 512))
+
+    Raises:
+        UserError: the file is missing, damaged, or of another version.
+    """
+    return Avatar(read_portable(Path(path)))
+
+
+def render(
+    gaussians: Gaussians, camera: Camera, background: Vector = (1.0, 1.0, 1.0)
+) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+    """The picture of Gaussians over a background, RGB, 0..1 and above where colours are bright; and alpha, 0..1.
+
+    The picture is premultiplied: image = colours times alpha + (1 - alpha) times background. Over black,
+    dividing it by alpha gives straight colours. Kernel and constants are those of `mien.render.rasterize`.
+
+    Raises:
+        ValueError: NaN or infinity in an input.
+    """
+    image = np.empty((camera.height, camera.width, 3), np.float32)
+    alpha = np.empty((camera.height, camera.width), np.float32)
+    radii = np.empty(len(gaussians), np.int32)
+    pose = gaussians.T_world_local
+    viewmat = camera.viewmat if pose is None else camera.viewmat @ pose
+    frame = _native.rasterize_forward(
+        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh,
+        np.asarray(background, np.float32), np.ascontiguousarray(viewmat), np.ascontiguousarray(camera.K),
+        image, alpha, radii,
+    )  # fmt: skip
+    if frame is None:
+        raise ValueError("render: NaN or infinity in the Gaussians, the camera or the background")
+    return image, alpha
+
+
+def _with_named(
+    rest: np.ndarray,
+    given: Mapping[str, float | int] | Mapping[str, Vector] | np.ndarray | None,
+    names: Sequence[str],
+    of: str,
+) -> np.ndarray:
+    """`rest` with the rows that are given by name, or all of them."""
+    if given is None:
+        return rest
+    if isinstance(given, Mapping):
+        values = rest.copy()
+        for name, value in given.items():
+            if name not in names:
+                near = difflib.get_close_matches(name, names, 3, 0.5)
+                meant = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(names)}"
+                raise ValueError(f"no {of} {name!r}; {meant}")
+            values[list(names).index(name)] = value
+    else:
+        values = np.asarray(given, np.float32)
+        if values.shape != rest.shape:
+            raise ValueError(f"{of}s of shape {values.shape}, expected {rest.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{of}s are not finite: {given}")
+    return values
+
+
+def _vector(rest: np.ndarray, given: Vector | None, name: str) -> np.ndarray:
+    if given is None:
+        return rest
+    values = np.asarray(given, np.float32)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise ValueError(f"{name} {given}: give three finite numbers")
+    return values

@@ -1,0 +1,100 @@
+"""The .mien file: one safetensors file whose metadata says what its arrays mean (docs/avatar_file.md).
+
+The metadata has one entry, `mien`, a json text: `format` = "mien.baked", `version`, `sha256` of content and arrays, and
+`content`: the nested classes of `mien.runtime.model`, each with its `kind`; arrays are objects {"tensor": NAME}.
+"""
+
+import hashlib
+import json
+import struct
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+from jaxtyping import jaxtyped
+
+from mien.config import decode
+from mien.errors import UserError
+from mien.files import check_writable, read_safetensors, write_arrays
+from mien.runtime.checks import check
+from mien.runtime.model import PortableAvatar
+
+FORMAT, VERSION = "mien.baked", 1
+ENDING = ".mien"
+
+
+def write_portable(path: Path, avatar: PortableAvatar) -> None:
+    """Write a .mien file, atomically; the same avatar gives the same bytes.
+
+    Raises:
+        UserError: the path cannot be written, or an array is NaN or infinite.
+    """
+    check_writable(path)
+    check(avatar, str(path))
+    arrays: dict[str, np.ndarray] = {}
+    content = _tree(avatar, "", arrays)
+    header = {"format": FORMAT, "version": VERSION, "sha256": _digest(content, arrays), "content": content}
+    # One entry: safetensors puts several in random order.
+    write_arrays(path, arrays, {"mien": json.dumps(header, allow_nan=False, sort_keys=True)})
+
+
+def read_portable(path: Path) -> PortableAvatar:
+    """Read a .mien file; everything in it is checked, so that what comes back can be posed.
+
+    Raises:
+        UserError: the file is missing, damaged, of another version, or no .mien file.
+    """
+    metadata, arrays = read_safetensors(path, _load)
+    try:
+        header = json.loads(metadata.get("mien", "{}"))
+        found = (header.get("format"), header.get("version"))
+        if found != (FORMAT, VERSION):
+            raise UserError(
+                f"{path}: has format {found[0]!r} version {found[1]!r}, expected {FORMAT!r} version {VERSION}; "
+                "export it again with `mien export`"
+            )
+        if header["sha256"] != _digest(header["content"], arrays):
+            raise UserError(f"{path}: is not what was written; copy it again, or export it again with `mien export`")
+        tree = _restored(header["content"], arrays)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise UserError(f"{path}: damaged ({error!r}); export it again with `mien export`") from None
+    with jaxtyped("context"):
+        avatar: PortableAvatar = decode(PortableAvatar, tree, str(path))
+    check(avatar, str(path))
+    return avatar
+
+
+def _load(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    with safetensors.safe_open(path, framework="numpy") as file:
+        return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+
+def _tree(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
+    """`value` as json, its arrays put aside under their dotted paths."""
+    if isinstance(value, np.ndarray):
+        arrays[path] = value
+        return {"tensor": path}
+    if is_dataclass(value) and not isinstance(value, type):
+        inside = {f.name: _tree(getattr(value, f.name), f"{path}.{f.name}".lstrip("."), arrays) for f in fields(value)}
+        return {"kind": type(value).__name__, **inside}
+    if isinstance(value, tuple):
+        return [_tree(item, f"{path}.{index}", arrays) for index, item in enumerate(value)]
+    return value
+
+
+def _restored(node: Any, arrays: dict[str, np.ndarray]) -> Any:
+    if isinstance(node, dict) and set(node) == {"tensor"}:
+        return arrays[node["tensor"]]
+    if isinstance(node, dict):
+        return {key: _restored(item, arrays) for key, item in node.items()}
+    return [_restored(item, arrays) for item in node] if isinstance(node, list) else node
+
+
+def _digest(content: Any, arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(name.encode() + str(array.dtype).encode() + struct.pack(f"<{array.ndim}q", *array.shape))
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

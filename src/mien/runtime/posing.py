@@ -1,0 +1,196 @@
+"""From face parameters to Gaussians, in numpy: what `mien.avatar.pose_baked` does in torch, for one timestep."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from mien import _native
+from mien.runtime.model import AttributeNetwork, Attributes, Baked, BlendSkinned, LinearBases, MeshBound, Rig
+from mien.runtime.rotation import matrix_from_axis_angle, rigid_transform
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic: colour = 0.5 + SH_C0 * coefficient."""
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """What a face does at one moment."""
+
+    expression: Float32[np.ndarray, " e"]
+    joints: Float32[np.ndarray, "j 3"]
+    """Axis-angle, radians, of the free joints."""
+    head_rotation: Float32[np.ndarray, " 3"]
+    """Axis-angle, radians."""
+    head_translation: Float32[np.ndarray, " 3"]
+    """Metres."""
+
+    @property
+    def T_world_head(self) -> Float32[np.ndarray, "4 4"]:
+        """The pose of the head frame."""
+        turned = matrix_from_axis_angle(self.head_rotation)
+        return rigid_transform(turned, self.head_translation.astype(np.float64)).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """n activated Gaussians."""
+
+    means: Float32[np.ndarray, "n 3"]
+    """Centres in the local frame, metres."""
+    quats: Float32[np.ndarray, "n 4"]
+    """Rotations, wxyz; not always of unit length."""
+    scales: Float32[np.ndarray, "n 3"]
+    """Standard deviations along the rotated axes, metres."""
+    opacities: Float32[np.ndarray, " n"]
+    """0..1."""
+    sh: Float32[np.ndarray, "n s 3"]
+    """Real spherical-harmonics coefficients of the colour in the local frame."""
+    T_world_local: Float32[np.ndarray, "4 4"] | None = None
+    """Rigid pose of the local frame; None: the world's."""
+
+    def __len__(self) -> int:
+        """The number of Gaussians, n."""
+        return len(self.means)
+
+
+def pose(baked: Baked, face: Face) -> Gaussians:
+    """The Gaussians of a face."""
+    if isinstance(baked, MeshBound):
+        return _pose_mesh_bound(baked, face)
+    if isinstance(baked, BlendSkinned):
+        return _pose_blend_skinned(baked, face)
+    none = np.zeros_like(baked.means)
+    raw = _raw_values(baked.attributes, baked.bases, baked.network, none, face)
+    scales, opacities = np.exp(raw["log_scales"]), sigmoid(raw["opacity_logits"])
+    return _contiguous(baked.means + raw["means"], raw["quats"], scales, opacities, raw["sh"], face.T_world_head)
+
+
+def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
+    centres = rig_points(baked.rig, face)
+    raw = _raw_values(baked.attributes, baked.bases, baked.network, centres - baked.rig.template, face)
+    if baked.scale_activation == "sigmoid":
+        scales = baked.scale_gain * sigmoid(raw["log_scales"]) + baked.scale_offset
+    else:
+        scales = np.exp(raw["log_scales"])
+    sh = (sigmoid(raw["sh"]) - 0.5) / SH_C0 if baked.colour_activation == "sigmoid" else raw["sh"]
+    return _contiguous(centres, raw["quats"], scales, sigmoid(raw["opacity_logits"]), sh, face.T_world_head)
+
+
+def rig_points(rig: Rig, face: Face) -> Float32[np.ndarray, "m 3"]:
+    """The rig's points in the head frame, metres."""
+    m = len(rig.template)
+    shaped = rig.template + (face.expression @ rig.expression_basis.reshape(-1, 3 * m)).reshape(m, 3)
+    if rig.pose_basis is not None:
+        turned = (matrix_from_axis_angle(face.joints) - np.eye(3)).astype(np.float32)
+        shaped = shaped + (turned.reshape(-1) @ rig.pose_basis.reshape(-1, 3 * m)).reshape(m, 3)
+    transforms = joint_transforms(rig, face)[:, :3].astype(np.float32)
+    moved = (rig.skinning_weights @ transforms.reshape(-1, 12)).reshape(m, 3, 4)
+    return np.einsum("mrc,mc->mr", moved[..., :3], shaped) + moved[..., 3]
+
+
+def joint_transforms(rig: Rig, face: Face) -> Float[np.ndarray, "k 4 4"]:
+    """What each joint does to points of the rest pose, in the head frame."""
+    rest = rig.joint_template.astype(np.float64)
+    expression = face.expression.astype(np.float64)
+    rotation = np.einsum("e,ekc->kc", expression, rig.joint_rotation_basis)
+    shift = np.einsum("e,ekc->kc", expression, rig.joint_translation_basis)
+    rotation[list(rig.joint_free)] = face.joints
+    matrices = matrix_from_axis_angle(rotation)
+    # About the joint: x -> R (x - rest) + rest + shift.
+    local = rigid_transform(matrices, rest + shift - np.einsum("krc,kc->kr", matrices, rest))
+    chained: list[np.ndarray] = []
+    for index, parent in enumerate(rig.joint_parents):
+        chained.append(local[index] if parent < 0 else chained[parent] @ local[index])
+    return np.stack(chained)
+
+
+def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
+    pose, raw = face.T_world_head, baked.attributes
+    in_head = baked.sh_frame == "head"
+    vertices = rig_points(baked.rig, face)
+    if not in_head:
+        vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
+    n = len(raw.quats)
+    frames = np.empty((1, len(baked.faces), _native.TRIANGLE_FRAME_FLOATS), np.float32)
+    means, quats, scales = (np.empty((1, n, width), np.float32) for width in (3, 4, 3))
+    _native.rig_forward(
+        np.ascontiguousarray(vertices[None]), baked.faces.astype(np.int64), baked.face_index.astype(np.int64),
+        baked.means, raw.quats, raw.log_scales, frames=frames, means=means, quats=quats, scales=scales,
+    )  # fmt: skip
+    T_world_local = pose if in_head else None
+    return _contiguous(means[0], quats[0], scales[0], sigmoid(raw.opacity_logits), raw.sh, T_world_local)
+
+
+def _raw_values(
+    attributes: Attributes,
+    bases: LinearBases | None,
+    network: AttributeNetwork | None,
+    displacement: Float32[np.ndarray, "n 3"],
+    face: Face,
+) -> dict[str, np.ndarray]:
+    """Constants, plus linear bases, plus the network's outputs."""
+    raw = {f.name: getattr(attributes, f.name) for f in fields(Attributes)}
+    raw["means"] = np.zeros_like(displacement)
+    if bases is not None:
+        for f in fields(LinearBases):
+            basis = getattr(bases, f.name)
+            if basis is not None:
+                raw[f.name] = raw[f.name] + np.tensordot(face.expression, basis, 1)
+    if network is not None:
+        outputs, start = run_network(network, displacement, face), 0
+        for name in network.outputs:
+            width = raw[name][0].size if len(raw[name]) else 0
+            raw[name] = raw[name] + outputs[:, start : start + width].reshape(raw[name].shape)
+            start += width
+    return raw
+
+
+def run_network(
+    network: AttributeNetwork, displacement: Float32[np.ndarray, "n 3"], face: Face
+) -> Float32[np.ndarray, "n _"]:
+    """The outputs of an attribute network."""
+    if network.input == "features":
+        blended = _combined(network.basis, face.expression)
+        if network.joint_basis is not None:
+            blended = blended + _combined(network.joint_basis, face.joints.reshape(-1))
+        values = network.base.copy()
+        values[:, : blended.shape[1]] += blended
+    else:
+        values = np.concatenate([network.base, displacement], axis=1)
+    for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+        values = values @ weight.T + bias
+        if index + 1 < len(network.weights):
+            values = _ACTIVATIONS[network.activation](values)
+    return values
+
+
+def _combined(basis: Float32[np.ndarray, "b n w"], coefficients: Float32[np.ndarray, " b"]) -> np.ndarray:
+    """The basis weighed by coefficients; rows whose coefficient is zero are not even read."""
+    used = np.flatnonzero(coefficients)
+    flat = basis.reshape(len(basis), -1)
+    total = np.zeros(flat.shape[1], np.float32)
+    for row in used:
+        total += coefficients[row] * flat[row]
+    return total.reshape(basis.shape[1:])
+
+
+def sigmoid(values: Float32[np.ndarray, "*s"]) -> Float32[np.ndarray, "*s"]:
+    """1 / (1 + exp(-x)), without overflow."""
+    small = np.exp(-np.abs(values))
+    return np.where(values >= 0, 1 / (1 + small), small / (1 + small)).astype(np.float32)
+
+
+def _softplus(values: np.ndarray) -> np.ndarray:
+    return np.logaddexp(values, np.float32(0))
+
+
+_ACTIVATIONS = {
+    "relu": lambda values: np.maximum(values, 0),
+    "leaky_relu": lambda values: np.maximum(values, np.float32(0.01) * values),
+    "softplus": _softplus,
+}
+
+
+def _contiguous(*arrays: np.ndarray | None) -> Gaussians:
+    return Gaussians(*(None if a is None else np.ascontiguousarray(a, np.float32) for a in arrays))  # pyright: ignore[reportArgumentType]

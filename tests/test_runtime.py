@@ -1,0 +1,201 @@
+"""Avatars without torch: the same pictures, no torch import, files that say when they are damaged."""
+
+import json
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import torch
+
+from mien import runtime
+from mien.avatar import METHODS, Avatar, baked, make_portable
+from mien.camera import Camera
+from mien.errors import UserError
+from mien.face import FaceParams
+from mien.gaussians import Gaussians
+from mien.render import rasterize
+from mien.runtime import model
+from toy_scene import toy_camera, toy_sequence
+
+SIZE = 64
+EQUAL = 1e-5
+method = pytest.mark.parametrize("method", METHODS)
+
+
+def new_avatar(method: str, **config: object) -> Avatar:
+    """An avatar of the toy head whose parameters are all away from where they start."""
+    face_model, sequence = toy_sequence(5, SIZE)
+    torch.manual_seed(0)
+    settings = replace(METHODS[method].config(), **config)  # type: ignore[arg-type]
+    avatar = METHODS[method].avatar(settings, face_model, sequence.tracking.face)
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in avatar.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
+    return avatar
+
+
+def export(avatar: Avatar, path: Path) -> runtime.Avatar:
+    runtime.write_portable(path, make_portable(avatar, toy_camera(SIZE), "toy"))
+    return runtime.load(path)
+
+
+def pose_as(avatar: runtime.Avatar, face: FaceParams) -> runtime.Gaussians:
+    return avatar.pose(
+        face.expression[0].numpy(), face.joints[0].numpy(), face.head_rotation[0].numpy(),
+        face.head_translation[0].numpy(),
+    )  # fmt: skip
+
+
+def at_a_cutoff(gaussians: Gaussians, camera: Camera, image: np.ndarray) -> np.ndarray:
+    """Pixels that a change in the last bits moves beyond the tolerance: contributions of just 1/255 come or go."""
+    moved = np.zeros(image.shape[:2], dtype=bool)
+    for seed in range(4):
+        noise = 3e-8 * torch.randn(gaussians.means.shape, generator=torch.Generator().manual_seed(seed))
+        nudged = replace(gaussians, means=gaussians.means + noise)
+        other = rasterize(nudged, camera, torch.ones(3)).image.numpy()
+        moved |= np.abs(other - image).max(-1) > EQUAL
+    return moved
+
+
+@method
+@torch.no_grad()
+def test_pictures_equal_those_of_training(method: str, tmp_path: Path) -> None:
+    avatar = new_avatar(method)
+    portable = export(avatar, tmp_path / "toy.mien")
+    camera = toy_camera(SIZE)
+    for timestep in range(5):
+        face = toy_sequence(5, SIZE)[1].tracking.face[timestep]
+        gaussians = avatar.pose(face).gaussians.timestep(0)
+        expected = rasterize(gaussians, camera, torch.ones(3))
+        image, alpha = portable.render(pose_as(portable, face), portable.camera)
+        assert expected.image.numpy().std() > 0.05
+        kept = ~at_a_cutoff(gaussians, camera, expected.image.numpy())
+        assert kept.mean() > 0.99
+        assert np.abs(image - expected.image.numpy())[kept].max() <= EQUAL
+        assert np.abs(alpha - expected.alpha.numpy())[kept].max() <= EQUAL
+
+
+@torch.no_grad()
+def test_colours_that_depend_on_the_view_in_either_frame(tmp_path: Path) -> None:
+    for frame in ("world", "head"):
+        avatar = new_avatar("gaussian_avatars", sh_degree=2, sh_frame=frame)
+        portable = export(avatar, tmp_path / f"{frame}.mien")
+        face = toy_sequence(5, SIZE)[1].tracking.face[1]
+        gaussians = avatar.pose(face).gaussians.timestep(0)
+        expected = rasterize(gaussians, toy_camera(SIZE), torch.ones(3)).image.numpy()
+        image, _ = portable.render(pose_as(portable, face))
+        # World coordinates of half a metre keep fewer digits of small triangles.
+        np.testing.assert_allclose(image, expected, atol=1e-4)
+
+
+@method
+def test_at_rest_it_is_the_subject(method: str, tmp_path: Path) -> None:
+    avatar = new_avatar(method)
+    portable = export(avatar, tmp_path / "toy.mien")
+    np.testing.assert_allclose(portable.pose().means, pose_as(portable, avatar.subject).means)
+    assert portable.expression_names == ("drop", "swell")
+    assert portable.joint_names == ("neck",)
+    assert portable.portable.about.method == method
+
+
+def test_names_and_their_mistakes(tmp_path: Path) -> None:
+    portable = export(new_avatar("gaussian_avatars"), tmp_path / "toy.mien")
+    rest = portable.face()
+    face = portable.face({"drop": 0.7}, {"neck": (0.1, 0, 0)}, head_rotation=(0, 0.2, 0))
+    assert face.expression[0] == np.float32(0.7)
+    assert face.expression[1] == rest.expression[1]
+    assert face.joints.tolist() == [[np.float32(0.1), 0, 0]]
+    assert face.head_translation.tolist() == rest.head_translation.tolist()
+    for wrong, part in (
+        ({"expression": {"dorp": 1.0}}, "no expression 'dorp'; did you mean drop?"),
+        ({"expression": np.zeros(3, np.float32)}, "expected \\(2,\\)"),
+        ({"expression": {"drop": float("nan")}}, "not finite"),
+        ({"joints": {"nose": (0, 0, 0)}}, "did you mean neck"),
+        ({"head_rotation": (0, 1)}, "three finite numbers"),
+    ):
+        with pytest.raises(ValueError, match=part):
+            portable.pose(**wrong)
+
+
+def test_no_torch_is_imported(tmp_path: Path) -> None:
+    runtime.write_portable(tmp_path / "a.mien", make_portable(new_avatar("headgas"), toy_camera(SIZE), "toy"))
+    code = (
+        "import sys; from mien import runtime\n"
+        "avatar = runtime.load(sys.argv[1])\n"
+        "image, alpha = avatar.render(avatar.pose({'drop': 0.5}), avatar.camera.resized(32, 32))\n"
+        "assert image.shape == (32, 32, 3) and alpha.max() > 0.1\n"
+        "heavy = {'torch', 'cv2', 'av', 'mediapipe', 'rich', 'tyro'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code, str(tmp_path / "a.mien")], check=True)
+
+
+@method
+def test_the_same_avatar_gives_the_same_bytes(method: str, tmp_path: Path) -> None:
+    export(new_avatar(method), tmp_path / "a.mien")
+    runtime.write_portable(tmp_path / "b.mien", runtime.read_portable(tmp_path / "a.mien"))
+    assert (tmp_path / "a.mien").read_bytes() == (tmp_path / "b.mien").read_bytes()
+
+
+def test_both_sides_have_the_same_classes() -> None:
+    for name in ("Rig", "Attributes", "LinearBases", "AttributeNetwork", "MeshBound", "BlendSkinned", "Static"):
+        ours, theirs = getattr(model, name), getattr(baked, name)
+        assert [f.name for f in fields(ours)] == [f.name for f in fields(theirs)], name
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_damaged_files_are_told(seed: int, tmp_path: Path) -> None:
+    """Cut short or with a bit flipped anywhere: one line."""
+    path = tmp_path / "a.mien"
+    export(new_avatar("gaussian_avatars"), path)
+    random, content = np.random.default_rng(seed), bytearray(path.read_bytes())
+    if seed % 2:
+        # Half of the flips go into the header, which is a small part of the file.
+        content[random.integers(len(content) if seed % 4 == 1 else 4000)] ^= 1 << random.integers(8)
+    else:
+        del content[random.integers(len(content)) :]
+    path.write_bytes(content)
+    with pytest.raises(UserError) as told:
+        runtime.read_portable(path)
+    assert str(path) in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_files_with_other_content_are_told(tmp_path: Path) -> None:
+    """Written by someone else's program: the checksum is right, what is inside is not."""
+    path = tmp_path / "a.mien"
+    whole = export(new_avatar("gaussian_avatars"), path).portable
+    bound = whole.baked
+    assert isinstance(bound, model.MeshBound)
+    nan = np.full_like(whole.neutral.expression, np.nan)
+    for wrong, part in (
+        (replace(whole, neutral=replace(whole.neutral, expression=nan)), "NaN"),
+        (replace(whole, baked=replace(bound, face_index=bound.face_index + 10**6)), "names what does not exist"),
+        (replace(whole, expression_names=("drop",)), "1 expression names"),
+        (replace(whole, joint_names=()), "0 joint names"),
+        (replace(whole, baked=replace(bound, rig=replace(bound.rig, joint_parents=(2, 0, 0)))), "before its parent"),
+    ):
+        with pytest.raises(UserError, match=part):
+            runtime.write_portable(path, wrong)
+    arrays = safetensors.numpy.load_file(path)
+    safetensors.numpy.save_file(arrays, path, {"mien": json.dumps({"format": "mien.baked", "version": 9})})
+    with pytest.raises(UserError, match="version 9"):
+        runtime.load(path)
+    safetensors.numpy.save_file(arrays, path)
+    with pytest.raises(UserError, match="has format None"):
+        runtime.load(path)
+    (tmp_path / "b.mien").write_text(json.dumps({}))
+    with pytest.raises(UserError, match="damaged"):
+        runtime.load(tmp_path / "b.mien")
+
+
+def test_face_models_that_may_not_be_passed_on_are_not() -> None:
+    avatar = new_avatar("gaussian_avatars")
+    avatar.face_model = replace(avatar.face_model, name="flame")
+    with pytest.raises(UserError, match="does not allow"):
+        make_portable(avatar, toy_camera(SIZE), "toy")
