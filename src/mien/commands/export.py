@@ -11,12 +11,12 @@ from mien.workspace import open_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Write an avatar for other programs: .mien (all of it, for mien.runtime) or .ply (one expression, for splat viewers)."""
+    """Write an avatar for other programs: .mien (all of it, for mien.runtime) or .ply (one expression, for viewers)."""
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
     out: Path
-    """The .ply to write."""
+    """The .mien or .ply to write."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Which run (default: the only one)."""
     set: tuple[str, ...] = ()

@@ -1,5 +1,7 @@
 """Expressions on the command line: `--set jawOpen=0.6 mouthSmileLeft=0.4`."""
 
+import difflib
+import math
 from dataclasses import replace
 
 from mien.errors import UserError
@@ -10,26 +12,32 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
     """`face` with some expression coefficients set by name, at every timestep; none set: `face` itself.
 
     Raises:
-        UserError: an assignment is not NAME=NUMBER, or the face model has no expression of that name.
+        UserError: an assignment is not NAME=NUMBER, the face model has no expression of that name, or the number is
+            out of that expression's range.
     """
     expression = face.expression.clone()
     for assignment in assignments:
         name, _, text = assignment.partition("=")
-        if name not in model.expression_names:
-            raise UserError(
-                f"--set {assignment}: no expression {name!r}; there are: {', '.join(model.expression_names)}"
-            )
+        index = _index_of(name, model, assignment)
         try:
             value = float(text)
         except ValueError:
             raise UserError(f"--set {assignment}: {text!r} is no number; write for example --set {name}=0.6") from None
-        if not abs(value) <= _LARGEST:
-            raise UserError(
-                f"--set {assignment}: {text} is outside -{_LARGEST:g}..{_LARGEST:g}; 1 is the full expression"
-            )
-        expression[:, model.expression_names.index(name)] = value
+        lower, upper = (round(float(bound), 4) for bound in model.expression_bounds[index])
+        if lower == upper:
+            raise UserError(f"--set {assignment}: {name} does nothing with the face model {model.name!r}; leave it out")
+        if math.isnan(value) or not lower <= value <= upper:
+            raise UserError(f"--set {assignment}: {name} goes from {lower:g} to {upper:g}; 1 is the full expression")
+        expression[:, index] = value
     return replace(face, expression=expression)
 
 
-_LARGEST = 3.0
-"""Three times the full expression: beyond, no avatar shows anything but garbage."""
+def _index_of(name: str, model: FaceModel, assignment: str) -> int:
+    names = model.expression_names
+    if name in names:
+        return names.index(name)
+    # Letter by letter in small letters: `jawopen` is as near to jawOpen as can be.
+    folded = {known.lower(): known for known in names}
+    near = [folded[match] for match in difflib.get_close_matches(name.lower(), folded, 3, 0.6)]
+    hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {', '.join(names)}"
+    raise UserError(f"--set {assignment}: no expression {name!r}; {hint}")
