@@ -12,7 +12,7 @@ from mien.capture import write_capture
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, read_metrics
 from mien.evaluation.load import load_experiments
-from mien.evaluation.protocols import METRICS
+from mien.evaluation.scoring import METRICS
 from mien.storage import read_tensors, write_tensors
 from mien.tracking import write_scoring, write_tracking
 from mien.training import TrainSettings, read_sequence, train

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from mien.evaluation.experiment import Experiment, Frame, target_image
+from mien.evaluation.experiment import Experiment, Frame, spread_frames, target_image
 from mien.render.mesh import rasterize_mesh, render_mesh, vertex_normals
 
 _COLOUR_FRAMES = 60
@@ -22,18 +22,29 @@ _SMOOTHING_ROUNDS = 200
 class Baselines:
     """Both baselines, ready to draw any frame."""
 
-    mean_frames: dict[tuple[str, int, int], Float[Tensor, "h w 3"]]
-    """The mean training target of each camera, by `_camera_key`."""
+    mean_frames: dict[Frame, Float[Tensor, "h w 3"]]
+    """The mean training target of each sequence and camera (timestep 0 stands for all)."""
     vertex_colors: Float[Tensor, "v 3"]
     """0..1."""
 
     def mean_frame_image(self, experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
-        """The mean of the training targets of this frame's camera (of any camera of its size, where that has none)."""
-        key = _camera_key(experiment, frame)
-        same_size = [mean for other, mean in self.mean_frames.items() if other[1:] == key[1:]]
-        if key in self.mean_frames:
-            return self.mean_frames[key]
-        return same_size[0] if same_size else torch.ones(key[2], key[1], 3)
+        """The mean of the training targets of this frame's sequence and camera.
+
+        Where nothing of them was trained on (a held-out sequence, a held-out camera): the mean of the same camera's
+        pictures in other sequences, else of the same sequence's other cameras, else of all pictures of that size.
+        """
+        camera, camera_id = experiment.camera(frame), experiment.camera_id(frame)
+        size = (camera.height, camera.width, 3)
+        known = {key: mean for key, mean in self.mean_frames.items() if mean.shape == size}
+        for alike in (
+            [mean for key, mean in known.items() if (key.sequence, key.camera) == (frame.sequence, frame.camera)],
+            [mean for key, mean in known.items() if experiment.camera_id(key) == camera_id],
+            [mean for key, mean in known.items() if key.sequence == frame.sequence],
+            list(known.values()),
+        ):
+            if alike:
+                return torch.stack(alike).mean(0)
+        return torch.ones(size)
 
     def mesh_image(self, experiment: Experiment, frame: Frame, supersample: int = 2) -> Float[Tensor, "h w 3"]:
         """The face model posed as in a frame, with the mean vertex colours, unlit, over white."""
@@ -51,16 +62,11 @@ def make_baselines(experiment: Experiment) -> Baselines:
     return Baselines(_mean_frames(experiment), _vertex_colors(experiment))
 
 
-def _camera_key(experiment: Experiment, frame: Frame) -> tuple[str, int, int]:
-    camera = experiment.camera(frame)
-    return experiment.camera_id(frame), camera.width, camera.height
-
-
-def _mean_frames(experiment: Experiment) -> dict[tuple[str, int, int], Float[Tensor, "h w 3"]]:
-    sums: dict[tuple[str, int, int], Tensor] = {}
-    counts: dict[tuple[str, int, int], int] = {}
+def _mean_frames(experiment: Experiment) -> dict[Frame, Float[Tensor, "h w 3"]]:
+    sums: dict[Frame, Tensor] = {}
+    counts: dict[Frame, int] = {}
     for frame in experiment.training_frames:
-        key, target = _camera_key(experiment, frame), target_image(experiment, frame)
+        key, target = frame._replace(timestep=0), target_image(experiment, frame)
         sums[key] = sums[key].add_(target) if key in sums else target
         counts[key] = counts.get(key, 0) + 1
     return {key: total / counts[key] for key, total in sums.items()}
@@ -74,9 +80,7 @@ def _vertex_colors(experiment: Experiment) -> Float[Tensor, "v 3"]:
     face_model = experiment.avatar.face_model
     count = len(face_model.template)
     colors, weights = torch.zeros(count, 3), torch.zeros(count)
-    frames = experiment.training_frames
-    step = max(1, len(frames) // _COLOUR_FRAMES)
-    for frame in frames[::step]:
+    for frame in spread_frames(experiment.training_frames, _COLOUR_FRAMES):
         vertices = face_model(experiment.face(frame))[0]
         seen, weight = _seen_colors(experiment, frame, vertices, face_model.faces)
         colors += weight[:, None] * seen

@@ -1,26 +1,39 @@
 """`evaluate`: a trained run in, metrics.json and report.html out."""
 
+import hashlib
+import json
 from collections.abc import Sequence as Items
 from pathlib import Path
 from typing import Any
 
 from mien.errors import UserError
+from mien.evaluation.experiment import Experiment
 from mien.evaluation.load import load_experiments
-from mien.evaluation.protocols import EvaluationSettings, evaluate_frames, protocol_content
-from mien.evaluation.report import RunRecord, write_report
-from mien.storage import read_json, write_json
+from mien.evaluation.partial import PartialScores
+from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
+from mien.evaluation.report import ReportVideo, RunRecord, write_report
+from mien.evaluation.videos import write_comparison_video, write_scored_pictures
+from mien.storage import file_digest, read_json, write_json
 from mien.training import read_curves, read_run_config, read_training_summary
 
 _FORMAT, _VERSION = "mien.metrics", 1
+_RECIPE = 2
+"""Raised whenever the same frame would be scored otherwise."""
 
 
-def evaluate(run_dir: Path, sequence_dirs: Items[Path], settings: EvaluationSettings | None = None) -> dict[str, Any]:
+def evaluate(
+    run_dir: Path,
+    sequence_dirs: Items[Path],
+    settings: EvaluationSettings | None = None,
+    driver_dirs: Items[Path] = (),
+) -> dict[str, Any]:
     """Score a run on its held-out frames; writes metrics.json and report.html into its folder.
 
     Args:
         run_dir: A finished run.
         sequence_dirs: The folders of the sequences it was trained on, in that order.
         settings: What to compute; None for the defaults.
+        driver_dirs: Folders of tracked sequences whose motion drives the avatar as well.
 
     Returns:
         The content of metrics.json: `protocols` and `training`.
@@ -32,14 +45,51 @@ def evaluate(run_dir: Path, sequence_dirs: Items[Path], settings: EvaluationSett
     summary = read_training_summary(run_dir)
     experiments = load_experiments(run_dir, sequence_dirs)
     if not experiments:
-        raise UserError(f"{run_dir}: nothing was held out, so nothing can be scored; train with the split `blocks`")
-    results = {name: (one, evaluate_frames(one, settings)) for name, one in experiments.items()}
+        raise UserError(
+            f"{run_dir}: nothing was held out, so nothing can be scored; train with the split `blocks` or `tail`"
+        )
+    partials = {
+        name: PartialScores(run_dir / f".{name}.partial", _fingerprint(run_dir, name, experiment, settings))
+        for name, experiment in experiments.items()
+    }
+    results = {
+        name: (experiment, evaluate_frames(experiment, settings, partials[name], f"evaluate {name}"))
+        for name, experiment in experiments.items()
+    }
     protocols = {name: protocol_content(*result, settings) for name, result in results.items()}
     content = {"protocols": protocols, "training": summary}
+    videos = {
+        name: _video(run_dir, name, experiment, evaluation, settings)
+        for name, (experiment, evaluation) in results.items()
+        if settings.video_frames
+    }
+    for name, experiment in experiments.items():
+        if settings.pictures:
+            write_scored_pictures(run_dir / "pictures" / name, experiment)
     run = RunRecord(run_dir.name, read_run_config(run_dir), summary, read_curves(run_dir))
-    write_report(run_dir / "report.html", run, protocols, results)
+    write_report(run_dir / "report.html", run, protocols, results, videos)
     write_json(run_dir / "metrics.json", _FORMAT, _VERSION, content)
+    for partial in partials.values():
+        partial.remove()
     return content
+
+
+def _video(
+    run_dir: Path, name: str, experiment: Experiment, evaluation: Evaluation, settings: EvaluationSettings
+) -> ReportVideo:
+    path = run_dir / "videos" / f"{name}.mp4"
+    count = write_comparison_video(path, experiment, evaluation, settings.video_frames)
+    return ReportVideo(path, count, len(evaluation.frames))
+
+
+def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings: EvaluationSettings) -> str:
+    """What the figures of a frame depend on, as hex digits."""
+    content = [
+        _RECIPE, protocol, file_digest(run_dir / "avatar" / "avatar.safetensors"),
+        file_digest(run_dir / "face_track.safetensors"), experiment.digests, experiment.held_out_frames,
+        settings.baselines, settings.perceptual, settings.perceptual_frames, settings.backbone,
+    ]  # fmt: skip
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
 def read_metrics(run_dir: Path) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """What is evaluated: an avatar, the sequences it was trained on, and which frames it has never seen."""
 
+from collections.abc import Sequence as Items
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -11,10 +12,11 @@ from torch import Tensor
 from mien.avatar.avatar import Avatar
 from mien.camera import Camera
 from mien.evaluation.metrics import Box
+from mien.evaluation.scoring import evenly_spread
 from mien.face import FaceParams
 from mien.render import rasterize
 from mien.tracking import Scoring
-from mien.training.sequence import Sequence
+from mien.training.sequence import Sequence, composite
 
 FaceSource = Literal["as_tracked", "corrected"]
 """Whether held-out frames are posed as the tracker left them, or with what training corrected in the frames beside
@@ -43,7 +45,9 @@ class Experiment:
     training_frames: tuple[Frame, ...]
     held_out_frames: tuple[Frame, ...]
     split: str
-    """Name of the split: `blocks`, `tail`, ..."""
+    """Name of the split: `blocks`, `tail`, `sequences`, `cameras`."""
+    digests: tuple[dict[str, str], ...] = ()
+    """One a sequence: the hashes of its `pictures` and of its `mask`; empty where nothing was read from disk."""
 
     def camera(self, frame: Frame) -> Camera:
         """The camera of a frame."""
@@ -63,17 +67,25 @@ class Experiment:
         return self.faces[frame.sequence][frame.timestep]
 
 
+def spread_frames(frames: Items[Frame], most: int) -> list[Frame]:
+    """At most `most` of the frames, evenly spread over sequences, cameras and time; 0 for all."""
+    # One camera after the other: a stride over cameras of the same timestep could meet one of them only.
+    ordered = sorted(frames, key=lambda frame: (frame.sequence, frame.camera, frame.timestep))
+    return evenly_spread(ordered, most)
+
+
 def target_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
-    """What a rendering should equal: the picture where the frozen scoring mask keeps it, white elsewhere."""
-    sequence = experiment.sequences[frame.sequence]
-    image = torch.from_numpy(sequence.capture.images[frame[1:]].astype(np.float32)) / 255
-    alpha = scoring_alpha(experiment, frame)[..., None]
-    return image * alpha + (1 - alpha)
+    """What a rendering should equal, at 8 bits: the picture where the frozen scoring mask keeps it, over white."""
+    picture = np.asarray(experiment.sequences[frame.sequence].capture.images[frame[1:]])
+    mask = np.asarray(experiment.scorings[frame.sequence].masks[frame[1:]])
+    return torch.from_numpy(composite(picture, mask, np.full(3, 255, np.uint8))).float() / 255
 
 
-def scoring_alpha(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w"]:
-    """The frozen scoring mask of a frame, 0..1."""
-    return torch.from_numpy(experiment.scorings[frame.sequence].masks[frame[1:]].astype(np.float32)) / 255
+def scored_on(experiment: Experiment, frames: Items[Frame]) -> dict[str, dict[str, str]]:
+    """The hashes of the pictures and of the mask of each sequence among some frames: what figures compare by."""
+    if not experiment.digests:
+        return {}
+    return {experiment.sequences[i].name: experiment.digests[i] for i in sorted({frame.sequence for frame in frames})}
 
 
 @torch.no_grad()

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from mien.avatar import load_avatar
+from mien.capture import read_capture, read_capture_hash
 from mien.config import decode
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, FaceSource, Frame
 from mien.face import FaceParams
 from mien.storage import read_tensors
-from mien.tracking import read_scoring
-from mien.training import Sequence, TrainSettings, read_run_config, read_sequence
+from mien.tracking import read_scoring, read_scoring_hash, read_tracking
+from mien.training import Sequence, TrainSettings, read_run_config
 from mien.training.frames import training_frames
 from mien.training.split import held_out
 
@@ -21,8 +22,11 @@ from mien.training.split import held_out
 def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Experiment]:
     """What there is to evaluate, by protocol; nothing where nothing was held out.
 
-    `self_reenactment` (`self_reenactment_tail` for that split) holds the timesteps and sequences that training left
-    out, `novel_view` the cameras that it left out, at timesteps it has seen.
+    - `self_reenactment` (`self_reenactment_tail` for that split): timesteps left out of sequences trained on.
+    - `self_reenactment_sequence`: sequences left out as a whole, posed as tracked.
+    - `novel_view`: cameras left out, at timesteps that other cameras were trained at.
+
+    The first two show all cameras, also those left out.
 
     Raises:
         UserError: the run is not finished, or the sequences are not those that it was trained on.
@@ -33,42 +37,56 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
     if [folder.name for folder in sequence_dirs] != wanted:
         given = ", ".join(folder.name for folder in sequence_dirs)
         raise UserError(f"{run_dir}: was trained on {', '.join(wanted)}, not on {given}; give it those sequences")
-    sequences = tuple(read_sequence(folder) for folder in sequence_dirs)
+    scorings = tuple(read_scoring(folder / "scoring") for folder in sequence_dirs)
+    sequences = tuple(
+        Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), scoring.masks)
+        for folder, scoring in zip(sequence_dirs, scorings, strict=True)
+    )
     faces = _faces_of_run(run_dir, sequences)
-    trained = tuple(Frame(f.sequence, f.timestep, f.camera) for f in training_frames(sequences, settings))
     base = Experiment(
         avatar=load_avatar(run_dir),
         sequences=sequences,
         faces=faces,
         face_source="as_tracked",
-        scorings=tuple(read_scoring(folder / "scoring") for folder in sequence_dirs),
-        training_frames=trained,
+        scorings=scorings,
+        training_frames=tuple(Frame(f.sequence, f.timestep, f.camera) for f in training_frames(sequences, settings)),
         held_out_frames=(),
         split=settings.split,
+        digests=tuple(_digests(folder) for folder in sequence_dirs),
     )
     return {
         protocol: replace(base, held_out_frames=frames, split=split, face_source=_face_source(sequences, faces, frames))
-        for protocol, (split, frames) in _protocols(sequences, settings).items()
+        for protocol, (split, frames) in held_out_by_protocol(sequences, settings).items()
     }
 
 
-def _protocols(sequences: Items[Sequence], settings: TrainSettings) -> dict[str, tuple[str, tuple[Frame, ...]]]:
-    """Held-out frames by protocol, each with the name of its split."""
+def _digests(folder: Path) -> dict[str, str]:
+    return {"pictures": read_capture_hash(folder / "capture"), "mask": read_scoring_hash(folder / "scoring")}
+
+
+def held_out_by_protocol(
+    sequences: Items[Sequence], settings: TrainSettings
+) -> dict[str, tuple[str, tuple[Frame, ...]]]:
+    """Frames that training left out, by protocol, each with the name of its split; only protocols with a frame."""
     unseen_timesteps: list[Frame] = []
+    unseen_sequences: list[Frame] = []
     unseen_cameras: list[Frame] = []
-    whole = bool(settings.held_out_sequences)
     for index, sequence in enumerate(sequences):
         left_out = held_out(sequence.capture.timesteps, settings.split).numpy()
         for timestep, camera in np.argwhere(sequence.usable()).tolist():
             frame = Frame(index, timestep, camera)
-            if left_out[timestep] or sequence.name in settings.held_out_sequences:
+            if sequence.name in settings.held_out_sequences:
+                unseen_sequences.append(frame)
+            elif left_out[timestep]:
                 unseen_timesteps.append(frame)
             elif sequence.capture.camera_ids[camera] in settings.held_out_cameras:
                 unseen_cameras.append(frame)
-    name = "self_reenactment_tail" if settings.split == "tail" else "self_reenactment"
-    parts = ([] if settings.split == "none" else [settings.split]) + ["sequences"] * whole
-    split = "+".join(parts)
-    found = {name: (split, tuple(unseen_timesteps)), "novel_view": ("cameras", tuple(unseen_cameras))}
+    by_time = "self_reenactment_tail" if settings.split == "tail" else "self_reenactment"
+    found = {
+        by_time: (settings.split, tuple(unseen_timesteps)),
+        "self_reenactment_sequence": ("sequences", tuple(unseen_sequences)),
+        "novel_view": ("cameras", tuple(unseen_cameras)),
+    }
     return {protocol: entry for protocol, entry in found.items() if entry[1]}
 
 

@@ -1,50 +1,47 @@
-"""Self-reenactment on held-out frames: the avatar and both baselines, on the same frames, by the same metrics."""
+"""Protocols with a truth: the avatar and both baselines on the same held-out frames, by the same metrics."""
 
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import Any, TypeVar
+from typing import Any
 
-import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from mien.evaluation.baselines import Baselines, make_baselines
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, target_image
-from mien.evaluation.metrics import Box, crop_to, l1, psnr, ssim
-from mien.evaluation.perceptual import MINIMUM_SIZE, Backbone, PerceptualDistance, load_perceptual
+from mien.evaluation.experiment import Experiment, Frame, avatar_image, scored_on, spread_frames, target_image
+from mien.evaluation.metrics import psnr
+from mien.evaluation.partial import PartialScores
+from mien.evaluation.scoring import (
+    PIXELS,
+    SSIM_WINDOW,
+    Scores,
+    ScoreSettings,
+    as_8_bit,
+    in_threads,
+    mean_scores,
+    perceptual_metric,
+    score_pictures,
+    worker_threads,
+)
 from mien.progress import progress_bar
 
 AVATAR, AS_TRACKED, MEAN_FRAME, MESH = "avatar", "as_tracked", "mean_frame", "mesh"
-METRICS = ("psnr", "ssim", "l1", "perceptual")
 _TRAINING_FRAMES = 200
 _MASK = "frozen scoring mask: matte cut below the neck line, over white"
 _CROP = "frozen head box of each frame"
-_SSIM = "11x11 Gaussian window, sigma 1.5, zeros beyond the border"
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-Scores = Mapping[str, float]
-"""`psnr`, `ssim`, `l1`, `perceptual` and the same with `head_` in front."""
 
 
 @dataclass(frozen=True)
-class EvaluationSettings:
-    """How to evaluate; the figures do not depend on `threads`."""
+class EvaluationSettings(ScoreSettings):
+    """How to evaluate a run."""
 
-    perceptual: bool = True
-    """Whether to compute ST-LPIPS, which takes most of the time."""
-    perceptual_frames: int = 32
-    """ST-LPIPS is computed on at most this many held-out frames, evenly spread: 3 s each at 512x512; 0 for all."""
     baselines: bool = True
     """Also score the mean training picture and the coloured mesh."""
-    threads: int = 2
-    """Frames scored at a time."""
-    backbone: Backbone = "st-lpips-alex"
-    """Network of the perceptual metric."""
+    video_frames: int = 600
+    """At most this many frames in each side-by-side video; 0 for no videos."""
+    pictures: bool = False
+    """Also write every scored picture and its truth as png."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,107 +58,106 @@ class Evaluation:
     training_psnr: dict[Frame, tuple[float, float]]
     """Whole frame and head crop of some training frames, evenly spread: how much worse the held-out ones are."""
 
-    def mean(self, subject: str, name: str) -> float:
-        """The mean of one figure over the frames that have it."""
-        return fmean(entry[name] for entry in self.scores[subject] if name in entry)
-
     def ranked(self) -> list[int]:
         """Indices into `frames` from the worst PSNR of the avatar on the head crop to the best."""
         figures = [entry["head_psnr"] for entry in self.scores[AVATAR]]
         return sorted(range(len(figures)), key=figures.__getitem__)
 
 
-def evaluate_frames(experiment: Experiment, settings: EvaluationSettings) -> Evaluation:
-    """Score every held-out frame. Rendering is done here, one frame after the other; scoring in `settings.threads`."""
-    assert experiment.held_out_frames, "nothing is held out"
-    metric = load_perceptual(settings.backbone) if settings.perceptual else None
-    baselines = make_baselines(experiment) if settings.baselines else None
-    as_tracked = None if experiment.face_source == "as_tracked" else _as_tracked(experiment)
-    seconds: list[float] = []
-    frames = experiment.held_out_frames
-    judged = _evenly_spread(frames, settings.perceptual_frames)
+def evaluate_frames(
+    experiment: Experiment, settings: EvaluationSettings, partial: PartialScores | None = None, title: str = "evaluate"
+) -> Evaluation:
+    """Score every held-out frame. Rendering is done here, one frame after the other; scoring in threads.
 
-    def pictures(frame: Frame) -> dict[str, Tensor]:
+    Args:
+        experiment: What to score.
+        settings: What to compute.
+        partial: Figures of frames that an interrupted evaluation has computed already, and where new ones are kept.
+        title: Of the progress bar.
+    """
+    assert experiment.held_out_frames, "nothing is held out"
+    frames = experiment.held_out_frames
+    done = partial.read() if partial is not None else {}
+    metric = perceptual_metric(settings)
+    judged = set(spread_frames(frames, settings.perceptual_frames))
+    baselines = make_baselines(experiment) if settings.baselines else None
+
+    def score(job: tuple[Frame, dict[str, Tensor], float]) -> tuple[Frame, dict[str, Scores], float]:
+        frame, drawn, seconds = job
+        pictures = {name: as_8_bit(picture) for name, picture in drawn.items()}
+        truth, crop = target_image(experiment, frame), experiment.crop(frame)
+        return frame, score_pictures(pictures, truth, crop, metric if frame in judged else None), seconds
+
+    with progress_bar(title, len(frames), len(done)) as advance:
+        jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines)
+        for frame, row, seconds in in_threads(score, jobs, worker_threads(settings.threads)):
+            done[frame] = row, seconds
+            if partial is not None:
+                partial.add(frame, row, seconds)
+            advance(status=f"PSNR {fmean(r[AVATAR]['psnr'] for r, _ in done.values()):.2f}")
+    rows = [done[frame][0] for frame in frames]
+    scores = {subject: tuple(row[subject] for row in rows) for subject in rows[0]}
+    seconds = sorted(done[frame][1] for frame in frames)
+    return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, _training_psnr(experiment))
+
+
+def _drawn(
+    experiment: Experiment, frames: list[Frame], baselines: Baselines | None
+) -> Iterator[tuple[Frame, dict[str, Tensor], float]]:
+    """Each frame with what is scored of it, by name, and the seconds that posing and rendering the avatar took."""
+    as_tracked = None if experiment.face_source == "as_tracked" else _as_tracked(experiment)
+    for frame in frames:
         start = time.perf_counter()
         drawn = {AVATAR: avatar_image(experiment, frame)}
-        seconds.append(time.perf_counter() - start)
+        seconds = time.perf_counter() - start
         if as_tracked is not None:
             drawn[AS_TRACKED] = avatar_image(as_tracked, frame)
         if baselines is not None:
             drawn[MEAN_FRAME] = baselines.mean_frame_image(experiment, frame)
             drawn[MESH] = baselines.mesh_image(experiment, frame)
-        return drawn
-
-    def score(job: tuple[Frame, dict[str, Tensor]]) -> dict[str, Scores]:
-        frame, drawn = job
-        return score_pictures(
-            drawn, target_image(experiment, frame), experiment.crop(frame), metric if frame in judged else None
-        )
-
-    rows: list[dict[str, Scores]] = []
-    with progress_bar("evaluate", len(frames)) as advance:
-        jobs = ((frame, pictures(frame)) for frame in frames)
-        for row in _in_threads(score, jobs, settings.threads):
-            rows.append(row)
-            advance(status=f"PSNR {fmean(r[AVATAR]['psnr'] for r in rows):.2f}")
-    scores = {subject: tuple(row[subject] for row in rows) for subject in rows[0]}
-    seen = _training_psnr(experiment)
-    return Evaluation(frames, scores, sorted(seconds)[len(seconds) // 2], baselines, seen)
+        yield frame, drawn, seconds
 
 
 def _as_tracked(experiment: Experiment) -> Experiment:
-    """The same with the faces that the tracker left."""
-    return replace(experiment, faces=tuple(sequence.tracking.face for sequence in experiment.sequences))
+    """The same with the motion that the tracker left; the person stays the one that was trained."""
+    tracked = (
+        replace(sequence.tracking.face, identity=used.identity, vertex_offsets=used.vertex_offsets)
+        for sequence, used in zip(experiment.sequences, experiment.faces, strict=True)
+    )
+    return replace(experiment, faces=tuple(tracked))
 
 
 def _training_psnr(experiment: Experiment) -> dict[Frame, tuple[float, float]]:
     """PSNR on the whole frame and on the head crop of at most `_TRAINING_FRAMES` frames that were trained on."""
     figures = {}
-    for frame in sorted(_evenly_spread(experiment.training_frames, _TRAINING_FRAMES)):
-        image, target = avatar_image(experiment, frame), target_image(experiment, frame)
+    for frame in spread_frames(experiment.training_frames, _TRAINING_FRAMES):
+        image, target = as_8_bit(avatar_image(experiment, frame)), target_image(experiment, frame)
         figures[frame] = (psnr(image, target), psnr(image, target, experiment.crop(frame)))
     return figures
 
 
-@torch.no_grad()
-def score_pictures(
-    pictures: Mapping[str, Float[Tensor, "h w 3"]],
-    target: Float[Tensor, "h w 3"],
-    crop: Box,
-    metric: PerceptualDistance | None,
-) -> dict[str, Scores]:
-    """The figures of several pictures against one target, on the whole frame and on the head crop."""
-    rows: dict[str, dict[str, float]] = {name: {} for name in pictures}
-    for prefix, box in (("", None), ("head_", crop)):
-        cut = crop_to(target, box)
-        small = min(cut.shape[:2]) < MINIMUM_SIZE
-        reference = metric.features(cut) if metric is not None and not small else None
-        for name, picture in pictures.items():
-            image, row = crop_to(picture, box), rows[name]
-            row[f"{prefix}psnr"], row[f"{prefix}ssim"] = psnr(image, cut), ssim(image, cut)
-            row[f"{prefix}l1"] = l1(image, cut)
-            if metric is not None and reference is not None:
-                row[f"{prefix}perceptual"] = metric.between(metric.features(image), reference)
-    return dict(rows)
-
-
 def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: EvaluationSettings) -> dict[str, Any]:
     """The protocol's entry of metrics.json: means over frames, how they were made, and every frame's figures."""
-    own_rows = evaluation.scores[AVATAR]
+    scores = evaluation.scores
+    own_rows = scores[AVATAR]
     return {
-        **_means(evaluation, AVATAR),
+        **mean_scores(own_rows),
         "perceptual_backbone": settings.backbone if settings.perceptual else None,
         "perceptual_frames": sum("perceptual" in row for row in own_rows),
         "split": experiment.split,
         "mask": _MASK,
         "crop": _CROP,
-        "ssim_window": _SSIM,
+        "ssim_window": SSIM_WINDOW,
+        "pixels": PIXELS,
         "face_params": experiment.face_source,
         "frames": len(evaluation.frames),
+        "sequences": sorted({experiment.sequences[frame.sequence].name for frame in evaluation.frames}),
+        "camera_ids": sorted({experiment.camera_id(frame) for frame in evaluation.frames}),
+        "scored_on": scored_on(experiment, evaluation.frames),
         "seconds_per_frame": evaluation.seconds_per_frame,
         "training_frames": _training_means(evaluation),
-        "baselines": {name: _means(evaluation, name) for name in (MEAN_FRAME, MESH) if name in evaluation.scores},
-        "as_tracked": _means(evaluation, AS_TRACKED if AS_TRACKED in evaluation.scores else AVATAR),
+        "baselines": {name: mean_scores(scores[name]) for name in (MEAN_FRAME, MESH) if name in scores},
+        "as_tracked": mean_scores(scores.get(AS_TRACKED, own_rows)),
         "per_frame": {
             "sequence": [experiment.sequences[frame.sequence].name for frame in evaluation.frames],
             "timestep": [frame.timestep for frame in evaluation.frames],
@@ -177,34 +173,5 @@ def _training_means(evaluation: Evaluation) -> dict[str, Any]:
     return {"psnr": fmean(whole), "head": {"psnr": fmean(head)}, "frames": len(whole)}
 
 
-def _means(evaluation: Evaluation, subject: str) -> dict[str, Any]:
-    """Mean figures; None for a metric that was left out."""
-    known = set().union(*evaluation.scores[subject])
-
-    def means(prefix: str) -> dict[str, float | None]:
-        names = {name: prefix + name for name in METRICS}
-        return {name: evaluation.mean(subject, key) if key in known else None for name, key in names.items()}
-
-    return {**means(""), "head": means("head_")}
-
-
 def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 5)
-
-
-def _evenly_spread(frames: tuple[Frame, ...], most: int) -> set[Frame]:
-    """At most `most` of the frames, the first always among them; 0 for all."""
-    step = max(1, -(-len(frames) // most)) if most else 1
-    return set(frames[::step])
-
-
-def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """Results in order; at most two items a thread are prepared ahead, so that memory stays small."""
-    with ThreadPoolExecutor(threads) as pool:
-        waiting: deque[Future[Result]] = deque()
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) >= 2 * threads:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()

@@ -11,11 +11,11 @@ from mien.evaluation.metrics import Box, crop_to
 from mien.evaluation.pictures import HEAT_STOPS, data_uri, error_heat, shrunk, to_uint8
 from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import AVATAR, MESH, Evaluation
+from mien.evaluation.videos import HEAT_LIMIT
 from mien.render.mesh import render_mesh
 
 _PICTURE_SIZE = 400
 _OVERLAY_SIZE = 300
-_HEAT_LIMIT = 0.25
 _ROWS = 6
 _OVERLAYS = 6
 _MARGIN = 0.05
@@ -28,12 +28,12 @@ def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
     middle = len(ranked) // 2
     places = _places(len(ranked), middle)
     names = {len(ranked) - 1: "best", middle: "median", 0: "worst"}
-    box = _head_box(experiment, [evaluation.frames[ranked[place]] for place in places])
+    box = head_box(experiment, [evaluation.frames[ranked[place]] for place in places])
     rows = [_comparison_row(experiment, evaluation, ranked[place], names.get(place, ""), box) for place in places]
     stops = ", ".join(f"rgb{stop}" for stop in HEAT_STOPS)
     scale = (
         f'<span class="scale">0 <i style="background:linear-gradient(90deg,{stops})"></i> '
-        f"{_HEAT_LIMIT * 255:.0f} of 255 and more</span>"
+        f"{HEAT_LIMIT * 255:.0f} of 255 and more</span>"
     )
     labels = f'<div class="labels"><span>Truth</span><span>Render</span><span>Error {scale}</span></div>'
     return labels + "".join(rows)
@@ -48,7 +48,7 @@ def _places(count: int, middle: int) -> list[int]:
     return places[::-1]
 
 
-def _head_box(experiment: Experiment, frames: Sequence[Frame]) -> Box:
+def head_box(experiment: Experiment, frames: Sequence[Frame]) -> Box:
     """A box around the head crops of some frames, with a margin: one cut for all, so that motion can be seen."""
     crops = np.array([experiment.crop(frame) for frame in frames])
     left, top = crops[:, :2].min(0)
@@ -60,7 +60,7 @@ def _head_box(experiment: Experiment, frames: Sequence[Frame]) -> Box:
 def _comparison_row(experiment: Experiment, evaluation: Evaluation, index: int, name: str, box: Box) -> str:
     frame, scores = evaluation.frames[index], evaluation.scores[AVATAR][index]
     target, image = target_image(experiment, frame), avatar_image(experiment, frame)
-    whole = (to_uint8(target), to_uint8(image), error_heat(image, target, _HEAT_LIMIT))
+    whole = (to_uint8(target), to_uint8(image), error_heat(image, target, HEAT_LIMIT))
     pictures = [crop_to(torch.from_numpy(picture), box).numpy() for picture in whole]
     figures = f"PSNR {scores['psnr']:.2f} dB, head {scores['head_psnr']:.2f} dB, SSIM {scores['ssim']:.3f}"
     if "perceptual" in scores:

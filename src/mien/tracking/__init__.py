@@ -5,7 +5,7 @@ from mien.tracking.overlay import draw_overlay, write_overlay
 from mien.tracking.pipeline import track, track_subject
 from mien.tracking.report import residual_report, write_residual_report
 from mien.tracking.scoring import Scoring, make_scoring
-from mien.tracking.scoring_files import read_scoring, scoring_exists, write_scoring
+from mien.tracking.scoring_files import read_scoring, read_scoring_hash, scoring_exists, write_scoring
 from mien.tracking.settings import SmoothnessSettings, TrackingSettings
 from mien.tracking.tracking import Tracking
 
@@ -17,6 +17,7 @@ __all__ = [
     "draw_overlay",
     "make_scoring",
     "read_scoring",
+    "read_scoring_hash",
     "read_tracking",
     "residual_report",
     "scoring_exists",

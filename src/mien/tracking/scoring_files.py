@@ -72,6 +72,15 @@ def read_scoring(path: Path) -> Scoring:
     return Scoring(masks, crops.astype(np.int64))
 
 
+def read_scoring_hash(path: Path) -> str:
+    """The hash over masks and crops of a scoring on disk, without reading them.
+
+    Raises:
+        UserError: there is no scoring, or one of another version.
+    """
+    return str(read_json(path / "scoring.json", _FORMAT, _VERSION).get("sha256"))
+
+
 def _write_into(folder: Path, scoring: Scoring, capture_hash: str | None) -> None:
     timesteps, cameras, height, width = scoring.masks.shape
     for timestep, camera in np.ndindex(timesteps, cameras):

@@ -1,24 +1,62 @@
 """Run -> metrics, as the command line runs it."""
 
+from collections.abc import Sequence as Items
+from pathlib import Path
 from typing import Any
 
+from mien.evaluation.compare import Comparison, compare_runs
+from mien.evaluation.compare_report import write_comparison
 from mien.evaluation.evaluate import evaluate
+from mien.evaluation.protocols import EvaluationSettings
+from mien.evaluation.words import protocol_line
 from mien.progress import say
 from mien.training import read_run_config
-from mien.workspace import Workspace
+from mien.workspace import Workspace, open_workspace
 
 
-def evaluation_stage(workspace: Workspace, run: str) -> dict[str, Any]:
-    """Evaluate a run on what it held out; returns the content of metrics.json."""
+def evaluation_stage(
+    workspace: Workspace, run: str, settings: EvaluationSettings | None = None, drivers: Items[Path] = ()
+) -> dict[str, Any]:
+    """Evaluate a run on what it held out, and on other sequences' motion; returns the content of metrics.json."""
     run_dir = workspace.run_dir(run)
-    metrics = evaluate(
-        run_dir, [workspace.sequence_dir(entry["sequence"]) for entry in read_run_config(run_dir)["data"]]
-    )
+    metrics = evaluate(run_dir, run_sequences(workspace, run_dir), settings, _driver_folders(drivers))
     for name, entry in metrics["protocols"].items():
-        baselines = ", ".join(f"{key} {value['psnr']:.2f}" for key, value in entry["baselines"].items())
-        say(
-            f"{name} ({entry['split']}, {entry['frames']} frames): PSNR {entry['psnr']:.2f} dB whole frame, "
-            f"{entry['head']['psnr']:.2f} head crop; baselines: {baselines}"
-        )
+        say(protocol_line(name, entry))
     say(f"Look at {run_dir / 'report.html'}")
     return metrics
+
+
+def run_sequences(workspace: Workspace, run_dir: Path) -> list[Path]:
+    """The folders of the sequences that a run was trained with, in its order."""
+    return [workspace.sequence_dir(entry["sequence"]) for entry in read_run_config(run_dir)["data"]]
+
+
+def comparison_stage(workspaces: Items[Workspace], run: str | None, out: Path | None) -> Comparison:
+    """Compare the runs of some workspaces and write the page, in the first workspace unless told otherwise."""
+    roots = [workspace.root.resolve() for workspace in workspaces]
+    by_name = len({root.name for root in roots}) == len(roots)
+    run_dirs: dict[str, Path] = {}
+    sequence_dirs: dict[Path, list[Path]] = {}
+    for workspace, root in zip(workspaces, roots, strict=True):
+        names = workspace.run_names() if run is None else [workspace.pick_run(run)]
+        for name in names:
+            label = name if len(roots) == 1 else f"{root.name if by_name else root}/{name}"
+            run_dirs[label] = workspace.run_dir(name)
+            sequence_dirs[run_dirs[label]] = run_sequences(workspace, run_dirs[label])
+    comparison = compare_runs(run_dirs)
+    path = out or workspaces[0].root / "compare.html"
+    write_comparison(path, comparison, sequence_dirs)
+    say(f"Look at {path}")
+    return comparison
+
+
+def _driver_folders(drivers: Items[Path]) -> list[Path]:
+    """Sequence folders: those given, and all of the workspaces given."""
+    folders: list[Path] = []
+    for driver in drivers:
+        if (driver / "tracking").is_dir():
+            folders.append(driver)
+            continue
+        workspace = open_workspace(driver)
+        folders += [workspace.sequence_dir(name) for name in workspace.sequence_names()]
+    return folders

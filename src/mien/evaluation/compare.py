@@ -1,0 +1,195 @@
+"""One table over runs: the figures of their metrics.json, side by side, and whether they may be compared at all."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mien.errors import UserError
+from mien.evaluation.evaluate import read_metrics
+from mien.evaluation.words import FACES, NAMES
+from mien.training import read_run_config
+
+COLUMNS = (
+    ("psnr", "PSNR", 2, True), ("ssim", "SSIM", 3, True), ("l1", "L1", 4, False), ("perceptual", "ST-LPIPS", 3, False),
+)  # fmt: skip
+"""Metric, heading, digits, whether more is better."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredRun:
+    """A run that was evaluated."""
+
+    label: str
+    """Of the run; with its workspace's name where there are several."""
+    run_dir: Path
+    method: str
+    metrics: Mapping[str, Any]
+    """metrics.json."""
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A line of a table."""
+
+    label: str
+    entry: Mapping[str, Any]
+    """`psnr`, ..., `head`: {...}."""
+    run: ScoredRun | None
+    """None for baselines."""
+    faces: str
+    """What the face parameters of held-out frames were."""
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """One protocol on one set of frames: rows that may be compared with each other."""
+
+    protocol: str
+    split: str
+    frames: int
+    scored_on: Mapping[str, Any]
+    """Hashes of pictures and masks by sequence."""
+    rows: tuple[Row, ...]
+
+    def best(self, part: str | None, metric: str, higher: bool) -> float | None:
+        """The best figure of a column among the runs, rounded as printed; None where there are not two runs."""
+        digits = next(digits for name, _, digits, _ in COLUMNS if name == metric)
+        own = [figure(row.entry, part, metric) for row in self.rows if row.run is not None]
+        known = [round(value, digits) for value in own if value is not None]
+        return None if len(known) < 2 else (max(known) if higher else min(known))
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """All tables, and what a reader has to know about them."""
+
+    runs: tuple[ScoredRun, ...]
+    tables: tuple[Table, ...]
+    warnings: tuple[str, ...]
+
+    def content(self) -> dict[str, Any]:
+        """The comparison for machines."""
+        return {
+            "format": "mien.comparison",
+            "version": 1,
+            "tables": [
+                {
+                    "protocol": table.protocol,
+                    "split": table.split,
+                    "frames": table.frames,
+                    "scored_on": dict(table.scored_on),
+                    "rows": [_row_content(row) for row in table.rows],
+                }
+                for table in self.tables
+            ],
+            "warnings": list(self.warnings),
+        }
+
+
+def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
+    """Read the figures of some runs, by label, and sort them into tables of what may be compared.
+
+    Raises:
+        UserError: none of them was evaluated, or a metrics.json is damaged or of another version.
+    """
+    runs, warnings = [], []
+    for label, run_dir in run_dirs.items():
+        if not (run_dir / "metrics.json").is_file():
+            warnings.append(f"{label}: was not evaluated; run `mien evaluate` on it")
+            continue
+        method = read_run_config(run_dir)["method"]["kind"]
+        runs.append(ScoredRun(label, run_dir, method, read_metrics(run_dir)))
+    if not runs:
+        listed = ", ".join(run_dirs) or "there is none"
+        raise UserError(f"no evaluated run to compare ({listed}); run `mien evaluate DIR --run NAME` first")
+    tables, more = _tables(runs)
+    return Comparison(tuple(runs), tuple(tables), tuple(warnings + more))
+
+
+def figure(entry: Mapping[str, Any], part: str | None, metric: str) -> float | None:
+    """One figure of a row; None where it was not computed."""
+    return (entry if part is None else entry[part]).get(metric)
+
+
+def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
+    """Tables by protocol and by the frames and masks that were scored, and warnings where those differ."""
+    tables, warnings = [], []
+    protocols = dict.fromkeys(
+        name for run in runs for name, entry in run.metrics["protocols"].items() if "psnr" in entry
+    )
+    for protocol in protocols:
+        groups: dict[str, list[ScoredRun]] = {}
+        for run in runs:
+            entry = run.metrics["protocols"].get(protocol)
+            if entry is None:
+                warnings.append(f"{run.label}: has no {protocol}; it held out other frames or was evaluated otherwise")
+                continue
+            if not entry.get("scored_on"):
+                warnings.append(f"{run.label}: was evaluated by an older mien; evaluate it again to compare its mask")
+            groups.setdefault(_ground(entry), []).append(run)
+        tables += [_table(protocol, group) for group in groups.values()]
+        if len(groups) > 1:
+            sets = " | ".join(", ".join(run.label for run in group) for group in groups.values())
+            warnings.append(f"{protocol}: not scored on the same frames, pictures and masks, so not compared: {sets}")
+    for table in tables:
+        warnings += _differences(table)
+    return tables, warnings
+
+
+def _ground(entry: Mapping[str, Any]) -> str:
+    """What figures must have in common to be compared."""
+    frames = entry["per_frame"]
+    keys = ("sequence", "timestep", "camera_id")
+    return repr([entry.get("scored_on"), entry.get("pixels"), *(frames[key] for key in keys)])
+
+
+def _differences(table: Table) -> list[str]:
+    """What else is not alike in the runs of a table."""
+    own = [row for row in table.rows if row.run is not None]
+    warnings = []
+    if len({row.faces for row in own}) > 1:
+        warnings.append(
+            f"{table.protocol}: some runs correct the tracking of held-out frames and some do not; compare the rows "
+            f"{FACES['as_tracked']!r}, or train alike"
+        )
+    if len({(row.entry.get("perceptual_backbone"), row.entry.get("perceptual_frames")) for row in own}) > 1:
+        warnings.append(f"{table.protocol}: ST-LPIPS was computed on other frames; evaluate the runs alike")
+    return warnings
+
+
+def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
+    rows: list[Row] = []
+    for run in runs:
+        entry = run.metrics["protocols"][protocol]
+        rows.append(Row(run.label, entry, run, FACES[entry["face_params"]]))
+    for run in runs:
+        entry = run.metrics["protocols"][protocol]
+        if entry["face_params"] != "as_tracked":
+            rows.append(Row(run.label, entry["as_tracked"], None, FACES["as_tracked"]))
+    first = runs[0].metrics["protocols"][protocol]
+    for key, name in NAMES.items():
+        rows += _baseline_rows(key, name, runs, protocol)
+    return Table(protocol, first["split"], first["frames"], first.get("scored_on", {}), tuple(rows))
+
+
+def _baseline_rows(key: str, name: str, runs: Sequence[ScoredRun], protocol: str) -> list[Row]:
+    """A baseline's row, or one for each run where they differ (the mesh follows a run's corrected faces)."""
+    found: dict[str, tuple[list[str], Any]] = {}
+    for run in runs:
+        entry = run.metrics["protocols"][protocol]["baselines"].get(key)
+        if entry is not None:
+            found.setdefault(f"{entry['psnr']:.2f} {entry['head']['psnr']:.2f}", ([], entry))[0].append(run.label)
+    several = len(found) > 1
+    return [Row(f"{name} ({', '.join(of)})" if several else name, entry, None, "") for of, entry in found.values()]
+
+
+def _row_content(row: Row) -> dict[str, Any]:
+    names = [metric for metric, *_ in COLUMNS]
+    content: dict[str, Any] = {"label": row.label, "faces": row.faces or None, "baseline": not row.faces}
+    content |= {name: figure(row.entry, None, name) for name in names}
+    content["head"] = {name: figure(row.entry, "head", name) for name in names}
+    if row.run is not None:
+        content |= {"run": str(row.run.run_dir), "method": row.run.method, "training": row.run.metrics["training"]}
+        content["seconds_per_frame"] = row.entry["seconds_per_frame"]
+    return content

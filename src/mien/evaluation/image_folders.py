@@ -1,0 +1,242 @@
+"""Pictures of any other program scored by the code that scores avatars: folders or videos, matched by name."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from mien.errors import UserError
+from mien.evaluation.image_source import PictureSource, open_pictures
+from mien.evaluation.metrics import Box
+from mien.evaluation.scoring import (
+    PIXELS,
+    SSIM_WINDOW,
+    Scores,
+    ScoreSettings,
+    evenly_spread,
+    in_threads,
+    mean_scores,
+    perceptual_metric,
+    score_pictures,
+    worker_threads,
+)
+from mien.progress import progress_bar, say
+from mien.storage import read_json, write_json
+from mien.tracking.scoring import head_crop
+from mien.training.sequence import composite
+
+SCORES_FORMAT, SCORES_VERSION = "mien.scores", 1
+CROPS_FORMAT, CROPS_VERSION = "mien.crops", 1
+CROPS_NAME = "crops.json"
+Background = Literal["white", "black"]
+_COLORS = {"white": 255, "black": 0}
+_NAMED = 3
+
+
+@dataclass(frozen=True)
+class ImageFolders:
+    """What is compared."""
+
+    images: Path
+    """Folder of pictures, or a video."""
+    truth: Path
+    """Folder of pictures, or a video."""
+    mattes: Path | None = None
+    """Folder of opacity pictures: the truth counts where they are white and is `background` elsewhere."""
+    crops: Path | None = None
+    """crops.json with a head box for each picture; None for the one in the folder `truth`, else the mattes' boxes."""
+    background: Background = "white"
+    """Behind pictures with an alpha channel, and behind the truth where the mattes say so."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """One picture and its truth."""
+
+    name: str
+    image: UInt8[np.ndarray, "h w 3"]
+    truth: UInt8[np.ndarray, "h w 3"]
+    crop: Box | None
+
+
+def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) -> dict[str, Any]:
+    """Score pictures against their truth, matched by name (frames of a video: by order).
+
+    Returns:
+        What `write_scores` writes: mean `psnr, ssim, l1, perceptual`, the same on the `head` crop (None where no crop
+        is known), how they were made, and `per_frame` figures.
+
+    Raises:
+        UserError: names, numbers or sizes do not match, or a picture cannot be read.
+    """
+    settings = settings or ScoreSettings()
+    pairs = _Pairs(folders)
+    metric = perceptual_metric(settings)
+    judged = set(evenly_spread(range(len(pairs.names)), settings.perceptual_frames))
+
+    def score(job: tuple[int, _Pair]) -> Scores:
+        index, pair = job
+        own = {"image": _floats(pair.image)}
+        return score_pictures(own, _floats(pair.truth), pair.crop, metric if index in judged else None)["image"]
+
+    rows: list[Scores] = []
+    with progress_bar("score", len(pairs.names)) as advance:
+        for row in in_threads(score, pairs.read(), worker_threads(settings.threads)):
+            rows.append(row)
+            advance()
+    return {
+        **mean_scores(rows),
+        "perceptual_backbone": settings.backbone if settings.perceptual else None,
+        "perceptual_frames": sum("perceptual" in row for row in rows),
+        "frames": len(rows),
+        "crop": pairs.crop_source,
+        "mask": "none: whole pictures" if folders.mattes is None else f"mattes, over {folders.background}",
+        "ssim_window": SSIM_WINDOW,
+        "pixels": PIXELS,
+        "per_frame": {"name": pairs.names, **{key: [row.get(key) for row in rows] for key in rows[0]}},
+    }
+
+
+def write_scores(path: Path, scores: dict[str, Any]) -> None:
+    """Write what `score_folders` returned."""
+    write_json(path, SCORES_FORMAT, SCORES_VERSION, scores)
+
+
+def write_crops(path: Path, crops: dict[str, Box]) -> None:
+    """Write the head boxes (left, top, width, height) of named pictures."""
+    write_json(path, CROPS_FORMAT, CROPS_VERSION, {"crops": {name: list(box) for name, box in crops.items()}})
+
+
+def read_crops(path: Path) -> dict[str, Box]:
+    """Read what `write_crops` wrote.
+
+    Raises:
+        UserError: it is missing or damaged.
+    """
+    crops = read_json(path, CROPS_FORMAT, CROPS_VERSION).get("crops")
+    boxes: dict[str, Box] = {}
+    for name, box in crops.items() if isinstance(crops, dict) else [("", None)]:
+        if not isinstance(box, list) or len(box) != 4 or not all(isinstance(v, int) for v in box) or min(box[2:]) < 1:
+            raise UserError(f"{path}: {name!r} has no box of 4 numbers (left, top, width, height); write it again")
+        boxes[name] = (box[0], box[1], box[2], box[3])
+    return boxes
+
+
+class _Pairs:
+    """Pictures and their truth in order, read one after the other."""
+
+    def __init__(self, folders: ImageFolders) -> None:
+        self._folders = folders
+        self._images, self._truth = open_pictures(folders.images), open_pictures(folders.truth)
+        self._mattes = None if folders.mattes is None else open_pictures(folders.mattes)
+        self.names = _matched(self._truth, self._images)
+        if self._mattes is not None:
+            _matched(self._truth, self._mattes)
+        own = folders.truth / CROPS_NAME
+        crops_path = folders.crops or (own if own.is_file() else None)
+        self._crops = None if crops_path is None else read_crops(crops_path)
+        without = [name for name in self.names if self._crops is not None and name not in self._crops]
+        if without:
+            raise UserError(f"{crops_path}: has no head box for {_listed(without)}; write one for every picture")
+        known = "box of each matte" if self._mattes is not None else None
+        self.crop_source = known if crops_path is None else "frozen head box of each frame"
+
+    def read(self) -> Any:
+        """(index, pair) of every picture.
+
+        Raises:
+            UserError: a picture cannot be read, or has another size than its truth.
+        """
+        color = np.full(3, _COLORS[self._folders.background], np.uint8)
+        images = self._images.read(self.names)
+        truths = self._truth.read(self.names)
+        mattes = None if self._mattes is None else self._mattes.read(self.names)
+        surround: list[float] = []
+        for index, name in enumerate(self.names):
+            image, truth = _flat(next(images), color), _flat(next(truths), color)
+            self._check_size(name, image, truth, self._folders.images)
+            crop = None if self._crops is None else self._crops[name]
+            if mattes is not None:
+                matte = _opacity(next(mattes))
+                self._check_size(name, matte, truth, self._folders.mattes)
+                truth = composite(truth, matte, color)
+                crop = crop or _box(matte)
+                if (matte == 0).any():
+                    surround.append(float(np.abs(image[matte == 0].astype(np.int16) - int(color[0])).mean()))
+            if crop is not None and not _meets(crop, truth):
+                raise UserError(f"{name}: the head box {crop} lies outside of the picture; write {CROPS_NAME} again")
+            yield index, _Pair(name, image, truth, crop)
+        if surround and float(np.mean(surround)) > 64:
+            say(
+                f"warning: {self._folders.images}: pictures are not {self._folders.background} where the mattes are "
+                "empty, which costs much PSNR; render them over that colour, or give --background"
+            )
+
+    def _check_size(self, name: str, picture: np.ndarray, truth: np.ndarray, folder: Path | None) -> None:
+        if picture.shape[:2] != truth.shape[:2]:
+            sizes = [f"{shape[1]}x{shape[0]}" for shape in (picture.shape, truth.shape)]
+            raise UserError(
+                f"{folder}: {name} has {sizes[0]} pixels, its truth {sizes[1]}; bring them to one size (mien does not "
+                "resize: that would change the figures)"
+            )
+
+
+def _matched(truth: PictureSource, images: PictureSource) -> list[str]:
+    """The names to score, in order: those of the truth.
+
+    Raises:
+        UserError: a picture is missing, or a video has another number of frames.
+    """
+    if truth.names is None or images.names is None:
+        # Frames of a video have no names: their order has to do.
+        if truth.count != images.count:
+            raise UserError(
+                f"{images.path}: has {images.count} pictures, {truth.path} has {truth.count}; videos are matched by "
+                "order, so give equally many"
+            )
+        return truth.names or images.names or [f"{index:06d}" for index in range(truth.count)]
+    missing = sorted(set(truth.names) - set(images.names))
+    if missing:
+        raise UserError(
+            f"{images.path}: lacks {len(missing)} of the {truth.count} pictures of {truth.path} ({_listed(missing)}; "
+            f"it has {_listed(images.names)}); give pictures the names of their truths"
+        )
+    extra = len(images.names) - len(truth.names)
+    if extra:
+        say(f"warning: {images.path}: {extra} pictures have no truth in {truth.path} and are left out")
+    return truth.names
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+
+
+def _floats(image: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    return torch.from_numpy(image).float() / 255
+
+
+def _flat(picture: UInt8[np.ndarray, "h w _"], color: UInt8[np.ndarray, " 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture without its alpha channel, if it has one: over a colour."""
+    if picture.shape[2] == 4:
+        return composite(picture[..., :3], picture[..., 3], color)
+    return picture
+
+
+def _opacity(picture: UInt8[np.ndarray, "h w _"]) -> UInt8[np.ndarray, "h w"]:
+    """A matte from its picture: the alpha channel where there is one, else the brightness of grey."""
+    return np.ascontiguousarray(picture[..., 3] if picture.shape[2] == 4 else picture[..., 1])
+
+
+def _box(matte: UInt8[np.ndarray, "h w"]) -> Box:
+    left, top, width, height = (int(value) for value in head_crop(matte))
+    return left, top, width, height
+
+
+def _meets(box: Box, picture: np.ndarray) -> bool:
+    left, top, width, height = box
+    return left < picture.shape[1] and top < picture.shape[0] and left + width > 0 and top + height > 0

@@ -1,0 +1,91 @@
+"""Pictures by name from a folder, or in order from a video; one is in memory at a time."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from mien.capture.video import read_video_frames
+from mien.errors import UserError
+from mien.progress import say
+
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+
+
+@dataclass(frozen=True)
+class PictureSource:
+    """A folder of pictures, or a video."""
+
+    path: Path
+    count: int
+    names: list[str] | None
+    """File names without their ending, in order; None for a video."""
+    files: dict[str, Path]
+    """By name; empty for a video."""
+
+    def read(self, names: Sequence[str]) -> Iterator[UInt8[np.ndarray, "h w _"]]:
+        """Pictures with 3 or 4 channels, of these names; a video's in order.
+
+        Raises:
+            UserError: one cannot be read.
+        """
+        if self.names is None:
+            yield from itertools.islice((picture for _, picture in read_video_frames(self.path)), len(names))
+            return
+        in_order = len(names) == self.count and any(name not in self.files for name in names)
+        for name in self.names if in_order else names:
+            yield read_picture(self.files[name])
+
+
+def open_pictures(path: Path) -> PictureSource:
+    """The pictures at a path.
+
+    Raises:
+        UserError: nothing is there, it holds no picture, or two of the same name.
+    """
+    if path.is_file():
+        count = sum(1 for _ in read_video_frames(path))
+        say(f"warning: {path}: a video's compression changes pixels; png pictures score more truly")
+        return PictureSource(path, count, None, {})
+    if not path.is_dir():
+        raise UserError(f"{path}: no such folder; name a folder of pictures, or a video")
+    files: dict[str, Path] = {}
+    for file in sorted(path.iterdir()):
+        if file.suffix.lower() not in ENDINGS or file.name.startswith("."):
+            continue
+        if file.stem in files:
+            raise UserError(f"{path}: holds both {files[file.stem].name} and {file.name}; keep one picture a name")
+        files[file.stem] = file
+    if not files:
+        raise UserError(f"{path}: holds no picture; give files that end in {', '.join(ENDINGS)}")
+    return PictureSource(path, len(files), list(files), files)
+
+
+def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
+    """A picture of 8 bits a channel as RGB or RGBA; grey becomes RGB.
+
+    Raises:
+        UserError: it is no picture, is cut off, or has more than 8 bits.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+    # libpng returns the upper half of a truncated file.
+    cut = path.suffix.lower() == ".png" and not data.endswith(b"IEND\xaeB`\x82")
+    try:
+        picture = None if cut or not data else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:  # a header that asks for more pixels than OpenCV allows
+        picture = None
+    if picture is None:
+        raise UserError(f"{path}: no whole picture; write it again")
+    if picture.dtype != np.uint8:
+        raise UserError(f"{path}: has {picture.dtype} values; convert it to 8 bits a channel")
+    if picture.ndim == 2:
+        return np.repeat(picture[..., None], 3, axis=2)
+    order = [2, 1, 0, 3][: picture.shape[2]]
+    return np.ascontiguousarray(picture[..., order])

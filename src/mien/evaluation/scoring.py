@@ -1,0 +1,120 @@
+"""Figures of pictures against a target: what protocols and pictures of other programs are scored by alike."""
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.errors import UserError
+from mien.evaluation.metrics import Box, crop_to, l1, psnr, ssim
+from mien.evaluation.perceptual import MINIMUM_SIZE, Backbone, PerceptualDistance, load_perceptual
+from mien.evaluation.pictures import to_uint8
+
+METRICS = ("psnr", "ssim", "l1", "perceptual")
+_MOST_THREADS = 8
+"""Unless asked for: each holds some hundred megabytes of the perceptual metric's features."""
+SSIM_WINDOW = "11x11 Gaussian window, sigma 1.5, zeros beyond the border"
+PIXELS = "8 bits a channel, rounded"
+"""What is scored: the pictures as a png file would hold them, so that files of any program score alike."""
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Scores = Mapping[str, float]
+"""`psnr`, `ssim`, `l1`, `perceptual` and the same with `head_` in front."""
+
+
+@dataclass(frozen=True)
+class ScoreSettings:
+    """Which figures, and how."""
+
+    perceptual: bool = True
+    """Whether to compute ST-LPIPS, which takes most of the time."""
+    perceptual_frames: int = 32
+    """ST-LPIPS is computed on at most this many frames, evenly spread: 3 s each at 512x512; 0 for all."""
+    threads: int = 0
+    """Frames scored at a time; 0 for MIEN_THREADS or all cores. Figures do not depend on it."""
+    backbone: Backbone = "st-lpips-alex"
+    """Network of the perceptual metric."""
+
+
+def perceptual_metric(settings: ScoreSettings) -> PerceptualDistance | None:
+    """The perceptual metric, where it is asked for."""
+    return load_perceptual(settings.backbone) if settings.perceptual else None
+
+
+def as_8_bit(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """The image as a png file would hold it, back in 0..1."""
+    return torch.from_numpy(to_uint8(image)).float() / 255
+
+
+@torch.no_grad()
+def score_pictures(
+    pictures: Mapping[str, Float[Tensor, "h w 3"]],
+    target: Float[Tensor, "h w 3"],
+    crop: Box | None,
+    metric: PerceptualDistance | None,
+) -> dict[str, Scores]:
+    """The figures of several pictures against one target, on the whole frame and, where given, on the head crop."""
+    rows: dict[str, dict[str, float]] = {name: {} for name in pictures}
+    parts = [("", None), *([("head_", crop)] if crop is not None else [])]
+    for prefix, box in parts:
+        cut = crop_to(target, box)
+        small = min(cut.shape[:2]) < MINIMUM_SIZE
+        reference = metric.features(cut) if metric is not None and not small else None
+        for name, picture in pictures.items():
+            image, row = crop_to(picture, box), rows[name]
+            row[f"{prefix}psnr"], row[f"{prefix}ssim"] = psnr(image, cut), ssim(image, cut)
+            row[f"{prefix}l1"] = l1(image, cut)
+            if metric is not None and reference is not None:
+                row[f"{prefix}perceptual"] = metric.between(metric.features(image), reference)
+    return dict(rows)
+
+
+def mean_scores(rows: Sequence[Scores]) -> dict[str, Any]:
+    """Means over the frames that have a figure, None where none has; those on the head crop under `head`."""
+
+    def mean(name: str) -> float | None:
+        known = [row[name] for row in rows if name in row]
+        return fmean(known) if known else None
+
+    whole = {name: mean(name) for name in METRICS}
+    return {**whole, "head": {name: mean(f"head_{name}") for name in METRICS}}
+
+
+def evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
+    """At most `most` of the items, the first always among them; 0 for all."""
+    step = max(1, -(-len(items) // most)) if most else 1
+    return list(items[::step])
+
+
+def worker_threads(threads: int) -> int:
+    """How many frames to work on at a time.
+
+    Raises:
+        UserError: MIEN_THREADS is no positive number.
+    """
+    if threads > 0:
+        return threads
+    wanted = os.environ.get("MIEN_THREADS", "")
+    if wanted and (not wanted.isdecimal() or int(wanted) == 0):
+        raise UserError(f"MIEN_THREADS={wanted}: give a number from 1 up, or unset it")
+    return int(wanted) if wanted else min(_MOST_THREADS, os.cpu_count() or 1)
+
+
+def in_threads(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
+    """Results in order; at most two items a thread are prepared ahead, so that memory stays small."""
+    with ThreadPoolExecutor(threads) as pool:
+        waiting: deque[Future[Result]] = deque()
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) >= 2 * threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()

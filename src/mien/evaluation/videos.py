@@ -1,0 +1,116 @@
+"""What was scored as files: side-by-side videos for people, png pictures for other programs."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from mien.capture.video import write_video
+from mien.evaluation.experiment import Experiment, Frame, avatar_image, target_image
+from mien.evaluation.image_folders import CROPS_NAME, write_crops
+from mien.evaluation.metrics import Box
+from mien.evaluation.pictures import WHITE, error_heat, shrunk, side_by_side, to_uint8
+from mien.evaluation.protocols import AVATAR, Evaluation
+from mien.progress import track_progress
+from mien.storage import write_atomically
+
+HEAT_LIMIT = 0.25
+"""Error, of 1, that is the brightest colour of heat maps."""
+_LARGEST = 400
+_BAR = 26
+_CRF = 24
+
+
+def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evaluation, most: int) -> int:
+    """Write held-out frames as truth, rendering and error heat map side by side; returns how many.
+
+    Args:
+        path: Of the .mp4.
+        experiment: What was evaluated.
+        evaluation: Its figures, which are written above the pictures.
+        most: Of many frames this many, the first ones of each sequence and camera.
+    """
+    places = {frame: index for index, frame in enumerate(evaluation.frames)}
+    frames = video_frames(evaluation.frames, most)
+
+    def picture(frame: Frame) -> UInt8[np.ndarray, "h w 3"]:
+        truth, image = target_image(experiment, frame), avatar_image(experiment, frame)
+        scores = evaluation.scores[AVATAR][places[frame]]
+        where = f"{experiment.sequences[frame.sequence].name}, camera {experiment.camera_id(frame)}, {frame.timestep}"
+        panels = {
+            f"truth  {where}": to_uint8(truth),
+            f"rendering  {scores['psnr']:.1f} dB, head {scores['head_psnr']:.1f} dB": to_uint8(image),
+            "error": error_heat(image, truth, HEAT_LIMIT),
+        }
+        return labelled_row(panels)
+
+    first = experiment.sequences[frames[0].sequence].capture
+    drawn = (picture(frame) for frame in track_progress(frames, f"video {path.stem}", len(frames)))
+    write_video(path, same_size(drawn), first.fps, _CRF)
+    return len(frames)
+
+
+def video_frames(frames: Sequence[Frame], most: int) -> list[Frame]:
+    """The frames of a video, one camera after the other, at most `most`: equally many of each, the first ones."""
+    groups: dict[tuple[int, int], list[Frame]] = {}
+    for frame in sorted(frames, key=lambda one: (one.sequence, one.camera, one.timestep)):
+        groups.setdefault((frame.sequence, frame.camera), []).append(frame)
+    each = len(frames) if len(frames) <= most else max(1, most // len(groups))
+    return [frame for group in groups.values() for frame in group[:each]]
+
+
+def labelled_row(panels: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.ndarray, "h w 3"]:
+    """Pictures in a row, shrunk, each below a bar with its name."""
+    named = []
+    for name, panel in panels.items():
+        small = shrunk(panel, _LARGEST)
+        bar = np.full((_BAR, small.shape[1], 3), WHITE, np.uint8)
+        cv2.putText(bar, name, (4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA)
+        named.append(np.concatenate([bar, small]))
+    return side_by_side(named)
+
+
+def same_size(pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Pictures in the size of the first: smaller ones get white around them, larger ones are shrunk."""
+    size: tuple[int, int] | None = None
+    for picture in pictures:
+        if size is None:
+            size = (picture.shape[0], picture.shape[1])
+        if picture.shape[:2] == size:
+            yield picture
+            continue
+        factor = min(1.0, size[0] / picture.shape[0], size[1] / picture.shape[1])
+        small = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else picture
+        page = np.full((*size, 3), WHITE, np.uint8)
+        height, width = min(size[0], small.shape[0]), min(size[1], small.shape[1])
+        page[:height, :width] = small[:height, :width]
+        yield page
+
+
+def write_scored_pictures(folder: Path, experiment: Experiment) -> None:
+    """Write what was scored as FOLDER/{truth,rendering}/SEQUENCE_CAMERA_TIMESTEP.png, and truth/crops.json.
+
+    `score_folders` gives the figures of metrics.json for them; a folder of any other program's pictures of these names
+    is scored alike.
+    """
+    crops: dict[str, Box] = {}
+    frames = experiment.held_out_frames
+    for frame in track_progress(frames, f"pictures {folder.name}", len(frames)):
+        name = picture_name(experiment, frame)
+        crops[name] = experiment.crop(frame)
+        _write_png(folder / "truth" / f"{name}.png", to_uint8(target_image(experiment, frame)))
+        _write_png(folder / "rendering" / f"{name}.png", to_uint8(avatar_image(experiment, frame)))
+    write_crops(folder / "truth" / CROPS_NAME, crops)
+
+
+def picture_name(experiment: Experiment, frame: Frame) -> str:
+    """File name of a frame without its ending."""
+    return f"{experiment.sequences[frame.sequence].name}_{experiment.camera_id(frame)}_{frame.timestep:06d}"
+
+
+def _write_png(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
+    encoded, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+    assert encoded, f"cannot encode a picture of shape {image.shape}"
+    write_atomically(path, lambda aside: aside.write_bytes(data.tobytes()))

@@ -1,0 +1,34 @@
+"""Figures as lines for people."""
+
+from collections.abc import Mapping
+from typing import Any
+
+NAMES = {"mean_frame": "mean training picture", "mesh": "tracked mesh with its colours"}
+FACES = {"corrected": "faces corrected by training", "as_tracked": "faces as tracked"}
+
+
+def protocol_line(name: str, entry: Mapping[str, Any]) -> str:
+    """A protocol of metrics.json in one line: what each PSNR is of, then the baselines' alike."""
+    text = f"{name} ({entry['split']}, {entry['frames']} frames): PSNR {_both(entry)}, {FACES[entry['face_params']]}"
+    if entry["face_params"] != "as_tracked":
+        text += f" ({_both(entry['as_tracked'])}, {FACES['as_tracked']})"
+    for key, baseline in entry["baselines"].items():
+        text += f"; {NAMES[key]} {_both(baseline)}"
+    return text
+
+
+def scores_lines(scores: Mapping[str, Any]) -> list[str]:
+    """The figures of `score_folders`, one line a part of the picture."""
+    lines = [f"{scores['frames']} pictures; whole frame: {_figures(scores)}"]
+    if scores["crop"] is None:
+        return [*lines, "head crop: not known; give --crops or --mattes"]
+    return [*lines, f"head crop ({scores['crop']}): {_figures(scores['head'])}"]
+
+
+def _both(entry: Mapping[str, Any]) -> str:
+    return f"{entry['psnr']:.2f} dB whole frame / {entry['head']['psnr']:.2f} dB head crop"
+
+
+def _figures(entry: Mapping[str, Any]) -> str:
+    text = f"PSNR {entry['psnr']:.2f} dB, SSIM {entry['ssim']:.4f}, L1 {entry['l1']:.5f}"
+    return text if entry["perceptual"] is None else f"{text}, ST-LPIPS {entry['perceptual']:.4f}"
