@@ -36,9 +36,10 @@ class Row:
     entry: Mapping[str, Any]
     """`psnr`, ..., `head`: {...}."""
     run: ScoredRun | None
-    """None for baselines."""
+    """None for baselines, and for what a run would be without its corrections."""
     faces: str
-    """What the face parameters of held-out frames were."""
+    """What the face parameters of held-out frames were; of a baseline that depends on them: whose."""
+    baseline: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +152,7 @@ def _differences(table: Table) -> list[str]:
     if len({row.faces for row in own}) > 1:
         warnings.append(
             f"{table.protocol}: some runs correct the tracking of held-out frames and some do not; compare the rows "
-            f"{FACES['as_tracked']!r}, or train alike"
+            f"with faces {FACES['as_tracked']}, or train alike"
         )
     if len({(row.entry.get("perceptual_backbone"), row.entry.get("perceptual_frames")) for row in own}) > 1:
         warnings.append(f"{table.protocol}: ST-LPIPS was computed on other frames; evaluate the runs alike")
@@ -181,12 +182,12 @@ def _baseline_rows(key: str, name: str, runs: Sequence[ScoredRun], protocol: str
         if entry is not None:
             found.setdefault(f"{entry['psnr']:.2f} {entry['head']['psnr']:.2f}", ([], entry))[0].append(run.label)
     several = len(found) > 1
-    return [Row(f"{name} ({', '.join(of)})" if several else name, entry, None, "") for of, entry in found.values()]
+    return [Row(name, entry, None, f"of {', '.join(of)}" if several else "", True) for of, entry in found.values()]
 
 
 def _row_content(row: Row) -> dict[str, Any]:
     names = [metric for metric, *_ in COLUMNS]
-    content: dict[str, Any] = {"label": row.label, "faces": row.faces or None, "baseline": not row.faces}
+    content: dict[str, Any] = {"label": row.label, "faces": row.faces or None, "baseline": row.baseline}
     content |= {name: figure(row.entry, None, name) for name in names}
     content["head"] = {name: figure(row.entry, "head", name) for name in names}
     if row.run is not None:

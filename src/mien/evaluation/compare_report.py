@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.evaluation.compare import COLUMNS, Comparison, Row, Table, figure
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, target_image
+from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import Box, crop_to
 from mien.evaluation.pictures import HEAT_STOPS, data_uri, error_heat, shrunk, to_uint8
-from mien.evaluation.report_sections import frame_name, head_box
+from mien.evaluation.report_sections import frame_name
 from mien.evaluation.report_words import GLOSSARY
 from mien.evaluation.videos import HEAT_LIMIT
 from mien.progress import track_progress
@@ -69,14 +69,14 @@ def _table_html(table: Table) -> str:
         f'<th class="group" colspan="{len(COLUMNS)}">Whole frame</th>'
         f'<th class="group head" colspan="{len(COLUMNS)}">Head crop</th>'
         '<th class="group head" colspan="3">Cost</th></tr>'
-        f"<tr><th></th><th>faces</th>{metrics}{head_metrics}"
+        f"<tr><th></th><th class=left>faces</th>{metrics}{head_metrics}"
         f'<th class="head">Gaussians</th><th>training, s</th><th>ms/frame</th></tr></thead><tbody>{rows}</tbody>'
         "</table></div></div>"
     )
 
 
 def _row_html(table: Table, row: Row) -> str:
-    cells = [f"<td>{escape(row.label)}</td><td>{escape(row.faces)}</td>"]
+    cells = [f"<td>{escape(row.label)}</td><td class=left>{escape(row.faces)}</td>"]
     for part in _PARTS:
         for index, (metric, _, digits, higher) in enumerate(COLUMNS):
             value = figure(row.entry, part, metric)
@@ -118,7 +118,7 @@ def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> str
         f'<span class="scale">Error 0 <i style="background:linear-gradient(90deg,{stops})"></i> '
         f"{HEAT_LIMIT * 255:.0f} of 255 and more</span>"
     )
-    grid = f'style="grid-template-columns:repeat({len(runs) + 1},minmax(0,1fr))"'
+    grid = f'style="grid-template-columns:repeat({len(runs) + 1},minmax(0,280px))"'
     body = []
     for index, caption in enumerate(captions):
         heads = "".join(f"<span>{escape(name)}</span>" for name in ["Truth", *(run.label for run in runs)])

@@ -20,7 +20,13 @@ def _table_text(table: Table, bold: bool) -> str:
     sequences = ", ".join(sorted(set(table.rows[0].entry["per_frame"]["sequence"])))
     title = f"{table.protocol}: {table.frames} frames held out of {sequences} ({table.split})"
     extra = ("Gaussians", "training", "ms/frame")
-    heads = ["", "", *(heading for _, heading, _, _ in COLUMNS), *(heading for _, heading, _, _ in COLUMNS), *extra]
+    heads = [
+        "",
+        "faces",
+        *(heading for _, heading, _, _ in COLUMNS),
+        *(heading for _, heading, _, _ in COLUMNS),
+        *extra,
+    ]
     lines = [[(text, False) for text in heads]]
     lines += [_cells(table, row) for row in table.rows]
     widths = [max(len(line[i][0]) for line in lines) for i in range(len(heads))]

@@ -23,6 +23,9 @@ FaceSource = Literal["as_tracked", "corrected"]
 them (never with anything learnt from their own pixels)."""
 
 
+_HEAD_MARGIN = 0.05
+
+
 class Frame(NamedTuple):
     """One picture: a timestep of a sequence seen by a camera; indices."""
 
@@ -72,6 +75,15 @@ def spread_frames(frames: Items[Frame], most: int) -> list[Frame]:
     # One camera after the other: a stride over cameras of the same timestep could meet one of them only.
     ordered = sorted(frames, key=lambda frame: (frame.sequence, frame.camera, frame.timestep))
     return evenly_spread(ordered, most)
+
+
+def head_box(experiment: Experiment, frames: Items[Frame]) -> Box:
+    """A box around the head crops of some frames, with a margin: one cut for all, so that motion can be seen."""
+    crops = np.array([experiment.crop(frame) for frame in frames])
+    left, top = crops[:, :2].min(0)
+    right, bottom = (crops[:, :2] + crops[:, 2:]).max(0)
+    margin = int(_HEAD_MARGIN * max(right - left, bottom - top))
+    return int(left) - margin, int(top) - margin, int(right - left) + 2 * margin, int(bottom - top) + 2 * margin
 
 
 def target_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:

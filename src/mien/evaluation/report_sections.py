@@ -6,7 +6,7 @@ from html import escape
 import numpy as np
 import torch
 
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, target_image
+from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
 from mien.evaluation.metrics import Box, crop_to
 from mien.evaluation.pictures import HEAT_STOPS, data_uri, error_heat, shrunk, to_uint8
 from mien.evaluation.plots import Axes, Series, line_chart
@@ -18,7 +18,6 @@ _PICTURE_SIZE = 400
 _OVERLAY_SIZE = 300
 _ROWS = 6
 _OVERLAYS = 6
-_MARGIN = 0.05
 _SMOOTHING = 15
 
 
@@ -46,15 +45,6 @@ def _places(count: int, middle: int) -> list[int]:
         nearest = min(range(1, len(places) - 1), key=lambda index: abs(places[index] - middle))
         places[nearest] = middle
     return places[::-1]
-
-
-def head_box(experiment: Experiment, frames: Sequence[Frame]) -> Box:
-    """A box around the head crops of some frames, with a margin: one cut for all, so that motion can be seen."""
-    crops = np.array([experiment.crop(frame) for frame in frames])
-    left, top = crops[:, :2].min(0)
-    right, bottom = (crops[:, :2] + crops[:, 2:]).max(0)
-    margin = int(_MARGIN * max(right - left, bottom - top))
-    return int(left) - margin, int(top) - margin, int(right - left) + 2 * margin, int(bottom - top) + 2 * margin
 
 
 def _comparison_row(experiment: Experiment, evaluation: Evaluation, index: int, name: str, box: Box) -> str:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.capture.video import write_video
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, target_image
+from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
-from mien.evaluation.metrics import Box
+from mien.evaluation.metrics import Box, crop_to
 from mien.evaluation.pictures import WHITE, error_heat, shrunk, side_by_side, to_uint8
 from mien.evaluation.protocols import AVATAR, Evaluation
 from mien.progress import track_progress
@@ -18,7 +18,7 @@ from mien.storage import write_atomically
 
 HEAT_LIMIT = 0.25
 """Error, of 1, that is the brightest colour of heat maps."""
-_LARGEST = 400
+_LARGEST = 440
 _BAR = 26
 _CRF = 24
 
@@ -34,14 +34,16 @@ def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evalu
     """
     places = {frame: index for index, frame in enumerate(evaluation.frames)}
     frames = video_frames(evaluation.frames, most)
+    boxes = {view: head_box(experiment, [f for f in frames if f[::2] == view]) for view in {f[::2] for f in frames}}
 
     def picture(frame: Frame) -> UInt8[np.ndarray, "h w 3"]:
-        truth, image = target_image(experiment, frame), avatar_image(experiment, frame)
+        box = boxes[frame[::2]]
+        truth, image = crop_to(target_image(experiment, frame), box), crop_to(avatar_image(experiment, frame), box)
         scores = evaluation.scores[AVATAR][places[frame]]
         where = f"{experiment.sequences[frame.sequence].name}, camera {experiment.camera_id(frame)}, {frame.timestep}"
         panels = {
-            f"truth  {where}": to_uint8(truth),
-            f"rendering  {scores['psnr']:.1f} dB, head {scores['head_psnr']:.1f} dB": to_uint8(image),
+            f"truth: {where}": to_uint8(truth),
+            f"rendering: {scores['psnr']:.1f} dB, head {scores['head_psnr']:.1f}": to_uint8(image),
             "error": error_heat(image, truth, HEAT_LIMIT),
         }
         return labelled_row(panels)

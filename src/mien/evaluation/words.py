@@ -3,15 +3,18 @@
 from collections.abc import Mapping
 from typing import Any
 
-NAMES = {"mean_frame": "mean training picture", "mesh": "tracked mesh with its colours"}
-FACES = {"corrected": "faces corrected by training", "as_tracked": "faces as tracked"}
+NAMES = {"mean_frame": "mean training picture", "mesh": "coloured mesh"}
+FACES = {"corrected": "corrected", "as_tracked": "as tracked"}
+"""What posed held-out frames: the tracker alone, or with what training corrected beside them."""
 
 
 def protocol_line(name: str, entry: Mapping[str, Any]) -> str:
     """A protocol of metrics.json in one line: what each PSNR is of, then the baselines' alike."""
-    text = f"{name} ({entry['split']}, {entry['frames']} frames): PSNR {_both(entry)}, {FACES[entry['face_params']]}"
+    text = (
+        f"{name} ({entry['split']}, {entry['frames']} frames): PSNR {_both(entry)}, faces {FACES[entry['face_params']]}"
+    )
     if entry["face_params"] != "as_tracked":
-        text += f" ({_both(entry['as_tracked'])}, {FACES['as_tracked']})"
+        text += f" ({_both(entry['as_tracked'])}, faces {FACES['as_tracked']})"
     for key, baseline in entry["baselines"].items():
         text += f"; {NAMES[key]} {_both(baseline)}"
     return text

@@ -1,0 +1,173 @@
+"""Pictures of other programs: the same figures as `mien evaluate`, and clear words where names or sizes differ."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from evaluation_case import make_experiment
+from evaluation_rig import write_run, write_sequence
+from mien.capture.video import write_video
+from mien.cli import main
+from mien.errors import UserError
+from mien.evaluation import EvaluationSettings, evaluate
+from mien.evaluation.image_folders import ImageFolders, read_crops, score_folders, write_crops
+from mien.evaluation.metrics import psnr
+from mien.evaluation.scoring import ScoreSettings
+from mien.storage import read_json
+from mien.training import TrainSettings
+
+PLAIN = ScoreSettings(perceptual=False)
+
+
+def write_pictures(folder: Path, names: list[str], seed: int = 0, size: tuple[int, int] = (40, 36)) -> np.ndarray:
+    """Random pictures as png; returns them."""
+    folder.mkdir(exist_ok=True)
+    pictures = np.random.default_rng(seed).integers(0, 256, (len(names), *size, 3)).astype(np.uint8)
+    for name, picture in zip(names, pictures, strict=True):
+        cv2.imwrite(str(folder / f"{name}.png"), picture[..., ::-1])
+    return pictures
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> ImageFolders:
+    names = ["a", "b", "c"]
+    write_pictures(tmp_path / "truth", names)
+    write_pictures(tmp_path / "mine", names, seed=1)
+    return ImageFolders(tmp_path / "mine", tmp_path / "truth")
+
+
+def test_the_same_pictures_get_the_same_figures_as_in_evaluate(tmp_path: Path) -> None:
+    experiment = make_experiment()
+    folder, run_dir = write_sequence(tmp_path, experiment, experiment.sequences[0]), tmp_path / "runs" / "first"
+    write_run(run_dir, experiment, [folder], TrainSettings(steps=10, checkpoint_every=10))
+    settings = EvaluationSettings(perceptual_frames=3, pictures=True, baselines=False, video_frames=0)
+    entry = evaluate(run_dir, [folder], settings)["protocols"]["self_reenactment"]
+    pictures = run_dir / "pictures" / "self_reenactment"
+    scores = score_folders(ImageFolders(pictures / "rendering", pictures / "truth"), ScoreSettings(perceptual_frames=3))
+    assert scores["per_frame"]["name"][0] == "clip_0_000040"
+    assert scores["crop"] == entry["crop"]
+    for metric in ("psnr", "ssim", "l1", "perceptual"):
+        assert scores[metric] == pytest.approx(entry[metric], abs=1e-6)
+        assert scores["head"][metric] == pytest.approx(entry["head"][metric], abs=1e-6)
+
+
+def test_mattes_cut_the_truth_and_give_the_head_crop(folders: ImageFolders, tmp_path: Path) -> None:
+    matte = np.zeros((40, 36), np.uint8)
+    matte[10:30, 5:25] = 255
+    (tmp_path / "mattes").mkdir()
+    for name in "abc":
+        truth = cv2.imread(str(folders.truth / f"{name}.png"))
+        cv2.imwrite(str(tmp_path / "mattes" / f"{name}.png"), matte)
+        cv2.imwrite(str(folders.images / f"{name}.png"), np.where(matte[..., None] > 0, truth, 0))
+    black = score_folders(ImageFolders(folders.images, folders.truth, tmp_path / "mattes", background="black"), PLAIN)
+    assert black["psnr"] == black["head"]["psnr"] == 100.0
+    assert black["mask"] == "mattes, over black"
+    white = score_folders(ImageFolders(folders.images, folders.truth, tmp_path / "mattes"), PLAIN)
+    assert white["head"]["psnr"] == 100.0
+    assert white["psnr"] < 10
+
+
+def test_background_that_does_not_fit_is_warned_of(
+    folders: ImageFolders, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mattes").mkdir()
+    for name in "abc":
+        cv2.imwrite(str(tmp_path / "mattes" / f"{name}.png"), np.eye(40, 36, dtype=np.uint8) * 255)
+    score_folders(ImageFolders(folders.images, folders.truth, tmp_path / "mattes"), PLAIN)
+    assert "not white where the mattes are empty" in " ".join(capsys.readouterr().err.split())
+
+
+def test_alpha_channel_is_put_over_the_background(folders: ImageFolders, tmp_path: Path) -> None:
+    see_through = np.dstack([np.zeros((40, 36, 3), np.uint8), np.zeros((40, 36), np.uint8)])
+    for name in "abc":
+        cv2.imwrite(str(folders.images / f"{name}.png"), see_through)
+        cv2.imwrite(str(folders.truth / f"{name}.png"), np.full((40, 36, 3), 255, np.uint8))
+    assert score_folders(folders, PLAIN)["psnr"] == 100.0
+
+
+def test_figures_are_those_of_the_metrics(folders: ImageFolders) -> None:
+    scores = score_folders(folders, PLAIN)
+    import torch
+
+    def floats(path: Path) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])).float() / 255
+
+    figures = [psnr(floats(folders.images / f"{n}.png"), floats(folders.truth / f"{n}.png")) for n in "abc"]
+    assert scores["per_frame"]["psnr"] == pytest.approx(figures, abs=1e-9)
+    assert scores["psnr"] == pytest.approx(np.mean(figures))
+    assert scores["crop"] is None
+    assert scores["head"]["psnr"] is None
+
+
+def test_crops_beside_the_truth_are_found(folders: ImageFolders) -> None:
+    write_crops(folders.truth / "crops.json", {name: (4, 4, 20, 20) for name in "abc"})
+    assert score_folders(folders, PLAIN)["head"]["psnr"] is not None
+    write_crops(folders.truth / "crops.json", {"a": (4, 4, 20, 20)})
+    with pytest.raises(UserError, match="no head box for b, c"):
+        score_folders(folders, PLAIN)
+    write_crops(folders.truth / "crops.json", {name: (99, 4, 20, 20) for name in "abc"})
+    with pytest.raises(UserError, match="outside of the picture"):
+        score_folders(folders, PLAIN)
+    (folders.truth / "crops.json").write_text('{"format": "mien.crops", "version": 1, "crops": {"a": [1, 2, 3]}}')
+    with pytest.raises(UserError, match="'a' has no box"):
+        read_crops(folders.truth / "crops.json")
+
+
+def test_names_and_sizes_that_do_not_match(folders: ImageFolders, tmp_path: Path) -> None:
+    (folders.images / "b.png").rename(folders.images / "z.png")
+    with pytest.raises(UserError, match=r"lacks 1 of the 3 pictures.*\(b; it has a, c, z\)"):
+        score_folders(folders, PLAIN)
+    write_pictures(folders.images, ["b"], size=(20, 20))
+    with pytest.raises(UserError, match="b has 20x20 pixels, its truth 36x40"):
+        score_folders(folders, PLAIN)
+
+
+def test_pictures_without_a_truth_are_left_out_with_a_warning(
+    folders: ImageFolders, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_pictures(folders.images, ["d"])
+    assert score_folders(folders, PLAIN)["frames"] == 3
+    assert "1 pictures have no truth" in capsys.readouterr().err
+
+
+def test_damaged_pictures_are_named(folders: ImageFolders) -> None:
+    path = folders.images / "b.png"
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(UserError, match=r"b\.png: no whole picture"):
+        score_folders(folders, PLAIN)
+    cv2.imwrite(str(path), np.zeros((40, 36, 3), np.uint16))
+    with pytest.raises(UserError, match="8 bits"):
+        score_folders(folders, PLAIN)
+
+
+def test_videos_are_matched_by_order(folders: ImageFolders, tmp_path: Path) -> None:
+    smooth = [np.full((40, 36, 3), 60 * index, np.uint8) for index in range(3)]
+    write_video(tmp_path / "mine.mp4", smooth, 25, crf=10)
+    for name, picture in zip("abc", smooth, strict=True):
+        cv2.imwrite(str(folders.truth / f"{name}.png"), picture)
+    scores = score_folders(ImageFolders(tmp_path / "mine.mp4", folders.truth), PLAIN)
+    assert scores["psnr"] > 40
+    assert score_folders(ImageFolders(folders.truth, tmp_path / "mine.mp4"), PLAIN)["psnr"] > 40
+    (folders.truth / "c.png").unlink()
+    with pytest.raises(UserError, match=r"has 3 pictures, .* has 2"):
+        score_folders(ImageFolders(tmp_path / "mine.mp4", folders.truth), PLAIN)
+
+
+def test_command(folders: ImageFolders, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["evaluate", "--images", str(folders.images), "--truth", str(folders.truth), "--no-perceptual"]
+    out = tmp_path / "scores.json"
+    assert main([*given, "--json", "--out", str(out)]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    stored = read_json(out, "mien.scores", 1)
+    assert printed["psnr"] == stored["psnr"]
+    assert main(given) == 0
+    assert f"PSNR {printed['psnr']:.2f} dB" in capsys.readouterr().out
+    for wrong in (
+        ["evaluate"], ["evaluate", "--images", str(folders.images)], [*given, "--compare"],
+        ["evaluate", "--images", str(tmp_path / "none"), "--truth", str(folders.truth)],
+        ["evaluate", str(tmp_path), str(tmp_path)],
+    ):  # fmt: skip
+        assert main(wrong) == 2
