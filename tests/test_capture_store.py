@@ -1,7 +1,6 @@
 """Captures on disk: round trip, cache, damage."""
 
 import dataclasses
-import json
 import os
 import shutil
 
@@ -10,6 +9,7 @@ import pytest
 import torch
 
 from capture_helpers import assert_same_capture, random_capture, tree_bytes
+from damage import edit_json
 from mien.camera import camera_from_fov
 from mien.capture import read_capture, read_capture_hash, write_capture
 from mien.errors import UserError
@@ -91,9 +91,7 @@ def test_cache_that_cannot_be_written_is_made_elsewhere(stored):
 def test_every_damage_is_named(stored, tmp_path):
     def edit(content):
         def change(path):
-            entries = json.loads((path / "capture.json").read_text())
-            entries.update(content)
-            (path / "capture.json").write_text(json.dumps(entries))
+            edit_json(path / "capture.json", lambda entries: entries.update(content))
 
         return change
 

@@ -50,11 +50,23 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert "no sub-command 'crate'" in complaint(capsys, "crate")
 
 
-def test_unknown_option_is_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as exit_info:
-        main(["export", "--nonsense", "1"])
-    assert exit_info.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("create", ("PATH, --out PATH", "see mien create --help")),
+        ("render here --out a.mp4 --siez 3", ("--siez", "--size INT", "see mien render --help")),
+        ("create a.mp4 --out here --steps many", ("--steps", "'many'")),
+        ("create a.mp4 --out here --preset fast", ("'fast'", "draft")),
+        ("export here --out", ("--out",)),
+        ("bench nothing", ("nothing", "render, quality")),
+    ],
+)
+def test_wrong_arguments_are_told_in_one_line(
+    arguments: str, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    message = complaint(capsys, *arguments.split())
+    assert all(word in message for word in words), message
+    assert not set("│╭╰─") & set(message)
 
 
 def test_missing_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

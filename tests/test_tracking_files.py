@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from damage import edit_json
 from mien.errors import UserError
 from mien.storage import read_tensors, write_tensors
 from mien.tracking import (
@@ -66,9 +67,8 @@ def _rewrite(folder, change) -> None:
     tensors = read_tensors(file)
     change(tensors)
     write_tensors(file, tensors)
-    content = json.loads((folder / "tracking.json").read_text())
-    content["tensors_sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
-    (folder / "tracking.json").write_text(json.dumps(content))
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    edit_json(folder / "tracking.json", lambda content: content.update(tensors_sha256=digest))
 
 
 @pytest.mark.parametrize(
@@ -92,10 +92,11 @@ def test_damage(tmp_path):
     with pytest.raises(UserError, match="missing"):
         read_tracking(tmp_path)
     write_tracking(tmp_path, _tracking())
+    edit_json(tmp_path / "tracking.json", lambda content: None)
     tensors, text = tmp_path / "tracking.safetensors", (tmp_path / "tracking.json").read_text()
     whole = tensors.read_bytes()
     tensors.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    with pytest.raises(UserError, match="is not what tracking.json was written with"):
+    with pytest.raises(UserError, match="is not what was written"):
         read_tracking(tmp_path)
     tensors.write_bytes(whole[:100])
     with pytest.raises(UserError, match="damaged"):

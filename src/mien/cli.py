@@ -1,6 +1,9 @@
 """The command line: picks the sub-command, loads only what it needs, turns errors into one line."""
 
+import contextlib
+import errno
 import importlib
+import io
 import os
 import sys
 import tempfile
@@ -28,6 +31,13 @@ COMMANDS = {
 
 EXIT_USER_ERROR = 2
 EXIT_INTERRUPTED = 130
+_USERS_ERRNOS = frozenset(
+    {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG}
+)
+"""The disk is full, read-only, protected or broken: nothing that mien could do better."""
+_USELESS = ("For full helptext", "Argument helptext")
+_INDENT_OF_DESCRIPTION = 8
+"""Spaces before an option's description in tyro's messages; names of options have fewer."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,14 +61,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         return 0
+    except MemoryError as error:
+        return _complain(f"not enough memory ({error}); close other programs, or ask for a smaller size")
+    except OSError as error:
+        if error.errno not in _USERS_ERRNOS:
+            return _crash()
+        return _complain(f"{error.filename or 'a file'}: {error.strerror}; mend that and run the same command again")
     except Exception:
-        log = _write_crash_log()
-        print(
-            f"mien: this is a bug in mien, not your mistake: {traceback.format_exc().splitlines()[-1]}\n"
-            f"mien: the traceback is in {log}; please report it with the command",
-            file=sys.stderr,
-        )
-        return 1
+        return _crash()
+
+
+def _crash() -> int:
+    """Say that it is a bug; its traceback goes to a file."""
+    log = _write_crash_log()
+    print(
+        f"mien: this is a bug in mien, not your mistake: {traceback.format_exc().splitlines()[-1]}\n"
+        f"mien: the traceback is in {log}; please report it with the command",
+        file=sys.stderr,
+    )
+    return 1
 
 
 def _run(name: str, rest: list[str]) -> int:
@@ -66,15 +87,40 @@ def _run(name: str, rest: list[str]) -> int:
 
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
     _use_one_torch_thread()
-    command = tyro.cli(
-        module.Command,
-        prog=f"mien {name}",
-        description=module.Command.__doc__,
-        args=rest,
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    complaints = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaints):
+            command = tyro.cli(
+                module.Command,
+                prog=f"mien {name}",
+                description=module.Command.__doc__,
+                args=rest,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as stop:
+        if stop.code != EXIT_USER_ERROR:
+            raise
+        raise UserError(f"{_in_one_line(complaints.getvalue())}; see mien {name} --help") from None
+    sys.stderr.write(complaints.getvalue())
     command.run()
     return 0
+
+
+def _in_one_line(box: str) -> str:
+    """What tyro says about wrong arguments in a box of several parts, without the descriptions of options."""
+    parts: list[str] = [""]
+    for line in box.splitlines():
+        inner = line.strip()
+        if inner[:1] in ("╭", "╰"):
+            continue
+        inner = inner.removeprefix("│ ").removesuffix("│").rstrip()
+        text = inner.strip()
+        if text and not text.strip("─"):
+            parts.append("")
+        elif len(inner) - len(inner.lstrip()) < _INDENT_OF_DESCRIPTION:
+            comma = inner.startswith(" ") and parts[-1] and not parts[-1].endswith(":")
+            parts[-1] = f"{parts[-1]}{',' if comma else ''} {text}".strip()
+    return "; ".join(part.rstrip(".") for part in parts if part and not part.startswith(_USELESS))
 
 
 def _use_one_torch_thread() -> None:

@@ -1,4 +1,4 @@
-"""The one kind of error that is the user's to mend."""
+"""The errors that are the user's to mend."""
 
 
 class UserError(Exception):
@@ -6,3 +6,16 @@ class UserError(Exception):
 
     The message is one line that names the offending value and the remedy.
     """
+
+
+class CannotWriteError(UserError, OSError):
+    """A file could not be written: the user's to mend, and still an OSError for who writes elsewhere instead."""
+
+    def __init__(self, message: str, cause: OSError):
+        super().__init__(message)
+        self.message = message
+        self.errno, self.strerror = cause.errno, cause.strerror
+
+    def __str__(self) -> str:
+        """The line alone, without OSError's number."""
+        return self.message

@@ -3,11 +3,13 @@
 `mien.storage` adds torch tensors. Nothing here knows what is stored.
 """
 
+import errno
 import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,17 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from mien.errors import UserError
+from mien.errors import CannotWriteError, UserError
 
 _KEPT_OF_NAME = 100
 """Characters of a file's name that its temporary name keeps: file systems allow 255 bytes in all."""
+_CHECKSUM = "checksum"
+"""Of everything else in a json file, or in the header and data of a safetensors file."""
+_LARGEST_JSON = 64 << 20
+"""Bytes; the largest that mien writes has some megabytes."""
+_LARGEST_HEADER = 100 << 20
+"""Bytes of a safetensors header, as its specification has it."""
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 def check_writable(path: Path, *, folder: bool = False) -> None:
@@ -56,23 +65,56 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Call `write` with a temporary path beside `path`, then rename it into place: readers see all or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:_KEPT_OF_NAME]}.", suffix=path.suffix[-20:])
-    os.close(handle)
-    temporary = Path(name)
+    """Call `write` with a temporary path beside `path`, then rename it into place: readers see all or nothing.
+
+    Raises:
+        CannotWriteError: the disk is full or read-only, or the place is not to be written to.
+    """
     try:
-        write(temporary)
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(
+            dir=path.parent, prefix=f".{path.name[:_KEPT_OF_NAME]}.", suffix=path.suffix[-20:]
+        )
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            write(temporary)
+            temporary.chmod(0o644)
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def cannot_write(path: Path, error: OSError) -> CannotWriteError:
+    """What to tell when writing `path` failed: the remedy depends on why."""
+    if isinstance(error, CannotWriteError):
+        return error
+    full = error.errno in _FULL
+    remedy = "free disk space and run the same command again" if full else "choose another place"
+    return CannotWriteError(f"{path}: cannot be written ({error.strerror or error}); {remedy}", error)
+
+
+@contextmanager
+def expect_whole(path: Path, remedy: str) -> Iterator[None]:
+    """Turn the errors of taking apart what was read from `path` into one line: entries missing, of another type, size.
+
+    Raises:
+        UserError: such an error happened inside.
+    """
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise UserError(f"{path}: incomplete or damaged ({reason}); {remedy}") from None
 
 
 def write_json(path: Path, format_name: str, version: int, content: Mapping[str, Any]) -> None:
-    """Write `content` as json behind its `format` and `version`."""
-    text = json.dumps({"format": format_name, "version": version, **content}, indent=1, allow_nan=False)
+    """Write `content` as json behind its `format` and `version`, with a checksum that `read_json` takes off again."""
+    whole = {"format": format_name, "version": version, **content}
+    text = json.dumps({**whole, _CHECKSUM: _json_checksum(whole)}, indent=1, allow_nan=False)
     write_atomically(path, lambda temporary: temporary.write_text(text + "\n", encoding="utf-8"))
 
 
@@ -80,10 +122,12 @@ def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
     """Read what `write_json` wrote.
 
     Raises:
-        UserError: the file is missing, is no json, or has another format or version.
+        UserError: the file is missing, is no json, has another format or version, or was changed since.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        if path.stat().st_size > _LARGEST_JSON:
+            raise ValueError(f"{path.stat().st_size} bytes are too many")
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except FileNotFoundError:
         raise UserError(f"{path}: missing; run the stage that writes it again") from None
     except (OSError, ValueError, RecursionError) as error:
@@ -96,7 +140,21 @@ def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
             f"{path}: has format {found[0]!r} version {found[1]!r}, expected {format_name!r} version {version}; "
             "run the stage that writes it again"
         )
+    if _CHECKSUM in content and content.pop(_CHECKSUM) != _json_checksum(content):
+        raise UserError(
+            f"{path}: was damaged or edited after it was written; delete its folder and run the stage again "
+            f"(or, if you know what you changed, remove its {_CHECKSUM!r})"
+        )
     return content
+
+
+def _json_checksum(content: Mapping[str, Any]) -> str:
+    canonical = json.dumps(json.loads(json.dumps(content)), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()[:32]
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"holds the number {name}")
 
 
 def file_digest(path: Path) -> str:
@@ -108,8 +166,24 @@ def file_digest(path: Path) -> str:
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str] | None = None) -> None:
     """Write numpy arrays as safetensors."""
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    kept = None if metadata is None else dict(metadata)
-    write_atomically(path, lambda temporary: safetensors.numpy.save_file(contiguous, temporary, metadata=kept))
+    write_safetensors(path, safetensors.numpy.save(contiguous), metadata)
+
+
+def write_safetensors(path: Path, data: bytes, metadata: Mapping[str, str] | None = None) -> None:
+    """Write the bytes of a safetensors file, with a checksum of header and data in its metadata."""
+    size = int.from_bytes(data[:8], "little")
+    header, body = json.loads(data[8 : 8 + size]), memoryview(data)[8 + size :]
+    checksum = _tensor_checksum(header, body)
+    text = json.dumps({"__metadata__": {**(metadata or {}), _CHECKSUM: checksum}, **header}, separators=(",", ":"))
+    packed = text.encode()
+    packed += b" " * (-len(packed) % 8)
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            for part in (len(packed).to_bytes(8, "little"), packed, body):
+                file.write(part)
+
+    write_atomically(path, write)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -130,6 +204,28 @@ def read_safetensors(path: Path, load: Callable[[Path], Any]) -> Any:
     if not path.is_file():
         raise UserError(f"{path}: missing; run the stage that writes it again")
     try:
+        _check_safetensors(path)
         return load(path)
-    except (safetensors.SafetensorError, OSError, ValueError) as error:
-        raise UserError(f"{path}: damaged safetensors file ({error}); delete it and run its stage again") from None
+    except (safetensors.SafetensorError, OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: damaged safetensors file ({reason}); delete it and run its stage again") from None
+
+
+def _check_safetensors(path: Path) -> None:
+    """Compare with the checksum that `write_safetensors` left; files of other programs have none."""
+    with path.open("rb") as file:
+        size = int.from_bytes(file.read(8), "little")
+        if not 2 <= size <= min(_LARGEST_HEADER, path.stat().st_size - 8):
+            raise ValueError("its header does not fit into the file")
+        header = json.loads(file.read(size))
+        if not isinstance(header, dict):
+            raise ValueError("its header is no object")
+        stored = header.pop("__metadata__", {}).get(_CHECKSUM)
+        if stored is not None and stored != _tensor_checksum(header, file.read()):
+            raise ValueError("it is not what was written")
+
+
+def _tensor_checksum(header: Mapping[str, Any], body: bytes | memoryview) -> str:
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True, separators=(",", ":")).encode())
+    digest.update(body)
+    return digest.hexdigest()

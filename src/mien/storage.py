@@ -7,7 +7,9 @@ import safetensors.torch
 from torch import Tensor
 
 from mien.files import (
+    cannot_write,
     check_writable,
+    expect_whole,
     file_digest,
     read_arrays,
     read_json,
@@ -15,10 +17,13 @@ from mien.files import (
     write_arrays,
     write_atomically,
     write_json,
+    write_safetensors,
 )
 
 __all__ = [
+    "cannot_write",
     "check_writable",
+    "expect_whole",
     "file_digest",
     "read_arrays",
     "read_json",
@@ -33,9 +38,7 @@ __all__ = [
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
     """Write torch tensors as safetensors."""
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    write_atomically(
-        path, lambda temporary: safetensors.torch.save_file(contiguous, temporary, metadata=dict(metadata or {}))
-    )
+    write_safetensors(path, safetensors.torch.save(contiguous), metadata)
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

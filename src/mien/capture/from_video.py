@@ -19,11 +19,11 @@ from mien.capture.parts import find_parts, whole_part
 from mien.capture.process import Means, Part, Reel, process_part
 from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, FrameSource, open_source, read_image
-from mien.capture.store import FORMAT, JSON_NAME, VERSION, cannot_write, check_replaceable, partial_folder, read_capture
+from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, partial_folder, read_capture
 from mien.capture.survey import Survey, survey_source
 from mien.errors import UserError
 from mien.progress import say
-from mien.storage import file_digest, read_json, write_json
+from mien.storage import cannot_write, file_digest, read_json, write_json
 
 _RECIPE = 3
 """Raised whenever the same video would give another capture, so that old ones are not taken for current."""

@@ -18,7 +18,7 @@ from mien.capture.frame_files import CACHE, FRAMES, MATTES, FrameLayout, FrameWr
 from mien.capture.quality import FrameQuality
 from mien.errors import UserError
 from mien.progress import progress_bar
-from mien.storage import read_arrays, read_json, write_arrays, write_json
+from mien.storage import cannot_write, read_arrays, read_json, write_arrays, write_json
 
 FORMAT, VERSION = "mien.capture", 1
 JSON_NAME, ARRAYS_NAME, REPORT_NAME = "capture.json", "landmarks.safetensors", "report.json"
@@ -178,11 +178,6 @@ def finish_capture(
     folder.rename(path)
     shutil.rmtree(old, ignore_errors=True)
     return capture_hash
-
-
-def cannot_write(path: Path, error: OSError) -> UserError:
-    """What to tell when the place for a capture refuses."""
-    return UserError(f"{path}: cannot be written ({error.strerror or error}); choose another place or free disk space")
 
 
 def _arrays(data: CaptureData, digests: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -13,7 +13,7 @@ from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
 from mien.evaluation.report import ReportVideo, RunRecord, write_report
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
-from mien.storage import file_digest, read_json, write_json
+from mien.storage import expect_whole, file_digest, read_json, write_json
 from mien.training import read_curves, read_run_config, read_training_summary
 
 _FORMAT, _VERSION = "mien.metrics", 1
@@ -96,7 +96,10 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
     """What `evaluate` wrote.
 
     Raises:
-        UserError: the run was not evaluated.
+        UserError: the run was not evaluated, or the file is damaged.
     """
-    content = read_json(run_dir / "metrics.json", _FORMAT, _VERSION)
+    path = run_dir / "metrics.json"
+    content = read_json(path, _FORMAT, _VERSION)
+    with expect_whole(path, "run `mien evaluate` again"):
+        _ = content["protocols"].keys(), content["training"].keys()
     return {name: value for name, value in content.items() if name not in ("format", "version")}

@@ -12,7 +12,7 @@ from mien.config import decode
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, FaceSource, Frame
 from mien.face import FaceParams
-from mien.storage import read_tensors
+from mien.storage import expect_whole, read_tensors
 from mien.tracking import read_scoring, read_scoring_hash, read_tracking
 from mien.training import Sequence, TrainSettings, read_run_config
 from mien.training.frames import training_frames
@@ -92,7 +92,10 @@ def held_out_by_protocol(
 
 def _faces_of_run(run_dir: Path, sequences: Items[Sequence]) -> tuple[FaceParams, ...]:
     """The face parameters that training ended with, one a sequence."""
-    tuned = FaceParams(**read_tensors(run_dir / "face_track.safetensors"))
+    path = run_dir / "face_track.safetensors"
+    tensors = read_tensors(path)
+    with expect_whole(path, "train it again"):
+        tuned = FaceParams(**tensors)
     lengths = [sequence.capture.timesteps for sequence in sequences]
     if len(tuned) != sum(lengths):
         raise UserError(f"{run_dir}: has face parameters of {len(tuned)} timesteps, not {sum(lengths)}; train it again")

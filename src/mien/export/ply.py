@@ -14,6 +14,7 @@ from mien.storage import write_atomically
 _HEADER_LIMIT = 65536
 _REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
 """SH coefficients (1, 4, 9, 16) by the number of f_rest_* properties."""
+_DIGITS_OF_COUNT = 12
 _LOCAL_COMMENT = "mien frame: local"
 _WORLD_COMMENT = "mien frame: world"
 
@@ -61,7 +62,7 @@ def read_ply(path: Path) -> Gaussians:
     """Read a 3D Gaussian .ply, ours or another program's; properties it does not know are skipped.
 
     Raises:
-        UserError: the file is missing, truncated, no ply, ASCII or big-endian, or holds no 3D Gaussians.
+        UserError: the file is missing, truncated, no ply, ASCII or big-endian, holds no 3D Gaussians, or NaN.
     """
     try:
         content = path.read_bytes()
@@ -102,21 +103,23 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
         found = next((line for line in lines if line.startswith("format")), "no format line")
         raise UserError(f"{path}: {found!r} is not supported; save it as binary_little_endian 1.0")
     elements = [line.split() for line in lines if line.startswith("element")]
-    if not elements or elements[0][1:2] != ["vertex"] or not elements[0][-1].isdigit():
-        raise UserError(f"{path}: its first element is not `vertex`; give a .ply with 3D Gaussians")
-    start = lines.index(" ".join(elements[0])) + 1
+    if not elements or elements[0][1:2] != ["vertex"] or len(elements[0]) != 3 or not elements[0][2].isdigit():
+        raise UserError(f"{path}: its first element is not `vertex` and a number; give a .ply with 3D Gaussians")
+    start = next(i for i, line in enumerate(lines) if line.startswith("element")) + 1
     properties: list[list[str]] = []
     for line in lines[start:]:
         if line.startswith("element"):
             break
         if line.startswith("property"):
             properties.append(line.split())
-    others = [" ".join(entry) for entry in properties if entry[1] not in ("float", "float32") or len(entry) != 3]
+    others = [" ".join(entry) for entry in properties if len(entry) != 3 or entry[1] not in ("float", "float32")]
     names = [entry[-1] for entry in properties]
     missing = [name for name in ("x", "f_dc_0", "opacity", "scale_0", "rot_0") if name not in names]
     if missing or others:
         reason = f"lacks {', '.join(missing)}" if missing else f"has {others[0]!r}, not float"
         raise UserError(f"{path}: {reason}; give a .ply with 3D Gaussians in full precision")
+    if len(elements[0][2]) > _DIGITS_OF_COUNT:
+        raise UserError(f"{path}: {elements[0][2][:_DIGITS_OF_COUNT]}... vertices are too many; export it again")
     return int(elements[0][2]), names
 
 
@@ -126,7 +129,10 @@ def _pose_of(path: Path, lines: list[str]) -> Tensor | None:
     if not marked:
         return None
     try:
-        return torch.tensor([float(value) for value in marked[0].split(":")[-1].split()]).reshape(4, 4)
+        pose = torch.tensor([float(value) for value in marked[0].split(":")[-1].split()]).reshape(4, 4)
+        if not pose.isfinite().all():
+            raise ValueError
+        return pose
     except (ValueError, RuntimeError):
         raise UserError(f"{path}: damaged frame comment {marked[0]!r}; export it again") from None
 
@@ -149,7 +155,7 @@ def _activated(columns: dict[str, np.ndarray], pose: Tensor | None, path: Path) 
     if rest:
         channels = stack([f"f_rest_{i}" for i in range(rest)]).reshape(-1, 3, coefficients - 1)
         higher = channels.transpose(1, 2)
-    return Gaussians(
+    gaussians = Gaussians(
         means=stack(["x", "y", "z"]),
         quats=stack([f"rot_{i}" for i in range(4)]),
         scales=stack([f"scale_{i}" for i in range(3)]).exp(),
@@ -157,3 +163,9 @@ def _activated(columns: dict[str, np.ndarray], pose: Tensor | None, path: Path) 
         sh=torch.cat([dc, higher], dim=1).contiguous(),
         T_world_local=pose,
     )
+    columns_read = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh.flatten(1))
+    bad = [not tensor.isfinite().all() for tensor in columns_read]
+    if any(bad):
+        name = ("position", "rotation", "scale", "opacity", "colour")[bad.index(True)]
+        raise UserError(f"{path}: the {name} of some Gaussians is NaN or infinite; export it again, or clean it up")
+    return gaussians

@@ -64,6 +64,11 @@ def read_scoring(path: Path) -> Scoring:
     crops = read_arrays(path / "crops.safetensors").get("crops")
     if crops is None or crops.shape != (*shape[:2], 4):
         raise UserError(f"{path / 'crops.safetensors'}: has not 4 numbers for each frame; {_REMEDY}")
+    # Before room is made for all: a damaged size may ask for more memory than there is.
+    missing = [t_c for t_c in np.ndindex(*shape[:2]) if not _mask_file(path, *t_c).is_file()]
+    if missing:
+        raise UserError(f"{_mask_file(path, *missing[0])}: missing; {_REMEDY}")
+    _read_mask(_mask_file(path, 0, 0), shape[2:])
     masks = np.empty(shape, np.uint8)
     for timestep, camera in np.ndindex(*shape[:2]):
         masks[timestep, camera] = _read_mask(_mask_file(path, timestep, camera), shape[2:])

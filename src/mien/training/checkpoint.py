@@ -10,7 +10,7 @@ from mien.avatar import Avatar, Moments
 from mien.avatar.files import overwrite
 from mien.errors import UserError
 from mien.progress import say
-from mien.storage import read_tensors, write_tensors
+from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.training.adam import Adam
 from mien.training.density import DensityStrategy
 from mien.training.face_track import FaceTrack
@@ -61,17 +61,26 @@ def checkpoint_files(folder: Path) -> list[Path]:
 def resume(folder: Path, state: TrainingState) -> None:
     """Bring `state`, which is that of the run's start, to the newest checkpoint that can be read, if there is any.
 
+    Says which checkpoints are damaged, and where training goes on instead.
+
     Raises:
         UserError: a checkpoint is of another method or other settings.
     """
+    damaged = False
     for path in reversed(checkpoint_files(folder)):
         try:
             tensors = read_tensors(path)
         except UserError as error:
-            say(f"{error}; going on from an older one")
+            say(f"warning: {error}")
+            damaged = True
             continue
-        _restore(path, state, tensors)
+        with expect_whole(path, "delete it and run the same command again"):
+            _restore(path, state, tensors)
+        if damaged:
+            say(f"going on from the older checkpoint {path.name}, step {state.step}")
         return
+    if damaged:
+        say(f"{folder}: no checkpoint can be read; training starts again from the first step")
 
 
 def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> None:

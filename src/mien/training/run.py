@@ -16,13 +16,14 @@ from mien.avatar import MethodConfig, method_of, write_avatar
 from mien.camera import Camera
 from mien.config import encode
 from mien.errors import UserError
-from mien.storage import read_json, read_tensors, write_json, write_tensors
+from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
 from mien.training.checkpoint import TrainingState
 from mien.training.sequence import Sequence
 from mien.training.settings import TrainSettings
 
 _FORMAT, _VERSION = "mien.run", 1
 _SUMMARY = "mien.training"
+_REMEDY = "delete the run's folder and train again"
 _FREE_TO_CHANGE = ("threads", "checkpoint_every")
 """Settings that do not change the result: a run may go on with others."""
 
@@ -58,7 +59,11 @@ def read_run_config(run_dir: Path) -> dict[str, Any]:
     Raises:
         UserError: it is missing or damaged.
     """
-    return read_json(run_dir / "config.json", _FORMAT, _VERSION)
+    path = run_dir / "config.json"
+    content = read_json(path, _FORMAT, _VERSION)
+    with expect_whole(path, _REMEDY):
+        _ = content["method"]["kind"], content["settings"]["split"], [entry["sequence"] for entry in content["data"]]
+    return content
 
 
 def run_camera(run_dir: Path) -> Camera:
@@ -67,9 +72,11 @@ def run_camera(run_dir: Path) -> Camera:
     Raises:
         UserError: config.json is missing or damaged.
     """
-    stored = read_run_config(run_dir)["data"][0]["camera"]
-    K, viewmat = torch.tensor(stored["K"]), torch.tensor(stored["viewmat"])
-    return Camera(K, viewmat, stored["width"], stored["height"])
+    config = read_run_config(run_dir)
+    with expect_whole(run_dir / "config.json", _REMEDY):
+        stored = config["data"][0]["camera"]
+        K, viewmat = torch.tensor(stored["K"]), torch.tensor(stored["viewmat"])
+        return Camera(K, viewmat, int(stored["width"]), int(stored["height"]))
 
 
 def is_finished(run_dir: Path) -> bool:

@@ -5,6 +5,7 @@ from pathlib import Path
 from mien.capture import CaptureSettings, capture_video_parts
 from mien.commands.stages.names import sequence_name
 from mien.progress import say
+from mien.storage import check_writable
 from mien.workspace import Workspace
 
 
@@ -17,6 +18,7 @@ def capture_stage(
         UserError: the video is bad, or a sequence of that name was made from something else and not `replace`.
     """
     name = sequence_name(video, name)
+    check_writable(workspace.root, folder=True)
     captures = capture_video_parts(video, workspace.root / "sequences", settings, name, replace)
     for capture in captures:
         found, blurred = int(capture.valid.any(axis=1).sum()), int((capture.valid & ~capture.usable).sum())
