@@ -108,14 +108,16 @@ def _run(name: str, rest: list[str]) -> int:
 
 def _in_one_line(box: str) -> str:
     """What tyro says about wrong arguments in a box of several parts, without the descriptions of options."""
+    lines = box.splitlines()
+    # Where the terminal has no Unicode, the box is a title, a line of dashes, and everything two spaces to the right.
+    lines = lines[1:] if "╭" in box else lines[2:]
     parts: list[str] = [""]
-    for line in box.splitlines():
-        inner = line.strip()
-        if inner[:1] in ("╭", "╰"):
+    for line in lines:
+        if line.startswith("╰"):
             continue
-        inner = inner.removeprefix("│ ").removesuffix("│").rstrip()
+        inner = line[2:].removesuffix("│").rstrip()
         text = inner.strip()
-        if text and not text.strip("─"):
+        if text and not text.strip("─-"):
             parts.append("")
         elif len(inner) - len(inner.lstrip()) < _INDENT_OF_DESCRIPTION:
             comma = inner.startswith(" ") and parts[-1] and not parts[-1].endswith(":")
