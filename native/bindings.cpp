@@ -5,6 +5,7 @@ void bind_mesh(nanobind::module_& module);
 void bind_photometric(nanobind::module_& module);
 void bind_rig(nanobind::module_& module);
 void bind_rasterize(nanobind::module_& module);
+void bind_training(nanobind::module_& module);
 
 NB_MODULE(_native, module) {
   nanobind::set_leak_warnings(false);  // a picture that lives until the interpreter ends is no leak
@@ -13,4 +14,5 @@ NB_MODULE(_native, module) {
   bind_photometric(module);
   bind_rig(module);
   bind_rasterize(module);
+  bind_training(module);
 }

@@ -2,44 +2,19 @@
 
 #include <algorithm>
 #include <cmath>
-#include <string>
 #include <vector>
 
+#include "isa.h"
 #include "photometric_band.h"
 #include "pool.h"
-#include "rasterize.h"
 
 namespace mien {
 
-#if defined(__x86_64__)
-namespace avx512 {
-void photometric_band(const PhotometricBand& band);
-}
-namespace avx2 {
-void photometric_band(const PhotometricBand& band);
-}
-namespace sse4 {
-void photometric_band(const PhotometricBand& band);
-}
-#else
-namespace baseline {
-void photometric_band(const PhotometricBand& band);
-}
-#endif
+MIEN_CHOOSE_KERNELS(PhotometricKernel, photometric_band)
 
 namespace {
 
 constexpr int kTaps = 2 * kPhotometricRadius + 1;
-
-// Compiled for the same instruction set as the rasterizer's kernels.
-PhotometricKernel choose_kernel() {
-#if defined(__x86_64__)
-  const std::string isa = rasterize_isa();
-  return isa == "avx512" ? avx512::photometric_band : isa == "avx2" ? avx2::photometric_band : sse4::photometric_band;
-#else
-  return baseline::photometric_band;
-#endif
-}
 
 struct Window {
   float weights[kTaps];
@@ -76,7 +51,7 @@ void set_row_buffers(PhotometricBand& band) {
 
 double photometric_loss(const PhotometricTask& task) {
   static const Window window;
-  const PhotometricKernel kernel = choose_kernel();
+  const PhotometricKernel kernel = photometric_band();
   thread_local Workspace work;
   const int stride = task.width * kPhotometricChannels;
   const double count = static_cast<double>(stride) * task.height;

@@ -161,8 +161,9 @@ void gradient_row(const PhotometricBand& band, int y) {
 }  // namespace
 
 namespace mien::MIEN_ISA {
+namespace {
 
-void photometric_band(const PhotometricBand& band) {
+void run_band(const PhotometricBand& band) {
   const int halo = band.gradient ? RADIUS : 0;
   for (int row = band.begin - halo; row < band.end + halo; ++row) {
     if (row >= band.top && row < band.bottom) {
@@ -173,5 +174,10 @@ void photometric_band(const PhotometricBand& band) {
     if (band.gradient && finished >= band.begin && finished < band.end) gradient_row(band, finished);
   }
 }
+
+}  // namespace
+
+extern const PhotometricKernel photometric_band;
+const PhotometricKernel photometric_band = run_band;
 
 }  // namespace mien::MIEN_ISA

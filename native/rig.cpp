@@ -1,44 +1,19 @@
 #include "rig.h"
 
 #include <algorithm>
-#include <string>
 #include <vector>
 
+#include "isa.h"
 #include "pool.h"
-#include "rasterize.h"
 #include "rig_kernels.h"
 
 namespace mien {
 
-#if defined(__x86_64__)
-namespace avx512 {
-extern const RigKernels rig_kernels;
-}
-namespace avx2 {
-extern const RigKernels rig_kernels;
-}
-namespace sse4 {
-extern const RigKernels rig_kernels;
-}
-#else
-namespace baseline {
-extern const RigKernels rig_kernels;
-}
-#endif
+MIEN_CHOOSE_KERNELS(RigKernels, rig_kernels)
 
 namespace {
 
 constexpr int64_t kGrain = 2048;  // triangles or Gaussians that are worth a piece of the pool's work
-
-// Compiled for the same instruction set as the rasterizer's kernels.
-const RigKernels& kernels() {
-#if defined(__x86_64__)
-  const std::string isa = rasterize_isa();
-  return isa == "avx512" ? avx512::rig_kernels : isa == "avx2" ? avx2::rig_kernels : sse4::rig_kernels;
-#else
-  return baseline::rig_kernels;
-#endif
-}
 
 template <typename Body>
 void in_pieces(int64_t count, Body&& body) {
@@ -80,7 +55,7 @@ void frame_to_vertices(const TriangleFrame& frame, const FrameGradient& gradient
 }  // namespace
 
 void rig_forward(const RigArrays& rig, TriangleFrame* frames, const RigWorld& world) {
-  const RigKernels& kernel = kernels();
+  const RigKernels& kernel = rig_kernels();
   in_pieces(rig.face_count, [&](int64_t first, int64_t last) { kernel.frames(rig, first, last, frames); });
   in_pieces(rig.count, [&](int64_t first, int64_t last) { kernel.to_world(rig, first, last, frames, world); });
 }
@@ -91,7 +66,7 @@ void rig_backward(const RigArrays& rig, const TriangleFrame* frames, const float
   thread_local std::vector<FrameGradient> per_gaussian, per_face;
   per_gaussian.resize(rig.count);
   FrameGradient* const shares = per_gaussian.data();
-  const RigKernels& kernel = kernels();
+  const RigKernels& kernel = rig_kernels();
   in_pieces(rig.count,
             [&](int64_t first, int64_t last) { kernel.to_local(rig, first, last, frames, scales, gradients, shares); });
   if (!gradients.vertices) return;

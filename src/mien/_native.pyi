@@ -1,5 +1,7 @@
 """What native/bind_*.cpp defines. Arrays are contiguous, on the CPU, float32 unless said otherwise."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -102,3 +104,26 @@ def rig_backward(
     grad_log_scales: Tensor,
     grad_vertices: Tensor | None,
 ) -> None: ...
+
+# native/bind_training.cpp; radii, radius: int32
+def adam_update(tasks: Sequence[tuple[int, int, int, int, int, float, float]]) -> None: ...
+def triangle_penalties(
+    means: Tensor,
+    log_scales: Tensor,
+    radii: Tensor,
+    thresholds: tuple[float, float],
+    weights: tuple[float, float],
+    grad_means: Tensor,
+    grad_log_scales: Tensor,
+) -> tuple[float, float]: ...
+def observe_view(
+    grad_means2d: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    scale: tuple[float, float],
+    pull: Tensor,
+    seen: Tensor,
+    radius: Tensor,
+    opacity: Tensor,
+) -> None: ...
+def box_of_nonzero(values: Tensor) -> tuple[int, int, int, int]: ...

@@ -14,6 +14,7 @@ from torch import Tensor
 from mien.avatar.avatar import TRAINED, Avatar, MethodConfig, ParameterGroup, Posed, Progress, Rate, store_group
 from mien.avatar.baked import Attributes, MeshBound, bake_rig
 from mien.avatar.density import GradientDensity, GradientSettings
+from mien.avatar.penalties import triangle_penalties
 from mien.avatar.rig import bind_to_world
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
@@ -91,15 +92,15 @@ class GaussianAvatars(Avatar):
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Section 3.4: of the Gaussians in view, distances and scales beyond their thresholds, in triangle units."""
-        visible = (rendering.radii > 0).reshape(-1, rendering.radii.shape[-1]).any(0)
-        share = visible / visible.sum().clamp_min(1)
-        distances = torch.linalg.vector_norm(self.store["means"], dim=-1)
-        too_far = torch.relu(distances - self.config.position_threshold)
-        too_large = torch.relu(self.store["log_scales"].exp() - self.config.scale_threshold)
-        return {
-            "position": self.config.position_weight * (too_far * share).sum(),
-            "scale": self.config.scale_weight * (torch.linalg.vector_norm(too_large, dim=-1) * share).sum(),
-        }
+        config = self.config
+        position, scale = triangle_penalties(
+            self.store["means"],
+            self.store["log_scales"],
+            rendering.radii.reshape(-1, rendering.radii.shape[-1]).amax(0),
+            thresholds=(config.position_threshold, config.scale_threshold),
+            weights=(config.position_weight, config.scale_weight),
+        )
+        return {"position": position, "scale": scale}
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group a tensor."""

@@ -1,18 +1,30 @@
 """Adam over parameter groups, with its state where density control and checkpoints can reach it."""
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.optim.adam import adam
 
+from mien import _native
 from mien.avatar import Moments, ParameterGroup, Progress
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
 
 
+@dataclass(frozen=True, eq=False)
+class Update:
+    """What one step does to one tensor."""
+
+    values: Tensor
+    gradient: Tensor
+    moments: Moments
+    rate: float
+
+
 class Adam:
-    """Adam (Kingma and Ba 2015) with the constants of 3D Gaussian Splatting; torch's fused kernel, one call a group.
+    """Adam (Kingma and Ba 2015) with the constants of 3D Gaussian Splatting; all tensors in one native call.
 
     The state of per-Gaussian tensors lives in their store, that of networks here.
     """
@@ -22,30 +34,14 @@ class Adam:
 
     def step(self, groups: Iterable[ParameterGroup], progress: Progress) -> None:
         """One update of every tensor that has a gradient, at the group's rate; clears the gradients."""
+        updates: list[Update] = []
         for group in groups:
             rate = group.rate.at(progress)
-            trained = {name: tensor for name, tensor in group.tensors.items() if tensor.grad is not None}
-            if rate > 0 and trained:
-                states = self._states(group, trained)
-                with torch.no_grad():
-                    adam(
-                        list(trained.values()),
-                        [_gradient(tensor) for tensor in trained.values()],
-                        [state.first for state in states],
-                        [state.second for state in states],
-                        [],
-                        [state.step for state in states],
-                        fused=True,
-                        amsgrad=False,
-                        beta1=_BETA1,
-                        beta2=_BETA2,
-                        lr=rate,
-                        weight_decay=0.0,
-                        eps=_EPSILON,
-                        maximize=False,
-                    )
-            for tensor in trained.values():
+            for name, tensor in group.tensors.items():
+                if tensor.grad is not None and rate > 0:
+                    updates.append(Update(tensor.detach(), tensor.grad, self._state(group, name, tensor), rate))
                 tensor.grad = None
+        update_all(updates)
 
     def state(self) -> dict[str, Moments]:
         """The state of everything that has no store, by group and tensor."""
@@ -58,14 +54,40 @@ class Adam:
             group, name = key.split("/", 1)
             self._moments.setdefault(group, {})[name] = moments
 
-    def _states(self, group: ParameterGroup, trained: Mapping[str, Tensor]) -> list[Moments]:
+    def _state(self, group: ParameterGroup, name: str, tensor: Tensor) -> Moments:
         own = self._moments.setdefault(group.name, {}) if group.moments is None else group.moments
-        for name, tensor in trained.items():
-            if name not in own:
-                own[name] = Moments.zeros(tensor.detach())
-        return [own[name] for name in trained]
+        if name not in own:
+            own[name] = Moments.zeros(tensor.detach())
+        return own[name]
 
 
-def _gradient(tensor: Tensor) -> Tensor:
-    assert tensor.grad is not None
-    return tensor.grad
+def update_all(updates: Sequence[Update]) -> None:
+    """Apply all updates in place, natively where tensors are float32, dense and on a CPU."""
+    tasks = []
+    for update in updates:
+        moments = update.moments
+        moments.step += 1
+        tensors = (update.values, update.gradient, moments.first, moments.second)
+        if not all(t.dtype == torch.float32 and t.device.type == "cpu" and t.is_contiguous() for t in tensors):
+            update_reference(update)
+            continue
+        assert len({tensor.shape for tensor in tensors}) == 1, "a gradient and moments have their tensor's shape"
+        pointers = [tensor.data_ptr() for tensor in tensors]
+        tasks.append((*pointers, update.values.numel(), *_step_sizes(update)))
+    if tasks:
+        _native.adam_update(tasks)
+
+
+def update_reference(update: Update) -> None:
+    """One update in plain PyTorch; `moments.step` already counts it."""
+    moments, gradient = update.moments, update.gradient
+    step_size, second_unbiased = _step_sizes(update)
+    moments.first.lerp_(gradient, 1 - _BETA1)
+    moments.second.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
+    update.values.addcdiv_(moments.first, moments.second.sqrt().mul_(second_unbiased).add_(_EPSILON), value=-step_size)
+
+
+def _step_sizes(update: Update) -> tuple[float, float]:
+    """Rate / (1 - beta1^t) and 1 / sqrt(1 - beta2^t)."""
+    step = float(update.moments.step)
+    return update.rate / (1 - _BETA1**step), 1 / math.sqrt(1 - _BETA2**step)

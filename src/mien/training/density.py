@@ -7,9 +7,10 @@ statistics of one entry per Gaussian, which checkpoints save.
 from abc import ABC, abstractmethod
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mien import _native
 from mien.avatar import DensityControl, FixedDensity, GaussianStore, GradientDensity, Posed, Progress, RefillDensity
 from mien.render.rendering import Rendering
 
@@ -57,13 +58,12 @@ class GradientStrategy(DensityStrategy):
         assert gradient is not None, "observe() needs the gradients of a backward pass"
         height, width = rendering.image.shape[-3:-1]
         # Pixels to normalised device coordinates, which span -1..1: the unit that thresholds are given in.
-        pull = torch.linalg.vector_norm(gradient * gradient.new_tensor([width / 2, height / 2]), dim=-1)
-        visible = rendering.radii > 0
-        # Culled Gaussians have no gradient, so the sum needs no mask.
-        self._pull += pull
-        self._seen += visible
-        torch.maximum(self._radius, rendering.radii, out=self._radius)
-        torch.maximum(self._opacity, posed.gaussians.opacities.detach().reshape(-1), out=self._opacity)
+        scale, opacities = (width / 2, height / 2), posed.gaussians.opacities.detach().reshape(-1)
+        statistics = (self._pull, self._seen, self._radius, self._opacity)
+        if gradient.device.type == "cpu":
+            _native.observe_view(gradient, rendering.radii, opacities, scale, *statistics)
+        else:
+            observe_reference(gradient, rendering.radii, opacities, scale, *statistics)
 
     def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
         """Grow and prune in rounds; reset opacities at their times."""
@@ -129,6 +129,22 @@ class GradientStrategy(DensityStrategy):
             strongest = pull.argsort(descending=True, stable=True)[: max(budget, 0)]
             grow = torch.zeros_like(grow).index_fill(0, strongest, True)
         return grow
+
+
+def observe_reference(
+    gradient: Float[Tensor, "n 2"],
+    radii: Int[Tensor, " n"],
+    opacities: Float[Tensor, " n"],
+    scale: tuple[float, float],
+    *statistics: Tensor,
+) -> None:
+    """`_native.observe_view` in plain PyTorch: adds a step to pull, seen, radius and opacity."""
+    pull, seen, radius, opacity = statistics
+    # Culled Gaussians have no gradient, so the sum needs no mask.
+    pull += torch.linalg.vector_norm(gradient * gradient.new_tensor(scale), dim=-1)
+    seen += radii > 0
+    torch.maximum(radius, radii, out=radius)
+    torch.maximum(opacity, opacities, out=opacity)
 
 
 class RefillStrategy(DensityStrategy):

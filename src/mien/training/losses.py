@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien import _native
 from mien.avatar import Photometric
 from mien.render.rendering import Rendering
 from mien.training.photometric import WINDOW_RADIUS, Box, photometric_loss
@@ -28,17 +29,23 @@ def train_psnr(rendering: Rendering, target: Target) -> float:
     return float(-10 * torch.log10((difference * difference).mean().clamp_min(1e-10)))
 
 
+def box_of_nonzero(values: Float[Tensor, "h w"]) -> Box:
+    """The smallest box around all values that are not zero; width and height 0 where there are none."""
+    if values.dtype == torch.float32 and values.device.type == "cpu":
+        return _native.box_of_nonzero(values.contiguous())
+    columns, rows = (values.ne(0).any(axis).nonzero()[:, 0] for axis in (0, 1))
+    if len(columns) == 0:
+        return 0, 0, 0, 0
+    left, top = int(columns[0]), int(rows[0])
+    return left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top
+
+
 def _box_of_difference(rendering: Rendering, target: Target) -> Box:
     """Outside of this box both pictures show the background and nothing else, also to SSIM's windows."""
-    alpha = rendering.alpha.detach()
-    columns, rows = (alpha.amax(axis).nonzero()[:, 0] for axis in (0, 1))
-    left, top, width, height = target.box
-    edges = [left, top, left + width, top + height] if width else []
-    if len(columns):
-        drawn = [int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1]
-        edges = [*map(min, edges[:2], drawn[:2]), *map(max, edges[2:], drawn[2:])] if edges else drawn
-    if not edges:
+    boxes = [box for box in (target.box, box_of_nonzero(rendering.alpha.detach())) if box[2] > 0]
+    if not boxes:
         return 0, 0, 0, 0
-    left, top, right, bottom = edges
+    left, top = (min(box[side] for box in boxes) for side in (0, 1))
+    right, bottom = (max(box[side] + box[side + 2] for box in boxes) for side in (0, 1))
     margin = WINDOW_RADIUS + 1
     return left - margin, top - margin, right - left + 2 * margin, bottom - top + 2 * margin

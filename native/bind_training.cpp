@@ -1,0 +1,91 @@
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <array>
+#include <tuple>
+#include <vector>
+
+#include "training.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+template <typename T, typename... Shape>
+using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
+using Floats = Array<float, nb::ndim<1>>;
+using Rows3 = Array<const float, nb::shape<-1, 3>>;
+using Radii = Array<const int32_t, nb::ndim<1>>;
+
+void require(bool condition, const char* message) {
+  if (!condition) throw nb::value_error(message);
+}
+
+// Addresses instead of arrays: unpacking forty arrays would cost as much as the update itself.
+using AdamArguments = std::tuple<uintptr_t, uintptr_t, uintptr_t, uintptr_t, int64_t, double, double>;
+
+void adam_update(const std::vector<AdamArguments>& arguments) {
+  std::vector<mien::AdamTask> tasks;
+  for (const auto& [values, gradient, first, second, count, step_size, second_unbiased] : arguments) {
+    tasks.push_back({reinterpret_cast<float*>(values), reinterpret_cast<const float*>(gradient),
+                     reinterpret_cast<float*>(first), reinterpret_cast<float*>(second), count,
+                     static_cast<float>(step_size), static_cast<float>(second_unbiased)});
+  }
+  const nb::gil_scoped_release release;
+  mien::adam_update(tasks.data(), static_cast<int>(tasks.size()));
+}
+
+std::tuple<double, double> triangle_penalties(const Rows3& means, const Rows3& log_scales, const Radii& radii,
+                                              const std::array<float, 2>& thresholds,
+                                              const std::array<float, 2>& weights,
+                                              const Array<float, nb::shape<-1, 3>>& grad_means,
+                                              const Array<float, nb::shape<-1, 3>>& grad_log_scales) {
+  const size_t n = means.shape(0);
+  require(log_scales.shape(0) == n && radii.shape(0) == n && grad_means.shape(0) == n && grad_log_scales.shape(0) == n,
+          "one row of every array a Gaussian");
+  const mien::PenaltyTask task{
+      static_cast<int64_t>(n), means.data(), log_scales.data(), radii.data(),          thresholds[0], weights[0],
+      thresholds[1],           weights[1],   grad_means.data(), grad_log_scales.data()};
+  const nb::gil_scoped_release release;
+  const mien::Penalties sums = mien::triangle_penalties(task);
+  return {sums.position, sums.scale};
+}
+
+void observe_view(const Array<const float, nb::shape<-1, 2>>& grad_means2d, const Radii& radii,
+                  const Array<const float, nb::ndim<1>>& opacities, const std::array<float, 2>& scale,
+                  const Floats& pull, const Floats& seen, const Array<int32_t, nb::ndim<1>>& radius,
+                  const Floats& opacity) {
+  const size_t n = radii.shape(0);
+  require(grad_means2d.shape(0) == n && opacities.shape(0) == n && pull.shape(0) == n && seen.shape(0) == n &&
+              radius.shape(0) == n && opacity.shape(0) == n,
+          "one entry of every array a Gaussian");
+  const nb::gil_scoped_release release;
+  mien::observe_view({static_cast<int64_t>(n), grad_means2d.data(), radii.data(), opacities.data(), scale[0], scale[1],
+                      pull.data(), seen.data(), radius.data(), opacity.data()});
+}
+
+std::tuple<int, int, int, int> box_of_nonzero(const Array<const float, nb::ndim<2>>& values) {
+  const nb::gil_scoped_release release;
+  const mien::PixelBox box =
+      mien::box_of_nonzero(values.data(), static_cast<int>(values.shape(1)), static_cast<int>(values.shape(0)));
+  return {box.left, box.top, box.right - box.left, box.bottom - box.top};
+}
+
+}  // namespace
+
+void bind_training(nb::module_& module) {
+  module.def("adam_update", &adam_update, "tasks"_a,
+             "Each task: the addresses of values, gradient, first and second moments; count, step size, 1 / sqrt(1 - "
+             "beta2^t).");
+  module.def("triangle_penalties", &triangle_penalties, "means"_a.noconvert(), "log_scales"_a.noconvert(),
+             "radii"_a.noconvert(), "thresholds"_a, "weights"_a, "grad_means"_a.noconvert(),
+             "grad_log_scales"_a.noconvert(), "The position and scale penalties; fills their gradients.");
+  module.def("observe_view", &observe_view, "grad_means2d"_a.noconvert(), "radii"_a.noconvert(),
+             "opacities"_a.noconvert(), "scale"_a, "pull"_a.noconvert(), "seen"_a.noconvert(), "radius"_a.noconvert(),
+             "opacity"_a.noconvert(), "Adds a step to the statistics of density control.");
+  module.def("box_of_nonzero", &box_of_nonzero, "values"_a.noconvert(), "Left, top, width and height; 0 where all is.");
+}

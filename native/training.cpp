@@ -1,0 +1,80 @@
+#include "training.h"
+
+#include <algorithm>
+#include <vector>
+
+#include "isa.h"
+#include "pool.h"
+#include "training_kernels.h"
+
+namespace mien {
+
+MIEN_CHOOSE_KERNELS(TrainingKernels, training_kernels)
+
+namespace {
+
+constexpr int64_t kElements = 16384, kGaussians = 4096;  // worth a piece of the pool's work
+
+struct Piece {
+  int task;
+  int64_t first, last;
+};
+
+}  // namespace
+
+void adam_update(const AdamTask* tasks, int count) {
+  thread_local std::vector<Piece> pieces;
+  pieces.clear();
+  for (int task = 0; task < count; ++task) {
+    for (int64_t first = 0; first < tasks[task].count; first += kElements) {
+      pieces.push_back({task, first, std::min(first + kElements, tasks[task].count)});
+    }
+  }
+  const TrainingKernels& kernels = training_kernels();
+  const Piece* all = pieces.data();
+  parallel_for(static_cast<int64_t>(pieces.size()),
+               [&](int64_t index) { kernels.adam(tasks[all[index].task], all[index].first, all[index].last); });
+}
+
+Penalties triangle_penalties(const PenaltyTask& task) {
+  const int64_t in_view = std::count_if(task.radii, task.radii + task.count, [](int32_t radius) { return radius > 0; });
+  const float share = 1.0f / static_cast<float>(std::max<int64_t>(in_view, 1));
+  const int64_t pieces = (task.count + kGaussians - 1) / kGaussians;
+  thread_local std::vector<Penalties> sums;
+  sums.resize(pieces);
+  Penalties* const parts = sums.data();
+  const TrainingKernels& kernels = training_kernels();
+  parallel_for(pieces, [&](int64_t index) {
+    parts[index] = kernels.penalties(task, share, index * kGaussians, std::min((index + 1) * kGaussians, task.count));
+  });
+  Penalties total{0, 0};  // in the order of the Gaussians
+  for (int64_t index = 0; index < pieces; ++index) {
+    total.position += parts[index].position;
+    total.scale += parts[index].scale;
+  }
+  return {task.position_weight * share * total.position, task.scale_weight * share * total.scale};
+}
+
+void observe_view(const ViewStatistics& task) { training_kernels().observe(task, 0, task.count); }
+
+PixelBox box_of_nonzero(const float* values, int width, int height) {
+  const auto any_nonzero = training_kernels().any_nonzero;
+  const auto row = [&](int y) { return values + static_cast<int64_t>(y) * width; };
+  int top = 0, bottom = height;
+  while (top < bottom && !any_nonzero(row(top), width)) ++top;
+  if (top == bottom) return {0, 0, 0, 0};
+  while (!any_nonzero(row(bottom - 1), width)) --bottom;
+  int left = width, right = 0;
+  for (int y = top; y < bottom; ++y) {
+    const float* from = row(y);
+    for (int x = 0; x < left; ++x) {
+      if (from[x] != 0) left = x;
+    }
+    for (int x = width; x > right; --x) {
+      if (from[x - 1] != 0) right = x;
+    }
+  }
+  return {left, top, right, bottom};
+}
+
+}  // namespace mien

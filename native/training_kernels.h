@@ -1,0 +1,18 @@
+// What training.cpp hands to its kernels, which are compiled once per instruction set.
+#pragma once
+
+#include "training.h"
+
+namespace mien {
+
+struct TrainingKernels {
+  // Elements, or Gaussians, first .. last - 1.
+  void (*adam)(const AdamTask&, int64_t first, int64_t last);
+  // `share` is 1 / number in view.
+  Penalties (*penalties)(const PenaltyTask&, float share, int64_t first, int64_t last);
+  void (*observe)(const ViewStatistics&, int64_t first, int64_t last);
+  // Whether any of `count` values is not zero.
+  bool (*any_nonzero)(const float* values, int64_t count);
+};
+
+}  // namespace mien

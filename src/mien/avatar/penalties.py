@@ -1,0 +1,70 @@
+"""Penalties on Gaussians that stray from the triangle they ride on (GaussianAvatars, CVPR 2024, section 3.4)."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mien import _native
+
+Pair = tuple[float, float]
+
+
+def triangle_penalties(
+    means: Float[Tensor, "n 3"],
+    log_scales: Float[Tensor, "n 3"],
+    radii: Int[Tensor, " n"],
+    thresholds: Pair,
+    weights: Pair,
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """How far centres, and how much scales, exceed their thresholds: means over the Gaussians in view, weighted.
+
+    Lengths are in units of the triangle's size. `thresholds` and `weights` are those of centres, then of scales.
+    Differentiable in `means` and `log_scales`; native for float32 on a CPU.
+
+    Args:
+        means: Centres in their triangle's frame.
+        log_scales: Logarithms of the scales in the same units.
+        radii: Pixels on screen, 0 for what is not in view.
+        thresholds: What is smaller is free.
+        weights: Of what exceeds the thresholds.
+    """
+    if means.dtype != torch.float32 or means.device.type != "cpu":
+        return triangle_penalties_reference(means, log_scales, radii, thresholds, weights)
+    return _TrianglePenalties.apply(means, log_scales, radii, thresholds, weights)
+
+
+def triangle_penalties_reference(
+    means: Float[Tensor, "n 3"],
+    log_scales: Float[Tensor, "n 3"],
+    radii: Int[Tensor, " n"],
+    thresholds: Pair,
+    weights: Pair,
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """`triangle_penalties` in plain PyTorch, any dtype and device."""
+    in_view = radii > 0
+    share = in_view / in_view.sum().clamp_min(1)
+    too_far = torch.relu(torch.linalg.vector_norm(means, dim=-1) - thresholds[0])
+    too_large = torch.linalg.vector_norm(torch.relu(log_scales.exp() - thresholds[1]), dim=-1)
+    return weights[0] * (too_far * share).sum(), weights[1] * (too_large * share).sum()
+
+
+class _TrianglePenalties(torch.autograd.Function):
+    """Values and gradients come from one native pass; `backward` only scales the gradients."""
+
+    @staticmethod
+    def forward(ctx, means: Tensor, log_scales: Tensor, radii: Tensor, thresholds: Pair, weights: Pair):
+        means, log_scales, radii = (tensor.detach().contiguous() for tensor in (means, log_scales, radii))
+        grad_means, grad_log_scales = torch.empty_like(means), torch.empty_like(log_scales)
+        position, scale = _native.triangle_penalties(
+            means, log_scales, radii, thresholds, weights, grad_means, grad_log_scales
+        )
+        ctx.save_for_backward(grad_means, grad_log_scales)
+        return means.new_tensor(position), means.new_tensor(scale)
+
+    @staticmethod
+    def backward(ctx, *output_gradients: Tensor):
+        scaled = [
+            gradient if float(factor) == 1 else gradient * factor
+            for gradient, factor in zip(ctx.saved_tensors, output_gradients, strict=True)
+        ]
+        return *scaled, None, None, None

@@ -1,0 +1,107 @@
+"""The native parts of a training step against their plain PyTorch twins."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from mien import _native
+from mien.avatar import Moments
+from mien.avatar.penalties import triangle_penalties, triangle_penalties_reference
+from mien.training.adam import Update, update_all, update_reference
+from mien.training.density import observe_reference
+from mien.training.losses import box_of_nonzero
+
+COUNTS = (0, 1, 15, 16, 4097)
+ISAS = ("avx512", "avx2", "sse4")
+
+
+@pytest.fixture(params=ISAS)
+def isa(request: pytest.FixtureRequest):
+    before = _native.rasterize_isa()
+    if not _native.set_rasterize_isa(request.param):
+        pytest.skip(f"this machine has no {request.param}")
+    yield request.param
+    assert _native.set_rasterize_isa(before)
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    """Standard normal numbers."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_adam_update_equals_its_reference(isa: str, count: int) -> None:
+    def twin() -> Update:
+        moments = Moments(0.1 * random(count, seed=1), random(count, seed=2).square(), torch.tensor(3.0))
+        return Update(random(count, seed=3), random(count, seed=4), moments, 0.01)
+
+    ours, theirs = twin(), twin()
+    update_all([ours, twin()])
+    theirs.moments.step += 1
+    update_reference(theirs)
+    assert ours.moments.step == theirs.moments.step == 4
+    # Where the second moment is small an update is large (up to 10): in float32 its last digits differ.
+    torch.testing.assert_close(ours.values, theirs.values, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(ours.moments.first, theirs.moments.first, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(ours.moments.second, theirs.moments.second, rtol=1e-6, atol=1e-7)
+
+
+def test_adam_takes_what_is_not_dense_by_the_reference() -> None:
+    values = torch.zeros(4, 3)
+    update_all([Update(values, torch.ones(1, 3).expand(4, 3), Moments.zeros(values), 0.1)])
+    torch.testing.assert_close(values, torch.full((4, 3), -0.1))
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_triangle_penalties_equal_their_reference(isa: str, count: int) -> None:
+    means, log_scales = random(count, 3), random(count, 3, seed=1)
+    means[:2] = 0  # whose length has no derivative
+    radii = torch.randint(0, 3, (count,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
+    results = []
+    for function, dtype in ((triangle_penalties, torch.float32), (triangle_penalties_reference, torch.float64)):
+        inputs = [tensor.to(dtype).requires_grad_() for tensor in (means, log_scales)]
+        position, scale = function(inputs[0], inputs[1], radii, thresholds=(1.0, 0.6), weights=(0.5, 2.0))
+        gradients = torch.autograd.grad(3 * position + scale, inputs)
+        results.append([tensor.double() for tensor in (position, scale, *gradients)])
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_observing_a_view_equals_its_reference(isa: str, count: int) -> None:
+    radii = torch.randint(0, 3, (count,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
+    arguments = (random(count, 2), radii, random(count, seed=5).sigmoid(), (256.0, 128.0))
+
+    def statistics() -> tuple[Tensor, ...]:
+        floats = (random(count, seed=6).abs(), random(count, seed=7).abs(), random(count, seed=8).sigmoid())
+        return floats[0], floats[1], torch.ones(count, dtype=torch.int32), floats[2]
+
+    ours, theirs = statistics(), statistics()
+    _native.observe_view(*arguments, *ours)
+    observe_reference(*arguments, *theirs)
+    for one, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130)])
+def test_box_of_nonzero(isa: str, size: tuple[int, int]) -> None:
+    values = torch.zeros(size)
+    assert box_of_nonzero(values) == box_of_nonzero(values.double()) == (0, 0, 0, 0)
+    for pixel in ((size[0] - 1, size[1] // 2), (size[0] // 3, size[1] - 1), (size[0] // 2, size[1] // 3)):
+        values[pixel] = 1e-6
+        assert box_of_nonzero(values) == box_of_nonzero(values.double())
+
+
+def test_the_same_bits_for_any_number_of_threads() -> None:
+    means, log_scales, radii = random(20_000, 3), random(20_000, 3, seed=1), torch.ones(20_000, dtype=torch.int32)
+    before, results = _native.thread_count(), []
+    for threads in (1, 2, 3):
+        _native.set_thread_count(threads)
+        inputs = [tensor.clone().requires_grad_() for tensor in (means, log_scales)]
+        position, scale = triangle_penalties(inputs[0], inputs[1], radii, thresholds=(1.0, 0.6), weights=(0.5, 2.0))
+        update = Update(means.clone(), log_scales, Moments.zeros(means), 0.1)
+        update_all([update])
+        results.append((position, scale, *torch.autograd.grad(position + scale, inputs), update.values))
+    _native.set_thread_count(before)
+    for other in results[1:]:
+        assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
