@@ -42,8 +42,8 @@ def test_adam_update_equals_its_reference(isa: str, count: int) -> None:
     assert ours.moments.step == theirs.moments.step == 4
     # Where the second moment is small an update is large (up to 10): in float32 its last digits differ.
     torch.testing.assert_close(ours.values, theirs.values, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(ours.moments.first, theirs.moments.first, rtol=1e-6, atol=1e-7)
-    torch.testing.assert_close(ours.moments.second, theirs.moments.second, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(ours.moments.first, theirs.moments.first, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(ours.moments.second, theirs.moments.second, rtol=1e-5, atol=1e-6)
 
 
 def test_adam_takes_what_is_not_dense_by_the_reference() -> None:

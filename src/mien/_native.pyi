@@ -127,3 +127,44 @@ def observe_view(
     opacity: Tensor,
 ) -> None: ...
 def box_of_nonzero(values: Tensor) -> tuple[int, int, int, int]: ...
+
+# native/bind_face.cpp; b timesteps first in all but rest and joint_rest
+class FaceModelData: ...
+
+def make_face_model(
+    expression_basis: Tensor,
+    pose_basis: Tensor | None,
+    rotation_basis: Tensor,
+    translation_basis: Tensor,
+    skinning_weights: Tensor,
+    parents: Sequence[int],
+    is_free: Sequence[bool],
+) -> FaceModelData: ...
+def pose_face(
+    model: FaceModelData,
+    rest: Tensor,
+    joint_rest: Tensor,
+    expression: Tensor,
+    joints: Tensor,
+    head_rotation: Tensor | None,
+    head_translation: Tensor | None,
+    shaped: Tensor,
+    vertices: Tensor,
+) -> None: ...
+def pose_face_backward(
+    model: FaceModelData,
+    rest: Tensor,
+    joint_rest: Tensor,
+    expression: Tensor,
+    joints: Tensor,
+    head_rotation: Tensor | None,
+    head_translation: Tensor | None,
+    shaped: Tensor,
+    grad_vertices: Tensor,
+    grad_rest: Tensor,
+    grad_joint_rest: Tensor,
+    grad_expression: Tensor,
+    grad_joints: Tensor,
+    grad_head_rotation: Tensor,
+    grad_head_translation: Tensor,
+) -> None: ...

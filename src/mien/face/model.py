@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.face.params import FaceParams
+from mien.face.posing import has_native_posing, pose_vertices
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 
 
@@ -116,18 +117,27 @@ class FaceModel:
         return torch.isin(self.face_regions, torch.tensor(wanted, dtype=self.face_regions.dtype))
 
     def __call__(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
-        """Vertices in world space, metres. Differentiable in every field of `face`."""
-        in_head = self.head_vertices(face)
-        pose = face.T_world_head
-        return in_head @ pose[:, :3, :3].transpose(-1, -2) + pose[:, None, :3, 3]
+        """Vertices in world space, metres. Differentiable in every field of `face`; native for float32 on a CPU."""
+        if has_native_posing(self, face):
+            return pose_vertices(self, face, in_world=True)
+        return self.vertices_reference(face)
 
     def head_vertices(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
         """Vertices in the head frame, metres. Differentiable in every field of `face` but the head pose."""
-        rest = self.template + torch.einsum("i,ivc->vc", face.identity, self.identity_basis)
-        if face.vertex_offsets is not None:
-            rest = rest + face.vertex_offsets
+        if has_native_posing(self, face):
+            return pose_vertices(self, face, in_world=False)
+        return self.head_vertices_reference(face)
+
+    def vertices_reference(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
+        """`__call__` in plain PyTorch, any dtype and device."""
+        pose = face.T_world_head
+        return self.head_vertices_reference(face) @ pose[:, :3, :3].transpose(-1, -2) + pose[:, None, :3, 3]
+
+    def head_vertices_reference(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
+        """`head_vertices` in plain PyTorch, any dtype and device."""
         e, v = self.expression_basis.shape[:2]
-        shaped = rest + (face.expression @ self.expression_basis.reshape(e, v * 3)).reshape(-1, v, 3)
+        moved = (face.expression @ self.expression_basis.reshape(e, v * 3)).reshape(-1, v, 3)
+        shaped = self.rest_vertices(face) + moved
         if self.pose_basis is not None:
             turned = matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)
             shaped = shaped + torch.einsum("bp,pvc->bvc", turned.flatten(1), self.pose_basis)
@@ -135,9 +145,18 @@ class FaceModel:
         moved = torch.einsum("vk,bkrc->bvrc", self.skinning_weights, transforms[:, :, :3])
         return (moved[..., :3] @ shaped[..., None])[..., 0] + moved[..., 3]
 
+    def rest_vertices(self, face: FaceParams) -> Float[Tensor, "v 3"]:
+        """This person without expression, in the head frame, metres."""
+        rest = self.template + torch.einsum("i,ivc->vc", face.identity, self.identity_basis)
+        return rest if face.vertex_offsets is None else rest + face.vertex_offsets
+
+    def rest_joints(self, face: FaceParams) -> Float[Tensor, "k 3"]:
+        """This person's joints without expression, in the head frame, metres."""
+        return self.joint_template + torch.einsum("i,ikc->kc", face.identity, self.joint_identity_basis)
+
     def joint_transforms(self, face: FaceParams) -> Float[Tensor, "b k 4 4"]:
         """What each joint does to points of the rest pose, in the head frame; the head's own is the identity."""
-        rest = self.joint_template + torch.einsum("i,ikc->kc", face.identity, self.joint_identity_basis)
+        rest = self.rest_joints(face)
         rotation = torch.einsum("be,ekc->bkc", face.expression, self.joint_rotation_basis)
         shift = torch.einsum("be,ekc->bkc", face.expression, self.joint_translation_basis)
         free = [index for index, is_free in enumerate(self.joint_free) if is_free]

@@ -1,0 +1,137 @@
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/vector.h>
+
+#include <optional>
+#include <vector>
+
+#include "face.h"
+#include "pool.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+template <typename T, typename... Shape>
+using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
+template <int... Shape>
+using In = Array<const float, nb::shape<Shape...>>;
+template <int... Shape>
+using Out = Array<float, nb::shape<Shape...>>;
+
+void require(bool condition, const char* message) {
+  if (!condition) throw nb::value_error(message);
+}
+
+mien::FaceModelData make_model(const In<-1, -1, 3>& expression_basis, const std::optional<In<-1, -1, 3>>& pose_basis,
+                               const In<-1, -1, 3>& rotation_basis, const In<-1, -1, 3>& translation_basis,
+                               const In<-1, -1>& skinning_weights, const std::vector<int>& parents,
+                               const std::vector<bool>& is_free) {
+  mien::FaceModelData sizes;
+  sizes.vertices = static_cast<int>(skinning_weights.shape(0));
+  sizes.expressions = static_cast<int>(expression_basis.shape(0));
+  sizes.joints = static_cast<int>(skinning_weights.shape(1));
+  const size_t e = expression_basis.shape(0), v = skinning_weights.shape(0), k = skinning_weights.shape(1);
+  require(expression_basis.shape(1) == v && rotation_basis.shape(0) == e && rotation_basis.shape(1) == k &&
+              translation_basis.shape(0) == e && translation_basis.shape(1) == k && parents.size() == k &&
+              is_free.size() == k,
+          "the arrays of a face model do not fit together");
+  for (size_t joint = 0; joint < k; ++joint) {
+    require(parents[joint] < static_cast<int>(joint), "a joint comes after its parent");
+    sizes.parents.push_back(parents[joint]);
+    sizes.free_index.push_back(is_free[joint] ? sizes.free_joints++ : -1);
+  }
+  require(
+      !pose_basis || (pose_basis->shape(0) == 9 * static_cast<size_t>(sizes.free_joints) && pose_basis->shape(1) == v),
+      "the pose basis has 9 shapes a free joint");
+  require(e + 9 * sizes.free_joints <= mien::kMostFaceShapes, "a face model has at most 256 blendshapes");
+  sizes.joint_rotation_basis.assign(rotation_basis.data(), rotation_basis.data() + rotation_basis.size());
+  sizes.joint_translation_basis.assign(translation_basis.data(), translation_basis.data() + translation_basis.size());
+  return mien::make_face_model(std::move(sizes), expression_basis.data(), pose_basis ? pose_basis->data() : nullptr,
+                               skinning_weights.data());
+}
+
+// The arrays of all timesteps; `pose(b)` are those of one.
+struct Batch {
+  const mien::FaceModelData& model;
+  const In<-1, 3>&rest, &joint_rest;
+  const In<-1, -1>& expression;
+  const In<-1, -1, 3>& joints;
+  const std::optional<In<-1, 3>>&head_rotation, &head_translation;
+
+  size_t size() const { return expression.shape(0); }
+  void check() const {
+    const size_t b = size();
+    require(rest.shape(0) == static_cast<size_t>(model.vertices) &&
+                joint_rest.shape(0) == static_cast<size_t>(model.joints) &&
+                expression.shape(1) == static_cast<size_t>(model.expressions) && joints.shape(0) == b &&
+                joints.shape(1) == static_cast<size_t>(model.free_joints) &&
+                head_rotation.has_value() == head_translation.has_value() &&
+                (!head_rotation || (head_rotation->shape(0) == b && head_translation->shape(0) == b)),
+            "the arrays do not fit the face model");
+  }
+  mien::FacePose pose(size_t b) const {
+    return {rest.data(),
+            joint_rest.data(),
+            expression.data() + b * model.expressions,
+            joints.data() + b * 3 * model.free_joints,
+            head_rotation ? head_rotation->data() + 3 * b : nullptr,
+            head_translation ? head_translation->data() + 3 * b : nullptr};
+  }
+};
+
+void forward(const mien::FaceModelData& model, const In<-1, 3>& rest, const In<-1, 3>& joint_rest,
+             const In<-1, -1>& expression, const In<-1, -1, 3>& joints, const std::optional<In<-1, 3>>& head_rotation,
+             const std::optional<In<-1, 3>>& head_translation, const Out<-1, -1, 3>& shaped,
+             const Out<-1, -1, 3>& vertices) {
+  const Batch batch{model, rest, joint_rest, expression, joints, head_rotation, head_translation};
+  batch.check();
+  const size_t floats = 3 * static_cast<size_t>(model.vertices);
+  require(shaped.size() == batch.size() * floats && vertices.size() == shaped.size(), "the outputs do not fit");
+  const nb::gil_scoped_release release;
+  mien::parallel_for(static_cast<int64_t>(batch.size()), [&](int64_t b) {
+    mien::pose_face(model, batch.pose(b), shaped.data() + b * floats, vertices.data() + b * floats);
+  });
+}
+
+void backward(const mien::FaceModelData& model, const In<-1, 3>& rest, const In<-1, 3>& joint_rest,
+              const In<-1, -1>& expression, const In<-1, -1, 3>& joints, const std::optional<In<-1, 3>>& head_rotation,
+              const std::optional<In<-1, 3>>& head_translation, const In<-1, -1, 3>& shaped,
+              const In<-1, -1, 3>& grad_vertices, const Out<-1, -1, 3>& grad_rest,
+              const Out<-1, -1, 3>& grad_joint_rest, const Out<-1, -1>& grad_expression,
+              const Out<-1, -1, 3>& grad_joints, const Out<-1, 3>& grad_head_rotation,
+              const Out<-1, 3>& grad_head_translation) {
+  const Batch batch{model, rest, joint_rest, expression, joints, head_rotation, head_translation};
+  batch.check();
+  const size_t b = batch.size(), floats = 3 * static_cast<size_t>(model.vertices);
+  require(shaped.size() == b * floats && grad_vertices.size() == b * floats && grad_rest.size() == b * floats &&
+              grad_joint_rest.size() == b * 3 * model.joints && grad_expression.size() == b * model.expressions &&
+              grad_joints.size() == b * 3 * model.free_joints && grad_head_rotation.size() == 3 * b &&
+              grad_head_translation.size() == 3 * b,
+          "a gradient must have the shape of its array");
+  const nb::gil_scoped_release release;
+  mien::parallel_for(static_cast<int64_t>(b), [&](int64_t i) {
+    mien::pose_face_backward(
+        model, batch.pose(i), shaped.data() + i * floats, grad_vertices.data() + i * floats,
+        {grad_rest.data() + i * floats, grad_joint_rest.data() + i * 3 * model.joints,
+         grad_expression.data() + i * model.expressions, grad_joints.data() + i * 3 * model.free_joints,
+         grad_head_rotation.data() + 3 * i, grad_head_translation.data() + 3 * i});
+  });
+}
+
+}  // namespace
+
+void bind_face(nb::module_& module) {
+  nb::class_<mien::FaceModelData>(module, "FaceModelData", "A face model's constants, compressed.");
+  module.def("make_face_model", &make_model, "expression_basis"_a, "pose_basis"_a.none(), "rotation_basis"_a,
+             "translation_basis"_a, "skinning_weights"_a, "parents"_a, "is_free"_a);
+  module.def("pose_face", &forward, "model"_a, "rest"_a, "joint_rest"_a, "expression"_a, "joints"_a,
+             "head_rotation"_a.none(), "head_translation"_a.none(), "shaped"_a, "vertices"_a,
+             "Fills the vertices of b timesteps, and those before the joints.");
+  module.def("pose_face_backward", &backward, "model"_a, "rest"_a, "joint_rest"_a, "expression"_a, "joints"_a,
+             "head_rotation"_a.none(), "head_translation"_a.none(), "shaped"_a, "grad_vertices"_a, "grad_rest"_a,
+             "grad_joint_rest"_a, "grad_expression"_a, "grad_joints"_a, "grad_head_rotation"_a,
+             "grad_head_translation"_a, "Fills the gradients, one of each a timestep.");
+}

@@ -1,0 +1,107 @@
+"""The native way from face parameters to vertices: autograd around the C++ core, for float32 on a CPU."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mien import _native
+from mien.face.params import FaceParams
+
+if TYPE_CHECKING:
+    from mien.face.model import FaceModel
+
+
+def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:
+    """Whether `pose_vertices` takes this model and these parameters."""
+    tensors = (model.template, *face.tensors().values())
+    return all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
+
+
+def pose_vertices(model: "FaceModel", face: FaceParams, in_world: bool) -> Float[Tensor, "b v 3"]:
+    """What `FaceModel.__call__` (in world space) or `FaceModel.head_vertices` returns; differentiable in all fields."""
+    compiled = _compiled.get(model)
+    if compiled is None:
+        compiled = _compiled[model] = _CompiledModel(model)
+    rest, joint_rest = compiled.rest_shape(model, face)
+    head = (face.head_rotation, face.head_translation) if in_world else (None, None)
+    return _PoseVertices.apply(compiled.data, rest, joint_rest, face.expression, face.joints, *head)
+
+
+class _CompiledModel:
+    """A model's constants as the core keeps them, and the last person's shape: training asks for it in every step."""
+
+    def __init__(self, model: "FaceModel"):
+        bases = (
+            model.expression_basis, model.pose_basis, model.joint_rotation_basis, model.joint_translation_basis,
+            model.skinning_weights,
+        )  # fmt: skip
+        arrays = [None if basis is None else basis.detach().contiguous() for basis in bases]
+        self.data = _native.make_face_model(*arrays, parents=model.joint_parents, is_free=model.joint_free)
+        self._last: _Person | None = None
+
+    def rest_shape(self, model: "FaceModel", face: FaceParams) -> tuple[Tensor, Tensor]:
+        """Vertices and joints of this person without expression."""
+        identity, offsets = face.identity, face.vertex_offsets
+        versions = (identity._version, None if offsets is None else offsets._version)
+        last = self._last
+        # The tensors kept here are alive, so the same object with the same version is the same person.
+        if last and last.identity is identity and last.offsets is offsets and last.versions == versions:
+            return last.shape
+        shape = model.rest_vertices(face), model.rest_joints(face)
+        if not shape[0].requires_grad:
+            self._last = _Person(identity, offsets, versions, shape)
+        return shape
+
+
+@dataclass(frozen=True, eq=False)
+class _Person:
+    identity: Tensor
+    offsets: Tensor | None
+    versions: tuple[int, int | None]
+    shape: tuple[Tensor, Tensor]
+
+
+_compiled: "WeakKeyDictionary[FaceModel, _CompiledModel]" = WeakKeyDictionary()
+
+
+class _PoseVertices(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, data: Any, *inputs: Tensor | None) -> Tensor:
+        arrays = [None if tensor is None else tensor.detach().contiguous() for tensor in inputs]
+        rest, _, expression, *_ = arrays
+        assert rest is not None
+        assert expression is not None
+        shaped, vertices = (rest.new_empty(len(expression), *rest.shape) for _ in range(2))
+        _native.pose_face(data, *arrays, shaped=shaped, vertices=vertices)
+        ctx.data = data
+        ctx.save_for_backward(*arrays, shaped)
+        return vertices
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_vertices: Tensor) -> tuple[Tensor | None, ...]:
+        *arrays, shaped = ctx.saved_tensors
+        rest, joint_rest, expression, joints, head_rotation, _ = arrays
+        b = len(expression)
+        grad_rest, grad_joint_rest = rest.new_empty(b, *rest.shape), rest.new_empty(b, *joint_rest.shape)
+        grad_expression, grad_joints = torch.empty_like(expression), torch.empty_like(joints)
+        grad_head = rest.new_empty(b, 3), rest.new_empty(b, 3)
+        _native.pose_face_backward(
+            ctx.data, *arrays, shaped=shaped, grad_vertices=grad_vertices.contiguous(), grad_rest=grad_rest,
+            grad_joint_rest=grad_joint_rest, grad_expression=grad_expression, grad_joints=grad_joints,
+            grad_head_rotation=grad_head[0], grad_head_translation=grad_head[1],
+        )  # fmt: skip
+        needs = ctx.needs_input_grad
+        return (
+            None,
+            grad_rest.sum(0) if needs[1] else None,
+            grad_joint_rest.sum(0) if needs[2] else None,
+            grad_expression,
+            grad_joints,
+            *(grad_head if head_rotation is not None else (None, None)),
+        )

@@ -1,0 +1,99 @@
+"""The native way from face parameters to vertices against the plain PyTorch one."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mien import _native
+from mien.face import FaceModel, FaceParams, load_face_model
+from small_face_model import make_small_face_model
+
+
+def chained_model() -> FaceModel:
+    """With pose correctives, a joint on a joint, translations, and blendshapes that move only a few vertices."""
+    model, random = make_small_face_model(), torch.Generator().manual_seed(3)
+    v = len(model.template)
+    correctives = 0.01 * torch.randn(27, v, 3, generator=random) * (torch.arange(v) % 100 < 20)[:, None]
+    return replace(
+        model, pose_basis=correctives, joint_parents=(-1, 0, 1, 1, 0),
+        joint_translation_basis=0.01 * torch.randn(8, 5, 3, generator=random),
+        joint_rotation_basis=0.1 * torch.randn(8, 5, 3, generator=random),
+    )  # fmt: skip
+
+
+def random_face(model: FaceModel, timesteps: int, joint_scale: float = 0.5) -> FaceParams:
+    """Every field random, with vertex offsets."""
+    random, neutral = torch.Generator().manual_seed(5), model.neutral(timesteps)
+
+    def noise(*shape: int, scale: float = 1.0) -> torch.Tensor:
+        return scale * torch.randn(*shape, generator=random)
+
+    return FaceParams(
+        noise(*neutral.identity.shape), noise(*neutral.expression.shape, scale=0.3),
+        noise(*neutral.joints.shape, scale=joint_scale), noise(timesteps, 3), noise(timesteps, 3),
+        noise(*model.template.shape, scale=0.001),
+    )  # fmt: skip
+
+
+@pytest.fixture(params=["avx512", "avx2", "sse4"])
+def isa(request: pytest.FixtureRequest):
+    before = _native.rasterize_isa()
+    if not _native.set_rasterize_isa(request.param):
+        pytest.skip(f"this machine has no {request.param}")
+    yield request.param
+    assert _native.set_rasterize_isa(before)
+
+
+@pytest.mark.parametrize("in_world", [True, False])
+@pytest.mark.parametrize("make_model", [chained_model, lambda: load_face_model("anny")], ids=["small", "anny"])
+@pytest.mark.parametrize("joint_scale", [0.5, 0.0])
+def test_vertices_and_gradients_equal_the_reference(isa, make_model, in_world: bool, joint_scale: float) -> None:
+    model = make_model()
+    face = random_face(model, 3, joint_scale)
+    weights = torch.randn(3, *model.template.shape, generator=torch.Generator().manual_seed(6))
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        like = torch.zeros((), dtype=dtype)
+        own, here = model.to(like), FaceParams(**{k: t.to(like).requires_grad_() for k, t in face.tensors().items()})
+        reference = own.vertices_reference if in_world else own.head_vertices_reference
+        vertices = (own(here) if in_world else own.head_vertices(here)) if dtype == torch.float32 else reference(here)
+        tensors = [tensor for name, tensor in here.tensors().items() if in_world or not name.startswith("head")]
+        results.append([vertices, *torch.autograd.grad((vertices * weights.to(like)).sum(), tensors)])
+    for index, (ours, theirs) in enumerate(zip(*results, strict=True)):
+        error = (ours.detach().double() - theirs.detach()).norm() / theirs.norm().clamp_min(1e-9)
+        assert float(error) < 2e-5, index
+
+
+def test_the_last_persons_shape_is_not_taken_for_anothers() -> None:
+    model = chained_model()
+    face = random_face(model, 1).detach()
+    first = model(face)
+    assert torch.equal(model(face), first)
+    other = replace(face, identity=-face.identity)
+    torch.testing.assert_close(model(other), model.vertices_reference(other), atol=1e-6, rtol=0)
+    face.identity.mul_(2)
+    torch.testing.assert_close(model(face), model.vertices_reference(face), atol=1e-6, rtol=0)
+    without = replace(face, vertex_offsets=None)
+    torch.testing.assert_close(model(without), model.vertices_reference(without), atol=1e-6, rtol=0)
+
+
+def test_the_same_bits_for_any_number_of_threads_and_any_batch() -> None:
+    model = load_face_model("anny")
+    face = random_face(model, 3).detach()
+    before, results = _native.thread_count(), []
+    for threads in (1, 2, 3):
+        _native.set_thread_count(threads)
+        leaf = replace(face, expression=face.expression.clone().requires_grad_())
+        vertices = model(leaf)
+        results.append((vertices.detach(), *torch.autograd.grad(vertices.square().sum(), [leaf.expression])))
+    _native.set_thread_count(before)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+    assert torch.equal(model(face[1])[0], results[0][0][1])
+
+
+def test_no_timestep_and_float64() -> None:
+    model = make_small_face_model()
+    assert model(model.neutral(0)).shape == (0, len(model.template), 3)
+    double = model.to(torch.zeros((), dtype=torch.float64))
+    assert double(double.neutral()).dtype == torch.float64
