@@ -36,12 +36,16 @@ class _CompiledModel:
     """A model's constants as the core keeps them, and the last person's shape: training asks for it in every step."""
 
     def __init__(self, model: "FaceModel"):
-        bases = (
-            model.expression_basis, model.pose_basis, model.joint_rotation_basis, model.joint_translation_basis,
-            model.skinning_weights,
-        )  # fmt: skip
-        arrays = [None if basis is None else basis.detach().contiguous() for basis in bases]
-        self.data = _native.make_face_model(*arrays, parents=model.joint_parents, is_free=model.joint_free)
+        pose_basis = model.pose_basis
+        self.data = _native.make_face_model(
+            model.expression_basis.contiguous(),
+            None if pose_basis is None else pose_basis.contiguous(),
+            model.joint_rotation_basis.contiguous(),
+            model.joint_translation_basis.contiguous(),
+            model.skinning_weights.contiguous(),
+            parents=model.joint_parents,
+            is_free=model.joint_free,
+        )
         self._last: _Person | None = None
 
     def rest_shape(self, model: "FaceModel", face: FaceParams) -> tuple[Tensor, Tensor]:
@@ -72,11 +76,15 @@ _compiled: "WeakKeyDictionary[FaceModel, _CompiledModel]" = WeakKeyDictionary()
 class _PoseVertices(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, data: Any, *inputs: Tensor | None) -> Tensor:
-        arrays = [None if tensor is None else tensor.detach().contiguous() for tensor in inputs]
-        rest, _, expression, *_ = arrays
+        rest, joint_rest, expression, joints, rotation, translation = (
+            None if tensor is None else tensor.detach().contiguous() for tensor in inputs
+        )
         assert rest is not None
+        assert joint_rest is not None
         assert expression is not None
+        assert joints is not None
         shaped, vertices = (rest.new_empty(len(expression), *rest.shape) for _ in range(2))
+        arrays = (rest, joint_rest, expression, joints, rotation, translation)
         _native.pose_face(data, *arrays, shaped=shaped, vertices=vertices)
         ctx.data = data
         ctx.save_for_backward(*arrays, shaped)
