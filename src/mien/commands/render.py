@@ -1,72 +1,128 @@
 """`mien render`."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
+import numpy as np
 import tyro
+from torch import Tensor
 
+from mien.camera import Camera
+from mien.commands.picture import PictureOptions
 from mien.errors import UserError
-from mien.workspace import open_workspace
+from mien.workspace import Workspace, open_workspace
 
 
 @dataclass(frozen=True)
 class Command:
-    """Render an avatar: a turntable as .mp4, or a still as .png, with any expression."""
+    """Render an avatar: a still, or a film along a camera path, at any expression or with a sequence's motion."""
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
     out: Path
-    """An .mp4 (turntable) or a .png (still) to write."""
+    """.png: a still; a folder or NAME_%06d.png: numbered pictures; .mp4 or .webm: a film."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Which run (default: the only one)."""
     set: tuple[str, ...] = ()
     """Expressions by name, e.g. --set jawOpen=0.6 mouthSmileLeft=0.4 (default: the person's neutral)."""
-    size: int = 512
-    """Width and height of the picture, pixels."""
+    path: Literal["turntable", "orbit", "sway", "still", "captured"] = "turntable"
+    """How the camera moves: to the sides, on an oval, on a figure eight, not at all, or from camera to camera of the
+    capture. A .png is always a still."""
+    cameras: Path | None = None
+    """Cameras from a json file, one a frame (format: docs/using.md), instead of --path; they keep their own sizes."""
     frames: int = 120
-    """Of the turntable."""
+    """Of the film."""
     fps: float = 25.0
-    """Of the turntable."""
+    """Of the film."""
     span: float = 40.0
     """Degrees that the camera swings through, 360 for all the way round; sides that were not filmed look broken."""
+    tilt: float = 15.0
+    """Degrees that orbit and sway go up and down."""
+    zoom: float = 1.0
+    """Magnification, 1 for what the camera saw in training."""
+    sequence: str | None = None
+    """Play this sequence's motion, a frame a timestep (`mien drive` has more)."""
+    picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
     def run(self) -> None:
-        """Pose once, render from every camera."""
-        import cv2
-        import torch
-
+        """Check everything, then pose and render frame by frame."""
         from mien.avatar import load_avatar
-        from mien.capture.video import write_video
         from mien.commands.expression import with_expression
-        from mien.evaluation.cameras import turntable
-        from mien.evaluation.pictures import to_uint8
+        from mien.export.pictures import write_pictures
         from mien.progress import say, track_progress
-        from mien.render import rasterize
-        from mien.storage import write_atomically
-        from mien.training.run import run_camera
+        from mien.training import read_sequence, run_camera
 
-        if self.out.suffix not in (".mp4", ".png"):
-            raise UserError(f"{self.out}: cannot write {self.out.suffix or 'a file without ending'}; use .mp4 or .png")
-        if not 16 <= self.size <= 8192 or self.frames < 1 or self.fps <= 0:
-            raise UserError(
-                f"--size {self.size} --frames {self.frames} --fps {self.fps:g}: use 16..8192, 1 or more, above 0"
-            )
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
+        motion = None
+        if self.sequence is not None:
+            motion = read_sequence(workspace.sequence_dir(workspace.pick_sequence(self.sequence))).tracking.face
+        self._check()
+        timesteps = None if motion is None else len(motion)
+        cameras = self._given_cameras(workspace, timesteps)
+        output = self.picture.plan(self.out, self._frames(timesteps) if cameras is None else len(cameras))
         avatar = load_avatar(run_dir)
-        face = with_expression(avatar.subject, avatar.face_model, self.set)
-        white = torch.ones(3)
-        camera = run_camera(run_dir).resized(self.size, self.size)
-        with torch.no_grad():
-            gaussians = avatar.pose(face).gaussians.timestep(0)
-            if self.out.suffix == ".png":
-                image = to_uint8(rasterize(gaussians, camera, white).image)
-                encoded = cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()
-                write_atomically(self.out, lambda path: path.write_bytes(encoded))
-            else:
-                cameras = turntable(camera, face.head_translation[0], self.frames, math.radians(self.span))
-                pictures = (to_uint8(rasterize(gaussians, view, white).image) for view in cameras)
-                write_video(self.out, track_progress(pictures, "Rendering", self.frames), self.fps)
-        say(f"{self.out}: {len(gaussians):,} Gaussians at {self.size}x{self.size}")
+        subject = avatar.subject
+        face = with_expression(subject if motion is None else motion, avatar.face_model, self.set)
+        face = replace(face, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
+        if cameras is None:
+            camera = self.picture.camera(run_camera(run_dir), self.zoom)
+            cameras = self._path(camera, subject.head_translation[0], self._frames(timesteps))
+        still = None if motion is not None else avatar.pose(face).gaussians.detach().timestep(0)
+
+        def picture(index: int) -> np.ndarray:
+            posed = still or avatar.pose(face[index]).gaussians.detach().timestep(0)
+            return self.picture.picture(posed, cameras[index])
+
+        pictures = (picture(index) for index in range(len(cameras)))
+        shown = pictures if output.kind == "still" else track_progress(pictures, "Rendering", len(cameras))
+        write_pictures(output, shown, self.fps)
+        count, first = len(avatar.gaussian_store()), cameras[0]
+        say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
+
+    def _check(self) -> None:
+        if self.frames < 1 or not 0 < self.fps <= 1000 or not 0.01 <= self.zoom <= 100:
+            raise UserError(
+                f"--frames {self.frames} --fps {self.fps:g} --zoom {self.zoom:g}: use 1 or more, 0..1000, 0.01..100"
+            )
+        if not (math.isfinite(self.span) and abs(self.tilt) < 180):
+            raise UserError(f"--span {self.span:g} --tilt {self.tilt:g}: give degrees, --tilt below 180")
+
+    def _is_still(self) -> bool:
+        return self.out.suffix.lower() == ".png" and "%" not in self.out.name
+
+    def _frames(self, timesteps: int | None) -> int:
+        return timesteps or (1 if self._is_still() else self.frames)
+
+    def _given_cameras(self, workspace: Workspace, timesteps: int | None) -> list[Camera] | None:
+        """Cameras that do not depend on the avatar, one a frame; None for a path around its head."""
+        from mien.evaluation.cameras import read_cameras
+        from mien.tracking import read_tracking
+
+        if self.cameras is not None:
+            cameras = read_cameras(self.cameras)
+            if timesteps is not None and len(cameras) < timesteps:
+                raise UserError(f"{self.cameras}: {len(cameras)} cameras, {timesteps} timesteps; give one for each")
+            if any((c.width, c.height) != (cameras[0].width, cameras[0].height) for c in cameras):
+                raise UserError(f"{self.cameras}: cameras of different sizes; give them one size, or render one by one")
+            return cameras[:timesteps]
+        if self.path != "captured":
+            return None
+        name = workspace.pick_sequence(self.sequence)
+        stored = read_tracking(workspace.sequence_dir(name) / "tracking").cameras
+        cameras = [self.picture.camera(camera, self.zoom) for camera in stored]
+        if self._is_still():
+            return cameras[:1]
+        return cameras if timesteps is None else [cameras[i * len(cameras) // timesteps] for i in range(timesteps)]
+
+    def _path(self, camera: Camera, centre: Tensor, frames: int) -> list[Camera]:
+        from mien.evaluation.cameras import sway, turntable
+
+        span, tilt = math.radians(self.span), math.radians(self.tilt)
+        if self.path == "still" or self._is_still():
+            return [camera] * frames
+        if self.path == "turntable":
+            return turntable(camera, centre, frames, span)
+        return sway(camera, centre, frames, span, tilt, crossing=self.path == "sway")

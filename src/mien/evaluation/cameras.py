@@ -1,15 +1,23 @@
 """Camera paths for pictures of avatars."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
+from mien.errors import UserError
 from mien.rotation import invert_rigid, matrix_from_axis_angle, rigid_transform
+from mien.storage import read_json, write_json
 
+FORMAT, VERSION = "mien.cameras", 1
+LARGEST_SIDE = 8192
+"""Pixels."""
 _WORLD_UP = (0.0, 1.0, 0.0)
 
 
@@ -35,6 +43,78 @@ def turntable(
     phases = [2 * math.pi * index / frames for index in range(frames)]
     full = span >= 2 * math.pi
     return [orbit(camera, centre, phase if full else 0.5 * span * math.sin(phase), up) for phase in phases]
+
+
+def sway(
+    camera: Camera, centre: Float[Tensor, " 3"], frames: int, span: float, tilt: float, crossing: bool = True
+) -> list[Camera]:
+    """Cameras on a figure eight lying on its side around `camera`'s place; without `crossing`, on an oval.
+
+    Args:
+        camera: The middle of the path; the centre keeps its place in the picture.
+        centre: What to look at, world space, metres.
+        frames: How many cameras; the path loops.
+        span: Radians from the far left to the far right.
+        tilt: Radians from the highest to the lowest.
+        crossing: Whether it is a figure eight.
+    """
+    views = []
+    for phase in (2 * math.pi * index / frames for index in range(frames)):
+        turned = 0.5 * span * math.sin(phase)
+        raised = 0.5 * tilt * (math.sin(2 * phase) if crossing else math.cos(phase))
+        sideways = invert_rigid(camera.viewmat)[:3, 0]
+        lifted = orbit(camera, centre, -raised, tuple(sideways.tolist()))
+        views.append(orbit(lifted, centre, turned))
+    return views
+
+
+def fitted(camera: Camera, width: int, height: int, zoom: float = 1.0) -> Camera:
+    """The same view in a picture of another shape: all of it is seen, in the middle, magnified by `zoom`."""
+    scale = min(width / camera.width, height / camera.height) * zoom
+    K = camera.K * camera.K.new_tensor([[scale], [scale], [1.0]])
+    K[0, 2] += 0.5 * (width - scale * camera.width)
+    K[1, 2] += 0.5 * (height - scale * camera.height)
+    return replace(camera, K=K, width=width, height=height)
+
+
+def write_cameras(path: Path, cameras: Sequence[Camera]) -> None:
+    """Write cameras as `read_cameras` reads them."""
+    listed = [
+        {"K": camera.K.tolist(), "viewmat": camera.viewmat.tolist(), "width": camera.width, "height": camera.height}
+        for camera in cameras
+    ]
+    write_json(path, FORMAT, VERSION, {"cameras": listed})
+
+
+def read_cameras(path: Path) -> list[Camera]:
+    """A camera path from json: one camera a frame.
+
+    {"format": "mien.cameras", "version": 1, "cameras": [{"K": 3x3, "viewmat": 4x4, "width": .., "height": ..}, ...]}
+    with intrinsics in pixels and world-to-camera matrices with OpenCV axes, metres (docs/conventions.md).
+
+    Raises:
+        UserError: the file is missing or damaged, or a camera is incomplete, not finite, or no rigid view.
+    """
+    listed = read_json(path, FORMAT, VERSION).get("cameras")
+    if not isinstance(listed, list) or not listed:
+        raise UserError(f"{path}: has no list `cameras`; give one camera for every frame")
+    return [_camera_of(entry, f"{path}: camera {index}") for index, entry in enumerate(listed)]
+
+
+def _camera_of(entry: Any, where: str) -> Camera:
+    try:
+        K, viewmat = torch.tensor(entry["K"], dtype=torch.float32), torch.tensor(entry["viewmat"], dtype=torch.float32)
+        width, height = int(entry["width"]), int(entry["height"])
+    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise UserError(f"{where}: needs K [3][3], viewmat [4][4], width and height ({error!r})") from None
+    if K.shape != (3, 3) or viewmat.shape != (4, 4) or not (K.isfinite().all() and viewmat.isfinite().all()):
+        raise UserError(f"{where}: K must be 3x3 and viewmat 4x4 finite numbers")
+    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE) or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise UserError(f"{where}: {width}x{height}, focal {float(K[0, 0]):g}; sizes are 1..{LARGEST_SIDE}, focal > 0")
+    turned = viewmat[:3, :3]
+    if not torch.allclose(turned @ turned.T, torch.eye(3), atol=1e-3) or torch.det(turned) < 0:
+        raise UserError(f"{where}: viewmat is no rotation and translation (world to camera, OpenCV axes)")
+    return Camera(K, viewmat, width, height)
 
 
 def orbit(

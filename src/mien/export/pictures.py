@@ -1,0 +1,177 @@
+"""Pictures as files, by the ending of a path: one .png, numbered .png files, .mp4, or .webm.
+
+Transparent pictures have four channels with straight (not premultiplied) colours, as PNG demands and as players take
+the alpha of a VP9 .webm. An .mp4 has no transparency.
+"""
+
+import itertools
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal
+
+import av
+import cv2
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
+from jaxtyping import Float32, UInt8
+
+from mien.capture.video import write_video
+from mien.errors import UserError
+from mien.storage import check_writable, write_atomically
+
+ENDINGS = ".png (one picture), a folder or NAME_%06d.png (numbered pictures), .mp4 or .webm"
+_NUMBER = re.compile(r"%0?\d*d")
+_ROWS = 512
+"""Of a picture are converted at once: an 8192x8192 picture would otherwise be held four times."""
+_FRINGE = 8
+"""Pixels that colours are spread beyond the opaque part, since video keeps colour at half the resolution."""
+_WEBM_QUALITY = 24
+"""VP9's constant quality: 0 is lossless, 63 is worst."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where pictures go, found to be possible before any of them is made."""
+
+    path: Path
+    """A file; a folder or a pattern for `sequence`."""
+    kind: Literal["still", "sequence", "mp4", "webm"]
+    transparent: bool
+
+    def numbered(self, index: int) -> Path:
+        """The file of one picture of a sequence."""
+        if _NUMBER.search(self.path.name):
+            return self.path.with_name(_NUMBER.sub(lambda match: match.group() % index, self.path.name))
+        return self.path / f"{index:06d}.png"
+
+
+def plan_output(path: Path, frames: int, transparent: bool = False) -> Output:
+    """What the ending of `path` asks for, checked before any work.
+
+    Raises:
+        UserError: the ending is none of `ENDINGS` or does not suit the number of frames or transparency, the place
+            cannot be written, or pictures of a longer sequence lie there.
+    """
+    ending = path.suffix.lower()
+    if ending == ".png" and _NUMBER.search(path.name):
+        output = Output(path, "sequence", transparent)
+        check_writable(output.numbered(0))
+    elif ending == "":
+        output = Output(path, "sequence", transparent)
+        check_writable(path, folder=True)
+    elif ending == ".png":
+        output = Output(path, "still", transparent)
+        check_writable(path)
+        if frames != 1:
+            numbered = path.with_name(f"{path.stem}_%06d.png")
+            raise UserError(f"{path}: one picture, but there are {frames}; write --out {numbered} or --frames 1")
+    elif ending in (".mp4", ".webm"):
+        output = Output(path, "mp4" if ending == ".mp4" else "webm", transparent)
+        check_writable(path)
+    else:
+        raise UserError(f"{path}: cannot write {path.suffix}; use {ENDINGS}")
+    if output.kind == "mp4" and transparent:
+        raise UserError(f"{path}: an .mp4 cannot be transparent; use .webm or .png, or name a --background")
+    if output.kind == "sequence" and output.numbered(frames).exists():
+        raise UserError(f"{output.numbered(frames)}: belongs to a longer sequence; delete it, or choose another name")
+    return output
+
+
+def write_pictures(output: Output, pictures: Iterable[UInt8[np.ndarray, "h w _"]], fps: int | float) -> None:
+    """Write pictures (RGB, or RGBA where `output.transparent`), each file atomically; read once, all of one size.
+
+    Raises:
+        UserError: there are none, or they cannot be written.
+    """
+    try:
+        if output.kind == "mp4":
+            write_video(output.path, pictures, fps)
+        elif output.kind == "webm":
+            _write_webm(output, pictures, fps)
+        else:
+            for index, picture in enumerate(pictures):
+                write_png(output.path if output.kind == "still" else output.numbered(index), picture)
+    except OSError as error:
+        raise UserError(f"{output.path}: cannot be written ({error.strerror or error}); choose another place") from None
+
+
+def write_png(path: Path, picture: UInt8[np.ndarray, "h w _"]) -> None:
+    """One RGB or RGBA picture, atomically."""
+    swapped = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA if picture.shape[2] == 4 else cv2.COLOR_RGB2BGR)
+    done, encoded = cv2.imencode(".png", swapped)
+    assert done, f"cannot encode a picture of shape {picture.shape}"
+    write_atomically(path, lambda temporary: temporary.write_bytes(encoded.tobytes()))
+
+
+def to_rgb(image: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture in 0..1 as bytes, clamped and rounded, in bands of rows."""
+    picture = np.empty(image.shape, np.uint8)
+    for top in range(0, len(image), _ROWS):
+        picture[top : top + _ROWS] = np.clip(image[top : top + _ROWS], 0, 1) * 255 + 0.5
+    return picture
+
+
+def to_rgba(over_black: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 4"]:
+    """What was rendered over black, as straight colours and alpha; colours are 0 where nothing is."""
+    picture = np.empty((*alpha.shape, 4), np.uint8)
+    for top in range(0, len(alpha), _ROWS):
+        band = slice(top, top + _ROWS)
+        opacity = alpha[band, :, None]
+        colours = np.divide(over_black[band], opacity, out=np.zeros_like(over_black[band]), where=opacity > 1e-6)
+        picture[band, :, :3] = np.clip(colours, 0, 1) * 255 + 0.5
+        picture[band, :, 3] = np.clip(alpha[band], 0, 1) * 255 + 0.5
+    return picture
+
+
+def _write_webm(output: Output, pictures: Iterable[np.ndarray], fps: int | float) -> None:
+    iterator = iter(pictures)
+    first = next(iterator, None)
+    if first is None:
+        raise UserError(f"{output.path}: no frames to write; check the selection of frames")
+    everything = itertools.chain([first], iterator)
+    write_atomically(output.path, lambda aside: _encode_webm(aside, everything, first.shape, fps))
+
+
+def _encode_webm(path: Path, pictures: Iterator[np.ndarray], shape: tuple[int, ...], fps: int | float) -> None:
+    """VP9 in BT.709, yuva420p where there is alpha; odd sizes get a repeated last row or column."""
+    height, width, channels = shape
+    options = {"crf": str(_WEBM_QUALITY), "b": "0", "deadline": "good", "cpu-used": "4", "row-mt": "1"}
+    if channels == 4:
+        # Alternate reference frames and alpha do not go together in libvpx.
+        options["auto-alt-ref"] = "0"
+    with av.open(str(path), "w", format="webm") as container:
+        stream = container.add_stream("libvpx-vp9", rate=Fraction(fps).limit_denominator(1001), options=options)
+        stream.width, stream.height = width + width % 2, height + height % 2
+        stream.pix_fmt = "yuva420p" if channels == 4 else "yuv420p"
+        context = stream.codec_context
+        context.colorspace = context.color_primaries = context.color_trc = 1
+        context.color_range = ColorRange.MPEG
+        reformatter = VideoReformatter()
+        for picture in pictures:
+            assert picture.shape == shape, f"frames of {shape}, then one of {picture.shape}"
+            full = _spread_colours(picture) if channels == 4 else picture
+            even = np.pad(full, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+            frame = reformatter.reformat(
+                av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgba" if channels == 4 else "rgb24"),
+                format=stream.pix_fmt,
+                dst_colorspace=Colorspace.ITU709,
+                dst_color_range=ColorRange.MPEG,
+            )
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def _spread_colours(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
+    """The same picture with the colours of its border continued outwards, where alpha is 0 and nobody sees them.
+
+    Video keeps colour at half the resolution and blurs it: without this, black would bleed into outlines.
+    """
+    alpha = picture[..., 3:].astype(np.float32)
+    size = (2 * _FRINGE + 1, 2 * _FRINGE + 1)
+    weights = cv2.blur(alpha, size)[..., None]
+    around = cv2.blur(picture[..., :3] * alpha, size) / np.maximum(weights, 1e-6)
+    seen = alpha > 127
+    return np.concatenate([np.where(seen, picture[..., :3], around + 0.5).astype(np.uint8), picture[..., 3:]], axis=2)
