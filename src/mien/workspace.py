@@ -24,6 +24,12 @@ class Workspace:
         """Names of the sequences that were captured, sorted."""
         return sorted(p.parent.parent.name for p in self.root.glob("sequences/*/capture/capture.json"))
 
+    def tracked_names(self) -> list[str]:
+        """Names of the sequences that were tracked, sorted."""
+        return [
+            name for name in self.sequence_names() if (self.sequence_dir(name) / "tracking/tracking.json").is_file()
+        ]
+
     def run_names(self) -> list[str]:
         """Names of the runs, sorted."""
         return sorted(p.parent.name for p in self.root.glob("runs/*/config.json"))

@@ -15,14 +15,18 @@ from mien.workspace import Workspace
 
 @dataclass(frozen=True)
 class Command:
-    """A video in; an avatar, metrics and a report out. Stopped at any time, the same command goes on where it was."""
+    """Videos of one person in; an avatar, metrics and a report out. The same command goes on where it was stopped.
 
-    video: Annotated[Path, tyro.conf.Positional]
-    """A video file, or a folder of pictures in order."""
+    Each video is captured on its own; all sequences of the workspace are tracked together, with one identity; the
+    avatar is trained on the videos named here.
+    """
+
+    videos: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Video files, or folders of pictures in order."""
     out: Path
     """Workspace folder to make or to go on with."""
-    name: str | None = None
-    """Name of the sequence (default: the video's name)."""
+    name: tuple[str, ...] = ()
+    """Names of the sequences, one a video (default: the videos' names)."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the method's)."""
     face_model: str = "anny"
@@ -32,18 +36,33 @@ class Command:
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
 
     def run(self) -> None:
-        """All stages, each skipped if its result is current."""
-        from mien.commands.stages import capture_stage, evaluation_stage, sequence_name, tracking_stage, training_stage
+        """All stages, each skipped if its result is current; what can be told before any work is told then."""
+        from mien.commands.stages import (
+            capture_stage,
+            evaluation_stage,
+            run_name,
+            sequence_names,
+            tracking_stage,
+            training_stage,
+        )
+        from mien.face import load_face_model
         from mien.progress import say
+        from mien.storage import check_writable
+        from mien.training import check_held_out, check_run
 
         began = time.monotonic()
         method, settings = self.options.method_config(), self.options.settings()
-        workspace, run = Workspace(self.out), self.run_name or self.options.method
-        sequence_name(self.video, run)
-        names = capture_stage(workspace, self.video, self.name, self.capture)
-        for name in names:
-            tracking_stage(workspace, name, self.face_model, self.tracking)
-        training_stage(workspace, names, run, method, settings)
-        if settings.split != "none":
+        names = sequence_names(self.videos, self.name)
+        workspace, run = Workspace(self.out), run_name(self.run_name or self.options.method)
+        check_writable(self.out, folder=True)
+        check_run(workspace.run_dir(run), method, settings)
+        load_face_model(self.face_model)
+
+        videos = zip(self.videos, names, strict=True)
+        captured = [part for video, name in videos for part in capture_stage(workspace, video, name, self.capture)]
+        check_held_out(captured, settings)
+        trackings = tracking_stage(workspace, self.face_model, self.tracking)
+        training_stage(workspace, [name for name in captured if name in trackings], run, method, settings)
+        if settings.holds_out:
             evaluation_stage(workspace, run)
         say(f"Done in {time.monotonic() - began:.0f} s. Next: mien render {self.out} --out turntable.mp4")

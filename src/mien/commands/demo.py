@@ -35,4 +35,4 @@ class Command:
         if not video.is_file():
             write_synthetic_video(recipe, video, self.seed)
         options = TrainOptions(preset=self.preset, steps=self.steps)
-        Create(video=video, out=self.out, name="synthetic", options=options).run()
+        Create(videos=(video,), out=self.out, name=("synthetic",), options=options).run()

@@ -25,7 +25,10 @@ class TrainOptions:
     """Optimiser steps instead of the preset's (schedules stretch with it); 0 for the preset's."""
     seed: int = 0
     """Same seed, same data, same settings: the same bytes."""
-
+    hold_out: tuple[str, ...] = ()
+    """Whole sequences that are not trained on, only scored."""
+    hold_out_cameras: tuple[str, ...] = ()
+    """Ids of cameras that are not trained on, only scored (captures with several cameras)."""
     face_tuning: bool = True
     """Whether training also corrects the tracking of the frames it sees (held-out frames get what lies beside them)."""
 
@@ -38,7 +41,14 @@ class TrainOptions:
         if self.steps < 0:
             raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's")
         preset = PRESETS[self.preset]
-        return replace(preset, split=self.split, seed=self.seed, steps=self.steps or preset.steps)
+        return replace(
+            preset,
+            split=self.split,
+            seed=self.seed,
+            steps=self.steps or preset.steps,
+            held_out_sequences=tuple(sorted(set(self.hold_out))),
+            held_out_cameras=tuple(sorted(set(self.hold_out_cameras))),
+        )
 
     def method_config(self) -> MethodConfig:
         """The method's settings.

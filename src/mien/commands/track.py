@@ -12,22 +12,22 @@ from mien.workspace import open_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Fit the face model to a captured sequence: DIR/sequences/NAME/tracking with overlay.mp4 and a residual report."""
+    """Fit the face model to all sequences of a workspace: DIR/sequences/NAME/tracking with overlay.mp4 and a report.
+
+    A workspace is one person, so its sequences are tracked together, with one identity. One that came new has all of
+    them tracked again.
+    """
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
-    sequence: str | None = None
-    """Which sequence (default: the only one)."""
     face_model: str = "anny"
     """See `mien face-models`."""
     again: bool = False
-    """Track again even if nothing changed. The scoring mask stays as it is."""
+    """Track again even if nothing changed. The scoring masks stay as they are."""
     settings: Annotated[TrackingSettings, tyro.conf.arg(name="tracking")] = field(default_factory=TrackingSettings)
 
     def run(self) -> None:
-        """Track and write overlay and report."""
+        """Track and write overlays and reports."""
         from mien.commands.stages import tracking_stage
 
-        workspace = open_workspace(self.workspace)
-        name = workspace.pick_sequence(self.sequence)
-        tracking_stage(workspace, name, self.face_model, self.settings, again=self.again)
+        tracking_stage(open_workspace(self.workspace), self.face_model, self.settings, again=self.again)

@@ -8,7 +8,7 @@ import tyro
 
 from mien.commands.options import TrainOptions
 from mien.errors import UserError
-from mien.workspace import open_workspace
+from mien.workspace import Workspace, open_workspace
 
 
 @dataclass(frozen=True)
@@ -18,19 +18,28 @@ class Command:
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
     sequences: tuple[str, ...] = ()
-    """Which sequences (default: all)."""
+    """Which sequences (default: all that are tracked); those of --hold-out belong to the run as well."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the method's)."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
 
     def run(self) -> None:
         """Train to the end."""
-        from mien.commands.stages import training_stage
+        from mien.commands.stages import run_name, training_stage
+        from mien.training import check_held_out, check_run
 
         workspace = open_workspace(self.workspace)
-        names = list(self.sequences) or workspace.sequence_names()
-        if not names:
-            raise UserError(f"{self.workspace}: no sequences to train on; add one with `mien capture` and `mien track`")
-        names = [workspace.pick_sequence(name) for name in names]
-        run = self.run_name or self.options.method
-        training_stage(workspace, names, run, self.options.method_config(), self.options.settings())
+        method, settings = self.options.method_config(), self.options.settings()
+        run = run_name(self.run_name or self.options.method)
+        names = self._names(workspace)
+        check_held_out(names, settings)
+        check_run(workspace.run_dir(run), method, settings, names)
+        training_stage(workspace, names, run, method, settings)
+
+    def _names(self, workspace: Workspace) -> list[str]:
+        if not self.sequences:
+            names = workspace.tracked_names()
+            if not names:
+                raise UserError(f"{workspace.root}: no tracked sequences; run `mien track {workspace.root}`")
+            return names
+        return [workspace.pick_sequence(name) for name in dict.fromkeys((*self.sequences, *self.options.hold_out))]

@@ -14,7 +14,7 @@ from mien.evaluation.experiment import Experiment, FaceSource, Frame
 from mien.face import FaceParams
 from mien.storage import expect_whole, read_tensors
 from mien.tracking import read_scoring, read_scoring_hash, read_tracking
-from mien.training import Sequence, TrainSettings, read_run_config
+from mien.training import Sequence, TrainSettings, check_data, read_run_config
 from mien.training.frames import training_frames
 from mien.training.split import held_out
 
@@ -42,6 +42,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
         Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), scoring.masks)
         for folder, scoring in zip(sequence_dirs, scorings, strict=True)
     )
+    check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
     faces = _faces_of_run(run_dir, sequences)
     base = Experiment(
         avatar=load_avatar(run_dir),

@@ -46,6 +46,11 @@ class Shot:
         return tuple(Camera(K, viewmat, *size).to(like) for K, viewmat in pairs)
 
 
+def has_enough_faces(capture: Capture) -> bool:
+    """Whether a face was found often enough for tracking."""
+    return int(_seen(capture).any(1).sum()) >= _LEAST_FRAMES
+
+
 def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
     """What there is to fit to.
 
@@ -59,7 +64,7 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
             "(`mien create A.mp4 B.mp4`), or give the cameras' calibration"
         )
     detected = torch.from_numpy(np.asarray(capture.landmarks, dtype=np.float64))
-    seen = torch.from_numpy(np.array(capture.valid, dtype=bool)) & detected.isfinite().all(-1).all(-1)
+    seen = _seen(capture)
     valid = seen.any(1)
     found = int(valid.sum())
     if found < _LEAST_FRAMES:
@@ -75,6 +80,12 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
         T_world_fit = invert_rigid(batch.viewmat[int(seen.sum(0).argmax())]) @ _FACING
         batch = CameraBatch(batch.K, batch.viewmat @ T_world_fit)
     return Shot(views, valid, batch, capture.fps, capture, T_world_fit)
+
+
+def _seen(capture: Capture) -> Bool[Tensor, "t c"]:
+    """In which pictures a face was found."""
+    finite = np.isfinite(np.asarray(capture.landmarks)).all((-1, -2))
+    return torch.from_numpy(np.asarray(capture.valid, dtype=bool) & finite)
 
 
 def lenses_of(captures: Sequence[Capture], settings: TrackingSettings) -> list[int | None]:

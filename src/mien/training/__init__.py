@@ -1,17 +1,32 @@
 """Training: sequences and a method's config in, an avatar out."""
 
-from mien.training.run import read_curves, read_run_config, read_training_summary, run_camera
+from mien.training.frames import FRAME_ROLES, check_held_out, frames_by_role
+from mien.training.run import (
+    check_data,
+    check_run,
+    outdated_sequences,
+    read_curves,
+    read_run_config,
+    read_training_summary,
+    run_camera,
+)
 from mien.training.sequence import Sequence, read_sequence
 from mien.training.settings import PRESETS, TrainSettings
 from mien.training.split import Split, held_out
 from mien.training.trainer import train
 
 __all__ = [
+    "FRAME_ROLES",
     "PRESETS",
     "Sequence",
     "Split",
     "TrainSettings",
+    "check_data",
+    "check_held_out",
+    "check_run",
+    "frames_by_role",
     "held_out",
+    "outdated_sequences",
     "read_curves",
     "read_run_config",
     "read_sequence",

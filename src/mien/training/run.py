@@ -4,6 +4,7 @@ import hashlib
 import json
 import resource
 import sys
+from collections.abc import Mapping
 from collections.abc import Sequence as Items
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from mien.camera import Camera
 from mien.config import encode
 from mien.errors import UserError
 from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
+from mien.tracking import Tracking
 from mien.training.checkpoint import TrainingState
 from mien.training.sequence import Sequence
 from mien.training.settings import TrainSettings
@@ -34,23 +36,60 @@ def claim_run(run_dir: Path, sequences: Items[Sequence], method_config: MethodCo
     Raises:
         UserError: the folder holds a run with other settings, method or data.
     """
-    path = run_dir / "config.json"
+    names = [sequence.name for sequence in sequences]
+    if check_run(run_dir, method_config, settings, names):
+        check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
+        return
     content = {
-        "method": {**encode(method_config), "kind": method_of(method_config)},
-        "settings": encode(settings),
+        **_choices(method_config, settings),
         "data": [_fingerprint(sequence) for sequence in sequences],
         "mien": mien.__version__,
         "command_line": sys.argv,
     }
-    if not path.is_file():
-        write_json(path, _FORMAT, _VERSION, content)
-        return
-    found = read_json(path, _FORMAT, _VERSION)
-    different = sorted(_differences(found, json.loads(json.dumps(content))))
+    write_json(run_dir / "config.json", _FORMAT, _VERSION, content)
+
+
+def check_run(
+    run_dir: Path, method_config: MethodConfig, settings: TrainSettings, names: Items[str] | None = None
+) -> bool:
+    """Whether the folder holds a run already, which then has to be one with these choices (and sequences).
+
+    Raises:
+        UserError: it holds another one.
+    """
+    if not (run_dir / "config.json").is_file():
+        return False
+    found = read_run_config(run_dir)
+    remedy = "give this run another name (--run NAME) or delete it"
+    choices = json.loads(json.dumps(_choices(method_config, settings)))
+    different = sorted(_differences({name: found.get(name) for name in choices}, choices))
     if different:
+        raise UserError(f"{run_dir}: holds a run with other {', '.join(different[:5])}; {remedy}")
+    trained = [entry["sequence"] for entry in found["data"]]
+    if names is not None and trained != list(names):
+        raise UserError(f"{run_dir}: was trained on {', '.join(trained)}, not on {', '.join(names)}; {remedy}")
+    return True
+
+
+def check_data(run_dir: Path, trackings: Mapping[str, Tracking]) -> None:
+    """Find that sequences are still tracked as they were when a run was trained on them.
+
+    Raises:
+        UserError: some were tracked again since.
+    """
+    outdated = outdated_sequences(run_dir, trackings)
+    if outdated:
         raise UserError(
-            f"{run_dir}: holds a run with other {', '.join(different[:5])}; give this run another name or delete it"
+            f"{run_dir}: {', '.join(outdated)} was tracked again after this run was trained; train a new one "
+            "(`mien train DIR --run NAME`), or delete this one first"
         )
+
+
+def outdated_sequences(run_dir: Path, trackings: Mapping[str, Tracking]) -> list[str]:
+    """Names of the sequences that a run was trained on and that these trackings (by name) have otherwise."""
+    data = read_run_config(run_dir)["data"]
+    known = [entry for entry in data if entry["sequence"] in trackings]
+    return [e["sequence"] for e in known if e["tracking"] != _tracking_digest(trackings[e["sequence"]])]
 
 
 def read_run_config(run_dir: Path) -> dict[str, Any]:
@@ -119,19 +158,22 @@ def read_curves(run_dir: Path) -> dict[str, np.ndarray]:
     return {name: curve.numpy() for name, curve in read_tensors(run_dir / "curves.safetensors").items()}
 
 
+def _choices(method_config: MethodConfig, settings: TrainSettings) -> dict[str, Any]:
+    return {
+        "method": {**encode(method_config), "kind": method_of(method_config)},
+        "settings": encode(settings),
+    }
+
+
 def _fingerprint(sequence: Sequence) -> dict[str, Any]:
     """What tells two sequences apart: their source and how they were tracked."""
-    digest = hashlib.sha256()
-    for name, tensor in sorted(sequence.tracking.face.tensors().items()):
-        digest.update(name.encode() + tensor.detach().numpy().tobytes())
     first = sequence.tracking.cameras[0]
-    for camera in sequence.tracking.cameras:
-        digest.update(camera.K.numpy().tobytes() + camera.viewmat.numpy().tobytes())
     return {
         "sequence": sequence.name,
         "timesteps": sequence.capture.timesteps,
+        "camera_ids": list(sequence.capture.camera_ids),
         "source": encode(sequence.capture.source),
-        "tracking": digest.hexdigest()[:16],
+        "tracking": _tracking_digest(sequence.tracking),
         "camera": {
             "K": first.K.tolist(),
             "viewmat": first.viewmat.tolist(),
@@ -141,10 +183,18 @@ def _fingerprint(sequence: Sequence) -> dict[str, Any]:
     }
 
 
+def _tracking_digest(tracking: Tracking) -> str:
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tracking.face.tensors().items()):
+        digest.update(name.encode() + tensor.detach().numpy().tobytes())
+    for camera in tracking.cameras:
+        digest.update(camera.K.numpy().tobytes() + camera.viewmat.numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
 def _differences(found: Any, wanted: Any, name: str = "") -> set[str]:
     """Dotted names of what differs between two json values, apart from what may."""
     if isinstance(found, dict) and isinstance(wanted, dict):
-        ignored = {"format", "version", "mien", "command_line"} if not name else set(_FREE_TO_CHANGE)
-        names = (set(found) | set(wanted)) - ignored
+        names = (set(found) | set(wanted)) - set(_FREE_TO_CHANGE)
         return set().union(*(_differences(found.get(n), wanted.get(n), f"{name}.{n}".lstrip(".")) for n in names))
     return set() if found == wanted else {name}

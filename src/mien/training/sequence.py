@@ -28,8 +28,17 @@ class Sequence:
     """Opacity of what counts (the matte above the neck line), 255 = all."""
 
     def usable(self) -> np.ndarray:
-        """Bool [t, c]: a face was found and tracked."""
-        return self.capture.valid & self.tracking.valid.numpy()[:, None]
+        """Bool [t, c]: the face was tracked, and found in this very picture or in another camera's.
+
+        A calibrated camera sees the tracked head also where it finds no face: from behind, say.
+        """
+        tracked = self.tracking.valid.numpy()[:, None]
+        return (self.capture.valid | (self.capture.calibration is not None)) & tracked
+
+    def sharp(self) -> np.ndarray:
+        """Bool [t, c]: not marked as blurred by the capture."""
+        quality = self.capture.quality
+        return np.ones(self.capture.valid.shape, bool) if quality is None else ~quality.blurred
 
 
 def composite(
@@ -56,9 +65,15 @@ class Target:
 
 
 class Targets:
-    """The pictures of one sequence at training resolution, composited; those over a fixed background are kept."""
+    """The pictures of one sequence at training resolution, composited; those over a fixed background are kept.
 
-    def __init__(self, sequence: Sequence, resolution: int):
+    Args:
+        sequence: Whose pictures.
+        resolution: Longer side in pixels; 0 for the capture's own.
+        share: The number of sequences that share the memory for kept pictures.
+    """
+
+    def __init__(self, sequence: Sequence, resolution: int, share: int = 1):
         self._sequence = sequence
         longest = max(sequence.capture.width, sequence.capture.height)
         scale = min(1.0, resolution / longest) if resolution > 0 else 1.0
@@ -66,7 +81,7 @@ class Targets:
         self.height = max(1, round(sequence.capture.height * scale))
         self.cameras = tuple(camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
         self._kept: dict[tuple[int, int, bytes], Target] = {}
-        self._room = _CACHE_BYTES // (self.width * self.height * 4)
+        self._room = _CACHE_BYTES // (share * self.width * self.height * 4)
 
     def camera(self, camera: int) -> Camera:
         """The camera of the training pictures."""

@@ -28,9 +28,14 @@ class TrainSettings:
     record_every: int = 10
     """Steps between entries of the curves."""
     held_out_sequences: tuple[str, ...] = ()
-    """Whole sequences that are not trained on."""
+    """Whole sequences that are not trained on; the split divides the others."""
     held_out_cameras: tuple[str, ...] = ()
-    """Camera ids that are not trained on."""
+    """Camera ids that are not trained on, in any sequence."""
+
+    @property
+    def holds_out(self) -> bool:
+        """Whether anything is left to score."""
+        return self.split != "none" or bool(self.held_out_sequences or self.held_out_cameras)
 
 
 PRESETS = {

@@ -53,21 +53,16 @@ def train(
     bytes as if it had never stopped; if that run is finished, its avatar is loaded.
 
     Raises:
-        UserError: `run_dir` holds another run; the face model is not the one the sequences were tracked with; nothing
-            is left to train on.
+        UserError: `run_dir` holds another run; the face model is not the one the sequences were tracked with; they
+            were not tracked together; nothing is left to train on.
         KeyboardInterrupt: after Ctrl-C, when a checkpoint is safe.
     """
-    for sequence in sequences:
-        if sequence.tracking.face_model_hash != face_model.content_hash:
-            raise UserError(
-                f"{sequence.name}: tracked with face model {sequence.tracking.face_model!r} "
-                f"{sequence.tracking.face_model_hash}, not {face_model.name!r} {face_model.content_hash}; track again"
-            )
+    _check_trackings(sequences, face_model)
     order = FrameOrder(training_frames(sequences, settings), settings.seed)
     claim_run(run_dir, sequences, method_config, settings)
     if is_finished(run_dir):
         return load_avatar(run_dir)
-    data = TrainingData(order, tuple(Targets(sequence, settings.resolution) for sequence in sequences))
+    data = TrainingData(order, tuple(Targets(sequence, settings.resolution, len(sequences)) for sequence in sequences))
     state = start(sequences, face_model, method_config, settings)
     resume(run_dir / "checkpoints", state)
     with _one_torch_thread(), _deferred_interrupt() as interrupted:
@@ -81,6 +76,20 @@ def train(
                     raise KeyboardInterrupt
         write_results(run_dir, state)
     return state.avatar
+
+
+def _check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
+    for sequence in sequences:
+        if sequence.tracking.face_model_hash != face_model.content_hash:
+            raise UserError(
+                f"{sequence.name}: tracked with face model {sequence.tracking.face_model!r} "
+                f"{sequence.tracking.face_model_hash}, not {face_model.name!r} {face_model.content_hash}; track again"
+            )
+        if not sequence.tracking.face.identity.equal(sequences[0].tracking.face.identity):
+            raise UserError(
+                f"{sequences[0].name} and {sequence.name}: tracked apart, with two identities; "
+                "run `mien track` on their workspace"
+            )
 
 
 def start(

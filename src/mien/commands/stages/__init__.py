@@ -3,7 +3,7 @@
 from mien.commands.stages.capturing import capture_stage
 from mien.commands.stages.driving import drive_stage
 from mien.commands.stages.evaluating import evaluation_stage
-from mien.commands.stages.names import sequence_name
+from mien.commands.stages.names import run_name, sequence_name, sequence_names
 from mien.commands.stages.tracking import tracking_stage
 from mien.commands.stages.training import training_stage
 
@@ -11,7 +11,9 @@ __all__ = [
     "capture_stage",
     "drive_stage",
     "evaluation_stage",
+    "run_name",
     "sequence_name",
+    "sequence_names",
     "tracking_stage",
     "training_stage",
 ]

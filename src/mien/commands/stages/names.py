@@ -1,5 +1,7 @@
 """Names that become folders."""
 
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 from mien.errors import UserError
@@ -15,3 +17,32 @@ def sequence_name(video: Path, name: str | None) -> str:
     if not name or name in (".", "..") or "/" in name:
         raise UserError(f"{name!r} cannot be the name of a folder; give another with --name or --run")
     return name
+
+
+def run_name(name: str) -> str:
+    """`name`, if it can be a folder's.
+
+    Raises:
+        UserError: it is empty or holds a path separator.
+    """
+    return sequence_name(Path(name), name)
+
+
+def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
+    """A name for each video: those given, or else the videos' own.
+
+    Raises:
+        UserError: no video, one that is not there, a wrong number of names, two alike, or one that no folder can have.
+    """
+    if not videos:
+        raise UserError("no video; name one or several: mien create VIDEO [VIDEO ...] --out DIR")
+    for video in videos:
+        if not video.exists():
+            raise UserError(f"{video}: no such video or folder of pictures; check the path")
+    if names and len(names) != len(videos):
+        raise UserError(f"--name {' '.join(names)}: {len(names)} names for {len(videos)} videos; give one for each")
+    found = [sequence_name(video, name) for video, name in zip(videos, names or [None] * len(videos), strict=True)]
+    twice = [name for name, count in Counter(found).items() if count > 1]
+    if twice:
+        raise UserError(f"two videos would both be the sequence {twice[0]!r}; name all of them with --name")
+    return found

@@ -1,69 +1,126 @@
-"""Capture -> Tracking, as the command line runs it: a current tracking is read back."""
+"""Captures -> Trackings, as the command line runs it: current trackings are read back."""
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
 from mien.capture import Capture, read_capture, read_capture_hash
+from mien.errors import UserError
 from mien.face import FaceModel, load_face_model
 from mien.progress import say
 from mien.tracking import (
     Tracking,
     TrackingSettings,
+    has_enough_faces,
     make_scoring,
     read_tracking,
     scoring_exists,
-    track,
+    track_subject,
+    write_overlay,
+    write_residual_report,
     write_scoring,
     write_tracking,
 )
+from mien.training import outdated_sequences
 from mien.workspace import Workspace
 
-_TRACKING_RECIPE = 2
-"""Raised whenever the same capture would be tracked otherwise, so that old trackings are not taken for current."""
+_TRACKING_RECIPE = 3
+"""Raised whenever the same captures would be tracked otherwise, so that old trackings are not taken for current."""
 
 
 def tracking_stage(
-    workspace: Workspace, name: str, face_model_name: str, settings: TrackingSettings, again: bool = False
-) -> Tracking:
-    """Track a sequence, write the overlay and, once for ever, the scoring mask; a current tracking is read back."""
-    folder = workspace.sequence_dir(name)
+    workspace: Workspace, face_model_name: str, settings: TrackingSettings, again: bool = False
+) -> dict[str, Tracking]:
+    """Track all sequences of a workspace together, with one identity; current trackings are read back.
+
+    Writes overlays and, once for ever, the scoring masks. Sequences with too few faces are left out, unless that leaves
+    none; returns the others' trackings by name.
+    """
     face_model = load_face_model(face_model_name)
-    capture_hash = read_capture_hash(folder / "capture")
-    fingerprint = _tracking_fingerprint(capture_hash, face_model, settings)
-    tracking = None if again else _current_tracking(folder / "tracking", fingerprint)
-    if tracking is None:
-        capture = read_capture(folder / "capture")
-        tracking = track(capture, face_model, settings)
-        tracking = replace(tracking, settings={**tracking.settings, "fingerprint": fingerprint})
-        write_tracking(folder / "tracking", tracking)
-        say(f"{name}: tracked with a median landmark residual of {tracking.residuals.nanmedian():.2f} pixels")
-    if not scoring_exists(folder / "scoring", capture_hash):
-        if scoring_exists(folder / "scoring"):
-            say(f"{name}: the pictures changed, so the scoring mask is made anew")
-        capture = read_capture(folder / "capture")
-        write_scoring(folder / "scoring", make_scoring(capture, tracking, face_model), capture_hash)
-    _show_tracking(folder, tracking, face_model)
-    return tracking
+    names = workspace.sequence_names()
+    if not names:
+        raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")
+    fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
+    trackings = None if again else _current_trackings(workspace, names, fingerprint)
+    if trackings is None:
+        trackings = _track(workspace, names, face_model, settings, fingerprint)
+    for name, tracking in trackings.items():
+        folder = workspace.sequence_dir(name)
+        capture_hash = read_capture_hash(folder / "capture")
+        if not scoring_exists(folder / "scoring", capture_hash):
+            if scoring_exists(folder / "scoring"):
+                say(f"{name}: the pictures changed, so the scoring mask is made anew")
+            capture = read_capture(folder / "capture")
+            write_scoring(folder / "scoring", make_scoring(capture, tracking, face_model), capture_hash)
+        _show_tracking(folder, tracking, face_model)
+    return trackings
 
 
-def _tracking_fingerprint(capture_hash: str, face_model: FaceModel, settings: TrackingSettings) -> str:
-    content = [_TRACKING_RECIPE, capture_hash, face_model.name, face_model.content_hash, asdict(settings)]
+def _tracking_fingerprint(
+    workspace: Workspace, names: list[str], face_model: FaceModel, settings: TrackingSettings
+) -> str:
+    captures = [(name, read_capture_hash(workspace.sequence_dir(name) / "capture")) for name in names]
+    content = [_TRACKING_RECIPE, captures, face_model.name, face_model.content_hash, asdict(settings)]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-def _current_tracking(folder: Path, fingerprint: str) -> Tracking | None:
-    if not (folder / "tracking.json").is_file():
+def _current_trackings(workspace: Workspace, names: list[str], fingerprint: str) -> dict[str, Tracking] | None:
+    """The trackings that are there, if they are what these captures and settings give; says why where not."""
+    found, missing = {}, []
+    for name in names:
+        folder = workspace.sequence_dir(name) / "tracking"
+        if not (folder / "tracking.json").is_file():
+            missing.append(name)
+            continue
+        try:
+            found[name] = read_tracking(folder)
+        except UserError as error:
+            say(f"{str(error).split('; ')[0]}; tracking again")
+            return None
+    together = {member for tracking in found.values() for member in tracking.settings.get("tracked_together", [])}
+    if not found:
         return None
-    tracking = read_tracking(folder)
-    return tracking if tracking.settings.get("fingerprint") == fingerprint else None
+    if all(tracking.settings.get("fingerprint") == fingerprint for tracking in found.values()):
+        # Those without a tracking had too few faces, or tracking was stopped before they were written.
+        return None if set(missing) & together else found
+    added = [name for name in missing if name not in together]
+    reason = f"{', '.join(added)} came new" if added else "captures or settings changed"
+    say(f"{reason}: all {len(names)} sequences are tracked again, so that they share one identity" if len(names) > 1
+        else "Captures or settings changed since the sequence was tracked: tracking again")  # fmt: skip
+    return None
+
+
+def _track(
+    workspace: Workspace, names: list[str], face_model: FaceModel, settings: TrackingSettings, fingerprint: str
+) -> dict[str, Tracking]:
+    captures = {name: read_capture(workspace.sequence_dir(name) / "capture") for name in names}
+    usable = {name: capture for name, capture in captures.items() if has_enough_faces(capture)} or captures
+    for name in captures.keys() - usable.keys():
+        say(f"{name}: left out, there are too few faces in it")
+    tracked = track_subject(list(usable.values()), face_model, settings)
+    trackings = {}
+    for name, tracking in zip(usable, tracked, strict=True):
+        made_from = {"fingerprint": fingerprint, "tracked_together": list(usable)}
+        trackings[name] = replace(tracking, settings={**tracking.settings, **made_from})
+        write_tracking(workspace.sequence_dir(name) / "tracking", trackings[name])
+        say(f"{name}: tracked with a median landmark residual of {tracking.residuals.nanmedian():.2f} pixels")
+    _tell_outdated_runs(workspace, trackings)
+    return trackings
+
+
+def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking]) -> None:
+    outdated = [run for run in workspace.run_names() if outdated_sequences(workspace.run_dir(run), trackings)]
+    if outdated:
+        say(
+            f"Trained on the tracking before this one: {', '.join(outdated)}. Such a run can be rendered as ever, but "
+            "not resumed or scored; train anew under another name (--run NAME), or delete its folder first"
+        )
 
 
 def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel) -> None:
     """Write overlay.mp4 and the residual report, unless those there are newer than the tracking."""
-    from mien.tracking import write_overlay, write_residual_report
-
     overlay, written = folder / "tracking" / "overlay.mp4", folder / "tracking" / "tracking.json"
     if overlay.is_file() and overlay.stat().st_mtime >= written.stat().st_mtime:
         return

@@ -1,9 +1,6 @@
 """Sequences -> a run, as the command line runs it."""
 
-from pathlib import Path
-
 from mien.avatar import MethodConfig
-from mien.commands.stages.names import sequence_name
 from mien.face import load_face_model
 from mien.progress import say
 from mien.training import TrainSettings, read_sequence, read_training_summary, train
@@ -14,8 +11,8 @@ def training_stage(
     workspace: Workspace, sequences: list[str], run: str, method: MethodConfig, settings: TrainSettings
 ) -> None:
     """Train a run on some sequences of the workspace; a finished or interrupted one goes on where it was."""
-    sequence_name(Path(run), run)
+    run_dir = workspace.run_dir(run)
     loaded = [read_sequence(workspace.sequence_dir(name)) for name in sequences]
-    train(loaded, load_face_model(loaded[0].tracking.face_model), method, settings, workspace.run_dir(run))
-    summary = read_training_summary(workspace.run_dir(run))
+    train(loaded, load_face_model(loaded[0].tracking.face_model), method, settings, run_dir)
+    summary = read_training_summary(run_dir)
     say(f"{run}: {summary['gaussians']:,} Gaussians after {summary['steps']:,} steps in {summary['seconds']:.0f} s")
