@@ -1,0 +1,126 @@
+"""Several videos of one person on the command line: captured apart, tracked and trained together."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from mien.capture.video import read_video_frames, write_video
+from mien.cli import main
+from mien.synthetic import SyntheticRecipe, write_synthetic_video
+from mien.tracking import read_tracking
+
+SMALL = ("--capture.size", "128", "--steps", "20", "--preset", "draft")
+PARTS = {"one": slice(0, 12), "two": slice(12, 24), "three": slice(24, 32)}
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One person, filmed three times."""
+    folder = tmp_path_factory.mktemp("clips")
+    recipe = SyntheticRecipe(width=192, height=192, seconds=3.2, fps=10.0, supersample=1, texture_size=256)
+    write_synthetic_video(recipe, folder / "whole.mp4", 3)
+    frames = [image for _, image in read_video_frames(folder / "whole.mp4")]
+    for name, part in PARTS.items():
+        write_video(folder / f"{name}.mp4", iter(frames[part]), 10.0)
+    return {name: folder / f"{name}.mp4" for name in PARTS}
+
+
+@pytest.fixture(scope="module")
+def workspace(clips: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("subject") / "out"
+    arguments = ["create", str(clips["one"]), str(clips["two"]), "--out", str(folder), "--hold-out", "two"]
+    assert main([*arguments, *SMALL, "--split", "none"]) == 0
+    return folder
+
+
+def _identity(workspace: Path, name: str) -> torch.Tensor:
+    return read_tracking(workspace / "sequences" / name / "tracking").face.identity.clone()  # not a map of the file
+
+
+def _config(workspace: Path, run: str = "gaussian_avatars") -> dict:
+    return json.loads((workspace / "runs" / run / "config.json").read_text())
+
+
+@pytest.mark.slow
+def test_two_clips_make_one_avatar(workspace: Path) -> None:
+    assert torch.equal(_identity(workspace, "one"), _identity(workspace, "two"))
+    assert [entry["sequence"] for entry in _config(workspace)["data"]] == ["one", "two"]
+    assert _config(workspace)["settings"]["held_out_sequences"] == ["two"]
+    metrics = json.loads((workspace / "runs/gaussian_avatars/metrics.json").read_text())
+    assert sum(entry["frames"] for entry in metrics["protocols"].values()) == 12
+    assert all((workspace / f"sequences/{name}/tracking/overlay.mp4").is_file() for name in ("one", "two"))
+
+
+@pytest.mark.slow
+def test_the_same_command_does_nothing_again(
+    workspace: Path, clips: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in workspace.rglob("*.safetensors")}
+    arguments = ["create", str(clips["one"]), str(clips["two"]), "--out", str(workspace), "--hold-out", "two"]
+    assert main([*arguments, *SMALL, "--split", "none"]) == 0
+    assert "Tracking" not in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in workspace.rglob("*.safetensors")} == before
+
+
+@pytest.mark.slow
+def test_a_damaged_tracking_is_made_again(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = _identity(workspace, "two")
+    (workspace / "sequences/two/tracking/tracking.safetensors").write_bytes(b"broken")
+    assert main(["track", str(workspace)]) == 0
+    assert "tracking again" in capsys.readouterr().err
+    assert torch.equal(_identity(workspace, "two"), before)
+
+
+@pytest.mark.slow
+def test_a_third_clip_gives_all_a_new_identity(
+    workspace: Path, clips: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, arguments = _identity(workspace, "one"), ["--out", str(workspace), "--capture.size", "128"]
+    assert main(["capture", str(clips["three"]), *arguments]) == 0
+    assert main(["track", str(workspace)]) == 0
+    shown = capsys.readouterr().err
+    assert "three came new: all 3 sequences are tracked again" in shown
+    assert "Trained on the tracking before this one: gaussian_avatars" in shown
+    assert torch.equal(_identity(workspace, "one"), _identity(workspace, "three"))
+    assert not torch.equal(_identity(workspace, "one"), before)
+
+    assert main(["evaluate", str(workspace)]) == 2
+    assert "tracked again after this run was trained" in capsys.readouterr().err
+    train = ["train", str(workspace), "--steps", "20", "--preset", "draft"]
+    assert main(train) == 2
+    assert "gaussian_avatars: holds a run with other settings" in capsys.readouterr().err
+    assert main([*train, "--run", "all"]) == 0
+    assert [entry["sequence"] for entry in _config(workspace, "all")["data"]] == ["one", "three", "two"]
+    assert main([*train, "--run", "some", "--sequences", "one", "--hold-out", "three"]) == 0
+    assert [entry["sequence"] for entry in _config(workspace, "some")["data"]] == ["one", "three"]
+    assert main([*train, "--run", "some", "--hold-out", "three"]) == 2
+    assert "was trained on one, three, not on one, three, two" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ([], "no video"),
+        (["{clip}", "{gone}"], "no such video"),
+        (["{clip}", "{clip}"], "two videos would both be the sequence 'clip'"),
+        (["{clip}", "--name", "a", "b"], "2 names for 1 videos"),
+        (["{clip}", "--face-model", "any"], "no face model 'any'"),
+        (["{clip}", "--out", "{clip}"], "is a file, but a folder"),
+        (["{clip}", "--run", "a/b"], "cannot be the name of a folder"),
+        (["{clip}", "--run", "other"], "holds a run with other"),
+    ],
+)
+def test_mistakes_are_told_before_any_work(
+    arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clip, out = tmp_path / "clip.mp4", tmp_path / "out"
+    clip.write_bytes(b"")
+    (out / "runs" / "other").mkdir(parents=True)
+    content = {"format": "mien.run", "version": 1, "method": {}, "settings": {}, "data": []}
+    (out / "runs" / "other" / "config.json").write_text(json.dumps(content))
+    arguments = [part.format(clip=clip, gone=tmp_path / "gone.mp4") for part in arguments]
+    assert main(["create", "--out", str(out), *arguments]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not (out / "sequences").exists()
