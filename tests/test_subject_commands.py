@@ -118,7 +118,13 @@ def test_mistakes_are_told_before_any_work(
     clip, out = tmp_path / "clip.mp4", tmp_path / "out"
     clip.write_bytes(b"")
     (out / "runs" / "other").mkdir(parents=True)
-    content = {"format": "mien.run", "version": 1, "method": {}, "settings": {}, "data": []}
+    content = {
+        "format": "mien.run",
+        "version": 1,
+        "method": {"kind": "other"},
+        "settings": {"split": "none"},
+        "data": [],
+    }
     (out / "runs" / "other" / "config.json").write_text(json.dumps(content))
     arguments = [part.format(clip=clip, gone=tmp_path / "gone.mp4") for part in arguments]
     assert main(["create", "--out", str(out), *arguments]) == 2

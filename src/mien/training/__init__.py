@@ -1,6 +1,6 @@
 """Training: sequences and a method's config in, an avatar out."""
 
-from mien.training.frames import FRAME_ROLES, check_held_out, frames_by_role
+from mien.training.frames import check_held_out
 from mien.training.run import (
     check_data,
     check_run,
@@ -16,7 +16,6 @@ from mien.training.split import Split, held_out
 from mien.training.trainer import train
 
 __all__ = [
-    "FRAME_ROLES",
     "PRESETS",
     "Sequence",
     "Split",
@@ -24,7 +23,6 @@ __all__ = [
     "check_data",
     "check_held_out",
     "check_run",
-    "frames_by_role",
     "held_out",
     "outdated_sequences",
     "read_curves",

@@ -28,41 +28,10 @@ class Frame:
     """Of the timestep among those of all sequences in a row."""
 
 
-FRAME_ROLES = ("training", "self_reenactment", "self_reenactment_sequence", "novel_view", "unused")
-"""What a usable frame is for; see `frames_by_role`."""
-
-
-def frames_by_role(sequences: Items[Sequence], settings: TrainSettings) -> dict[str, list[Frame]]:
-    """All usable frames of a run by what they are for (each is in one list, any list may be empty).
-
-    - `training`: what steps look at.
-    - `self_reenactment`: timesteps that the split holds out, in cameras that are trained on.
-    - `self_reenactment_sequence`: all timesteps of sequences that are held out as a whole, in the same cameras. The
-      split divides only the sequences that are trained on.
-    - `novel_view`: held-out cameras, at timesteps that other cameras show in training.
-    - `unused`: held-out cameras at held-out timesteps (two questions at once), and blurred frames that would have been
-      trained on. Blurred frames that are held out are scored: avatars of one recipe and another see the same ones.
-    """
-    roles: dict[str, list[Frame]] = {role: [] for role in FRAME_ROLES}
-    start = 0
-    for index, sequence in enumerate(sequences):
-        whole = sequence.name in settings.held_out_sequences
-        left_out, sharp = held_out(sequence.capture.timesteps, settings.split).numpy(), sequence.sharp()
-        for timestep, camera in np.argwhere(sequence.usable()).tolist():
-            new_view = sequence.capture.camera_ids[camera] in settings.held_out_cameras
-            new_time = whole or bool(left_out[timestep])
-            role = "training" if sharp[timestep, camera] else "unused"
-            if new_view:
-                role = "unused" if new_time else "novel_view"
-            elif new_time:
-                role = "self_reenactment_sequence" if whole else "self_reenactment"
-            roles[role].append(Frame(index, timestep, camera, start + timestep))
-        start += sequence.capture.timesteps
-    return roles
-
-
 def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list[Frame]:
-    """All frames that are usable and not held out.
+    """All frames that are usable, sharp and not held out: by their timestep, their sequence or their camera.
+
+    The split divides each sequence that is trained on; a sequence or a camera that is held out is so at all timesteps.
 
     Raises:
         UserError: there is none, or what is to be held out is not there.
@@ -73,7 +42,14 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
     unknown = [camera_id for camera_id in settings.held_out_cameras if camera_id not in ids]
     if unknown:
         raise UserError(f"--hold-out-cameras {unknown[0]}: no such camera; there are: {', '.join(ids)}")
-    frames = frames_by_role(sequences, settings)["training"]
+    frames, start = [], 0
+    for index, sequence in enumerate(sequences):
+        usable = sequence.usable() & sequence.sharp()
+        usable = usable & ~held_out(sequence.capture.timesteps, settings.split).numpy()[:, None]
+        cameras = [camera_id not in settings.held_out_cameras for camera_id in sequence.capture.camera_ids]
+        if sequence.name not in settings.held_out_sequences:
+            frames += [Frame(index, int(t), int(c), start + int(t)) for t, c in np.argwhere(usable & np.array(cameras))]
+        start += sequence.capture.timesteps
     if not frames:
         raise UserError(
             f"{', '.join(names)}: no frame to train on with split {settings.split!r} and what is held out; "

@@ -89,7 +89,7 @@ def outdated_sequences(run_dir: Path, trackings: Mapping[str, Tracking]) -> list
     """Names of the sequences that a run was trained on and that these trackings (by name) have otherwise."""
     data = read_run_config(run_dir)["data"]
     known = [entry for entry in data if entry["sequence"] in trackings]
-    return [e["sequence"] for e in known if e["tracking"] != _tracking_digest(trackings[e["sequence"]])]
+    return [e["sequence"] for e in known if e.get("tracking") != _tracking_digest(trackings[e["sequence"]])]
 
 
 def read_run_config(run_dir: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -111,7 +112,12 @@ def _track(
 
 
 def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking]) -> None:
-    outdated = [run for run in workspace.run_names() if outdated_sequences(workspace.run_dir(run), trackings)]
+    outdated = []
+    for run in workspace.run_names():
+        # A damaged run is told where it is used.
+        with suppress(UserError):
+            if outdated_sequences(workspace.run_dir(run), trackings):
+                outdated.append(run)
     if outdated:
         say(
             f"Trained on the tracking before this one: {', '.join(outdated)}. Such a run can be rendered as ever, but "
