@@ -132,10 +132,7 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], fps: i
     first = next(iterator, None)
     if first is None:
         raise UserError(f"{path}: no frames to write; check the selection of frames")
-    try:
-        write_atomically(path, lambda aside: _encode(aside, itertools.chain([first], iterator), first.shape, fps, crf))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from None
+    write_atomically(path, lambda aside: _encode(aside, itertools.chain([first], iterator), first.shape, fps, crf))
 
 
 def _encode(path: Path, frames: Iterable[np.ndarray], shape: tuple[int, ...], fps: int | float, crf: int) -> None:
