@@ -43,6 +43,7 @@ def main() -> None:
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1)  # wxyz
 
     target = target_picture()
+    picture = torch.zeros_like(target)
     optimizer = torch.optim.Adam([means, log_scales, opacity_logits, sh], lr=0.02)
     for step in range(options.steps):
         gaussians = Gaussians(means, quats, log_scales.exp(), opacity_logits.sigmoid(), sh)

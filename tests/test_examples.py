@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from mien.cli import main
+
 ROOT = Path(__file__).parents[1]
 SUBJECT = "out/examples/subject"
 
@@ -69,6 +71,13 @@ def test_render_expressions(trained: Path) -> None:
 def test_drive(trained: Path) -> None:
     run_script(trained, example("07_drive.py"), SUBJECT, "--by", SUBJECT, "--run", "example", "--out", "driven.mp4")
     assert (trained / "driven.mp4").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_runtime(trained: Path) -> None:
+    assert main(["export", str(trained / SUBJECT), "--run", "example", "--out", str(trained / "avatar.mien")]) == 0
+    run_script(trained, example("08_runtime.py"), "avatar.mien", "--out", "frames", "--frames", "3", "--size", "48")
+    assert len(list((trained / "frames").glob("*.png"))) == 3
 
 
 @pytest.mark.slow

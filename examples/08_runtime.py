@@ -1,0 +1,47 @@
+"""An avatar without torch: numpy and the native core load, pose and render a .mien file.
+
+mien export out/examples/subject --out out/examples/avatar.mien
+python examples/08_runtime.py out/examples/avatar.mien --out out/examples/frames
+"""
+
+import argparse
+import math
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mien import runtime
+
+
+def main() -> None:
+    """A short performance: the jaw opens and closes while the head turns; one PNG a frame."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("avatar", type=Path, help="a .mien file")
+    parser.add_argument("--out", type=Path, required=True, help="folder of pictures")
+    parser.add_argument("--frames", type=int, default=25)
+    parser.add_argument("--size", type=int, default=256, help="pixels")
+    options = parser.parse_args()
+
+    avatar = runtime.load(options.avatar)
+    camera = avatar.camera.resized(options.size, options.size)
+    at_rest = avatar.face()
+    options.out.mkdir(parents=True, exist_ok=True)
+    seconds = 0.0
+    for frame in range(options.frames):
+        phase = 2 * math.pi * frame / options.frames
+        began = time.perf_counter()
+        gaussians = avatar.pose(
+            {"jawOpen": 0.25 * (1 - math.cos(phase))},
+            head_rotation=at_rest.head_rotation + np.array([0, 0.2 * math.sin(phase), 0], np.float32),
+        )
+        image, _alpha = avatar.render(gaussians, camera, background=(1, 1, 1))
+        seconds += time.perf_counter() - began
+        picture = (image.clip(0, 1)[:, :, ::-1] * 255 + 0.5).astype(np.uint8)
+        cv2.imwrite(str(options.out / f"{frame:06d}.png"), picture)
+    print(f"wrote {options.out}: {options.frames} pictures, {1000 * seconds / options.frames:.1f} ms a frame")
+
+
+if __name__ == "__main__":
+    main()
