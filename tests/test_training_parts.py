@@ -46,6 +46,33 @@ def test_frames_leave_out_what_is_invalid_or_held_out() -> None:
     assert {frame.sequence for frame in only} == {1}
 
 
+def test_what_is_held_out_has_to_be_there() -> None:
+    _, sequence = toy_sequence(12, 16)
+    for settings, words in (
+        (TrainSettings(held_out_sequences=("tyo",)), "--hold-out tyo: no such sequence in this run; there are: toy"),
+        (TrainSettings(held_out_cameras=("back",)), "--hold-out-cameras back: no such camera; there are: front"),
+        (TrainSettings(held_out_sequences=("toy",)), "leaves no sequence to train on"),
+    ):
+        with pytest.raises(UserError, match=words):
+            training_frames([sequence], settings)
+
+
+def test_calibrated_cameras_train_also_where_they_find_no_face() -> None:
+    _, sequence = toy_sequence(6, 16)
+    capture, tracking = sequence.capture, sequence.tracking
+    both = replace(
+        capture, camera_ids=("front", "back"), images=capture.images.repeat(2, 1), mattes=capture.mattes.repeat(2, 1),
+        landmarks=capture.landmarks.repeat(2, 1), valid=np.array([[True, False]] * 6),
+        principal_point=capture.principal_point.repeat(2, 0), calibration=tracking.cameras * 2,
+    )  # fmt: skip
+    seen = replace(tracking, valid=torch.tensor([True] * 5 + [False]), cameras=tracking.cameras * 2)
+    ring = replace(sequence, capture=both, tracking=seen, scoring=sequence.scoring.repeat(2, 1))
+    frames = training_frames([ring], TrainSettings(split="none"))
+    assert [(frame.timestep, frame.camera) for frame in frames] == [(t, c) for t in range(5) for c in range(2)]
+    only = training_frames([ring], TrainSettings(split="none", held_out_cameras=("back",)))
+    assert {frame.camera for frame in only} == {0}
+
+
 def test_nothing_to_train_on_is_the_users_to_mend() -> None:
     _, sequence = toy_sequence(5, 16)
     with pytest.raises(UserError, match="no frame to train on"):
