@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 
@@ -70,3 +71,53 @@ def write_face_clip(path: Path, test_data: Path, frames: int = 12, size: tuple[i
         picture[40:280, left : left + 240] = face
     write_video(path, iter(pictures), 25.0, crf=12)
     return np.stack([lefts + 120, np.full(frames, 160)], axis=-1)
+
+
+def write_planes(
+    path: Path,
+    pictures: list[np.ndarray],
+    pixel_format: str,
+    colours: tuple[int, int, int, int] = (1, 1, 1, 1),
+    ticks: list[int] | None = None,
+) -> None:
+    """A lossless clip (FFV1 in Matroska, 25 frames a second) of Y'CbCr planes [3, h, w], 4:4:4, exactly as given.
+
+    Args:
+        path: ends in .mkv.
+        pictures: uint8 or uint16, as the pixel format has it.
+        pixel_format: as yuv444p10le.
+        colours: codes of matrix, primaries, transfer and range.
+        ticks: times in milliseconds instead of an even rate.
+    """
+    _, height, width = pictures[0].shape
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=25 if ticks is None else 1000)
+        stream.width, stream.height, stream.pix_fmt = width, height, pixel_format
+        context = stream.codec_context
+        context.colorspace, context.color_primaries, context.color_trc, context.color_range = colours
+        for index, planes in enumerate(pictures):
+            frame = av.VideoFrame(width, height, pixel_format)
+            frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range = colours
+            frame.pts = index if ticks is None else ticks[index]
+            for plane, values in zip(frame.planes, planes, strict=True):
+                padded = np.zeros((height, plane.line_size // values.itemsize), values.dtype)
+                padded[:, :width] = values
+                plane.update(padded.tobytes())
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def to_planes(signal: np.ndarray, weights: tuple[float, float], bits: int) -> np.ndarray:
+    """R'G'B' in 0..1 [h, w, 3] as Y'CbCr planes of studio range; `weights` are those of red and blue in luma."""
+    red, green, blue = np.moveaxis(signal, -1, 0)
+    luma = weights[0] * red + (1 - sum(weights)) * green + weights[1] * blue
+    chroma = [(blue - luma) / (2 - 2 * weights[1]), (red - luma) / (2 - 2 * weights[0])]
+    unit = 1 << (bits - 8)
+    planes = [16 * unit + 219 * unit * luma, *(128 * unit + 224 * unit * value for value in chroma)]
+    return np.rint(planes).astype(np.uint16 if bits > 8 else np.uint8)
+
+
+def face_picture(test_data: Path, side: int = 160, margin: int = 0) -> np.ndarray:
+    """The scan's texture with a plain margin around it."""
+    face = cv2.resize(scan_texture(test_data), (side, side), interpolation=cv2.INTER_AREA)
+    return np.pad(face, ((margin, margin), (margin, margin), (0, 0)), constant_values=190)

@@ -35,6 +35,7 @@ class Display:
         self._longest_side = longest_side
         self._reformatter = VideoReformatter()
         self._tone_mappers: dict[int, ToneMapper] = {}
+        self._matrix: list[int] = []
         self._stored_size = (0, 0)
         self._size = (0, 0)
 
@@ -60,7 +61,7 @@ class Display:
             transfer = int(frame.color_trc)
             mapper = self._tone_mappers.setdefault(transfer, ToneMapper(transfer))
             converted = mapper.to_srgb(converted)
-        return _apply_display_matrix(converted, frame)
+        return _turn(converted, self._matrix) if self._matrix else converted
 
     def _fit(self, frame: av.VideoFrame) -> None:
         """Choose the size at the first frame; later ones may have another resolution, but no other shape."""
@@ -69,6 +70,7 @@ class Display:
             return
         if self._stored_size == (0, 0):
             self._stored_size = stored
+            self._matrix = _display_matrix(frame)
             self._size = _display_size(*stored, self._pixel_aspect, self._longest_side)
         elif abs(stored[0] / stored[1] / (self._stored_size[0] / self._stored_size[1]) - 1) > _ASPECT_TOLERANCE:
             before = f"{self._stored_size[0]}x{self._stored_size[1]}"
@@ -93,13 +95,20 @@ def _colorspace(frame: av.VideoFrame, is_hdr: bool) -> int:
     return Colorspace.ITU709 if frame.height >= _HIGH_DEFINITION_HEIGHT else Colorspace.ITU601
 
 
-def _apply_display_matrix(image: np.ndarray, frame: av.VideoFrame) -> np.ndarray:
-    """Rotate and mirror by the display matrix: x' = a x + c y, y' = b x + d y with entries of -1, 0, 1."""
+def _display_matrix(frame: av.VideoFrame) -> list[int]:
+    """The upper two rows of the display matrix; empty where there is none.
+
+    To be asked once a clip: whoever touches a frame's side data makes a reference cycle, and whole frames then wait
+    for the garbage collector.
+    """
     side_data: Any = frame.side_data  # PyAV's stub types its keys as strings
     data = side_data.get(SideDataType.DISPLAYMATRIX)
-    if data is None:
-        return image
-    a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
+    return [] if data is None else np.frombuffer(bytes(data), np.int32)[:5].tolist()
+
+
+def _turn(image: np.ndarray, matrix: list[int]) -> np.ndarray:
+    """Rotate and mirror by the display matrix: x' = a x + c y, y' = b x + d y with entries of -1, 0, 1."""
+    a, b, _, c, d = matrix
     if abs(b) > abs(a):
         image = image.swapaxes(0, 1)
         flip_x, flip_y = c < 0, b < 0

@@ -18,6 +18,8 @@ _SIZE_RANGE = 2.5
 """The same person's face is at most so much larger or smaller when it comes back..."""
 _LOOK_RANGE = 0.12
 """...and its mean colours (0..1) differ by at most this."""
+_CANDIDATES = 8
+"""So many of the faces that fill the picture most are considered."""
 _PASSING = 3
 """A face seen in fewer frames than this is taken for a false detection, where the clip has more."""
 
@@ -68,12 +70,10 @@ def choose_person(survey: Survey) -> Person:
             others[list(frames), list(places)] = np.nan
     if not lasting:
         return Person(boxes, others)
-    sizes = _sizes(survey.boxes)
-    lasting.sort(key=lambda track: -sum(sizes[entry] ** 2 for entry in track.entries))
-    accepted = [lasting[0]]
-    for track in lasting[1:]:
-        if _is_same_person(accepted, track, sizes, survey.looks):
-            accepted.append(track)
+    areas = np.square(_sizes(survey.boxes))
+    lasting.sort(key=lambda track: -_weight([track], areas))
+    people = [_gather(track, lasting, areas, survey.looks) for track in lasting[:_CANDIDATES]]
+    accepted = max(people, key=lambda tracks: _weight(tracks, areas))
     for track in accepted:
         for frame, place in track.entries:
             boxes[frame] = survey.boxes[frame, place]
@@ -122,15 +122,26 @@ def _distance(before: Float[np.ndarray, " 4"], now: Float[np.ndarray, " 4"]) -> 
     return float(np.abs(centres).max()) / max(size_before, size_now)
 
 
-def _is_same_person(accepted: list[_Track], track: _Track, sizes: np.ndarray, looks: np.ndarray) -> bool:
+def _weight(tracks: list[_Track], areas: Float[np.ndarray, "t f"]) -> float:
+    """How much of the video a person's face fills."""
+    return float(sum(areas[entry] for track in tracks for entry in track.entries))
+
+
+def _gather(first: _Track, tracks: list[_Track], areas: np.ndarray, looks: np.ndarray) -> list[_Track]:
+    """All tracks that can be of the person of the first one, the weightiest first."""
+    accepted = [first]
+    for track in tracks:
+        if track is not first and _is_same_person(accepted, track, areas, looks):
+            accepted.append(track)
+    return accepted
+
+
+def _is_same_person(accepted: list[_Track], track: _Track, areas: np.ndarray, looks: np.ndarray) -> bool:
     frames = track.frames()
     if any(frames & other.frames() for other in accepted):
         return False
-    before = [entry for other in accepted for entry in other.entries]
-
-    def median(values: np.ndarray, entries: list[tuple[int, int]]) -> np.ndarray:
-        return np.median(values[tuple(np.array(entries).T)], axis=0)
-
-    ratio = median(sizes, track.entries) / median(sizes, before)
-    change = np.abs(median(looks, track.entries) - median(looks, before)).mean()
+    now = tuple(np.array(track.entries).T)
+    before = tuple(np.array([entry for other in accepted for entry in other.entries]).T)
+    ratio = math.sqrt(float(np.median(areas[now])) / float(np.median(areas[before])))
+    change = np.abs(np.median(looks[now], axis=0) - np.median(looks[before], axis=0)).mean()
     return bool(1 / _SIZE_RANGE <= ratio <= _SIZE_RANGE and change <= _LOOK_RANGE)
