@@ -87,20 +87,20 @@ def _sizes(boxes: Float[np.ndarray, "t f 4"]) -> Float[np.ndarray, "t f"]:
 
 
 def _link(survey: Survey) -> list[_Track]:
-    """Faces joined over time: each to the nearest of the frames before, nearest pairs first."""
+    """Faces joined over time: to the ones seen last, the nearest first; so nobody takes over who has just gone."""
     tracks: list[_Track] = []
     open_tracks: list[_Track] = []
     for frame, (seconds, boxes) in enumerate(zip(survey.timestamps, survey.boxes, strict=True)):
         places = np.flatnonzero(np.isfinite(boxes[:, 0])).tolist()
         open_tracks = [track for track in open_tracks if seconds - survey.timestamps[track.entries[-1][0]] <= _PATIENCE]
         pairs = sorted(
-            (distance, index, place)
+            (frame - track.entries[-1][0], distance, index, place)
             for index, track in enumerate(open_tracks)
             for place in places
             if (distance := _distance(survey.boxes[track.entries[-1]], boxes[place])) <= _REACH
         )
         taken: set[int] = set()
-        for _, index, place in pairs:
+        for *_, index, place in pairs:
             track = open_tracks[index]
             if place in places and index not in taken:
                 track.entries.append((frame, place))
