@@ -60,7 +60,7 @@ def test_given_landmarks_and_mattes_are_taken_as_they_are(test_data, tmp_path):
 
 def test_blur_stands_out(test_data):
     face = face_picture(test_data)
-    blurred = cv2.blur(face, (11, 3))
+    blurred = cv2.blur(face, (19, 9))
     points = np.array([[40.0, 30.0], [120.0, 130.0]])
     measured = np.array([measure_face(picture, points) for picture in [face] * 5 + [blurred]])
     assert relative_quality(measured).blurred[:, 0].tolist() == [False] * 5 + [True]
