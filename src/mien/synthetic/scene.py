@@ -3,9 +3,9 @@
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,8 +15,10 @@ from jaxtyping import Float, UInt8
 from mien.camera import Camera
 from mien.face import FaceModel, load_face_model
 from mien.synthetic.motion import head_motion
+from mien.synthetic.off_model import bend_off_model
 from mien.synthetic.painter import develop, draw, to_uint8, wall
 from mien.synthetic.recipe import SyntheticRecipe
+from mien.synthetic.rig import cameras_of
 from mien.synthetic.subject import Subject, build_subject, pose_subject
 from mien.tracking import Tracking
 from mien.tracking.neck_line import fit_neck_lines
@@ -37,53 +39,89 @@ class SyntheticFrame:
 class SyntheticScene:
     """A person in motion before a camera; everything follows from the recipe and the seed."""
 
-    def __init__(self, recipe: SyntheticRecipe, seed: int) -> None:
-        self.recipe, self.seed = recipe, seed
+    def __init__(self, recipe: SyntheticRecipe, seed: int, motion_seed: int | None = None) -> None:
+        """Lay out a scene; nothing is drawn yet.
+
+        Args:
+            recipe: What it shows.
+            seed: Decides the person, the light and the room.
+            motion_seed: Decides what the person does; None for `seed`. Sequences of one subject share only `seed`.
+        """
+        self.recipe, self.seed, self.motion_seed = recipe, seed, seed if motion_seed is None else motion_seed
         self.model: FaceModel = load_face_model(recipe.face_model)
         count = self.model.identity_basis.shape[0]
         coefficients = np.random.default_rng([seed, 0]).standard_normal(count).astype(np.float32)
         self.identity = torch.from_numpy(recipe.identity_scale * np.clip(coefficients, -2, 2)).float()
-        self.face = head_motion(self.model, self.identity, recipe, seed)
-        focal = recipe.focal * recipe.width
-        K = torch.tensor([[focal, 0, recipe.width / 2], [0, focal, recipe.height / 2], [0, 0, 1.0]])
-        self.camera = Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])), recipe.width, recipe.height)
+        self.face = head_motion(self.model, self.identity, recipe, self.motion_seed)
+        self.drawn_model, self._drawn_face = self.model, self.face
+        if recipe.off_model > 0:
+            bent = bend_off_model(self.model, self.identity, recipe.off_model, seed)
+            self.drawn_model, self._drawn_face = bent.model, bent.face(self.face, recipe.fps, seed)
+            self.face = replace(self.face, vertex_offsets=bent.offsets)
+        self.cameras = cameras_of(recipe)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera in front."""
+        return self.cameras[0]
 
     @cached_property
     def subject(self) -> Subject:
         """The person; takes some seconds when first asked for."""
-        return build_subject(self.model, self.identity, self.recipe, self.seed)
+        return build_subject(self.drawn_model, self.identity, self.recipe, self.seed)
 
     @cached_property
-    def background(self) -> Float[np.ndarray, "h w 3"]:
-        """The empty room, linear."""
-        return wall(self.recipe, self.seed)
+    def backgrounds(self) -> list[Float[np.ndarray, "h w 3"]]:
+        """The empty room as each camera sees it, linear."""
+        return [wall(self.recipe, self.seed + 31 * index) for index in range(len(self.cameras))]
 
     def vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
-        """True vertices of the face model, world space, metres."""
-        return self.model(self.face[timestep])[0]
+        """True vertices of the head, in the face model's topology, world space, metres."""
+        return self.drawn_model(self._drawn_face[timestep])[0]
 
-    def frame(self, timestep: int) -> SyntheticFrame:
-        """The picture of one timestep; the same bytes every time. Safe to call from several threads at once."""
-        face = self.face[timestep]
+    def head_vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
+        """True vertices of the head in the head frame, metres."""
+        return self.drawn_model.head_vertices(self._drawn_face[timestep])[0]
+
+    def frame(self, timestep: int, camera: int = 0) -> SyntheticFrame:
+        """One picture; the same bytes every time. Safe to call from several threads at once."""
+        return self.timestep_frames(timestep, (camera,))[0]
+
+    def timestep_frames(self, timestep: int, cameras: Sequence[int] | None = None) -> list[SyntheticFrame]:
+        """The pictures of some cameras (default: all) at one timestep; posing is shared."""
+        face = self._drawn_face[timestep]
         posed = pose_subject(self.subject, face, self.camera.position.numpy())
-        colors, coverage = draw(
-            self.subject, posed, self.camera.in_frame(face.T_world_head[0]), self.recipe.supersample
-        )
-        image = develop(colors, coverage, self.background)
-        random = np.random.default_rng([self.seed, 8, timestep])
-        return SyntheticFrame(to_uint8(image, self.recipe.noise, random), np.rint(coverage * 255).astype(np.uint8))
+        frames = []
+        for index in range(len(self.cameras)) if cameras is None else cameras:
+            camera = self.cameras[index].in_frame(face.T_world_head[0])
+            seen = replace(posed, viewpoint=camera.position.numpy())
+            colors, coverage = draw(self.subject, seen, camera, self.recipe.supersample)
+            image = develop(colors, coverage, self.backgrounds[index])
+            random = np.random.default_rng([self.motion_seed, 8, timestep, *([index] if index else [])])
+            frames.append(
+                SyntheticFrame(to_uint8(image, self.recipe.noise, random), np.rint(coverage * 255).astype(np.uint8))
+            )
+        return frames
 
     def frames(self) -> Iterator[SyntheticFrame]:
-        """All pictures in order, drawn by up to MIEN_THREADS threads, a few of them ahead of what was asked for."""
+        """The front camera's pictures in order."""
+        for frames in self.all_frames(range(self.recipe.timesteps), (0,)):
+            yield frames[0]
+
+    def all_frames(
+        self, timesteps: Sequence[int], cameras: Sequence[int] | None = None
+    ) -> Iterator[list[SyntheticFrame]]:
+        """Pictures of some timesteps in order, by up to MIEN_THREADS threads, a few ahead of what was asked for."""
         assert self.subject is not None
+        assert self.backgrounds
         threads = int(os.environ.get("MIEN_THREADS", 0)) or os.cpu_count() or 1
         before = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
             with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-                pending: list[Future[SyntheticFrame]] = []
-                for timestep in range(self.recipe.timesteps):
-                    pending.append(pool.submit(self.frame, timestep))
+                pending: list[Future[list[SyntheticFrame]]] = []
+                for timestep in timesteps:
+                    pending.append(pool.submit(self.timestep_frames, timestep, cameras))
                     if len(pending) > threads * _AHEAD:
                         yield pending.pop(0).result()
                 for future in pending:
@@ -91,26 +129,31 @@ class SyntheticScene:
         finally:
             torch.set_num_threads(before)
 
-    def landmarks(self) -> Float[np.ndarray, "t l 2"]:
-        """MediaPipe's 478 points of every timestep in pixels, by the face model's embedding."""
+    def landmarks(self, camera: int = 0) -> Float[np.ndarray, "t l 2"]:
+        """MediaPipe's 478 points of every timestep in pixels, by the face model's embedding, hidden ones too."""
         projected = []
         for timestep in range(self.recipe.timesteps):
             points = self.model.landmark_positions(self.vertices(timestep), "mediapipe")
-            projected.append(self.camera.project(points)[0])
+            projected.append(self.cameras[camera].project(points)[0])
         return torch.stack(projected).numpy()
 
     def tracking(self) -> Tracking:
-        """The truth."""
+        """The truth. With `recipe.off_model` it is the truth only for head pose, cameras and the neutral shape."""
         timesteps = self.recipe.timesteps
         return Tracking(
             face_model=self.model.name,
             face_model_hash=self.model.content_hash,
             face=self.face,
             valid=torch.ones(timesteps, dtype=torch.bool),
-            cameras=(self.camera,),
-            neck_lines=fit_neck_lines(self.model, self.face, (self.camera,)),
-            residuals=torch.zeros(timesteps, 1),
-            settings={"kind": "synthetic", "seed": self.seed, "recipe": asdict(self.recipe)},
+            cameras=self.cameras,
+            neck_lines=fit_neck_lines(self.model, self.face, self.cameras),
+            residuals=torch.zeros(timesteps, len(self.cameras)),
+            settings={
+                "kind": "synthetic",
+                "seed": self.seed,
+                "motion_seed": self.motion_seed,
+                "recipe": asdict(self.recipe),
+            },
         )
 
     @property
@@ -121,6 +164,7 @@ class SyntheticScene:
         content = {
             "recipe": asdict(self.recipe),
             "seed": self.seed,
+            "motion_seed": self.motion_seed,
             "face_model": self.model.content_hash,
             "landmarks": hashlib.sha256(embedding).hexdigest()[:16],
         }
