@@ -81,7 +81,7 @@ def test_matte_is_the_coverage(scene):
     frame = scene.frame(3)
     darker = SyntheticScene(SMALL, seed=3)
     darker.__dict__["subject"] = scene.subject  # the same person, not built again
-    darker.__dict__["backgrounds"] = [np.zeros_like(scene.backgrounds[0])]
+    darker.__dict__["background"] = np.zeros_like(scene.background)
     black = darker.frame(3)
     np.testing.assert_array_equal(black.matte, frame.matte)
     assert (black.image[frame.matte == 0] == 0).all()

@@ -28,17 +28,17 @@ class Strands:
         """Unit directions along the strands."""
         return unit(np.gradient(self.points, axis=1).astype(np.float32))
 
-    def ribbon_faces(self) -> Int[np.ndarray, "f 3"]:
-        """Triangles over `ribbon_vertices`."""
-        n, s = self.points.shape[:2]
-        start = 2 * (np.arange(n)[:, None] * s + np.arange(s - 1))
-        quads = np.stack([start, start + 1, start + 3, start, start + 3, start + 2], -1)
-        return quads.reshape(-1, 3).astype(np.int64)
-
     def ribbon_vertices(self, viewpoint: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "v 3"]:
         """Two vertices a point, apart by its width, across the view from `viewpoint` (head frame)."""
         across = np.cross(self.tangents, viewpoint - self.points)
         return ribbon(self.points, unit(across), self.widths)
+
+
+def ribbon_faces(strands: int, points: int) -> Int[np.ndarray, "f 3"]:
+    """Triangles over the `ribbon_vertices` of so many strands with so many points each."""
+    start = 2 * (np.arange(strands)[:, None] * points + np.arange(points - 1))
+    quads = np.stack([start, start + 1, start + 3, start, start + 3, start + 2], -1)
+    return quads.reshape(-1, 3).astype(np.int64)
 
 
 def ribbon(points: np.ndarray, across: np.ndarray, widths: np.ndarray) -> Float[np.ndarray, "v 3"]:
@@ -70,7 +70,7 @@ def short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, coun
     enters the head.
     """
     random, noise = np.random.default_rng([seed, 3]), SolidNoise(seed + 31)
-    roots = _scalp_points(anatomy, count, random)
+    roots = scalp_points(anatomy, count, random)
     part = random.choice([-1.0, 1.0]) * 0.028
     centre = anatomy.skull_centre
     direction = unit(roots - centre)
@@ -101,7 +101,8 @@ def short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, coun
     return Strands(points, (0.00095 * taper).astype(np.float32), colors.astype(np.float32), outwards)
 
 
-def _scalp_points(anatomy: Anatomy, count: int, random: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+def scalp_points(anatomy: Anatomy, count: int, random: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+    """Places on the scalp where hair grows, evenly spread, thinning out at the hairline."""
     faces = anatomy.faces[anatomy.skin & ~anatomy.region("ears")]
     corners = anatomy.vertices[faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)

@@ -98,14 +98,19 @@ class Visibility:
 def compute_visibility(
     points: Float[np.ndarray, "v 3"],
     normals: Float[np.ndarray, "v 3"],
-    occluders: tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]],
+    occluders: tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]] | None,
 ) -> Visibility:
-    """Shadow maps from all around: a point is lit from where its depth is (within 2 mm) the first."""
+    """Shadow maps from all around: a point is lit from where its depth is (within 2 mm) the first.
+
+    Without occluders nothing is in shadow.
+    """
     index = np.arange(_DIRECTIONS) + 0.5
     polar, azimuth = np.arccos(1 - 2 * index / _DIRECTIONS), math.pi * (1 + 5**0.5) * index  # Fibonacci's spiral
     directions = np.stack([np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth)], -1)
     directions = directions.astype(np.float32)
     unshadowed = np.clip(normals @ directions.T, 0, None)
+    if occluders is None:
+        return Visibility(directions, unshadowed, unshadowed)
     visible = np.stack([_lit_share(points + 0.0015 * normals, direction, occluders) for direction in directions], -1)
     return Visibility(directions, unshadowed * visible, unshadowed)
 

@@ -144,7 +144,8 @@ def _paint_eyes(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
         axis = unit(posed.head[eye.front].mean(0) - centre) if len(eye.front) else np.array([0, 0, 1], np.float32)
         colors[mine] = shading.shade_eye(
             unit(values[mine, :3]), unit(points - centre), axis, under,
-            canvas.views(canvas.pixels[rows[mine]]), canvas.light, (eye.iris_size, subject.iris_color),
+            canvas.views(canvas.pixels[rows[mine]]), canvas.light,
+            (eye.iris_size, subject.iris_color, subject.wet_eyes),
         )  # fmt: skip
     return colors
 
@@ -171,9 +172,7 @@ def _paint_hair(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
     subject, posed = canvas.subject, canvas.posed
     colors = np.zeros_like(canvas.vertices)
     start = len(posed.head)
-    for strands in (subject.hair, posed.brows, posed.lashes):
-        if strands is None:
-            continue
+    for strands in posed.strands:
         shaded = shading.shade_hair(strands, canvas.light, posed.viewpoint).reshape(-1, 3)
         colors[start : start + 2 * len(shaded)] = np.repeat(shaded, 2, axis=0)
         start += 2 * len(shaded)

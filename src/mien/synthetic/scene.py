@@ -71,9 +71,9 @@ class SyntheticScene:
         return build_subject(self.drawn_model, self.identity, self.recipe, self.seed)
 
     @cached_property
-    def backgrounds(self) -> list[Float[np.ndarray, "h w 3"]]:
-        """The empty room as each camera sees it, linear."""
-        return [wall(self.recipe, self.seed + 31 * index) for index in range(len(self.cameras))]
+    def background(self) -> Float[np.ndarray, "h w 3"]:
+        """The empty room, linear; it looks the same to every camera."""
+        return wall(self.recipe, self.seed)
 
     def vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
         """True vertices of the head, in the face model's topology, world space, metres."""
@@ -96,7 +96,7 @@ class SyntheticScene:
             camera = self.cameras[index].in_frame(face.T_world_head[0])
             seen = replace(posed, viewpoint=camera.position.numpy())
             colors, coverage = draw(self.subject, seen, camera, self.recipe.supersample)
-            image = develop(colors, coverage, self.backgrounds[index])
+            image = develop(colors, coverage, self.background)
             random = np.random.default_rng([self.motion_seed, 8, timestep, *([index] if index else [])])
             frames.append(
                 SyntheticFrame(to_uint8(image, self.recipe.noise, random), np.rint(coverage * 255).astype(np.uint8))
@@ -113,7 +113,7 @@ class SyntheticScene:
     ) -> Iterator[list[SyntheticFrame]]:
         """Pictures of some timesteps in order, by up to MIEN_THREADS threads, a few ahead of what was asked for."""
         assert self.subject is not None
-        assert self.backgrounds
+        assert self.background is not None
         threads = int(os.environ.get("MIEN_THREADS", 0)) or os.cpu_count() or 1
         before = torch.get_num_threads()
         torch.set_num_threads(1)

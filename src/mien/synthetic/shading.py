@@ -120,7 +120,7 @@ def shade_eye(
     under_lid: Float[np.ndarray, " n"],
     views: Float[np.ndarray, "n 3"],
     light: LocalLight,
-    iris: tuple[float, np.ndarray],
+    iris: tuple[float, np.ndarray, bool],
 ) -> Float[np.ndarray, "n 3"]:
     """White with veins towards the corners; iris with fibres, limbal ring and pupil; a wet cornea.
 
@@ -131,9 +131,9 @@ def shade_eye(
         under_lid: Metres below the upper lid's rim.
         views: Towards the camera.
         light: The scene's.
-        iris: Its size (sine of the angle to its rim) and its colour.
+        iris: Its size (sine of the angle to its rim), its colour, and whether the eye is wet.
     """
-    size, color = iris
+    size, color, is_wet = iris
     radius = np.linalg.norm(local[:, :2], axis=-1)
     q = radius / size
     turn = np.arctan2(local[:, 1], local[:, 0])
@@ -155,6 +155,8 @@ def shade_eye(
     outward = normals - along(normals, axis)[:, None] * axis
     bowl = unit(normals - 1.2 * share * outward)
     diffuse = albedo * light.irradiance(bowl.astype(np.float32)) * shadow
+    if not is_wet:
+        return diffuse
     cornea = unit(normals + 0.75 * outward * smoothstep(1.25, 0.9, q)[:, None])
     wet = highlight(cornea, views, light, ((0.5, 900.0), (0.1, 60.0)))
     return diffuse + np.minimum(wet, 1.5) * (0.25 + 0.75 * shadow)

@@ -11,6 +11,7 @@ from mien.camera import Camera
 from mien.render.mesh import interpolate, rasterize_mesh
 from mien.synthetic import anatomy as places
 from mien.synthetic.anatomy import SIDES, Anatomy, FrontView, face_view
+from mien.synthetic.beard import beard_zone
 from mien.synthetic.noise import SolidNoise, smoothstep
 from mien.synthetic.recipe import SyntheticRecipe
 
@@ -55,9 +56,10 @@ def paint_skin(
     canvas.albedo[:] = tone * np.exp(random.normal(0, 0.04))
     view = face_view(anatomy)
     _paint_zones(canvas, anatomy, noise)
-    _paint_detail(canvas, anatomy, noise, random)
+    _paint_detail(canvas, anatomy, noise, random, recipe.detail.pores)
     _paint_eyes(canvas, anatomy, view)
-    _paint_stubble(canvas, anatomy, noise, max(recipe.stubble, 0.12 * (random.uniform() < 0.5)), hair_color)
+    stubble = max(recipe.stubble, 0.12 * (random.uniform() < 0.5), 0.8 * (recipe.beard > 0))
+    _paint_stubble(canvas, anatomy, noise, stubble, hair_color)
     _paint_lips(canvas, anatomy, view, noise, tone)
     _paint_brows(canvas, anatomy, view, noise, hair_color)
     if recipe.hair != "none":
@@ -130,10 +132,12 @@ def _paint_zones(canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise) -> None:
     canvas.albedo[:] *= np.exp(-0.10 * canvas.neck[:, None])
 
 
-def _paint_detail(canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise, random: np.random.Generator) -> None:
+def _paint_detail(
+    canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise, random: np.random.Generator, pores: float
+) -> None:
     """Mottling, freckles, moles; pores and fine lines as bumps; oil on forehead and nose."""
     points, marks = canvas.points, anatomy.landmarks
-    fine, tiny = noise(points, 0.0022), noise(points + 0.5, 0.0011)
+    fine, tiny = pores * noise(points, 0.0022), pores * noise(points + 0.5, 0.0011)
     canvas.albedo[:] *= np.exp(0.05 * fine + 0.05 * tiny + 0.05 * noise.octaves(points, 0.03, 2))[:, None]
     middle = 0.5 * (marks[places.CHEEKS[0]] + marks[places.CHEEKS[1]])
     freckled = np.clip(_near(points, middle + [0, 0.01, 0], 0.04) * 1.3, 0, 1) * random.uniform(0.25, 1.0)
@@ -149,7 +153,7 @@ def _paint_detail(canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise, random: 
     canvas.gloss[:] = (0.7 + 0.8 * oily + 0.15 * cheeks) * (1 + 0.35 * fine + 0.2 * noise(points, 0.012))
     canvas.height[:] += 0.00004 * fine + 0.00003 * tiny * (1 + cheeks)
     brow = _near(points, 0.5 * (marks[places.FOREHEAD_TOP] + marks[9]), 0.024)
-    folds = noise(points * np.array([0.22, 1.0, 0.22], np.float32) + 3.1, 0.0045)
+    folds = pores * noise(points * np.array([0.22, 1.0, 0.22], np.float32) + 3.1, 0.0045)
     canvas.height[:] += 0.00006 * folds * brow
 
 
@@ -212,13 +216,8 @@ def _paint_stubble(
     """Dots of cut hair over upper lip, chin and jaw."""
     if strength <= 0:
         return
-    points, marks = canvas.points, anatomy.landmarks
-    nose, mouth = marks[places.NOSE_BASE], marks[places.MOUTH_TOP]
-    width = 0.5 * abs(marks[454, 0] - marks[234, 0])
-    border = np.interp(np.abs(points[:, 0]), [0, 0.2 * width, 0.5 * width, 0.85 * width, width],
-                       [nose[1], nose[1], mouth[1] - 0.004, nose[1] - 0.01, nose[1] + 0.02])  # fmt: skip
-    zone = smoothstep(0.004, -0.008, points[:, 1] - border) * smoothstep(-0.055, -0.035, points[:, 1] - marks[152, 1])
-    zone *= smoothstep(-0.02, 0.01, points[:, 2] - marks[234, 2])
+    points = canvas.points
+    zone = beard_zone(anatomy, points)
     dots = smoothstep(0.1, 0.5, noise(points + 4.2, 0.0008)) * (0.7 + 0.3 * noise(points, 0.006))
     share = (strength * zone * (0.28 + 0.6 * dots))[:, None]
     canvas.albedo[:] = canvas.albedo * (1 - share) + (0.6 * hair_color + 0.02) * share

@@ -10,8 +10,10 @@ from mien.face import FaceModel, FaceParams
 from mien.render.mesh import vertex_normals
 from mien.synthetic.accessories import Glasses, Part, build_glasses, build_shirt
 from mien.synthetic.anatomy import CHIN, SIDES, Anatomy, measure
-from mien.synthetic.hair import SkinStrands, Strands, brow_strands, lash_strands, short_hair
+from mien.synthetic.beard import RootedStrands, full_beard
+from mien.synthetic.hair import SkinStrands, Strands, brow_strands, lash_strands, ribbon_faces, short_hair
 from mien.synthetic.light import Lighting, Visibility, compute_visibility, studio_lighting
+from mien.synthetic.long_hair import DrapedStrands, long_hair
 from mien.synthetic.motion import neck_pivot, shoulder_rotation
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.skin import SkinTextures, paint_skin
@@ -57,9 +59,11 @@ class Subject:
     visibility: Visibility
     eyes: tuple[Eye, ...]
     iris_color: Float[np.ndarray, " 3"]
+    wet_eyes: bool
     shirt_color: Float[np.ndarray, " 3"]
-    hair: Strands | None
-    brows: SkinStrands | None
+    hair: Strands | DrapedStrands | None
+    on_skin: tuple[SkinStrands | RootedStrands, ...]
+    """Brows and beard."""
     lashes: bool
     glasses: Glasses | None
     shirt: Part | None
@@ -79,8 +83,8 @@ class PosedSubject:
     normals: Float[np.ndarray, "v 3"]
     landmarks: Float[np.ndarray, "l 3"]
     eye_centres: Float[np.ndarray, "2 3"]
-    brows: Strands | None
-    lashes: Strands | None
+    strands: tuple[Strands, ...]
+    """Hair, brows, beard, lashes: what there is, in the order of the subject's `faces`."""
     T_head_shoulders: Float[np.ndarray, "4 4"]
     R_world_head: Float[np.ndarray, "3 3"]
     viewpoint: Float[np.ndarray, " 3"]
@@ -92,24 +96,32 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
     random = np.random.default_rng([seed, 6])
     anatomy = measure(model, identity)
     hair_color = _HAIR_COLORS[random.integers(len(_HAIR_COLORS))]
-    hair = short_hair(anatomy, hair_color, seed) if recipe.hair == "short" else None
-    glasses = build_glasses(anatomy) if recipe.glasses else None
     collar, size = _collar(anatomy)
+    hair = _grow_hair(anatomy, recipe, hair_color, float(collar[1]), seed)
+    glasses = build_glasses(anatomy) if recipe.glasses else None
     shirt = build_shirt(collar, size, _shoulder_points(anatomy, collar, size), seed) if recipe.clothes else None
-    brows = brow_strands(anatomy, 0.7 * hair_color, seed) if recipe.brows_and_lashes else None
+    on_skin: tuple[SkinStrands | RootedStrands, ...] = ()
+    if recipe.brows_and_lashes:
+        on_skin += (brow_strands(anatomy, 0.7 * hair_color, seed),)
+    if recipe.beard > 0:
+        on_skin += (full_beard(anatomy, 0.8 * hair_color, recipe.beard, seed),)
     kept = _uncovered_faces(anatomy, collar) if recipe.clothes else np.arange(len(anatomy.faces))
-    faces, materials = _all_faces(anatomy, kept, hair, brows, recipe.brows_and_lashes, glasses, shirt)
+    faces, materials = _all_faces(
+        anatomy, kept, _strand_sizes(hair, on_skin, recipe.brows_and_lashes, anatomy), glasses, shirt
+    )
+    occluders = _occluders(anatomy, _at_rest(hair), glasses, shirt) if recipe.detail.shadows else None
     return Subject(
         model=model,
         anatomy=anatomy,
         textures=paint_skin(anatomy, recipe, seed, 0.75 * hair_color),
         lighting=studio_lighting(seed),
-        visibility=compute_visibility(anatomy.vertices, anatomy.normals, _occluders(anatomy, hair, glasses, shirt)),
+        visibility=compute_visibility(anatomy.vertices, anatomy.normals, occluders),
         eyes=tuple(_eye(anatomy, side) for side in SIDES),
         iris_color=_IRIS_COLORS[random.integers(len(_IRIS_COLORS))],
+        wet_eyes=recipe.detail.wet_eyes,
         shirt_color=_SHIRT_COLORS[random.integers(len(_SHIRT_COLORS))],
         hair=hair,
-        brows=brows,
+        on_skin=on_skin,
         lashes=recipe.brows_and_lashes,
         glasses=glasses,
         shirt=shirt,
@@ -128,23 +140,53 @@ def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.n
     T_world_head = face.T_world_head[0].numpy()
     R = T_world_head[:3, :3]
     centres = np.stack([head.numpy()[eye.vertices].mean(0) for eye in subject.eyes])
+    T_head_shoulders = _shoulders(subject, face, R)
     return PosedSubject(
         head=head.numpy(),
         normals=normals,
         landmarks=landmarks,
         eye_centres=centres,
-        brows=subject.brows.posed(subject.anatomy, head.numpy(), normals) if subject.brows else None,
-        lashes=lash_strands(landmarks, centres, subject.eyes[0].radius) if subject.lashes else None,
-        T_head_shoulders=_shoulders(subject, face, R),
+        strands=_posed_strands(subject, head.numpy(), normals, landmarks, centres, T_head_shoulders),
+        T_head_shoulders=T_head_shoulders,
         R_world_head=R,
         viewpoint=R.T @ (camera_position - T_world_head[:3, 3]),
     )
 
 
+def _grow_hair(
+    anatomy: Anatomy, recipe: SyntheticRecipe, color: Float[np.ndarray, " 3"], collar: float, seed: int
+) -> Strands | DrapedStrands | None:
+    if recipe.hair == "none":
+        return None
+    return long_hair(anatomy, color, collar, seed) if recipe.hair == "long" else short_hair(anatomy, color, seed)
+
+
+def _at_rest(hair: Strands | DrapedStrands | None) -> Strands | None:
+    return hair.rest if isinstance(hair, DrapedStrands) else hair
+
+
+def _posed_strands(
+    subject: Subject,
+    head: np.ndarray,
+    normals: np.ndarray,
+    landmarks: np.ndarray,
+    eye_centres: np.ndarray,
+    T_head_shoulders: np.ndarray,
+) -> tuple[Strands, ...]:
+    strands = []
+    if subject.hair is not None:
+        hair = subject.hair
+        strands.append(hair.posed(T_head_shoulders) if isinstance(hair, DrapedStrands) else hair)
+    strands += [part.posed(subject.anatomy, head, normals) for part in subject.on_skin]
+    if subject.lashes:
+        strands.append(lash_strands(landmarks, eye_centres, subject.eyes[0].radius))
+    return tuple(strands)
+
+
 def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, "w 3"]:
     """Vertices of `subject.faces`, head frame."""
     parts = [posed.head]
-    parts += [s.ribbon_vertices(posed.viewpoint) for s in (subject.hair, posed.brows, posed.lashes) if s is not None]
+    parts += [strands.ribbon_vertices(posed.viewpoint) for strands in posed.strands]
     if subject.glasses is not None:
         parts.append(subject.glasses.frame.vertices)
     if subject.shirt is not None:
@@ -214,7 +256,7 @@ def _occluders(
     if hair is not None:
         wide = Strands(hair.points[::4], 3.0 * hair.widths[::4], hair.colors[::4], hair.outwards[::4])
         # Seen from far above its lie, a strand is as wide as it is on the skin.
-        meshes.append((wide.ribbon_vertices(anatomy.skull_centre), wide.ribbon_faces()))
+        meshes.append((wide.ribbon_vertices(anatomy.skull_centre), ribbon_faces(*wide.widths.shape)))
     meshes += [
         (part.vertices, part.faces) for part in ([glasses.frame] if glasses else []) + ([shirt] if shirt else [])
     ]
@@ -227,12 +269,25 @@ def _stack(meshes: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.
     return vertices, np.concatenate([faces + offset for (_, faces), offset in zip(meshes, offsets, strict=False)])
 
 
+def _strand_sizes(
+    hair: Strands | DrapedStrands | None,
+    on_skin: tuple[SkinStrands | RootedStrands, ...],
+    lashes: bool,
+    anatomy: Anatomy,
+) -> list[tuple[int, int]]:
+    """Strands and points a strand of everything that grows, in drawing order."""
+    rest = _at_rest(hair)
+    sizes = [] if rest is None else [rest.widths.shape]
+    sizes += [strands.widths.shape for strands in on_skin]
+    if lashes:
+        sizes.append(lash_strands(anatomy.landmarks, np.zeros((2, 3)), 0.017).widths.shape)
+    return sizes
+
+
 def _all_faces(
     anatomy: Anatomy,
     kept: np.ndarray,
-    hair: Strands | None,
-    brows: SkinStrands | None,
-    lashes: bool,
+    strand_sizes: list[tuple[int, int]],
     glasses: Glasses | None,
     shirt: Part | None,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -249,14 +304,8 @@ def _all_faces(
         materials.append(np.full(len(part_faces), material))
         start += vertices
 
-    if hair is not None:
-        add(hair.ribbon_faces(), 2 * hair.widths.size, HAIR)
-    if brows is not None:
-        empty = np.zeros((*brows.widths.shape, 3), np.float32)
-        add(Strands(empty, brows.widths, empty, empty).ribbon_faces(), 2 * brows.widths.size, HAIR)
-    if lashes:
-        strands = lash_strands(anatomy.landmarks, np.zeros((2, 3)), 0.017)
-        add(strands.ribbon_faces(), 2 * strands.widths.size, HAIR)
+    for strands, points in strand_sizes:
+        add(ribbon_faces(strands, points), 2 * strands * points, HAIR)
     if glasses is not None:
         add(glasses.frame.faces, len(glasses.frame.vertices), FRAME)
     if shirt is not None:
