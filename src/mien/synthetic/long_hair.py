@@ -103,9 +103,9 @@ class _Path:
         top = smoothstep(0.3, 0.85, outward[:, 1])
         mirrored = points * np.array([1, 1, 1], np.float32)
         mirrored[:, 0] = np.abs(mirrored[:, 0])
-        at_ear = np.exp(-((mirrored - self._ear) ** 2).sum(-1) / (2 * 0.026**2))
+        at_ear = np.exp(-((mirrored - self._ear) ** 2).sum(-1) / (2 * 0.042**2))
         height = self._layer * (0.011 + 0.009 * top) * smoothstep(-0.02, 0.25, np.full(len(points), along))
-        height = height + 0.003 + 0.017 * at_ear * (along > 0.05)
+        height = height + 0.003 + 0.016 * at_ear * (along > 0.05)
         least = self._anatomy.skull_radius(outward.astype(np.float32)) + height
         upper = smoothstep(self._chin - 0.06, self._chin - 0.02, points[:, 1])
         # On the skull a strand lies; where the skull recedes it hangs free.

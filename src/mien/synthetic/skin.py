@@ -63,7 +63,9 @@ def paint_skin(
     _paint_lips(canvas, anatomy, view, noise, tone)
     _paint_brows(canvas, anatomy, view, noise, hair_color)
     if recipe.hair != "none":
-        share = 0.85 * anatomy.hair_share(canvas.points)[:, None]
+        # Long hair is combed away from the hairline, which shows skin.
+        lowered = np.array([0, 0.022 if recipe.hair == "long" else 0.0, 0], np.float32)
+        share = 0.85 * anatomy.hair_share(canvas.points - lowered)[:, None]
         canvas.albedo[:] = canvas.albedo * (1 - share) + 0.5 * hair_color * share
     gradient = _surface_gradient(canvas, positions)
     channels = np.zeros((*canvas.covered.shape, 7), np.float32)
