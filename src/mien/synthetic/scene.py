@@ -39,15 +39,23 @@ class SyntheticFrame:
 class SyntheticScene:
     """A person in motion before a camera; everything follows from the recipe and the seed."""
 
-    def __init__(self, recipe: SyntheticRecipe, seed: int, motion_seed: int | None = None) -> None:
+    def __init__(
+        self,
+        recipe: SyntheticRecipe,
+        seed: int,
+        motion_seed: int | None = None,
+        same_person: "SyntheticScene | None" = None,
+    ) -> None:
         """Lay out a scene; nothing is drawn yet.
 
         Args:
             recipe: What it shows.
             seed: Decides the person, the light and the room.
             motion_seed: Decides what the person does; None for `seed`. Sequences of one subject share only `seed`.
+            same_person: Another scene with the same person, who then is built only once.
         """
         self.recipe, self.seed, self.motion_seed = recipe, seed, seed if motion_seed is None else motion_seed
+        self._same_person = same_person
         self.model: FaceModel = load_face_model(recipe.face_model)
         count = self.model.identity_basis.shape[0]
         coefficients = np.random.default_rng([seed, 0]).standard_normal(count).astype(np.float32)
@@ -68,6 +76,8 @@ class SyntheticScene:
     @cached_property
     def subject(self) -> Subject:
         """The person; takes some seconds when first asked for."""
+        if self._same_person is not None:
+            return self._same_person.subject
         return build_subject(self.drawn_model, self.identity, self.recipe, self.seed)
 
     @cached_property

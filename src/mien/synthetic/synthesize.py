@@ -24,21 +24,25 @@ def synthesize(recipe: SyntheticRecipe, seed: int) -> tuple[Capture, Tracking]:
         >>> capture, truth = synthesize(RECIPES["plain"], seed=3)
     """
     scene = SyntheticScene(recipe, seed)
-    shape = (recipe.timesteps, 1, recipe.height, recipe.width)
+    cameras = len(scene.cameras)
+    shape = (recipe.timesteps, cameras, recipe.height, recipe.width)
     images, mattes = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint8)
-    for timestep, frame in enumerate(track_progress(scene.frames(), f"Drawing {recipe.name}", recipe.timesteps)):
-        images[timestep, 0], mattes[timestep, 0] = frame.image, frame.matte
+    drawn = track_progress(scene.all_frames(range(recipe.timesteps)), f"Drawing {recipe.name}", recipe.timesteps)
+    for timestep, frames in enumerate(drawn):
+        for camera, frame in enumerate(frames):
+            images[timestep, camera], mattes[timestep, camera] = frame.image, frame.matte
     capture = Capture(
         name=recipe.name,
-        camera_ids=("front",),
+        camera_ids=recipe.camera_ids,
         fps=recipe.fps,
         timestamps=np.arange(recipe.timesteps) / recipe.fps,
         images=images,
         mattes=mattes,
-        landmarks=scene.landmarks()[:, None],
-        valid=np.ones((recipe.timesteps, 1), bool),
-        principal_point=np.array([[recipe.width / 2, recipe.height / 2]], np.float32),
+        landmarks=np.stack([scene.landmarks(camera) for camera in range(cameras)], axis=1),
+        valid=np.ones((recipe.timesteps, cameras), bool),
+        principal_point=np.tile(np.array([recipe.width / 2, recipe.height / 2], np.float32), (cameras, 1)),
         source=scene.source,
+        calibration=scene.cameras if cameras > 1 else None,
     )
     return capture, scene.tracking()
 
@@ -51,4 +55,4 @@ def write_synthetic_video(recipe: SyntheticRecipe, path: Path, seed: int) -> Non
         for frame in track_progress(scene.frames(), f"Drawing {recipe.name}", recipe.timesteps):
             yield frame.image
 
-    write_video(path, images(), recipe.fps)
+    write_video(path, images(), recipe.fps, recipe.detail.compression)

@@ -1,0 +1,123 @@
+"""Reference captures: fixed recipes by name, the same for everybody, that figures are quoted on."""
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mien.errors import UserError
+from mien.synthetic.recipe import Segment, SyntheticRecipe
+from mien.synthetic.scene import SyntheticScene
+from mien.synthetic.writing import hash_scene, write_scene
+
+
+@dataclass(frozen=True)
+class ReferenceCapture:
+    """One synthetic person in one or several sequences, and how it is trained on for comparison."""
+
+    name: str
+    what: str
+    """One line for tables."""
+    seed: int
+    """Of the person."""
+    sequences: tuple[SyntheticRecipe, ...]
+    """Their names are the sequences'."""
+    held_out_sequences: tuple[str, ...] = ()
+    held_out_cameras: tuple[str, ...] = ()
+    steps: int = 2_000
+    """Optimiser steps of `mien bench quality`."""
+
+    def scenes(self) -> list[SyntheticScene]:
+        """The sequences, not yet drawn; the person is shared, what happens differs."""
+        scenes: list[SyntheticScene] = []
+        for index, recipe in enumerate(self.sequences):
+            scenes.append(SyntheticScene(recipe, self.seed, 1000 * self.seed + index, scenes[0] if scenes else None))
+        return scenes
+
+    def write(self, folder: Path) -> str:
+        """Draw every sequence into FOLDER/NAME, unless it is there; returns the hash of the whole reference."""
+        return combined_hash([write_scene(scene, folder / scene.recipe.name) for scene in self.scenes()])
+
+    def hash_in_memory(self) -> str:
+        """The same hash, without writing anything: for tiny versions."""
+        return combined_hash([hash_scene(scene) for scene in self.scenes()])
+
+    def tiny(self) -> "ReferenceCapture":
+        """The same people and motions in three frames of 64x64 pixels from at most three cameras: for tests."""
+        small = [
+            replace(
+                recipe, width=64, height=64, texture_size=128, supersample=1, ring_size=3,
+                fps=3 / sum(segment.seconds for segment in recipe.script),
+            )
+            for recipe in self.sequences
+        ]  # fmt: skip
+        return replace(self, sequences=tuple(small))
+
+
+def combined_hash(hashes: list[str]) -> str:
+    """One sequence's own hash, or one over those of several."""
+    return hashes[0] if len(hashes) == 1 else hashlib.sha256(" ".join(hashes).encode()).hexdigest()[:16]
+
+
+def reference_named(name: str) -> ReferenceCapture:
+    """A reference capture by its name.
+
+    Raises:
+        UserError: there is none.
+    """
+    if name not in REFERENCES:
+        raise UserError(f"there is no reference capture {name!r}; choose of: {', '.join(REFERENCES)}")
+    return REFERENCES[name]
+
+
+def _script(*parts: tuple[str, float]) -> tuple[Segment, ...]:
+    return tuple(Segment(kind, seconds) for kind, seconds in parts)  # type: ignore[arg-type]
+
+
+_PERSON = SyntheticRecipe(glasses=False, turns=(35.0, 16.0), rotation=(20.0, 10.0, 7.0))
+_BRIEF = replace(
+    _PERSON, width=384, height=384, fps=20.0,
+    script=_script(("still", 1.0), ("free", 5.0), ("turns", 4.0), ("still", 1.0)),
+)  # fmt: skip
+_RING = replace(
+    _PERSON, width=256, height=256, fps=10.0, cameras="ring", translation=(0.012, 0.008, 0.02),
+    rotation=(8.0, 5.0, 4.0), turns=(30.0, 14.0),
+)  # fmt: skip
+
+
+def _one(name: str, what: str, seed: int, recipe: SyntheticRecipe, steps: int = 2_000) -> ReferenceCapture:
+    return ReferenceCapture(name, what, seed, (replace(recipe, name=name),), steps=steps)
+
+
+REFERENCES = {
+    reference.name: reference
+    for reference in (
+        _one(
+            "mono-short", "20 s of one camera, 512x512, 25 fps", 2,
+            replace(_PERSON, script=_script(
+                ("still", 1.5), ("free", 6.0), ("speech", 4.0), ("turns", 5.0), ("free", 2.0), ("still", 1.5)
+            )),
+        ),
+        _one(
+            "mono-long", "2 minutes of one camera, 384x384, 15 fps: speech, posed expressions, wide turns", 13,
+            replace(_PERSON, width=384, height=384, fps=15.0, turns=(58.0, 24.0), script=_script(
+                ("still", 2.0), ("speech", 40.0), ("expressions", 34.0), ("turns", 24.0), ("still", 2.0),
+                ("free", 16.0), ("still", 2.0),
+            )),
+            steps=3_000,
+        ),
+        ReferenceCapture(
+            "ring-16", "16 calibrated cameras, 256x256, 10 fps: turns, expressions, speech (held out)", 8,
+            (
+                replace(_RING, name="turns", script=_script(("still", 0.6), ("turns", 2.4))),
+                replace(_RING, name="expressions", script=_script(("expressions", 4.0))),
+                replace(_RING, name="speech", script=_script(("speech", 2.4), ("still", 0.6))),
+            ),
+            held_out_sequences=("speech",), held_out_cameras=("08",),
+        ),
+        _one("beard", "a full beard, 384x384", 3, replace(_BRIEF, beard=0.014)),
+        _one("long-hair", "hair to the shoulders, 384x384", 6, replace(_BRIEF, hair="long")),
+        _one("glasses", "glasses, 384x384", 11, replace(_BRIEF, glasses=True)),
+        _one("off-model", "shape and expressions beyond the face model, 384x384", 7, replace(_BRIEF, off_model=1.0)),
+    )
+}  # fmt: skip
+"""By name."""

@@ -1,0 +1,113 @@
+"""What is exactly known of a synthetic capture: for measuring trackers in millimetres and pixels."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from mien.errors import UserError
+from mien.storage import read_arrays, read_json, write_arrays, write_json
+from mien.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy, measure
+from mien.synthetic.scene import SyntheticScene
+from mien.tracking import Tracking, read_tracking, write_tracking
+
+FORMAT, VERSION = "mien.synthetic_truth", 1
+_JSON, _ARRAYS, _TRACKING = "truth.json", "truth.safetensors", "tracking"
+_METRE, _PIXEL = 1e-5, 1 / 16
+"""Units of the stored 16-bit numbers: 10 micrometres, a sixteenth of a pixel."""
+_LARGEST = np.iinfo(np.int16).max
+_REMEDY = "delete the folder and draw the capture again"
+_EAR = 234
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Of one sequence of t timesteps and c cameras."""
+
+    tracking: Tracking
+    """Head poses, cameras and identity; exact vertices too, unless the head leaves the face model (`off_model`)."""
+    vertex_index: Int[np.ndarray, " n"]
+    """The face region: vertices of the face model on the skin between chin and hairline, in front of the ears."""
+    vertices: Float[np.ndarray, "t n 3"]
+    """Where those are in the head frame, metres, to 10 micrometres; exact for every recipe."""
+    landmarks: Float[np.ndarray, "t c l 2"]
+    """MediaPipe's 478 points on the true surface, projected: pixels of the drawn pictures, hidden ones too."""
+
+    @property
+    def vertices_world(self) -> Float[np.ndarray, "t n 3"]:
+        """The region in world space."""
+        poses = self.tracking.face.T_world_head.numpy()
+        return np.einsum("tij,tnj->tni", poses[:, :3, :3], self.vertices) + poses[:, None, :3, 3]
+
+
+def truth_of(scene: SyntheticScene) -> Truth:
+    """The truth of a scene, rounded as it is stored."""
+    index = face_region(measure(scene.model, scene.identity))
+    chosen = torch.from_numpy(index)
+    vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.recipe.timesteps)])
+    landmarks = np.stack([scene.landmarks(camera) for camera in range(len(scene.cameras))], axis=1)
+    return Truth(scene.tracking(), index, _unpacked(_packed(vertices, _METRE), _METRE),
+                 _unpacked(_packed(landmarks, _PIXEL), _PIXEL))  # fmt: skip
+
+
+def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
+    """Vertices of the skin of the face: no ears, no neck, nothing behind the ears or above the forehead."""
+    skin = np.unique(anatomy.faces[anatomy.skin & ~anatomy.region("ears", "neck", "scalp")])
+    points, marks = anatomy.vertices[skin], anatomy.landmarks
+    inside = (points[:, 1] > marks[CHIN, 1] - 0.005) & (points[:, 1] < marks[FOREHEAD_TOP, 1])
+    return skin[inside & (points[:, 2] > marks[_EAR, 2])].astype(np.int64)
+
+
+def hash_truth(digest: "hashlib._Hash", truth: Truth) -> None:
+    """Add the truth's numbers to a hash."""
+    digest.update(truth.vertex_index.astype(np.int32).tobytes())
+    digest.update(_packed(truth.vertices, _METRE).tobytes() + _packed(truth.landmarks, _PIXEL).tobytes())
+
+
+def write_truth(folder: Path, truth: Truth) -> None:
+    """Write FOLDER/truth.json, truth.safetensors and tracking/; the json comes last."""
+    write_tracking(folder / _TRACKING, truth.tracking)
+    arrays = {
+        "vertex_index": truth.vertex_index.astype(np.int32),
+        "vertices": _packed(truth.vertices, _METRE),
+        "landmarks": _packed(truth.landmarks, _PIXEL),
+    }
+    write_arrays(folder / _ARRAYS, arrays)
+    content = {"metre": _METRE, "pixel": _PIXEL, "arrays_sha256": _file_digest(folder / _ARRAYS)}
+    write_json(folder / _JSON, FORMAT, VERSION, content)
+
+
+def read_truth(folder: Path) -> Truth:
+    """Read what `write_truth` wrote.
+
+    Raises:
+        UserError: something is missing, damaged or of another version.
+    """
+    content = read_json(folder / _JSON, FORMAT, VERSION)
+    arrays = read_arrays(folder / _ARRAYS)
+    if _file_digest(folder / _ARRAYS) != content.get("arrays_sha256"):
+        raise UserError(f"{folder / _ARRAYS}: is not what {_JSON} was written with; {_REMEDY}")
+    try:
+        return Truth(
+            tracking=read_tracking(folder / _TRACKING),
+            vertex_index=arrays["vertex_index"].astype(np.int64),
+            vertices=_unpacked(arrays["vertices"], float(content["metre"])),
+            landmarks=_unpacked(arrays["landmarks"], float(content["pixel"])),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{folder / _JSON}: incomplete ({error}); {_REMEDY}") from None
+
+
+def _packed(values: np.ndarray, unit: float) -> np.ndarray:
+    return np.clip(np.rint(values / unit), -_LARGEST, _LARGEST).astype(np.int16)
+
+
+def _unpacked(values: np.ndarray, unit: float) -> np.ndarray:
+    return (values * np.float32(unit)).astype(np.float32)
+
+
+def _file_digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,217 @@
+"""Synthetic captures on disk: drawn frame by frame in bounded memory, resumed where they stopped, with their truth."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mien.capture import Capture, write_capture
+from mien.capture.faces import LANDMARKS, LandmarkDetector
+from mien.capture.video import write_video
+from mien.errors import UserError
+from mien.progress import progress_bar, say
+from mien.storage import read_json, write_json
+from mien.synthetic.recipe import SyntheticRecipe
+from mien.synthetic.scene import SyntheticScene
+from mien.synthetic.truth import hash_truth, truth_of, write_truth
+
+FORMAT, VERSION = "mien.synthetic_capture", 1
+_JSON, _WORK, _STATE = "synthetic.json", ".drawing", "state.json"
+VIDEO_NAME, CAPTURE_NAME, TRUTH_NAME = "video.mp4", "capture", "truth"
+_DRAWING = 1
+"""Raised whenever the same recipe would be drawn otherwise, so that old captures are not taken for current."""
+_CHUNK = 16
+"""Timesteps after which progress is kept."""
+
+
+def write_synthetic_capture(recipe: SyntheticRecipe, seed: int, folder: Path) -> str:
+    """`write_scene` of a recipe and a seed."""
+    return write_scene(SyntheticScene(recipe, seed), folder)
+
+
+def write_scene(scene: SyntheticScene, folder: Path) -> str:
+    """Draw a capture into a folder and return its content hash: over all pictures, mattes and the truth.
+
+    With one camera FOLDER/video.mp4 is what a user would have filmed. With several FOLDER/capture is a Capture with
+    calibration, exact mattes, and landmarks as a detector finds them in the drawn pictures (NaN where it finds none).
+    FOLDER/truth holds what `read_truth` reads. A folder that is complete is left as it is; an interrupted one goes on.
+
+    Raises:
+        UserError: the folder cannot be written.
+    """
+    key = scene_key(scene)
+    if _finished_hash(folder, key) is None:
+        try:
+            content_hash = _draw_all(scene, folder, key)
+        except OSError as error:
+            raise UserError(f"{folder}: cannot be written ({error.strerror or error}); choose another place") from None
+        say(f"{scene.recipe.name}: drawn, content hash {content_hash}")
+    return read_synthetic_hash(folder)
+
+
+def read_synthetic_hash(folder: Path) -> str:
+    """The content hash of a drawn capture.
+
+    Raises:
+        UserError: there is none, or it is not complete.
+    """
+    return str(read_json(folder / _JSON, FORMAT, VERSION).get("content_hash"))
+
+
+def scene_key(scene: SyntheticScene) -> str:
+    """A hash of all that decides the pictures, known before they are drawn."""
+    content = {"drawing": _DRAWING, "name": scene.recipe.name, "source": scene.source}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def hash_scene(scene: SyntheticScene) -> str:
+    """The content hash of a scene, drawn in memory: for small ones."""
+    pictures = _Hasher(scene)
+    for frames in scene.all_frames(range(scene.recipe.timesteps)):
+        pictures.add(np.stack([f.image for f in frames]), np.stack([f.matte for f in frames]))
+    return pictures.finish(scene)
+
+
+class _Hasher:
+    def __init__(self, scene: SyntheticScene) -> None:
+        self._digest = hashlib.sha256(repr((scene.recipe.timesteps, scene.recipe.camera_ids)).encode())
+
+    def add(self, images: np.ndarray, mattes: np.ndarray) -> None:
+        self._digest.update(images.tobytes())
+        self._digest.update(mattes.tobytes())
+
+    def finish(self, scene: SyntheticScene) -> str:
+        hash_truth(self._digest, truth_of(scene))
+        return self._digest.hexdigest()[:16]
+
+
+def _finished_hash(folder: Path, key: str) -> str | None:
+    try:
+        content = read_json(folder / _JSON, FORMAT, VERSION)
+    except UserError:
+        return None
+    return str(content["content_hash"]) if content.get("key") == key else None
+
+
+def _draw_all(scene: SyntheticScene, folder: Path, key: str) -> str:
+    (folder / _JSON).unlink(missing_ok=True)
+    store = _Pictures(folder / _WORK, scene.recipe)
+    store.resume(key)
+    _draw_missing(scene, store, key)
+    images, mattes = store.maps()
+    pictures = _Hasher(scene)
+    for timestep in range(scene.recipe.timesteps):
+        pictures.add(images[timestep], mattes[timestep])
+    content_hash = pictures.finish(scene)
+    recipe = scene.recipe
+    if recipe.cameras == "front":
+        write_video(folder / VIDEO_NAME, (frame[0] for frame in images), recipe.fps, recipe.detail.compression)
+    else:
+        write_capture(folder / CAPTURE_NAME, _as_capture(scene, images, mattes, content_hash))
+    truth = truth_of(scene)
+    write_truth(folder / TRUTH_NAME, truth)
+    content = {
+        "content_hash": content_hash,
+        "key": key,
+        "seed": scene.seed,
+        "motion_seed": scene.motion_seed,
+        "recipe": asdict(recipe),
+    }
+    write_json(folder / _JSON, FORMAT, VERSION, content)
+    del images, mattes
+    shutil.rmtree(folder / _WORK)
+    return content_hash
+
+
+@dataclass(frozen=True)
+class _Pictures:
+    """Raw frames and mattes of a drawing that is not complete."""
+
+    folder: Path
+    recipe: SyntheticRecipe
+
+    @property
+    def _shape(self) -> tuple[int, int, int, int]:
+        recipe = self.recipe
+        return (recipe.timesteps, len(recipe.camera_ids), recipe.height, recipe.width)
+
+    def resume(self, key: str) -> None:
+        """Start anew unless what is there belongs to the same key."""
+        try:
+            kept = read_json(self.folder / _STATE, FORMAT, VERSION).get("key") == key
+        except UserError:
+            kept = False
+        if not kept:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            self.folder.mkdir(parents=True)
+            for name in ("frames.u8", "mattes.u8"):
+                (self.folder / name).touch()
+            self.mark(key, 0)
+
+    def mark(self, key: str, done: int) -> None:
+        """Note how many timesteps are complete."""
+        write_json(self.folder / _STATE, FORMAT, VERSION, {"key": key, "done": done})
+
+    def done(self) -> int:
+        """Timesteps that are complete."""
+        return int(read_json(self.folder / _STATE, FORMAT, VERSION)["done"])
+
+    def append(self, timestep: int, images: np.ndarray, mattes: np.ndarray) -> None:
+        """Put one timestep in its place; by plain writes, so that a full disk is an error and no crash."""
+        for name, array in (("frames.u8", images), ("mattes.u8", mattes)):
+            with (self.folder / name).open("r+b") as file:
+                file.seek(timestep * array.nbytes)
+                file.write(array.tobytes())
+
+    def maps(self) -> tuple[np.ndarray, np.ndarray]:
+        """All frames [t, c, h, w, 3] and mattes [t, c, h, w] as memory maps."""
+        images = np.memmap(self.folder / "frames.u8", np.uint8, "r", shape=(*self._shape, 3))
+        return images, np.memmap(self.folder / "mattes.u8", np.uint8, "r", shape=self._shape)
+
+
+def _draw_missing(scene: SyntheticScene, store: _Pictures, key: str) -> None:
+    total, done = scene.recipe.timesteps, store.done()
+    with progress_bar(f"Drawing {scene.recipe.name}", total, done) as advance:
+        drawn = scene.all_frames(range(done, total)) if done < total else iter(())
+        for timestep, frames in enumerate(drawn, done):
+            store.append(timestep, np.stack([f.image for f in frames]), np.stack([f.matte for f in frames]))
+            if (timestep + 1) % _CHUNK == 0 or timestep + 1 == total:
+                store.mark(key, timestep + 1)
+            advance()
+
+
+def _as_capture(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray, content_hash: str) -> Capture:
+    recipe = scene.recipe
+    landmarks = np.stack(list(_detected(scene, images)), axis=1)
+    return Capture(
+        name=recipe.name,
+        camera_ids=recipe.camera_ids,
+        fps=recipe.fps,
+        timestamps=np.arange(recipe.timesteps) / recipe.fps,
+        images=images,
+        mattes=mattes,
+        landmarks=landmarks,
+        valid=np.isfinite(landmarks[..., 0, 0]),
+        principal_point=np.tile(np.array([recipe.width / 2, recipe.height / 2], np.float32), (len(scene.cameras), 1)),
+        source={**scene.source, "drawn_hash": content_hash},
+        calibration=scene.cameras,
+    )
+
+
+def _detected(scene: SyntheticScene, images: np.ndarray) -> Iterator[Float[np.ndarray, "t l 2"]]:
+    """Landmarks that a detector finds in each camera's pictures."""
+    with progress_bar(f"Landmarks of {scene.recipe.name}", len(scene.cameras)) as advance:
+        for camera in range(len(scene.cameras)):
+            found = np.full((len(images), LANDMARKS, 2), np.nan, np.float32)
+            with LandmarkDetector(several_faces=False) as detector:
+                for timestep, frames in enumerate(images):
+                    points = detector.detect(np.ascontiguousarray(frames[camera]))
+                    if points is not None:
+                        found[timestep] = points
+            yield found
+            advance()
