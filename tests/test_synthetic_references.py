@@ -1,0 +1,128 @@
+"""Reference captures: fixed for ever by their hashes, true to the micrometre, drawn in pieces like in one go."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mien.capture import read_capture
+from mien.errors import UserError
+from mien.synthetic import (
+    RECIPES,
+    REFERENCES,
+    Segment,
+    SyntheticScene,
+    read_truth,
+    reference_named,
+    truth_of,
+    write_synthetic_capture,
+)
+from mien.synthetic.writing import _Pictures, hash_scene, read_synthetic_hash, scene_key
+
+TINY_HASHES = {
+    "mono-short": "664f3da447bc70d2",
+    "mono-long": "798fa9b5c47365e6",
+    "ring-16": "fab1c3f7f64302d8",
+    "beard": "d077c0f3d81e7e43",
+    "long-hair": "9ce69a23793b7b9e",
+    "glasses": "4d46be40f67ffd60",
+    "off-model": "f2ebf4b3d57b4d89",
+}
+"""Of `tiny()`. A change means that figures on this capture cannot be compared any more: raise `_DRAWING`, say so in
+docs/results.md, and set the new one."""
+SMALL = replace(
+    RECIPES["demo"], width=64, height=64, fps=4.0, texture_size=128, supersample=1, hair="none", glasses=False,
+    brows_and_lashes=False, script=(Segment("free", 1.0), Segment("still", 1.0)),
+)  # fmt: skip
+RING = replace(SMALL, cameras="ring", ring_size=3, width=128, height=128)
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_hash_of_each_reference_is_fixed(name):
+    assert REFERENCES[name].tiny().hash_in_memory() == TINY_HASHES[name]
+
+
+def test_an_unknown_reference_names_those_there_are():
+    with pytest.raises(UserError, match="choose of: mono-short, mono-long, ring-16"):
+        reference_named("mono")
+
+
+@pytest.fixture(scope="module")
+def ring(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ring")
+    write_synthetic_capture(RING, 3, folder)
+    return folder
+
+
+def test_ring_is_a_calibrated_capture_with_its_truth(ring):
+    capture, truth = read_capture(ring / "capture"), read_truth(ring / "truth")
+    assert capture.images.shape == (8, 3, 128, 128, 3)
+    assert capture.calibration is not None
+    assert not (ring / ".drawing").exists()
+    scene = SyntheticScene(RING, 3)
+    np.testing.assert_array_equal(capture.images[2, 1], scene.frame(2, 1).image)
+    for camera, calibrated in enumerate(capture.calibration):
+        torch.testing.assert_close(calibrated.K, truth.tracking.cameras[camera].K)
+        pixels, _ = calibrated.project(torch.from_numpy(truth.vertices_world[4].astype(np.float32)))
+        columns, rows = np.clip(pixels.numpy().astype(int), 0, 127).T
+        assert (capture.mattes[4, camera, rows, columns] > 0).mean() > 0.99
+    in_front = capture.landmarks[:, 0]
+    assert capture.valid[:, 0].all()
+    assert np.median(np.linalg.norm(in_front - truth.landmarks[:, 0], axis=-1)) < 3
+
+
+def test_truth_is_what_the_face_model_says(ring):
+    truth, scene = read_truth(ring / "truth"), SyntheticScene(RING, 3)
+    expected = scene.model(truth.tracking.face[5])[0][torch.from_numpy(truth.vertex_index)]
+    np.testing.assert_allclose(truth.vertices_world[5], expected.numpy(), atol=2e-5)
+    np.testing.assert_allclose(truth.landmarks[5, 2], scene.landmarks(2)[5], atol=0.04)
+
+
+def test_damaged_truth_is_refused(ring, tmp_path):
+    (tmp_path / "truth").mkdir()
+    for path in (ring / "truth").glob("truth.*"):
+        (tmp_path / "truth" / path.name).write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(UserError, match="draw the capture again|run the stage"):
+        read_truth(tmp_path / "truth")
+
+
+def test_an_interrupted_drawing_goes_on(tmp_path):
+    scene = SyntheticScene(SMALL, 3)
+    store = _Pictures(tmp_path / ".drawing", SMALL)
+    store.resume(scene_key(scene))
+    for timestep in range(5):
+        frame = scene.frame(timestep)
+        store.append(timestep, frame.image[None], frame.matte[None])
+    store.mark(scene_key(scene), 5)
+    write_synthetic_capture(SMALL, 3, tmp_path)
+    assert read_synthetic_hash(tmp_path) == hash_scene(scene)
+    before = (tmp_path / "video.mp4").stat().st_mtime_ns
+    write_synthetic_capture(SMALL, 3, tmp_path)
+    assert (tmp_path / "video.mp4").stat().st_mtime_ns == before
+
+
+def test_nothing_moves_while_the_script_is_still():
+    truth = truth_of(SyntheticScene(replace(SMALL, fps=20.0), 3))
+    speed = np.abs(np.diff(truth.landmarks[:, 0], axis=0)).max((-1, -2))
+    assert speed[-10:].max() == 0
+    assert speed[:15].max() > 0.2
+
+
+def test_off_model_leaves_the_face_models_shapes_and_keeps_the_eyes():
+    scene = SyntheticScene(replace(SMALL, off_model=1.0), 3)
+    truth = truth_of(scene)
+    index = torch.from_numpy(truth.vertex_index)
+    assert truth.tracking.face.vertex_offsets is not None
+    offsets = truth.tracking.face.vertex_offsets[index].reshape(-1)
+    basis = scene.model.identity_basis[:, index].flatten(1).T
+    rigid = torch.stack([torch.eye(3)[axis].repeat(len(index)) for axis in range(3)], -1)
+    basis = torch.cat([basis, rigid], -1)
+    best = basis @ torch.linalg.lstsq(basis, offsets[:, None]).solution
+    left = (offsets - best[:, 0]).reshape(-1, 3).norm(dim=-1)
+    assert 0.0008 < float(left.mean()) < 0.006
+    eyes = scene.model.faces[scene.model.region_mask("eyes")].unique()
+    assert float(truth.tracking.face.vertex_offsets[eyes].norm(dim=-1).max()) < 0.0008
+    # Its expressions differ, too: vertices are not those of the face model's own parameters.
+    own = scene.model.head_vertices(truth.tracking.face[3])[0][index].numpy()
+    assert 2e-4 < float(np.linalg.norm(own - truth.vertices[3], axis=-1).mean()) < 0.01
