@@ -1,38 +1,41 @@
 """`mien drive`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from mien.commands.picture import PictureOptions
 from mien.workspace import open_workspace
 
 
 @dataclass(frozen=True)
 class Command:
-    """Play an avatar with another sequence's tracking into an mp4: driver on the left, avatar on the right."""
+    """Make an avatar do what someone else does: a video, a sequence, or what a phone or MediaPipe recorded."""
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder of the avatar."""
     by: Path
-    """Workspace folder of the driver (may be the avatar's own)."""
+    """The driver: a workspace (may be the avatar's own), a video file (tracked first, and kept in the cache), a .csv of
+    Live Link Face, or a .json of blend shapes (docs/using.md)."""
     out: Path
-    """The .mp4 to write."""
+    """.mp4, .webm, a folder or NAME_%06d.png; a video or workspace shows the driver on the left."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Which of the avatar's runs (default: the only one)."""
     sequence: str | None = None
     """Which of the driver's sequences (default: the only one)."""
     head_pose: bool = True
-    """Whether the head follows the driver's; else only the expression does."""
+    """The head follows the driver's; with --no-head-pose it stays still and only the face moves."""
     alone: bool = False
     """Only the avatar, without the driver's pictures beside it."""
+    picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
     def run(self) -> None:
-        """Pose and render every timestep of the driver."""
-        from mien.commands.stages import drive_stage
+        """Track the driver if need be, then pose and render every timestep."""
+        from mien.commands.stages import DriveOptions, drive_stage
 
-        workspace, driver = open_workspace(self.workspace), open_workspace(self.by)
+        workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
-        sequence_dir = driver.sequence_dir(driver.pick_sequence(self.sequence))
-        drive_stage(run_dir, sequence_dir, self.out, head_pose=self.head_pose, alone=self.alone)
+        options = DriveOptions(self.sequence, self.head_pose, self.alone)
+        drive_stage(run_dir, self.by, self.out, options, self.picture)

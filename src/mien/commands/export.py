@@ -6,7 +6,8 @@ from typing import Annotated
 
 import tyro
 
-from mien.workspace import open_workspace
+from mien.errors import UserError
+from mien.workspace import Workspace, open_workspace
 
 
 @dataclass(frozen=True)
@@ -16,31 +17,83 @@ class Command:
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
     out: Path
-    """The .mien or .ply to write."""
+    """The .mien or .ply to write; with --series the name of the .ply files, which get numbers: NAME_000000.ply."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Which run (default: the only one)."""
     set: tuple[str, ...] = ()
     """Expressions by name, e.g. --set jawOpen=0.6 mouthSmileLeft=0.4 (default: the person's neutral)."""
+    series: str | None = None
+    """A .ply for every frame of a motion: the name of one of the workspace's sequences, or anything `mien drive --by`
+    takes. The head stays at the origin."""
+    every: int = 1
+    """With --series: only every so many-th frame."""
 
     def run(self) -> None:
-        """Pose, then write."""
-        import torch
-
+        """Check, pose, write."""
         from mien.avatar import load_avatar
-        from mien.commands.expression import with_expression
-        from mien.export import in_world, write_ply
-        from mien.progress import say
+        from mien.storage import check_writable
 
         workspace = open_workspace(self.workspace)
-        avatar = load_avatar(workspace.run_dir(workspace.pick_run(self.run_name)))
+        run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
+        kind = self.out.suffix.lower()
+        if kind not in (".ply", ".mien"):
+            raise UserError(f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply or .mien")
+        if kind == ".mien" and (self.set or self.series):
+            raise UserError(f"{self.out}: a .mien file holds every expression; leave --set and --series out")
+        if self.every < 1:
+            raise UserError(f"--every {self.every}: give 1 or more")
+        check_writable(self.out if self.series is None else self._numbered(0))
+        avatar = load_avatar(run_dir)
+        if kind == ".mien":
+            self._write_mien(avatar, run_dir)
+        elif self.series is None:
+            self._write_one(avatar)
+        else:
+            self._write_series(avatar, workspace, self.series)
+
+    def _write_mien(self, avatar, run_dir: Path) -> None:
+        from mien.avatar import make_portable
+        from mien.progress import say
+        from mien.runtime import write_portable
+        from mien.training import run_camera
+
+        name = self.workspace.resolve().name
+        write_portable(self.out, make_portable(avatar, run_camera(run_dir), name))
+        say(f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians, {self.out.stat().st_size / 1e6:.1f} MB")
+
+    def _write_one(self, avatar) -> None:
+        from mien.commands.expression import with_expression
+        from mien.progress import say
+
         face = with_expression(avatar.subject, avatar.face_model, self.set)
-        # Viewers turn around the origin, so the head goes there: +y up, +z out of the face.
-        face = replace(
-            face,
-            head_rotation=torch.zeros_like(face.head_rotation),
-            head_translation=torch.zeros_like(face.head_translation),
-        )
-        with torch.no_grad():
-            gaussians = avatar.pose(face).gaussians.timestep(0)
-        write_ply(self.out, in_world(gaussians))
-        say(f"{self.out}: {len(gaussians):,} Gaussians")
+        say(f"{self.out}: {_write_ply(self.out, avatar, face):,} Gaussians")
+
+    def _write_series(self, avatar, workspace: Workspace, series: str) -> None:
+        from mien.commands.expression import with_expression
+        from mien.commands.stages.driving import open_driver
+        from mien.evaluation.driving import drive
+        from mien.progress import say, track_progress
+
+        own = series in workspace.sequence_names()
+        driver = open_driver(workspace.root if own else Path(series), series if own else None, avatar.face_model)
+        bounds = avatar.face_model.expression_bounds
+        driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, with_head_pose=False)
+        driven = with_expression(driven[:: self.every], avatar.face_model, self.set)
+        for index in track_progress(range(len(driven)), "Exporting", len(driven)):
+            _write_ply(self._numbered(index), avatar, driven[index])
+        say(f"{self._numbered(0)} ... {self._numbered(len(driven) - 1).name}: {len(driven)} files")
+
+    def _numbered(self, index: int) -> Path:
+        return self.out.with_name(f"{self.out.stem}_{index:06d}.ply")
+
+
+def _write_ply(path: Path, avatar, face) -> int:
+    """One timestep with the head at the origin, since viewers turn around it: +y up, +z out of the face."""
+    import torch
+
+    from mien.export import in_world, write_ply
+
+    origin = torch.zeros_like(face.head_rotation)
+    gaussians = avatar.pose(replace(face, head_rotation=origin, head_translation=origin)).gaussians.detach()
+    write_ply(path, in_world(gaussians.timestep(0)))
+    return len(gaussians)

@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mien.errors import UserError
-from mien.face import FaceParams
+from mien.face import FaceModel, FaceParams
+from mien.motion import ARKIT_NAMES, Motion
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 
@@ -70,3 +72,35 @@ def _relative_rotation(
     """Axis-angle of: the avatar's neutral rotation, after what leads from the driver's neutral to the driver's."""
     motion = matrix_from_axis_angle(driver_neutral).transpose(-1, -2) @ matrix_from_axis_angle(driver)
     return axis_angle_from_matrix(matrix_from_axis_angle(avatar_neutral) @ motion)
+
+
+def face_of_motion(motion: Motion, model: FaceModel) -> tuple[FaceParams, FaceParams]:
+    """What another program recorded as face parameters of a face model, and the driver at rest (one timestep).
+
+    Coefficients go to the expressions of the same names, gaze to the eye joints. At rest all coefficients are zero,
+    which is what ARKit and MediaPipe mean by zero; the head is at rest where it mostly is.
+
+    Raises:
+        UserError: the face model knows none of ARKit's names.
+    """
+    known = [(ours, ARKIT_NAMES.index(name)) for ours, name in enumerate(model.expression_names) if name in ARKIT_NAMES]
+    if not known:
+        raise UserError(
+            f"the face model {model.name!r} has none of ARKit's expressions; drive it by a video or a sequence"
+        )
+    face, coefficients = model.neutral(len(motion)), torch.from_numpy(motion.coefficients)
+    expression, joints = face.expression.clone(), face.joints.clone()
+    for ours, theirs in known:
+        expression[:, ours] = coefficients[:, theirs]
+    for side, name in enumerate(("left_eye", "right_eye")):
+        if name in model.free_joint_names:
+            joints[:, model.free_joint_names.index(name)] = torch.from_numpy(motion.eyes[:, side])
+    rotation, translation = torch.from_numpy(motion.head_rotation), torch.from_numpy(motion.head_translation)
+    rest = replace(
+        model.neutral(),
+        head_rotation=rotation.median(0, keepdim=True).values,
+        head_translation=translation.median(0, keepdim=True).values,
+    )
+    return replace(
+        face, expression=expression, joints=joints, head_rotation=rotation, head_translation=translation
+    ), rest

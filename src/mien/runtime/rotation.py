@@ -28,3 +28,31 @@ def rigid_transform(
     transforms = np.zeros((*rotations.shape[:-2], 4, 4), rotations.dtype)
     transforms[..., :3, :3], transforms[..., :3, 3], transforms[..., 3, 3] = rotations, translations, 1
     return transforms
+
+
+def axis_angle_from_matrix(matrices: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:
+    """Axis-angle vectors, angle in 0..pi, of rotation matrices (by way of the unit quaternion's largest component)."""
+    flat = matrices.reshape(-1, 3, 3)
+    vectors = np.zeros((len(flat), 3))
+    for index, m in enumerate(flat):
+        # The symmetric matrix 4 q q^T of a wxyz quaternion; its largest row is best conditioned.
+        outer = np.array([
+            [1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[1, 2] + m[2, 1]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 - m[0, 0] - m[1, 1] + m[2, 2]],
+        ])  # fmt: skip
+        quat = outer[np.argmax(np.diagonal(outer))]
+        quat = quat / np.linalg.norm(quat) * (1 if quat[0] >= 0 else -1)
+        length = np.linalg.norm(quat[1:])
+        angle = 2 * np.arctan2(length, quat[0])
+        vectors[index] = quat[1:] * (angle / length if length > 1e-9 else 2.0)
+    return vectors.reshape(matrices.shape[:-1])
+
+
+def rotation_of(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"] | None:
+    """The nearest rotation to a rotation times a scale; None for what is none."""
+    u, sizes, vt = np.linalg.svd(matrix)
+    if sizes[2] < 1e-6 or sizes[0] > 1.2 * sizes[2] or np.linalg.det(matrix) <= 0:
+        return None
+    return u @ vt

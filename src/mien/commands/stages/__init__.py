@@ -1,13 +1,14 @@
 """The stages as the command line runs them: each reads its folders, skips what is current, writes its own folder."""
 
 from mien.commands.stages.capturing import capture_stage
-from mien.commands.stages.driving import drive_stage
+from mien.commands.stages.driving import DriveOptions, drive_stage
 from mien.commands.stages.evaluating import evaluation_stage
 from mien.commands.stages.names import run_name, sequence_name, sequence_names
 from mien.commands.stages.tracking import tracking_stage
 from mien.commands.stages.training import training_stage
 
 __all__ = [
+    "DriveOptions",
     "capture_stage",
     "drive_stage",
     "evaluation_stage",

@@ -1,39 +1,127 @@
-"""Avatar + motion -> video, as the command line runs it."""
+"""Avatar + motion -> pictures, as the command line runs it."""
 
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
-import torch
 
 from mien.avatar import load_avatar, neutral_of
-from mien.capture.video import write_video
+from mien.capture import CaptureSettings
+from mien.commands.picture import PictureOptions
+from mien.commands.stages.capturing import capture_stage
+from mien.commands.stages.tracking import tracking_stage
 from mien.errors import UserError
-from mien.evaluation.driving import drive
-from mien.evaluation.pictures import side_by_side, to_uint8
+from mien.evaluation.driving import drive, face_of_motion
+from mien.evaluation.pictures import side_by_side
+from mien.export.pictures import plan_output, write_pictures
+from mien.face import FaceModel, FaceParams
+from mien.face.loading import cache_folder
+from mien.face.params import concatenate
+from mien.motion import Motion, read_blendshape_json, read_live_link_face
 from mien.progress import say, track_progress
-from mien.render import rasterize
+from mien.storage import file_digest
+from mien.tracking import TrackingSettings
 from mien.training import read_sequence
 from mien.training.run import run_camera
+from mien.workspace import Workspace, open_workspace
+
+_READERS: dict[str, Callable[[Path], Motion]] = {".csv": read_live_link_face, ".json": read_blendshape_json}
 
 
-def drive_stage(run_dir: Path, sequence_dir: Path, out: Path, head_pose: bool = True, alone: bool = False) -> None:
-    """Play a run's avatar with a sequence's tracking into an mp4, the driver's pictures beside it unless `alone`."""
-    if out.suffix != ".mp4":
-        raise UserError(f"{out}: cannot write {out.suffix or 'a file without ending'}; use .mp4")
-    avatar, sequence = load_avatar(run_dir), read_sequence(sequence_dir)
-    driver = sequence.tracking.face
-    at_rest = neutral_of(driver[sequence.tracking.valid])
+@dataclass(frozen=True, eq=False)
+class Driver:
+    """Who is followed."""
+
+    face: FaceParams
+    at_rest: FaceParams
+    """One timestep."""
+    fps: float
+    pictures: Callable[[int], np.ndarray] | None
+    """The driver's picture at a timestep; None where there are none."""
+
+
+def open_driver(by: Path, sequence: str | None, face_model: FaceModel) -> Driver:
+    """A driver from a workspace, a video (captured and tracked, and kept for the next time), a csv or a json file.
+
+    Raises:
+        UserError: it is none of these, or its stages fail.
+    """
+    if not by.exists():
+        raise UserError(f"{by}: no such file or folder; give a workspace, a video, a csv of Live Link Face, or a json")
+    if by.suffix.lower() in _READERS and by.is_file():
+        motion = _READERS[by.suffix.lower()](by)
+        if motion.lost:
+            say(f"{by}: no face in {motion.lost} of {len(motion)} frames; they repeat the one before")
+        face, at_rest = face_of_motion(motion, face_model)
+        return Driver(face, at_rest, motion.fps, None)
+    if by.is_file():
+        workspace, names = _tracked_video(by, face_model.name)
+    else:
+        workspace = open_workspace(by)
+        names = [workspace.pick_sequence(sequence)]
+    return _driver_of([workspace.sequence_dir(name) for name in names])
+
+
+def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
+    """Names of a video's sequences in this user's cache, captured and tracked unless they are there."""
+    workspace = Workspace(cache_folder() / "drivers" / f"{video.stem}-{file_digest(video)[:12]}")
+    names = capture_stage(workspace, video, None, CaptureSettings())
+    for name in names:
+        tracking_stage(workspace, name, face_model_name, TrackingSettings())
+    say(f"{video}: tracked in {workspace.root}, kept for the next time")
+    return workspace, names
+
+
+def _driver_of(folders: list[Path]) -> Driver:
+    sequences = [read_sequence(folder) for folder in folders]
+    face = concatenate([one.tracking.face for one in sequences])
+    at_rest = neutral_of(concatenate([one.tracking.face[one.tracking.valid] for one in sequences]))
+    places = [(one, timestep) for one in sequences for timestep in range(one.capture.timesteps)]
+    return Driver(
+        face,
+        at_rest,
+        sequences[0].capture.fps,
+        lambda index: np.asarray(places[index][0].capture.images[places[index][1], 0]),
+    )
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """How a driver is followed and shown."""
+
+    sequence: str | None = None
+    """Which of the driver's sequences."""
+    head_pose: bool = True
+    alone: bool = False
+
+
+def drive_stage(
+    run_dir: Path, by: Path, out: Path, options: DriveOptions | None = None, picture: PictureOptions | None = None
+) -> None:
+    """Play a run's avatar as a driver moves, the driver's pictures beside it unless `alone` or there are none."""
+    options, look = options or DriveOptions(), picture or PictureOptions()
+    # Whether it is many frames is not known before the driver is tracked, but a film or a sequence takes any number.
+    output = look.plan(out, 2)
+    avatar = load_avatar(run_dir)
+    driver = open_driver(by, options.sequence, avatar.face_model)
     bounds = avatar.face_model.expression_bounds
-    driven = drive(driver, at_rest, avatar.subject, bounds, with_head_pose=head_pose)
-    camera, white = run_camera(run_dir), torch.ones(3)
+    driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, with_head_pose=options.head_pose)
+    if output.kind == "sequence":
+        plan_output(out, len(driven), output.transparent)
+    camera = look.camera(run_camera(run_dir))
+    beside = None if options.alone or output.transparent else driver.pictures
 
-    @torch.no_grad()
-    def picture(timestep: int) -> np.ndarray:
-        gaussians = avatar.pose(driven[timestep]).gaussians.timestep(0)
-        image = to_uint8(rasterize(gaussians, camera, white).image)
-        return image if alone else side_by_side([np.asarray(sequence.capture.images[timestep, 0]), image])
+    def frame(timestep: int) -> np.ndarray:
+        shown = look.picture(avatar.pose(driven[timestep]).gaussians.detach().timestep(0), camera)
+        if beside is None:
+            return shown
+        theirs = beside(timestep)
+        width = max(1, round(theirs.shape[1] * camera.height / theirs.shape[0]))
+        return side_by_side([cv2.resize(theirs, (width, camera.height), interpolation=cv2.INTER_AREA), shown])
 
-    steps = range(sequence.capture.timesteps)
-    pictures = (picture(timestep) for timestep in track_progress(steps, "Driving", len(steps)))
-    write_video(out, pictures, sequence.capture.fps)
-    say(f"{out}: {len(steps)} frames")
+    frames = (frame(timestep) for timestep in itertools.islice(itertools.count(), len(driven)))
+    write_pictures(output, track_progress(frames, "Driving", len(driven)), driver.fps)
+    say(f"{out}: {len(driven)} frames")

@@ -1,0 +1,111 @@
+"""Blend shapes as json: our plain list of frames, and MediaPipe FaceLandmarker's own results.
+
+Plain: [{"timestamp_ms": 0, "blendshapes": {"jawOpen": 0.3, ...}}, ...]; names that are absent are 0.
+FaceLandmarker: one result or a list of them as its JavaScript gives them, with "timestamp_ms" (or "timestampMs") added:
+{"faceBlendshapes": [{"categories": [{"categoryName": .., "score": ..}, ...]}],
+ "facialTransformationMatrixes": [{"rows": 4, "columns": 4, "data": [16 numbers, column by column]}]}; centimetres,
+OpenGL axes. Only the first face counts. A frame without a face repeats the one before.
+"""
+
+import difflib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mien.errors import UserError
+from mien.motion.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, evenly, gaze_of, held
+from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
+
+_INDEX = {name: index for index, name in enumerate(ARKIT_NAMES)}
+_NO_EXPRESSION = "_neutral"
+_DEFAULT_FPS = 30.0
+_CENTIMETRE = 0.01
+
+
+def read_blendshape_json(path: Path) -> Motion:
+    """Motion from json of blend shapes.
+
+    Raises:
+        UserError: the file cannot be read or is neither kind of json, a name is unknown, a score is NaN or out of
+            range, or times do not increase (naming the frame).
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path}: cannot be read as json ({error}); give frames of blend shapes") from None
+    frames = [content] if isinstance(content, dict) else content
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise UserError(f'{path}: give a list of frames {{"timestamp_ms": .., "blendshapes": {{name: score}}}}')
+    rows, found = np.zeros((len(frames), 52 + 6)), np.zeros(len(frames), dtype=bool)
+    for index, frame in enumerate(frames):
+        where = f"{path}, frame {index}"
+        scores, matrix = from_face_landmarker(frame, where) if "faceBlendshapes" in frame else _plain(frame, where)
+        found[index] = scores is not None
+        if scores is not None:
+            rows[index, :52] = _row(scores, where)
+        if matrix is not None:
+            rotation = rotation_of(matrix[:3, :3])
+            if rotation is None:
+                raise UserError(f"{where}: its facial transformation matrix holds no rotation")
+            rows[index, 52:55] = axis_angle_from_matrix(rotation)
+            rows[index, 55:] = _CENTIMETRE * matrix[:3, 3]
+    if not found.any():
+        raise UserError(f"{path}: no frame has a face in it")
+    fps, rows = evenly(_seconds(frames, path), held(rows, found))
+    coefficients = rows[:, :52].astype(np.float32)
+    head = rows[:, 52:].astype(np.float32)
+    return Motion(fps, coefficients, gaze_of(coefficients), head[:, :3], head[:, 3:], int((~found).sum()))
+
+
+def from_face_landmarker(frame: dict[str, Any], where: str) -> tuple[dict[str, Any] | None, np.ndarray | None]:
+    """Scores by name and T_camera_face [4, 4] (centimetres, OpenGL axes) of a result's first face, where it has one.
+
+    Raises:
+        UserError: it is laid out otherwise.
+    """
+    try:
+        faces, poses = frame["faceBlendshapes"], frame.get("facialTransformationMatrixes") or []
+        scores = {entry["categoryName"]: entry["score"] for entry in faces[0]["categories"]} if faces else None
+        matrix = np.array(poses[0]["data"], dtype=np.float64).reshape(4, 4).T if poses else None
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise UserError(f"{where}: is not as FaceLandmarker gives its results ({error!r})") from None
+    if matrix is not None and not np.isfinite(matrix).all():
+        raise UserError(f"{where}: its facial transformation matrix is not finite")
+    return scores, matrix
+
+
+def _plain(frame: dict[str, Any], where: str) -> tuple[dict[str, Any] | None, None]:
+    scores = frame.get("blendshapes")
+    if "blendshapes" not in frame or not (scores is None or isinstance(scores, dict)):
+        raise UserError(f'{where}: has no "blendshapes": {{name: score}} (null where no face was found)')
+    return scores, None
+
+
+def _row(scores: dict[str, Any], where: str) -> np.ndarray:
+    row = np.zeros(52)
+    for name, score in scores.items():
+        if name == _NO_EXPRESSION:
+            continue
+        if name not in _INDEX:
+            near = difflib.get_close_matches(str(name), ARKIT_NAMES, 1)
+            raise UserError(f"{where}: no blend shape {name!r}" + (f"; did you mean {near[0]}?" if near else ""))
+        if isinstance(score, bool) or not isinstance(score, (int, float)) or not SMALLEST <= score <= LARGEST:
+            raise UserError(f"{where}: {name} is {score!r}; scores go from 0 to 1")
+        row[_INDEX[name]] = score
+    return row
+
+
+def _seconds(frames: list[dict[str, Any]], path: Path) -> np.ndarray:
+    """Times of the frames; none of them has one: 30 a second."""
+    stamps = [frame.get("timestamp_ms", frame.get("timestampMs")) for frame in frames]
+    if all(stamp is None for stamp in stamps):
+        return np.arange(len(frames)) / _DEFAULT_FPS
+    for index, stamp in enumerate(stamps):
+        if isinstance(stamp, bool) or not isinstance(stamp, (int, float)) or not math.isfinite(stamp):
+            raise UserError(f"{path}, frame {index}: timestamp_ms is {stamp!r}; give every frame a number")
+        if index and stamp <= stamps[index - 1]:  # pyright: ignore[reportOperatorIssue]
+            raise UserError(f"{path}, frame {index}: its timestamp_ms is not after the one before")
+    return np.array(stamps, dtype=np.float64) / 1000

@@ -1,0 +1,166 @@
+"""Motion of other programs: Live Link Face's csv and blend shapes as json, good and bad, and what the avatar does."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mien.errors import UserError
+from mien.evaluation.driving import drive, face_of_motion
+from mien.motion import ARKIT_NAMES, read_blendshape_json, read_live_link_face
+from mien.motion.live_link_face import EYES, HEAD
+from mien.motion.motion import LOOK_ANGLE
+from mien.rotation import matrix_from_axis_angle
+from small_face_model import make_small_face_model
+from toy_scene import toy_face_model
+
+COLUMNS = ["Timecode", "BlendshapeCount", *(name[0].upper() + name[1:] for name in ARKIT_NAMES), *HEAD, *EYES]
+
+
+def row(timecode: str, **values: float | str) -> list[str]:
+    return [timecode, "61", *(str(values.get(name, 0)) for name in COLUMNS[2:])]
+
+
+def write_csv(path: Path, *rows: list[str], columns: list[str] | None = None) -> Path:
+    path.write_text("\n".join(",".join(cells) for cells in (columns or COLUMNS, *rows)) + "\n")
+    return path
+
+
+def jaw(motion) -> list[float]:
+    return motion.coefficients[:, ARKIT_NAMES.index("jawOpen")].tolist()
+
+
+def test_layout_is_live_link_faces() -> None:
+    assert len(COLUMNS) == 63
+    assert COLUMNS[2] == "EyeBlinkLeft"
+    assert COLUMNS[53:57] == ["TongueOut", "HeadYaw", "HeadPitch", "HeadRoll"]
+
+
+def test_values_times_and_turns(tmp_path: Path) -> None:
+    first = row("11:59:59:58.5", JawOpen=0.25, HeadYaw=0.3, EyeLookOutLeft=1, EyeLookInRight=1, EyeLookDownLeft=0.5)
+    motion = read_live_link_face(write_csv(tmp_path / "a.csv", first, row("11:59:59:59.5", JawOpen=0.5),
+                                           row("12:00:00:00.5", JawOpen=1, HeadPitch=-0.2)))  # fmt: skip
+    assert motion.fps == pytest.approx(60)
+    assert jaw(motion) == [0.25, 0.5, 1]
+    np.testing.assert_allclose(motion.head_rotation[0], [0, 0.3, 0], atol=1e-6)
+    np.testing.assert_allclose(motion.head_rotation[2], [-0.2, 0, 0], atol=1e-6)
+    # Both eyes to the subject's left, the left one down as well.
+    np.testing.assert_allclose(motion.eyes[0], [[LOOK_ANGLE / 2, LOOK_ANGLE, 0], [0, LOOK_ANGLE, 0]], atol=1e-6)
+    assert motion.lost == 0
+
+
+def test_dropped_rows_are_interpolated_and_lost_faces_held(tmp_path: Path) -> None:
+    lost = ["0:00:00:05.0", "0"]
+    rows = [row(f"0:00:00:0{index}.0", JawOpen=index / 10) for index in (0, 1, 3, 4)]
+    motion = read_live_link_face(write_csv(tmp_path / "a.csv", *rows, lost, row("0:00:00:06.0", JawOpen=0)))
+    np.testing.assert_allclose(jaw(motion), [0, 0.1, 0.2, 0.3, 0.4, 0.4, 0], atol=1e-6)
+    assert motion.lost == 1
+
+
+def test_eye_angles_count_where_coefficients_do_not(tmp_path: Path) -> None:
+    motion = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", LeftEyeYaw=0.2, RightEyePitch=0.1)))
+    np.testing.assert_allclose(motion.eyes[0], [[0, 0.2, 0], [0.1, 0, 0]], atol=1e-6)
+
+
+def test_bad_csv_files(tmp_path: Path) -> None:
+    good = row("0:00:00:01.0")
+    without = [name for name in COLUMNS if name not in ("JawOpen", "TongueOut")]
+    for rows, columns, part in (
+        ([good[: len(without)]], without, "lacks the columns JawOpen, TongueOut"),
+        ([good, row("0:00:00:02.0", JawOpen="nan")], COLUMNS, "line 3: JawOpen is nan"),
+        ([row("0:00:00:02.0", JawOpen="")], COLUMNS, "line 2: JawOpen is ''"),
+        ([row("0:00:00:02.0", JawOpen=45)], COLUMNS, "line 2: JawOpen is 45; coefficients go from 0 to 1"),
+        ([row("0:00:00:02.0", HeadYaw=20)], COLUMNS, "convert it from degrees"),
+        ([good, good], COLUMNS, "line 3: its Timecode is not after"),
+        ([row("soon")], COLUMNS, "line 2: Timecode 'soon'"),
+        ([good[:30]], COLUMNS, "line 2: 30 of 63 values"),
+        ([[*good[:1], "0"]], COLUMNS, "no row has a face"),
+        ([], COLUMNS, "has no frames"),
+    ):
+        with pytest.raises(UserError, match=part):
+            read_live_link_face(write_csv(tmp_path / "a.csv", *rows, columns=columns))
+    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x81" * 9)
+    with pytest.raises(UserError, match="cannot be read as csv"):
+        read_live_link_face(tmp_path / "b.csv")
+
+
+def write(path: Path, content: object) -> Path:
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_plain_json(tmp_path: Path) -> None:
+    frames = [{"timestamp_ms": 40 * i, "blendshapes": {"jawOpen": i / 4, "_neutral": 0.9}} for i in range(4)]
+    frames[2]["blendshapes"] = None
+    motion = read_blendshape_json(write(tmp_path / "a.json", frames))
+    assert motion.fps == pytest.approx(25)
+    assert jaw(motion) == [0, 0.25, 0.25, 0.75]
+    assert motion.lost == 1
+
+
+def test_face_landmarker_results(tmp_path: Path) -> None:
+    turn = matrix_from_axis_angle(torch.tensor([0.1, -0.4, 0.2])).numpy()
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn, [1, 2, -45]
+    result = {
+        "faceLandmarks": [],
+        "faceBlendshapes": [{"headIndex": -1, "categories": [{"index": 25, "score": 0.5, "categoryName": "jawOpen"}]}],
+        "facialTransformationMatrixes": [{"rows": 4, "columns": 4, "data": matrix.T.flatten().tolist()}],
+    }
+    motion = read_blendshape_json(write(tmp_path / "a.json", result))
+    assert jaw(motion) == [0.5]
+    np.testing.assert_allclose(motion.head_rotation[0], [0.1, -0.4, 0.2], atol=1e-5)
+    np.testing.assert_allclose(motion.head_translation[0], [0.01, 0.02, -0.45], atol=1e-6)
+    none = {"faceBlendshapes": [], "facialTransformationMatrixes": []}
+    assert read_blendshape_json(write(tmp_path / "b.json", [none, result])).lost == 1
+
+
+def test_bad_json_files(tmp_path: Path) -> None:
+    good = {"timestamp_ms": 0, "blendshapes": {}}
+    for content, part in (
+        ([], "give a list of frames"),
+        ("jawOpen", "give a list of frames"),
+        ([{"jawOpen": 1}], 'frame 0: has no "blendshapes"'),
+        ([good, good], "frame 1: its timestamp_ms is not after"),
+        ([good, {"blendshapes": {}}], "frame 1: timestamp_ms is None"),
+        ([{"blendshapes": {"jawopen": 1}}], "did you mean jawOpen"),
+        ([{"blendshapes": {"jawOpen": float("nan")}}], "jawOpen is nan"),
+        ([{"blendshapes": {"jawOpen": "wide"}}], "jawOpen is 'wide'"),
+        ([{"blendshapes": {"jawOpen": 60}}], "jawOpen is 60"),
+        ([{"blendshapes": None}], "no frame has a face"),
+        ([{"faceBlendshapes": [{"categories": [{}]}]}], "not as FaceLandmarker"),
+        ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [1, 2]}]}], "not as FaceLandmarker"),
+        ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [0] * 16}]}], "holds no rotation"),
+    ):
+        with pytest.raises(UserError, match=part):
+            read_blendshape_json(write(tmp_path / "a.json", content))
+    (tmp_path / "a.json").write_text("[{")
+    with pytest.raises(UserError, match="cannot be read as json"):
+        read_blendshape_json(tmp_path / "a.json")
+
+
+def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
+    names = ("jawOpen", "mouthLeft", *(f"other{i}" for i in range(6)))
+    model = replace(make_small_face_model(), expression_names=names)
+    rows = [
+        row(f"0:00:00:0{i}.0", JawOpen=i / 10, EyeLookUpLeft=1, EyeLookUpRight=1, HeadYaw=0.1 * i) for i in range(3)
+    ]
+    motion = read_live_link_face(write_csv(tmp_path / "a.csv", *rows))
+    face, at_rest = face_of_motion(motion, model)
+    rest = model.neutral()
+    rest = replace(rest, expression=rest.expression + 0.05, head_translation=torch.tensor([[0.0, 0, -0.6]]))
+    driven = drive(face, at_rest, rest, model.expression_bounds)
+    torch.testing.assert_close(driven.expression[:, 0], torch.tensor([0.05, 0.15, 0.25]))
+    assert (driven.expression[:, 1] == 0.05).all()
+    up = torch.tensor([-math.radians(30), 0, 0])
+    for joint in ("left_eye", "right_eye"):
+        torch.testing.assert_close(driven.joints[0, model.free_joint_names.index(joint)], up, atol=1e-5, rtol=0)
+    # The head is at rest where it mostly is: the middle of the turn.
+    torch.testing.assert_close(driven.head_rotation[:, 1], torch.tensor([-0.1, 0, 0.1]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(driven.head_translation, rest.head_translation.expand(3, -1))
+    with pytest.raises(UserError, match="none of ARKit's"):
+        face_of_motion(motion, toy_face_model())
