@@ -210,8 +210,7 @@ def _detected(scene: SyntheticScene, images: np.ndarray) -> Iterator[Float[np.nd
             found = np.full((len(images), LANDMARKS, 2), np.nan, np.float32)
             with LandmarkDetector(several_faces=False) as detector:
                 for timestep, frames in enumerate(images):
-                    points = detector.detect(np.ascontiguousarray(frames[camera]))
-                    if points is not None:
+                    for points in detector.detect(np.ascontiguousarray(frames[camera]))[:1]:
                         found[timestep] = points
             yield found
             advance()
