@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from mien import runtime
 from mien.capture.video import probe_video
 from mien.cli import main
 from mien.export import read_ply
@@ -55,6 +56,17 @@ def test_using_the_avatar(workspace: Path, tmp_path: Path) -> None:
     assert main(["export", avatar, "--out", str(tmp_path / "open.ply"), "--set", "jawOpen=0.6"]) == 0
     assert len(read_ply(tmp_path / "open.ply")) > 1000
     assert main(["render", avatar, "--out", str(tmp_path / "still.png"), "--size", "64"]) == 0
+    assert main(["export", avatar, "--out", str(tmp_path / "me.mien")]) == 0
+    assert runtime.load(tmp_path / "me.mien").render()[1].max() > 0.5
+    series = ["--series", "synthetic", "--every", "20"]
+    assert main(["export", avatar, "--out", str(tmp_path / "talk.ply"), *series]) == 0
+    assert len(list(tmp_path.glob("talk_*.ply"))) == 3
+    clear = ["--background", "transparent", "--size", "64"]
+    assert main(["render", avatar, "--out", str(tmp_path / "f"), "--path", "sway", "--frames", "2", *clear]) == 0
+    assert len(list((tmp_path / "f").iterdir())) == 2
+    (tmp_path / "a.json").write_text('[{"blendshapes": {"jawOpen": 0.5}}, {"blendshapes": {}}]')
+    by = ["--by", str(tmp_path / "a.json")]
+    assert main(["drive", avatar, *by, "--out", str(tmp_path / "d.webm"), *clear]) == 0
     assert main(["render", avatar, "--out", str(tmp_path / "turn.mp4"), "--size", "64", "--frames", "6"]) == 0
     assert probe_video(tmp_path / "turn.mp4").frames == 6
     assert main(["drive", avatar, "--by", avatar, "--out", str(tmp_path / "driven.mp4")]) == 0
