@@ -68,9 +68,8 @@ def open_driver(by: Path, sequence: str | None, face_model: FaceModel) -> Driver
 def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
     """Names of a video's sequences in this user's cache, captured and tracked unless they are there."""
     workspace = Workspace(cache_folder() / "drivers" / f"{video.stem}-{file_digest(video)[:12]}")
-    names = capture_stage(workspace, video, None, CaptureSettings())
-    for name in names:
-        tracking_stage(workspace, name, face_model_name, TrackingSettings())
+    capture_stage(workspace, video, None, CaptureSettings())
+    names = list(tracking_stage(workspace, face_model_name, TrackingSettings()))
     say(f"{video}: tracked in {workspace.root}, kept for the next time")
     return workspace, names
 
