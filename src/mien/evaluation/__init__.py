@@ -1,8 +1,20 @@
-"""Evaluation: figures and a report for a trained run, and driving avatars."""
+"""Evaluation: figures, videos and a report for a trained run, comparisons of runs, and driving avatars."""
 
 from mien.evaluation.cameras import orbit, turntable
+from mien.evaluation.compare import compare_runs
 from mien.evaluation.driving import drive
 from mien.evaluation.evaluate import evaluate, read_metrics
+from mien.evaluation.image_folders import ImageFolders, score_folders
 from mien.evaluation.protocols import EvaluationSettings
 
-__all__ = ["EvaluationSettings", "drive", "evaluate", "orbit", "read_metrics", "turntable"]
+__all__ = [
+    "EvaluationSettings",
+    "ImageFolders",
+    "compare_runs",
+    "drive",
+    "evaluate",
+    "orbit",
+    "read_metrics",
+    "score_folders",
+    "turntable",
+]

@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from mien.errors import UserError
+from mien.evaluation.cross import cross_reenactment
+from mien.evaluation.cross_report import cross_section
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.load import load_experiments
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
-from mien.evaluation.report import ReportVideo, RunRecord, write_report
+from mien.evaluation.report import RunRecord, write_report
+from mien.evaluation.report_video import ReportVideo
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.storage import expect_whole, file_digest, read_json, write_json
 from mien.training import read_curves, read_run_config, read_training_summary
@@ -44,7 +47,7 @@ def evaluate(
     settings = settings or EvaluationSettings()
     summary = read_training_summary(run_dir)
     experiments = load_experiments(run_dir, sequence_dirs)
-    if not experiments:
+    if not experiments and not driver_dirs:
         raise UserError(
             f"{run_dir}: nothing was held out, so nothing can be scored; train with the split `blocks` or `tail`"
         )
@@ -57,7 +60,11 @@ def evaluate(
         for name, experiment in experiments.items()
     }
     protocols = {name: protocol_content(*result, settings) for name, result in results.items()}
-    content = {"protocols": protocols, "training": summary}
+    driven, driven_videos = {}, []
+    if driver_dirs:
+        entry, driven_videos = cross_reenactment(run_dir, sequence_dirs[0], driver_dirs, settings.video_frames)
+        driven = {"cross_reenactment": entry}
+    content = {"protocols": {**protocols, **driven}, "training": summary}
     videos = {
         name: _video(run_dir, name, experiment, evaluation, settings)
         for name, (experiment, evaluation) in results.items()
@@ -67,7 +74,8 @@ def evaluate(
         if settings.pictures:
             write_scored_pictures(run_dir / "pictures" / name, experiment)
     run = RunRecord(run_dir.name, read_run_config(run_dir), summary, read_curves(run_dir))
-    write_report(run_dir / "report.html", run, protocols, results, videos)
+    section = cross_section(driven["cross_reenactment"], driven_videos, run_dir) if driven else ""
+    write_report(run_dir / "report.html", run, protocols, results, videos, section)
     write_json(run_dir / "metrics.json", _FORMAT, _VERSION, content)
     for partial in partials.values():
         partial.remove()

@@ -1,6 +1,5 @@
 """report.html: one file to send around; no network, no scripts, light, dark and on paper."""
 
-import base64
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -16,6 +15,7 @@ import numpy as np
 from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.protocols import Evaluation
+from mien.evaluation.report_video import ReportVideo
 from mien.evaluation.report_words import GLOSSARY
 from mien.storage import write_atomically
 
@@ -25,7 +25,6 @@ _TITLES = {
     "self_reenactment_sequence": "Self-reenactment, held-out sequences",
     "novel_view": "Novel views, held-out cameras",
 }
-_EMBEDDED_BYTES = 6 << 20
 _BASELINES = {"mesh": "Tracked mesh with its colours", "mean_frame": "Mean training picture"}
 _ROWS = {"avatar": "Avatar", "as_tracked": "Avatar, faces as tracked", **_BASELINES}
 _METRICS = (("psnr", "PSNR, dB ↑", 2), ("ssim", "SSIM ↑", 3), ("l1", "L1 ↓", 4), ("perceptual", "ST-LPIPS ↓", 3))
@@ -43,35 +42,13 @@ class RunRecord:
     curves: Mapping[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class ReportVideo:
-    """A side-by-side video of a protocol."""
-
-    path: Path
-    shown: int
-    """Frames in it..."""
-    scored: int
-    """...of this many."""
-
-    def html(self, page_folder: Path) -> str:
-        """The video inside the page where it is small, so that the page stays one file; else a link to it."""
-        link = self.path.relative_to(page_folder).as_posix()
-        data = self.path.read_bytes()
-        embedded = f"data:video/mp4;base64,{base64.b64encode(data).decode('ascii')}"
-        source = embedded if len(data) <= _EMBEDDED_BYTES else link
-        part = "" if self.shown == self.scored else f", {self.shown} of {self.scored} frames"
-        return (
-            f'<video controls muted loop preload="metadata" src="{escape(source)}"></video>'
-            f'<p class="note">Truth, rendering, error{part}: <a href="{escape(link)}">{escape(link)}</a></p>'
-        )
-
-
 def write_report(
     path: Path,
     run: RunRecord,
     protocols: Mapping[str, Any],
     results: Mapping[str, tuple[Experiment, Evaluation]],
     videos: Mapping[str, ReportVideo] = MappingProxyType({}),
+    driven: str = "",
 ) -> None:
     """Write the page of a run.
 
@@ -81,8 +58,11 @@ def write_report(
         protocols: `protocols` of metrics.json.
         results: What was evaluated and every frame's figures, by protocol.
         videos: Side-by-side videos by protocol, in or below the page's folder.
+        driven: The section on cross-reenactment, HTML.
     """
-    text = report_html(run, protocols, results, {name: video.html(path.parent) for name, video in videos.items()})
+    text = report_html(
+        run, protocols, results, {name: video.html(path.parent) for name, video in videos.items()}, driven
+    )
 
     def write(temporary: Path) -> None:
         temporary.write_text(text, encoding="utf-8")
@@ -95,6 +75,7 @@ def report_html(
     protocols: Mapping[str, Any],
     results: Mapping[str, tuple[Experiment, Evaluation]],
     videos: Mapping[str, str] = MappingProxyType({}),
+    driven: str = "",
 ) -> str:
     """The page as text; `videos` holds a piece of HTML by protocol."""
     style = files("mien.evaluation").joinpath("report.css").read_text(encoding="utf-8")
@@ -107,6 +88,7 @@ def report_html(
         body.append(videos.get(name, ""))
         body += [f"<h2>{heading}: over time</h2>", sections.over_time(experiment, evaluation)]
         body += ["<h2>Baselines</h2>", sections.baseline_pictures(experiment, evaluation)]
+    body.append(driven)
     body += ["<h2>Training</h2>", sections.training_curves(run.curves)]
     first = next(iter(results.values()), None)
     if first is not None:

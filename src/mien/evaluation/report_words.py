@@ -3,7 +3,8 @@
 GLOSSARY = {
     "Held out": (
         "Frames that training never saw. blocks: every fifth block of 10 frames. tail: the last 20 %, which may show "
-        "poses and expressions that never occurred before, so its figures are lower."
+        "poses and expressions that never occurred before, so its figures are lower. sequences: whole sequences, posed "
+        "as tracked. cameras: cameras at moments that other cameras were trained at."
     ),
     "Target": (
         "The picture inside a frozen mask (the matte, cut below the neck line), over white. The mask stays when the "

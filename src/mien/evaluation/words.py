@@ -20,6 +20,19 @@ def protocol_line(name: str, entry: Mapping[str, Any]) -> str:
     return text
 
 
+def driven_line(entry: Mapping[str, Any]) -> str:
+    """Cross-reenactment in one line; figures beside what an avatar that never moves would get."""
+    text = f"cross_reenactment ({len(entry['drivers'])} drivers, {entry['frames']} frames): "
+    if entry["expression_error"] is None:
+        return f"{text}no face is found in any picture of the avatar"
+    expression, rotation = "expression_error", "head_rotation_error"
+    return (
+        f"{text}expression error {entry[expression]:.4f} eye distances (of an avatar that never moves: "
+        f"{entry[f'{expression}_still']:.4f}), head rotation error {entry[f'{rotation}_degrees']:.1f} degrees "
+        f"({entry[f'{rotation}_still_degrees']:.1f}), faces found in {100 * entry['faces_found']:.0f} % of frames"
+    )
+
+
 def scores_lines(scores: Mapping[str, Any]) -> list[str]:
     """The figures of `score_folders`, one line a part of the picture."""
     lines = [f"{scores['frames']} pictures; whole frame: {_figures(scores)}"]

@@ -8,7 +8,7 @@ from mien.evaluation.compare import Comparison, compare_runs
 from mien.evaluation.compare_report import write_comparison
 from mien.evaluation.evaluate import evaluate
 from mien.evaluation.protocols import EvaluationSettings
-from mien.evaluation.words import protocol_line
+from mien.evaluation.words import driven_line, protocol_line
 from mien.progress import say
 from mien.training import read_run_config
 from mien.workspace import Workspace, open_workspace
@@ -21,7 +21,7 @@ def evaluation_stage(
     run_dir = workspace.run_dir(run)
     metrics = evaluate(run_dir, run_sequences(workspace, run_dir), settings, _driver_folders(drivers))
     for name, entry in metrics["protocols"].items():
-        say(protocol_line(name, entry))
+        say(driven_line(entry) if name == "cross_reenactment" else protocol_line(name, entry))
     say(f"Look at {run_dir / 'report.html'}")
     return metrics
 

@@ -1,0 +1,186 @@
+"""Cross-reenactment: another sequence's motion on the avatar, relative to each one's neutral; there is no truth."""
+
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch.nn.functional import normalize
+
+from mien.avatar import load_avatar, neutral_of
+from mien.avatar.avatar import Avatar
+from mien.camera import Camera
+from mien.capture import Capture, read_capture, read_capture_hash
+from mien.capture.video import write_video
+from mien.errors import UserError
+from mien.evaluation.driving import drive
+from mien.evaluation.pictures import to_uint8
+from mien.evaluation.redetection import MEASURED_BY, FaceReader, Motion, motion, transfer_figures
+from mien.evaluation.scoring import evenly_spread
+from mien.evaluation.videos import labelled_row, same_size
+from mien.face import FaceParams
+from mien.progress import track_progress
+from mien.render import rasterize
+from mien.rotation import matrix_from_axis_angle
+from mien.tracking import Tracking, read_tracking
+
+_FRAMES = 100
+_MEANS = (
+    "expression_error", "expression_error_still", "head_rotation_error_degrees", "head_rotation_error_still_degrees",
+    "mouth_correlation", "eyes_correlation", "faces_found",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """An avatar that does what a driver does."""
+
+    avatar: Avatar
+    camera: Camera
+    faces: FaceParams
+    """The avatar's, one a timestep of the driver."""
+    driver: Capture
+    tracking: Tracking
+    driver_camera: int
+    """The driver's camera that looks at the face."""
+    by_rest: tuple[int, ...]
+    """Timesteps with a tracked face, from the nearest to the driver's neutral to the farthest."""
+
+    @torch.no_grad()
+    def picture(self, timestep: int) -> UInt8[np.ndarray, "h w 3"]:
+        """The avatar at a timestep, over white."""
+        gaussians = self.avatar.pose(self.faces[timestep]).gaussians.timestep(0)
+        return to_uint8(rasterize(gaussians, self.camera, torch.ones(3)).image)
+
+    def driver_picture(self, timestep: int) -> UInt8[np.ndarray, "h w 3"]:
+        """The driver at a timestep."""
+        return np.asarray(self.driver.images[timestep, self.driver_camera])
+
+
+def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
+    """A run's avatar, seen by the camera of `sequence_dir` that looks at its face, driven by another sequence.
+
+    Raises:
+        UserError: the driver was tracked with another face model, or has no tracked frame.
+    """
+    avatar, tracking = load_avatar(run_dir), read_tracking(driver_dir / "tracking")
+    if tracking.face_model_hash != avatar.face_model.content_hash:
+        raise UserError(
+            f"{driver_dir}: was tracked with the face model {tracking.face_model}, the avatar has another "
+            f"({avatar.face_model.name}); track the driver with the avatar's"
+        )
+    valid = torch.nonzero(tracking.valid)[:, 0].tolist()
+    if not valid:
+        raise UserError(f"{driver_dir}: no frame of it was tracked; choose another driver")
+    at_rest = neutral_of(tracking.face[tracking.valid])
+    faces = drive(tracking.face, at_rest, avatar.subject, avatar.face_model.expression_bounds)
+    cameras = read_tracking(sequence_dir / "tracking").cameras
+    return Driven(
+        avatar=avatar,
+        camera=cameras[frontal_camera(cameras, avatar.subject)],
+        faces=faces,
+        driver=read_capture(driver_dir / "capture"),
+        tracking=tracking,
+        driver_camera=frontal_camera(tracking.cameras, at_rest),
+        by_rest=tuple(sorted(valid, key=_activity(tracking.face, at_rest).__getitem__)),
+    )
+
+
+def frontal_camera(cameras: Items[Camera], neutral: FaceParams) -> int:
+    """Which camera looks most squarely at the face of the one timestep `neutral`."""
+    ahead = matrix_from_axis_angle(neutral.head_rotation)[0, :, 2]
+    origin = neutral.head_translation[0]
+    facing = [float(normalize(camera.position - origin, dim=0) @ ahead) for camera in cameras]
+    return max(range(len(cameras)), key=facing.__getitem__)
+
+
+def _activity(face: FaceParams, at_rest: FaceParams) -> list[float]:
+    """How far each timestep is from rest: expression coefficients and radians of head rotation alike."""
+    turn = matrix_from_axis_angle(at_rest.head_rotation).transpose(-1, -2) @ matrix_from_axis_angle(face.head_rotation)
+    angle = ((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).arccos()
+    return ((face.expression - at_rest.expression).norm(dim=-1) + angle).tolist()
+
+
+def cross_reenactment(
+    run_dir: Path, sequence_dir: Path, driver_dirs: Items[Path], video_frames: int
+) -> tuple[dict[str, Any], list[Path]]:
+    """The protocol's entry of metrics.json, and side-by-side videos (driver, avatar) in the run's folder.
+
+    Figures are means over drivers; see `mien.evaluation.redetection` for what they measure. They say how much of the
+    motion arrives, not how good pictures look. The avatar's own sequence as a driver shows the best to be hoped for.
+
+    Args:
+        run_dir: A finished run.
+        sequence_dir: A sequence that it was trained on: whose camera the avatar is seen by.
+        driver_dirs: Folders of tracked sequences.
+        video_frames: At most this many frames a video; 0 for none.
+
+    Raises:
+        UserError: a driver does not fit, or no face is found in its pictures.
+    """
+    entries, videos = [], []
+    for folder in driver_dirs:
+        name = _driver_name(folder)
+        driven = load_driven(run_dir, sequence_dir, folder)
+        entries.append({"driver": name, "pictures": read_capture_hash(folder / "capture"), **measure(driven, name)})
+        if video_frames:
+            videos.append(_write_video(run_dir / "videos" / f"cross_reenactment_{name}.mp4", driven, video_frames))
+    content: dict[str, Any] = {}
+    for key in _MEANS:
+        known = [entry[key] for entry in entries if entry[key] is not None]
+        content[key] = fmean(known) if known else None
+    frames = sum(entry["frames"] for entry in entries)
+    return {**content, "frames": frames, "measured_by": MEASURED_BY, "drivers": entries}, videos
+
+
+def measure(driven: Driven, name: str) -> dict[str, Any]:
+    """Figures of evenly spread frames of one driver.
+
+    Raises:
+        UserError: no face is found in the driver's pictures, or none in the avatar's.
+    """
+    frames = evenly_spread(sorted(driven.by_rest), _FRAMES)
+    seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    found_driver = found_avatar = 0
+    with FaceReader() as reader:
+        for timestep in track_progress(frames, f"driven by {name}", len(frames)):
+            theirs = reader.read(driven.driver_picture(timestep))
+            if theirs is None:
+                continue
+            found_driver += 1
+            ours = reader.read(driven.picture(timestep))
+            if ours is not None:
+                found_avatar += 1
+                seen[timestep] = theirs, ours
+    if not found_driver:
+        raise UserError(f"{name}: no face is found in the driver's pictures; choose another driver")
+    figures: dict[str, float | None] = dict.fromkeys(_MEANS)
+    if seen:
+        rest = seen[next(timestep for timestep in driven.by_rest if timestep in seen)]
+        pairs: list[tuple[Motion, Motion]] = [
+            (motion(theirs, rest[0]), motion(ours, rest[1])) for theirs, ours in seen.values()
+        ]
+        figures |= transfer_figures(pairs)
+    return {**figures, "faces_found": found_avatar / found_driver, "frames": found_driver}
+
+
+def _write_video(path: Path, driven: Driven, most: int) -> Path:
+    timesteps = range(min(most, driven.driver.timesteps))
+    pictures = (
+        labelled_row({f"driver: {t}": driven.driver_picture(t), "avatar": driven.picture(t)})
+        for t in track_progress(timesteps, f"video {path.stem}", len(timesteps))
+    )
+    write_video(path, same_size(pictures), driven.driver.fps, crf=24)
+    return path
+
+
+def _driver_name(folder: Path) -> str:
+    """WORKSPACE_SEQUENCE, or the folder's name where it lies in no workspace; just one where both are the same."""
+    folder = folder.resolve()
+    in_workspace = folder.parent.name == "sequences"
+    names = [folder.parent.parent.name, folder.name] if in_workspace else [folder.name]
+    return "_".join(dict.fromkeys(names))

@@ -1,0 +1,128 @@
+"""What a face detector sees in pictures, relative to a frame at rest: how driven avatars are judged without a truth.
+
+Expression: where lips, lids and brows are once the head's pose, size and place are taken out (a similarity fitted to
+nose and eye corners), as a displacement from the same face at rest, in its own distance between the outer eye corners.
+So neither identity nor head pose count, only what moves. Both sides are measured by the same detector, alike.
+"""
+
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
+from mien.tracking.landmark_groups import BROWS, EYE_CORNERS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
+
+MEASURED_BY = "MediaPipe face mesh, 478 points in 3D, each picture by itself"
+_RIGID = np.array(NOSE + EYE_CORNERS)
+_MOVING = np.array(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS + BROWS)
+_OUTER_CORNERS = (33, 263)
+_MOUTH = ((13, 14),)
+_EYES = ((159, 145), (386, 374))
+
+
+class FaceReader:
+    """Landmarks of single pictures. Use as a context manager."""
+
+    def __enter__(self) -> "FaceReader":
+        module = load_solution("face_mesh")
+        with quiet_mediapipe():
+            self._mesh = module.FaceMesh(static_image_mode=True, max_num_faces=1, refine_landmarks=True)
+            self._mesh.process(np.zeros((64, 64, 3), np.uint8))
+        self._quiet_until_found = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._mesh.close()
+
+    def read(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "l 3"] | None:
+        """Landmarks in pixels (z, away from the camera, in the same unit), or none where no face is found."""
+        picture = np.ascontiguousarray(image)
+        if self._quiet_until_found:
+            # Its last warning comes with the first face.
+            with quiet_mediapipe():
+                found = self._mesh.process(picture).multi_face_landmarks
+            self._quiet_until_found = not found
+        else:
+            found = self._mesh.process(picture).multi_face_landmarks
+        if not found:
+            return None
+        height, width = image.shape[:2]
+        points = np.array([(point.x, point.y, point.z) for point in found[0].landmark])
+        return points * (width, height, width)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What one face does, relative to the same face at rest."""
+
+    displacement: Float[np.ndarray, "m 3"]
+    """Of lips, lids and brows, in distances between the outer eye corners."""
+    rotation: Float[np.ndarray, "3 3"]
+    """Of the head, in the camera's axes."""
+    mouth: float
+    """Opening of the lips, in distances between the outer eye corners."""
+    eyes: float
+    """Mean opening of the lids, alike."""
+
+
+def motion(points: Float[np.ndarray, "l 3"], at_rest: Float[np.ndarray, "l 3"]) -> Motion:
+    """What a face does, from its landmarks and those of the same face at rest."""
+    rotation, scale, shift = similarity(points[_RIGID], at_rest[_RIGID])
+    aligned = scale * points @ rotation.T + shift
+    unit = float(np.linalg.norm(at_rest[_OUTER_CORNERS[0]] - at_rest[_OUTER_CORNERS[1]]))
+    displacement = (aligned - at_rest)[_MOVING] / unit
+    # The fit takes the picture back to rest: the head's own motion is the inverse.
+    return Motion(displacement, rotation.T, _opening(aligned, _MOUTH) / unit, _opening(aligned, _EYES) / unit)
+
+
+def similarity(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3 3"], float, Float[np.ndarray, " 3"]]:
+    """Rotation, scale and shift with target ~ scale * rotation @ source + shift, by least squares (Umeyama 1991)."""
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    centred, wanted = source - source_mean, target - target_mean
+    u, values, vt = np.linalg.svd(wanted.T @ centred)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * signs) @ vt
+    scale = float((values * signs).sum() / (centred**2).sum())
+    return rotation, scale, target_mean - scale * rotation @ source_mean
+
+
+def angle_degrees(rotation: Float[np.ndarray, "3 3"]) -> float:
+    """The angle of a rotation."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
+
+
+def transfer_figures(pairs: list[tuple[Motion, Motion]]) -> dict[str, float | None]:
+    """How well (driver, avatar) motions agree, beside what an avatar that never moves would get (`..._still`).
+
+    Correlations are Pearson's, of an opening over the frames; None where the driver's hardly changes or for less than
+    three frames.
+    """
+    driver, own = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+
+    def mean_length(displacements: list[np.ndarray]) -> float:
+        return float(np.mean([np.linalg.norm(one, axis=1).mean() for one in displacements]))
+
+    return {
+        "expression_error": mean_length([a.displacement - b.displacement for a, b in pairs]),
+        "expression_error_still": mean_length([one.displacement for one in driver]),
+        "head_rotation_error_degrees": float(np.mean([angle_degrees(a.rotation.T @ b.rotation) for a, b in pairs])),
+        "head_rotation_error_still_degrees": float(np.mean([angle_degrees(one.rotation) for one in driver])),
+        "mouth_correlation": _correlation([one.mouth for one in driver], [one.mouth for one in own]),
+        "eyes_correlation": _correlation([one.eyes for one in driver], [one.eyes for one in own]),
+    }
+
+
+def _correlation(first: list[float], second: list[float]) -> float | None:
+    if len(first) < 3 or min(np.std(first), np.std(second)) < 1e-6:
+        return None
+    return float(np.corrcoef(first, second)[0, 1])
+
+
+def _opening(points: Float[np.ndarray, "l 3"], pairs: tuple[tuple[int, int], ...]) -> float:
+    return float(np.mean([np.linalg.norm(points[a] - points[b]) for a, b in pairs]))

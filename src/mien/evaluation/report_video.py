@@ -1,0 +1,36 @@
+"""Videos in report.html: inside the page where they are small, linked where they are not."""
+
+import base64
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+_EMBEDDED_BYTES = 6 << 20
+
+
+def video_html(path: Path, page_folder: Path, note: str) -> str:
+    """The video inside the page where it is small, so that the page stays one file; else a link to it."""
+    link = path.relative_to(page_folder).as_posix()
+    data = path.read_bytes()
+    embedded = f"data:video/mp4;base64,{base64.b64encode(data).decode('ascii')}"
+    source = embedded if len(data) <= _EMBEDDED_BYTES else link
+    return (
+        f'<video controls muted loop preload="metadata" src="{escape(source)}"></video>'
+        f'<p class="note">{escape(note)}: <a href="{escape(link)}">{escape(link)}</a></p>'
+    )
+
+
+@dataclass(frozen=True)
+class ReportVideo:
+    """A side-by-side video of a protocol."""
+
+    path: Path
+    shown: int
+    """Frames in it..."""
+    scored: int
+    """...of this many."""
+
+    def html(self, page_folder: Path) -> str:
+        """Truth, rendering and error, for the page."""
+        part = "" if self.shown == self.scored else f", {self.shown} of {self.scored} frames"
+        return video_html(self.path, page_folder, f"Truth, rendering, error{part}")
