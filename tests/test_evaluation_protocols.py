@@ -201,11 +201,11 @@ def test_comparison_ranks_runs_of_the_same_frames(scored: dict[str, dict], root:
 def test_comparison_warns_of_other_frames_masks_and_missing_runs(
     scored: dict[str, dict], root: Path, tmp_path: Path
 ) -> None:
-    content = json.loads((root / "runs" / "short" / "metrics.json").read_text())
+    content = read_metrics(root / "runs" / "short")
     content["protocols"]["self_reenactment"]["scored_on"]["talk"]["mask"] = "another"
     other = tmp_path / "other"
     other.mkdir()
-    (other / "metrics.json").write_text(json.dumps(content))
+    write_json(other / "metrics.json", "mien.metrics", 1, content)
     (other / "config.json").write_text((root / "runs" / "short" / "config.json").read_text())
     comparison = compare_runs({"short": root / "runs" / "short", "other": other, "never": tmp_path / "never"})
     assert len(comparison.tables) == 2

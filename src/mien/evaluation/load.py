@@ -74,13 +74,16 @@ def held_out_by_protocol(
     unseen_cameras: list[Frame] = []
     for index, sequence in enumerate(sequences):
         left_out = held_out(sequence.capture.timesteps, settings.split).numpy()
+        trained_cameras = [camera_id not in settings.held_out_cameras for camera_id in sequence.capture.camera_ids]
+        sharp = sequence.usable() & sequence.sharp()
+        seen = np.any(sharp & np.array(trained_cameras), axis=1).tolist()
         for timestep, camera in np.argwhere(sequence.usable()).tolist():
             frame = Frame(index, timestep, camera)
             if sequence.name in settings.held_out_sequences:
                 unseen_sequences.append(frame)
             elif left_out[timestep]:
                 unseen_timesteps.append(frame)
-            elif sequence.capture.camera_ids[camera] in settings.held_out_cameras:
+            elif not trained_cameras[camera] and seen[timestep]:
                 unseen_cameras.append(frame)
     by_time = "self_reenactment_tail" if settings.split == "tail" else "self_reenactment"
     found = {
