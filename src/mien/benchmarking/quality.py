@@ -1,0 +1,184 @@
+"""How far a tracking is from the truth of a synthetic capture, and the rows and tables of `mien bench quality`."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from mien.capture import Capture
+from mien.face import FaceModel
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.synthetic import Truth
+from mien.tracking import Tracking
+
+_FACING = 0.2
+"""Least cosine between a visible vertex's normal and the direction to the camera."""
+_STILL = 0.02
+"""Pixels a frame: below, true landmarks stand still."""
+
+
+@dataclass(frozen=True)
+class TrackingErrors:
+    """Means over the tracked timesteps of one sequence; None where there is nothing to measure."""
+
+    vertex_mm: float
+    """Distance of the face region's visible vertices after a similarity alignment of each frame, millimetres."""
+    landmark_px: float
+    """Distance of the tracked model's landmarks, projected, from the true ones, capture pixels; visible cameras."""
+    rotation_deg: float
+    """Of the head, degrees."""
+    rotation_steady_deg: float
+    """The same without its constant part, in which shape and pose stand in for each other."""
+    jitter_px: float | None
+    """Median second difference of the tracked landmarks where the true ones stand still, capture pixels."""
+
+
+@torch.no_grad()
+def tracking_errors(tracking: Tracking, capture: Capture, truth: Truth, face_model: FaceModel) -> TrackingErrors:
+    """Compare a tracking with the truth; both must be of the same face model's topology.
+
+    Cameras are compared in the pixels of the capture, which may be a crop of the drawn pictures.
+    """
+    timesteps = tracking.valid.nonzero()[:, 0].tolist()
+    index = torch.from_numpy(truth.vertex_index)
+    expected = crop_landmarks(truth.landmarks, capture)
+    vertex, pixel, projected = [], [], np.full(expected.shape, np.nan, np.float32)
+    for timestep in timesteps:
+        vertices = face_model(tracking.face[timestep])[0]
+        visible = _visible(truth, face_model, timestep)
+        vertex.append(aligned_distance(vertices[index].numpy()[visible], truth.vertices[timestep][visible]))
+        points = face_model.landmark_positions(vertices, "mediapipe")
+        for camera, view in enumerate(tracking.cameras):
+            projected[timestep, camera] = view.project(points)[0].numpy()
+        seen = capture.valid[timestep]
+        pixel.append(np.linalg.norm(projected[timestep, seen] - expected[timestep, seen], axis=-1).mean())
+    mean, steady = _rotation_errors(tracking, truth)
+    return TrackingErrors(
+        vertex_mm=1e3 * float(np.mean(vertex)),
+        landmark_px=float(np.mean(pixel)),
+        rotation_deg=mean,
+        rotation_steady_deg=steady,
+        jitter_px=_jitter(projected, expected),
+    )
+
+
+def crop_landmarks(landmarks: Float[np.ndarray, "t c l 2"], capture: Capture) -> Float[np.ndarray, "t c l 2"]:
+    """Pixels of the drawn pictures as pixels of the capture, which may be cropped and shrunk."""
+    crop = capture.source.get("crop")
+    if crop is None:
+        return landmarks
+    scale = np.array([capture.width / crop["width"], capture.height / crop["height"]], np.float32)
+    return (landmarks - np.array([crop["left"], crop["top"]], np.float32)) * scale
+
+
+def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> float:
+    """Mean distance after the best rotation, scale and shift of `points` (Umeyama 1991), in the target's unit."""
+    a, b = points.astype(np.float64), target.astype(np.float64)
+    a, b = a - a.mean(0), b - b.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation, scale = (u * sign) @ vt, (s * sign).sum() / (a * a).sum()
+    return float(np.linalg.norm(scale * a @ rotation.T - b, axis=-1).mean())
+
+
+def _visible(truth: Truth, face_model: FaceModel, timestep: int) -> Bool[np.ndarray, " n"]:
+    """Vertices of the region that face any camera."""
+    index, faces = truth.vertex_index, face_model.faces.numpy()
+    place = np.full(len(face_model.template), -1)
+    place[index] = np.arange(len(index))
+    local = place[faces]
+    local = local[(local >= 0).all(1)]
+    points = truth.vertices[timestep]
+    corners = points[local]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(points)
+    for corner in range(3):
+        np.add.at(normals, local[:, corner], areas)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-12
+    pose = truth.tracking.face.T_world_head[timestep].numpy()
+    facing = np.zeros(len(index), bool)
+    for camera in truth.tracking.cameras:
+        towards = pose[:3, :3].T @ (camera.position.numpy() - pose[:3, 3]) - points
+        towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+        facing |= (normals * towards).sum(-1) > _FACING
+    return facing
+
+
+def _rotation_errors(tracking: Tracking, truth: Truth) -> tuple[float, float]:
+    """Mean angles in degrees: as it is, and beside the mean difference."""
+    kept = tracking.valid
+    tracked, true = (matrix_from_axis_angle(t.face.head_rotation)[kept].double() for t in (tracking, truth.tracking))
+    difference = tracked.transpose(-1, -2) @ true
+    u, _, vh = torch.linalg.svd(difference.mean(0))
+    mean = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vh))]).double()) @ vh
+    angles = [
+        torch.rad2deg(axis_angle_from_matrix(part.float()).norm(dim=-1)).mean()
+        for part in (difference, mean.T @ difference)
+    ]
+    return float(angles[0]), float(angles[1])
+
+
+def _jitter(projected: Float[np.ndarray, "t c l 2"], true: Float[np.ndarray, "t c l 2"]) -> float | None:
+    moving = np.linalg.norm(np.diff(true[:, 0], axis=0), axis=-1).max(-1)
+    still = (moving[1:] < _STILL) & (moving[:-1] < _STILL)
+    second = np.linalg.norm(projected[2:] - 2 * projected[1:-1] + projected[:-2], axis=-1)[still]
+    second = second[np.isfinite(second)]
+    return float(np.median(second)) if len(second) else None
+
+
+@dataclass(frozen=True)
+class QualityRow:
+    """All figures of one reference capture."""
+
+    capture: str
+    content_hash: str
+    method: str
+    steps: int
+    gaussians: int
+    protocols: dict[str, Any]
+    """As in metrics.json, without the figures of single frames."""
+    tracking: dict[str, TrackingErrors]
+    """By sequence."""
+    seconds: dict[str, float]
+    """Of each stage when it was last run."""
+
+    def as_json(self) -> dict[str, Any]:
+        """For json."""
+        return asdict(self)
+
+
+def markdown_table(rows: list[QualityRow]) -> str:
+    """Pictures and trackings, as docs/results.md shows them."""
+    lines = [
+        "| capture (hash) | protocol | what | whole frame: PSNR / SSIM / L1 / ST-LPIPS | head crop |", "|---|---|---|---|---|"
+    ]  # fmt: skip
+    for row in rows:
+        for protocol, entry in row.protocols.items():
+            named = {"avatar": entry, **entry["baselines"]}
+            for what, figures in named.items():
+                label = f"{row.capture} (`{row.content_hash}`)" if what == "avatar" else ""
+                lines.append(f"| {label} | {protocol if what == 'avatar' else ''} | {what.replace('_', ' ')} | "
+                             f"{_figures(figures)} | {_figures(figures['head'])} |")  # fmt: skip
+    lines += [
+        "",
+        "| capture | sequence | face vertices | landmarks | head rotation (without its constant part) | jitter, still |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        for name, errors in row.tracking.items():
+            jitter = "-" if errors.jitter_px is None else f"{errors.jitter_px:.3f} px"
+            lines.append(f"| {row.capture} | {name} | {errors.vertex_mm:.2f} mm | {errors.landmark_px:.2f} px | "
+                         f"{errors.rotation_deg:.2f} ({errors.rotation_steady_deg:.2f}) deg | {jitter} |")  # fmt: skip
+    lines += ["", "| capture | steps | Gaussians | seconds by stage |", "|---|---|---|---|"]
+    for row in rows:
+        seconds = ", ".join(f"{name} {value:.0f}" for name, value in row.seconds.items())
+        lines.append(f"| {row.capture} | {row.steps:,} | {row.gaussians:,} | {seconds} |")
+    return "\n".join(lines) + "\n"
+
+
+def _figures(entry: dict[str, Any]) -> str:
+    perceptual = entry.get("perceptual")
+    last = "-" if perceptual is None else f"{perceptual:.3f}"
+    return f"{entry['psnr']:.2f} / {entry['ssim']:.3f} / {entry['l1']:.4f} / {last}"
