@@ -152,8 +152,9 @@ class QualityRow:
 def markdown_table(rows: list[QualityRow]) -> str:
     """Pictures and trackings, as docs/results.md shows them."""
     lines = [
-        "| capture (hash) | protocol | what | whole frame: PSNR / SSIM / L1 / ST-LPIPS | head crop |", "|---|---|---|---|---|"
-    ]  # fmt: skip
+        "| capture (hash) | protocol | what | whole frame: PSNR / SSIM / L1 / ST-LPIPS | head crop |",
+        "|---|---|---|---|---|",
+    ]
     for row in rows:
         for protocol, entry in row.protocols.items():
             named = {"avatar": entry, **entry["baselines"]}
@@ -163,7 +164,7 @@ def markdown_table(rows: list[QualityRow]) -> str:
                              f"{_figures(figures)} | {_figures(figures['head'])} |")  # fmt: skip
     lines += [
         "",
-        "| capture | sequence | face vertices | landmarks | head rotation (without its constant part) | jitter, still |",
+        "| capture | sequence | face vertices | landmarks | head rotation (steady part left out) | jitter, still |",
         "|---|---|---|---|---|---|",
     ]
     for row in rows:

@@ -1,0 +1,112 @@
+"""What `mien bench quality` measures: nothing where a tracking is the truth, and the right amount where it is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mien.benchmarking.quality import (
+    QualityRow,
+    TrackingErrors,
+    aligned_distance,
+    crop_landmarks,
+    markdown_table,
+    tracking_errors,
+)
+from mien.capture import Capture
+from mien.cli import main
+from mien.synthetic import RECIPES, Segment, SyntheticScene, truth_of
+
+RECIPE = replace(
+    RECIPES["demo"], width=128, height=128, fps=10.0, glasses=False, hair="none",
+    script=(Segment("free", 1.0), Segment("still", 1.5)),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def case():
+    scene = SyntheticScene(RECIPE, 3)
+    truth, timesteps = truth_of(scene), RECIPE.timesteps
+    capture = Capture(
+        name="case",
+        camera_ids=("front",),
+        fps=10.0,
+        timestamps=np.arange(timesteps) / 10,
+        images=np.zeros((timesteps, 1, 128, 128, 3), np.uint8),
+        mattes=np.zeros((timesteps, 1, 128, 128), np.uint8),
+        landmarks=truth.landmarks,
+        valid=np.ones((timesteps, 1), bool),
+        principal_point=np.full((1, 2), 64.0, np.float32),
+        source={},
+    )
+    return scene, capture, truth
+
+
+def test_the_truth_has_no_error(case):
+    scene, capture, truth = case
+    errors = tracking_errors(truth.tracking, capture, truth, scene.model)
+    assert errors.vertex_mm < 0.02
+    assert errors.landmark_px < 0.05
+    assert errors.rotation_deg < 0.05
+    assert errors.jitter_px is not None
+    assert errors.jitter_px < 0.01
+
+
+def test_a_constant_turn_is_not_unsteady(case):
+    scene, capture, truth = case
+    face = truth.tracking.face
+    still = replace(face, head_rotation=torch.zeros_like(face.head_rotation))
+    turned = replace(face, head_rotation=torch.zeros_like(face.head_rotation) + torch.tensor([0.0, 0.1, 0.0]))
+    errors = tracking_errors(
+        replace(truth.tracking, face=turned), capture, replace(truth, tracking=replace(truth.tracking, face=still)),
+        scene.model,
+    )  # fmt: skip
+    assert errors.rotation_deg == pytest.approx(np.degrees(0.1), abs=1e-2)
+    assert errors.rotation_steady_deg < 0.05
+
+
+def test_another_expression_is_a_distance_and_noise_is_jitter(case):
+    scene, capture, truth = case
+    face, random = truth.tracking.face, torch.Generator().manual_seed(0)
+    open_mouth = face.expression.clone()
+    open_mouth[:, scene.model.expression_names.index("jawOpen")] += 0.5
+    shift = 0.002 * torch.randn(len(face), 3, generator=random)
+    worse = replace(face, expression=open_mouth, head_translation=face.head_translation + shift)
+    errors = tracking_errors(replace(truth.tracking, face=worse), capture, truth, scene.model)
+    assert 1 < errors.vertex_mm < 10
+    assert errors.jitter_px is not None
+    assert errors.jitter_px > 0.3
+
+
+def test_distances_do_not_see_rotation_scale_and_shift():
+    random = np.random.default_rng(0)
+    points = random.normal(size=(50, 3))
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    assert aligned_distance(3 * points @ turn.T + 5, points) < 1e-9
+    assert aligned_distance(points * [1, 1, -1], points) > 0.1  # but they do see a mirror
+
+
+def test_truth_follows_the_capture_s_crop(case):
+    _, capture, truth = case
+    cropped = replace(capture, source={"crop": {"left": 32, "top": 16, "width": 64, "height": 64}})
+    moved = crop_landmarks(truth.landmarks, cropped)
+    np.testing.assert_allclose(moved, (truth.landmarks - [32, 16]) * 2, rtol=1e-5)
+
+
+def test_the_table_names_hash_and_baselines():
+    figures = {"psnr": 30.0, "ssim": 0.9, "l1": 0.01, "perceptual": None}
+    figures = {**figures, "head": dict(figures)}
+    protocols = {"novel_view": {**figures, "baselines": {"mean_frame": figures, "mesh": figures}}}
+    errors = {"a": TrackingErrors(1.0, 2.0, 3.0, 0.5, None)}
+    table = markdown_table([QualityRow("ring-16", "abcd", "headgas", 10, 99, protocols, errors, {"draw": 1.0})])
+    assert "ring-16 (`abcd`) | novel_view | avatar | 30.00 / 0.900 / 0.0100 / - |" in table
+    assert "mean frame" in table
+    assert "| mesh |" in table
+    assert "1.00 mm | 2.00 px | 3.00 (0.50) deg | - |" in table
+
+
+def test_an_unknown_capture_is_one_line(tmp_path, capsys):
+    assert main(["bench", "quality", "--captures", "mono", "--out", str(tmp_path)]) == 2
+    assert "choose of: mono-short" in capsys.readouterr().err
