@@ -19,6 +19,7 @@ from mien.commands.stages.evaluating import evaluation_stage, run_sequences
 from mien.commands.stages.tracking import tracking_stage
 from mien.commands.stages.training import training_stage
 from mien.errors import UserError
+from mien.evaluation import read_metrics
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.protocols import EvaluationSettings
@@ -82,7 +83,8 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
     with times.measured("train"):
         training_stage(workspace, list(trackings), run, method_named(method).config(), settings)
     with times.measured("evaluate"):
-        metrics = evaluation_stage(workspace, run, _SCORED)
+        scored = (workspace.run_dir(run) / "metrics.json").is_file()
+        metrics = read_metrics(workspace.run_dir(run)) if scored else evaluation_stage(workspace, run, _SCORED)
     errors = {name: _errors(workspace, drawn, name) for name in trackings}
     summary = read_training_summary(workspace.run_dir(run))
     protocols = {
