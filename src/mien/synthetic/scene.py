@@ -87,11 +87,11 @@ class SyntheticScene:
 
     def vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
         """True vertices of the head, in the face model's topology, world space, metres."""
-        return self.drawn_model(self._drawn_face[timestep])[0]
+        return self.drawn_model.vertices_reference(self._drawn_face[timestep])[0]
 
     def head_vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
         """True vertices of the head in the head frame, metres."""
-        return self.drawn_model.head_vertices(self._drawn_face[timestep])[0]
+        return self.drawn_model.head_vertices_reference(self._drawn_face[timestep])[0]
 
     def frame(self, timestep: int, camera: int = 0) -> SyntheticFrame:
         """One picture; the same bytes every time. Safe to call from several threads at once."""

@@ -134,7 +134,7 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
 def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.ndarray, " 3"]) -> PosedSubject:
     """The subject at one timestep (`face` has a batch of one)."""
     model = subject.model
-    head = model.head_vertices(face)[0]
+    head = model.head_vertices_reference(face)[0]  # whose rounding stays, and with it the hash of pictures
     landmarks = model.landmark_positions(head, "mediapipe").numpy()
     normals = vertex_normals(head, model.faces).numpy()
     T_world_head = face.T_world_head[0].numpy()
