@@ -23,7 +23,7 @@ from mien.synthetic.writing import _Pictures, hash_scene, read_synthetic_hash, s
 
 TINY_HASHES = {
     "mono-short": "664f3da447bc70d2",
-    "mono-long": "798fa9b5c47365e6",
+    "mono-long": "62131cd0f25ac65f",
     "ring-16": "fab1c3f7f64302d8",
     "beard": "d077c0f3d81e7e43",
     "long-hair": "9ce69a23793b7b9e",

@@ -40,7 +40,8 @@ def test_reduced_model_is_the_model():
     full = reduced.face_model
     vertices = full(layout.face_params(state, identity))
     expected = camera.project(full.landmark_positions(vertices, "mediapipe"))[0]
-    projected = reduced.project(state, identity, torch.zeros(478, 3, dtype=torch.float64), batch_of((camera,) * 3))
+    bias = torch.zeros(478, 3, dtype=torch.float64)
+    projected = reduced.project(state, identity, bias, batch_of((camera,) * 3), torch.arange(3))
     torch.testing.assert_close(projected, expected, atol=1e-4, rtol=0)
 
 
@@ -49,7 +50,7 @@ def test_derivatives_match_finite_differences(which):
     model = _model_with_correctives()
     layout = layout_of(model)
     reduced = reduce_face_model(model, layout)
-    camera = still_camera()
+    camera, row = still_camera(), torch.tensor([0, 2, 1, 2])  # one timestep was seen by two cameras
     at = {"state": _random_state(layout), "identity": torch.linspace(-1, 1, 6, dtype=torch.float64),
           "bias": torch.zeros(478, 3, dtype=torch.float64), "focal": torch.zeros(1, dtype=torch.float64)}  # fmt: skip
 
@@ -58,10 +59,12 @@ def test_derivatives_match_finite_differences(which):
         K = camera.K.clone()
         K[[0, 1], [0, 1]] *= values["focal"].exp()
         return reduced.project(
-            values["state"], values["identity"], values["bias"], batch_of((replace(camera, K=K),) * 3)
+            values["state"], values["identity"], values["bias"], batch_of((replace(camera, K=K),) * 4), row
         )
 
-    linear = reduced.linearize(at["state"], at["identity"], at["bias"], batch_of((camera,) * 3), with_identity=True)
+    linear = reduced.linearize(
+        at["state"], at["identity"], at["bias"], batch_of((camera,) * 4), row, with_identity=True
+    )
     analytic = {"state": linear.by_frame, "identity": linear.by_identity, "bias": linear.by_bias,
                 "focal": linear.by_log_focal[..., None]}[which]  # fmt: skip
     step = 1e-6

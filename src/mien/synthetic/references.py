@@ -98,7 +98,7 @@ REFERENCES = {
             )),
         ),
         _one(
-            "mono-long", "2 minutes of one camera, 384x384, 15 fps: speech, posed expressions, wide turns", 4,
+            "mono-long", "2 minutes of one camera, 384x384, 15 fps: speech, posed expressions, wide turns", 14,
             replace(_PERSON, width=384, height=384, fps=15.0, turns=(58.0, 24.0), script=_script(
                 ("still", 2.0), ("speech", 40.0), ("expressions", 34.0), ("turns", 24.0), ("still", 2.0),
                 ("free", 16.0), ("still", 2.0),

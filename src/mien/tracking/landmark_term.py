@@ -61,9 +61,8 @@ class LandmarkTerm:
 
     def _offsets(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "n l 2"]:
         views = self.views
-        return (
-            self.model.project(state[views.row], subject.identity, subject.bias, cameras[views.camera]) - views.detected
-        )
+        projected = self.model.project(state, subject.identity, subject.bias, cameras[views.camera], views.row)
+        return projected - views.detected
 
     def cost(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
         """Of each timestep."""
@@ -82,7 +81,10 @@ class LandmarkTerm:
         for start in range(0, len(views.row), _CHUNK):
             part = slice(start, start + _CHUNK)
             row, camera = views.row[part], views.camera[part]
-            at = self.model.linearize(state[row], subject.identity, subject.bias, cameras[camera], with_identity)
+            seen, place = row.unique(return_inverse=True)
+            at = self.model.linearize(
+                state[seen], subject.identity, subject.bias, cameras[camera], place, with_identity
+            )
             residual = at.pixels - views.detected[part]
             cost, weights = self._robust(residual, camera)
             yield WeightedLinearization(at, row, residual, weights, cost)
