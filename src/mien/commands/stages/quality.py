@@ -144,7 +144,9 @@ def _strip(workspace: Workspace, run: str) -> np.ndarray:
     run_dir = workspace.run_dir(run)
     experiment: Experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
     frames = experiment.held_out_frames
-    chosen = [frames[index] for index in np.linspace(0, len(frames) - 1, _SHEET_FRAMES).astype(int)]
+    # Not evenly spread, which with several cameras would show one camera again and again.
+    places = np.random.default_rng(0).choice(len(frames), _SHEET_FRAMES, replace=len(frames) < _SHEET_FRAMES)
+    chosen = [frames[index] for index in np.sort(places)]
     rows = [
         np.concatenate([_small(draw(experiment, frame).numpy()) for frame in chosen], axis=1)
         for draw in (target_image, avatar_image)
