@@ -3,6 +3,7 @@
 
 void bind_face(nanobind::module_& module);
 void bind_mesh(nanobind::module_& module);
+void bind_mesh_gradients(nanobind::module_& module);
 void bind_photometric(nanobind::module_& module);
 void bind_rig(nanobind::module_& module);
 void bind_rasterize(nanobind::module_& module);
@@ -13,6 +14,7 @@ NB_MODULE(_native, module) {
   module.doc() = "mien's native core. Private: only the autograd functions in mien.render and mien.avatar call it.";
   bind_face(module);
   bind_mesh(module);
+  bind_mesh_gradients(module);
   bind_photometric(module);
   bind_rig(module);
   bind_rasterize(module);

@@ -22,6 +22,80 @@ def interpolate_mesh(
     face_index: Tensor, barycentric: Tensor, attributes: Tensor, corners: Tensor, out: Tensor
 ) -> None: ...
 
+# native/bind_mesh_gradients.cpp; gradients of points and light: float64; edges: int32. All are added to but those of
+# barycentrics, uv and images, which are written.
+def barycentric_backward(
+    face_index: Tensor,
+    barycentric: Tensor,
+    depth: Tensor,
+    points: Tensor,
+    faces: Tensor,
+    grad_barycentric: Tensor,
+    grad_points: Tensor,
+) -> None: ...
+def interpolate_mesh_backward(
+    face_index: Tensor,
+    barycentric: Tensor,
+    attributes: Tensor,
+    corners: Tensor,
+    grad_out: Tensor,
+    grad_attributes: Tensor | None,
+    grad_barycentric: Tensor | None,
+) -> None: ...
+def sample_texture(texture: Tensor, uv: Tensor, out: Tensor) -> None: ...
+def sample_texture_backward(
+    texture: Tensor, uv: Tensor, grad_out: Tensor, grad_texture: Tensor | None, grad_uv: Tensor | None
+) -> None: ...
+def antialias(
+    face_index: Tensor,
+    barycentric: Tensor,
+    depth: Tensor,
+    points: Tensor,
+    faces: Tensor,
+    edge_vertices: Tensor,
+    edge_faces: Tensor,
+    opposite: Tensor,
+    image: Tensor,
+    out: Tensor,
+) -> None: ...
+def antialias_backward(
+    face_index: Tensor,
+    barycentric: Tensor,
+    depth: Tensor,
+    points: Tensor,
+    faces: Tensor,
+    edge_vertices: Tensor,
+    edge_faces: Tensor,
+    opposite: Tensor,
+    image: Tensor,
+    grad_out: Tensor,
+    grad_image: Tensor,
+    grad_points: Tensor,
+) -> None: ...
+def mesh_loss(
+    face_index: Tensor,
+    barycentric: Tensor,
+    depth: Tensor,
+    points: Tensor,
+    faces: Tensor,
+    edge_vertices: Tensor,
+    edge_faces: Tensor,
+    opposite: Tensor,
+    normals: Tensor,
+    uv: Tensor,
+    face_weights: Tensor,
+    texture: Tensor,
+    light: Tensor,
+    target: Tensor,
+    mask: Tensor,
+    epsilon: float,
+    picture: Tensor | None,
+    grad_points: Tensor,
+    grad_normals: Tensor,
+    grad_texture: Tensor,
+    grad_light: Tensor,
+) -> tuple[float, float]: ...
+
 # native/bind_photometric.cpp; target: float32 or uint8; box: left, top, width, height
 def photometric_loss(
     image: Tensor,

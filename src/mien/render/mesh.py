@@ -1,7 +1,7 @@
 """Triangle meshes: visible fragments, interpolation, textures, simple light, pictures.
 
-Forward only in the vertices; differentiable in what is interpolated, in textures and in light. Everything runs on one
-thread of a CPU and releases the GIL, so that frames can be drawn by several Python threads at once.
+Differentiable in what is interpolated, in textures and in light; in the vertices with `mien.render.mesh_gradients`.
+Everything runs on one thread of a CPU and releases the GIL: several Python threads can each draw a frame.
 """
 
 from dataclasses import dataclass
@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, normalize
+from torch.nn.functional import avg_pool2d, normalize
 
 from mien import _native
 from mien.camera import Camera
+from mien.render.mesh_functions import interpolate_rows, look_up_texture
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,19 +82,15 @@ def interpolate(
 ) -> Float[Tensor, "h w c"]:
     """Attributes of vertices, or of every triangle's corners, at each pixel; 0 where no triangle is.
 
-    Differentiable in `attributes`.
+    Differentiable in `attributes`, and in the barycentrics where these are (`differentiable_fragments`).
     """
     corners = faces
     if attributes.ndim == 3:
         corners = torch.arange(3 * len(faces)).view(-1, 3)
         attributes = attributes.flatten(0, 1)
-    if attributes.requires_grad or attributes.dtype != torch.float32:
+    if attributes.dtype != torch.float32:
         return interpolate_reference(fragments, attributes, corners)
-    out = torch.empty(*fragments.face_index.shape, attributes.shape[1])
-    _native.interpolate_mesh(
-        fragments.face_index, fragments.barycentric, attributes.contiguous(), corners.contiguous(), out
-    )
-    return out
+    return interpolate_rows(attributes, fragments.barycentric, fragments.face_index, corners.contiguous())
 
 
 def interpolate_reference(
@@ -107,16 +104,12 @@ def interpolate_reference(
     return out.masked_scatter(covered[..., None], (weights[..., None] * values).sum(-2))
 
 
-def sample_texture(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "h w 2"]) -> Float[Tensor, "h w c"]:
+def sample_texture(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n c"]:
     """Bilinear look-up; (0, 0) is the lower left corner of the texture's picture, v goes up. Clamped at the borders.
 
-    Differentiable in both arguments.
+    float32. Differentiable in both arguments.
     """
-    grid = torch.stack([2 * uv[..., 0] - 1, 1 - 2 * uv[..., 1]], dim=-1)
-    sampled = grid_sample(
-        texture.permute(2, 0, 1)[None], grid[None], mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return sampled[0].permute(1, 2, 0)
+    return look_up_texture(texture, uv)
 
 
 def vertex_normals(vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "*b v 3"]:
