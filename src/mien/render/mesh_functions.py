@@ -123,8 +123,8 @@ class _MeshLoss(torch.autograd.Function):
         grad_light = torch.zeros(9, 3, dtype=torch.float64)
         total, weight = _native.mesh_loss(
             face_index, barycentric, depth, tensors[0], faces, edge_vertices, edge_faces, opposite, tensors[1], uv,
-            face_weights, tensors[2], tensors[3], image, mask, epsilon, picture, grad_points, grad_normals, grad_texture,
-            grad_light,
+            face_weights, tensors[2], tensors[3], image, mask, epsilon, picture, grad_points, grad_normals,
+            grad_texture, grad_light,
         )  # fmt: skip
         weight = max(weight, 1.0)
         ctx.weight = weight
