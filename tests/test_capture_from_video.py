@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from capture_helpers import assert_same_capture, scan_texture, tree_bytes, write_face_clip, write_gradient_video
-from mien.capture import CaptureSettings, capture_video, process, read_capture
+from mien.capture import CaptureSettings, capture_video, capture_video_parts, process, read_capture
 from mien.capture.video import write_video
 from mien.errors import UserError
 
@@ -65,6 +65,22 @@ def test_captured_again_it_is_read_back(face_clip, face_capture, monkeypatch):
     monkeypatch.setattr("mien.capture.from_video.survey_source", None)  # any work would call it
     assert_same_capture(capture, capture_video(face_clip[0], path, CaptureSettings(size=200)))
     assert tree_bytes(path) == before
+
+
+@pytest.mark.parametrize("name", ["frames/0/000003.png", "mattes/0/000001.png", "landmarks.safetensors"])
+def test_a_damaged_capture_is_captured_again(face_clip, tmp_path, capsys, name):
+    settings = CaptureSettings(size=64, max_frames=4)
+    (whole,) = capture_video_parts(face_clip[0], tmp_path, settings)
+    before = tree_bytes(tmp_path)
+    file = tmp_path / "wandering" / "capture" / name
+    file.write_bytes(file.read_bytes()[:-30])
+    with pytest.raises(UserError, match="`mien capture`"):
+        read_capture(tmp_path / "wandering" / "capture")
+    (mended,) = capture_video_parts(face_clip[0], tmp_path, settings)
+    assert f"{file}: " in (said := capsys.readouterr().err)
+    assert "it is captured again" in said
+    assert_same_capture(whole, mended)
+    assert tree_bytes(tmp_path) == before
 
 
 def test_other_settings_replace_the_capture(face_clip, tmp_path):

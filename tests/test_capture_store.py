@@ -101,6 +101,12 @@ def test_every_damage_is_named(stored, tmp_path):
     def swap(path):
         (path / "frames/camera0/000000.png").write_bytes((path / "frames/camera1/000001.png").read_bytes())
 
+    def scribble(path):
+        file = path / "frames/camera0/000002.png"
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2 : len(content) // 2 + 40] = bytes(40)
+        file.write_bytes(content)
+
     cases = {
         "no json": (lambda path: (path / "capture.json").unlink(), "capture.json: missing"),
         "broken json": (truncate("capture.json", 30), "cannot be read as json"),
@@ -116,6 +122,7 @@ def test_every_damage_is_named(stored, tmp_path):
         "frame": (lambda path: (path / "frames/camera1/000002.png").unlink(), "000002.png: missing"),
         "camera": (lambda path: shutil.rmtree(path / "mattes/camera1"), "missing .3 of 3 are"),
         "cut png": (truncate("mattes/camera0/000001.png", 200), "000001.png: truncated"),
+        "damaged png": (scribble, "000002.png: (damaged|has other pixels)"),
         "empty png": (truncate("frames/camera0/000001.png", 0), "000001.png: truncated"),
         "swapped png": (swap, "000000.png: has other pixels"),
     }
@@ -126,6 +133,7 @@ def test_every_damage_is_named(stored, tmp_path):
         with pytest.raises(UserError, match=message) as error:
             read_capture(path)
         assert str(path) in str(error.value), name
+        assert "`mien capture`" in str(error.value), name
         assert "\n" not in str(error.value), name
     with pytest.raises(UserError, match="no capture there"):
         read_capture(tmp_path / "nowhere")

@@ -99,7 +99,9 @@ def test_damaged_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     capture = tmp_path / "out" / "sequences" / "clip" / "capture"
     capture.mkdir(parents=True)
     (capture / "capture.json").write_text('{"format": "mien.capture", "ver')
-    assert "capture.json" in complaint(capsys, "track", str(tmp_path / "out"))
+    said = complaint(capsys, "track", str(tmp_path / "out"))
+    assert "capture.json" in said
+    assert "run `mien capture` again" in said
 
 
 def test_options_are_checked_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

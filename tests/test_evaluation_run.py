@@ -1,6 +1,7 @@
 """From a run's folder to metrics.json and report.html, through the files that the stages before write."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,16 @@ def test_wrong_sequences_and_unfinished_runs(workspace: tuple[Path, Path], tmp_p
         evaluate(tmp_path, [folder])
     with pytest.raises(UserError, match="missing"):
         read_metrics(tmp_path)
+
+
+def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path], tmp_path: Path) -> None:
+    folder, run_dir = tmp_path / "clip", workspace[1]
+    shutil.copytree(workspace[0], folder)
+    shutil.rmtree(folder / "scoring")
+    write_scoring(folder / "scoring", make_experiment().scorings[0], capture_hash="of another capture")
+    for read in (lambda: evaluate(run_dir, [folder]), lambda: read_sequence(folder)):
+        with pytest.raises(UserError, match=r"scoring: its masks are of other pictures .* run `mien track` again"):
+            read()
 
 
 def test_without_perceptual_metric_and_baselines(workspace: tuple[Path, Path]) -> None:

@@ -1,5 +1,6 @@
 """Trackings and scoring masks on disk: round trips, damage, and that a scoring mask never changes."""
 
+import hashlib
 import json
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from mien.tracking import (
     Scoring,
     Tracking,
     read_scoring,
+    read_scoring_hash,
     read_tracking,
     scoring_exists,
     write_scoring,
@@ -151,3 +153,25 @@ def test_damaged_scoring(tmp_path):
     mask.write_bytes((tmp_path / "other" / "masks" / "00" / "000001.png").read_bytes())
     with pytest.raises(UserError, match="not those that were written"):
         read_scoring(tmp_path / "s")
+
+
+def test_scoring_of_other_pictures_is_refused(tmp_path):
+    write_scoring(tmp_path / "s", _scoring(), capture_hash="a1")
+    assert read_scoring(tmp_path / "s", "a1").masks.max() == 200
+    with pytest.raises(UserError, match=r"other pictures than the capture beside it has; run `mien track` again"):
+        read_scoring(tmp_path / "s", "b2")
+    # Those of the first release do not say what they belong to.
+    write_scoring(tmp_path / "old", _scoring())
+    assert read_scoring(tmp_path / "old", "b2").masks.max() == 200
+
+
+def test_the_hash_of_a_scoring_is_over_masks_and_crops(tmp_path):
+    """Figures of other runs name it, so that it must not change."""
+    write_scoring(tmp_path / "s", _scoring())
+    digest = hashlib.sha256(_scoring().masks.tobytes() + _scoring().crops.astype(np.int32).tobytes()).hexdigest()
+    assert read_scoring_hash(tmp_path / "s") == digest
+    other = _scoring()
+    other.crops[1, 0, 2] += 1
+    write_scoring(tmp_path / "crops", other)
+    write_scoring(tmp_path / "masks", _scoring(value=201))
+    assert len({read_scoring_hash(tmp_path / name) for name in ("s", "crops", "masks")}) == 3

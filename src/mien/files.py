@@ -23,6 +23,7 @@ _KEPT_OF_NAME = 100
 """Characters of a file's name that its temporary name keeps: file systems allow 255 bytes in all."""
 _CHECKSUM = "checksum"
 """Of everything else in a json file, or in the header and data of a safetensors file."""
+_ANY_STAGE = "the stage that writes it"
 _LARGEST_JSON = 64 << 20
 """Bytes; the largest that mien writes has some megabytes."""
 _LARGEST_HEADER = 100 << 20
@@ -118,8 +119,8 @@ def write_json(path: Path, format_name: str, version: int, content: Mapping[str,
     write_atomically(path, lambda temporary: temporary.write_text(text + "\n", encoding="utf-8"))
 
 
-def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
-    """Read what `write_json` wrote.
+def read_json(path: Path, format_name: str, version: int, stage: str = _ANY_STAGE) -> dict[str, Any]:
+    """Read what `write_json` wrote; `stage` is the command to name where that fails.
 
     Raises:
         UserError: the file is missing, is no json, has another format or version, or was changed since.
@@ -129,20 +130,18 @@ def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
             raise ValueError(f"{path.stat().st_size} bytes are too many")
         content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except FileNotFoundError:
-        raise UserError(f"{path}: missing; run the stage that writes it again") from None
+        raise UserError(f"{path}: missing; run {stage} again") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise UserError(
-            f"{path}: cannot be read as json ({error}); delete its folder and run the stage again"
-        ) from None
+        raise UserError(f"{path}: cannot be read as json ({error}); delete its folder and run {stage} again") from None
     found = (content.get("format"), content.get("version")) if isinstance(content, dict) else (None, None)
     if found != (format_name, version):
         raise UserError(
             f"{path}: has format {found[0]!r} version {found[1]!r}, expected {format_name!r} version {version}; "
-            "run the stage that writes it again"
+            f"run {stage} again"
         )
     if _CHECKSUM in content and content.pop(_CHECKSUM) != _json_checksum(content):
         raise UserError(
-            f"{path}: was damaged or edited after it was written; delete its folder and run the stage again "
+            f"{path}: was damaged or edited after it was written; delete its folder and run {stage} again "
             f"(or, if you know what you changed, remove its {_CHECKSUM!r})"
         )
     return content
@@ -186,29 +185,29 @@ def write_safetensors(path: Path, data: bytes, metadata: Mapping[str, str] | Non
     write_atomically(path, write)
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read safetensors as numpy arrays.
+def read_arrays(path: Path, stage: str = _ANY_STAGE) -> dict[str, np.ndarray]:
+    """Read safetensors as numpy arrays; `stage` is the command to name where that fails.
 
     Raises:
         UserError: the file is missing or damaged.
     """
-    return read_safetensors(path, safetensors.numpy.load_file)
+    return read_safetensors(path, safetensors.numpy.load_file, stage)
 
 
-def read_safetensors(path: Path, load: Callable[[Path], Any]) -> Any:
+def read_safetensors(path: Path, load: Callable[[Path], Any], stage: str = _ANY_STAGE) -> Any:
     """What `load` reads from a safetensors file, with the errors of a missing or damaged one in words.
 
     Raises:
         UserError: the file is missing or damaged.
     """
     if not path.is_file():
-        raise UserError(f"{path}: missing; run the stage that writes it again")
+        raise UserError(f"{path}: missing; run {stage} again")
     try:
         _check_safetensors(path)
         return load(path)
     except (safetensors.SafetensorError, OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: damaged safetensors file ({reason}); delete it and run its stage again") from None
+        raise UserError(f"{path}: damaged safetensors file ({reason}); delete it and run {stage} again") from None
 
 
 def _check_safetensors(path: Path) -> None:

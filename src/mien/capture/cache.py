@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mien.capture.frame_files import CACHE, FRAMES, MATTES, CacheWriter, FrameLayout, read_png
+from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, CacheWriter, FrameLayout, read_png
 from mien.errors import UserError
+from mien.picture_files import map_pictures
 from mien.progress import progress_bar
 from mien.storage import read_json, write_json
 
@@ -42,7 +43,7 @@ def map_frames(layout: FrameLayout, capture_hash: str, digests: dict[str, np.nda
     _check_present(layout)
     if not _is_valid(layout, capture_hash):
         layout = _rebuild(layout, capture_hash, digests)
-    images, mattes = (np.memmap(layout.raw(kind), np.uint8, "r", shape=layout.shape(kind)) for kind in (FRAMES, MATTES))
+    images, mattes = (map_pictures(layout.raw(kind), layout.shape(kind)) for kind in (FRAMES, MATTES))
     if layout.folder.name.startswith(_SCRATCH_PREFIX):
         # The maps keep the pages; nobody else needs the names.
         shutil.rmtree(layout.folder, ignore_errors=True)
@@ -56,10 +57,7 @@ def _check_present(layout: FrameLayout) -> None:
         found = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
         missing = sorted(expected - found)
         if missing:
-            raise UserError(
-                f"{folder / missing[0]}: missing ({len(missing)} of {layout.timesteps} are); "
-                "delete the capture's folder and capture again"
-            )
+            raise UserError(f"{folder / missing[0]}: missing ({len(missing)} of {layout.timesteps} are); {REMEDY}")
 
 
 def _is_valid(layout: FrameLayout, capture_hash: str) -> bool:

@@ -14,8 +14,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.errors import UserError
+from mien.picture_files import write_at
 
 FRAMES, MATTES, CACHE = "frames", "mattes", "cache"
+STAGE = "`mien capture`"
+REMEDY = "run `mien capture` on its video again, which mends it"
+"""For damaged captures."""
 _PNG_OPTIONS = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
@@ -69,12 +73,8 @@ class CacheWriter:
 
     def write(self, kind: str, timestep: int, camera: int, picture: np.ndarray) -> None:
         """Put one picture in its place."""
-        assert picture.flags.c_contiguous
         index = timestep * len(self._layout.camera_ids) + camera
-        data, offset = picture.data.cast("B"), index * picture.nbytes
-        while data:
-            written = os.pwrite(self._files[kind], data, offset)
-            data, offset = data[written:], offset + written
+        write_at(self._files[kind], picture, index * picture.nbytes)
 
     def close(self) -> None:
         """Close the files."""
@@ -149,25 +149,24 @@ def read_png(path: Path, shape: tuple[int, ...], expected_digest: int) -> UInt8[
     Raises:
         UserError: it is missing, damaged, or not what was written.
     """
-    remedy = "delete the capture's folder and capture again"
     try:
         data = np.fromfile(path, np.uint8)
     except FileNotFoundError:
-        raise UserError(f"{path}: missing; {remedy}") from None
+        raise UserError(f"{path}: missing; {REMEDY}") from None
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+        raise UserError(f"{path}: cannot be read ({error.strerror}); {REMEDY}") from None
     if not data.tobytes().endswith(b"IEND\xaeB`\x82"):
         # Checked here, because libpng would print its complaint and return half a picture.
-        raise UserError(f"{path}: truncated; {remedy}")
+        raise UserError(f"{path}: truncated; {REMEDY}")
     try:
         picture = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB if len(shape) == 3 else cv2.IMREAD_GRAYSCALE)
     except cv2.error:
         picture = None
     if picture is None or picture.shape != shape:
-        raise UserError(f"{path}: damaged, or not of {shape[1]}x{shape[0]} pixels; {remedy}")
+        raise UserError(f"{path}: damaged, or not of {shape[1]}x{shape[0]} pixels; {REMEDY}")
     picture = picture.astype(np.uint8, copy=False)
     if picture_digest(picture) != expected_digest:
-        raise UserError(f"{path}: has other pixels than when it was captured; {remedy}")
+        raise UserError(f"{path}: has other pixels than when it was captured; {REMEDY}")
     return picture
 
 

@@ -161,7 +161,7 @@ def _read_finished(out: Path, key: str) -> Capture | None:
     try:
         return read_capture(out)
     except UserError as error:
-        say(f"{error}: doing so now")
+        say(f"{str(error).split('; ')[0]}; it is captured again")
         return None
 
 
@@ -270,7 +270,7 @@ def _survey(job: _Job, folder: Path, means: Means) -> Survey:
 def _process(job: _Job, reel: Reel, part: Part, place: tuple[int, int], means: Means, out: Path) -> None:
     """Capture one part, unless that is done."""
     key = _part_key(job, *place)
-    if (_read_source(out) or {}).get("key") == key:
+    if _read_finished(out, key) is not None:
         return
     work = _prepare(partial_folder(out), key)
     layout = FrameLayout(work, (CAMERA_ID,), part.timesteps, part.crop.height, part.crop.width)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from mien.camera import Camera
 from mien.capture.cache import map_frames, stamp_cache
 from mien.capture.capture import Capture
-from mien.capture.frame_files import CACHE, FRAMES, MATTES, FrameLayout, FrameWriter
+from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, STAGE, FrameLayout, FrameWriter
 from mien.capture.quality import FrameQuality
 from mien.errors import UserError
 from mien.progress import progress_bar
@@ -23,7 +23,6 @@ from mien.storage import cannot_write, read_arrays, read_json, write_arrays, wri
 FORMAT, VERSION = "mien.capture", 1
 JSON_NAME, ARRAYS_NAME, REPORT_NAME = "capture.json", "landmarks.safetensors", "report.json"
 _OWN_NAMES = frozenset({JSON_NAME, ARRAYS_NAME, REPORT_NAME, FRAMES, MATTES, CACHE})
-_REMEDY = "delete the folder and capture again"
 _ARRAYS = {
     "timestamps": ("t", np.float64),
     "landmarks": ("tcl2", np.float32),
@@ -98,10 +97,10 @@ def read_capture(path: Path) -> Capture:
     """
     if not path.is_dir():
         raise UserError(f"{path}: no capture there; run `mien capture` first, or check the path")
-    content = read_json(path / JSON_NAME, FORMAT, VERSION)
-    layout, data, digests = _checked(path, content, read_arrays(path / ARRAYS_NAME))
+    content = read_json(path / JSON_NAME, FORMAT, VERSION, STAGE)
+    layout, data, digests = _checked(path, content, read_arrays(path / ARRAYS_NAME, STAGE))
     if content.get("capture_hash") != _hash(data, layout, digests):
-        raise UserError(f"{path / ARRAYS_NAME}: does not belong to the {JSON_NAME} beside it; {_REMEDY}")
+        raise UserError(f"{path / ARRAYS_NAME}: does not belong to the {JSON_NAME} beside it; {REMEDY}")
     images, mattes = map_frames(layout, content["capture_hash"], digests)
     return Capture(
         name=data.name,
@@ -125,7 +124,7 @@ def read_capture_hash(path: Path) -> str:
     Raises:
         UserError: there is no capture, or one of another version.
     """
-    return str(read_json(path / JSON_NAME, FORMAT, VERSION).get("capture_hash"))
+    return str(read_json(path / JSON_NAME, FORMAT, VERSION, STAGE).get("capture_hash"))
 
 
 def partial_folder(path: Path) -> Path:
@@ -219,7 +218,7 @@ def _checked(
         and (isinstance(fps, int | float) and math.isfinite(fps) and fps > 0)
         and (isinstance(name, str) and isinstance(source, dict))
     ):
-        raise UserError(f"{path / JSON_NAME}: has missing or wrong entries; {_REMEDY}")
+        raise UserError(f"{path / JSON_NAME}: has missing or wrong entries; {REMEDY}")
     _check_arrays(path / ARRAYS_NAME, arrays, timesteps, len(camera_ids))
     data = CaptureData(
         name=name,
@@ -241,7 +240,7 @@ def _calibration(path: Path, arrays: dict[str, np.ndarray], width: int, height: 
     if "K" not in arrays:
         return None
     if not all(np.isfinite(arrays[name]).all() for name in _CALIBRATION_ARRAYS):
-        raise UserError(f"{path}: the cameras' K or viewmat is not finite; {_REMEDY}")
+        raise UserError(f"{path}: the cameras' K or viewmat is not finite; {REMEDY}")
     pairs = zip(arrays["K"].astype(np.float32), arrays["viewmat"].astype(np.float32), strict=True)
     return tuple(Camera(torch.from_numpy(K), torch.from_numpy(viewmat), width, height) for K, viewmat in pairs)
 
@@ -266,4 +265,4 @@ def _check_arrays(path: Path, arrays: dict[str, np.ndarray], timesteps: int, cam
         expected = tuple(sizes[axis] for axis in axes)
         if name not in arrays or arrays[name].shape != expected or arrays[name].dtype != dtype:
             found = f"{arrays[name].dtype} {arrays[name].shape}" if name in arrays else "missing"
-            raise UserError(f"{path}: {name} is {found}, expected {np.dtype(dtype)} {expected}; {_REMEDY}")
+            raise UserError(f"{path}: {name} is {found}, expected {np.dtype(dtype)} {expected}; {REMEDY}")

@@ -37,7 +37,9 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
     if [folder.name for folder in sequence_dirs] != wanted:
         given = ", ".join(folder.name for folder in sequence_dirs)
         raise UserError(f"{run_dir}: was trained on {', '.join(wanted)}, not on {given}; give it those sequences")
-    scorings = tuple(read_scoring(folder / "scoring") for folder in sequence_dirs)
+    scorings = tuple(
+        read_scoring(folder / "scoring", read_capture_hash(folder / "capture")) for folder in sequence_dirs
+    )
     sequences = tuple(
         Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), scoring.masks)
         for folder, scoring in zip(sequence_dirs, scorings, strict=True)
@@ -97,7 +99,7 @@ def held_out_by_protocol(
 def _faces_of_run(run_dir: Path, sequences: Items[Sequence]) -> tuple[FaceParams, ...]:
     """The face parameters that training ended with, one a sequence."""
     path = run_dir / "face_track.safetensors"
-    tensors = read_tensors(path)
+    tensors = read_tensors(path, "`mien train`")
     with expect_whole(path, "train it again"):
         tuned = FaceParams(**tensors)
     lengths = [sequence.capture.timesteps for sequence in sequences]

@@ -20,6 +20,7 @@ _AXES = {
     "vertex_offsets": "v3", "valid": "t", "neck_lines": "tc3", "residuals": "tc", "camera_K": "c33",
     "camera_viewmats": "c44",
 }  # fmt: skip
+_STAGE = "`mien track`"
 _REMEDY = "delete the folder and run `mien track` again"
 
 
@@ -53,8 +54,8 @@ def read_tracking(path: Path) -> Tracking:
     Raises:
         UserError: something is missing, damaged, of another version, or not finite.
     """
-    content = read_json(path / _JSON, _FORMAT, _VERSION)
-    tensors = read_tensors(path / _TENSORS)
+    content = read_json(path / _JSON, _FORMAT, _VERSION, _STAGE)
+    tensors = read_tensors(path / _TENSORS, _STAGE)
     if _digest(path / _TENSORS) != content.get("tensors_sha256"):
         raise UserError(f"{path / _TENSORS}: is not what {_JSON} was written with; {_REMEDY}")
     _check_shapes(path, tensors)

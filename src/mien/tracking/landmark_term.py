@@ -13,6 +13,8 @@ from mien.tracking.views import CameraBatch, Views
 
 _CHUNK = 48
 """Pictures linearised at once: bounds the memory to about 100 MB."""
+_PROJECTED = 512
+"""Pictures projected at once, with about as much memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,19 +61,27 @@ class LandmarkTerm:
         pull = state @ self.model.layout.precision
         return (state * pull).sum(-1), pull
 
-    def _offsets(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "n l 2"]:
+    def _offsets(
+        self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
+    ) -> Iterator[tuple[Float[Tensor, "m l 2"], Int[Tensor, " m"]]]:
+        """From detected to projected landmarks in all pictures, a bounded number at a time, and their cameras."""
         views = self.views
-        projected = self.model.project(state, subject.identity, subject.bias, cameras[views.camera], views.row)
-        return projected - views.detected
+        for start in range(0, len(views.row), _PROJECTED):
+            part = slice(start, start + _PROJECTED)
+            camera = views.camera[part]
+            # What is the same for all cameras of a timestep is worked out once.
+            seen, place = views.row[part].unique(return_inverse=True)
+            projected = self.model.project(state[seen], subject.identity, subject.bias, cameras[camera], place)
+            yield projected - views.detected[part], camera
 
     def cost(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
         """Of each timestep."""
-        of_pictures = self._robust(self._offsets(state, subject, cameras), self.views.camera)[0]
+        of_pictures = torch.cat([self._robust(*part)[0] for part in self._offsets(state, subject, cameras)])
         return self._prior(state)[0].index_add(0, self.views.row, of_pictures)
 
     def residuals(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "n l"]:
         """Distances of detected from projected landmarks in each picture, pixels."""
-        return self._offsets(state, subject, cameras).norm(dim=-1)
+        return torch.cat([offsets.norm(dim=-1) for offsets, _ in self._offsets(state, subject, cameras)])
 
     def linearizations(
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch, with_identity: bool = False

@@ -1,6 +1,7 @@
 """The scoring mask: what of each picture belongs to the head, frozen once a sequence so that runs compare."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.face import FaceModel
+from mien.picture_files import PictureStack
 from mien.progress import track_progress
 from mien.render.mesh import rasterize_mesh
 from mien.tracking.neck_line import neck_vertices
@@ -29,19 +31,19 @@ class Scoring:
     """What is trained on and scored, frames of t timesteps and c cameras."""
 
     masks: UInt8[np.ndarray, "t c h w"]
-    """Opacity of the head, 255 = head: the matte, cut below the neck line."""
+    """Opacity of the head, 255 = head: the matte, cut below the neck line. A memory map where they are many."""
     crops: Int[np.ndarray, "t c 4"]
     """Left, top, width, height of the head crop, pixels: the box of the mask."""
 
 
-def make_scoring(capture: Capture, tracking: Tracking, face_model: FaceModel) -> Scoring:
-    """Masks and head crops of every frame.
+def make_scoring(capture: Capture, tracking: Tracking, face_model: FaceModel, scratch: Path | None = None) -> Scoring:
+    """Masks and head crops of every frame; masks too many for the memory lie in a nameless file in `scratch`.
 
     A pixel keeps its matte if it is above the neck line and not far beside the neck, or inside the projected head (a
     bowed chin hangs below the line); what is then not connected to the head goes as well.
     """
-    masks = np.zeros(capture.mattes.shape, np.uint8)
-    crops = np.zeros((*masks.shape[:2], 4), np.int64)
+    masks = PictureStack(capture.mattes.shape, scratch)
+    crops = np.zeros((*capture.mattes.shape[:2], 4), np.int64)
     head_faces = face_model.faces[~face_model.region_mask("neck")]
     ring = neck_vertices(face_model)
     for timestep in track_progress(range(capture.timesteps), "Scoring masks", capture.timesteps):
@@ -51,8 +53,9 @@ def make_scoring(capture: Capture, tracking: Tracking, face_model: FaceModel) ->
             neck = camera.project(vertices[ring])[0].numpy()
             keep = above_neck_line(tracking.neck_lines[timestep, index].numpy(), neck, camera)
             mask = cut_matte(np.asarray(capture.mattes[timestep, index]), head, keep)
-            masks[timestep, index], crops[timestep, index] = mask, head_crop(mask)
-    return Scoring(masks, crops)
+            masks.write(timestep, index, mask)
+            crops[timestep, index] = head_crop(mask)
+    return Scoring(masks.array(), crops)
 
 
 def above_neck_line(

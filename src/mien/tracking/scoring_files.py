@@ -9,10 +9,12 @@ import cv2
 import numpy as np
 
 from mien.errors import UserError
+from mien.picture_files import PictureStack
 from mien.storage import read_arrays, read_json, write_arrays, write_json
 from mien.tracking.scoring import Scoring
 
 _FORMAT, _VERSION = "mien.scoring", 1
+_STAGE = "`mien track`"
 _REMEDY = "delete the folder and run `mien track` again (scores before and after will not compare)"
 
 
@@ -22,7 +24,7 @@ def scoring_exists(path: Path, capture_hash: str | None = None) -> bool:
     if capture_hash is None or not file.is_file():
         return file.is_file()
     # Scorings of the first release do not say; they were removed whenever their capture changed.
-    return read_json(file, _FORMAT, _VERSION).get("capture_hash", capture_hash) == capture_hash
+    return read_json(file, _FORMAT, _VERSION, _STAGE).get("capture_hash", capture_hash) == capture_hash
 
 
 def write_scoring(path: Path, scoring: Scoring, capture_hash: str | None = None) -> None:
@@ -50,18 +52,27 @@ def write_scoring(path: Path, scoring: Scoring, capture_hash: str | None = None)
         raise
 
 
-def read_scoring(path: Path) -> Scoring:
+def read_scoring(path: Path, capture_hash: str | None = None) -> Scoring:
     """Read what `write_scoring` wrote.
 
+    Args:
+        path: of the folder.
+        capture_hash: of the capture that it has to belong to; None for any.
+
     Raises:
-        UserError: something is missing, damaged or not what was written.
+        UserError: something is missing, damaged, not what was written, or of another capture.
     """
-    content = read_json(path / "scoring.json", _FORMAT, _VERSION)
+    content = read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE)
+    if capture_hash is not None and content.get("capture_hash", capture_hash) != capture_hash:
+        raise UserError(
+            f"{path}: its masks are of other pictures than the capture beside it has; run `mien track` again, "
+            "which makes them anew"
+        )
     try:
         shape = tuple(int(content[name]) for name in ("timesteps", "cameras", "height", "width"))
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path / 'scoring.json'}: incomplete ({error}); {_REMEDY}") from None
-    crops = read_arrays(path / "crops.safetensors").get("crops")
+    crops = read_arrays(path / "crops.safetensors", _STAGE).get("crops")
     if crops is None or crops.shape != (*shape[:2], 4):
         raise UserError(f"{path / 'crops.safetensors'}: has not 4 numbers for each frame; {_REMEDY}")
     # Before room is made for all: a damaged size may ask for more memory than there is.
@@ -69,12 +80,15 @@ def read_scoring(path: Path) -> Scoring:
     if missing:
         raise UserError(f"{_mask_file(path, *missing[0])}: missing; {_REMEDY}")
     _read_mask(_mask_file(path, 0, 0), shape[2:])
-    masks = np.empty(shape, np.uint8)
+    masks, digest = PictureStack(shape, path), hashlib.sha256()
     for timestep, camera in np.ndindex(*shape[:2]):
-        masks[timestep, camera] = _read_mask(_mask_file(path, timestep, camera), shape[2:])
-    if _digest(masks, crops) != content.get("sha256"):
+        mask = _read_mask(_mask_file(path, timestep, camera), shape[2:])
+        masks.write(timestep, camera, mask)
+        digest.update(mask.tobytes())
+    digest.update(crops.astype(np.int32).tobytes())
+    if digest.hexdigest() != content.get("sha256"):
         raise UserError(f"{path}: masks or crops are not those that were written; {_REMEDY}")
-    return Scoring(masks, crops.astype(np.int64))
+    return Scoring(masks.array(), crops.astype(np.int64))
 
 
 def read_scoring_hash(path: Path) -> str:
@@ -83,23 +97,26 @@ def read_scoring_hash(path: Path) -> str:
     Raises:
         UserError: there is no scoring, or one of another version.
     """
-    return str(read_json(path / "scoring.json", _FORMAT, _VERSION).get("sha256"))
+    return str(read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE).get("sha256"))
 
 
 def _write_into(folder: Path, scoring: Scoring, capture_hash: str | None) -> None:
     timesteps, cameras, height, width = scoring.masks.shape
+    digest = hashlib.sha256()
     for timestep, camera in np.ndindex(timesteps, cameras):
         file = _mask_file(folder, timestep, camera)
         file.parent.mkdir(parents=True, exist_ok=True)
-        encoded, data = cv2.imencode(".png", scoring.masks[timestep, camera])
+        mask = np.array(scoring.masks[timestep, camera])
+        digest.update(mask.tobytes())
+        encoded, data = cv2.imencode(".png", mask)
         assert encoded
         file.write_bytes(data.tobytes())
     crops = scoring.crops.astype(np.int32)
     write_arrays(folder / "crops.safetensors", {"crops": crops})
     size = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width}
     origin = {} if capture_hash is None else {"capture_hash": capture_hash}
-    digest = _digest(scoring.masks, crops)
-    write_json(folder / "scoring.json", _FORMAT, _VERSION, {**size, **origin, "sha256": digest})
+    digest.update(crops.tobytes())
+    write_json(folder / "scoring.json", _FORMAT, _VERSION, {**size, **origin, "sha256": digest.hexdigest()})
 
 
 def _read_mask(file: Path, shape: tuple[int, ...]) -> np.ndarray:
@@ -117,9 +134,3 @@ def _read_mask(file: Path, shape: tuple[int, ...]) -> np.ndarray:
 
 def _mask_file(folder: Path, timestep: int, camera: int) -> Path:
     return folder / "masks" / f"{camera:02d}" / f"{timestep:06d}.png"
-
-
-def _digest(masks: np.ndarray, crops: np.ndarray) -> str:
-    digest = hashlib.sha256(masks.tobytes())
-    digest.update(crops.astype(np.int32).tobytes())
-    return digest.hexdigest()

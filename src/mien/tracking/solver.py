@@ -1,6 +1,7 @@
 """Batched Levenberg-Marquardt: small dense problems side by side, tied by shared parameters or along time."""
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -8,6 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 _DAMPING_START, _DAMPING_LEAST, _DAMPING_MOST = 1e-3, 1e-7, 1e7
+_SEGMENT = 1024
+"""Blocks of a chain whose factors are kept at a time: some 120 MB for pairs of frames with 60 parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,44 +187,71 @@ def solve_chain(
     t, p = state.shape
     moving = (~held).to(state)
     diagonal, first, second = smoothness.bands(state)
-    tied = NormalEquations(
-        frames.cost, frames.gradient + smoothness.gradient(state), frames.hessian + torch.diag_embed(diagonal + 1e-12)
-    )
-    tied = hold(tied, held)
-    hessian, gradient = tied.hessian, tied.gradient
+    gradient = (frames.gradient + smoothness.gradient(state)) * moving
     first = first * moving * torch.cat([moving[1:], moving[:1]])
     second = second * moving * torch.cat([moving[2:], moving[:2]])
-
-    blocks = (t + 1) // 2
     if t % 2:
-        hessian = torch.cat([hessian, torch.eye(p).to(state)[None]])
         gradient, first, second = (torch.cat([part, part.new_zeros(1, p)]) for part in (gradient, first, second))
-    own = state.new_zeros(blocks, 2 * p, 2 * p)
-    own[:, :p, :p], own[:, p:, p:] = hessian[0::2], hessian[1::2]
-    own[:, :p, p:] = own[:, p:, :p] = torch.diag_embed(first[0::2])
-    upper = state.new_zeros(blocks, 2 * p, 2 * p)
-    upper[:, :p, :p], upper[:, p:, p:] = torch.diag_embed(second[0::2]), torch.diag_embed(second[1::2])
-    upper[:, p:, :p] = torch.diag_embed(first[1::2])
-    return -_solve_tridiagonal(own, upper, gradient.reshape(blocks, 2 * p)).reshape(-1, p)[:t]
+
+    def frame(index: int) -> Float[Tensor, "p p"]:
+        if index == t:
+            return torch.eye(p).to(state)
+        free = moving[index]
+        hessian = frames.hessian[index] + torch.diag(diagonal[index] + 1e-12)
+        return hessian * free[:, None] * free + torch.diag(1 - free)
+
+    def own(block: int) -> Float[Tensor, "q q"]:
+        tie = torch.diag(first[2 * block])
+        return torch.cat([torch.cat([frame(2 * block), tie], 1), torch.cat([tie, frame(2 * block + 1)], 1)])
+
+    def upper(block: int) -> Float[Tensor, "q q"]:
+        here, next_ = torch.diag(second[2 * block]), torch.diag(second[2 * block + 1])
+        tie = torch.diag(first[2 * block + 1])
+        return torch.cat([torch.cat([here, torch.zeros_like(here)], 1), torch.cat([tie, next_], 1)])
+
+    return -_solve_tridiagonal(own, upper, gradient.reshape(-1, 2 * p)).reshape(-1, p)[:t]
 
 
 def _solve_tridiagonal(
-    own: Float[Tensor, "n q q"], upper: Float[Tensor, "n q q"], right: Float[Tensor, "n q"]
+    own: Callable[[int], Tensor], upper: Callable[[int], Tensor], right: Float[Tensor, "n q"]
 ) -> Float[Tensor, "n q"]:
-    """Solve a symmetric positive definite block-tridiagonal system; `upper[i]` couples block i to block i + 1."""
-    factors: list[Tensor] = []
-    reduced: list[Tensor] = []
-    block, side = own[0], right[0]
-    for index in range(len(own)):
-        factors.append(torch.linalg.cholesky(block))
-        reduced.append(side)
-        if index + 1 < len(own):
-            solved = torch.cholesky_solve(torch.cat([upper[index], side[:, None]], dim=1), factors[index])
-            block = own[index + 1] - upper[index].T @ solved[:, :-1]
-            side = right[index + 1] - upper[index].T @ solved[:, -1]
-    solution = torch.cholesky_solve(reduced[-1][:, None], factors[-1])[:, 0]
-    solutions = [solution]
-    for index in range(len(own) - 2, -1, -1):
-        solution = torch.cholesky_solve((reduced[index] - upper[index] @ solution)[:, None], factors[index])[:, 0]
-        solutions.append(solution)
-    return torch.stack(solutions[::-1])
+    """Solve a symmetric positive definite block-tridiagonal system; `upper(i)` couples block i to block i + 1.
+
+    Factors are kept for a segment of blocks at a time. A system of several segments is eliminated twice: first to know
+    where each segment begins, then from the last segment to the first, to go back through each.
+    """
+    starts = range(0, len(right), _SEGMENT)
+    begins = [(own(0), right[0])]
+    for start in starts[:-1]:
+        steps = _eliminate(own, upper, right, begins[-1], range(start, start + _SEGMENT + 1))
+        _, block, side = deque(steps, maxlen=1).pop()
+        begins.append((block, side))
+    solution = torch.zeros_like(right)
+    for start, begin in zip(reversed(starts), reversed(begins), strict=True):
+        segment = range(start, min(start + _SEGMENT, len(right)))
+        steps = list(_eliminate(own, upper, right, begin, segment))
+        for index, (factor, _, side) in zip(reversed(segment), reversed(steps), strict=True):
+            if index + 1 < len(right):
+                side = side - upper(index) @ solution[index + 1]
+            solution[index] = torch.cholesky_solve(side[:, None], factor)[:, 0]
+        steps.clear()  # before the next segment's are made
+    return solution
+
+
+def _eliminate(
+    own: Callable[[int], Tensor],
+    upper: Callable[[int], Tensor],
+    right: Float[Tensor, "n q"],
+    begin: tuple[Tensor, Tensor],
+    blocks: range,
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Factor, reduced block and right side of consecutive blocks, of which `begin` is the first's."""
+    block, side = begin
+    for index in blocks:
+        factor = torch.linalg.cholesky(block)
+        yield factor, block, side
+        if index + 1 < blocks.stop:
+            coupling = upper(index)
+            solved = torch.cholesky_solve(torch.cat([coupling, side[:, None]], dim=1), factor)
+            block = own(index + 1) - coupling.T @ solved[:, :-1]
+            side = right[index + 1] - coupling.T @ solved[:, -1]

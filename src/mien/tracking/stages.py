@@ -25,6 +25,8 @@ from mien.tracking.solver import Box, Smoothness, minimize_frames, solve_chain
 from mien.tracking.views import CameraBatch, Views
 
 _FRAME_ITERATIONS = 12
+_FRAMES_AT_ONCE = 512
+"""Timesteps fitted side by side, each alone: bounds the memory to some 100 MB."""
 _SEQUENCE_ROUNDS, _SEQUENCE_ITERATIONS = 2, 5
 _RIM_BIAS_SHARE = 0.25
 """Of other landmarks' standard deviation of the static offset: for lids and lips."""
@@ -99,12 +101,15 @@ def _without_similarity(
 
 def fit_frames(term: LandmarkTerm, subject: Subject, own: SequenceFit) -> SequenceFit:
     """Pose, expression and eyes of every timestep alone."""
-    state = minimize_frames(
-        lambda state: term.equations(state, subject, own.cameras),
-        lambda state: term.cost(state, subject, own.cameras),
-        own.state, box_of(term.model.layout), _FRAME_ITERATIONS,
-    )  # fmt: skip
-    return replace(own, state=state)
+    parts = []
+    for rows in torch.arange(len(own.state)).split(_FRAMES_AT_ONCE):
+        part = term.at(rows)
+        parts.append(minimize_frames(
+            lambda state, part=part: part.equations(state, subject, own.cameras),
+            lambda state, part=part: part.cost(state, subject, own.cameras),
+            own.state[rows], box_of(term.model.layout), _FRAME_ITERATIONS,
+        ))  # fmt: skip
+    return replace(own, state=torch.cat(parts))
 
 
 def fit_sequences(

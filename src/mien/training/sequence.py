@@ -10,11 +10,11 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.capture import Capture, read_capture
+from mien.capture import Capture, read_capture, read_capture_hash
 from mien.tracking import Tracking, read_scoring, read_tracking
 from mien.training.photometric import Box
 
-_CACHE_BYTES = 2 << 30
+_CACHE_BYTES = 1 << 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ def read_sequence(folder: Path) -> Sequence:
     """The sequence in FOLDER/{capture,tracking,scoring}; its name is the folder's.
 
     Raises:
-        UserError: a part is missing, damaged or of another version.
+        UserError: a part is missing, damaged or of another version, or the scoring is of other pictures.
     """
-    masks = read_scoring(folder / "scoring").masks
+    masks = read_scoring(folder / "scoring", read_capture_hash(folder / "capture")).masks
     return Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), masks)

@@ -54,7 +54,8 @@ def tracking_stage(
             if scoring_exists(folder / "scoring"):
                 say(f"{name}: the pictures changed, so the scoring mask is made anew")
             capture = read_capture(folder / "capture")
-            write_scoring(folder / "scoring", make_scoring(capture, tracking, face_model), capture_hash)
+            scoring = make_scoring(capture, tracking, face_model, scratch=folder)
+            write_scoring(folder / "scoring", scoring, capture_hash)
         _show_tracking(folder, tracking, face_model)
     return trackings
 

@@ -1,0 +1,164 @@
+"""Long clips in bounded memory: each test fails where all of a sequence's pictures are held at once."""
+
+import gc
+import tracemalloc
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from capture_helpers import random_capture
+from mien import picture_files
+from mien.capture import read_capture, write_capture
+from mien.picture_files import PictureStack, map_pictures
+from mien.tracking import landmark_term, make_scoring, read_scoring, solver, stages, track, write_scoring
+from mien.tracking.landmark_model import LandmarkModel
+from small_face_model import make_small_face_model
+from test_tracking_scoring import _tracking, _upright
+from tracking_case import capture_of, make_tracking_case
+
+MIB = 1 << 20
+
+
+@pytest.fixture
+def tiny_limit(monkeypatch: pytest.MonkeyPatch) -> int:
+    """What may be held is a mebibyte."""
+    monkeypatch.setattr(picture_files, "_KEPT", MIB)
+    return MIB
+
+
+def mapped_bytes() -> int:
+    """File pages in this process's share of the memory."""
+    status = Path("/proc/self/status")
+    if not status.is_file():
+        pytest.skip("needs /proc")
+    line = next(line for line in status.read_text().splitlines() if line.startswith("RssFile"))
+    return int(line.split()[1]) << 10
+
+
+@contextmanager
+def allocating_at_most(limit: int) -> Iterator[None]:
+    """Of what numpy and Python ask for."""
+    gc.collect()
+    tracemalloc.start()
+    try:
+        yield
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < limit, f"{peak / MIB:.0f} MiB"
+
+
+def largest_share(pictures: np.ndarray, look: Callable[[np.ndarray], object]) -> int:
+    """How far the mapped pages grow while every picture is looked at."""
+    before = mapped_bytes()
+    most = 0
+    for index in np.ndindex(pictures.shape[:2]):
+        look(pictures[index])
+        most = max(most, mapped_bytes() - before)
+    return most
+
+
+def test_a_map_gives_its_pages_back(tmp_path: Path, tiny_limit: int) -> None:
+    file = tmp_path / "pictures.u8"
+    shape = (64, 1, 512, 512)
+    file.write_bytes(bytes(range(256)) * (64 << 10))
+    pictures = map_pictures(file, shape)
+    assert largest_share(pictures, np.sum) < 6 * MIB
+    assert largest_share(np.memmap(file, np.uint8, "r", shape=shape), np.sum) > 12 * MIB, "the test sees what is held"
+    np.testing.assert_array_equal(pictures, np.memmap(file, np.uint8, "r", shape=shape))
+    assert largest_share(pictures[:, 0][:, None], np.sum) < 6 * MIB, "views count, too"
+
+
+def test_captures_are_looked_at_without_being_held(tmp_path: Path, tiny_limit: int) -> None:
+    write_capture(tmp_path / "capture", random_capture(timesteps=40, height=256, width=300))
+    capture = read_capture(tmp_path / "capture")
+    assert capture.images.nbytes > 16 * MIB
+    assert largest_share(capture.images, np.sum) < 6 * MIB
+
+
+def test_scoring_is_made_written_and_read_without_being_held(tmp_path: Path, tiny_limit: int) -> None:
+    model, face = _upright(120)
+    short, long = (capture_of(torch.full((timesteps, 478, 2), 100.0)) for timesteps in (2, 120))
+    before = mapped_bytes()
+    with allocating_at_most(26 * MIB):
+        made = make_scoring(long, _tracking(model, face), model, scratch=tmp_path)
+        write_scoring(tmp_path / "scoring", made, "of this capture")
+        read = read_scoring(tmp_path / "scoring", "of this capture")
+    assert read.masks.nbytes == 30 * MIB
+    assert mapped_bytes() - before < 6 * MIB
+    assert [entry.name for entry in tmp_path.iterdir()] == ["scoring"], "files for the time being have no name"
+    np.testing.assert_array_equal(read.masks, made.masks)
+    np.testing.assert_array_equal(read.masks[7], make_scoring(short, _tracking(model, face[:2]), model).masks[1])
+
+
+def test_few_pictures_stay_in_memory_and_many_are_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures = np.random.default_rng(0).integers(0, 256, (3, 2, 20, 31), dtype=np.uint8)
+    arrays = []
+    for kept in (1 << 20, 100):
+        monkeypatch.setattr(picture_files, "_KEPT", kept)
+        stack = PictureStack(pictures.shape, tmp_path)
+        for timestep, camera in ((2, 1), (0, 0), (1, 1), (0, 1), (1, 0), (2, 0)):
+            stack.write(timestep, camera, pictures[timestep, camera])
+        arrays.append(stack.array())
+    assert [isinstance(array, np.memmap) for array in arrays] == [False, True]
+    for array in arrays:
+        np.testing.assert_array_equal(array, pictures)
+    assert not list(tmp_path.iterdir())
+
+
+def test_tracking_looks_at_a_bounded_number_of_frames_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And finds the same."""
+    case = make_tracking_case(timesteps=24)
+    model = make_small_face_model()
+    expected = track(case.capture, model)
+    largest = {"project": 0, "linearize": 0}
+    for name in largest:
+        original = getattr(LandmarkModel, name)
+
+        def watched(self, state, *arguments, original=original, name=name, **options):
+            largest[name] = max(largest[name], len(state))
+            return original(self, state, *arguments, **options)
+
+        monkeypatch.setattr(LandmarkModel, name, watched)
+    monkeypatch.setattr(landmark_term, "_PROJECTED", 16)
+    monkeypatch.setattr(landmark_term, "_CHUNK", 14)
+    monkeypatch.setattr(stages, "_FRAMES_AT_ONCE", 18)
+    monkeypatch.setattr(solver, "_SEGMENT", 5)
+    found = track(case.capture, model)
+    assert largest == {"project": 16, "linearize": 14}
+    for name, tensor in expected.face.tensors().items():
+        torch.testing.assert_close(getattr(found.face, name), tensor, atol=1e-6, rtol=0)
+
+
+def test_the_chain_holds_the_factors_of_one_segment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solver, "_SEGMENT", 4)
+    alive: weakref.WeakSet[torch.Tensor] = weakref.WeakSet()
+    most = 0
+    cholesky = torch.linalg.cholesky
+
+    def watched(matrix: torch.Tensor) -> torch.Tensor:
+        nonlocal most
+        factor = cholesky(matrix)
+        alive.add(factor)
+        most = max(most, len(alive))
+        return factor
+
+    monkeypatch.setattr(torch.linalg, "cholesky", watched)
+    random = torch.Generator().manual_seed(0)
+    blocks, size = 19, 3
+    root = torch.randn(blocks, size, size, generator=random, dtype=torch.float64)
+    own = root @ root.mT + 5 * torch.eye(size, dtype=torch.float64)
+    upper = torch.randn(blocks, size, size, generator=random, dtype=torch.float64)
+    right = torch.randn(blocks, size, generator=random, dtype=torch.float64)
+    dense = torch.block_diag(*own)
+    for index in range(blocks - 1):
+        here, there = slice(size * index, size * (index + 1)), slice(size * (index + 1), size * (index + 2))
+        dense[here, there], dense[there, here] = upper[index], upper[index].T
+    solution = solver._solve_tridiagonal(own.__getitem__, upper.__getitem__, right)
+    torch.testing.assert_close(dense @ solution.flatten(), right.flatten())
+    assert most <= 6, most
