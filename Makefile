@@ -30,16 +30,16 @@ test: setup
 	MIEN_THREADS=2 $(BIN)/pytest
 
 lint: setup
-	$(BIN)/ruff check src tests examples
-	$(BIN)/ruff format --check src tests examples
+	$(BIN)/ruff check src tests examples benchmarks
+	$(BIN)/ruff format --check src tests examples benchmarks
 	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h)
 	$(BIN)/typos
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
 format: setup
-	$(BIN)/ruff check --fix src tests examples
-	$(BIN)/ruff format src tests examples
+	$(BIN)/ruff check --fix src tests examples benchmarks
+	$(BIN)/ruff format src tests examples benchmarks
 	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h)
 
 # Re-resolve the locked requirements (both Pythons, every platform) after a change in pyproject.toml or overrides.txt.

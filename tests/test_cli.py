@@ -58,7 +58,7 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
         ("create a.mp4 --out here --steps many", ("--steps", "'many'")),
         ("create a.mp4 --out here --preset fast", ("'fast'", "draft")),
         ("export here --out", ("--out",)),
-        ("bench nothing", ("nothing", "render, quality")),
+        ("bench nothing", ("nothing", "render, train-step, scaling, quality")),
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(

@@ -1,102 +1,77 @@
 """How fast the native rasterizer draws a synthetic head that fills half of the picture.
 
-Run as `mien bench render [--json]`.
+Run as `mien bench render` (three sizes, every instruction set) and `mien bench scaling` (sizes of the papers).
 """
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import torch
 
 from mien import _native
-from mien.camera import Camera
-from mien.gaussians import Gaussians
+from mien.benchmarking.scenes import Scene, head_scene
+from mien.benchmarking.timing import BenchmarkRow, benchmark_row, time_function
 from mien.render import rasterize
+from mien.render.rasterize import Backend
+
+COUNTS = (10_000, 30_000, 100_000, 300_000)
+SIZES = {
+    "HeadGaS's figure": (512, 512),
+    "GaussianAvatars' table": (550, 802),
+    "": (1024, 1024),
+    "large": (2048, 2048),
+}
+"""Width and height in pixels (the papers' 802x550 is height x width), and who reports that size."""
+INSTRUCTION_SETS = ("avx512", "avx2", "sse4", "baseline")
 
 
-@dataclass(frozen=True)
-class BenchmarkRow:
-    """One timing; milliseconds of wall-clock time."""
-
-    name: str
-    gaussians: int
-    width: int
-    height: int
-    threads: int
-    isa: str
-    min_ms: float
-    median_ms: float
+def draw(scene: Scene, backend: Backend = "native") -> None:
+    """One picture without gradients."""
+    with torch.no_grad():
+        rasterize(scene.gaussians, scene.camera, scene.background, backend)
 
 
-def synthetic_head(count: int, coefficients: int = 1) -> Gaussians:
-    """An ellipsoid's surface in small, mostly opaque splats whose total area does not depend on their number."""
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    spread = torch.exp(0.35 * torch.randn(count, 3, generator=generator))
-    return Gaussians(
-        means=directions * torch.tensor([0.085, 0.11, 0.095]),
-        quats=torch.randn(count, 4, generator=generator),
-        scales=spread * 0.00056 * (30000 / count) ** 0.5,
-        opacities=torch.sigmoid(2 + 1.5 * torch.randn(count, generator=generator)),
-        sh=0.3 * torch.randn(count, coefficients, 3, generator=generator),
-    )
+def draw_and_differentiate(scene: Scene, backend: Backend = "native") -> None:
+    """One picture, and the gradients of all parameters."""
+    picture = rasterize(scene.gaussians, scene.camera, scene.background, backend).image
+    torch.autograd.grad(picture, scene.parameters, scene.gradient)
 
 
-def benchmark_render(count: int, size: int, threads: int, repetitions: int = 40) -> list[BenchmarkRow]:
-    """Forward alone, and forward with backward, of one square picture. Changes the number of native threads."""
+def benchmark_render(count: int, size: tuple[int, int], threads: int, seconds: float = 0.8) -> list[BenchmarkRow]:
+    """Forward alone, and forward with backward, of one picture. Changes the number of native threads."""
     _native.set_thread_count(threads)
-    viewmat = torch.eye(4)
-    viewmat[2, 3] = 0.6
-    focal = 2.35 * size
-    camera = Camera(torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]), viewmat, size, size)
-    background = torch.ones(3)
-    head = synthetic_head(count)
-    parameters = [t.requires_grad_() for t in (head.means, head.quats, head.scales, head.opacities, head.sh)]
-    gradient = torch.randn(size, size, 3, generator=torch.Generator().manual_seed(1))
-
-    def forward() -> None:
-        with torch.no_grad():
-            rasterize(head, camera, background, "native")
-
-    def both() -> None:
-        torch.autograd.grad(rasterize(head, camera, background, "native").image, parameters, gradient)
-
-    rows = []
-    for name, function in (("rasterize_forward", forward), ("rasterize_forward_backward", both)):
-        fastest, median = _time(function, repetitions)
-        rows.append(BenchmarkRow(name, count, size, size, threads, _native.rasterize_isa(), fastest, median))
-    return rows
+    scene = head_scene(count, *size)
+    forward = time_function(lambda: draw(scene), seconds)
+    both = time_function(lambda: draw_and_differentiate(scene), seconds)
+    return [
+        benchmark_row("rasterize_forward", count, size, forward),
+        benchmark_row("rasterize_forward_backward", count, size, both),
+    ]
 
 
-def _time(function: Callable[[], None], repetitions: int) -> tuple[float, float]:
-    """The least and the median duration in milliseconds, after a warm-up."""
-    for _ in range(3):
-        function()
-    durations = []
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        function()
-        durations.append(1e3 * (time.perf_counter() - start))
-    durations.sort()
-    return durations[0], durations[len(durations) // 2]
+def render_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
+    """10,000 to 100,000 Gaussians at two sizes by threads, then 30,000 at 512x512 by instruction set."""
+    for count in COUNTS[:3]:
+        for size in ((512, 512), (1024, 1024)):
+            for threads in thread_counts():
+                yield from benchmark_render(count, size, threads, seconds)
+    best = _native.rasterize_isa()
+    try:
+        for isa in INSTRUCTION_SETS:
+            if _native.set_rasterize_isa(isa):
+                yield from benchmark_render(30_000, (512, 512), 1, seconds)
+    finally:
+        _native.set_rasterize_isa(best)
 
 
-def benchmark_suite() -> list[BenchmarkRow]:
-    """The rows of docs/results.md: three counts, two sizes, one thread and all of them."""
-    torch.set_num_threads(1)
-    threads = _native.thread_count()
-    rows: list[BenchmarkRow] = []
-    for count in (10_000, 30_000, 100_000):
-        for size in (512, 1024):
-            for used in sorted({1, threads}):
-                rows += benchmark_render(count, size, used)
-    return rows
+def scaling_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
+    """10,000 to 300,000 Gaussians at the papers' sizes and up to 2048x2048, by threads."""
+    for size in SIZES.values():
+        for count in COUNTS:
+            for threads in thread_counts():
+                yield from benchmark_render(count, size, threads, seconds)
 
 
-def format_row(row: BenchmarkRow) -> str:
-    """One line of the table."""
-    return (
-        f"{row.name:28} {row.gaussians:7} {row.width:5}x{row.height:<5} {row.threads:2} threads {row.isa:8} "
-        f"{row.min_ms:8.2f} min {row.median_ms:8.2f} median ms"
-    )
+def thread_counts() -> list[int]:
+    """One, and all that `MIEN_THREADS` or the machine gives."""
+    _native.set_thread_count(0)
+    return sorted({1, _native.thread_count()})

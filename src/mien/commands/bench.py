@@ -1,30 +1,70 @@
 """`mien bench`."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+if TYPE_CHECKING:
+    from mien.benchmarking.timing import BenchmarkRow, Machine
 
 
 @dataclass(frozen=True)
 class Render:
-    """How fast the native core draws Gaussians on this machine, forward and backward, by size and threads."""
+    """How fast the native core draws Gaussians on this machine, forward and backward, by size, threads and CPU kind."""
 
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print a list of rows for programs."""
+    """Print the machine and a list of rows for programs."""
+    seconds: float = 0.8
+    """To spend on each row; more finds a smaller minimum on a busy machine."""
 
     def run(self) -> None:
         """Measure and print."""
-        from mien.benchmarking.render import benchmark_suite, format_row
+        from mien.benchmarking.render import render_suite
 
-        rows = benchmark_suite()
-        if self.as_json:
-            print(json.dumps([asdict(row) for row in rows]))
-            return
-        for row in rows:
-            print(format_row(row))
+        show_rows(render_suite(self.seconds), self.as_json)
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """How drawing scales: 10,000 to 300,000 Gaussians, at the sizes that papers report and up to 2048x2048."""
+
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the machine and a list of rows for programs."""
+    seconds: float = 0.8
+    """To spend on each row; more finds a smaller minimum on a busy machine."""
+    plot: Path | None = None
+    """Write a chart here: .png, .svg or .pdf."""
+
+    def run(self) -> None:
+        """Measure, print and draw."""
+        from mien.benchmarking.charts import check_chart_path, write_scaling_chart
+        from mien.benchmarking.render import scaling_suite
+
+        if self.plot is not None:
+            check_chart_path(self.plot)
+        machine, rows = show_rows(scaling_suite(self.seconds), self.as_json)
+        if self.plot is not None:
+            write_scaling_chart(self.plot, rows, machine)
+
+
+@dataclass(frozen=True)
+class TrainStep:
+    """How long a `gaussian_avatars` step takes as `mien train` runs it (no footage needed), and posing with drawing."""
+
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the machine and a list of rows for programs."""
+    seconds: float = 3.0
+    """To spend on each row; more finds a smaller minimum on a busy machine."""
+
+    def run(self) -> None:
+        """Measure and print."""
+        from mien.benchmarking.train_step import train_step_suite
+
+        show_rows(train_step_suite(self.seconds), self.as_json)
 
 
 @dataclass(frozen=True)
@@ -54,10 +94,12 @@ class Quality:
 
 @dataclass(frozen=True)
 class Command:
-    """Measure this machine and this version of mien: `mien bench render`, `mien bench quality`."""
+    """Measure this machine and this version of mien: `mien bench render`, `train-step`, `scaling`, `quality`."""
 
     what: Annotated[
         Annotated[Render, tyro.conf.subcommand("render", prefix_name=False)]
+        | Annotated[TrainStep, tyro.conf.subcommand("train-step", prefix_name=False)]
+        | Annotated[Scaling, tyro.conf.subcommand("scaling", prefix_name=False)]
         | Annotated[Quality, tyro.conf.subcommand("quality", prefix_name=False)],
         tyro.conf.arg(name=""),
     ]
@@ -65,3 +107,22 @@ class Command:
     def run(self) -> None:
         """Run the chosen benchmark."""
         self.what.run()
+
+
+def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool) -> "tuple[Machine, list[BenchmarkRow]]":
+    """Print the machine and every row as soon as it is measured, or all of it as json; torch keeps to one thread."""
+    import torch
+
+    from mien.benchmarking.timing import format_machine, format_row, measure_machine
+
+    torch.set_num_threads(1)
+    machine, shown = measure_machine(), []
+    if not as_json:
+        print(format_machine(machine), flush=True)
+    for row in rows:
+        shown.append(row)
+        if not as_json:
+            print(format_row(row), flush=True)
+    if as_json:
+        print(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
+    return machine, shown

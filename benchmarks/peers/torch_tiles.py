@@ -1,0 +1,51 @@
+"""Gaussian splatting as a plain PyTorch loop over tiles, with autograd: what one writes without a native core.
+
+Tiles of 16x16 pixels and boxes of 3 standard deviations, as in the original CUDA scheme (Kerbl et al. 2023).
+"""
+
+import torch
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.gaussians import Gaussians
+from mien.render.projection import ALPHA_MAX, ALPHA_MIN, project_splats
+
+TILE = 16
+
+
+def render_tiles(gaussians: Gaussians, camera: Camera, background: Tensor) -> Tensor:
+    """The picture [h, w, 3], differentiable in the Gaussians."""
+    splats = project_splats(gaussians, camera, torch.zeros(len(gaussians), 2))
+    order = splats.drawn.nonzero()[:, 0]
+    order = order[splats.depths.detach()[order].argsort()]
+    centres, colours = splats.means2d[order], splats.colors[order]
+    opacities = splats.opacities[order]
+    xx, xy, yy = splats.covariances[order].unbind(-1)
+    determinant = xx * yy - xy * xy
+    conics = torch.stack([yy, -xy, xx], -1) / determinant[:, None]
+    reach = 3 * torch.stack([xx, yy], -1).detach().sqrt()
+    low, high = (centres.detach() - reach) / TILE, (centres.detach() + reach) / TILE
+    rows = []
+    for row in range((camera.height + TILE - 1) // TILE):
+        in_row = ((low[:, 1] < row + 1) & (high[:, 1] > row)).nonzero()[:, 0]
+        tiles = []
+        for column in range((camera.width + TILE - 1) // TILE):
+            chosen = in_row[(low[in_row, 0] < column + 1) & (high[in_row, 0] > column)]
+            xs = torch.arange(column * TILE, min((column + 1) * TILE, camera.width)) + 0.5
+            ys = torch.arange(row * TILE, min((row + 1) * TILE, camera.height)) + 0.5
+            weights, remaining = _weights(centres[chosen], conics[chosen], opacities[chosen], xs, ys)
+            tiles.append(torch.einsum("nhw,nc->hwc", weights, colours[chosen]) + remaining[..., None] * background)
+        rows.append(torch.cat(tiles, dim=1))
+    return torch.cat(rows)
+
+
+def _weights(centres: Tensor, conics: Tensor, opacities: Tensor, xs: Tensor, ys: Tensor) -> tuple[Tensor, Tensor]:
+    """How much each splat adds to each pixel, front to back, [n, h, w]; and what shines through all of them, [h, w]."""
+    dx = xs[None, None, :] - centres[:, 0, None, None]
+    dy = ys[None, :, None] - centres[:, 1, None, None]
+    a, b, c = conics[:, :, None, None].unbind(1)
+    alpha = opacities[:, None, None] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+    alpha = torch.where(alpha < ALPHA_MIN, 0, alpha.clamp_max(ALPHA_MAX))
+    through = torch.cumprod(1 - alpha, dim=0)
+    before = torch.cat([through.new_ones(1, *through.shape[1:]), through])
+    return alpha * before[:-1], before[-1]

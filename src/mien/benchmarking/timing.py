@@ -1,0 +1,114 @@
+"""How benchmarks measure, and what they say about the machine."""
+
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from mien import _native
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Of one function, in milliseconds."""
+
+    min_ms: float
+    """Least wall-clock time."""
+    median_ms: float
+    """Median wall-clock time."""
+    cpu_ms: float
+    """Least processor time, all threads added: what other work on the machine disturbs least."""
+
+
+@dataclass(frozen=True)
+class BenchmarkRow(Timing):
+    """One line of a table."""
+
+    name: str
+    gaussians: int
+    width: int
+    height: int
+    threads: int
+    isa: str
+    """Instruction set of the native kernels."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What the figures were measured on."""
+
+    processor: str
+    cores: int
+    isa: str
+    """The best instruction set that the native kernels have here."""
+    gflops: float
+    """Float32 operations of one thread in 1e9 a second, measured: a matrix product of 512x512 by torch."""
+    load: float
+    """Of the last minute, before the benchmark: above 0 others were working."""
+
+
+def time_function(function: Callable[[], object], seconds: float = 0.8, least: int = 7) -> Timing:
+    """Run it for about so many seconds, but at least `least` times, after two runs that do not count."""
+    for _ in range(2):
+        function()
+    walls: list[float] = []
+    processors: list[float] = []
+    end = time.perf_counter() + seconds
+    while len(walls) < least or time.perf_counter() < end:
+        processor, wall = time.process_time(), time.perf_counter()
+        function()
+        walls.append(1e3 * (time.perf_counter() - wall))
+        processors.append(1e3 * (time.process_time() - processor))
+    return Timing(min(walls), sorted(walls)[len(walls) // 2], min(processors))
+
+
+def benchmark_row(name: str, gaussians: int, size: tuple[int, int], timing: Timing) -> BenchmarkRow:
+    """A row with the threads and the instruction set in use; `size` is (width, height)."""
+    width, height = size
+    return BenchmarkRow(
+        **asdict(timing), name=name, gaussians=gaussians, width=width, height=height,
+        threads=_native.thread_count(), isa=_native.rasterize_isa(),
+    )  # fmt: skip
+
+
+def measure_machine() -> Machine:
+    """Takes a fifth of a second."""
+    load = os.getloadavg()[0]
+    matrix = torch.randn(512, 512)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        timing = time_function(lambda: matrix @ matrix, seconds=0.2)
+    finally:
+        torch.set_num_threads(threads)
+    gflops = 2 * 512**3 / timing.cpu_ms / 1e6
+    return Machine(_processor(), os.cpu_count() or 1, _native.rasterize_isa(), round(gflops, 1), round(load, 2))
+
+
+def format_machine(machine: Machine) -> str:
+    """One line."""
+    return (
+        f"{machine.processor}, {machine.cores} cores, {machine.isa}, {machine.gflops:.0f} GFLOP/s a thread "
+        f"(matrix product), load {machine.load:.1f}"
+    )
+
+
+def format_row(row: BenchmarkRow) -> str:
+    """One line of the table."""
+    return (
+        f"{row.name:28} {row.gaussians:7} {row.width:5}x{row.height:<5} {row.threads:2} threads {row.isa:8} "
+        f"{row.min_ms:8.2f} min {row.median_ms:8.2f} median {row.cpu_ms:8.2f} processor ms"
+    )
+
+
+def _processor() -> str:
+    listing = Path("/proc/cpuinfo")
+    if listing.is_file():
+        for line in listing.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,123 @@
+"""How long a `gaussian_avatars` training step takes, as `mien train` runs it, on a sequence that needs no footage.
+
+Run as `mien bench train-step`.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from mien import _native
+from mien.avatar import Avatar, GaussianAvatarsConfig
+from mien.benchmarking.render import thread_counts
+from mien.benchmarking.timing import BenchmarkRow, benchmark_row, time_function
+from mien.camera import Camera
+from mien.capture import Capture
+from mien.face import FaceModel, FaceParams, load_face_model
+from mien.render import rasterize
+from mien.tracking import Tracking
+from mien.training.checkpoint import TrainingState
+from mien.training.frames import FrameOrder, training_frames
+from mien.training.sequence import Sequence, Targets
+from mien.training.settings import TrainSettings
+from mien.training.trainer import TrainingData, start, step
+
+TIMESTEPS = 20
+SETTINGS = TrainSettings(steps=1_000_000_000, split="none")
+"""So many that no round of density control comes while we measure."""
+
+
+def train_step_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
+    """Whole steps at 512x512 by the number of Gaussians and threads; pose and render at the papers' sizes."""
+    for count in (10_000, 30_000, 100_000):
+        state, data = training_case(load_face_model(), count, 512, 512)
+        for threads in thread_counts():
+            _native.set_thread_count(threads)
+            timing = time_function(lambda state=state, data=data: step(state, data, SETTINGS), seconds)
+            yield benchmark_row("train_step", count, (512, 512), timing)
+    for count, (width, height) in ((30_000, (512, 512)), (100_000, (550, 802))):
+        state, data = training_case(load_face_model(), count, width, height)
+        face = state.track.params()
+        for threads in thread_counts():
+            _native.set_thread_count(threads)
+            scene = (state.avatar, face, data.targets[0].camera(0))
+            timing = time_function(lambda scene=scene: pose_and_render(*scene), seconds / 3)
+            yield benchmark_row("pose_and_render", count, (width, height), timing)
+
+
+def pose_and_render(avatar: Avatar, face: FaceParams, camera: Camera) -> None:
+    """From face parameters to a picture."""
+    with torch.no_grad():
+        rasterize(avatar.pose(face[0]).gaussians.timestep(0), camera, torch.ones(3))
+
+
+def training_case(face_model: FaceModel, count: int, width: int, height: int) -> tuple[TrainingState, TrainingData]:
+    """The state in the middle of a run of so many Gaussians, and pictures to train on; head over half the picture."""
+    sequence = _sequence(face_model, width, height)
+    state = start([sequence], face_model, GaussianAvatarsConfig(), SETTINGS)
+    _grow(state.avatar, count)
+    order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
+    state = TrainingState(state.avatar, state.adam, state.density, state.track, {})
+    state.density.load_state(
+        {
+            "pull": torch.zeros(count),
+            "seen": torch.zeros(count),
+            "radius": torch.zeros(count, dtype=torch.int32),
+            "opacity": torch.zeros(count),
+        }
+    )
+    _paint_targets(sequence, state.avatar)
+    return state, TrainingData(order, (Targets(sequence, 0),))
+
+
+def _grow(avatar: Avatar, count: int) -> None:
+    """As density control leaves an avatar: several Gaussians on every triangle, small and mostly opaque."""
+    store, generator = avatar.gaussian_store(), torch.Generator().manual_seed(0)
+    faces = len(store)
+    store.select(torch.arange(count) % faces)
+    store.assign("means", 0.5 * torch.randn(count, 3, generator=generator))
+    store.assign("quats", torch.randn(count, 4, generator=generator))
+    spread = 0.5 * torch.randn(count, 3, generator=generator)
+    store.assign("log_scales", spread - 2.3 - 0.5 * np.log(count / 30_000))
+    store.assign("opacity_logits", 2 + 1.5 * torch.randn(count, generator=generator))
+    store.assign("sh_constant", 0.5 * torch.randn(count, 1, 3, generator=generator))
+
+
+def _sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
+    """A head that turns and opens its mouth a little, with pictures that are still black."""
+    time = torch.linspace(0, 2 * torch.pi, TIMESTEPS + 1)[:-1]
+    neutral = face_model.neutral(TIMESTEPS)
+    turn = torch.stack([0.1 * time.sin(), 0.2 * time.cos(), 0 * time], -1)
+    expression = neutral.expression + 0.3 * torch.rand(neutral.expression.shape[-1]) * time.sin()[:, None].abs()
+    place = torch.tensor([0.0, 0.02, -0.6]).expand(TIMESTEPS, 3)
+    face = FaceParams(neutral.identity, expression, neutral.joints, turn, place.contiguous())
+    focal = 1.8 * min(width, height)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    camera = Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])), width, height)
+    tracking = Tracking(
+        face_model=face_model.name, face_model_hash=face_model.content_hash, face=face,
+        valid=torch.ones(TIMESTEPS, dtype=torch.bool), cameras=(camera,),
+        neck_lines=torch.tensor([0.0, -1.0, float(height)]).expand(TIMESTEPS, 1, 3),
+        residuals=torch.zeros(TIMESTEPS, 1),
+    )  # fmt: skip
+    pictures = np.zeros((TIMESTEPS, 1, height, width, 3), np.uint8)
+    capture = Capture(
+        name="benchmark", camera_ids=("front",), fps=25.0, timestamps=np.arange(TIMESTEPS) / 25, images=pictures,
+        mattes=np.zeros(pictures.shape[:-1], np.uint8), landmarks=np.zeros((TIMESTEPS, 1, 478, 2), np.float32),
+        valid=np.ones((TIMESTEPS, 1), bool), principal_point=np.array([[width / 2, height / 2]], np.float32),
+        source={},
+    )  # fmt: skip
+    return Sequence("benchmark", capture, tracking, np.zeros(pictures.shape[:-1], np.uint8))
+
+
+def _paint_targets(sequence: Sequence, avatar: Avatar) -> None:
+    """Pictures of the same head in noisy colours, so that every loss has something to do."""
+    noise = np.random.default_rng(0)
+    for timestep in range(TIMESTEPS):
+        with torch.no_grad():
+            gaussians = avatar.pose(sequence.tracking.face[timestep]).gaussians.timestep(0)
+            rendering = rasterize(gaussians, sequence.tracking.cameras[0], torch.ones(3))
+        picture = 255 * rendering.image.numpy() + noise.normal(0, 20, rendering.image.shape)
+        sequence.capture.images[timestep, 0] = picture.clip(0, 255).astype(np.uint8)
+        sequence.scoring[timestep, 0] = (255 * rendering.alpha.numpy()).astype(np.uint8)

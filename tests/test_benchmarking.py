@@ -1,0 +1,117 @@
+"""`mien bench render | train-step | scaling`: rows that say what was measured, json, charts; peers draw the same."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mien import _native
+from mien.benchmarking import render as render_benchmark
+from mien.benchmarking import train_step
+from mien.benchmarking.charts import write_scaling_chart
+from mien.benchmarking.scenes import head_scene
+from mien.benchmarking.timing import BenchmarkRow, measure_machine, time_function
+from mien.cli import main
+from mien.face import load_face_model
+from mien.render import rasterize
+from mien.training.trainer import step
+
+PEERS = Path(__file__).parent.parent / "benchmarks" / "peers"
+
+
+@pytest.fixture(autouse=True)
+def restore_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+    _native.set_thread_count(0)
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(render_benchmark, "COUNTS", (5, 20))
+    monkeypatch.setattr(render_benchmark, "SIZES", {"a": (40, 30), "b": (32, 32)})
+
+
+def test_timing_counts_every_run_and_orders_its_figures() -> None:
+    runs: list[int] = []
+    timing = time_function(lambda: runs.append(sum(range(10_000))), seconds=0.0, least=5)
+    assert len(runs) == 7  # two of which warm up
+    assert 0 < timing.min_ms <= timing.median_ms
+    assert timing.cpu_ms > 0
+
+
+@pytest.mark.usefixtures("small")
+def test_scaling_as_json_with_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    chart = tmp_path / "chart.png"
+    assert main(["bench", "scaling", "--json", "--seconds", "0", "--plot", str(chart)]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["machine"]["gflops"] > 0
+    rows = [BenchmarkRow(**row) for row in shown["rows"]]
+    assert {(row.width, row.height) for row in rows} == {(40, 30), (32, 32)}
+    assert {row.gaussians for row in rows} == {5, 20}
+    assert {row.threads for row in rows} == set(render_benchmark.thread_counts())
+    for row in rows:
+        assert 0 < row.min_ms <= row.median_ms
+    assert chart.read_bytes().startswith(b"\x89PNG")
+
+
+def test_instruction_sets_are_compared_and_restored(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(render_benchmark, "COUNTS", ())
+    monkeypatch.setattr(render_benchmark, "benchmark_render", lambda *_: [_native.rasterize_isa()])
+    best = _native.rasterize_isa()
+    shown = [str(isa) for isa in render_benchmark.render_suite()]
+    assert shown[0] == best
+    assert len(shown) == len(set(shown))
+    assert _native.rasterize_isa() == best
+
+
+def test_a_chart_of_another_kind_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "scaling", "--plot", str(tmp_path / "chart.jpg")]) == 2
+    assert ".png, .svg, .pdf" in capsys.readouterr().err
+
+
+def test_a_chart_has_a_line_for_every_size(tmp_path: Path) -> None:
+    rows = [BenchmarkRow(1.0, 2.0, 1.0, "rasterize_forward", 10, 40, 30, threads, "avx2") for threads in (1, 2)]
+    write_scaling_chart(tmp_path / "a.svg", rows, measure_machine())
+    drawing = (tmp_path / "a.svg").read_text()
+    assert "40x30, 1 thread " in drawing
+    assert "40x30, 2 threads " in drawing
+
+
+def test_a_training_case_trains() -> None:
+    """The benchmarked step is the trainer's own, on pictures that it has something to learn from."""
+    state, data = train_step.training_case(load_face_model(), 2000, 96, 80)
+    before = state.avatar.gaussian_store()["sh_constant"].detach().clone()
+    for _ in range(10):
+        step(state, data, train_step.SETTINGS)
+    assert state.step == 10
+    assert len(state.avatar.gaussian_store()) == 2000
+    assert not torch.equal(before, state.avatar.gaussian_store()["sh_constant"])
+    target = data.targets[0].target(0, 0, np.full(3, 255, np.uint8), keep=False)
+    assert 0.2 < (target.matte > 127).float().mean() < 0.7  # the head fills about half of the picture
+
+
+def test_the_torch_tile_loop_draws_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(PEERS))
+    from torch_tiles import render_tiles  # pyright: ignore[reportMissingImports]
+
+    scene = head_scene(500, 50, 40)
+    found = render_tiles(scene.gaussians, scene.camera, scene.background)
+    expected = rasterize(scene.gaussians, scene.camera, scene.background).image
+    assert (found - expected).abs().mean() < 1e-3
+    ours, theirs = (torch.autograd.grad(picture, scene.parameters, scene.gradient) for picture in (expected, found))
+    for one, other in zip(ours, theirs, strict=True):
+        assert (one - other).norm() < 0.05 * other.norm()
+
+
+@pytest.mark.slow
+def test_peers_are_compared_in_one_run() -> None:
+    command = [sys.executable, str(PEERS / "compare.py"), "--counts", "200", "--size", "48", "--rounds", "1", "--json"]
+    shown = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert {row["name"] for row in shown["rows"]} >= {"mien_native", "torch_tiles"}
