@@ -22,6 +22,7 @@ from mien.errors import UserError
 from mien.evaluation import read_metrics
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
+from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import EvaluationSettings
 from mien.face import load_face_model
 from mien.progress import say
@@ -140,7 +141,7 @@ class _Times:
 
 @torch.no_grad()
 def _strip(workspace: Workspace, run: str) -> np.ndarray:
-    """Held-out pictures above, the avatar below, side by side."""
+    """Head crops of held-out pictures above, of the avatar below, side by side."""
     run_dir = workspace.run_dir(run)
     experiment: Experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
     frames = experiment.held_out_frames
@@ -148,15 +149,22 @@ def _strip(workspace: Workspace, run: str) -> np.ndarray:
     places = np.random.default_rng(0).choice(len(frames), _SHEET_FRAMES, replace=len(frames) < _SHEET_FRAMES)
     chosen = [frames[index] for index in np.sort(places)]
     rows = [
-        np.concatenate([_small(draw(experiment, frame).numpy()) for frame in chosen], axis=1)
+        np.concatenate(
+            [_small(crop_to(draw(experiment, frame), experiment.crop(frame)).numpy()) for frame in chosen], 1
+        )
         for draw in (target_image, avatar_image)
     ]
     return np.concatenate(rows)
 
 
 def _small(image: np.ndarray) -> np.ndarray:
-    scaled = cv2.resize(image, (_SHEET_SIDE, _SHEET_SIDE), interpolation=cv2.INTER_AREA)
-    return np.clip(np.rint(scaled * 255), 0, 255).astype(np.uint8)
+    """Shrunk or enlarged into a white square."""
+    scale = _SHEET_SIDE / max(image.shape[:2])
+    size = tuple(max(1, round(side * scale)) for side in image.shape[1::-1])
+    scaled = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    square = np.full((_SHEET_SIDE, _SHEET_SIDE, 3), 255, np.uint8)
+    square[: size[1], : size[0]] = np.clip(np.rint(scaled * 255), 0, 255).astype(np.uint8)
+    return square
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:
