@@ -4,6 +4,7 @@
 void bind_face(nanobind::module_& module);
 void bind_mesh(nanobind::module_& module);
 void bind_mesh_gradients(nanobind::module_& module);
+void bind_mesh_align(nanobind::module_& module);
 void bind_photometric(nanobind::module_& module);
 void bind_rig(nanobind::module_& module);
 void bind_rasterize(nanobind::module_& module);
@@ -15,6 +16,7 @@ NB_MODULE(_native, module) {
   bind_face(module);
   bind_mesh(module);
   bind_mesh_gradients(module);
+  bind_mesh_align(module);
   bind_photometric(module);
   bind_rig(module);
   bind_rasterize(module);

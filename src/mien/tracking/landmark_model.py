@@ -108,7 +108,7 @@ class LandmarkModel:
         by_head = torch.einsum("blxc,bcd->blxd", by_world, rotation[row])
 
         by_rotation = torch.linalg.cross(turned[row][:, :, None].expand_as(by_world), by_world)
-        by_rotation = torch.einsum("blxc,bcd->blxd", by_rotation, _left_jacobian(face.head_rotation)[row])
+        by_rotation = torch.einsum("blxc,bcd->blxd", by_rotation, left_jacobian(face.head_rotation)[row])
         by_expression = _through_joints(transforms, self.expression_basis[self.layout.expression_index])
         by_angles, by_derived = self._by_joint_motion(transforms, shaped, face)
         by_expression[..., self.layout.derived_column] += by_derived
@@ -227,7 +227,7 @@ def _derivatives(function: Callable[[Tensor], Tensor], at: Float[Tensor, "*b q"]
     return torch.stack([(function(at + shift) - function(at - shift)) / 2e-5 for shift in step])
 
 
-def _left_jacobian(axis_angle: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
+def left_jacobian(axis_angle: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
     """Left Jacobian of SO(3): exp(a + d) = exp(J d) exp(a) to first order."""
     squared = (axis_angle * axis_angle).sum(-1)[:, None, None]
     small = squared < 1e-8

@@ -1,0 +1,395 @@
+#include "mesh_align.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+namespace mien {
+namespace {
+
+constexpr int kBlocks = 6 * 3;   // corner pairs (0,0) (0,1) (0,2) (1,1) (1,2) (2,2), each a symmetric 2x2 block
+constexpr int kSums = kBlocks + 6;
+constexpr float kDepthTolerance = 0.003f;  // metres: a texel so far behind what is seen is hidden
+
+struct Color {
+  float c[3];
+};
+
+struct Sample {
+  Color color;
+  float weight;
+};
+
+struct Workspace {
+  std::vector<int32_t> face_index;
+  std::vector<float> barycentric, depth;
+  std::vector<float> sums;      // [f, kSums]
+  std::vector<int32_t> hit;     // triangles with sums
+  std::vector<int32_t> row_of;  // vertex -> row, -1
+  std::vector<int32_t> vertices;
+  std::vector<float> screen, product, force;  // [rows,2,p], [rows,2,p], [rows,2]
+};
+
+void basis(const float* n, float* out) {
+  const float x = n[0], y = n[1], z = n[2];
+  out[0] = 0.28209479177387814f;
+  out[1] = 0.4886025119029199f * y;
+  out[2] = 0.4886025119029199f * z;
+  out[3] = 0.4886025119029199f * x;
+  out[4] = 1.0925484305920792f * x * y;
+  out[5] = 1.0925484305920792f * y * z;
+  out[6] = 0.31539156525252005f * (3 * z * z - 1);
+  out[7] = 1.0925484305920792f * x * z;
+  out[8] = 0.5462742152960396f * (x * x - y * y);
+}
+
+Color shade(const float* normal, const float* light) {
+  float b[9];
+  basis(normal, b);
+  Color out{};
+  for (int k = 0; k < 9; ++k)
+    for (int c = 0; c < 3; ++c) out.c[c] += b[k] * light[3 * k + c];
+  return out;
+}
+
+// Bilinear among the texels that are known; the weight is their trust.
+Sample sample_texture(const TexturedSurface& surface, float u, float v) {
+  const float x = std::clamp(u, 0.0f, 1.0f) * surface.texture_width - 0.5f;
+  const float y = (1 - std::clamp(v, 0.0f, 1.0f)) * surface.texture_height - 0.5f;
+  const int x0 = static_cast<int>(std::floor(x)), y0 = static_cast<int>(std::floor(y));
+  Sample out{};
+  for (int dy = 0; dy < 2; ++dy) {
+    for (int dx = 0; dx < 2; ++dx) {
+      const int column = std::clamp(x0 + dx, 0, surface.texture_width - 1);
+      const int row = std::clamp(y0 + dy, 0, surface.texture_height - 1);
+      const int64_t texel = static_cast<int64_t>(row) * surface.texture_width + column;
+      const float share = (dx ? x - x0 : 1 - (x - x0)) * (dy ? y - y0 : 1 - (y - y0)) * surface.trust[texel];
+      out.weight += share;
+      for (int c = 0; c < 3; ++c) out.color.c[c] += share * surface.albedo[3 * texel + c];
+    }
+  }
+  if (out.weight > 0)
+    for (float& value : out.color.c) value /= out.weight;
+  return out;
+}
+
+struct SurfacePoint {
+  float position[3], normal[3];
+  float cosine;  // between the normal and the direction to the camera
+};
+
+SurfacePoint surface_point(const Mesh& mesh, const AlignFrame& frame, const float* eye, const int64_t* corners,
+                           const float* weights) {
+  SurfacePoint out{};
+  for (int k = 0; k < 3; ++k) {
+    for (int axis = 0; axis < 3; ++axis) {
+      out.position[axis] += weights[k] * mesh.vertices[3 * corners[k] + axis];
+      out.normal[axis] += weights[k] * frame.normals[3 * corners[k] + axis];
+    }
+  }
+  float length = 0, distance = 0, along = 0;
+  for (int axis = 0; axis < 3; ++axis) {
+    const float towards = eye[axis] - out.position[axis];
+    length += out.normal[axis] * out.normal[axis];
+    distance += towards * towards;
+    along += towards * out.normal[axis];
+  }
+  length = std::sqrt(length) + 1e-20f;
+  for (float& value : out.normal) value /= length;
+  out.cosine = along / (length * std::sqrt(distance) + 1e-20f);
+  return out;
+}
+
+void camera_position(const float* viewmat, float* eye) {
+  for (int axis = 0; axis < 3; ++axis) {
+    eye[axis] = 0;
+    for (int k = 0; k < 3; ++k) eye[axis] -= viewmat[4 * k + axis] * viewmat[4 * k + 3];
+  }
+}
+
+void draw(const Mesh& mesh, const MeshView& view, Workspace& workspace) {
+  const size_t pixels = static_cast<size_t>(view.width) * view.height;
+  workspace.face_index.resize(pixels);
+  workspace.barycentric.resize(3 * pixels);
+  workspace.depth.resize(pixels);
+  rasterize_mesh(mesh, view, false,
+                 {workspace.face_index.data(), workspace.barycentric.data(), workspace.depth.data()});
+}
+
+// Calls body(pixel, face, corners, barycentrics, point, texture sample, light) for every pixel that counts.
+template <typename Body>
+void for_pixels(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame, const AlignOptions& options,
+                const Workspace& workspace, Body&& body) {
+  float eye[3];
+  camera_position(frame.view.viewmat, eye);
+  const int width = frame.view.width, height = frame.view.height;
+  for (int y = 1; y + 1 < height; ++y) {
+    for (int x = 1; x + 1 < width; ++x) {
+      const int64_t pixel = static_cast<int64_t>(y) * width + x;
+      const int32_t face = workspace.face_index[pixel];
+      if (face < 0 || !surface.used[face] || !(frame.mask[pixel] > 0)) continue;
+      const int64_t* corners = mesh.faces + 3 * static_cast<int64_t>(face);
+      const float* weights = workspace.barycentric.data() + 3 * pixel;
+      const SurfacePoint point = surface_point(mesh, frame, eye, corners, weights);
+      if (point.cosine < options.least_cosine) continue;
+      const float* uv = surface.uv + 6 * static_cast<int64_t>(face);
+      const Sample sample =
+          sample_texture(surface, weights[0] * uv[0] + weights[1] * uv[2] + weights[2] * uv[4],
+                         weights[0] * uv[1] + weights[1] * uv[3] + weights[2] * uv[5]);
+      if (!(sample.weight > 0)) continue;
+      body(pixel, face, weights, point, sample, shade(point.normal, frame.light));
+    }
+  }
+}
+
+void add_pixel(float* sums, const float* weights, const float gradient[2][3], const Color& residual, float weight) {
+  float g[3] = {}, force[2] = {};
+  for (int c = 0; c < 3; ++c) {
+    g[0] += gradient[0][c] * gradient[0][c];
+    g[1] += gradient[0][c] * gradient[1][c];
+    g[2] += gradient[1][c] * gradient[1][c];
+    force[0] += gradient[0][c] * residual.c[c];
+    force[1] += gradient[1][c] * residual.c[c];
+  }
+  int at = 0;
+  for (int k = 0; k < 3; ++k) {
+    for (int l = k; l < 3; ++l) {
+      const float share = weight * weights[k] * weights[l];
+      for (int i = 0; i < 3; ++i) sums[at++] += share * g[i];
+    }
+  }
+  for (int k = 0; k < 3; ++k)
+    for (int i = 0; i < 2; ++i) sums[at++] += weight * weights[k] * force[i];
+}
+
+// Derivatives of a vertex's pixel position by the parameters.
+void screen_jacobian(const Mesh& mesh, const MeshView& view, int64_t vertex, const float* jacobian, int parameters,
+                     float* out) {
+  const float* position = mesh.vertices + 3 * vertex;
+  float in_camera[3];
+  for (int row = 0; row < 3; ++row) {
+    const float* m = view.viewmat + 4 * row;
+    in_camera[row] = m[0] * position[0] + m[1] * position[1] + m[2] * position[2] + m[3];
+  }
+  const float inverse = 1 / std::max(in_camera[2], static_cast<float>(kMeshNearPlane));
+  for (int row = 0; row < 2; ++row) {
+    const float focal = view.K[4 * row] * inverse, shift = -focal * in_camera[row] * inverse;
+    float by_world[3];
+    for (int axis = 0; axis < 3; ++axis)
+      by_world[axis] = focal * view.viewmat[4 * row + axis] + shift * view.viewmat[8 + axis];
+    const float* x = jacobian + 3 * vertex * parameters;
+    const float *y = x + parameters, *z = y + parameters;
+    float* target = out + static_cast<int64_t>(row) * parameters;
+    for (int i = 0; i < parameters; ++i) target[i] = by_world[0] * x[i] + by_world[1] * y[i] + by_world[2] * z[i];
+  }
+}
+
+// Sums of triangles -> J^T A J and J^T b, with A J accumulated per vertex: neighbours only.
+void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian, int parameters, double scale,
+                  Workspace& w, const AlignBuffers& out) {
+  const int64_t row_size = 2 * static_cast<int64_t>(parameters);
+  w.row_of.assign(mesh.vertex_count, -1);
+  w.vertices.clear();
+  for (const int32_t face : w.hit) {
+    for (int k = 0; k < 3; ++k) {
+      const int64_t vertex = mesh.faces[3 * static_cast<int64_t>(face) + k];
+      if (w.row_of[vertex] >= 0) continue;
+      w.row_of[vertex] = static_cast<int32_t>(w.vertices.size());
+      w.vertices.push_back(static_cast<int32_t>(vertex));
+    }
+  }
+  w.screen.resize(w.vertices.size() * row_size);
+  w.product.assign(w.vertices.size() * row_size, 0.0f);
+  w.force.assign(w.vertices.size() * 2, 0.0f);
+  for (size_t row = 0; row < w.vertices.size(); ++row)
+    screen_jacobian(mesh, view, w.vertices[row], jacobian, parameters, w.screen.data() + row * row_size);
+
+  static constexpr int kBlockOf[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+  for (const int32_t face : w.hit) {
+    float* sums = w.sums.data() + static_cast<int64_t>(face) * kSums;
+    for (int k = 0; k < 3; ++k) {
+      const int64_t row = w.row_of[mesh.faces[3 * static_cast<int64_t>(face) + k]];
+      float *product_x = w.product.data() + row * row_size, *product_y = product_x + parameters;
+      for (int l = 0; l < 3; ++l) {
+        const float* block = sums + 3 * kBlockOf[k][l];
+        const int64_t other = w.row_of[mesh.faces[3 * static_cast<int64_t>(face) + l]];
+        const float *x = w.screen.data() + other * row_size, *y = x + parameters;
+        const float xx = block[0], xy = block[1], yy = block[2];
+        for (int i = 0; i < parameters; ++i) {
+          product_x[i] += xx * x[i] + xy * y[i];
+          product_y[i] += xy * x[i] + yy * y[i];
+        }
+      }
+      w.force[2 * row] += sums[kBlocks + 2 * k];
+      w.force[2 * row + 1] += sums[kBlocks + 2 * k + 1];
+    }
+    std::fill_n(sums, kSums, 0.0f);
+  }
+  std::fill_n(out.hessian, static_cast<int64_t>(parameters) * parameters, 0.0f);
+  std::fill_n(out.gradient, parameters, 0.0f);
+  for (size_t row = 0; row < 2 * w.vertices.size(); ++row) {
+    const float *screen = w.screen.data() + row * parameters, *product = w.product.data() + row * parameters;
+    const float force = w.force[row];
+    for (int i = 0; i < parameters; ++i) {
+      const float left = screen[i];
+      if (left == 0) continue;
+      out.gradient[i] += left * force;
+      float* target = out.hessian + static_cast<int64_t>(i) * parameters;
+      for (int j = i; j < parameters; ++j) target[j] += left * product[j];
+    }
+  }
+  for (int i = 0; i < parameters; ++i) {
+    out.gradient[i] = static_cast<float>(out.gradient[i] * scale);
+    for (int j = i; j < parameters; ++j) {
+      const float value = static_cast<float>(out.hessian[static_cast<int64_t>(i) * parameters + j] * scale);
+      out.hessian[static_cast<int64_t>(i) * parameters + j] = value;
+      out.hessian[static_cast<int64_t>(j) * parameters + i] = value;
+    }
+  }
+}
+
+Workspace& own_workspace() {
+  thread_local Workspace workspace;  // kept between calls: fresh pages cost as much as the work
+  return workspace;
+}
+
+}  // namespace
+
+AlignResult align_mesh(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
+                       const AlignOptions& options, const float* jacobian, int parameters, const AlignBuffers& out) {
+  Workspace& w = own_workspace();
+  draw(mesh, frame.view, w);
+  w.hit.clear();
+  w.sums.resize(static_cast<size_t>(mesh.face_count) * kSums, 0.0f);
+  const int width = frame.view.width;
+  if (out.residual) {
+    std::fill_n(out.residual, 3 * static_cast<int64_t>(width) * frame.view.height,
+                std::numeric_limits<float>::quiet_NaN());
+  }
+  const float least = options.outlier * options.outlier, inverse_variance = 1 / (options.sigma * options.sigma);
+  double cost = 0, total = 0, gains[6] = {};
+  for_pixels(mesh, surface, frame, options, w,
+             [&](int64_t pixel, int32_t face, const float* weights, const SurfacePoint&, const Sample& sample,
+                 const Color& light) {
+               const float* seen = frame.image + 3 * pixel;
+               Color residual;
+               float squared = 0;
+               for (int c = 0; c < 3; ++c) {
+                 residual.c[c] = seen[c] - sample.color.c[c] * light.c[c];
+                 squared += residual.c[c] * residual.c[c] * inverse_variance;
+               }
+               const float weight = frame.mask[pixel] * sample.weight, fade = least / (least + squared);
+               total += weight;
+               cost += weight * squared * fade;
+               if (out.residual) std::copy_n(residual.c, 3, out.residual + 3 * pixel);
+               for (int c = 0; c < 3; ++c) {
+                 const float predicted = sample.color.c[c] * light.c[c], share = weight * fade * fade;
+                 gains[2 * c] += share * predicted * seen[c];
+                 gains[2 * c + 1] += share * predicted * predicted;
+               }
+               if (!out.hessian) return;
+               float gradient[2][3];
+               for (int c = 0; c < 3; ++c) {
+                 gradient[0][c] = 0.5f * (seen[3 + c] - seen[c - 3]);
+                 gradient[1][c] = 0.5f * (seen[3 * width + c] - seen[c - 3 * width]);
+               }
+               float* sums = w.sums.data() + static_cast<int64_t>(face) * kSums;
+               if (std::all_of(sums, sums + 3, [](float value) { return value == 0; })) w.hit.push_back(face);
+               add_pixel(sums, weights, gradient, residual, weight * fade * fade * inverse_variance);
+             });
+  for (int i = 0; i < 6; ++i) out.gains[i] = static_cast<float>(gains[i]);
+  const double scale = total > 0 ? 1 / total : 0;
+  if (out.hessian) {
+    std::sort(w.hit.begin(), w.hit.end());
+    w.hit.erase(std::unique(w.hit.begin(), w.hit.end()), w.hit.end());
+    project_sums(mesh, frame.view, jacobian, parameters, scale, w, out);
+  }
+  return {cost * scale, total};
+}
+
+void bake_texture(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
+                  const AlignOptions& options, const BakeTexels& texels, const BakeSums& out) {
+  Workspace& w = own_workspace();
+  draw(mesh, frame.view, w);
+  float eye[3];
+  camera_position(frame.view.viewmat, eye);
+  const MeshView& view = frame.view;
+  const float least = options.outlier * options.outlier, inverse_variance = 1 / (options.sigma * options.sigma);
+  const int64_t count = static_cast<int64_t>(surface.texture_width) * surface.texture_height;
+  for (int64_t texel = 0; texel < count; ++texel) {
+    const int32_t face = texels.face[texel];
+    if (face < 0 || !surface.used[face]) continue;
+    const SurfacePoint point =
+        surface_point(mesh, frame, eye, mesh.faces + 3 * static_cast<int64_t>(face), texels.barycentric + 3 * texel);
+    if (point.cosine < options.least_cosine) continue;
+    float in_camera[3];
+    for (int row = 0; row < 3; ++row) {
+      const float* m = view.viewmat + 4 * row;
+      in_camera[row] = m[0] * point.position[0] + m[1] * point.position[1] + m[2] * point.position[2] + m[3];
+    }
+    if (in_camera[2] < kMeshNearPlane) continue;
+    const float x = view.K[0] * in_camera[0] / in_camera[2] + view.K[2] - 0.5f;
+    const float y = view.K[4] * in_camera[1] / in_camera[2] + view.K[5] - 0.5f;
+    if (!(x >= 0 && y >= 0 && x < view.width - 1 && y < view.height - 1)) continue;
+    const int x0 = static_cast<int>(x), y0 = static_cast<int>(y);
+    const int64_t nearest = static_cast<int64_t>(std::lround(y)) * view.width + std::lround(x);
+    // What a slope rises within a pixel does not hide it.
+    const float tolerance = kDepthTolerance + 2 * in_camera[2] / view.K[0] / std::max(point.cosine, 0.1f);
+    if (in_camera[2] > w.depth[nearest] + tolerance) continue;
+    float color[3] = {}, mask = 0;
+    for (int dy = 0; dy < 2; ++dy) {
+      for (int dx = 0; dx < 2; ++dx) {
+        const float share = (dx ? x - x0 : 1 - (x - x0)) * (dy ? y - y0 : 1 - (y - y0));
+        const int64_t pixel = static_cast<int64_t>(y0 + dy) * view.width + x0 + dx;
+        mask += share * frame.mask[pixel];
+        for (int c = 0; c < 3; ++c) color[c] += share * frame.image[3 * pixel + c];
+      }
+    }
+    const Color light = shade(point.normal, frame.light);
+    float weight = mask * point.cosine * point.cosine;
+    if (surface.trust[texel] > 0) {
+      float squared = 0;
+      for (int c = 0; c < 3; ++c) {
+        const float difference = color[c] - surface.albedo[3 * texel + c] * light.c[c];
+        squared += difference * difference * inverse_variance;
+      }
+      const float fade = least / (least + squared);
+      weight *= fade * fade;
+    }
+    out.weight[texel] += weight;
+    for (int c = 0; c < 3; ++c) {
+      out.squares[3 * texel + c] += weight * light.c[c] * light.c[c];
+      out.mixed[3 * texel + c] += weight * light.c[c] * color[c];
+      out.image[3 * texel + c] += weight * color[c] * color[c];
+    }
+  }
+}
+
+void light_equations(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
+                     const AlignOptions& options, double* hessian, double* right) {
+  Workspace& w = own_workspace();
+  draw(mesh, frame.view, w);
+  const float least = options.outlier * options.outlier, inverse_variance = 1 / (options.sigma * options.sigma);
+  for_pixels(mesh, surface, frame, options, w,
+             [&](int64_t pixel, int32_t, const float*, const SurfacePoint& point, const Sample& sample,
+                 const Color& light) {
+               float b[9], squared = 0;
+               basis(point.normal, b);
+               const float* seen = frame.image + 3 * pixel;
+               for (int c = 0; c < 3; ++c) {
+                 const float difference = seen[c] - sample.color.c[c] * light.c[c];
+                 squared += difference * difference * inverse_variance;
+               }
+               const float fade = least / (least + squared);
+               for (int c = 0; c < 3; ++c) {
+                 const float albedo = sample.color.c[c], weight = frame.mask[pixel] * sample.weight * fade * fade * albedo;
+                 for (int i = 0; i < 9; ++i) {
+                   right[9 * c + i] += weight * b[i] * seen[c];
+                   for (int j = i; j < 9; ++j) hessian[81 * c + 9 * i + j] += weight * albedo * b[i] * b[j];
+                 }
+               }
+             });
+}
+
+}  // namespace mien
