@@ -1,0 +1,167 @@
+"""The subject's skin as a texture, and the light it is seen in, from pictures whose faces are about tracked."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien import _native
+from mien.camera import Camera
+from mien.face import FaceModel
+from mien.render.mesh import MeshFragments, rasterize_mesh
+from mien.tracking.photometric_pictures import Picture
+from mien.tracking.photometric_surface import PosedSurface
+
+HIDING_REGIONS = ("scalp", "neck", "mouth", "teeth", "tongue", "eye_sockets", "ears")
+"""What takes no part but hides what is behind it: hair and collars cover it, or it moves by itself."""
+_LEAST_COSINE = 0.25
+"""Between a surface's normal and the direction to the camera."""
+_LEAST_WEIGHT = 0.5
+"""Of a texel's sightings (cosine squared each), below which it is not known."""
+_ROUNDS = 3
+"""Of albedo and light in turn."""
+_LIGHT_STIFFNESS = 0.02
+"""Pull of the light towards an even one, of what the pictures say."""
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """An albedo texture and what of it can be trusted."""
+
+    albedo: Float[Tensor, "th tw 3"]
+    trust: Float[Tensor, "th tw"]
+    """0 where not known; less where the pictures contradict each other."""
+    sigma: float
+    """Expected difference between picture and prediction."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A posed surface in a picture under a light."""
+
+    posed: PosedSurface
+    picture: Picture
+    light: Float[Tensor, "9 3"]
+
+    def arguments(self) -> tuple[Tensor, ...]:
+        """As the native core takes them."""
+        camera, picture = self.picture.camera, self.picture
+        posed = self.posed
+        return posed.vertices, posed.normals, camera.K, camera.viewmat, picture.image, picture.mask, self.light
+
+
+@dataclass(frozen=True, eq=False)
+class TextureSpace:
+    """Which point of the surface each texel shows."""
+
+    faces: Float[Tensor, "f 3"]
+    corners: Float[Tensor, "f 3 2"]
+    """Texture coordinates of every triangle's corners."""
+    used: Bool[Tensor, " f"]
+    fragments: MeshFragments
+
+    def native(self, appearance: Appearance, outlier: float) -> "_native.AlignSurface":
+        """The surface with this appearance for the native core."""
+        return _native.AlignSurface(
+            self.faces, self.corners, self.used.to(torch.uint8), appearance.albedo, appearance.trust,
+            appearance.sigma, outlier, _LEAST_COSINE,
+        )  # fmt: skip
+
+
+def texture_space(face_model: FaceModel, size: int) -> TextureSpace:
+    """The face model's texture coordinates as a picture of `size` texels along each side."""
+    corners = face_model.uv[face_model.uv_faces].contiguous()
+    flat = torch.stack([corners[..., 0] * size, (1 - corners[..., 1]) * size, torch.ones(corners.shape[:2])], dim=-1)
+    camera = Camera(torch.eye(3), torch.eye(4), size, size)
+    apart = torch.arange(3 * len(corners)).reshape(-1, 3)
+    fragments = rasterize_mesh(flat.reshape(-1, 3), apart, camera)
+    used = ~face_model.region_mask(*HIDING_REGIONS)
+    return TextureSpace(face_model.faces.contiguous(), corners, used, fragments)
+
+
+def even_light() -> Float[Tensor, "9 3"]:
+    """Light that leaves an albedo as it is."""
+    light = torch.zeros(9, 3)
+    light[0] = math.sqrt(4 * math.pi)
+    return light
+
+
+def unknown_appearance(space: TextureSpace, sigma: float) -> Appearance:
+    """Nothing known."""
+    size = space.fragments.face_index.shape
+    return Appearance(torch.zeros(*size, 3), torch.zeros(size), sigma)
+
+
+def estimate_appearance(
+    space: TextureSpace, sightings: Sequence[Sequence[Sighting]], start: Appearance | None, outlier: float
+) -> tuple[Appearance, list[Float[Tensor, "9 3"]]]:
+    """Albedo by least squares a texel, robust from the second round on, in turn with the light of every sequence.
+
+    Args:
+        space: Where texels are.
+        sightings: Of each sequence, under the light known so far.
+        start: What is known so far; its sigma scales the robust weights.
+        outlier: In sigmas.
+    """
+    appearance = start if start is not None else unknown_appearance(space, 0.1)
+    lights = [own[0].light for own in sightings]
+    for turn in range(_ROUNDS):
+        appearance = _bake(space, sightings, lights, appearance, outlier)
+        if turn == 0 and start is None:
+            appearance = _one_color(appearance)
+        lights = [
+            _fit_light(space, own, light, appearance, outlier) for own, light in zip(sightings, lights, strict=True)
+        ]
+    return _bake(space, sightings, lights, appearance, outlier), lights
+
+
+def _bake(
+    space: TextureSpace,
+    sightings: Sequence[Sequence[Sighting]],
+    lights: Sequence[Float[Tensor, "9 3"]],
+    appearance: Appearance,
+    outlier: float,
+) -> Appearance:
+    size = space.fragments.face_index.shape
+    surface = space.native(appearance, outlier)
+    weight = torch.zeros(size)
+    squares, mixed, image = (torch.zeros(*size, 3) for _ in range(3))
+    for own, light in zip(sightings, lights, strict=True):
+        for sighting in own:
+            _native.bake_texture(
+                surface, *replace(sighting, light=light).arguments(), space.fragments.face_index,
+                space.fragments.barycentric, weight, squares, mixed, image,
+            )  # fmt: skip
+    known = weight > _LEAST_WEIGHT
+    albedo = mixed / squares.clamp_min(1e-6) * known[..., None]
+    variance = ((image - albedo * mixed).sum(-1) / weight.clamp_min(1e-6)).clamp_min(0)
+    sigma = float(variance[known].median().sqrt().clamp(0.01, 0.1)) if known.any() else appearance.sigma
+    trust = known * (sigma**2 / (0.5 * sigma**2 + variance)).clamp_max(1.0)
+    return Appearance(albedo, trust, sigma)
+
+
+def _one_color(appearance: Appearance) -> Appearance:
+    """Its median colour everywhere: what varies is light, to begin with."""
+    median = appearance.albedo[appearance.trust > 0].median(0).values
+    return replace(appearance, albedo=(appearance.trust > 0)[..., None] * median, sigma=0.1)
+
+
+def _fit_light(
+    space: TextureSpace,
+    sightings: Sequence[Sighting],
+    light: Float[Tensor, "9 3"],
+    appearance: Appearance,
+    outlier: float,
+) -> Float[Tensor, "9 3"]:
+    hessian, right = torch.zeros(3, 9, 9).double(), torch.zeros(3, 9).double()
+    surface = space.native(appearance, outlier)
+    for sighting in sightings:
+        _native.light_equations(surface, *replace(sighting, light=light).arguments(), hessian, right)
+    hessian = hessian + hessian.triu(1).mT
+    stiffness = _LIGHT_STIFFNESS * hessian.diagonal(dim1=1, dim2=2).amax(1)[:, None].expand(3, 9).clone() + 1e-9
+    hessian = hessian + torch.diag_embed(stiffness)
+    right = right + stiffness * even_light().T.double()
+    return torch.linalg.solve(hessian, right).T.float().contiguous()
