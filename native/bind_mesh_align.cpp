@@ -81,12 +81,12 @@ mien::AlignFrame frame_of(const Points& vertices, const Points& normals, const M
 
 std::pair<double, double> align_mesh(const AlignSurface& surface, const Points& vertices, const Points& normals,
                                      const Matrix3& K, const Matrix4& viewmat, const Picture& image, const Plane& mask,
-                                     const Light& light,
+                                     const Light& light, int high_pass,
                                      const std::optional<Array<const float, nb::shape<-1, 3, -1>>>& jacobian,
                                      const std::optional<Array<float, nb::ndim<2>>>& hessian,
                                      const std::optional<Array<float, nb::ndim<1>>>& gradient,
                                      const std::optional<Array<float, nb::shape<-1, -1, 3>>>& residual,
-                                     const Array<float, nb::shape<3, 2>>& gains) {
+                                     const std::optional<Array<float, nb::shape<-1, -1, 3>>>& smooth) {
   const bool derive = jacobian.has_value();
   if (derive != hessian.has_value() || derive != gradient.has_value()) {
     throw nb::value_error("jacobian, hessian and gradient go together");
@@ -95,14 +95,16 @@ std::pair<double, double> align_mesh(const AlignSurface& surface, const Points& 
                  hessian->shape(1) != jacobian->shape(2) || gradient->shape(0) != jacobian->shape(2))) {
     throw nb::value_error("jacobian, hessian and gradient must agree on vertices and parameters");
   }
-  if (residual && residual->size() != image.size()) throw nb::value_error("residual must be of the picture's size");
+  if ((residual && residual->size() != image.size()) || (smooth && smooth->size() != image.size())) {
+    throw nb::value_error("residual and smooth must be of the picture's size");
+  }
   const mien::Mesh mesh = surface.mesh(vertices);
   const mien::AlignFrame frame = frame_of(vertices, normals, K, viewmat, image, mask, light);
   const mien::AlignBuffers out{derive ? hessian->data() : nullptr, derive ? gradient->data() : nullptr,
-                               residual ? residual->data() : nullptr, gains.data()};
+                               residual ? residual->data() : nullptr, smooth ? smooth->data() : nullptr};
   const nb::gil_scoped_release release;
   const mien::AlignResult result =
-      mien::align_mesh(mesh, surface.surface(), frame, surface.options(), derive ? jacobian->data() : nullptr,
+      mien::align_mesh(mesh, surface.surface(), frame, surface.options(), {high_pass}, derive ? jacobian->data() : nullptr,
                        derive ? static_cast<int>(jacobian->shape(2)) : 0, out);
   return {result.cost, result.weight};
 }
@@ -147,8 +149,8 @@ void bind_mesh_align(nb::module_& module) {
            "trust"_a.noconvert(), "sigma"_a, "outlier"_a, "least_cosine"_a);
   module.def("align_mesh", &align_mesh, "surface"_a, "vertices"_a.noconvert(), "normals"_a.noconvert(),
              "K"_a.noconvert(), "viewmat"_a.noconvert(), "image"_a.noconvert(), "mask"_a.noconvert(),
-             "light"_a.noconvert(), "jacobian"_a.none(), "hessian"_a.none(), "gradient"_a.none(), "residual"_a.none(),
-             "gains"_a.noconvert());
+             "light"_a.noconvert(), "high_pass"_a, "jacobian"_a.none(), "hessian"_a.none(), "gradient"_a.none(), "residual"_a.none(),
+             "smooth"_a.none());
   module.def("bake_texture", &bake_texture, "surface"_a, "vertices"_a.noconvert(), "normals"_a.noconvert(),
              "K"_a.noconvert(), "viewmat"_a.noconvert(), "image"_a.noconvert(), "mask"_a.noconvert(),
              "light"_a.noconvert(), "texel_face"_a.noconvert(), "texel_barycentric"_a.noconvert(),

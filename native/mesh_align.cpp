@@ -10,7 +10,7 @@ namespace {
 
 constexpr int kBlocks = 6 * 3;   // corner pairs (0,0) (0,1) (0,2) (1,1) (1,2) (2,2), each a symmetric 2x2 block
 constexpr int kSums = kBlocks + 6;
-constexpr float kDepthTolerance = 0.003f;  // metres: a texel so far behind what is seen is hidden
+constexpr float kDepthTolerance = 0.0005f;  // metres: a texel so far behind what is seen is hidden
 
 struct Color {
   float c[3];
@@ -21,7 +21,20 @@ struct Sample {
   float weight;
 };
 
+struct Residual {
+  int32_t x, y, face;
+  float weight;
+  Color color;
+};
+
 struct Workspace {
+  std::vector<Residual> residuals;
+  int left, top, columns, rows;     // box of the residuals
+  std::vector<float> smooth, rows_of_sums;  // [rows,columns,4] weighted colours and weights, then smoothed
+  std::vector<uint8_t> touched;     // [f]
+  int64_t cell_of(const Residual& one) const {
+    return static_cast<int64_t>(one.y - top) * columns + (one.x - left);
+  }
   std::vector<int32_t> face_index;
   std::vector<float> barycentric, depth;
   std::vector<float> sums;      // [f, kSums]
@@ -249,6 +262,74 @@ void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian,
   }
 }
 
+float squared_norm(const Color& color) {
+  return color.c[0] * color.c[0] + color.c[1] * color.c[1] + color.c[2] * color.c[2];
+}
+
+// Geman and McClure: rho(s) = s * fading(s), and its derivative is the square of fading(s).
+float fading(float squared, const AlignOptions& options) {
+  const float least = options.outlier * options.outlier;
+  return least / (least + squared);
+}
+
+void collect_residuals(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
+                       const AlignOptions& options, Workspace& w) {
+  w.residuals.clear();
+  w.touched.resize(mesh.face_count, 0);
+  int right = 0, bottom = 0;
+  w.left = frame.view.width, w.top = frame.view.height;
+  for_pixels(mesh, surface, frame, options, w,
+             [&](int64_t pixel, int32_t face, const float*, const SurfacePoint&, const Sample& sample,
+                 const Color& light) {
+               const int x = static_cast<int>(pixel % frame.view.width), y = static_cast<int>(pixel / frame.view.width);
+               Residual one{x, y, face, frame.mask[pixel] * sample.weight, {}};
+               for (int c = 0; c < 3; ++c)
+                 one.color.c[c] = frame.image[3 * pixel + c] - sample.color.c[c] * light.c[c];
+               w.residuals.push_back(one);
+               w.left = std::min(w.left, x), w.top = std::min(w.top, y);
+               right = std::max(right, x + 1), bottom = std::max(bottom, y + 1);
+             });
+  w.columns = std::max(right - w.left, 0), w.rows = std::max(bottom - w.top, 0);
+}
+
+// Running sums over 2 radius + 1 of `count` cells of four numbers, `stride` numbers apart.
+void box_sums(const float* in, float* out, int count, int64_t stride, int radius) {
+  float sum[4] = {};
+  for (int i = -radius; i < count; ++i) {
+    const int enters = i + radius, leaves = i - radius - 1;
+    for (int c = 0; c < 4; ++c) {
+      if (enters < count) sum[c] += in[enters * stride + c];
+      if (leaves >= 0) sum[c] -= in[leaves * stride + c];
+      if (i >= 0) out[i * stride + c] = sum[c];
+    }
+  }
+}
+
+// The residuals' weighted mean around each of them: two box filters in a row, which make a triangle.
+void smooth_residuals(int radius, const AlignOptions& options, Workspace& w) {
+  const size_t size = 4 * static_cast<size_t>(w.columns) * w.rows;
+  w.smooth.assign(size, 0.0f);
+  w.rows_of_sums.resize(size);
+  const float inverse_variance = 1 / (options.sigma * options.sigma);
+  for (const Residual& one : w.residuals) {
+    float* cell = w.smooth.data() + 4 * w.cell_of(one);
+    const float fade = fading(squared_norm(one.color) * inverse_variance, options), weight = one.weight * fade * fade;
+    for (int c = 0; c < 3; ++c) cell[c] = weight * one.color.c[c];
+    cell[3] = weight;
+  }
+  const int64_t stride = 4 * static_cast<int64_t>(w.columns);
+  for (int turn = 0; turn < 2; ++turn) {
+    for (int y = 0; y < w.rows; ++y)
+      box_sums(w.smooth.data() + y * stride, w.rows_of_sums.data() + y * stride, w.columns, 4, radius);
+    for (int x = 0; x < w.columns; ++x)
+      box_sums(w.rows_of_sums.data() + 4 * x, w.smooth.data() + 4 * x, w.rows, stride, radius);
+  }
+  for (size_t cell = 0; cell < size; cell += 4) {
+    const float weight = w.smooth[cell + 3];
+    for (int c = 0; c < 3; ++c) w.smooth[cell + c] = weight > 1e-3f ? w.smooth[cell + c] / weight : 0.0f;
+  }
+}
+
 Workspace& own_workspace() {
   thread_local Workspace workspace;  // kept between calls: fresh pages cost as much as the work
   return workspace;
@@ -257,54 +338,45 @@ Workspace& own_workspace() {
 }  // namespace
 
 AlignResult align_mesh(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
-                       const AlignOptions& options, const float* jacobian, int parameters, const AlignBuffers& out) {
+                       const AlignOptions& options, HighPass high_pass, const float* jacobian, int parameters,
+                       const AlignBuffers& out) {
   Workspace& w = own_workspace();
   draw(mesh, frame.view, w);
+  collect_residuals(mesh, surface, frame, options, w);
+  if (high_pass.radius > 0) smooth_residuals(high_pass.radius, options, w);
   w.hit.clear();
   w.sums.resize(static_cast<size_t>(mesh.face_count) * kSums, 0.0f);
   const int width = frame.view.width;
-  if (out.residual) {
-    std::fill_n(out.residual, 3 * static_cast<int64_t>(width) * frame.view.height,
-                std::numeric_limits<float>::quiet_NaN());
+  const int64_t values = 3 * static_cast<int64_t>(width) * frame.view.height;
+  if (out.residual) std::fill_n(out.residual, values, std::numeric_limits<float>::quiet_NaN());
+  if (out.smooth) std::fill_n(out.smooth, values, 0.0f);
+  const float inverse_variance = 1 / (options.sigma * options.sigma);
+  double cost = 0, total = 0;
+  for (const Residual& one : w.residuals) {
+    Color residual;
+    const float* smooth = w.smooth.data() + 4 * w.cell_of(one);
+    for (int c = 0; c < 3; ++c) residual.c[c] = one.color.c[c] - (high_pass.radius > 0 ? smooth[c] : 0);
+    const float squared = squared_norm(residual) * inverse_variance, fade = fading(squared, options);
+    total += one.weight;
+    cost += one.weight * squared * fade;
+    const int64_t pixel = static_cast<int64_t>(one.y) * width + one.x;
+    if (out.residual) std::copy_n(residual.c, 3, out.residual + 3 * pixel);
+    if (out.smooth && high_pass.radius > 0) std::copy_n(smooth, 3, out.smooth + 3 * pixel);
+    if (!out.hessian) continue;
+    const float* seen = frame.image + 3 * pixel;
+    float gradient[2][3];
+    for (int c = 0; c < 3; ++c) {
+      gradient[0][c] = 0.5f * (seen[3 + c] - seen[c - 3]);
+      gradient[1][c] = 0.5f * (seen[3 * width + c] - seen[c - 3 * width]);
+    }
+    if (w.touched[one.face] == 0) w.hit.push_back(one.face);
+    w.touched[one.face] = 1;
+    add_pixel(w.sums.data() + static_cast<int64_t>(one.face) * kSums, w.barycentric.data() + 3 * pixel, gradient,
+              residual, one.weight * fade * fade * inverse_variance);
   }
-  const float least = options.outlier * options.outlier, inverse_variance = 1 / (options.sigma * options.sigma);
-  double cost = 0, total = 0, gains[6] = {};
-  for_pixels(mesh, surface, frame, options, w,
-             [&](int64_t pixel, int32_t face, const float* weights, const SurfacePoint&, const Sample& sample,
-                 const Color& light) {
-               const float* seen = frame.image + 3 * pixel;
-               Color residual;
-               float squared = 0;
-               for (int c = 0; c < 3; ++c) {
-                 residual.c[c] = seen[c] - sample.color.c[c] * light.c[c];
-                 squared += residual.c[c] * residual.c[c] * inverse_variance;
-               }
-               const float weight = frame.mask[pixel] * sample.weight, fade = least / (least + squared);
-               total += weight;
-               cost += weight * squared * fade;
-               if (out.residual) std::copy_n(residual.c, 3, out.residual + 3 * pixel);
-               for (int c = 0; c < 3; ++c) {
-                 const float predicted = sample.color.c[c] * light.c[c], share = weight * fade * fade;
-                 gains[2 * c] += share * predicted * seen[c];
-                 gains[2 * c + 1] += share * predicted * predicted;
-               }
-               if (!out.hessian) return;
-               float gradient[2][3];
-               for (int c = 0; c < 3; ++c) {
-                 gradient[0][c] = 0.5f * (seen[3 + c] - seen[c - 3]);
-                 gradient[1][c] = 0.5f * (seen[3 * width + c] - seen[c - 3 * width]);
-               }
-               float* sums = w.sums.data() + static_cast<int64_t>(face) * kSums;
-               if (std::all_of(sums, sums + 3, [](float value) { return value == 0; })) w.hit.push_back(face);
-               add_pixel(sums, weights, gradient, residual, weight * fade * fade * inverse_variance);
-             });
-  for (int i = 0; i < 6; ++i) out.gains[i] = static_cast<float>(gains[i]);
+  for (const int32_t face : w.hit) w.touched[face] = 0;
   const double scale = total > 0 ? 1 / total : 0;
-  if (out.hessian) {
-    std::sort(w.hit.begin(), w.hit.end());
-    w.hit.erase(std::unique(w.hit.begin(), w.hit.end()), w.hit.end());
-    project_sums(mesh, frame.view, jacobian, parameters, scale, w, out);
-  }
+  if (out.hessian) project_sums(mesh, frame.view, jacobian, parameters, scale, w, out);
   return {cost * scale, total};
 }
 
@@ -335,7 +407,8 @@ void bake_texture(const Mesh& mesh, const TexturedSurface& surface, const AlignF
     const int x0 = static_cast<int>(x), y0 = static_cast<int>(y);
     const int64_t nearest = static_cast<int64_t>(std::lround(y)) * view.width + std::lround(x);
     // What a slope rises within a pixel does not hide it.
-    const float tolerance = kDepthTolerance + 2 * in_camera[2] / view.K[0] / std::max(point.cosine, 0.1f);
+    const float slope = std::sqrt(std::max(1 - point.cosine * point.cosine, 0.0f)) / std::max(point.cosine, 0.1f);
+    const float tolerance = kDepthTolerance + in_camera[2] / view.K[0] * slope;
     if (in_camera[2] > w.depth[nearest] + tolerance) continue;
     float color[3] = {}, mask = 0;
     for (int dy = 0; dy < 2; ++dy) {

@@ -31,11 +31,17 @@ struct AlignOptions {
   float least_cosine;  // between normal and direction to the camera: steeper surfaces do not count
 };
 
+// What differs over more than about this many pixels is taken for light that the SH do not explain, and left out of
+// residuals; 0 leaves everything in.
+struct HighPass {
+  int radius;
+};
+
 struct AlignBuffers {
   float* hessian;   // [p,p] half Hessian of the mean cost, or null for the cost alone
   float* gradient;  // [p] half the gradient
   float* residual;  // [h,w,3] image less prediction, NaN where nothing counts; or null
-  float* gains;     // [3,2] sums of prediction * image and of prediction^2 a channel
+  float* smooth;    // [h,w,3] what was left out of the residuals as light, 0 where nothing counts; or null
 };
 
 // The mean over counted pixels of rho(|image - albedo * light|^2 / sigma^2), rho(s) = c^2 s / (c^2 + s), and the sum of
@@ -46,7 +52,8 @@ struct AlignResult {
   double weight;
 };
 AlignResult align_mesh(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
-                       const AlignOptions& options, const float* jacobian, int parameters, const AlignBuffers& out);
+                       const AlignOptions& options, HighPass high_pass, const float* jacobian, int parameters,
+                       const AlignBuffers& out);
 
 struct BakeTexels {
   const int32_t* face;       // [th,tw] -1 where no triangle is

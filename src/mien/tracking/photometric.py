@@ -43,6 +43,8 @@ class PhotometricSettings:
     """What all pixels of a picture are worth, whose errors go together: weighs them against landmarks and priors."""
     landmark_share: float = 0.3
     """Weight of landmarks, of that in the fit to landmarks alone."""
+    light_extent: float = 0.012
+    """metres"""
     outlier: float = 3.0
     """Beyond this many standard deviations of its colour a pixel's pull fades."""
 
@@ -101,6 +103,14 @@ def refine_photometrically(
     return at
 
 
+def high_pass(own: SequenceFit, shrink: int, settings: PhotometricSettings) -> int:
+    """Radius in pixels of a level of what counts as light."""
+    if settings.light_extent <= 0: return 0
+    camera = own.cameras
+    depth = (own.state[:, 3:6] @ camera.viewmat[0, 2, :3] + camera.viewmat[0, 2, 3]).median()
+    return max(int(settings.light_extent * float(camera.K[0, 0, 0] / depth) / shrink), 2)
+
+
 def _look(model, space, sequences, at, shrink, settings) -> PhotometricFit:
     sightings = []
     for sequence, own, light in zip(sequences, at.fit.sequences, at.lights, strict=True):
@@ -115,13 +125,14 @@ def _look(model, space, sequences, at, shrink, settings) -> PhotometricFit:
 
         found = in_threads(sight, rows.tolist())
         sightings.append([one for several in found for one in several])
-    appearance, lights = estimate_appearance(space, sightings, at.appearance, settings.outlier)
+    appearance, lights = estimate_appearance(space, sightings, at.appearance, settings.outlier, high_pass(at.fit.sequences[0], shrink, settings))
     return replace(at, appearance=appearance, lights=tuple(lights))
 
 
 def _refine_sequence(model, space, sequence, at, own, shrink, settings, advance) -> SequenceFit:
     surface = space.native(at.appearance, settings.outlier)
     pictures = Pictures(sequence.shot.capture, shrink)
+    radius = high_pass(at.fit.sequences[own], shrink, settings)
     fit = at.fit.sequences[own]
     subject = at.fit.subject
     box = box_of(model.layout)
@@ -133,8 +144,8 @@ def _refine_sequence(model, space, sequence, at, own, shrink, settings, advance)
         for camera in sequence.views_of(row):
             sighting = Sighting(posed, pictures.picture(int(sequence.timesteps[row]), camera, fit.cameras), at.lights[own])
             p = len(state)
-            h, g, gains = torch.empty(p, p), torch.empty(p), torch.empty(3, 2)
-            value, _ = _native.align_mesh(surface, *sighting.arguments(), posed.jacobian, h, g, None, gains)
+            h, g, gains = torch.empty(p, p), torch.empty(p), 0
+            value, _ = _native.align_mesh(surface, *sighting.arguments(), radius, posed.jacobian, h, g, None, None)
             cost, gradient, hessian = cost + value, gradient + g.double(), hessian + h.double()
         n = settings.independent_pixels
         return n * cost, n * gradient, n * hessian

@@ -15,7 +15,7 @@ from mien.render.mesh import MeshFragments, rasterize_mesh
 from mien.tracking.photometric_pictures import Picture
 from mien.tracking.photometric_surface import PosedSurface
 
-HIDING_REGIONS = ("scalp", "neck", "mouth", "teeth", "tongue", "eye_sockets", "ears")
+HIDING_REGIONS = ("scalp", "neck", "mouth", "teeth", "tongue", "eye_sockets", "ears", "eyes", "irises")
 """What takes no part but hides what is behind it: hair and collars cover it, or it moves by itself."""
 _LEAST_COSINE = 0.25
 """Between a surface's normal and the direction to the camera."""
@@ -96,7 +96,7 @@ def unknown_appearance(space: TextureSpace, sigma: float) -> Appearance:
 
 
 def estimate_appearance(
-    space: TextureSpace, sightings: Sequence[Sequence[Sighting]], start: Appearance | None, outlier: float
+    space: TextureSpace, sightings: Sequence[Sequence[Sighting]], start: Appearance | None, outlier: float, radius: int
 ) -> tuple[Appearance, list[Float[Tensor, "9 3"]]]:
     """Albedo by least squares a texel, robust from the second round on, in turn with the light of every sequence.
 
@@ -115,7 +115,19 @@ def estimate_appearance(
         lights = [
             _fit_light(space, own, light, appearance, outlier) for own, light in zip(sightings, lights, strict=True)
         ]
-    return _bake(space, sightings, lights, appearance, outlier), lights
+    even = [[without_smooth_residual(space, replace(one, light=light), appearance, outlier, radius) for one in own]
+            for own, light in zip(sightings, lights, strict=True)]
+    return _bake(space, even, lights, appearance, outlier), lights
+
+
+def without_smooth_residual(
+    space: TextureSpace, sighting: Sighting, appearance: Appearance, outlier: float, radius: int
+) -> Sighting:
+    """The same with what differs from the prediction over more than `radius` pixels taken out of the picture."""
+    smooth = torch.empty_like(sighting.picture.image)
+    surface = space.native(appearance, outlier)
+    _native.align_mesh(surface, *sighting.arguments(), radius, None, None, None, None, smooth)
+    return replace(sighting, picture=replace(sighting.picture, image=sighting.picture.image - smooth))
 
 
 def _bake(
