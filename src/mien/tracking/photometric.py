@@ -24,7 +24,9 @@ from mien.tracking.photometric_texture import (
 from mien.tracking.photometric_threads import in_threads
 from mien.tracking.shot import Shot
 from mien.tracking.solver import NormalEquations, Smoothness, solve_chain
-from mien.tracking.stages import Fit, SequenceFit, box_of
+from mien.tracking.stages import Fit, SequenceFit, box_of, choose_keyframes, fit_bias
+from mien.tracking.photometric_term import PhotometricTerm
+from mien.tracking.photometric_shared import step_shared
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,11 @@ class PhotometricSettings:
     """Gauss-Newton steps a level."""
     texture_frames: int = 48
     """Pictures of each sequence that make the texture."""
-    independent_pixels: float = 1000.0
+    shared_steps: int = 2
+    keyframes: int = 24
+    identity_weight: float = 4.0
+    focal_sigma: float = 0.03
+    independent_pixels: float = 300.0
     """What all pixels of a picture are worth, whose errors go together: weighs them against landmarks and priors."""
     landmark_share: float = 0.3
     """Weight of landmarks, of that in the fit to landmarks alone."""
@@ -83,6 +89,8 @@ def refine_photometrically(
     smoothness: Sequence[Smoothness],
     fit: Fit,
     settings: PhotometricSettings,
+    lenses,
+    tracking_settings,
 ) -> PhotometricFit:
     model = surface_model(face_model, terms[0].model.layout)
     space = texture_space(model.face_model, settings.texture_size)
@@ -92,15 +100,28 @@ def refine_photometrically(
         sequences.append(_Sequence(shot, quiet, smooth))
     at = PhotometricFit(fit, None, tuple(even_light() for _ in shots), None)
     total = len(settings.shrinks) * settings.iterations
+    first = fit
     with progress_bar("Fitting to pixels", total=total) as advance:
-        for shrink in settings.shrinks:
+        for level, shrink in enumerate(settings.shrinks):
+            if level > 0:
+                for _ in range(settings.shared_steps):
+                    at = _look(model, space, sequences, at, shrink, settings)
+                    rows = [choose_keyframes(own.state[:, :6], settings.keyframes) for own in at.fit.sequences]
+                    moved = step_shared(_terms(model, space, sequences, at, shrink, settings), rows, at.fit, first, lenses, settings.identity_weight, settings.focal_sigma, 1e-3)
+                    quiet = [sequence.term for sequence in sequences]
+                    at = replace(at, fit=fit_bias(quiet, moved, tracking_settings))
             at = _look(model, space, sequences, at, shrink, settings)
-            for own, sequence in enumerate(sequences):
-                refined = _refine_sequence(model, space, sequence, at, own, shrink, settings, advance)
-                parts = list(at.fit.sequences)
-                parts[own] = refined
-                at = replace(at, fit=replace(at.fit, sequences=tuple(parts)))
+            terms_now = _terms(model, space, sequences, at, shrink, settings)
+            parts = tuple(_refine_sequence(term, sequence.smoothness, at.fit.subject, own, settings, advance)
+                     for term, sequence, own in zip(terms_now, sequences, at.fit.sequences, strict=True))
+            at = replace(at, fit=replace(at.fit, sequences=parts))
     return at
+
+
+def _terms(model, space, sequences, at, shrink, settings) -> list[PhotometricTerm]:
+    surface = space.native(at.appearance, settings.outlier)
+    return [PhotometricTerm(model, sequence.term, Pictures(sequence.shot.capture, shrink), sequence.timesteps, surface, light, at.offsets, high_pass(own, shrink, settings), settings.independent_pixels)
+            for sequence, own, light in zip(sequences, at.fit.sequences, at.lights, strict=True)]
 
 
 def high_pass(own: SequenceFit, shrink: int, settings: PhotometricSettings) -> int:
@@ -129,49 +150,21 @@ def _look(model, space, sequences, at, shrink, settings) -> PhotometricFit:
     return replace(at, appearance=appearance, lights=tuple(lights))
 
 
-def _refine_sequence(model, space, sequence, at, own, shrink, settings, advance) -> SequenceFit:
-    surface = space.native(at.appearance, settings.outlier)
-    pictures = Pictures(sequence.shot.capture, shrink)
-    radius = high_pass(at.fit.sequences[own], shrink, settings)
-    fit = at.fit.sequences[own]
-    subject = at.fit.subject
-    box = box_of(model.layout)
-
-    def photometric(row_and_state) -> tuple[float, Tensor, Tensor]:
-        row, state = row_and_state
-        posed = model.pose(state, subject.identity, at.offsets)
-        cost, gradient, hessian = 0.0, 0, 0
-        for camera in sequence.views_of(row):
-            sighting = Sighting(posed, pictures.picture(int(sequence.timesteps[row]), camera, fit.cameras), at.lights[own])
-            p = len(state)
-            h, g, gains = torch.empty(p, p), torch.empty(p), 0
-            value, _ = _native.align_mesh(surface, *sighting.arguments(), radius, posed.jacobian, h, g, None, None)
-            cost, gradient, hessian = cost + value, gradient + g.double(), hessian + h.double()
-        n = settings.independent_pixels
-        return n * cost, n * gradient, n * hessian
-
-    def equations(state) -> NormalEquations:
-        marks = sequence.term.equations(state, subject, fit.cameras)
-        found = in_threads(photometric, list(enumerate(state)))
-        photo_cost = torch.tensor([one[0] for one in found]).double()
-        print("   photo %.1f marks %.2f"%(photo_cost.mean(), marks.cost.mean()), "smooth %.2f"%(sequence.smoothness.cost(state)/len(state)))
-        return NormalEquations(marks.cost + photo_cost, marks.gradient + torch.stack([one[1] for one in found]),
-                               marks.hessian + torch.stack([one[2] for one in found]))
-
-    state = fit.state
-    at_state = equations(state)
+def _refine_sequence(term, smoothness, subject, own, settings, advance) -> SequenceFit:
+    box = box_of(term.layout)
+    state = own.state
+    at_state = term.equations(state, subject, own.cameras)
     damping = torch.full((len(state),), 1e-3).double()
     for _ in range(settings.iterations):
         diagonal = torch.diag_embed(at_state.hessian.diagonal(dim1=1, dim2=2) * damping[:, None])
         damped = replace(at_state, hessian=at_state.hessian + diagonal)
-        held = box.held(state, at_state.gradient + sequence.smoothness.gradient(state))
-        candidate = box.clip(state + solve_chain(damped, sequence.smoothness, state, held))
-        at_candidate = equations(candidate)
+        held = box.held(state, at_state.gradient + smoothness.gradient(state))
+        candidate = box.clip(state + solve_chain(damped, smoothness, state, held))
+        at_candidate = term.equations(candidate, subject, own.cameras)
         worse = at_candidate.cost > at_state.cost * 1.02
-        print("   worse", int(worse.sum()))
         state = torch.where(worse[:, None], state, candidate)
         pick = lambda a, b: torch.where(worse.reshape(-1, *[1] * (a.ndim - 1)), a, b)
         at_state = NormalEquations(pick(at_state.cost, at_candidate.cost), pick(at_state.gradient, at_candidate.gradient), pick(at_state.hessian, at_candidate.hessian))
         damping = torch.where(worse, damping * 30, damping / 3)
-        advance(status=f"1/{shrink}")
-    return replace(fit, state=state)
+        advance(status=f"1/{term.pictures.shrink}")
+    return replace(own, state=state)

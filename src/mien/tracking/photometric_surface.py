@@ -21,7 +21,8 @@ class PosedSurface:
     vertices: Float[Tensor, "v 3"]
     normals: Float[Tensor, "v 3"]
     jacobian: Float[Tensor, "v 3 p"] | None
-    """Derivatives of the vertices by the per-frame parameters, then (if asked for) by the identity."""
+    """Derivatives of the vertices by the per-frame parameters, then (if asked for) by the identity, which leaves out
+    that joints move with it: a joint turns what a photometric fit looks at by little or nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class SurfaceModel:
         if self.exact.pose_basis is not None and by_joints.shape[-1]:
             parts[1] = parts[1] + _apply(rotation @ turns, self._pose_correctives(exact))
         if derive_identity:
-            parts.append(_apply(rotation @ turns, self.identity_basis) + _rotate(rotation, self._by_joint_rest(exact)))
+            parts.append(_apply(rotation @ turns, self.identity_basis))
         return PosedSurface(vertices, normals, torch.cat([by_rotation.mT, by_translation, *parts], dim=-1).contiguous())
 
     def _shaped(self, face: FaceParams) -> Float[Tensor, "v 3"]:
@@ -104,17 +105,6 @@ class SurfaceModel:
 
         motion = self._skinned(_derivatives(transforms, at).float(), shaped)
         return motion[..., : len(free)], motion[..., len(free) :]
-
-    def _by_joint_rest(self, face: FaceParams) -> Float[Tensor, "v 3 i"]:
-        """Through the joints' rest positions, by the identity."""
-
-        def shifts(identities: Float[Tensor, "n i"]) -> Tensor:
-            return torch.stack(
-                [self.exact.joint_transforms(replace(face, identity=row))[0, :, :3, 3] for row in identities]
-            )
-
-        by_identity = _derivatives(shifts, face.identity).float()
-        return torch.einsum("vk,ikr->vri", self.face_model.skinning_weights, by_identity)
 
     def _skinned(self, by_transforms: Float[Tensor, "n k 3 4"], shaped: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 n"]:
         n, k = by_transforms.shape[:2]

@@ -96,11 +96,11 @@ def _equations(
     for term, own, lens in zip(terms, fit.sequences, lenses, strict=True):
         own_frames, own_shared = term.joint_equations(own.state, fit.subject, own.cameras)
         frames.append(own_frames)
-        shared.append(_placed(own_shared, lens, free))
+        shared.append(placed(own_shared, lens, free))
     return joined(frames), joined_shared(shared)
 
 
-def _placed(own: SharedEquations, lens: int | None, free: int) -> SharedEquations:
+def placed(own: SharedEquations, lens: int | None, free: int) -> SharedEquations:
     """A sequence's blocks (identity, its focal length) among those of all focal lengths; a known one falls away."""
     identity = len(own.gradient) - 1
     placing = own.gradient.new_zeros(identity + 1, identity + free)
