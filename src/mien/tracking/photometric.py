@@ -41,6 +41,7 @@ class PhotometricSettings:
     """Gauss-Newton steps a level."""
     texture_frames: int = 48
     """Pictures of each sequence that make the texture."""
+    reference_angle: float = 0.12
     shared_steps: int = 2
     keyframes: int = 24
     identity_weight: float = 4.0
@@ -138,10 +139,14 @@ def _look(model, space, sequences, at, shrink, settings) -> PhotometricFit:
         pictures = Pictures(sequence.shot.capture, shrink)
         rows = torch.linspace(0, len(own.state) - 1, min(settings.texture_frames, len(own.state))).round().long()
 
+        middle = own.state[:, :3].median(0).values
+
         def sight(row: int) -> list[Sighting]:
             posed = model.pose(own.state[row], at.fit.subject.identity, at.offsets, derive=False)
             timestep = int(sequence.timesteps[row])
-            return [Sighting(posed, pictures.picture(timestep, camera, own.cameras), light)
+            away = (own.state[row, :3] - middle).norm() / settings.reference_angle
+            share = float(1 / (1 + away**4) + 0.03)
+            return [Sighting(posed, pictures.picture(timestep, camera, own.cameras), light, share)
                     for camera in sequence.views_of(row)]
 
         found = in_threads(sight, rows.tolist())

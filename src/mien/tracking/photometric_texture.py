@@ -19,7 +19,7 @@ HIDING_REGIONS = ("scalp", "neck", "mouth", "teeth", "tongue", "eye_sockets", "e
 """What takes no part but hides what is behind it: hair and collars cover it, or it moves by itself."""
 _LEAST_COSINE = 0.25
 """Between a surface's normal and the direction to the camera."""
-_LEAST_WEIGHT = 0.5
+_LEAST_WEIGHT = 0.05
 """Of a texel's sightings (cosine squared each), below which it is not known."""
 _ROUNDS = 3
 """Of albedo and light in turn."""
@@ -45,6 +45,12 @@ class Sighting:
     posed: PosedSurface
     picture: Picture
     light: Float[Tensor, "9 3"]
+    share: float = 1.0
+    """Of the texture."""
+
+    def weighted(self) -> "Sighting":
+        """With its share in the mask."""
+        return replace(self, picture=replace(self.picture, mask=self.picture.mask * self.share))
 
     def arguments(self) -> tuple[Tensor, ...]:
         """As the native core takes them."""
@@ -144,7 +150,7 @@ def _bake(
     for own, light in zip(sightings, lights, strict=True):
         for sighting in own:
             _native.bake_texture(
-                surface, *replace(sighting, light=light).arguments(), space.fragments.face_index,
+                surface, *replace(sighting, light=light).weighted().arguments(), space.fragments.face_index,
                 space.fragments.barycentric, weight, squares, mixed, image,
             )  # fmt: skip
     known = weight > _LEAST_WEIGHT
