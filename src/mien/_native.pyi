@@ -242,3 +242,62 @@ def pose_face_backward(
     grad_head_rotation: Tensor,
     grad_head_translation: Tensor,
 ) -> None: ...
+
+# native/bind_mesh_align.cpp; faces: int64; used: uint8; texel_face: int32; light_equations' sums: float64
+class AlignSurface:
+    def __init__(
+        self,
+        faces: Tensor,
+        uv: Tensor,
+        used: Tensor,
+        albedo: Tensor,
+        trust: Tensor,
+        sigma: float,
+        outlier: float,
+        least_cosine: float,
+    ) -> None: ...
+
+def align_mesh(
+    surface: AlignSurface,
+    vertices: Tensor,
+    normals: Tensor,
+    K: Tensor,
+    viewmat: Tensor,
+    image: Tensor,
+    mask: Tensor,
+    light: Tensor,
+    high_pass: int,
+    jacobian: Tensor | None,
+    hessian: Tensor | None,
+    gradient: Tensor | None,
+    residual: Tensor | None,
+    smooth: Tensor | None,
+) -> tuple[float, float]: ...
+def bake_texture(
+    surface: AlignSurface,
+    vertices: Tensor,
+    normals: Tensor,
+    K: Tensor,
+    viewmat: Tensor,
+    image: Tensor,
+    mask: Tensor,
+    light: Tensor,
+    texel_face: Tensor,
+    texel_barycentric: Tensor,
+    weight: Tensor,
+    squares: Tensor,
+    mixed: Tensor,
+    image_squares: Tensor,
+) -> None: ...
+def light_equations(
+    surface: AlignSurface,
+    vertices: Tensor,
+    normals: Tensor,
+    K: Tensor,
+    viewmat: Tensor,
+    image: Tensor,
+    mask: Tensor,
+    light: Tensor,
+    hessian: Tensor,
+    right: Tensor,
+) -> None: ...

@@ -1,18 +1,20 @@
-"""The photometric stage: faces tracked from landmarks are moved until a texture common to all pictures fits each one."""
+"""The photometric stage: faces tracked from landmarks are moved until one texture fits all pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien import _native
-from mien.face import FaceModel
 from mien.progress import progress_bar
+from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.photometric_pictures import Pictures
+from mien.tracking.photometric_settings import PhotometricSettings
+from mien.tracking.photometric_shared import SharedPrior, step_shared
 from mien.tracking.photometric_surface import SurfaceModel, surface_model
+from mien.tracking.photometric_term import PhotometricTerm
 from mien.tracking.photometric_texture import (
     Appearance,
     Sighting,
@@ -20,40 +22,19 @@ from mien.tracking.photometric_texture import (
     estimate_appearance,
     even_light,
     texture_space,
+    unknown_appearance,
 )
 from mien.tracking.photometric_threads import in_threads
+from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
-from mien.tracking.solver import NormalEquations, Smoothness, solve_chain
-from mien.tracking.stages import Fit, SequenceFit, box_of, choose_keyframes, fit_bias
-from mien.tracking.photometric_term import PhotometricTerm
-from mien.tracking.photometric_shared import step_shared
+from mien.tracking.solver import Smoothness, solve_chain
+from mien.tracking.stages import Fit, SequenceFit, all_landmarks, box_of, fit_bias, smoothness_of
 
-
-@dataclass(frozen=True)
-class PhotometricSettings:
-    """How faces are fitted to pixels."""
-
-    texture_size: int = 512
-    """Texels along each side."""
-    shrinks: tuple[int, ...] = (2, 1, 1)
-    """Levels from coarse to fine: pictures are shrunk by this; the texture is made anew at each."""
-    iterations: int = 2
-    """Gauss-Newton steps a level."""
-    texture_frames: int = 48
-    """Pictures of each sequence that make the texture."""
-    reference_angle: float = 0.12
-    shared_steps: int = 2
-    keyframes: int = 24
-    identity_weight: float = 4.0
-    focal_sigma: float = 0.03
-    independent_pixels: float = 300.0
-    """What all pixels of a picture are worth, whose errors go together: weighs them against landmarks and priors."""
-    landmark_share: float = 0.3
-    """Weight of landmarks, of that in the fit to landmarks alone."""
-    light_extent: float = 0.012
-    """metres"""
-    outlier: float = 3.0
-    """Beyond this many standard deviations of its colour a pixel's pull fades."""
+_DAMPING = 1e-3
+_WORSE = 1.02
+"""A frame whose cost grows by more than this factor in a step goes back to where it was."""
+_LEAST_SHARE = 0.03
+"""Of a frame in the texture, however far it is from the middle pose: it may be the only one that sees an ear."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,112 +45,146 @@ class PhotometricFit:
     appearance: Appearance
     lights: tuple[Float[Tensor, "9 3"], ...]
     """Of each sequence."""
-    offsets: Float[Tensor, "v 3"] | None
-    """Static offsets of the subject's vertices."""
+    improved: tuple[Bool[Tensor, " v"], ...]
+    """Of each sequence, timesteps that pixels made better; the others stay as landmarks had them."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Sequence:
-    shot: Shot
-    term: LandmarkTerm
-    smoothness: Smoothness
+class _Round:
+    """What all steps of one round have in common."""
 
-    @property
-    def timesteps(self) -> Int[Tensor, " v"]:
-        return self.shot.valid.nonzero()[:, 0]
+    model: SurfaceModel
+    space: TextureSpace
+    shots: Sequence[Shot]
+    landmarks: Sequence[LandmarkTerm]
+    settings: PhotometricSettings
+    shrink: int
 
-    def views_of(self, row: int) -> list[int]:
-        views = self.shot.views
-        return views.camera[views.row == row].tolist()
+    def light_radius(self, own: SequenceFit) -> int:
+        """Pixels over which a smooth difference counts as light."""
+        cameras = own.cameras
+        depth = (own.state[:, 3:6] @ cameras.viewmat[0, 2, :3] + cameras.viewmat[0, 2, 3]).median()
+        return max(round(self.settings.light_extent * float(cameras.K[0, 0, 0] / depth) / self.shrink), 2)
+
+    def terms(self, at: PhotometricFit) -> list[PhotometricTerm]:
+        """The cost of every sequence."""
+        surface = self.space.native(at.appearance, self.settings.outlier)
+        return [
+            PhotometricTerm(
+                self.model, marks, Pictures(shot.capture, self.shrink), shot.valid.nonzero()[:, 0], surface, light,
+                self.light_radius(own), self.settings.independent_pixels,
+            )
+            for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
+        ]  # fmt: skip
+
+    def look(self, at: PhotometricFit) -> PhotometricFit:
+        """Texture and light anew, from where the faces are now."""
+        sightings = [
+            self._sightings(shot, marks, own, at.fit.subject.identity, light)
+            for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
+        ]
+        radius = self.light_radius(at.fit.sequences[0])
+        found, lights = estimate_appearance(self.space, sightings, at.appearance, self.settings.outlier, radius)
+        return replace(at, appearance=found, lights=tuple(lights))
+
+    def _sightings(
+        self,
+        shot: Shot,
+        landmarks: LandmarkTerm,
+        own: SequenceFit,
+        identity: Float[Tensor, " i"],
+        light: Float[Tensor, "9 3"],
+    ) -> list[Sighting]:
+        pictures, timesteps = Pictures(shot.capture, self.shrink), shot.valid.nonzero()[:, 0]
+        middle = own.state[:, :3].median(0).values
+        away = (own.state[:, :3] - middle).norm(dim=1) / self.settings.reference_angle
+        shares = 1 / (1 + away**4) + _LEAST_SHARE
+
+        def sight(row: int) -> list[Sighting]:
+            posed = self.model.pose(own.state[row], identity, derive=False)
+            cameras = landmarks.views.camera[landmarks.views.row == row].tolist()
+            return [
+                Sighting(
+                    posed, pictures.picture(int(timesteps[row]), camera, own.cameras), light, float(shares[row])
+                )
+                for camera in cameras
+            ]  # fmt: skip
+
+        count = min(self.settings.texture_frames, len(own.state))
+        rows = torch.linspace(0, len(own.state) - 1, count).round().long().unique().tolist()
+        return [sighting for several in in_threads(sight, rows) for sighting in several]
 
 
 def refine_photometrically(
-    face_model: FaceModel,
+    model: LandmarkModel,
     shots: Sequence[Shot],
-    terms: Sequence[LandmarkTerm],
-    smoothness: Sequence[Smoothness],
+    lenses: Sequence[int | None],
     fit: Fit,
-    settings: PhotometricSettings,
-    lenses,
-    tracking_settings,
+    settings: TrackingSettings,
 ) -> PhotometricFit:
-    model = surface_model(face_model, terms[0].model.layout)
-    space = texture_space(model.face_model, settings.texture_size)
-    sequences = []
-    for shot, term, smooth in zip(shots, terms, smoothness, strict=True):
-        quiet = replace(term, weights=term.weights * settings.landmark_share)
-        sequences.append(_Sequence(shot, quiet, smooth))
-    at = PhotometricFit(fit, None, tuple(even_light() for _ in shots), None)
-    total = len(settings.shrinks) * settings.iterations
-    first = fit
-    with progress_bar("Fitting to pixels", total=total) as advance:
-        for level, shrink in enumerate(settings.shrinks):
-            if level > 0:
-                for _ in range(settings.shared_steps):
-                    at = _look(model, space, sequences, at, shrink, settings)
-                    rows = [choose_keyframes(own.state[:, :6], settings.keyframes) for own in at.fit.sequences]
-                    moved = step_shared(_terms(model, space, sequences, at, shrink, settings), rows, at.fit, first, lenses, settings.identity_weight, settings.focal_sigma, 1e-3)
-                    quiet = [sequence.term for sequence in sequences]
-                    at = replace(at, fit=fit_bias(quiet, moved, tracking_settings))
-            at = _look(model, space, sequences, at, shrink, settings)
-            terms_now = _terms(model, space, sequences, at, shrink, settings)
-            parts = tuple(_refine_sequence(term, sequence.smoothness, at.fit.subject, own, settings, advance)
-                     for term, sequence, own in zip(terms_now, sequences, at.fit.sequences, strict=True))
-            at = replace(at, fit=replace(at.fit, sequences=parts))
-    return at
+    """A fit to landmarks refined until pictures agree with a texture that all of them share.
+
+    In each round: identity and unknown focal lengths from keyframes (from the second round on), the albedo by robust
+    least squares a texel in turn with SH light, then one Gauss-Newton step of all timesteps of each sequence under
+    their smoothness cost. Landmarks stay in the cost with less weight: irises, lids and lips need them. Deterministic.
+
+    Args:
+        model: The face model reduced to its landmarks.
+        shots: The sequences.
+        lenses: The unknown focal length of each (`lenses_of`).
+        fit: What landmarks led to.
+        settings: Of the whole tracking.
+    """
+    own_settings = settings.photometric
+    landmarks = [
+        _quiet(all_landmarks(model, shot.views, own, settings), own_settings.landmark_share)
+        for shot, own in zip(shots, fit.sequences, strict=True)
+    ]
+    surface = surface_model(model.face_model, model.layout)
+    space = texture_space(surface.face_model, own_settings.texture_size)
+    focals = torch.stack([own.cameras.K[0, 0, 0] for own in fit.sequences])
+    prior = SharedPrior(lenses, focals, own_settings.focal_sigma, settings.identity_weight)
+    at = PhotometricFit(
+        fit, unknown_appearance(space), tuple(even_light() for _ in shots),
+        tuple(torch.zeros(len(own.state), dtype=torch.bool) for own in fit.sequences),
+    )  # fmt: skip
+    rounds = [_Round(surface, space, shots, landmarks, own_settings, shrink) for shrink in own_settings.shrinks]
+    with progress_bar("Fitting to pixels", total=len(own_settings.shrinks)) as advance:
+        for number, now in enumerate(rounds):
+            for _ in range(own_settings.shared_steps if number > 0 else 0):
+                at = now.look(at)
+                moved = step_shared(now.terms(at), at.fit, prior, own_settings.keyframes)
+                at = replace(at, fit=fit_bias(landmarks, moved, settings))
+            at = _step_sequences(now, now.look(at), settings)
+            advance(status=f"pictures {shots[0].capture.width // now.shrink} pixels wide")
+    return rounds[-1].look(at)
 
 
-def _terms(model, space, sequences, at, shrink, settings) -> list[PhotometricTerm]:
-    surface = space.native(at.appearance, settings.outlier)
-    return [PhotometricTerm(model, sequence.term, Pictures(sequence.shot.capture, shrink), sequence.timesteps, surface, light, at.offsets, high_pass(own, shrink, settings), settings.independent_pixels)
-            for sequence, own, light in zip(sequences, at.fit.sequences, at.lights, strict=True)]
+def _quiet(term: LandmarkTerm, share: float) -> LandmarkTerm:
+    return replace(term, weights=term.weights * share)
 
 
-def high_pass(own: SequenceFit, shrink: int, settings: PhotometricSettings) -> int:
-    """Radius in pixels of a level of what counts as light."""
-    if settings.light_extent <= 0: return 0
-    camera = own.cameras
-    depth = (own.state[:, 3:6] @ camera.viewmat[0, 2, :3] + camera.viewmat[0, 2, 3]).median()
-    return max(int(settings.light_extent * float(camera.K[0, 0, 0] / depth) / shrink), 2)
+def _step_sequences(now: _Round, at: PhotometricFit, settings: TrackingSettings) -> PhotometricFit:
+    """One step of all timesteps of every sequence."""
+    sequences, improved = [], []
+    parts = zip(now.terms(at), now.shots, at.fit.sequences, at.improved, strict=True)
+    for term, shot, own, before in parts:
+        smoothness = smoothness_of(term.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
+        state, better = _step(term, at.fit.subject, own, smoothness)
+        sequences.append(replace(own, state=state))
+        improved.append(before | better)
+    return replace(at, fit=replace(at.fit, sequences=tuple(sequences)), improved=tuple(improved))
 
 
-def _look(model, space, sequences, at, shrink, settings) -> PhotometricFit:
-    sightings = []
-    for sequence, own, light in zip(sequences, at.fit.sequences, at.lights, strict=True):
-        pictures = Pictures(sequence.shot.capture, shrink)
-        rows = torch.linspace(0, len(own.state) - 1, min(settings.texture_frames, len(own.state))).round().long()
-
-        middle = own.state[:, :3].median(0).values
-
-        def sight(row: int) -> list[Sighting]:
-            posed = model.pose(own.state[row], at.fit.subject.identity, at.offsets, derive=False)
-            timestep = int(sequence.timesteps[row])
-            away = (own.state[row, :3] - middle).norm() / settings.reference_angle
-            share = float(1 / (1 + away**4) + 0.03)
-            return [Sighting(posed, pictures.picture(timestep, camera, own.cameras), light, share)
-                    for camera in sequence.views_of(row)]
-
-        found = in_threads(sight, rows.tolist())
-        sightings.append([one for several in found for one in several])
-    appearance, lights = estimate_appearance(space, sightings, at.appearance, settings.outlier, high_pass(at.fit.sequences[0], shrink, settings))
-    return replace(at, appearance=appearance, lights=tuple(lights))
-
-
-def _refine_sequence(term, smoothness, subject, own, settings, advance) -> SequenceFit:
-    box = box_of(term.layout)
-    state = own.state
-    at_state = term.equations(state, subject, own.cameras)
-    damping = torch.full((len(state),), 1e-3).double()
-    for _ in range(settings.iterations):
-        diagonal = torch.diag_embed(at_state.hessian.diagonal(dim1=1, dim2=2) * damping[:, None])
-        damped = replace(at_state, hessian=at_state.hessian + diagonal)
-        held = box.held(state, at_state.gradient + smoothness.gradient(state))
-        candidate = box.clip(state + solve_chain(damped, smoothness, state, held))
-        at_candidate = term.equations(candidate, subject, own.cameras)
-        worse = at_candidate.cost > at_state.cost * 1.02
-        state = torch.where(worse[:, None], state, candidate)
-        pick = lambda a, b: torch.where(worse.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-        at_state = NormalEquations(pick(at_state.cost, at_candidate.cost), pick(at_state.gradient, at_candidate.gradient), pick(at_state.hessian, at_candidate.hessian))
-        damping = torch.where(worse, damping * 30, damping / 3)
-        advance(status=f"1/{term.pictures.shrink}")
-    return replace(own, state=state)
+def _step(
+    term: PhotometricTerm, subject: Subject, own: SequenceFit, smoothness: Smoothness
+) -> tuple[Float[Tensor, "v p"], Bool[Tensor, " v"]]:
+    """All timesteps moved by one Gauss-Newton step, except those that it would make worse; and which ones moved."""
+    box, state = box_of(term.layout), own.state
+    equations = term.equations(state, subject, own.cameras)
+    damping = torch.diag_embed(_DAMPING * equations.hessian.diagonal(dim1=1, dim2=2))
+    held = box.held(state, equations.gradient + smoothness.gradient(state))
+    damped = replace(equations, hessian=equations.hessian + damping)
+    candidate = box.clip(state + solve_chain(damped, smoothness, state, held))
+    better = term.costs(candidate, subject, own.cameras) < _WORSE * equations.cost
+    return torch.where(better[:, None], candidate, state), better

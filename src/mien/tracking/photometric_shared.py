@@ -2,62 +2,73 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from mien.tracking.photometric_term import PhotometricTerm
-from mien.tracking.landmark_term import Subject
 from mien.tracking.shared_fit import placed
-from mien.tracking.solver import SharedEquations, joined, joined_shared, solve_arrow
-from mien.tracking.stages import Fit, SequenceFit, box_of
+from mien.tracking.solver import joined, joined_shared, solve_arrow
+from mien.tracking.stages import Fit, SequenceFit, box_of, choose_keyframes
+
+_DAMPING = 1e-3
 
 
-def step_shared(
-    terms: Sequence[PhotometricTerm],
-    rows: Sequence[Int[Tensor, " k"]],
-    fit: Fit,
-    first: Fit,
-    lenses: Sequence[int | None],
-    identity_weight: float,
-    focal_sigma: float,
-    damping: float,
-) -> Fit:
-    """One Gauss-Newton step of identity and focal lengths; the keyframes' own parameters are eliminated, and left as
-    they were: the sequences' own steps move them, over time as well.
+@dataclass(frozen=True, eq=False)
+class SharedPrior:
+    """What is known of the shared parameters before pixels are looked at."""
+
+    lenses: Sequence[int | None]
+    """The lens of each sequence; None where the focal length is known."""
+    focal: Float[Tensor, " q"]
+    """The focal length of each sequence that landmarks led to, pixels."""
+    focal_sigma: float
+    identity_weight: float
+
+    @property
+    def groups(self) -> int:
+        """The number of unknown focal lengths."""
+        return 1 + max((lens for lens in self.lenses if lens is not None), default=-1)
+
+
+def step_shared(terms: Sequence[PhotometricTerm], fit: Fit, prior: SharedPrior, keyframes: int) -> Fit:
+    """One Gauss-Newton step of identity and focal lengths, the keyframes' own parameters eliminated.
+
+    A texture that was made with these very poses hardly resists a change that shifts every view alike, but it resists
+    one that the views contradict: what is gained is depth, from parallax.
     """
-    groups = 1 + max((lens for lens in lenses if lens is not None), default=-1)
-    identity = fit.subject.identity
+    identity, box = fit.subject.identity, box_of(terms[0].layout)
+    rows = [choose_keyframes(own.state[:, :6], keyframes) for own in fit.sequences]
     frames, shared = [], []
-    for term, own, chosen, lens in zip(terms, fit.sequences, rows, lenses, strict=True):
+    for term, own, chosen, lens in zip(terms, fit.sequences, rows, prior.lenses, strict=True):
         own_frames, own_shared = term.joint_equations(own.state, chosen, fit.subject, own.cameras)
         frames.append(own_frames)
-        shared.append(placed(own_shared, lens, groups))
-    keyframes = [float(sum(len(chosen) for chosen, lens in zip(rows, lenses, strict=True) if lens == group))
-                 for group in range(groups)]  # fmt: skip
-    precision = torch.cat([torch.full_like(identity, identity_weight), identity.new_tensor(keyframes) * focal_sigma**-2])
-    now = [_log_focal(fit, first, lenses.index(group)) for group in range(groups)]
-    equations = joined_shared(shared).with_prior(precision, torch.cat([identity, identity.new_tensor(now)]))
-    box = box_of(terms[0].layout)
+        shared.append(placed(own_shared, lens, prior.groups))
+    precision, values = _prior(fit, prior, [len(chosen) for chosen in rows])
+    equations = joined(frames)
     state = torch.cat([own.state[chosen] for own, chosen in zip(fit.sequences, rows, strict=True)])
-    own_equations = joined(frames)
-    step, shared_step = solve_arrow(own_equations, equations, box.held(state, own_equations.gradient), damping)
+    held = box.held(state, equations.gradient)
+    step, shared_step = solve_arrow(equations, joined_shared(shared).with_prior(precision, values), held, _DAMPING)
     sequences = []
     steps = step.split([len(chosen) for chosen in rows])
-    for own, own_step, chosen, lens in zip(fit.sequences, steps, rows, lenses, strict=True):
+    for own, own_step, lens in zip(fit.sequences, steps, prior.lenses, strict=True):
         factor = 1.0 if lens is None else math.exp(float(shared_step[len(identity) + lens]))
-        # Frames between keyframes follow them, so that a changed identity does not have to be paid for again.
-        moved = own.state + _between(own_step, chosen, len(own.state))
-        sequences.append(SequenceFit(own.cameras.with_focal(factor), box.clip(moved)))
-    return Fit(replace(fit.subject, identity=identity + shared_step[: len(identity)]), tuple(sequences))
+        # Every frame takes the keyframes' mean step: what the changed identity asks of all of them.
+        state = box.clip(own.state + own_step.mean(0))
+        sequences.append(SequenceFit(own.cameras.with_focal(factor), state))
+    subject = replace(fit.subject, identity=identity + shared_step[: len(identity)])
+    return Fit(subject, tuple(sequences))
 
 
-def _log_focal(fit: Fit, first: Fit, sequence: int) -> float:
-    return math.log(float(fit.sequences[sequence].cameras.K[0, 0, 0] / first.sequences[sequence].cameras.K[0, 0, 0]))
-
-
-def _between(steps: Float[Tensor, "k p"], rows: Int[Tensor, " k"], count: int) -> Float[Tensor, "v p"]:
-    """The mean step for all: what a change of identity asks of every frame."""
-    return steps.mean(0, keepdim=True).expand(count, -1)
+def _prior(fit: Fit, prior: SharedPrior, keyframes: Sequence[int]) -> tuple[Float[Tensor, " s"], Float[Tensor, " s"]]:
+    """Precisions of the shared parameters, and how far they are from what is expected."""
+    identity = fit.subject.identity
+    weights, values = identity.new_zeros(prior.groups), identity.new_zeros(prior.groups)
+    for own, lens, first, count in zip(fit.sequences, prior.lenses, prior.focal, keyframes, strict=True):
+        if lens is not None:
+            weights[lens] += count * prior.focal_sigma**-2
+            values[lens] = (own.cameras.K[0, 0, 0] / first).log()
+    identity_weights = torch.full_like(identity, prior.identity_weight)
+    return torch.cat([identity_weights, weights]), torch.cat([identity, values])

@@ -1,6 +1,6 @@
 """The cost of pixels and landmarks of one sequence, with its normal equations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -9,17 +9,20 @@ from torch import Tensor
 from mien import _native
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.parameters import ParameterLayout
-from mien.tracking.photometric_pictures import Picture, Pictures
-from mien.tracking.photometric_surface import SurfaceModel
+from mien.tracking.photometric_pictures import Pictures
+from mien.tracking.photometric_surface import PosedSurface, SurfaceModel
 from mien.tracking.photometric_texture import Sighting
 from mien.tracking.photometric_threads import in_threads
-from mien.tracking.solver import NormalEquations, SharedEquations
+from mien.tracking.solver import NormalEquations, SharedEquations, joined
 from mien.tracking.views import CameraBatch
 
 
 @dataclass(frozen=True, eq=False)
 class PhotometricTerm:
-    """Costs of the v timesteps of one sequence: pixels, landmarks, and the prior."""
+    """Costs of the v timesteps of one sequence: pixels, landmarks, and the prior.
+
+    Of a picture the robust mean over its pixels counts (native/mesh_align.h), so that it weighs the same at any size.
+    """
 
     model: SurfaceModel
     landmarks: LandmarkTerm
@@ -27,27 +30,36 @@ class PhotometricTerm:
     timesteps: Int[Tensor, " v"]
     """Of the capture."""
     surface: "_native.AlignSurface"
-    """Texture and robust scale."""
+    """The texture, and how well it is known."""
     light: Float[Tensor, "9 3"]
-    offsets: Float[Tensor, "v 3"] | None
-    high_pass: int
-    """Radius in pixels of what counts as light."""
+    light_radius: int
+    """Pixels over which a smooth difference counts as light."""
     weight: float
-    """Independent pixels a picture."""
+    """What the pixels of a picture are worth."""
 
     @property
     def layout(self) -> ParameterLayout:
+        """Of the timesteps' parameters."""
         return self.model.layout
 
     def equations(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> NormalEquations:
         """Of each timestep on its own, the shared parameters fixed."""
         rows = torch.arange(len(state))
-        found = self._photometric(state, rows, subject, cameras, shared=False)
+        pixels = self._pixel_equations(state, rows, subject, cameras, shared=False)
         marks = self.landmarks.equations(state, subject, cameras)
-        if True: print("   photo %.1f marks %.2f" % (found.cost.mean(), marks.cost.mean()))
         return NormalEquations(
-            marks.cost + found.cost, marks.gradient + found.gradient, marks.hessian + found.hessian
+            marks.cost + pixels.cost, marks.gradient + pixels.gradient, marks.hessian + pixels.hessian
         )
+
+    def costs(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
+        """Of each timestep."""
+
+        def of_row(row: int) -> float:
+            posed = self.model.pose(state[row], subject.identity, derive=False)
+            return sum(self._align(posed, row, camera, cameras)[0] for camera in self._seen_by(row))
+
+        pixels = torch.tensor(in_threads(of_row, list(range(len(state)))), dtype=torch.float64)
+        return self.landmarks.cost(state, subject, cameras) + self.weight * pixels
 
     def joint_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch
@@ -55,58 +67,55 @@ class PhotometricTerm:
         """Of some timesteps, and of what they share: identity, then the logarithm of the focal length."""
         p = state.shape[1]
         marks, shared = self.landmarks.at(rows).joint_equations(state[rows], subject, cameras)
-        found = self._photometric(state, rows, subject, cameras, shared=True)
-        print("   keyframes photo %.1f marks %.2f" % (found.cost.mean(), marks.cost.mean()))
+        pixels = self._pixel_equations(state, rows, subject, cameras, shared=True)
         own = NormalEquations(
-            marks.cost + found.cost, marks.gradient + found.gradient[:, :p], marks.hessian + found.hessian[:, :p, :p]
+            marks.cost + pixels.cost, marks.gradient + pixels.gradient[:, :p], marks.hessian + pixels.hessian[:, :p, :p]
         )
         return own, SharedEquations(
-            shared.across + found.hessian[:, :p, p:],
-            shared.hessian + found.hessian[:, p:, p:].sum(0),
-            shared.gradient + found.gradient[:, p:].sum(0),
+            shared.across + pixels.hessian[:, :p, p:],
+            shared.hessian + pixels.hessian[:, p:, p:].sum(0),
+            shared.gradient + pixels.gradient[:, p:].sum(0),
         )
 
-    def _photometric(
+    def _pixel_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch, shared: bool
     ) -> NormalEquations:
-        pictures = self.landmarks.views
-
         def of_row(row: int) -> NormalEquations:
-            posed = self.model.pose(state[row], subject.identity, self.offsets, derive_identity=shared)
-            jacobian = posed.jacobian
-            assert jacobian is not None
-            seen_by = pictures.camera[pictures.row == row].tolist()
+            posed, seen_by = self.model.pose(state[row], subject.identity, derive_identity=shared), self._seen_by(row)
+            assert posed.jacobian is not None
             if shared:
-                jacobian = torch.cat([jacobian, _by_log_focal(posed.vertices, cameras, seen_by)], dim=2).contiguous()
-            size = jacobian.shape[2]
-            cost, gradient, hessian = 0.0, torch.zeros(size).double(), torch.zeros(size, size).double()
-            for camera in seen_by:
-                picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
-                by_picture, by_picture_twice = torch.empty(size), torch.empty(size, size)
-                value, _ = _native.align_mesh(
-                    self.surface, *Sighting(posed, picture, self.light).arguments(), self.high_pass, jacobian,
-                    by_picture_twice, by_picture, None, None,
-                )  # fmt: skip
-                cost, gradient, hessian = cost + value, gradient + by_picture, hessian + by_picture_twice
+                by_focal = _by_log_focal(posed.vertices, cameras, seen_by)
+                posed = replace(posed, jacobian=torch.cat([posed.jacobian, by_focal], dim=2).contiguous())
+            parts = [self._align(posed, row, camera, cameras) for camera in seen_by]
             return NormalEquations(
-                torch.tensor([cost * self.weight]).double(), gradient[None] * self.weight, hessian[None] * self.weight
+                self.weight * torch.tensor([sum(cost for cost, _, _ in parts)], dtype=torch.float64),
+                self.weight * torch.stack([gradient for _, gradient, _ in parts]).sum(0, keepdim=True),
+                self.weight * torch.stack([hessian for _, _, hessian in parts]).sum(0, keepdim=True),
             )
 
-        parts = in_threads(of_row, rows.tolist())
-        return NormalEquations(
-            torch.cat([part.cost for part in parts]),
-            torch.cat([part.gradient for part in parts]),
-            torch.cat([part.hessian for part in parts]),
-        )
+        return joined(in_threads(of_row, rows.tolist()))
+
+    def _seen_by(self, row: int) -> list[int]:
+        views = self.landmarks.views
+        return views.camera[views.row == row].tolist()
+
+    def _align(
+        self, posed: PosedSurface, row: int, camera: int, cameras: CameraBatch
+    ) -> tuple[float, Float[Tensor, " s"], Float[Tensor, "s s"]]:
+        """Cost of one picture, half its gradient and half its Hessian (of no parameters without a Jacobian)."""
+        size = 0 if posed.jacobian is None else posed.jacobian.shape[2]
+        gradient, hessian = torch.empty(size), torch.empty(size, size)
+        derivatives = (None, None, None) if posed.jacobian is None else (posed.jacobian, hessian, gradient)
+        picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
+        sighting = Sighting(posed, picture, self.light)
+        cost, _ = _native.align_mesh(self.surface, *sighting.arguments(), self.light_radius, *derivatives, None, None)
+        return cost, gradient.double(), hessian.double()
 
 
-def _by_log_focal(
-    vertices: Float[Tensor, "v 3"], cameras: CameraBatch, seen_by: list[int]
-) -> Float[Tensor, "v 3 1"]:
-    """How vertices would have to move across the sight to be seen as through a longer lens."""
+def _by_log_focal(vertices: Float[Tensor, "v 3"], cameras: CameraBatch, seen_by: list[int]) -> Float[Tensor, "v 3 1"]:
+    """How vertices would have to move across the line of sight to look as through a longer lens."""
     if len(seen_by) != 1:
         return torch.zeros(len(vertices), 3, 1)  # several cameras are calibrated
     viewmat = cameras.viewmat[seen_by[0]].float()
-    in_camera = vertices @ viewmat[:3, :3].T + viewmat[:3, 3]
-    in_camera[:, 2] = 0
-    return (in_camera @ viewmat[:3, :3])[..., None]
+    across = vertices @ viewmat[:2, :3].T + viewmat[:2, 3]
+    return (across @ viewmat[:2, :3])[..., None]

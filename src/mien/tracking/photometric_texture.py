@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien import _native
@@ -21,6 +21,8 @@ _LEAST_COSINE = 0.25
 """Between a surface's normal and the direction to the camera."""
 _LEAST_WEIGHT = 0.05
 """Of a texel's sightings (cosine squared each), below which it is not known."""
+_FIRST_SIGMA, _SIGMAS = 0.1, (0.01, 0.1)
+"""Expected difference of a colour before anything is known, and its bounds afterwards."""
 _ROUNDS = 3
 """Of albedo and light in turn."""
 _LIGHT_STIFFNESS = 0.02
@@ -52,7 +54,7 @@ class Sighting:
         """With its share in the mask."""
         return replace(self, picture=replace(self.picture, mask=self.picture.mask * self.share))
 
-    def arguments(self) -> tuple[Tensor, ...]:
+    def arguments(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """As the native core takes them."""
         camera, picture = self.picture.camera, self.picture
         posed = self.posed
@@ -63,7 +65,7 @@ class Sighting:
 class TextureSpace:
     """Which point of the surface each texel shows."""
 
-    faces: Float[Tensor, "f 3"]
+    faces: Int[Tensor, "f 3"]
     corners: Float[Tensor, "f 3 2"]
     """Texture coordinates of every triangle's corners."""
     used: Bool[Tensor, " f"]
@@ -95,14 +97,14 @@ def even_light() -> Float[Tensor, "9 3"]:
     return light
 
 
-def unknown_appearance(space: TextureSpace, sigma: float) -> Appearance:
+def unknown_appearance(space: TextureSpace) -> Appearance:
     """Nothing known."""
     size = space.fragments.face_index.shape
-    return Appearance(torch.zeros(*size, 3), torch.zeros(size), sigma)
+    return Appearance(torch.zeros(*size, 3), torch.zeros(size), _FIRST_SIGMA)
 
 
 def estimate_appearance(
-    space: TextureSpace, sightings: Sequence[Sequence[Sighting]], start: Appearance | None, outlier: float, radius: int
+    space: TextureSpace, sightings: Sequence[Sequence[Sighting]], start: Appearance, outlier: float, light_radius: int
 ) -> tuple[Appearance, list[Float[Tensor, "9 3"]]]:
     """Albedo by least squares a texel, robust from the second round on, in turn with the light of every sequence.
 
@@ -111,22 +113,25 @@ def estimate_appearance(
         sightings: Of each sequence, under the light known so far.
         start: What is known so far; its sigma scales the robust weights.
         outlier: In sigmas.
+        light_radius: Pixels over which a smooth difference counts as light, and is left out of the texture.
     """
-    appearance = start if start is not None else unknown_appearance(space, 0.1)
+    appearance, known = start, bool((start.trust > 0).any())
     lights = [own[0].light for own in sightings]
     for turn in range(_ROUNDS):
         appearance = _bake(space, sightings, lights, appearance, outlier)
-        if turn == 0 and start is None:
+        if turn == 0 and not known:
             appearance = _one_color(appearance)
         lights = [
             _fit_light(space, own, light, appearance, outlier) for own, light in zip(sightings, lights, strict=True)
         ]
-    even = [[without_smooth_residual(space, replace(one, light=light), appearance, outlier, radius) for one in own]
-            for own, light in zip(sightings, lights, strict=True)]
+    even = [
+        [_without_smooth_residual(space, replace(one, light=light), appearance, outlier, light_radius) for one in own]
+        for own, light in zip(sightings, lights, strict=True)
+    ]
     return _bake(space, even, lights, appearance, outlier), lights
 
 
-def without_smooth_residual(
+def _without_smooth_residual(
     space: TextureSpace, sighting: Sighting, appearance: Appearance, outlier: float, radius: int
 ) -> Sighting:
     """The same with what differs from the prediction over more than `radius` pixels taken out of the picture."""
@@ -156,7 +161,7 @@ def _bake(
     known = weight > _LEAST_WEIGHT
     albedo = mixed / squares.clamp_min(1e-6) * known[..., None]
     variance = ((image - albedo * mixed).sum(-1) / weight.clamp_min(1e-6)).clamp_min(0)
-    sigma = float(variance[known].median().sqrt().clamp(0.01, 0.1)) if known.any() else appearance.sigma
+    sigma = float(variance[known].median().sqrt().clamp(*_SIGMAS)) if known.any() else appearance.sigma
     trust = known * (sigma**2 / (0.5 * sigma**2 + variance)).clamp_max(1.0)
     return Appearance(albedo, trust, sigma)
 
@@ -164,7 +169,7 @@ def _bake(
 def _one_color(appearance: Appearance) -> Appearance:
     """Its median colour everywhere: what varies is light, to begin with."""
     median = appearance.albedo[appearance.trust > 0].median(0).values
-    return replace(appearance, albedo=(appearance.trust > 0)[..., None] * median, sigma=0.1)
+    return replace(appearance, albedo=(appearance.trust > 0)[..., None] * median, sigma=_FIRST_SIGMA)
 
 
 def _fit_light(

@@ -20,6 +20,7 @@ from mien.tracking.landmark_model import LandmarkModel, reduce_face_model
 from mien.tracking.landmark_term import Subject
 from mien.tracking.neck_line import fit_neck_lines
 from mien.tracking.parameters import layout_of
+from mien.tracking.photometric import refine_photometrically
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shared_fit import fit_shared
 from mien.tracking.shot import Shot, lenses_of, shot_of
@@ -65,8 +66,10 @@ def track_subject(
     shots = [shot_of(capture, settings) for capture in captures]
     with torch.no_grad():
         model = reduce_face_model(face_model, layout_of(face_model))
-        fit = _fit_landmarks(model, shots, lenses_of(captures, settings), settings)
-        # A photometric stage refines `fit` here: `fit.subject` is shared, `fit.sequences` are each sequence's own.
+        lenses = lenses_of(captures, settings)
+        fit = _fit_landmarks(model, shots, lenses, settings)
+        if settings.schedule == "fast":
+            fit = refine_photometrically(model, shots, lenses, fit, settings).fit
         return [
             _as_tracking(shot, face_model, model, fit.subject, own, settings)
             for shot, own in zip(shots, fit.sequences, strict=True)

@@ -1,6 +1,9 @@
 """What a user may choose about tracking."""
 
 from dataclasses import dataclass, field
+from typing import Literal
+
+from mien.tracking.photometric_settings import PhotometricSettings
 
 
 @dataclass(frozen=True)
@@ -41,3 +44,7 @@ class TrackingSettings:
     """How far a landmark's point on the subject may lie from the model's, metres; one offset for all sequences."""
     smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
     """Over time."""
+    schedule: Literal["landmarks", "fast"] = "landmarks"
+    """landmarks: fit landmarks alone. fast: then fit the pixels, by a texture common to all pictures."""
+    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
+    """Of the fit to pixels."""
