@@ -1,25 +1,16 @@
 #include "mesh_align.h"
 
 #include <algorithm>
-#include <cmath>
 #include <limits>
 #include <vector>
+
+#include "mesh_align_surface.h"
 
 namespace mien {
 namespace {
 
 constexpr int kBlocks = 6 * 3;   // corner pairs (0,0) (0,1) (0,2) (1,1) (1,2) (2,2), each a symmetric 2x2 block
 constexpr int kSums = kBlocks + 6;
-constexpr float kDepthTolerance = 0.0005f;  // metres: a texel so far behind what is seen is hidden
-
-struct Color {
-  float c[3];
-};
-
-struct Sample {
-  Color color;
-  float weight;
-};
 
 struct Residual {
   int32_t x, y, face;
@@ -35,126 +26,12 @@ struct Workspace {
   int64_t cell_of(const Residual& one) const {
     return static_cast<int64_t>(one.y - top) * columns + (one.x - left);
   }
-  std::vector<int32_t> face_index;
-  std::vector<float> barycentric, depth;
   std::vector<float> sums;      // [f, kSums]
   std::vector<int32_t> hit;     // triangles with sums
   std::vector<int32_t> row_of;  // vertex -> row, -1
   std::vector<int32_t> vertices;
   std::vector<float> screen, product, force;  // [rows,2,p], [rows,2,p], [rows,2]
 };
-
-void basis(const float* n, float* out) {
-  const float x = n[0], y = n[1], z = n[2];
-  out[0] = 0.28209479177387814f;
-  out[1] = 0.4886025119029199f * y;
-  out[2] = 0.4886025119029199f * z;
-  out[3] = 0.4886025119029199f * x;
-  out[4] = 1.0925484305920792f * x * y;
-  out[5] = 1.0925484305920792f * y * z;
-  out[6] = 0.31539156525252005f * (3 * z * z - 1);
-  out[7] = 1.0925484305920792f * x * z;
-  out[8] = 0.5462742152960396f * (x * x - y * y);
-}
-
-Color shade(const float* normal, const float* light) {
-  float b[9];
-  basis(normal, b);
-  Color out{};
-  for (int k = 0; k < 9; ++k)
-    for (int c = 0; c < 3; ++c) out.c[c] += b[k] * light[3 * k + c];
-  return out;
-}
-
-// Bilinear among the texels that are known; the weight is their trust.
-Sample sample_texture(const TexturedSurface& surface, float u, float v) {
-  const float x = std::clamp(u, 0.0f, 1.0f) * surface.texture_width - 0.5f;
-  const float y = (1 - std::clamp(v, 0.0f, 1.0f)) * surface.texture_height - 0.5f;
-  const int x0 = static_cast<int>(std::floor(x)), y0 = static_cast<int>(std::floor(y));
-  Sample out{};
-  for (int dy = 0; dy < 2; ++dy) {
-    for (int dx = 0; dx < 2; ++dx) {
-      const int column = std::clamp(x0 + dx, 0, surface.texture_width - 1);
-      const int row = std::clamp(y0 + dy, 0, surface.texture_height - 1);
-      const int64_t texel = static_cast<int64_t>(row) * surface.texture_width + column;
-      const float share = (dx ? x - x0 : 1 - (x - x0)) * (dy ? y - y0 : 1 - (y - y0)) * surface.trust[texel];
-      out.weight += share;
-      for (int c = 0; c < 3; ++c) out.color.c[c] += share * surface.albedo[3 * texel + c];
-    }
-  }
-  if (out.weight > 0)
-    for (float& value : out.color.c) value /= out.weight;
-  return out;
-}
-
-struct SurfacePoint {
-  float position[3], normal[3];
-  float cosine;  // between the normal and the direction to the camera
-};
-
-SurfacePoint surface_point(const Mesh& mesh, const AlignFrame& frame, const float* eye, const int64_t* corners,
-                           const float* weights) {
-  SurfacePoint out{};
-  for (int k = 0; k < 3; ++k) {
-    for (int axis = 0; axis < 3; ++axis) {
-      out.position[axis] += weights[k] * mesh.vertices[3 * corners[k] + axis];
-      out.normal[axis] += weights[k] * frame.normals[3 * corners[k] + axis];
-    }
-  }
-  float length = 0, distance = 0, along = 0;
-  for (int axis = 0; axis < 3; ++axis) {
-    const float towards = eye[axis] - out.position[axis];
-    length += out.normal[axis] * out.normal[axis];
-    distance += towards * towards;
-    along += towards * out.normal[axis];
-  }
-  length = std::sqrt(length) + 1e-20f;
-  for (float& value : out.normal) value /= length;
-  out.cosine = along / (length * std::sqrt(distance) + 1e-20f);
-  return out;
-}
-
-void camera_position(const float* viewmat, float* eye) {
-  for (int axis = 0; axis < 3; ++axis) {
-    eye[axis] = 0;
-    for (int k = 0; k < 3; ++k) eye[axis] -= viewmat[4 * k + axis] * viewmat[4 * k + 3];
-  }
-}
-
-void draw(const Mesh& mesh, const MeshView& view, Workspace& workspace) {
-  const size_t pixels = static_cast<size_t>(view.width) * view.height;
-  workspace.face_index.resize(pixels);
-  workspace.barycentric.resize(3 * pixels);
-  workspace.depth.resize(pixels);
-  rasterize_mesh(mesh, view, false,
-                 {workspace.face_index.data(), workspace.barycentric.data(), workspace.depth.data()});
-}
-
-// Calls body(pixel, face, corners, barycentrics, point, texture sample, light) for every pixel that counts.
-template <typename Body>
-void for_pixels(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame, const AlignOptions& options,
-                const Workspace& workspace, Body&& body) {
-  float eye[3];
-  camera_position(frame.view.viewmat, eye);
-  const int width = frame.view.width, height = frame.view.height;
-  for (int y = 1; y + 1 < height; ++y) {
-    for (int x = 1; x + 1 < width; ++x) {
-      const int64_t pixel = static_cast<int64_t>(y) * width + x;
-      const int32_t face = workspace.face_index[pixel];
-      if (face < 0 || !surface.used[face] || !(frame.mask[pixel] > 0)) continue;
-      const int64_t* corners = mesh.faces + 3 * static_cast<int64_t>(face);
-      const float* weights = workspace.barycentric.data() + 3 * pixel;
-      const SurfacePoint point = surface_point(mesh, frame, eye, corners, weights);
-      if (point.cosine < options.least_cosine) continue;
-      const float* uv = surface.uv + 6 * static_cast<int64_t>(face);
-      const Sample sample =
-          sample_texture(surface, weights[0] * uv[0] + weights[1] * uv[2] + weights[2] * uv[4],
-                         weights[0] * uv[1] + weights[1] * uv[3] + weights[2] * uv[5]);
-      if (!(sample.weight > 0)) continue;
-      body(pixel, face, weights, point, sample, shade(point.normal, frame.light));
-    }
-  }
-}
 
 void add_pixel(float* sums, const float* weights, const float gradient[2][3], const Color& residual, float weight) {
   float g[3] = {}, force[2] = {};
@@ -262,23 +139,13 @@ void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian,
   }
 }
 
-float squared_norm(const Color& color) {
-  return color.c[0] * color.c[0] + color.c[1] * color.c[1] + color.c[2] * color.c[2];
-}
-
-// Geman and McClure: rho(s) = s * fading(s), and its derivative is the square of fading(s).
-float fading(float squared, const AlignOptions& options) {
-  const float least = options.outlier * options.outlier;
-  return least / (least + squared);
-}
-
 void collect_residuals(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
-                       const AlignOptions& options, Workspace& w) {
+                       const AlignOptions& options, const DrawnMesh& drawn, Workspace& w) {
   w.residuals.clear();
   w.touched.resize(mesh.face_count, 0);
   int right = 0, bottom = 0;
   w.left = frame.view.width, w.top = frame.view.height;
-  for_pixels(mesh, surface, frame, options, w,
+  for_pixels(mesh, surface, frame, options, drawn,
              [&](int64_t pixel, int32_t face, const float*, const SurfacePoint&, const Sample& sample,
                  const Color& light) {
                const int x = static_cast<int>(pixel % frame.view.width), y = static_cast<int>(pixel / frame.view.width);
@@ -341,8 +208,9 @@ AlignResult align_mesh(const Mesh& mesh, const TexturedSurface& surface, const A
                        const AlignOptions& options, HighPass high_pass, const float* jacobian, int parameters,
                        const AlignBuffers& out) {
   Workspace& w = own_workspace();
-  draw(mesh, frame.view, w);
-  collect_residuals(mesh, surface, frame, options, w);
+  DrawnMesh& drawn = own_drawing();
+  draw(mesh, frame.view, drawn);
+  collect_residuals(mesh, surface, frame, options, drawn, w);
   if (high_pass.radius > 0) smooth_residuals(high_pass.radius, options, w);
   w.hit.clear();
   w.sums.resize(static_cast<size_t>(mesh.face_count) * kSums, 0.0f);
@@ -371,98 +239,13 @@ AlignResult align_mesh(const Mesh& mesh, const TexturedSurface& surface, const A
     }
     if (w.touched[one.face] == 0) w.hit.push_back(one.face);
     w.touched[one.face] = 1;
-    add_pixel(w.sums.data() + static_cast<int64_t>(one.face) * kSums, w.barycentric.data() + 3 * pixel, gradient,
+    add_pixel(w.sums.data() + static_cast<int64_t>(one.face) * kSums, drawn.barycentric.data() + 3 * pixel, gradient,
               residual, one.weight * fade * fade * inverse_variance);
   }
   for (const int32_t face : w.hit) w.touched[face] = 0;
   const double scale = total > 0 ? 1 / total : 0;
   if (out.hessian) project_sums(mesh, frame.view, jacobian, parameters, scale, w, out);
   return {cost * scale, total};
-}
-
-void bake_texture(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
-                  const AlignOptions& options, const BakeTexels& texels, const BakeSums& out) {
-  Workspace& w = own_workspace();
-  draw(mesh, frame.view, w);
-  float eye[3];
-  camera_position(frame.view.viewmat, eye);
-  const MeshView& view = frame.view;
-  const float least = options.outlier * options.outlier, inverse_variance = 1 / (options.sigma * options.sigma);
-  const int64_t count = static_cast<int64_t>(surface.texture_width) * surface.texture_height;
-  for (int64_t texel = 0; texel < count; ++texel) {
-    const int32_t face = texels.face[texel];
-    if (face < 0 || !surface.used[face]) continue;
-    const SurfacePoint point =
-        surface_point(mesh, frame, eye, mesh.faces + 3 * static_cast<int64_t>(face), texels.barycentric + 3 * texel);
-    if (point.cosine < options.least_cosine) continue;
-    float in_camera[3];
-    for (int row = 0; row < 3; ++row) {
-      const float* m = view.viewmat + 4 * row;
-      in_camera[row] = m[0] * point.position[0] + m[1] * point.position[1] + m[2] * point.position[2] + m[3];
-    }
-    if (in_camera[2] < kMeshNearPlane) continue;
-    const float x = view.K[0] * in_camera[0] / in_camera[2] + view.K[2] - 0.5f;
-    const float y = view.K[4] * in_camera[1] / in_camera[2] + view.K[5] - 0.5f;
-    if (!(x >= 0 && y >= 0 && x < view.width - 1 && y < view.height - 1)) continue;
-    const int x0 = static_cast<int>(x), y0 = static_cast<int>(y);
-    const int64_t nearest = static_cast<int64_t>(std::lround(y)) * view.width + std::lround(x);
-    // What a slope rises within a pixel does not hide it.
-    const float slope = std::sqrt(std::max(1 - point.cosine * point.cosine, 0.0f)) / std::max(point.cosine, 0.1f);
-    const float tolerance = kDepthTolerance + in_camera[2] / view.K[0] * slope;
-    if (in_camera[2] > w.depth[nearest] + tolerance) continue;
-    float color[3] = {}, mask = 0;
-    for (int dy = 0; dy < 2; ++dy) {
-      for (int dx = 0; dx < 2; ++dx) {
-        const float share = (dx ? x - x0 : 1 - (x - x0)) * (dy ? y - y0 : 1 - (y - y0));
-        const int64_t pixel = static_cast<int64_t>(y0 + dy) * view.width + x0 + dx;
-        mask += share * frame.mask[pixel];
-        for (int c = 0; c < 3; ++c) color[c] += share * frame.image[3 * pixel + c];
-      }
-    }
-    const Color light = shade(point.normal, frame.light);
-    float weight = mask * point.cosine * point.cosine;
-    if (surface.trust[texel] > 0) {
-      float squared = 0;
-      for (int c = 0; c < 3; ++c) {
-        const float difference = color[c] - surface.albedo[3 * texel + c] * light.c[c];
-        squared += difference * difference * inverse_variance;
-      }
-      const float fade = least / (least + squared);
-      weight *= fade * fade;
-    }
-    out.weight[texel] += weight;
-    for (int c = 0; c < 3; ++c) {
-      out.squares[3 * texel + c] += weight * light.c[c] * light.c[c];
-      out.mixed[3 * texel + c] += weight * light.c[c] * color[c];
-      out.image[3 * texel + c] += weight * color[c] * color[c];
-    }
-  }
-}
-
-void light_equations(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
-                     const AlignOptions& options, double* hessian, double* right) {
-  Workspace& w = own_workspace();
-  draw(mesh, frame.view, w);
-  const float least = options.outlier * options.outlier, inverse_variance = 1 / (options.sigma * options.sigma);
-  for_pixels(mesh, surface, frame, options, w,
-             [&](int64_t pixel, int32_t, const float*, const SurfacePoint& point, const Sample& sample,
-                 const Color& light) {
-               float b[9], squared = 0;
-               basis(point.normal, b);
-               const float* seen = frame.image + 3 * pixel;
-               for (int c = 0; c < 3; ++c) {
-                 const float difference = seen[c] - sample.color.c[c] * light.c[c];
-                 squared += difference * difference * inverse_variance;
-               }
-               const float fade = least / (least + squared);
-               for (int c = 0; c < 3; ++c) {
-                 const float albedo = sample.color.c[c], weight = frame.mask[pixel] * sample.weight * fade * fade * albedo;
-                 for (int i = 0; i < 9; ++i) {
-                   right[9 * c + i] += weight * b[i] * seen[c];
-                   for (int j = i; j < 9; ++j) hessian[81 * c + 9 * i + j] += weight * albedo * b[i] * b[j];
-                 }
-               }
-             });
 }
 
 }  // namespace mien

@@ -99,9 +99,9 @@ class SurfaceModel:
             n = len(parameters)
             moved = angles.expand(n, -1).index_copy(1, free, parameters[:, : len(free)])
             expression = face.expression.expand(n, -1).index_copy(1, derived, parameters[:, len(free) :])
-            return self.exact.joint_transforms(
-                replace(face, joints=moved.reshape(n, *face.joints.shape[1:]), expression=expression)
-            )[:, :, :3]
+            head = face.head_rotation.expand(n, -1), face.head_translation.expand(n, -1)
+            joints = moved.reshape(n, *face.joints.shape[1:])
+            return self.exact.joint_transforms(FaceParams(face.identity, expression, joints, *head))[:, :, :3]
 
         motion = self._skinned(_derivatives(transforms, at).float(), shaped)
         return motion[..., : len(free)], motion[..., len(free) :]

@@ -1,0 +1,106 @@
+"""Faces fitted to pixels: better than landmarks alone; its derivatives; what it does where nothing is seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mien.rotation import matrix_from_axis_angle
+from mien.tracking import Tracking, TrackingSettings, track
+from mien.tracking.parameters import layout_of
+from mien.tracking.photometric_settings import PhotometricSettings
+from mien.tracking.photometric_surface import surface_model
+from photometric_case import FOCAL, PhotometricCase, make_photometric_case, make_textured_model
+from tracking_case import make_tracking_case
+
+LANDMARKS = TrackingSettings(focal=FOCAL, schedule="landmarks")
+FAST = replace(
+    LANDMARKS, schedule="fast",
+    photometric=PhotometricSettings(shrinks=(1, 1), texture_size=128, keyframes=8, shared_steps=1),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def case() -> PhotometricCase:
+    return make_photometric_case()
+
+
+@pytest.fixture(scope="module")
+def by_landmarks(case: PhotometricCase) -> Tracking:
+    return track(case.capture, case.model, LANDMARKS)
+
+
+@pytest.fixture(scope="module")
+def by_pixels(case: PhotometricCase) -> Tracking:
+    return track(case.capture, case.model, FAST)
+
+
+def wobble(case: PhotometricCase, tracking: Tracking) -> float:
+    """Pixels by which landmarks stray from a constant error: what differs from picture to picture."""
+    points = case.model.landmark_positions(case.model(tracking.face), "mediapipe")
+    error = tracking.cameras[0].project(points)[0] - case.landmarks
+    return float((error - error.mean(0)).norm(dim=-1).median())
+
+
+def turn_error(case: PhotometricCase, tracking: Tracking) -> float:
+    """Degrees beside the mean error."""
+    turn = matrix_from_axis_angle(tracking.face.head_rotation) @ matrix_from_axis_angle(case.face.head_rotation).mT
+    vector = torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], dim=-1)
+    return float((vector - vector.mean(0)).norm(dim=-1).median().rad2deg())
+
+
+def test_pixels_calm_what_landmarks_leave(case, by_landmarks, by_pixels):
+    assert wobble(case, by_pixels) < 0.5 * wobble(case, by_landmarks)
+    assert turn_error(case, by_pixels) < 1.1 * turn_error(case, by_landmarks)
+
+
+def test_expressions_come_nearer_the_truth(case, by_landmarks, by_pixels):
+    def error(tracking: Tracking) -> float:
+        return float((tracking.face.expression - case.face.expression).abs().mean())
+
+    assert error(by_pixels) < error(by_landmarks)
+
+
+def test_is_the_same_each_time_and_with_any_number_of_threads(case, by_pixels, monkeypatch):
+    monkeypatch.setenv("MIEN_THREADS", "3")
+    again = track(case.capture, case.model, FAST)
+    for name, tensor in by_pixels.face.tensors().items():
+        assert torch.equal(tensor, again.face.tensors()[name]), name
+
+
+def test_a_face_without_texture_stays_where_landmarks_put_it():
+    case = make_tracking_case(timesteps=6)
+    capture = replace(case.capture, images=np.full_like(case.capture.images, 128))
+    model = make_textured_model()
+    expected = track(capture, model, LANDMARKS)
+    found = track(capture, model, FAST)
+    marks = [model.landmark_positions(model(tracking.face), "mediapipe") for tracking in (expected, found)]
+    assert (marks[0] - marks[1]).norm(dim=-1).median() < 0.0008
+
+
+def test_derivatives_of_the_surface_are_those_of_the_face_model():
+    model = make_textured_model()
+    generator = torch.Generator().manual_seed(0)
+    pose_basis = 0.002 * torch.randn(27, *model.template.shape, generator=generator)
+    model = replace(model, pose_basis=pose_basis)
+    layout = layout_of(model)
+    state = 0.3 * torch.rand(layout.size, generator=generator, dtype=torch.float64)
+    state[3:6] = torch.tensor([0.02, 0.03, -0.8])
+    state = torch.minimum(torch.maximum(state, layout.lower), layout.upper)
+    identity = torch.randn(len(model.identity_basis), generator=generator, dtype=torch.float64)
+    exact = replace(model, joint_identity_basis=0 * model.joint_identity_basis).to(torch.zeros(()).double())
+    surface = surface_model(exact, layout)
+
+    def vertices(both: torch.Tensor) -> torch.Tensor:
+        return exact(layout.face_params(both[None, : layout.size], both[layout.size :]))[0]
+
+    both = torch.cat([state, identity])
+    posed = surface.pose(state, identity, derive_identity=True)
+    assert posed.jacobian is not None
+    torch.testing.assert_close(posed.vertices.double(), vertices(both), atol=1e-6, rtol=0)
+    assert posed.jacobian.shape[2] == len(both)
+    for index, step in enumerate(1e-5 * torch.eye(len(both), dtype=torch.float64)):
+        expected = (vertices(both + step) - vertices(both - step)) / 2e-5
+        difference = (posed.jacobian[..., index] - expected).abs().max()
+        assert difference < 2e-4 * expected.abs().max() + 1e-7, index
