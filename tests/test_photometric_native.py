@@ -89,12 +89,10 @@ def reference(seen: Sighting, looks: Appearance) -> tuple[Tensor, Tensor, Tensor
     by_x, by_y = torch.zeros_like(image), torch.zeros_like(image)
     by_x[:, 1:-1], by_y[1:-1] = (image[:, 2:] - image[:, :-2]) / 2, (image[2:] - image[:-2]) / 2
 
-    def screen(motion: Tensor) -> Tensor:
-        return CAMERA.project(vertices + motion)[0]
-
     assert seen.posed.jacobian is not None
-    still, motions = torch.zeros_like(vertices), seen.posed.jacobian.permute(2, 0, 1).contiguous()
-    columns = [torch.autograd.functional.jvp(screen, still, motion)[1] for motion in motions.unbind()]
+    apart = 1e-4 * seen.posed.jacobian.permute(2, 0, 1).double()
+    exact, ahead = CAMERA.to(apart), vertices.double()
+    columns = [(exact.project(ahead + d)[0] - exact.project(ahead - d)[0]).float() / 2e-4 for d in apart]
     moved = torch.stack([interpolate(fragments, column.contiguous(), MODEL.faces) for column in columns], -1).double()
     by_parameter = by_x[..., None] * moved[..., None, 0, :] + by_y[..., None] * moved[..., None, 1, :]
     scale = (weight * fade**2 / SIGMA**2)[counts] / total
