@@ -1,10 +1,10 @@
-# make setup | demo | test | lint | bench. The environment is .venv; everything else is in pyproject.toml.
+# make setup | demo | test | sanitize | lint | bench. The environment is .venv; everything else is in pyproject.toml.
 PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || echo python3.11)
 BIN := .venv/bin
-NATIVE := $(wildcard native/* native/*/*) CMakeLists.txt
+NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UV_VERSION := 0.13.8
 
-.PHONY: setup build demo test lint format bench lock clean
+.PHONY: setup build demo test sanitize lint format bench lock clean
 setup: .venv/.built
 
 .venv/.packages: requirements/lock.txt
@@ -29,10 +29,14 @@ demo: setup
 test: setup
 	MIEN_THREADS=2 $(BIN)/pytest
 
+# The native core's own checks under AddressSanitizer, UndefinedBehaviorSanitizer and ThreadSanitizer; needs no Python.
+sanitize:
+	$(MAKE) -C native/checks -j2
+
 lint: setup
 	$(BIN)/ruff check src tests examples benchmarks
 	$(BIN)/ruff format --check src tests examples benchmarks
-	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h)
+	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 	$(BIN)/typos
 	$(BIN)/lint-imports
 	$(BIN)/pyright
@@ -40,7 +44,7 @@ lint: setup
 format: setup
 	$(BIN)/ruff check --fix src tests examples benchmarks
 	$(BIN)/ruff format src tests examples benchmarks
-	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h)
+	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 
 # Re-resolve the locked requirements (both Pythons, every platform) after a change in pyproject.toml or overrides.txt.
 lock: .venv/.packages

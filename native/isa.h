@@ -6,7 +6,7 @@
 #include "rasterize.h"
 
 // In namespace mien: declares `Type name` of each instruction set, and `name()` for the one the rasterizer runs on.
-#if defined(__x86_64__)
+#if defined(__x86_64__) && !defined(MIEN_PORTABLE)  // MIEN_PORTABLE: sanitizers check what runs elsewhere
 #define MIEN_CHOOSE_KERNELS(Type, name)                                              \
   namespace avx512 {                                                                 \
   extern const Type name;                                                            \

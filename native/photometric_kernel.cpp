@@ -87,6 +87,7 @@ void map_row(const PhotometricBand& band, int y) {
   clear(by_mean + end, by_mean + end + 2 * W);
   clear(by_squares + end, by_squares + end + 2 * W);
   clear(by_products + end, by_products + end + 2 * W);
+  if (y < band.begin || y >= band.end) return;  // a neighbour's row
   double total = 0;
   for (int lane = 0; lane < W; ++lane) total += map_sum[lane];
   band.ssim_sums[y] = total;

@@ -12,7 +12,7 @@
 
 namespace mien {
 
-#if defined(__x86_64__)
+#if defined(__x86_64__) && !defined(MIEN_PORTABLE)
 extern const Kernels kernels_avx512, kernels_avx2, kernels_sse4;
 #else
 extern const Kernels kernels_baseline;
@@ -28,7 +28,7 @@ struct Isa {
 
 // Best first.
 const std::vector<Isa>& isas() {
-#if defined(__x86_64__)
+#if defined(__x86_64__) && !defined(MIEN_PORTABLE)
   static const std::vector<Isa> all = {
       {"avx512", &kernels_avx512, __builtin_cpu_supports("x86-64-v4") != 0},
       {"avx2", &kernels_avx2, __builtin_cpu_supports("x86-64-v3") != 0},

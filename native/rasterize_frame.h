@@ -20,9 +20,9 @@ class Buffer {
   Buffer& operator=(const Buffer&) = delete;
   ~Buffer() { std::free(data_); }
 
-  // At least `count` elements; what they held may be lost.
+  // At least `count` elements, never null; what they held may be lost.
   T* reserve(int64_t count) {
-    if (count > capacity_) {
+    if (count > capacity_ || !data_) {
       std::free(data_);
       capacity_ = count + count / 4 + 64;
       const size_t bytes = (sizeof(T) * static_cast<size_t>(capacity_) + 63) / 64 * 64;
