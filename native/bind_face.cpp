@@ -121,6 +121,21 @@ void backward(const mien::FaceModelData& model, const In<-1, 3>& rest, const In<
   });
 }
 
+void head_poses(const In<-1, 3>& rotation, const In<-1, 3>& translation, const Out<-1, 4, 4>& transforms) {
+  const size_t b = rotation.shape(0);
+  require(translation.shape(0) == b && transforms.shape(0) == b, "head poses of different numbers");
+  for (size_t i = 0; i < b; ++i)
+    mien::head_pose(rotation.data() + 3 * i, translation.data() + 3 * i, transforms.data() + 16 * i);
+}
+
+void head_poses_backward(const In<-1, 3>& rotation, const In<-1, 4, 4>& grad_transforms,
+                         const Out<-1, 3>& grad_rotation) {
+  const size_t b = rotation.shape(0);
+  require(grad_transforms.shape(0) == b && grad_rotation.shape(0) == b, "head poses of different numbers");
+  for (size_t i = 0; i < b; ++i)
+    mien::head_pose_backward(rotation.data() + 3 * i, grad_transforms.data() + 16 * i, grad_rotation.data() + 3 * i);
+}
+
 }  // namespace
 
 void bind_face(nb::module_& module) {
@@ -134,4 +149,8 @@ void bind_face(nb::module_& module) {
              "head_rotation"_a.none(), "head_translation"_a.none(), "shaped"_a, "grad_vertices"_a, "grad_rest"_a,
              "grad_joint_rest"_a, "grad_expression"_a, "grad_joints"_a, "grad_head_rotation"_a,
              "grad_head_translation"_a, "Fills the gradients, one of each a timestep.");
+  module.def("head_poses", &head_poses, "rotation"_a.noconvert(), "translation"_a.noconvert(),
+             "transforms"_a.noconvert(), "Fills T_world_head of b timesteps.");
+  module.def("head_poses_backward", &head_poses_backward, "rotation"_a.noconvert(), "grad_transforms"_a.noconvert(),
+             "grad_rotation"_a.noconvert());
 }

@@ -1,6 +1,7 @@
 // The Python module `mien._native`. Each operation binds itself in its own bind_*.cpp; this file only lists them.
 #include <nanobind/nanobind.h>
 
+void bind_activation(nanobind::module_& module);
 void bind_face(nanobind::module_& module);
 void bind_mesh(nanobind::module_& module);
 void bind_mesh_gradients(nanobind::module_& module);
@@ -13,6 +14,7 @@ void bind_training(nanobind::module_& module);
 NB_MODULE(_native, module) {
   nanobind::set_leak_warnings(false);  // a picture that lives until the interpreter ends is no leak
   module.doc() = "mien's native core. Private: only the autograd functions in mien.render and mien.avatar call it.";
+  bind_activation(module);
   bind_face(module);
   bind_mesh(module);
   bind_mesh_gradients(module);

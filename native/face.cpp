@@ -241,6 +241,23 @@ FaceModelData make_face_model(FaceModelData model, const float* expression_basis
   return model;
 }
 
+void head_pose(const float* rotation, const float* translation, float* transform) {
+  float R[9];
+  Rodrigues(rotation).matrix(R);
+  for (int row = 0; row < 3; ++row) {
+    std::copy(R + 3 * row, R + 3 * row + 3, transform + 4 * row);
+    transform[4 * row + 3] = translation[row];
+    transform[12 + row] = 0;
+  }
+  transform[15] = 1;
+}
+
+void head_pose_backward(const float* rotation, const float* grad_transform, float* grad_rotation) {
+  float by_R[9];
+  for (int i = 0; i < 9; ++i) by_R[i] = grad_transform[4 * (i / 3) + i % 3];
+  Rodrigues(rotation).backward(by_R, grad_rotation);
+}
+
 void pose_face(const FaceModelData& model, const FacePose& pose, float* shaped, float* vertices) {
   const Skeleton skeleton(model, pose);
   const RigidTransform* head = pose.head_rotation ? &skeleton.head : nullptr;

@@ -52,6 +52,11 @@ struct FaceGradients {
   float* head_translation;
 };
 
+// T_world_head [4,4], row-major, of an axis-angle and a translation: the head frame of `pose_face`, to the bit. And
+// back: d loss / d axis-angle, from the whole gradient's rotation.
+void head_pose(const float* rotation, const float* translation, float* transform);
+void head_pose_backward(const float* rotation, const float* grad_transform, float* grad_rotation);
+
 // Fills `vertices` [v,3] and `shaped` [v,3], the vertices before the joints, which the backward pass reads.
 void pose_face(const FaceModelData& model, const FacePose& pose, float* shaped, float* vertices);
 void pose_face_backward(const FaceModelData& model, const FacePose& pose, const float* shaped,

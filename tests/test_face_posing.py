@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mien import _native
-from mien.face import FaceModel, FaceParams, load_face_model
+from mien.face import FaceModel, FaceParams, head_poses, load_face_model
 from small_face_model import make_small_face_model
 
 
@@ -97,3 +97,19 @@ def test_no_timestep_and_float64() -> None:
     assert model(model.neutral(0)).shape == (0, len(model.template), 3)
     double = model.to(torch.zeros((), dtype=torch.float64))
     assert double(double.neutral()).dtype == torch.float64
+
+
+def test_head_poses_and_gradients_equal_the_reference() -> None:
+    face = random_face(chained_model(), 7)
+    rotation = torch.cat([face.head_rotation[:4], torch.tensor([[0.0, 0, 0], [1e-6, 0, 0], [3.0, 0, 1.0]])])
+    translation = torch.randn(len(rotation), 3, generator=torch.Generator().manual_seed(8))
+    weights = torch.randn(len(rotation), 4, 4, generator=torch.Generator().manual_seed(9))
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [tensor.to(dtype).requires_grad_() for tensor in (rotation, translation)]
+        posed = replace(face, head_rotation=leaves[0], head_translation=leaves[1])
+        found = head_poses(posed) if dtype == torch.float32 else posed.T_world_head
+        results.append([found, *torch.autograd.grad((found * weights.to(dtype)).sum(), leaves)])
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs.float(), atol=2e-6, rtol=2e-6)
+    assert head_poses(face.to(torch.zeros((), dtype=torch.float64))).dtype == torch.float64

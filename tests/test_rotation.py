@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -11,6 +12,7 @@ from torch import Tensor
 from mien.rotation import (
     axis_angle_from_matrix,
     axis_angle_from_quaternion,
+    compose_rigid,
     invert_rigid,
     matrix_from_axis_angle,
     matrix_from_quaternion,
@@ -19,6 +21,7 @@ from mien.rotation import (
     rigid_transform,
     skew,
 )
+from mien.runtime import rotation as runtime_rotation
 
 numbers = st.floats(-3, 3, allow_nan=False, width=32)
 vectors = st.lists(numbers, min_size=3, max_size=3).map(lambda v: torch.tensor(v, dtype=torch.float64))
@@ -122,3 +125,10 @@ def test_the_quarter_turn_about_z_takes_x_to_y() -> None:
 
 def test_a_zero_quaternion_is_no_rotation() -> None:
     close(matrix_from_quaternion(torch.zeros(4)), torch.eye(3))
+
+
+def test_compositions_round_as_without_torch() -> None:
+    first, second = (torch.randn(4, 4, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2))
+    composed = compose_rigid(first, second)
+    torch.testing.assert_close(composed, first @ second)
+    np.testing.assert_array_equal(composed.numpy(), runtime_rotation.compose_rigid(first.numpy(), second.numpy()))

@@ -13,10 +13,8 @@ import torch
 
 from mien import runtime
 from mien.avatar import METHODS, Avatar, baked, make_portable
-from mien.camera import Camera
 from mien.errors import UserError
 from mien.face import FaceParams
-from mien.gaussians import Gaussians
 from mien.render import rasterize
 from mien.runtime import model
 from toy_scene import toy_camera, toy_sequence
@@ -51,17 +49,6 @@ def pose_as(avatar: runtime.Avatar, face: FaceParams) -> runtime.Gaussians:
     )  # fmt: skip
 
 
-def at_a_cutoff(gaussians: Gaussians, camera: Camera, image: np.ndarray) -> np.ndarray:
-    """Pixels that a change in the last bits moves beyond the tolerance: contributions of just 1/255 come or go."""
-    moved = np.zeros(image.shape[:2], dtype=bool)
-    for seed in range(4):
-        noise = 3e-8 * torch.randn(gaussians.means.shape, generator=torch.Generator().manual_seed(seed))
-        nudged = replace(gaussians, means=gaussians.means + noise)
-        other = rasterize(nudged, camera, torch.ones(3)).image.numpy()
-        moved |= np.abs(other - image).max(-1) > EQUAL
-    return moved
-
-
 @method
 @torch.no_grad()
 def test_pictures_equal_those_of_training(method: str, tmp_path: Path) -> None:
@@ -74,10 +61,12 @@ def test_pictures_equal_those_of_training(method: str, tmp_path: Path) -> None:
         expected = rasterize(gaussians, camera, torch.ones(3))
         image, alpha = portable.render(pose_as(portable, face), portable.camera)
         assert expected.image.numpy().std() > 0.05
-        kept = ~at_a_cutoff(gaussians, camera, expected.image.numpy())
-        assert kept.mean() > 0.99
-        assert np.abs(image - expected.image.numpy())[kept].max() <= EQUAL
-        assert np.abs(alpha - expected.alpha.numpy())[kept].max() <= EQUAL
+        # Contributions of just 1/255 come or go where networks round differently (test_runtime_equality.py).
+        most, share = (0.0, 0.0) if method == "gaussian_avatars" else (1 / 255, 1e-3)
+        for found, truth in ((image, expected.image.numpy()), (alpha[..., None], expected.alpha.numpy()[..., None])):
+            difference = np.abs(found - truth).max(-1)
+            assert difference.max() <= most
+            assert (difference > EQUAL).mean() <= share
 
 
 @torch.no_grad()
@@ -89,8 +78,7 @@ def test_colours_that_depend_on_the_view_in_either_frame(tmp_path: Path) -> None
         gaussians = avatar.pose(face).gaussians.timestep(0)
         expected = rasterize(gaussians, toy_camera(SIZE), torch.ones(3)).image.numpy()
         image, _ = portable.render(pose_as(portable, face))
-        # World coordinates of half a metre keep fewer digits of small triangles.
-        np.testing.assert_allclose(image, expected, atol=1e-4)
+        np.testing.assert_array_equal(image, expected)
 
 
 @method

@@ -106,6 +106,12 @@ def rigid_transform(rotations: Float[Tensor, "*b 3 3"], translations: Float[Tens
     return torch.cat([top, bottom], dim=-2)
 
 
+def compose_rigid(first: Float[Tensor, "4 4"], second: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """`first @ second`, added up in the order that `mien.runtime` adds, so that both round alike."""
+    columns = [first[:, axis, None] * second[axis] for axis in range(4)]
+    return ((columns[0] + columns[1]) + columns[2]) + columns[3]
+
+
 def invert_rigid(transforms: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     """Inverses of rigid transforms, exact and cheaper than a general inverse."""
     inverse_rotation = transforms[..., :3, :3].transpose(-1, -2)

@@ -14,8 +14,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import leaky_relu, softplus
 
+from mien.avatar.activation import sigmoid
 from mien.avatar.rig import bind_to_world
-from mien.face import FaceModel, FaceParams
+from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians, sh_from_rgb
 
 
@@ -132,18 +133,14 @@ BakedAvatar = MeshBound | BlendSkinned | Static
 
 def bake_rig(face_model: FaceModel, subject: FaceParams) -> Rig:
     """A face model's vertices with one subject's identity and offsets applied."""
-    template = face_model.template + torch.einsum("i,ivc->vc", subject.identity, face_model.identity_basis)
-    if subject.vertex_offsets is not None:
-        template = template + subject.vertex_offsets
-    joints = face_model.joint_template + torch.einsum("i,ikc->kc", subject.identity, face_model.joint_identity_basis)
     return Rig(
-        template=template,
+        template=face_model.rest_vertices(subject),
         expression_names=face_model.expression_names,
         expression_basis=face_model.expression_basis,
         joint_names=face_model.joint_names,
         joint_parents=face_model.joint_parents,
         joint_free=face_model.joint_free,
-        joint_template=joints,
+        joint_template=face_model.rest_joints(subject),
         joint_rotation_basis=face_model.joint_rotation_basis,
         joint_translation_basis=face_model.joint_translation_basis,
         skinning_weights=face_model.skinning_weights,
@@ -176,25 +173,25 @@ def pose_baked(baked: BakedAvatar, face: FaceParams) -> Gaussians:
         centres = rig_points(baked.rig, face)
         raw = _raw_values(baked.attributes, baked.bases, baked.network, centres - baked.rig.template, face)
         if baked.scale_activation == "sigmoid":
-            scales = baked.scale_gain * raw["log_scales"].sigmoid() + baked.scale_offset
+            scales = baked.scale_gain * sigmoid(raw["log_scales"]) + baked.scale_offset
         else:
             scales = raw["log_scales"].exp()
-        sh = sh_from_rgb(raw["sh"].sigmoid()) if baked.colour_activation == "sigmoid" else raw["sh"]
-        return Gaussians(centres, raw["quats"], scales, raw["opacity_logits"].sigmoid(), sh, face.T_world_head)
+        sh = sh_from_rgb(sigmoid(raw["sh"])) if baked.colour_activation == "sigmoid" else raw["sh"]
+        return Gaussians(centres, raw["quats"], scales, sigmoid(raw["opacity_logits"]), sh, head_poses(face))
     still = baked.means.expand(len(face), -1, -1)
     raw = _raw_values(baked.attributes, baked.bases, baked.network, torch.zeros_like(still), face)
-    scales, opacities = raw["log_scales"].exp(), raw["opacity_logits"].sigmoid()
-    return Gaussians(still + raw["means"], raw["quats"], scales, opacities, raw["sh"], face.T_world_head)
+    scales, opacities = raw["log_scales"].exp(), sigmoid(raw["opacity_logits"])
+    return Gaussians(still + raw["means"], raw["quats"], scales, opacities, raw["sh"], head_poses(face))
 
 
 def _pose_mesh_bound(baked: MeshBound, face: FaceParams) -> Gaussians:
-    pose, raw = face.T_world_head, baked.attributes
+    pose, raw = head_poses(face), baked.attributes
     vertices = rig_points(baked.rig, face)
     if baked.sh_frame == "world":
         vertices = vertices @ pose[:, :3, :3].transpose(-1, -2) + pose[:, None, :3, 3]
     bound = bind_to_world(vertices, baked.faces, baked.face_index, baked.means, raw.quats, raw.log_scales)
     return Gaussians(
-        *bound, raw.opacity_logits.sigmoid(), raw.sh, T_world_local=pose if baked.sh_frame == "head" else None
+        *bound, sigmoid(raw.opacity_logits), raw.sh, T_world_local=pose if baked.sh_frame == "head" else None
     )
 
 

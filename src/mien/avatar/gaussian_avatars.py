@@ -11,13 +11,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien.avatar.activation import sigmoid
 from mien.avatar.avatar import TRAINED, Avatar, MethodConfig, ParameterGroup, Posed, Progress, Rate, store_group
 from mien.avatar.baked import Attributes, MeshBound, bake_rig
 from mien.avatar.density import GradientDensity, GradientSettings
 from mien.avatar.penalties import triangle_penalties
 from mien.avatar.rig import bind_to_world
 from mien.avatar.store import GaussianStore
-from mien.face import FaceModel, FaceParams
+from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 
@@ -86,8 +87,8 @@ class GaussianAvatars(Avatar):
             store["quats"],
             store["log_scales"],
         )
-        opacities = store["opacity_logits"].sigmoid()
-        T_world_local = face.T_world_head if in_head else None
+        opacities = sigmoid(store["opacity_logits"])
+        T_world_local = head_poses(face) if in_head else None
         return Posed(Gaussians(means, quats, scales, opacities, self._active_sh(progress), T_world_local), {})
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:

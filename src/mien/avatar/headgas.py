@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mien.avatar.activation import sigmoid
 from mien.avatar.avatar import (
     TRAINED,
     Avatar,
@@ -28,7 +29,7 @@ from mien.avatar.baked import AttributeNetwork, Attributes, Static
 from mien.avatar.density import GradientDensity, GradientSettings
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.store import GaussianStore
-from mien.face import FaceModel, FaceParams
+from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 
@@ -101,9 +102,9 @@ class HeadGas(Avatar):
         encoding = self._encoding().expand(len(face), -1, -1)
         output = self.network(torch.cat([features, encoding], dim=-1))
         sh = output[..., :-1].unflatten(-1, (self._coefficients, 3))
-        opacities = output[..., -1].sigmoid()
+        opacities = sigmoid(output[..., -1])
         gaussians = Gaussians(
-            store["means"], store["quats"], store["log_scales"].exp(), opacities, sh, face.T_world_head
+            store["means"], store["quats"], store["log_scales"].exp(), opacities, sh, head_poses(face)
         )
         return Posed(gaussians, {})
 

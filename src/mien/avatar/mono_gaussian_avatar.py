@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mien.avatar.activation import sigmoid
 from mien.avatar.avatar import (
     TRAINED,
     Avatar,
@@ -39,7 +40,7 @@ from mien.avatar.mono_networks import (
     DeformationNet,
 )
 from mien.avatar.store import GaussianStore
-from mien.face import FaceModel, FaceParams
+from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.rendering import Rendering
 from mien.rotation import matrix_from_axis_angle
@@ -116,11 +117,11 @@ class MonoGaussianAvatar(Avatar):
         # Detached, as published: attributes do not pull at points.
         change = self.change(displacement.detach() / LENGTH_UNIT)
         raw = split_attributes(self.attributes(self.store["means"].detach() / LENGTH_UNIT) + change)
-        scales = self.config.scale_gain * raw["log_scales"].sigmoid() + rendering_radius(progress.fraction)
+        scales = self.config.scale_gain * sigmoid(raw["log_scales"]) + rendering_radius(progress.fraction)
         quats = torch.nn.functional.normalize(raw["quats"], dim=-1)
-        opacities = raw["opacity_logits"][..., 0].sigmoid()
-        sh = sh_from_rgb(raw["sh"].sigmoid())[..., None, :]
-        gaussians = Gaussians(means, quats, scales, opacities, sh, face.T_world_head)
+        opacities = sigmoid(raw["opacity_logits"][..., 0])
+        sh = sh_from_rgb(sigmoid(raw["sh"]))[..., None, :]
+        gaussians = Gaussians(means, quats, scales, opacities, sh, head_poses(face))
         return Posed(gaussians, {name: points[name] for name in ("canonical", "expression", "pose", "weights")})
 
     def canonical_face(self) -> FaceParams:

@@ -3,6 +3,7 @@
 from mien.face.loading import FaceModelInfo, available_face_models, load_face_model
 from mien.face.model import FaceModel, Landmarks
 from mien.face.params import FaceParams, concatenate
+from mien.face.posing import head_poses
 
 __all__ = [
     "FaceModel",
@@ -11,5 +12,6 @@ __all__ = [
     "Landmarks",
     "available_face_models",
     "concatenate",
+    "head_poses",
     "load_face_model",
 ]

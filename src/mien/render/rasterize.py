@@ -15,6 +15,7 @@ from mien.render.native import render_native
 from mien.render.reference import render_reference
 from mien.render.rendering import Rendering
 from mien.render.validation import check_shapes
+from mien.rotation import compose_rigid
 
 Backend = Literal["auto", "native", "gsplat", "reference"]
 RenderView = Callable[[Gaussians, Camera, Tensor, Tensor], Rendering]
@@ -113,4 +114,6 @@ def _in_local_frame(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Ca
     """The same view with the Gaussians' local frame as the world."""
     pose = gaussians.T_world_local
     camera = camera.to(gaussians.means)
-    return (gaussians, camera) if pose is None else (replace(gaussians, T_world_local=None), camera.in_frame(pose))
+    if pose is None:
+        return gaussians, camera
+    return replace(gaussians, T_world_local=None), replace(camera, viewmat=compose_rigid(camera.viewmat, pose))

@@ -11,6 +11,7 @@ from mien import _native
 from mien.runtime.file import read_portable
 from mien.runtime.model import Camera, PortableAvatar
 from mien.runtime.posing import Face, Gaussians, pose
+from mien.runtime.rotation import compose_rigid
 
 Vector = Sequence[float | int] | np.ndarray
 """Three numbers."""
@@ -115,7 +116,7 @@ def render(
     alpha = np.empty((camera.height, camera.width), np.float32)
     radii = np.empty(len(gaussians), np.int32)
     pose = gaussians.T_world_local
-    viewmat = camera.viewmat if pose is None else camera.viewmat @ pose
+    viewmat = camera.viewmat if pose is None else compose_rigid(camera.viewmat, pose)
     frame = _native.rasterize_forward(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh,
         np.asarray(background, np.float32), np.ascontiguousarray(viewmat), np.ascontiguousarray(camera.K),

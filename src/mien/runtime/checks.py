@@ -9,6 +9,9 @@ import numpy as np
 from mien.errors import UserError
 from mien.runtime.model import AttributeNetwork, Attributes, BlendSkinned, MeshBound, PortableAvatar, Rig, Static
 
+MOST_SHAPES = 256
+"""Expressions, and nine of each free joint, that native/face.h takes."""
+
 
 def check(avatar: PortableAvatar, where: str) -> None:
     """Finite numbers, indices within their arrays, as many names as rows.
@@ -58,6 +61,8 @@ def _rig_faults(rig: Rig) -> Iterator[str]:
         yield "a joint comes before its parent"
     if rig.pose_basis is not None and len(rig.pose_basis) != 9 * sum(rig.joint_free):
         yield f"{len(rig.pose_basis)} pose correctives for {sum(rig.joint_free)} free joints"
+    if len(rig.expression_names) + 9 * sum(rig.joint_free) > MOST_SHAPES:
+        yield f"{len(rig.expression_names)} expressions and {sum(rig.joint_free)} free joints, more than can be posed"
 
 
 def _network_faults(network: AttributeNetwork, attributes: Attributes, e: int, j: int) -> Iterator[str]:

@@ -1,13 +1,13 @@
 """From face parameters to Gaussians, in numpy: what `mien.avatar.pose_baked` does in torch, for one timestep."""
 
 from dataclasses import dataclass, fields
+from weakref import WeakKeyDictionary
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from mien import _native
 from mien.runtime.model import AttributeNetwork, Attributes, Baked, BlendSkinned, LinearBases, MeshBound, Rig
-from mien.runtime.rotation import matrix_from_axis_angle, rigid_transform
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * coefficient."""
@@ -28,8 +28,9 @@ class Face:
     @property
     def T_world_head(self) -> Float32[np.ndarray, "4 4"]:
         """The pose of the head frame."""
-        turned = matrix_from_axis_angle(self.head_rotation)
-        return rigid_transform(turned, self.head_translation.astype(np.float64)).astype(np.float32)
+        transform = np.empty((1, 4, 4), np.float32)
+        _native.head_poses(_batch(self.head_rotation), _batch(self.head_translation), transform)
+        return transform[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,40 +78,40 @@ def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
     return _contiguous(centres, raw["quats"], scales, sigmoid(raw["opacity_logits"]), sh, face.T_world_head)
 
 
-def rig_points(rig: Rig, face: Face) -> Float32[np.ndarray, "m 3"]:
-    """The rig's points in the head frame, metres."""
-    m = len(rig.template)
-    shaped = rig.template + (face.expression @ rig.expression_basis.reshape(-1, 3 * m)).reshape(m, 3)
-    if rig.pose_basis is not None:
-        turned = (matrix_from_axis_angle(face.joints) - np.eye(3)).astype(np.float32)
-        shaped = shaped + (turned.reshape(-1) @ rig.pose_basis.reshape(-1, 3 * m)).reshape(m, 3)
-    transforms = joint_transforms(rig, face)[:, :3].astype(np.float32)
-    moved = (rig.skinning_weights @ transforms.reshape(-1, 12)).reshape(m, 3, 4)
-    return np.einsum("mrc,mc->mr", moved[..., :3], shaped) + moved[..., 3]
+def rig_points(rig: Rig, face: Face, in_world: bool = False) -> Float32[np.ndarray, "m 3"]:
+    """The rig's points in the head frame or in world space, metres: by the very operation that training uses."""
+    compiled = _compiled.get(rig)
+    if compiled is None:
+        compiled = _compiled[rig] = _native.make_face_model(
+            rig.expression_basis,
+            rig.pose_basis,
+            rig.joint_rotation_basis,
+            rig.joint_translation_basis,
+            rig.skinning_weights,
+            parents=rig.joint_parents,
+            is_free=rig.joint_free,
+        )
+    head = (_batch(face.head_rotation), _batch(face.head_translation)) if in_world else (None, None)
+    shaped, points = (np.empty((1, *rig.template.shape), np.float32) for _ in range(2))
+    _native.pose_face(
+        compiled, rig.template, rig.joint_template, _batch(face.expression), _batch(face.joints), *head,
+        shaped=shaped, vertices=points,
+    )  # fmt: skip
+    return points[0]
 
 
-def joint_transforms(rig: Rig, face: Face) -> Float[np.ndarray, "k 4 4"]:
-    """What each joint does to points of the rest pose, in the head frame."""
-    rest = rig.joint_template.astype(np.float64)
-    expression = face.expression.astype(np.float64)
-    rotation = np.einsum("e,ekc->kc", expression, rig.joint_rotation_basis)
-    shift = np.einsum("e,ekc->kc", expression, rig.joint_translation_basis)
-    rotation[list(rig.joint_free)] = face.joints
-    matrices = matrix_from_axis_angle(rotation)
-    # About the joint: x -> R (x - rest) + rest + shift.
-    local = rigid_transform(matrices, rest + shift - np.einsum("krc,kc->kr", matrices, rest))
-    chained: list[np.ndarray] = []
-    for index, parent in enumerate(rig.joint_parents):
-        chained.append(local[index] if parent < 0 else chained[parent] @ local[index])
-    return np.stack(chained)
+_compiled: "WeakKeyDictionary[Rig, _native.FaceModelData]" = WeakKeyDictionary()
+
+
+def _batch(values: np.ndarray) -> np.ndarray:
+    """One timestep's parameters as the core takes them."""
+    return np.ascontiguousarray(values[None], np.float32)
 
 
 def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
     pose, raw = face.T_world_head, baked.attributes
     in_head = baked.sh_frame == "head"
-    vertices = rig_points(baked.rig, face)
-    if not in_head:
-        vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
+    vertices = rig_points(baked.rig, face, in_world=not in_head)
     n = len(raw.quats)
     frames = np.empty((1, len(baked.faces), _native.TRIANGLE_FRAME_FLOATS), np.float32)
     means, quats, scales = (np.empty((1, n, width), np.float32) for width in (3, 4, 3))
@@ -176,9 +177,10 @@ def _combined(basis: Float32[np.ndarray, "b n w"], coefficients: Float32[np.ndar
 
 
 def sigmoid(values: Float32[np.ndarray, "*s"]) -> Float32[np.ndarray, "*s"]:
-    """1 / (1 + exp(-x)), without overflow."""
-    small = np.exp(-np.abs(values))
-    return np.where(values >= 0, 1 / (1 + small), small / (1 + small)).astype(np.float32)
+    """1 / (1 + exp(-x)), by the very operation that training uses."""
+    out = np.empty(values.shape, np.float32)
+    _native.sigmoid(np.ascontiguousarray(values, np.float32), out)
+    return out
 
 
 def _softplus(values: np.ndarray) -> np.ndarray:

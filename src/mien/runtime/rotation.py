@@ -21,13 +21,10 @@ def matrix_from_axis_angle(axis_angle: Float[np.ndarray, "*b 3"]) -> Float[np.nd
     return np.eye(3) + sine * cross + cosine * (cross @ cross)
 
 
-def rigid_transform(
-    rotations: Float[np.ndarray, "*b 3 3"], translations: Float[np.ndarray, "*b 3"]
-) -> Float[np.ndarray, "*b 4 4"]:
-    """Homogeneous matrices that rotate, then translate."""
-    transforms = np.zeros((*rotations.shape[:-2], 4, 4), rotations.dtype)
-    transforms[..., :3, :3], transforms[..., :3, 3], transforms[..., 3, 3] = rotations, translations, 1
-    return transforms
+def compose_rigid(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """`first @ second`, added up in a fixed order: a matrix product's depends on the machine."""
+    columns = [first[:, axis, None] * second[axis] for axis in range(4)]
+    return ((columns[0] + columns[1]) + columns[2]) + columns[3]
 
 
 def axis_angle_from_matrix(matrices: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:

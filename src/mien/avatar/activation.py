@@ -1,0 +1,33 @@
+"""The sigmoid with the rounding of `mien.runtime`, so that pictures without torch are the same to the bit."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mien import _native
+
+
+def sigmoid(values: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
+    """1 / (1 + exp(-x)); differentiable, native for float32 on a CPU. NaN stays NaN."""
+    if values.dtype != torch.float32 or values.device.type != "cpu":
+        return values.sigmoid()
+    return _Sigmoid.apply(values)  # pyright: ignore[reportReturnType]
+
+
+class _Sigmoid(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        values = values.detach().contiguous()
+        out = torch.empty_like(values)
+        _native.sigmoid(values, out)
+        ctx.save_for_backward(out)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (out,) = ctx.saved_tensors
+        return gradient * out * (1 - out)
