@@ -16,7 +16,7 @@ from mien.avatar.mono_gaussian_avatar import (
     unskin,
 )
 from mien.avatar.mono_networks import LENGTH_UNIT, AttributeChangeNet, AttributeNet, DeformationNet
-from mien.face import FaceModel
+from mien.face import FaceModel, head_poses
 from mien.gaussians import rgb_from_sh
 from mien.render.rendering import Rendering
 from toy_scene import toy_face, toy_face_model
@@ -97,7 +97,7 @@ def test_vertices_with_their_own_directions_move_as_the_mesh_does() -> None:
     gaussians = avatar.pose(face).gaussians
     torch.testing.assert_close(gaussians.means, avatar.face_model.head_vertices(face), atol=1e-6, rtol=0)
     assert gaussians.T_world_local is not None
-    assert torch.equal(gaussians.T_world_local, face.T_world_head)
+    assert torch.equal(gaussians.T_world_local, head_poses(face))
 
 
 def test_vertices_with_their_own_directions_cost_nothing() -> None:
