@@ -30,8 +30,12 @@ class AlignSurface {
  public:
   AlignSurface(Faces faces, Array<const float, nb::shape<-1, 3, 2>> uv, Array<const uint8_t, nb::ndim<1>> used,
                Picture albedo, Plane trust, float sigma, float outlier, float least_cosine)
-      : faces_(std::move(faces)), uv_(std::move(uv)), used_(std::move(used)), albedo_(std::move(albedo)),
-        trust_(std::move(trust)), options_{sigma, outlier, least_cosine} {
+      : faces_(std::move(faces)),
+        uv_(std::move(uv)),
+        used_(std::move(used)),
+        albedo_(std::move(albedo)),
+        trust_(std::move(trust)),
+        options_{sigma, outlier, least_cosine} {
     if (uv_.shape(0) != faces_.shape(0) || used_.shape(0) != faces_.shape(0)) {
       throw nb::value_error("uv and used must have a row a face");
     }
@@ -53,7 +57,11 @@ class AlignSurface {
   }
 
   mien::TexturedSurface surface() const {
-    return {uv_.data(), used_.data(), albedo_.data(), trust_.data(), static_cast<int>(albedo_.shape(1)),
+    return {uv_.data(),
+            used_.data(),
+            albedo_.data(),
+            trust_.data(),
+            static_cast<int>(albedo_.shape(1)),
             static_cast<int>(albedo_.shape(0))};
   }
 
@@ -76,7 +84,10 @@ mien::AlignFrame frame_of(const Points& vertices, const Points& normals, const M
     throw nb::value_error("image and mask must be of one picture");
   }
   return {{K.data(), viewmat.data(), static_cast<int>(image.shape(1)), static_cast<int>(image.shape(0))},
-          normals.data(), image.data(), mask.data(), light.data()};
+          normals.data(),
+          image.data(),
+          mask.data(),
+          light.data()};
 }
 
 std::pair<double, double> align_mesh(const AlignSurface& surface, const Points& vertices, const Points& normals,
@@ -104,8 +115,8 @@ std::pair<double, double> align_mesh(const AlignSurface& surface, const Points& 
                                residual ? residual->data() : nullptr, smooth ? smooth->data() : nullptr};
   const nb::gil_scoped_release release;
   const mien::AlignResult result =
-      mien::align_mesh(mesh, surface.surface(), frame, surface.options(), {high_pass}, derive ? jacobian->data() : nullptr,
-                       derive ? static_cast<int>(jacobian->shape(2)) : 0, out);
+      mien::align_mesh(mesh, surface.surface(), frame, surface.options(), {high_pass},
+                       derive ? jacobian->data() : nullptr, derive ? static_cast<int>(jacobian->shape(2)) : 0, out);
   return {result.cost, result.weight};
 }
 
@@ -149,8 +160,8 @@ void bind_mesh_align(nb::module_& module) {
            "trust"_a.noconvert(), "sigma"_a, "outlier"_a, "least_cosine"_a);
   module.def("align_mesh", &align_mesh, "surface"_a, "vertices"_a.noconvert(), "normals"_a.noconvert(),
              "K"_a.noconvert(), "viewmat"_a.noconvert(), "image"_a.noconvert(), "mask"_a.noconvert(),
-             "light"_a.noconvert(), "high_pass"_a, "jacobian"_a.none(), "hessian"_a.none(), "gradient"_a.none(), "residual"_a.none(),
-             "smooth"_a.none());
+             "light"_a.noconvert(), "high_pass"_a, "jacobian"_a.none(), "hessian"_a.none(), "gradient"_a.none(),
+             "residual"_a.none(), "smooth"_a.none());
   module.def("bake_texture", &bake_texture, "surface"_a, "vertices"_a.noconvert(), "normals"_a.noconvert(),
              "K"_a.noconvert(), "viewmat"_a.noconvert(), "image"_a.noconvert(), "mask"_a.noconvert(),
              "light"_a.noconvert(), "texel_face"_a.noconvert(), "texel_barycentric"_a.noconvert(),

@@ -94,8 +94,8 @@ void interpolate_backward(const FaceIndex& face_index, const Image& barycentric,
   check_range<int64_t>(corners, static_cast<int64_t>(attributes.shape(0)), "a face names a vertex that does not exist");
   check_range<int64_t>(face_index, static_cast<int64_t>(corners.shape(0)),
                        "the fragments name a triangle that does not exist", -1);
-  const mien::Fragments fragments{face_index.data(), barycentric.data(), nullptr,
-                                  static_cast<int>(face_index.shape(1)), static_cast<int>(face_index.shape(0))};
+  const mien::Fragments fragments{face_index.data(), barycentric.data(), nullptr, static_cast<int>(face_index.shape(1)),
+                                  static_cast<int>(face_index.shape(0))};
   mien::interpolate_backward(fragments, attributes.data(), corners.data(), channels, grad_out.data(), by_attributes,
                              by_barycentric);
 }
@@ -116,8 +116,8 @@ void sample_texture(const Image& texture, const Array<const float, nb::shape<-1,
   mien::sample_texture(view, uv.data(), static_cast<int64_t>(uv.shape(0)), out.data());
 }
 
-void sample_texture_backward(const Image& texture, const Array<const float, nb::shape<-1, 2>>& uv,
-                             const Rows& grad_out, const Grad<float>& grad_texture, const Grad<float>& grad_uv) {
+void sample_texture_backward(const Image& texture, const Array<const float, nb::shape<-1, 2>>& uv, const Rows& grad_out,
+                             const Grad<float>& grad_texture, const Grad<float>& grad_uv) {
   const mien::TextureView view = texture_of(texture);
   if (grad_out.shape(0) != uv.shape(0) || grad_out.shape(1) != texture.shape(2)) {
     throw nb::value_error("grad_out must hold one colour a point");
@@ -166,10 +166,9 @@ std::pair<double, double> mesh_loss(
     const Pairs& edge_vertices, const Pairs& edge_faces, const Opposite& opposite, const Points& normals,
     const Array<const float, nb::shape<-1, 3, 2>>& uv, const Array<const float, nb::ndim<1>>& face_weights,
     const Array<const float, nb::shape<-1, -1, 3>>& texture, const Array<const float, nb::shape<9, 3>>& light,
-    const Array<const float, nb::shape<-1, -1, 3>>& target, const Gray& mask, float epsilon,
-    const Grad<float>& picture, const Array<double, nb::shape<-1, 3>>& grad_points,
-    const Array<float, nb::shape<-1, 3>>& grad_normals, const Array<float, nb::shape<-1, -1, 3>>& grad_texture,
-    const Array<double, nb::shape<9, 3>>& grad_light) {
+    const Array<const float, nb::shape<-1, -1, 3>>& target, const Gray& mask, float epsilon, const Grad<float>& picture,
+    const Array<double, nb::shape<-1, 3>>& grad_points, const Array<float, nb::shape<-1, 3>>& grad_normals,
+    const Array<float, nb::shape<-1, -1, 3>>& grad_texture, const Array<double, nb::shape<9, 3>>& grad_light) {
   if (normals.size() != points.size() || grad_points.size() != points.size() || grad_normals.size() != points.size() ||
       uv.shape(0) != faces.shape(0) || face_weights.shape(0) != faces.shape(0) ||
       target.size() != 3 * face_index.size() || mask.size() != face_index.size() ||
@@ -180,8 +179,8 @@ std::pair<double, double> mesh_loss(
   const nb::gil_scoped_release release;
   const mien::ImageMesh mesh = mesh_of(points, faces);
   const mien::MeshEdges edges = edges_of(edge_vertices, edge_faces, opposite, mesh);
-  const mien::TextureView view{texture.data(), static_cast<int>(texture.shape(1)),
-                               static_cast<int>(texture.shape(0)), 3};
+  const mien::TextureView view{texture.data(), static_cast<int>(texture.shape(1)), static_cast<int>(texture.shape(0)),
+                               3};
   const mien::LossValue value = mien::mesh_loss(
       fragments_of(face_index, barycentric, depth, mesh.face_count), mesh, edges,
       {normals.data(), uv.data(), face_weights.data(), view, light.data()}, {target.data(), mask.data(), epsilon},
@@ -196,8 +195,8 @@ void bind_mesh_gradients(nb::module_& module) {
              "depth"_a.noconvert(), "points"_a.noconvert(), "faces"_a.noconvert(), "grad_barycentric"_a.noconvert(),
              "grad_points"_a.noconvert());
   module.def("interpolate_mesh_backward", &interpolate_backward, "face_index"_a.noconvert(),
-             "barycentric"_a.noconvert(), "attributes"_a.noconvert(), "corners"_a.noconvert(),
-             "grad_out"_a.noconvert(), "grad_attributes"_a.noconvert().none(), "grad_barycentric"_a.noconvert().none());
+             "barycentric"_a.noconvert(), "attributes"_a.noconvert(), "corners"_a.noconvert(), "grad_out"_a.noconvert(),
+             "grad_attributes"_a.noconvert().none(), "grad_barycentric"_a.noconvert().none());
   module.def("sample_texture", &sample_texture, "texture"_a.noconvert(), "uv"_a.noconvert(), "out"_a.noconvert());
   module.def("sample_texture_backward", &sample_texture_backward, "texture"_a.noconvert(), "uv"_a.noconvert(),
              "grad_out"_a.noconvert(), "grad_texture"_a.noconvert().none(), "grad_uv"_a.noconvert().none());

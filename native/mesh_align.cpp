@@ -9,7 +9,7 @@
 namespace mien {
 namespace {
 
-constexpr int kBlocks = 6 * 3;   // corner pairs (0,0) (0,1) (0,2) (1,1) (1,2) (2,2), each a symmetric 2x2 block
+constexpr int kBlocks = 6 * 3;  // corner pairs (0,0) (0,1) (0,2) (1,1) (1,2) (2,2), each a symmetric 2x2 block
 constexpr int kSums = kBlocks + 6;
 
 struct Residual {
@@ -20,12 +20,10 @@ struct Residual {
 
 struct Workspace {
   std::vector<Residual> residuals;
-  int left, top, columns, rows;     // box of the residuals
+  int left, top, columns, rows;             // box of the residuals
   std::vector<float> smooth, rows_of_sums;  // [rows,columns,4] weighted colours and weights, then smoothed
-  std::vector<uint8_t> touched;     // [f]
-  int64_t cell_of(const Residual& one) const {
-    return static_cast<int64_t>(one.y - top) * columns + (one.x - left);
-  }
+  std::vector<uint8_t> touched;             // [f]
+  int64_t cell_of(const Residual& one) const { return static_cast<int64_t>(one.y - top) * columns + (one.x - left); }
   std::vector<float> sums;      // [f, kSums]
   std::vector<int32_t> hit;     // triangles with sums
   std::vector<int32_t> row_of;  // vertex -> row, -1
@@ -145,17 +143,16 @@ void collect_residuals(const Mesh& mesh, const TexturedSurface& surface, const A
   w.touched.resize(mesh.face_count, 0);
   int right = 0, bottom = 0;
   w.left = frame.view.width, w.top = frame.view.height;
-  for_pixels(mesh, surface, frame, options, drawn,
-             [&](int64_t pixel, int32_t face, const float*, const SurfacePoint&, const Sample& sample,
-                 const Color& light) {
-               const int x = static_cast<int>(pixel % frame.view.width), y = static_cast<int>(pixel / frame.view.width);
-               Residual one{x, y, face, frame.mask[pixel] * sample.weight, {}};
-               for (int c = 0; c < 3; ++c)
-                 one.color.c[c] = frame.image[3 * pixel + c] - sample.color.c[c] * light.c[c];
-               w.residuals.push_back(one);
-               w.left = std::min(w.left, x), w.top = std::min(w.top, y);
-               right = std::max(right, x + 1), bottom = std::max(bottom, y + 1);
-             });
+  for_pixels(
+      mesh, surface, frame, options, drawn,
+      [&](int64_t pixel, int32_t face, const float*, const SurfacePoint&, const Sample& sample, const Color& light) {
+        const int x = static_cast<int>(pixel % frame.view.width), y = static_cast<int>(pixel / frame.view.width);
+        Residual one{x, y, face, frame.mask[pixel] * sample.weight, {}};
+        for (int c = 0; c < 3; ++c) one.color.c[c] = frame.image[3 * pixel + c] - sample.color.c[c] * light.c[c];
+        w.residuals.push_back(one);
+        w.left = std::min(w.left, x), w.top = std::min(w.top, y);
+        right = std::max(right, x + 1), bottom = std::max(bottom, y + 1);
+      });
   w.columns = std::max(right - w.left, 0), w.rows = std::max(bottom - w.top, 0);
 }
 

@@ -72,7 +72,7 @@ struct SurfacePoint {
 };
 
 inline SurfacePoint surface_point(const Mesh& mesh, const AlignFrame& frame, const float* eye, const int64_t* corners,
-                           const float* weights) {
+                                  const float* weights) {
   SurfacePoint out{};
   for (int k = 0; k < 3; ++k) {
     for (int axis = 0; axis < 3; ++axis) {
@@ -105,8 +105,7 @@ inline void draw(const Mesh& mesh, const MeshView& view, DrawnMesh& drawn) {
   drawn.face_index.resize(pixels);
   drawn.barycentric.resize(3 * pixels);
   drawn.depth.resize(pixels);
-  rasterize_mesh(mesh, view, false,
-                 {drawn.face_index.data(), drawn.barycentric.data(), drawn.depth.data()});
+  rasterize_mesh(mesh, view, false, {drawn.face_index.data(), drawn.barycentric.data(), drawn.depth.data()});
 }
 
 // Calls body(pixel, face, corners, barycentrics, point, texture sample, light) for every pixel that counts.
@@ -126,9 +125,8 @@ void for_pixels(const Mesh& mesh, const TexturedSurface& surface, const AlignFra
       const SurfacePoint point = surface_point(mesh, frame, eye, corners, weights);
       if (point.cosine < options.least_cosine) continue;
       const float* uv = surface.uv + 6 * static_cast<int64_t>(face);
-      const Sample sample =
-          sample_texture(surface, weights[0] * uv[0] + weights[1] * uv[2] + weights[2] * uv[4],
-                         weights[0] * uv[1] + weights[1] * uv[3] + weights[2] * uv[5]);
+      const Sample sample = sample_texture(surface, weights[0] * uv[0] + weights[1] * uv[2] + weights[2] * uv[4],
+                                           weights[0] * uv[1] + weights[1] * uv[3] + weights[2] * uv[5]);
       if (!(sample.weight > 0)) continue;
       body(pixel, face, weights, point, sample, shade(point.normal, frame.light));
     }

@@ -74,25 +74,25 @@ void light_equations(const Mesh& mesh, const TexturedSurface& surface, const Ali
   DrawnMesh& drawn = own_drawing();
   draw(mesh, frame.view, drawn);
   const float least = options.outlier * options.outlier, inverse_variance = 1 / (options.sigma * options.sigma);
-  for_pixels(mesh, surface, frame, options, drawn,
-             [&](int64_t pixel, int32_t, const float*, const SurfacePoint& point, const Sample& sample,
-                 const Color& light) {
-               float b[9], squared = 0;
-               basis(point.normal, b);
-               const float* seen = frame.image + 3 * pixel;
-               for (int c = 0; c < 3; ++c) {
-                 const float difference = seen[c] - sample.color.c[c] * light.c[c];
-                 squared += difference * difference * inverse_variance;
-               }
-               const float fade = least / (least + squared);
-               for (int c = 0; c < 3; ++c) {
-                 const float albedo = sample.color.c[c], weight = frame.mask[pixel] * sample.weight * fade * fade * albedo;
-                 for (int i = 0; i < 9; ++i) {
-                   right[9 * c + i] += weight * b[i] * seen[c];
-                   for (int j = i; j < 9; ++j) hessian[81 * c + 9 * i + j] += weight * albedo * b[i] * b[j];
-                 }
-               }
-             });
+  for_pixels(
+      mesh, surface, frame, options, drawn,
+      [&](int64_t pixel, int32_t, const float*, const SurfacePoint& point, const Sample& sample, const Color& light) {
+        float b[9], squared = 0;
+        basis(point.normal, b);
+        const float* seen = frame.image + 3 * pixel;
+        for (int c = 0; c < 3; ++c) {
+          const float difference = seen[c] - sample.color.c[c] * light.c[c];
+          squared += difference * difference * inverse_variance;
+        }
+        const float fade = least / (least + squared);
+        for (int c = 0; c < 3; ++c) {
+          const float albedo = sample.color.c[c], weight = frame.mask[pixel] * sample.weight * fade * fade * albedo;
+          for (int i = 0; i < 9; ++i) {
+            right[9 * c + i] += weight * b[i] * seen[c];
+            for (int j = i; j < 9; ++j) hessian[81 * c + 9 * i + j] += weight * albedo * b[i] * b[j];
+          }
+        }
+      });
 }
 
 }  // namespace mien

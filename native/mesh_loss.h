@@ -22,10 +22,10 @@ struct LossTarget {
 };
 
 struct LossGradients {  // each is added to
-  double* points;  // [v,3]
-  float* normals;  // [v,3]
-  float* texels;   // [th,tw,3]
-  double* light;   // [9,3]
+  double* points;       // [v,3]
+  float* normals;       // [v,3]
+  float* texels;        // [th,tw,3]
+  double* light;        // [9,3]
 };
 
 struct LossValue {

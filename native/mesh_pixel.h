@@ -14,7 +14,8 @@ namespace mien {
 // Gradients of barycentrics, summed over each triangle's pixels before they are chained to its corners.
 //
 // With corners a, b, c and the pixel q = (x, y, 1), u_a = (b x c) . q and so on are the weights before they are divided
-// by their sum, which is det(a, b, c) / depth. So all pixels of a triangle end in three sums of q (Olano and Greer 1997).
+// by their sum, which is det(a, b, c) / depth. So all pixels of a triangle end in three sums of q (Olano and Greer
+// 1997).
 class FaceMoments {
  public:
   void reset(int64_t faces) { moments_.assign(9 * faces, 0.0); }
