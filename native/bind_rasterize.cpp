@@ -2,9 +2,11 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
 
 #include <optional>
 #include <string>
+#include <vector>
 
 #include "pool.h"
 #include "rasterize.h"
@@ -59,55 +61,139 @@ mien::View make_view(const In<4, 4>& viewmat, const In<3, 3>& K, int width, int 
   return view;
 }
 
-std::optional<RasterizeFrame> forward(const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1, 3>& scales,
-                                      const In<-1>& opacities, const In<-1, -1, 3>& sh, const In<3>& background,
-                                      const In<4, 4>& viewmat, const In<3, 3>& K, const Out<-1, -1, 3>& image,
-                                      const Out<-1, -1>& alpha, const Array<int32_t, nb::shape<-1>>& radii) {
-  const auto gaussians = gaussian_arrays(means, quats, scales, opacities, sh);
-  require(alpha.shape(0) == image.shape(0) && alpha.shape(1) == image.shape(1), "alpha must be as large as image");
-  require(static_cast<int64_t>(radii.shape(0)) == gaussians.count, "radii must have one entry a Gaussian");
-  const auto view =
-      make_view(viewmat, K, static_cast<int>(image.shape(1)), static_cast<int>(image.shape(0)), background.data());
-  const nb::gil_scoped_release release;
-  auto frame = mien::rasterize_forward(gaussians, view, {image.data(), alpha.data(), radii.data()});
-  if (!frame) return std::nullopt;
-  return RasterizeFrame{std::move(frame), view, gaussians.count};
+template <typename T>
+T item(const nb::tuple& task, size_t index) {
+  return nb::cast<T>(task[index]);
 }
 
-void backward(RasterizeFrame& frame, const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1, 3>& scales,
-              const In<-1>& opacities, const In<-1, -1, 3>& sh, const In<-1, -1, 3>& image, const In<-1, -1>& alpha,
-              const In<-1, -1, 3>& grad_image, const std::optional<In<-1, -1>>& grad_alpha,
-              const Out<-1, 3>& grad_means, const Out<-1, 4>& grad_quats, const Out<-1, 3>& grad_scales,
-              const Out<-1>& grad_opacities, const Out<-1, -1, 3>& grad_sh, const Out<-1, 2>& grad_means2d,
-              const Out<mien::kViewGradients>& grad_view) {
-  const auto gaussians = gaussian_arrays(means, quats, scales, opacities, sh);
-  const size_t n = means.shape(0), pixels = static_cast<size_t>(frame.view.width) * frame.view.height;
-  require(gaussians.count == frame.count, "these are not the Gaussians of the forward pass");
-  require(image.size() == 3 * pixels && grad_image.size() == 3 * pixels && alpha.size() == pixels &&
-              (!grad_alpha || grad_alpha->size() == pixels),
-          "these are not the pictures of the forward pass");
-  require(grad_means.shape(0) == n && grad_quats.shape(0) == n && grad_scales.shape(0) == n &&
-              grad_opacities.shape(0) == n && grad_sh.size() == sh.size() && grad_means2d.shape(0) == n,
-          "a gradient must have the shape of its array");
-  const mien::PictureGradient picture{image.data(), alpha.data(), grad_image.data(),
-                                      grad_alpha ? grad_alpha->data() : nullptr};
-  const mien::GaussianGradients gradients{grad_means.data(),     grad_quats.data(), grad_scales.data(),
-                                          grad_opacities.data(), grad_sh.data(),    grad_means2d.data()};
+// One view's arrays, in the order of the tuple.
+struct ForwardTask {
+  In<-1, 3> means;
+  In<-1, 4> quats;
+  In<-1, 3> scales;
+  In<-1> opacities;
+  In<-1, -1, 3> sh;
+  In<3> background;
+  In<4, 4> viewmat;
+  In<3, 3> K;
+  Out<-1, -1, 3> image;
+  Out<-1, -1> alpha;
+  Array<int32_t, nb::shape<-1>> radii;
+
+  explicit ForwardTask(const nb::tuple& t)
+      : means(item<In<-1, 3>>(t, 0)),
+        quats(item<In<-1, 4>>(t, 1)),
+        scales(item<In<-1, 3>>(t, 2)),
+        opacities(item<In<-1>>(t, 3)),
+        sh(item<In<-1, -1, 3>>(t, 4)),
+        background(item<In<3>>(t, 5)),
+        viewmat(item<In<4, 4>>(t, 6)),
+        K(item<In<3, 3>>(t, 7)),
+        image(item<Out<-1, -1, 3>>(t, 8)),
+        alpha(item<Out<-1, -1>>(t, 9)),
+        radii(item<Array<int32_t, nb::shape<-1>>>(t, 10)) {
+    require(alpha.shape(0) == image.shape(0) && alpha.shape(1) == image.shape(1), "alpha must be as large as image");
+    require(radii.shape(0) == means.shape(0), "radii must have one entry a Gaussian");
+  }
+  mien::GaussianArrays gaussians() const { return gaussian_arrays(means, quats, scales, opacities, sh); }
+  mien::View view() const {
+    return make_view(viewmat, K, static_cast<int>(image.shape(1)), static_cast<int>(image.shape(0)), background.data());
+  }
+};
+
+struct BackwardTask {
+  RasterizeFrame& frame;
+  In<-1, 3> means;
+  In<-1, 4> quats;
+  In<-1, 3> scales;
+  In<-1> opacities;
+  In<-1, -1, 3> sh;
+  In<-1, -1, 3> image;
+  In<-1, -1> alpha;
+  In<-1, -1, 3> grad_image;
+  std::optional<In<-1, -1>> grad_alpha;
+  Out<-1, 3> grad_means;
+  Out<-1, 4> grad_quats;
+  Out<-1, 3> grad_scales;
+  Out<-1> grad_opacities;
+  Out<-1, -1, 3> grad_sh;
+  Out<-1, 2> grad_means2d;
+  Out<mien::kViewGradients> grad_view;
+
+  explicit BackwardTask(const nb::tuple& t)
+      : frame(nb::cast<RasterizeFrame&>(t[0])),
+        means(item<In<-1, 3>>(t, 1)),
+        quats(item<In<-1, 4>>(t, 2)),
+        scales(item<In<-1, 3>>(t, 3)),
+        opacities(item<In<-1>>(t, 4)),
+        sh(item<In<-1, -1, 3>>(t, 5)),
+        image(item<In<-1, -1, 3>>(t, 6)),
+        alpha(item<In<-1, -1>>(t, 7)),
+        grad_image(item<In<-1, -1, 3>>(t, 8)),
+        grad_means(item<Out<-1, 3>>(t, 10)),
+        grad_quats(item<Out<-1, 4>>(t, 11)),
+        grad_scales(item<Out<-1, 3>>(t, 12)),
+        grad_opacities(item<Out<-1>>(t, 13)),
+        grad_sh(item<Out<-1, -1, 3>>(t, 14)),
+        grad_means2d(item<Out<-1, 2>>(t, 15)),
+        grad_view(item<Out<mien::kViewGradients>>(t, 16)) {
+    if (!t[9].is_none()) grad_alpha = item<In<-1, -1>>(t, 9);
+    const size_t n = means.shape(0), pixels = static_cast<size_t>(frame.view.width) * frame.view.height;
+    require(static_cast<int64_t>(n) == frame.count, "these are not the Gaussians of the forward pass");
+    require(image.size() == 3 * pixels && grad_image.size() == 3 * pixels && alpha.size() == pixels &&
+                (!grad_alpha || grad_alpha->size() == pixels),
+            "these are not the pictures of the forward pass");
+    require(grad_means.shape(0) == n && grad_quats.shape(0) == n && grad_scales.shape(0) == n &&
+                grad_opacities.shape(0) == n && grad_sh.size() == sh.size() && grad_means2d.shape(0) == n,
+            "a gradient must have the shape of its array");
+  }
+  void run() const {
+    const mien::PictureGradient picture{image.data(), alpha.data(), grad_image.data(),
+                                        grad_alpha ? grad_alpha->data() : nullptr};
+    const mien::GaussianGradients gradients{grad_means.data(),     grad_quats.data(), grad_scales.data(),
+                                            grad_opacities.data(), grad_sh.data(),    grad_means2d.data()};
+    mien::rasterize_backward(*frame.frame, gaussian_arrays(means, quats, scales, opacities, sh), frame.view, picture,
+                             gradients, grad_view.data());
+  }
+};
+
+// A single view gets all threads; of several, each gets one.
+std::vector<std::optional<RasterizeFrame>> forward(const std::vector<nb::tuple>& views) {
+  const std::vector<ForwardTask> tasks(views.begin(), views.end());
+  std::vector<mien::GaussianArrays> gaussians;
+  for (const ForwardTask& task : tasks) gaussians.push_back(task.gaussians());
+  std::vector<std::optional<RasterizeFrame>> frames(tasks.size());
   const nb::gil_scoped_release release;
-  mien::rasterize_backward(*frame.frame, gaussians, frame.view, picture, gradients, grad_view.data());
+  mien::parallel_for(static_cast<int64_t>(tasks.size()), [&](int64_t i) {
+    const ForwardTask& task = tasks[i];
+    const mien::View view = task.view();
+    auto frame = mien::rasterize_forward(gaussians[i], view, {task.image.data(), task.alpha.data(), task.radii.data()});
+    if (frame) frames[i] = RasterizeFrame{std::move(frame), view, gaussians[i].count};
+  });
+  return frames;
+}
+
+void backward(const std::vector<nb::tuple>& views) {
+  const std::vector<BackwardTask> tasks(views.begin(), views.end());
+  const nb::gil_scoped_release release;
+  mien::parallel_for(static_cast<int64_t>(tasks.size()), [&](int64_t i) { tasks[i].run(); });
 }
 
 }  // namespace
 
 void bind_rasterize(nb::module_& module) {
   nb::class_<RasterizeFrame>(module, "RasterizeFrame", "What a backward pass needs of its forward pass.");
-  module.def("rasterize_forward", &forward, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "background"_a,
-             "viewmat"_a, "K"_a, "image"_a, "alpha"_a, "radii"_a,
-             "Fills image, alpha and radii; None where an input is NaN or infinite.");
-  module.def("rasterize_backward", &backward, "frame"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
-             "image"_a, "alpha"_a, "grad_image"_a, "grad_alpha"_a.none(), "grad_means"_a, "grad_quats"_a,
-             "grad_scales"_a, "grad_opacities"_a, "grad_sh"_a, "grad_means2d"_a, "grad_view"_a,
-             "Fills the gradients; grad_view is that of the viewmat's rotation and translation, then fx, fy, cx, cy.");
+  module.def(
+      "rasterize_forward", [](nb::args view) { return std::move(forward({nb::tuple(view)})[0]); },
+      "One view of `rasterize_views`.");
+  module.def("rasterize_views", &forward, "views"_a,
+             "Fills image, alpha and radii of each view, given as (means, quats, scales, opacities, sh, background, "
+             "viewmat, K, image, alpha, radii); None for a view where an input is NaN or infinite.");
+  module.def("rasterize_views_backward", &backward, "views"_a,
+             "Fills the gradients of each view, given as (frame, means, quats, scales, opacities, sh, image, alpha, "
+             "grad_image, grad_alpha or None, grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, "
+             "grad_means2d, grad_view); grad_view is that of the viewmat's rotation and translation, then fx, fy, cx, "
+             "cy.");
   module.def("thread_count", &mien::thread_count, "The number of threads that native operations use.");
   module.def("set_thread_count", &mien::set_thread_count, "count"_a, "Replaces the threads; 0 for the default.");
   module.def("rasterize_isa", &mien::rasterize_isa, "The instruction set of the rasterizer's kernels.");

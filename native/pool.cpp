@@ -36,6 +36,9 @@ bool spin_until(Done&& done) {
   return done();
 }
 
+// Whether this thread runs a loop's body: loops within it are serial.
+thread_local bool t_in_loop = false;
+
 class Pool {
  public:
   explicit Pool(int threads) {
@@ -51,8 +54,9 @@ class Pool {
   int threads() const { return static_cast<int>(workers_.size()) + 1; }
 
   void run(int64_t count, detail::LoopBody body, void* context) {
-    const std::unique_lock<std::mutex> lock(busy_, std::try_to_lock);
-    if (!lock.owns_lock() || workers_.empty()) {
+    std::unique_lock<std::mutex> lock;
+    if (!t_in_loop && !workers_.empty()) lock = std::unique_lock(busy_, std::try_to_lock);
+    if (!lock.owns_lock()) {
       for (int64_t index = 0; index < count; ++index) body(context, index);
       return;
     }
@@ -62,7 +66,9 @@ class Pool {
     next_.store(0, std::memory_order_relaxed);
     state_.store(kOpen, std::memory_order_release);
     announce();
+    t_in_loop = true;
     work();
+    t_in_loop = false;
     // From here on no worker enters; wait for those inside.
     state_.fetch_and(~kOpen, std::memory_order_acq_rel);
     const auto left = [this] { return state_.load(std::memory_order_acquire) == 0; };
@@ -90,6 +96,7 @@ class Pool {
   }
 
   void serve() {
+    t_in_loop = true;
     uint32_t seen = 0;
     while (!stop_) {
       const auto announced = [this, seen] { return signal_.load(std::memory_order_acquire) != seen; };

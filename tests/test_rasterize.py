@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from mien import _native
-from mien.render import Rendering
 from rasterize_scenes import (
-    Scene,
-    comparable_pixels,
+    WeightedSum,
+    assert_matches_reference,
     gradients,
     leaves,
     random_scene,
@@ -28,34 +27,6 @@ def restore_native_settings() -> Iterator[None]:
     yield
     _native.set_rasterize_isa(before)
     _native.set_thread_count(0)
-
-
-class WeightedSum:
-    """A random linear loss on the pixels that can be compared."""
-
-    def __init__(self, comparable: Tensor, seed: int) -> None:
-        generator = torch.Generator().manual_seed(seed)
-        self.weights = comparable[..., None] * torch.randn(*comparable.shape, 4, generator=generator)
-
-    def __call__(self, rendering: Rendering) -> Tensor:
-        rgba = torch.cat([rendering.image, rendering.alpha[..., None]], -1)
-        return (self.weights.to(rgba) * rgba).sum()
-
-
-def assert_matches_reference(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Rounding alone gives about 2e-7 in the image and 2e-6 in the gradients.
-    exact = scene.to(torch.float64)
-    comparable = comparable_pixels(exact, monkeypatch)
-    assert comparable.float().mean() > 0.9
-    loss = WeightedSum(comparable, seed=0)
-    expected, expected_gradients = gradients(exact, "reference", loss)
-    found, found_gradients = gradients(scene, "native", loss)
-    assert relative_error(found.image[comparable], expected.image[comparable]) < 1e-5
-    assert relative_error(found.alpha[comparable], expected.alpha[comparable]) < 1e-5
-    assert torch.equal(found.radii > 0, expected.radii > 0)
-    assert (found.radii - expected.radii).abs().max() <= 1  # rounded up from 3 sigma
-    errors = {name: relative_error(found_gradients[name], value) for name, value in expected_gradients.items()}
-    assert max(errors.values()) < 1e-4, errors
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])

@@ -6,11 +6,17 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 import train_toy
+from mien import _native
+from mien.benchmarking.train_step import SETTINGS as BENCHMARK_SETTINGS
+from mien.benchmarking.train_step import training_case
 from mien.errors import UserError
+from mien.face import load_face_model
 from mien.training import read_curves, read_training_summary, train
 from mien.training.checkpoint import checkpoint_files
+from mien.training.trainer import step
 from toy_scene import toy_sequence
 
 STEPS = train_toy.SETTINGS.steps
@@ -86,6 +92,29 @@ def test_finished_run_is_loaded(undisturbed: Path, capsys: pytest.CaptureFixture
     summary = read_training_summary(undisturbed)
     assert summary["steps"] == STEPS
     assert set(summary) == {"steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"}
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    """Whole steps on a real face model, with enough Gaussians that every native loop is divided."""
+    results = []
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for threads in (1, 2, 3):
+            _native.set_thread_count(threads)
+            state, data = training_case(load_face_model(), 6000, 128, 160)
+            for _ in range(8):
+                step(state, data, BENCHMARK_SETTINGS)
+            store = state.avatar.gaussian_store()
+            tensors = {name: store[name].detach().clone() for name in store.names()}
+            tensors |= {f"{name}.second": moments.second for name, moments in store.moments.items()}
+            results.append(tensors | state.density.state() | state.track.state())
+    finally:
+        _native.set_thread_count(0)
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        for name, tensor in results[0].items():
+            assert torch.equal(tensor, other[name]), name
 
 
 def test_other_settings_are_refused(undisturbed: Path) -> None:

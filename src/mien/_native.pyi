@@ -1,6 +1,7 @@
 """What native/bind_*.cpp defines. Arrays are contiguous, on the CPU, float32 unless said otherwise."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -122,25 +123,8 @@ def rasterize_forward(
     alpha: Tensor,
     radii: Tensor,
 ) -> RasterizeFrame | None: ...
-def rasterize_backward(
-    frame: RasterizeFrame,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh: Tensor,
-    image: Tensor,
-    alpha: Tensor,
-    grad_image: Tensor,
-    grad_alpha: Tensor | None,
-    grad_means: Tensor,
-    grad_quats: Tensor,
-    grad_scales: Tensor,
-    grad_opacities: Tensor,
-    grad_sh: Tensor,
-    grad_means2d: Tensor,
-    grad_view: Tensor,
-) -> None: ...
+def rasterize_views(views: list[tuple[Any, ...]]) -> list[RasterizeFrame | None]: ...
+def rasterize_views_backward(views: list[tuple[Any, ...]]) -> None: ...
 def thread_count() -> int: ...
 def set_thread_count(count: int) -> None: ...
 def rasterize_isa() -> str: ...

@@ -89,7 +89,8 @@ def _sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
     time = torch.linspace(0, 2 * torch.pi, TIMESTEPS + 1)[:-1]
     neutral = face_model.neutral(TIMESTEPS)
     turn = torch.stack([0.1 * time.sin(), 0.2 * time.cos(), 0 * time], -1)
-    expression = neutral.expression + 0.3 * torch.rand(neutral.expression.shape[-1]) * time.sin()[:, None].abs()
+    strengths = 0.3 * torch.rand(neutral.expression.shape[-1], generator=torch.Generator().manual_seed(1))
+    expression = neutral.expression + strengths * time.sin()[:, None].abs()
     place = torch.tensor([0.0, 0.02, -0.6]).expand(TIMESTEPS, 3)
     face = FaceParams(neutral.identity, expression, neutral.joints, turn, place.contiguous())
     focal = 1.8 * min(width, height)

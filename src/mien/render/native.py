@@ -1,84 +1,106 @@
 """The CPU rasterizer: autograd around the C++ core (native/README.md has its algorithm)."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.utils.dlpack import to_dlpack
 
 from mien import _native
-from mien.camera import Camera
-from mien.gaussians import Gaussians
-from mien.render.rendering import Rendering
+from mien.render.rendering import Rendering, View
 from mien.render.validation import check_finite
+
+_INPUTS = 9
+"""Tensors a view: offset of the centres, means, quats, scales, opacities, sh, background, viewmat, K."""
 
 
 def render_native(
-    gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], means2d_offset: Float[Tensor, "n 2"]
-) -> Rendering:
-    """One view of unbatched float32 CPU Gaussians given in the camera's world.
+    views: Sequence[View], background: Float[Tensor, " 3"], means2d_offsets: Sequence[Float[Tensor, "n 2"]]
+) -> list[Rendering]:
+    """Views of unbatched float32 CPU Gaussians given in their camera's world; of several, each gets one thread.
 
-    Differentiable in the Gaussians, the background, `means2d_offset` (whose values are not read), `camera.viewmat`
+    Differentiable in the Gaussians, the background, `means2d_offsets` (whose values are not read), `camera.viewmat`
     and `camera.K`. The result does not depend on the number of threads.
     """
-    means = gaussians.means
-    if means.is_cuda or means.dtype != torch.float32:
-        raise ValueError(
-            f"rasterize: backend 'native' takes float32 CPU tensors, got {means.dtype} on {means.device}; "
-            "use backend='auto'"
-        )
-    parameters = (means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    inputs = (*parameters, background, camera.viewmat, camera.K)
-    size = (camera.height, camera.width)
+    inputs: list[Tensor] = []
+    for (gaussians, camera), offset in zip(views, means2d_offsets, strict=True):
+        means = gaussians.means
+        if means.is_cuda or means.dtype != torch.float32:
+            raise ValueError(
+                f"rasterize: backend 'native' takes float32 CPU tensors, got {means.dtype} on {means.device}; "
+                "use backend='auto'"
+            )
+        own = (means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+        inputs += (t.contiguous() for t in (offset, *own, background, camera.viewmat, camera.K))
+    sizes = [(camera.height, camera.width) for _, camera in views]
     try:
-        image, alpha, radii = _Rasterize.apply(size, means2d_offset, *(t.contiguous() for t in inputs))  # pyright: ignore[reportGeneralTypeIssues]
-    except _NotFiniteError:
-        check_finite(gaussians, camera, background)
+        outputs: tuple[Tensor, ...] = _Rasterize.apply(sizes, *inputs)  # pyright: ignore[reportAssignmentType]
+    except _NotFiniteError as error:
+        check_finite(*views[error.view], background)
         raise
-    return Rendering(image, alpha, radii, means2d_offset)
+    return [
+        Rendering(*outputs[3 * index : 3 * index + 3], means2d_offset=offset)
+        for index, offset in enumerate(means2d_offsets)
+    ]
 
 
 class _NotFiniteError(ValueError):
-    """A NaN or an infinity, not yet named."""
+    """A NaN or an infinity in one of the views, not yet named."""
+
+    def __init__(self, view: int):
+        super().__init__("rasterize: NaN or infinity in an input")
+        self.view = view
 
 
 class _Rasterize(torch.autograd.Function):
+    """`_INPUTS` tensors a view in; image, alpha and radii of each view out."""
+
     @staticmethod
-    def forward(ctx: Any, size: tuple[int, int], means2d_offset: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
-        means, quats, scales, opacities, sh, background, viewmat, K = (tensor.detach() for tensor in inputs)
-        image, alpha = means.new_empty(*size, 3), means.new_empty(size)
-        radii = torch.empty(len(means), dtype=torch.int32)
-        frame = _native.rasterize_forward(
-            means, quats, scales, opacities, sh, background, viewmat, K, image, alpha, radii
-        )  # fmt: skip
-        if frame is None:
-            raise _NotFiniteError("rasterize: NaN or infinity in an input")
-        ctx.frame = frame
+    def forward(ctx: Any, sizes: list[tuple[int, int]], *inputs: Tensor) -> tuple[Tensor, ...]:
+        outputs, tasks = [], []
+        for index, size in enumerate(sizes):
+            own = [tensor.detach() for tensor in inputs[_INPUTS * index + 1 : _INPUTS * (index + 1)]]
+            count = len(own[0])
+            view = (torch.empty(*size, 3), torch.empty(size), torch.empty(count, dtype=torch.int32))
+            tasks.append((*map(to_dlpack, own), *map(to_dlpack, view)))
+            outputs += view
+        ctx.frames = _native.rasterize_views(tasks)
+        if None in ctx.frames:
+            raise _NotFiniteError(ctx.frames.index(None))
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(radii)
-        ctx.save_for_backward(*inputs[:5], image, alpha)
-        return image, alpha, radii
+        ctx.mark_non_differentiable(*outputs[2::3])
+        ctx.save_for_backward(*inputs, *(output for output in outputs if output.is_floating_point()))
+        return tuple(outputs)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_image: Tensor | None, grad_alpha: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
-        means, quats, scales, opacities, sh, image, alpha = ctx.saved_tensors
-        grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
-        grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-        parameters = (means, quats, scales, opacities, sh)
-        grad_means, grad_quats, grad_scales, grad_opacities, grad_sh = (torch.empty_like(t) for t in parameters)
-        grad_means2d, grad_view = means.new_empty(len(means), 2), means.new_empty(16)
-        _native.rasterize_backward(
-            ctx.frame, means, quats, scales, opacities, sh, image, alpha, grad_image, grad_alpha,
-            grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, grad_means2d, grad_view,
-        )  # fmt: skip
-        needs_background, needs_viewmat, needs_K = ctx.needs_input_grad[7:]
-        grad_background = torch.einsum("hwc,hw->c", grad_image, 1 - alpha) if needs_background else None
-        grad_viewmat = _viewmat_gradient(grad_view) if needs_viewmat else None
-        grad_K = _intrinsics_gradient(grad_view) if needs_K else None
-        grad_parameters = (grad_means, grad_quats, grad_scales, grad_opacities, grad_sh)
-        return (None, grad_means2d, *grad_parameters, grad_background, grad_viewmat, grad_K)
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        saved = ctx.saved_tensors
+        inputs, pictures = saved[: _INPUTS * len(ctx.frames)], saved[_INPUTS * len(ctx.frames) :]
+        views, tasks = [], []
+        for index, frame in enumerate(ctx.frames):
+            own = [tensor.detach() for tensor in inputs[_INPUTS * index + 1 : _INPUTS * index + 6]]
+            image, alpha = pictures[2 * index : 2 * index + 2]
+            grad_image, grad_alpha, _ = gradients[3 * index : 3 * index + 3]
+            grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
+            grad_alpha = None if grad_alpha is None else to_dlpack(grad_alpha.contiguous())
+            found = [torch.empty_like(t) for t in own] + [torch.empty(len(own[0]), 2), torch.empty(16)]
+            known = (*own, image.detach(), alpha.detach(), grad_image)
+            tasks.append((frame, *map(to_dlpack, known), grad_alpha, *map(to_dlpack, found)))
+            views.append((grad_image, alpha, *found))
+        _native.rasterize_views_backward(tasks)
+        result: list[Tensor | None] = [None]
+        for index, (grad_image, alpha, *found) in enumerate(views):
+            *grad_parameters, grad_means2d, grad_view = found
+            needs_background, needs_viewmat, needs_K = ctx.needs_input_grad[1 + _INPUTS * index + 6 :][:3]
+            result += (grad_means2d, *grad_parameters)
+            result.append(torch.einsum("hwc,hw->c", grad_image, 1 - alpha) if needs_background else None)
+            result.append(_viewmat_gradient(grad_view) if needs_viewmat else None)
+            result.append(_intrinsics_gradient(grad_view) if needs_K else None)
+        return tuple(result)
 
 
 # The kernel's gradient of the view: rotation [9], translation [3], fx, fy, cx, cy.

@@ -9,22 +9,32 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.gaussians import Gaussians
+from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.gsplat_backend import render_gsplat
 from mien.render.native import render_native
 from mien.render.reference import render_reference
-from mien.render.rendering import Rendering
+from mien.render.rendering import Rendering, View
 from mien.render.validation import check_shapes
 from mien.rotation import compose_rigid
 
 Backend = Literal["auto", "native", "gsplat", "reference"]
 RenderView = Callable[[Gaussians, Camera, Tensor, Tensor], Rendering]
 """One view of unbatched Gaussians given in the camera's world, over a background, with offsets of the 2D centres."""
+RenderViews = Callable[[Sequence[View], Tensor, Sequence[Tensor]], list[Rendering]]
+"""Several of them over one background, each with its own offsets."""
 
-_BACKENDS: dict[str, RenderView] = {
+
+def _one_by_one(render_view: RenderView) -> RenderViews:
+    def render_views(views: Sequence[View], background: Tensor, offsets: Sequence[Tensor]) -> list[Rendering]:
+        return [render_view(*view, background, offset) for view, offset in zip(views, offsets, strict=True)]
+
+    return render_views
+
+
+_BACKENDS: dict[str, RenderViews] = {
     "native": render_native,
-    "gsplat": render_gsplat,
-    "reference": render_reference,
+    "gsplat": _one_by_one(render_gsplat),
+    "reference": _one_by_one(render_reference),
 }
 
 
@@ -33,6 +43,7 @@ def rasterize(
     camera: Camera | Sequence[Camera],
     background: Float[Tensor, " 3"] | None = None,
     backend: Backend = "auto",
+    depth: bool = False,
 ) -> Rendering:
     """The picture of `gaussians` seen by `camera` over `background` (RGB; black by default).
 
@@ -42,6 +53,7 @@ def rasterize(
 
     Differentiable in the Gaussians (with `T_world_local`), the background and `camera.viewmat`. The rendering's
     `means2d_offset` is a leaf whose `.grad` is the gradient with respect to the projected centres, in pixels.
+    With `depth` the rendering also has a depth picture, which takes a second pass.
 
     `auto` is `native` for float32 on a CPU, `gsplat` on a GPU, and otherwise (float64) the slow `reference`.
 
@@ -51,26 +63,40 @@ def rasterize(
     if background is None:
         background = gaussians.means.new_zeros(3)
     check_shapes(gaussians, background)
-    render_view = _BACKENDS.get(choose_backend(gaussians.means) if backend == "auto" else backend)
-    if render_view is None:
+    render_views = _BACKENDS.get(choose_backend(gaussians.means) if backend == "auto" else backend)
+    if render_views is None:
         raise ValueError(f"rasterize: unknown backend {backend!r}, expected auto, {', '.join(_BACKENDS)}")
-    views = _views(gaussians, camera)
-    shape = (len(gaussians), 2) if views is None else (len(views), len(gaussians), 2)
+    batch = _views(gaussians, camera)
+    shape = (len(gaussians), 2) if batch is None else (len(batch), len(gaussians), 2)
     offset = gaussians.means.new_zeros(shape).requires_grad_(torch.is_grad_enabled())
-    if views is None:
+    if batch is None:
         assert isinstance(camera, Camera)
-        rendering = render_view(*_in_local_frame(gaussians, camera), background, offset)
-        return replace(rendering, means2d_offset=offset)
-    pictures = [
-        render_view(*_in_local_frame(*view), background, view_offset)
-        for view, view_offset in zip(views, offset.unbind(), strict=True)
-    ]
+        view = _in_local_frame(gaussians, camera)
+        picture = render_views([view], background, [offset])[0]
+        return replace(picture, depth=_depths([view], [picture], render_views)[0]) if depth else picture
+    views = [_in_local_frame(*view) for view in batch]
+    pictures = render_views(views, background, offset.unbind())
     return Rendering(
         torch.stack([picture.image for picture in pictures]),
         torch.stack([picture.alpha for picture in pictures]),
         torch.stack([picture.radii for picture in pictures]),
         offset,
+        torch.stack(_depths(views, pictures, render_views)) if depth else None,
     )
+
+
+def _depths(views: Sequence[View], pictures: Sequence[Rendering], render_views: RenderViews) -> list[Tensor]:
+    """The expected depth of each view: depths blended as if they were colours, over the same weights' sum."""
+    coloured = []
+    for gaussians, camera in views:
+        depths = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        coloured.append((replace(gaussians, sh=sh_from_rgb(depths[:, None, None].expand(-1, 1, 3))), camera))
+    black, offsets = views[0][0].means.new_zeros(3), [torch.zeros_like(picture.means2d_offset) for picture in pictures]
+    blended = [picture.image[..., 0] for picture in render_views(coloured, black, offsets)]
+    return [
+        torch.where(picture.alpha > 0, sums / picture.alpha.clamp_min(1e-6), 0)
+        for sums, picture in zip(blended, pictures, strict=True)
+    ]
 
 
 def choose_backend(like: Tensor) -> Literal["native", "gsplat", "reference"]:

@@ -5,6 +5,12 @@ from dataclasses import dataclass
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mien.camera import Camera
+from mien.gaussians import Gaussians
+
+View = tuple[Gaussians, Camera]
+"""Unbatched Gaussians, given in the world of the camera that looks at them."""
+
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
@@ -19,3 +25,5 @@ class Rendering:
     means2d_offset: Float[Tensor, "*b n 2"]
     """Zeros added to the projected centres: after `backward()` its `.grad` is the loss's gradient with respect to
     the centres in pixels, which density control reads."""
+    depth: Float[Tensor, "*b h w"] | None = None
+    """Only if asked for: the expected depth along the camera's z axis in metres, 0 where nothing is. Differentiable."""

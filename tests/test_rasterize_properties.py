@@ -1,0 +1,181 @@
+"""The native rasterizer against the float64 reference on scenes that nobody chose: sizes, counts, shapes, oddities."""
+
+import pytest
+import torch
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from mien import _native
+from mien.gaussians import Gaussians
+from mien.render import rasterize
+from rasterize_scenes import Scene, assert_matches_reference, gradients, random_scene, relative_error
+
+ODDITIES = (
+    "zero quaternion",
+    "short quaternion",
+    "no extent",
+    "needle",
+    "disc",
+    "huge",
+    "transparent",
+    "opaque",
+    "behind the camera",
+    "on the camera",
+    "far outside",
+    "far away",
+)
+
+
+def make_odd(scene: Scene, oddities: list[str]) -> None:
+    """Give Gaussian i the oddity i, in place; those after them stay as they are."""
+    gaussians = scene.gaussians
+    pose, viewmat = gaussians.T_world_local, scene.camera.viewmat
+    assert pose is not None
+    T_local_camera = torch.linalg.inv(viewmat.double() @ pose.double()).float()
+    camera, ahead = T_local_camera[:3, 3], T_local_camera[:3, 2]
+    for index, oddity in zip(range(len(gaussians)), oddities, strict=False):
+        mean, quat, scale = gaussians.means[index], gaussians.quats[index], gaussians.scales[index]
+        match oddity:
+            case "zero quaternion":
+                quat.zero_()
+            case "short quaternion":
+                quat.mul_(0.01)
+            case "no extent":
+                scale.zero_()
+            case "needle":
+                scale.copy_(torch.tensor([0.3, 1e-5, 1e-5]))
+            case "disc":
+                scale.copy_(torch.tensor([0.2, 0.2, 0.0]))
+            case "huge":
+                scale.mul_(100)
+                gaussians.opacities[index] *= 0.3
+            case "transparent":
+                gaussians.opacities[index] = 0
+            case "opaque":
+                gaussians.opacities[index] = 1
+            case "behind the camera":
+                mean.copy_(camera - 0.5 * ahead)
+            case "on the camera":
+                mean.copy_(camera)
+            case "far outside":
+                mean.copy_(camera + 0.3 * ahead + 50 * T_local_camera[:3, 0])
+            case "far away":
+                mean.copy_(camera + 1e4 * ahead)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    seed=st.integers(0, 2**20),
+    count=st.one_of(st.integers(0, 3), st.integers(4, 120)),
+    coefficients=st.sampled_from([1, 4, 9, 16]),
+    size=st.tuples(st.integers(1, 70), st.integers(1, 70)),
+    oddities=st.lists(st.sampled_from(ODDITIES), max_size=6),
+)
+@example(seed=1, count=0, coefficients=1, size=(20, 10), oddities=[])
+@example(seed=2, count=1, coefficients=16, size=(1, 1), oddities=[])
+@example(seed=3, count=60, coefficients=4, size=(33, 31), oddities=list(ODDITIES))
+@example(seed=4, count=1, coefficients=9, size=(30, 30), oddities=["on the camera"])
+def test_any_scene_matches_the_reference(
+    seed: int,
+    count: int,
+    coefficients: int,
+    size: tuple[int, int],
+    oddities: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = random_scene(seed, count, coefficients, *size)
+    make_odd(scene, oddities)
+    assert_matches_reference(scene, monkeypatch)
+
+
+@pytest.mark.parametrize(("width", "height"), [(5000, 3), (3, 5000)])
+def test_long_and_thin_pictures(width: int, height: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = random_scene(11, 60, 4, width, height)
+    scene.gaussians.means.mul_(torch.tensor([2.0, 2.0, 1.0]))  # along the whole picture
+    scene.camera.K[0, 0] = scene.camera.K[1, 1] = 0.3 * max(width, height)
+    assert_matches_reference(scene, monkeypatch)
+
+
+@pytest.mark.parametrize("coefficients", [4, 9, 16])
+def test_view_directions_carry_gradients(coefficients: int) -> None:
+    """A small opaque ball in the middle of one pixel: moving it sideways changes its colour through its direction."""
+    scene = random_scene(coefficients, 1, coefficients, 9, 9)
+    gaussians = scene.gaussians
+    pose = gaussians.T_world_local
+    assert pose is not None
+    T_local_camera = torch.linalg.inv(scene.camera.viewmat @ pose)
+    gaussians.means.copy_(T_local_camera[:3, 3] + 0.5 * T_local_camera[:3, 2])
+    gaussians.scales.fill_(5.0)  # the picture is flat: what is left of the gradient is the colour's
+    gaussians.opacities.fill_(0.9)
+    _, expected = gradients(scene.to(torch.float64), "reference", lambda r: r.image[4, 4].sum())
+    _, found = gradients(scene, "native", lambda r: r.image[4, 4].sum())
+    assert expected["means"].norm() > 1e-2
+    for name in ("means", "viewmat", "T_world_local", "sh"):
+        assert relative_error(found[name], expected[name]) < 1e-4, name
+
+
+def test_depth_is_the_expected_depth() -> None:
+    scene = random_scene(3, 80)
+    exact = scene.to(torch.float64)
+    found = rasterize(scene.gaussians, scene.camera, depth=True)
+    expected = rasterize(exact.gaussians, exact.camera, backend="reference", depth=True)
+    assert found.depth is not None
+    assert expected.depth is not None
+    seen = found.alpha > 0.05
+    assert (found.depth[seen] - expected.depth[seen]).abs().median() < 1e-5
+    assert (found.depth[found.alpha == 0] == 0).all()
+    assert rasterize(scene.gaussians, scene.camera).depth is None
+
+
+def test_depth_of_one_ball_and_its_gradient() -> None:
+    means = torch.tensor([[0.0, 0.0, 1.25]], requires_grad=True)
+    camera = random_scene(0, width=11, height=11).camera
+    camera.viewmat.copy_(torch.eye(4))
+    camera.K.copy_(torch.tensor([[60.0, 0, 5.5], [0, 60, 5.5], [0, 0, 1]]))
+    ball = Gaussians(means, torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.05), torch.tensor([0.7]),
+                     torch.zeros(1, 1, 3))  # fmt: skip
+    depth = rasterize(ball, [camera, camera], depth=True).depth
+    assert depth is not None
+    assert depth.shape == (2, 11, 11)
+    assert depth[0, 5, 5].item() == pytest.approx(1.25, abs=1e-5)
+    depth[1, 5, 5].backward()
+    assert means.grad is not None
+    torch.testing.assert_close(means.grad, torch.tensor([[0.0, 0.0, 1.0]]), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_views_of_one_call_equal_single_calls_to_the_bit(threads: int) -> None:
+    """Of several views each is drawn by one thread; gradients of what they share add up in their order."""
+    scenes = [random_scene(seed, 300, 4, 90, 70) for seed in range(5)]
+    cameras = [scene.camera for scene in scenes]
+    shared = scenes[0].gaussians
+    _native.set_thread_count(threads)
+    try:
+        means = shared.means.clone().requires_grad_()
+        moved = Gaussians(means, shared.quats, shared.scales, shared.opacities, shared.sh, shared.T_world_local)
+        batch = rasterize(moved, cameras)
+        (batch.image**2).sum().backward()
+        found = means.grad
+        _native.set_thread_count(1)
+        total = torch.zeros_like(means)
+        for index in reversed(range(5)):  # autograd's order
+            own = shared.means.clone().requires_grad_()
+            alone = Gaussians(own, shared.quats, shared.scales, shared.opacities, shared.sh, shared.T_world_local)
+            single = rasterize(alone, cameras[index])
+            (single.image**2).sum().backward()
+            assert torch.equal(batch.image[index], single.image)
+            assert torch.equal(batch.radii[index], single.radii)
+            assert own.grad is not None
+            total += own.grad
+        assert found is not None
+        assert relative_error(found, total) < 1e-6
+    finally:
+        _native.set_thread_count(0)
+
+
+def test_a_view_that_is_not_finite_is_named_among_others() -> None:
+    scenes = [random_scene(seed, 20) for seed in range(3)]
+    cameras = [scene.camera for scene in scenes]
+    cameras[1].viewmat[0, 3] = torch.nan
+    with pytest.raises(ValueError, match=r"camera.viewmat\[0, \d\] is nan"):
+        rasterize(scenes[0].gaussians, cameras)
