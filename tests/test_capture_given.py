@@ -8,7 +8,6 @@ from capture_helpers import face_picture, write_gradient_video
 from mien.capture import CaptureSettings, capture_video_parts
 from mien.capture.given import read_landmarks
 from mien.capture.plate import plate_matte
-from mien.capture.quality import measure_face, relative_quality
 from mien.capture.video import write_video
 from mien.errors import UserError
 from mien.storage import write_arrays
@@ -58,13 +57,30 @@ def test_given_landmarks_and_mattes_are_taken_as_they_are(test_data, tmp_path):
     assert not (tmp_path / "other").exists()
 
 
-def test_blur_stands_out(test_data):
-    face = face_picture(test_data)
-    blurred = cv2.blur(face, (19, 9))
-    points = np.array([[40.0, 30.0], [120.0, 130.0]])
-    measured = np.array([measure_face(picture, points) for picture in [face] * 5 + [blurred]])
-    assert relative_quality(measured).blurred[:, 0].tolist() == [False] * 5 + [True]
-    assert measure_face((face * 0.2).astype(np.uint8), points)[1] < 0.18
+def test_mattes_may_be_a_video(test_data, tmp_path):
+    """As any matting program writes: H.264, so near the values; cropped and shrunk as the pictures are."""
+    clip, mattes = tmp_path / "clip.mp4", tmp_path / "mattes.mp4"
+    write_video(clip, iter([face_picture(test_data, 160, 80)] * 5), 25.0)
+    column = np.arange(320)
+    ramps = [np.clip((column - 100 - 10 * index) * 4, 0, 255) for index in range(5)]
+    write_video(
+        mattes, iter([np.tile(ramp[None, :, None], (320, 1, 3)).astype(np.uint8) for ramp in ramps]), 25.0, crf=4
+    )
+    settings = CaptureSettings(size=120, stride=2, mattes=mattes)
+    (capture,) = capture_video_parts(clip, tmp_path / "sequences", settings)
+    crop = capture.source["crop"]
+    assert crop["width"] > 120
+    assert capture.timesteps == 3
+    middles = crop["left"] + (np.arange(120) + 0.5) * crop["width"] / 120 - 0.5
+    for index in range(3):
+        expected = np.interp(middles, column, ramps[2 * index])
+        assert np.abs(capture.mattes[index, 0].mean(axis=0) - expected).max() < 8
+    write_video(mattes, iter([np.zeros((160, 160, 3), np.uint8)] * 5), 25.0)
+    with pytest.raises(UserError, match=r"mattes.mp4: is 160x160, the source's pictures are 320x320"):
+        capture_video_parts(clip, tmp_path / "other", settings)
+    write_video(mattes, iter([np.zeros((320, 320, 3), np.uint8)] * 4), 25.0)
+    with pytest.raises(UserError, match=r"has 4 mattes, .* has 5 frames"):
+        capture_video_parts(clip, tmp_path / "other", settings)
 
 
 def test_places_are_respected(test_data, tmp_path, capsys):

@@ -25,7 +25,7 @@ from mien.errors import UserError
 from mien.progress import say
 from mien.storage import cannot_write, file_digest, read_json, write_json
 
-_RECIPE = 3
+_RECIPE = 4
 """Raised whenever the same video would give another capture, so that old ones are not taken for current."""
 _STATE, _CHUNKS = "state.json", "chunks"
 

@@ -18,7 +18,7 @@ from mien.capture.frame_files import FRAMES, MATTES, FrameLayout, FrameWriter
 from mien.capture.given import GivenMattes
 from mien.capture.matting import MakeMatte, choose_matting
 from mien.capture.people import Person
-from mien.capture.quality import measure_face
+from mien.capture.quality import MEASURES, measure_face
 from mien.capture.source import FrameSource, SourceFrame
 from mien.capture.survey import Survey
 from mien.errors import UserError
@@ -37,7 +37,7 @@ class Chunk:
 
     landmarks: Float[np.ndarray, "t l 2"]
     """Pixels of the cropped frames; NaN where there is no face."""
-    quality: Float[np.ndarray, "t 3"]
+    quality: Float[np.ndarray, "t m"]
     """What `measure_face` gave; NaN where there is no face."""
     frame_digests: UInt64[np.ndarray, "t 1"]
     matte_digests: UInt64[np.ndarray, "t 1"]
@@ -119,7 +119,7 @@ class PartProcessor:
         """The next `count` frames, the first of which is the part's timestep `start`."""
         part = self._part
         landmarks = np.full((count, LANDMARKS, 2), np.nan, np.float32)
-        quality = np.full((count, 3), np.nan, np.float32)
+        quality = np.full((count, MEASURES), np.nan, np.float32)
         done = 0
         with ExitStack() as stack:
             follower = None

@@ -9,10 +9,15 @@ from jaxtyping import Bool, Float, UInt8
 
 from mien.progress import say
 
-_SIDE = 128
+_SIDE = 192
 """Pixels to which the face is brought, so that its distance hardly counts."""
-_BLURRED = 0.5
-"""Frames of less than this part of the clip's usual sharpness count as blurred."""
+_BLURRED = 0.65
+"""Frames of less than this part of the clip's usual sharpness count as blurred: such as a motion by 4 % of the face's
+width gives, or by 5 pixels in a face of 130. Turned heads and closed eyes stay above it (docs/log.md)."""
+_DIRECTIONS = 4
+"""Detail is measured across, down and along both diagonals: motion takes it away in its own direction only."""
+MEASURES = _DIRECTIONS + 2
+"""Numbers that `measure_face` gives."""
 _WHITE_LEVEL = 250
 """A channel from this level on (of 255) has lost its colour."""
 _DARK = 0.18
@@ -26,7 +31,8 @@ class FrameQuality:
     """Of the face in every frame of a capture; NaN where there is none."""
 
     sharpness: Float[np.ndarray, "t c"]
-    """Of the face's fine detail, relative to the median over the clip: 1 as usual, 0 nothing left."""
+    """Of the face's fine detail in the direction that lacks it most, relative to the median over the clip: 1 as usual,
+    0 nothing left."""
     brightness: Float[np.ndarray, "t c"]
     """Mean level of the face, 0..1, sRGB."""
     clipped: Float[np.ndarray, "t c"]
@@ -38,30 +44,39 @@ class FrameQuality:
         return self.sharpness < _BLURRED  # NaN is not
 
 
-def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " 3"]:
-    """Sharpness (in units of its own), brightness and clipped part of a face; NaN where it is outside the picture."""
+def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " m"]:
+    """Detail in each direction (in units of its own), brightness and clipped part of a face; NaN if it is outside."""
     height, width = image.shape[:2]
     left, top = np.clip(np.floor(landmarks.min(axis=0)), 0, [width, height]).astype(int)
     right, bottom = np.clip(np.ceil(landmarks.max(axis=0)), 0, [width, height]).astype(int)
     if right - left < 2 or bottom - top < 2:
-        return np.full(3, np.nan)
+        return np.full(MEASURES, np.nan)
     face = image[top:bottom, left:right]
-    grey = cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)
-    enlarges = min(grey.shape) < _SIDE
-    grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_LINEAR if enlarges else cv2.INTER_AREA)
-    # Noise is finer than a face's detail, and would pass for sharpness.
-    grey = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
-    detail = float(np.abs(cv2.Laplacian(grey, cv2.CV_32F)).mean())
     clipped = float((face.max(axis=-1) >= _WHITE_LEVEL).mean())
-    return np.array([detail / (float(grey.std()) + 1), float(face.mean()) / 255, clipped])
+    return np.array([*_detail(face), float(face.mean()) / 255, clipped])
 
 
-def relative_quality(measured: Float[np.ndarray, "t 3"]) -> FrameQuality:
+def _detail(face: UInt8[np.ndarray, "h w 3"]) -> list[float]:
+    """Mean second derivative along each direction, relative to the contrast."""
+    grey = cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)
+    scale = _SIDE / min(grey.shape)
+    grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_LINEAR if scale > 1 else cv2.INTER_AREA)
+    # Noise is finer than a face's detail, and would pass for sharpness; where the face is small, it is enlarged, too.
+    grey = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), max(1.0, scale))
+    across, down, mixed = (cv2.Sobel(grey, cv2.CV_32F, x, y, ksize=3) for x, y in ((2, 0), (0, 2), (1, 1)))
+    diagonal = (across + down) / 2
+    contrast = float(grey.std()) + 1
+    return [float(np.abs(bend).mean()) / contrast for bend in (across, down, diagonal + mixed, diagonal - mixed)]
+
+
+def relative_quality(measured: Float[np.ndarray, "t m"]) -> FrameQuality:
     """The quality of a clip's frames, with what `measure_face` gave for each."""
     values = measured.astype(np.float32)
-    seen = np.isfinite(values[:, 0])
-    usual = float(np.median(values[seen, 0])) if seen.any() else 1.0
-    return FrameQuality(values[:, :1] / max(usual, 1e-6), values[:, 1:2], values[:, 2:])
+    detail, others = values[:, :_DIRECTIONS], values[:, _DIRECTIONS:]
+    seen = np.isfinite(detail[:, 0])
+    usual = np.median(detail[seen], axis=0) if seen.any() else np.ones(_DIRECTIONS, np.float32)
+    sharpness = (detail / np.maximum(usual, 1e-6)).min(axis=1, keepdims=True)
+    return FrameQuality(sharpness, others[:, :1], others[:, 1:])
 
 
 def quality_report(name: str, quality: FrameQuality) -> dict[str, Any]:
