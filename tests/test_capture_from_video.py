@@ -10,7 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-from capture_helpers import assert_same_capture, scan_texture, tree_bytes, write_face_clip, write_gradient_video
+from capture_helpers import (
+    assert_same_capture,
+    face_picture,
+    scan_texture,
+    tree_bytes,
+    write_face_clip,
+    write_gradient_video,
+)
 from mien.capture import CaptureSettings, capture_video, capture_video_parts, process, read_capture
 from mien.capture.video import write_video
 from mien.errors import UserError
@@ -170,6 +177,34 @@ def test_nobody_there_is_said(tmp_path):
         capture_video(path, tmp_path / "capture")
     assert str(path) in str(error.value)
     assert not (tmp_path / "capture").exists()
+
+
+def test_why_nobody_is_seen_is_said(test_data, tmp_path):
+    """Sideways, dark, too bright: each has its own remedy."""
+    upright = [np.pad(face_picture(test_data, 160), ((20, 20), (60, 60), (0, 0)), mode="edge")] * 6
+    lying = [np.ascontiguousarray(np.rot90(picture)) for picture in upright]
+    write_video(tmp_path / "lying.mp4", iter(lying), 25, crf=8)
+    with pytest.raises(UserError, match=r"it lies on its side: add --capture.turn 90"):
+        capture_video(tmp_path / "lying.mp4", tmp_path / "capture")
+    with pytest.raises(UserError, match=r"it lies on its side: add --capture.turn 90"):
+        capture_video(tmp_path / "lying.mp4", tmp_path / "capture", CaptureSettings(turn=180))
+    capture = capture_video(tmp_path / "lying.mp4", tmp_path / "turned", CaptureSettings(turn=90, crop="none"))
+    assert capture.images.shape[2:4] == (200, 280)
+    assert np.abs(capture.images[3, 0].astype(int) - upright[3]).mean() < 3
+    for level, remedy in ((8, "very dark .mean level 3%.: film again with light"), (250, "over-exposed")):
+        write_video(tmp_path / "flat.mp4", iter([np.full((120, 160, 3), level, np.uint8)] * 3), 25)
+        with pytest.raises(UserError, match=remedy):
+            capture_video(tmp_path / "flat.mp4", tmp_path / "capture")
+    assert not (tmp_path / "capture").exists()
+
+
+def test_a_clip_is_trimmed_at_both_ends(face_clip, tmp_path):
+    capture = capture_video(face_clip[0], tmp_path / "capture", CaptureSettings(size=64, start=0.08, end=0.32))
+    assert capture.timesteps == 6
+    assert capture.source["first_frame"] == 2
+    np.testing.assert_allclose(capture.timestamps, np.arange(6) / 25, atol=1e-6)
+    with pytest.raises(UserError, match=r"--capture.end 0.04: give a second after --capture.start \(0.08\)"):
+        capture_video(face_clip[0], tmp_path / "other", CaptureSettings(start=0.08, end=0.04))
 
 
 def test_bad_requests_are_refused(face_clip, tmp_path):

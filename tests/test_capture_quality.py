@@ -79,7 +79,7 @@ def capture_said(tmp_path, capsys, pictures) -> tuple[str, dict]:
 
 @pytest.mark.parametrize(
     ("gain", "warning", "flags"),
-    [(0.2, "the face is dark", (True, False)), (2.0, "the face is over-exposed", (False, True)), (1.0, "", (0, 0))],
+    [(0.2, "the face is dark", (True, False)), (1.4, "the face is over-exposed", (False, True)), (1.0, "", (0, 0))],
 )
 def test_dark_and_overexposed_clips_are_warned_of(face, tmp_path, capsys, gain, warning, flags):
     lit = np.clip(face.astype(np.float32) * gain, 0, 255).astype(np.uint8)

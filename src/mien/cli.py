@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import importlib
+import inspect
 import io
 import os
 import sys
@@ -93,7 +94,7 @@ def _run(name: str, rest: list[str]) -> int:
             command = tyro.cli(
                 module.Command,
                 prog=f"mien {name}",
-                description=module.Command.__doc__,
+                description=inspect.getdoc(module.Command),
                 args=rest,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )

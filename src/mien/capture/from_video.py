@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from mien.capture.capture import Capture
+from mien.capture.faceless import explain_no_face
 from mien.capture.frame_files import FrameLayout
 from mien.capture.given import GivenMattes, check_mattes, read_landmarks
 from mien.capture.outcome import CAMERA_ID, Origin, finish_part
@@ -119,7 +121,8 @@ def capture_video_parts(
 
 def _job(source: Path, settings: CaptureSettings, name: str | None, replace_others: bool) -> _Job:
     settings.check()
-    frames = open_source(source, FrameSelection(settings.start, settings.stride, settings.max_frames), settings.fps)
+    selection = FrameSelection(settings.start, settings.end, settings.stride, settings.max_frames)
+    frames = open_source(source, selection, settings.fps, settings.turn // 90)
     name = name or source.resolve().stem
     # Files count by what is in them.
     contents = {
@@ -264,7 +267,10 @@ def _means(job: _Job) -> Means:
 def _survey(job: _Job, folder: Path, means: Means) -> Survey:
     if job.frames.hdr:
         say(f"{job.frames.path}: HDR video ({job.frames.hdr}); its pictures are tone-mapped to sRGB")
-    return survey_source(job.frames, _prepare(folder, job.key), means.landmarks)
+    survey = survey_source(job.frames, _prepare(folder, job.key), means.landmarks)
+    if means.landmarks is None and not np.isfinite(survey.boxes).any():
+        raise explain_no_face(job.frames, survey, job.settings.turn)
+    return survey
 
 
 def _process(job: _Job, reel: Reel, part: Part, place: tuple[int, int], means: Means, out: Path) -> None:

@@ -17,19 +17,23 @@ class CaptureSettings:
     size: int = 512
     """Longest side of the captured frames in pixels; smaller sources are not enlarged."""
     crop: Literal["auto", "none"] = "auto"
-    """auto: one square around the head for the whole clip; none: the whole picture."""
+    """auto: a square around the head, the same for the whole clip; none: the whole picture."""
     start: float = 0.0
     """Seconds to skip at the beginning."""
+    end: float = 0.0
+    """Second of the video at which to stop; 0 takes it to its end."""
+    turn: Literal[0, 90, 180, 270] = 0
+    """Degrees to turn the pictures clockwise, for a video that lies on its side because its rotation flag was lost."""
     stride: int = 1
-    """Take every n-th frame."""
+    """Take every n-th frame: 2 for half of them."""
     max_frames: int = 0
     """Stop after so many frames; 0 takes all."""
     fps: float = 25.0
-    """Frames a second of a folder of images; videos know their own."""
+    """Frames a second of a folder of pictures; videos know their own."""
     cuts: bool = True
-    """Whether a video is parted where it cuts to another shot: NAME-1, NAME-2, ..."""
+    """Do (or do not) part the video where it cuts to another shot, into NAME-1, NAME-2, ..."""
     shortest_part: float = 1.0
-    """Seconds; what lies between two cuts and is shorter is left out."""
+    """Seconds; parts between two cuts that are shorter are left out."""
     clean_plate: Path | None = None
     """A picture of the scene without the person, from the same, still camera: gives better mattes."""
     mattes: Path | None = None
@@ -44,6 +48,8 @@ class CaptureSettings:
         )
         _require(self.size <= _LARGEST_SIZE, "size", self.size, f"too large; give {_LARGEST_SIZE} or less")
         _require(_is_at_least(self.start, 0), "start", self.start, "give the seconds to skip, 0 or more")
+        later = self.end == 0 or _is_at_least(self.end, self.start) and self.end > self.start
+        _require(later, "end", self.end, f"give a second after --capture.start ({self.start:g}), or 0 for all")
         _require(self.stride >= 1, "stride", self.stride, "give 1 for every frame, 2 for every second one, ...")
         _require(self.max_frames >= 0, "max-frames", self.max_frames, "give 0 for all frames, or a positive number")
         _require(_is_at_least(self.fps, 0) and self.fps > 0, "fps", self.fps, "give frames a second, above 0")

@@ -24,6 +24,8 @@ class FrameSelection:
 
     start: float = 0.0
     """Seconds to skip at the beginning."""
+    end: float = 0.0
+    """Second at which to stop; 0 takes all."""
     stride: int = 1
     """Take every n-th frame."""
     max_frames: int = 0
@@ -55,6 +57,8 @@ class FrameSource:
     """Of the file, or of the names and contents of all images."""
     hdr: str = ""
     """PQ, HLG, or empty for ordinary pictures."""
+    quarter_turns: int = 0
+    """By which pictures are turned clockwise, besides the file's own rotation flag."""
 
     def frames(self, longest_side: int = 0) -> Iterator[SourceFrame]:
         """The frames taken; pictures are shrunk to `longest_side` pixels unless that is 0.
@@ -70,11 +74,14 @@ class FrameSource:
         for number, (seconds, picture) in enumerate(everything):
             if seconds < self.selection.start - 1e-6:
                 continue
+            if self.selection.end and seconds >= self.selection.end - 1e-6:
+                break
             candidates += 1
             if (candidates - 1) % self.selection.stride:
                 continue
             first = seconds if taken == 0 else first
-            yield SourceFrame(number, seconds - first, picture)
+            turned = partial(_turned, picture, self.quarter_turns) if self.quarter_turns else picture
+            yield SourceFrame(number, seconds - first, turned)
             taken += 1
             if taken == self.selection.max_frames:
                 break
@@ -92,13 +99,14 @@ class FrameSource:
         return len(list_images(self.path)) if self.path.is_dir() else count_frames(self.path)
 
 
-def open_source(path: Path, selection: FrameSelection, fps: float) -> FrameSource:
+def open_source(path: Path, selection: FrameSelection, fps: float, quarter_turns: int = 0) -> FrameSource:
     """Look at a source without reading its frames.
 
     Args:
         path: a video file, or a folder with images, which are taken in the natural order of their names.
         selection: which frames to take.
         fps: frames a second of a folder of images; a video knows its own.
+        quarter_turns: by which to turn pictures clockwise.
 
     Raises:
         UserError: the source is missing, is no video, or holds no images.
@@ -112,11 +120,16 @@ def open_source(path: Path, selection: FrameSelection, fps: float) -> FrameSourc
         info = probe_video(path)
         fps, total, hdr = info.fps, info.frames, info.hdr
         content_hash = _hash_files([path], with_names=False)
-    remaining = max(0, total - round(selection.start * fps))
+    last = min(total, round(selection.end * fps)) if selection.end else total
+    remaining = max(0, last - round(selection.start * fps))
     expected = -(-remaining // selection.stride)
     if selection.max_frames:
         expected = min(expected, selection.max_frames) if total else selection.max_frames
-    return FrameSource(path, selection, fps / selection.stride, expected, content_hash, hdr)
+    return FrameSource(path, selection, fps / selection.stride, expected, content_hash, hdr, quarter_turns)
+
+
+def _turned(picture: Callable[[], np.ndarray], quarter_turns: int) -> UInt8[np.ndarray, "h w 3"]:
+    return np.ascontiguousarray(np.rot90(picture(), -quarter_turns))
 
 
 def list_images(folder: Path) -> list[Path]:

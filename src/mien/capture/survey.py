@@ -17,7 +17,7 @@ from mien.storage import read_arrays, write_arrays
 
 MOST_FACES = 4
 """The largest so many faces of a frame are looked at."""
-_SURVEY_SIZE = 512
+SURVEY_SIZE = 512
 """Longest side, pixels, of the pictures in which faces are searched: the detectors see 192 pixels at most."""
 _CHUNK = 1000
 """Frames after which progress is kept."""
@@ -63,7 +63,7 @@ def survey_source(frames: FrameSource, memory: Path, landmarks: Float[np.ndarray
         done.append(Survey(**read_arrays(path)))
     first = next(frames.frames()).picture()
     size = np.array([first.shape[1], first.shape[0]], np.int64)
-    stream = itertools.islice(frames.frames(_SURVEY_SIZE), len(done) * _CHUNK, None)
+    stream = itertools.islice(frames.frames(SURVEY_SIZE), len(done) * _CHUNK, None)
     title = f"find the face in {frames.path.name}"
     with ExitStack() as stack:
         find = _search(stack.enter_context(FaceFinder())) if landmarks is None else _look_up(landmarks / size)

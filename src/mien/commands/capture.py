@@ -12,16 +12,24 @@ from mien.workspace import Workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Turn a video into frames, mattes and landmarks: OUT/sequences/NAME/capture (NAME-1, NAME-2 if it cuts)."""
+    """Turn a video of one person into frames, mattes and landmarks, in OUT/sequences/NAME/capture.
+
+    Any video that a camera or telephone writes will do: upright or turned, HDR, variable frame rate, any length. One
+    that cuts to other shots becomes NAME-1, NAME-2, ... The same command goes on where it was stopped.
+
+    Film half a minute or more, in even light, with the whole head in the picture: look around, talk, make faces.
+
+    Example: mien capture me.mp4 --out out/me, then mien track out/me
+    """
 
     video: Annotated[Path, tyro.conf.Positional]
     """A video file, or a folder of pictures in order."""
     out: Path
-    """Workspace folder (one subject)."""
+    """Workspace folder of the person, new or with other videos of the same one."""
     name: str | None = None
-    """Name of the sequence (default: the video's name)."""
+    """Name of the sequence; by default the video's."""
     replace: bool = False
-    """Whether a sequence of that name may be replaced that was made from another video."""
+    """Replace a sequence of that name that was made from another video."""
     settings: Annotated[CaptureSettings, tyro.conf.arg(name="capture")] = field(default_factory=CaptureSettings)
 
     def run(self) -> None:
