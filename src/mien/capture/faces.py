@@ -47,6 +47,11 @@ class FaceFinder:
                 return np.array([(b.xmin, b.ymin, b.xmin + b.width, b.ymin + b.height) for b in boxes])
         return np.zeros((0, 4))
 
+    def surest(self, image: UInt8[np.ndarray, "h w 3"]) -> float:
+        """How sure the surer detector is of a face, 0..1; 0 for none."""
+        found = [detection for detector in self._detectors for detection in detector.process(image).detections or ()]
+        return max((float(detection.score[0]) for detection in found), default=0.0)
+
 
 class LandmarkDetector:
     """Face-mesh landmarks over consecutive pictures of one clip. Use as a context manager, one for each clip.

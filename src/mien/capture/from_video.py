@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 
 from mien.capture.capture import Capture
-from mien.capture.faceless import explain_no_face
 from mien.capture.frame_files import FrameLayout
 from mien.capture.given import GivenMattes, check_mattes, read_landmarks
 from mien.capture.outcome import CAMERA_ID, Origin, finish_part
@@ -23,6 +21,7 @@ from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, FrameSource, open_source, read_image
 from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, partial_folder, read_capture
 from mien.capture.survey import Survey, survey_source
+from mien.capture.upright import check_upright
 from mien.errors import UserError
 from mien.progress import say
 from mien.storage import cannot_write, file_digest, read_json, write_json
@@ -268,8 +267,8 @@ def _survey(job: _Job, folder: Path, means: Means) -> Survey:
     if job.frames.hdr:
         say(f"{job.frames.path}: HDR video ({job.frames.hdr}); its pictures are tone-mapped to sRGB")
     survey = survey_source(job.frames, _prepare(folder, job.key), means.landmarks)
-    if means.landmarks is None and not np.isfinite(survey.boxes).any():
-        raise explain_no_face(job.frames, survey, job.settings.turn)
+    if means.landmarks is None:
+        check_upright(job.frames, survey, job.settings.turn)
     return survey
 
 
