@@ -5,6 +5,7 @@ what was written, or it is refused. A .ply, pictures and videos of other program
 damage must be a valid object (finite numbers, whole pictures).
 """
 
+import json
 import os
 import random
 import resource
@@ -21,6 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import safetensors.numpy
 import torch
 from torch import Tensor, nn
 
@@ -29,13 +31,18 @@ from damage import flip_or_cut
 from mien.avatar import load_avatar
 from mien.avatar.portable import make_portable
 from mien.capture import read_capture, write_capture
+from mien.capture.crop import whole_picture
+from mien.capture.given import GivenMattes, read_landmarks
 from mien.capture.source import read_image
 from mien.capture.video import write_video
 from mien.errors import UserError
 from mien.evaluation import read_metrics
+from mien.evaluation.cameras import read_cameras
+from mien.evaluation.image_folders import read_crops, write_crops
 from mien.export import in_world, read_ply, write_ply
 from mien.face import FaceParams
 from mien.face.loading import read_face_model, write_face_model
+from mien.motion import ARKIT_NAMES, Motion, read_blendshape_json, read_live_link_face
 from mien.runtime import read_portable, write_portable
 from mien.storage import read_tensors, write_json
 from mien.tracking import Scoring, read_scoring, read_tracking, write_scoring, write_tracking
@@ -90,6 +97,12 @@ READERS = (
     Reader("head.mien", lambda root, file: read_portable(file)),
     Reader("head.ply", lambda root, file: read_ply(file), exact=False),
     Reader("pictures/*", lambda root, file: read_image(file), exact=False),
+    Reader("given/points.*", lambda root, file: read_landmarks(file, 3), exact=False),
+    Reader("given/mattes/*", lambda root, file: read_mattes(root / "given/mattes"), exact=False),
+    Reader("given/crops.json", lambda root, file: read_crops(file)),
+    Reader("given/cameras.json", lambda root, file: read_cameras(file), exact=False),
+    Reader("given/take.csv", lambda root, file: read_live_link_face(file), exact=False),
+    Reader("given/*take.json", lambda root, file: read_blendshape_json(file), exact=False),
 )
 
 
@@ -120,7 +133,39 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     picture = sequence.capture.images[0, 0]
     for suffix in ("png", "jpg", "webp", "tif", "bmp"):
         assert cv2.imwrite(str(root / f"pictures/a.{suffix}"), picture)
+    write_what_users_give(root / "given", picture)
     return root
+
+
+def write_what_users_give(folder: Path, picture: np.ndarray) -> None:
+    """Landmarks, mattes, crops, cameras and motion as other programs write them: without any redundancy."""
+    points = np.random.default_rng(0).uniform(0, 32, (3, 478, 2)).astype(np.float32)
+    points[1] = np.nan
+    folder.mkdir()
+    safetensors.numpy.save_file({"landmarks": points}, folder / "points.safetensors")
+    rows = [",".join(f"{value:.3f}" for value in row) for row in points.reshape(3, -1)]
+    (folder / "points.csv").write_text("\n".join(rows) + "\n")
+    (folder / "mattes").mkdir()
+    for index in range(3):
+        assert cv2.imwrite(str(folder / f"mattes/{index}.png"), picture[..., 0])
+    write_crops(folder / "crops.json", {f"{index}.png": (4, 4, 20, 20) for index in range(3)})
+    camera = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
+    cameras = {"format": "mien.cameras", "version": 1, "cameras": [camera, camera]}
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+    columns = ["Timecode", "BlendshapeCount", *(name[0].upper() + name[1:] for name in ARKIT_NAMES), "HeadYaw"]
+    takes = [[f"0:00:0{frame}:00.0", "61", *["0.25"] * 53] for frame in range(4)]
+    (folder / "take.csv").write_text("\n".join(",".join(cells) for cells in (columns, *takes)) + "\n")
+    plain = [{"timestamp_ms": 40 * frame, "blendshapes": {"jawOpen": 0.5}} for frame in range(3)]
+    (folder / "take.json").write_text(json.dumps(plain))
+    categories = [{"categoryName": "jawOpen", "score": 0.5}]
+    matrix = {"rows": 4, "columns": 4, "data": np.eye(4).flatten().tolist()}
+    result = {"faceBlendshapes": [{"categories": categories}], "facialTransformationMatrixes": [matrix]}
+    (folder / "landmarker_take.json").write_text(json.dumps(result))
+
+
+def read_mattes(folder: Path) -> np.ndarray:
+    mattes, whole = GivenMattes(folder, (32, 32)), whole_picture(32, 32, 32)
+    return np.stack([mattes.matte(number, whole) for number in range(3)], axis=-1)
 
 
 @contextmanager
@@ -152,8 +197,14 @@ def content_of(value: Any) -> Any:
 
 def is_valid(value: Any) -> bool:
     """Whole and finite, for content without redundancy."""
-    if isinstance(value, np.ndarray):
-        return value.dtype == np.uint8 and value.ndim == 3 and value.size > 0
+    if isinstance(value, np.ndarray) and value.dtype == np.uint8:
+        return value.ndim == 3 and value.size > 0
+    if isinstance(value, np.ndarray):  # landmarks: whole rows are nan where there is no face
+        return value.shape == (3, 478, 2) and not np.isinf(value).any()
+    if isinstance(value, list):
+        return all(bool(camera.K.isfinite().all() and camera.viewmat.isfinite().all()) for camera in value)
+    if isinstance(value, Motion):
+        return all(np.isfinite(getattr(value, field.name)).all() for field in fields(value)) and 0 < value.fps <= 1e6
     return all(bool(getattr(value, name).isfinite().all()) for name in ("means", "quats", "scales", "opacities", "sh"))
 
 

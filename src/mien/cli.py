@@ -1,6 +1,7 @@
 """The command line: picks the sub-command, loads only what it needs, turns errors into one line."""
 
 import contextlib
+import difflib
 import errno
 import importlib
 import inspect
@@ -52,7 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     name, rest = arguments[0], arguments[1:]
     if name not in COMMANDS:
-        return _complain(f"no sub-command {name!r}; there are: {', '.join(COMMANDS)}")
+        near = difflib.get_close_matches(name, COMMANDS, 1)
+        hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(COMMANDS)}"
+        return _complain(f"no sub-command {name!r}; {hint}")
+    if "" in rest:
+        # As a path, nothing is the current folder: an unset variable of a shell must not fill that with pictures.
+        return _complain(f"argument {rest.index('') + 1} after {name} is empty (an unset variable?); give it a value")
     try:
         return _run(name, rest)
     except UserError as error:

@@ -23,12 +23,19 @@ def encode(value: Any) -> Any:
     return value
 
 
-def decode(hint: Any, value: Any, where: str = "settings") -> Any:
+def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make it again") -> Any:
     """What `encode` encoded, as the type `hint`; fields that are missing get their defaults.
 
     Raises:
-        UserError: a field is unknown, is missing without a default, or has a value of another type.
+        UserError: a field is unknown, is missing without a default, or has a value of another type; ends in `remedy`.
     """
+    try:
+        return _decode(hint, value, where)
+    except UserError as error:
+        raise UserError(f"{error} (made by another version of mien?); {remedy}") from None
+
+
+def _decode(hint: Any, value: Any, where: str) -> Any:
     if hint is Any:
         return value
     origin = get_origin(hint)
@@ -40,10 +47,10 @@ def decode(hint: Any, value: Any, where: str = "settings") -> Any:
         items = get_args(hint)
         kinds = [items[0]] * len(value) if len(items) == 2 and items[1] is Ellipsis else items
         if len(kinds) != len(value):
-            raise UserError(f"{where}: {len(value)} entries instead of {len(kinds)}; make it again")
-        return tuple(decode(kind, item, where) for kind, item in zip(kinds, value, strict=True))
+            raise UserError(f"{where}: {len(value)} entries instead of {len(kinds)}")
+        return tuple(_decode(kind, item, where) for kind, item in zip(kinds, value, strict=True))
     if origin is dict and isinstance(value, dict):
-        return {key: decode(get_args(hint)[1], item, where) for key, item in value.items()}
+        return {key: _decode(get_args(hint)[1], item, where) for key, item in value.items()}
     if origin is Literal and value in get_args(hint):
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -54,12 +61,12 @@ def decode(hint: Any, value: Any, where: str = "settings") -> Any:
     alike = isinstance(value, bool) == (hint is bool)
     if origin is None and isinstance(hint, type) and isinstance(value, hint) and alike:
         return value
-    raise UserError(f"{where}: {_in_short(value)} is not a {hint}; made by another version of mien? Make it again")
+    raise UserError(f"{where}: {_in_short(value)} is not a {hint}")
 
 
 def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
-        raise UserError(f"{where}: {_in_short(value)} is not a {hint.__name__}; make it again")
+        raise UserError(f"{where}: {_in_short(value)} is not a {hint.__name__}")
     hints = get_type_hints(hint)
     known = {f.name: f for f in fields(hint)}
     unknown = set(value) - set(known) - {"kind"}
@@ -67,10 +74,8 @@ def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
         name for name, f in known.items() if name not in value and f.default is MISSING and f.default_factory is MISSING
     ]
     if unknown or missing:
-        raise UserError(
-            f"{where}: unknown {sorted(unknown)}, missing {missing}: made by another version of mien; make it again"
-        )
-    return hint(**{name: decode(hints[name], value[name], f"{where}.{name}") for name in known if name in value})
+        raise UserError(f"{where}: unknown {sorted(unknown)}, missing {missing}")
+    return hint(**{name: _decode(hints[name], value[name], f"{where}.{name}") for name in known if name in value})
 
 
 def _decode_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
@@ -83,10 +88,10 @@ def _decode_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
     plain = [option for option in options if not is_dataclass(option) and option is not type(None)]
     for option in plain:
         try:
-            return decode(option, value, where)
+            return _decode(option, value, where)
         except UserError:
             continue
-    raise UserError(f"{where}: {_in_short(value)} is none of {options}; made by another version of mien? Make it again")
+    raise UserError(f"{where}: {_in_short(value)} is none of {options}")
 
 
 def _in_short(value: Any) -> str:

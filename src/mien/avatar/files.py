@@ -16,6 +16,7 @@ from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
+_REMEDY = "train it again with `mien train`"
 NOT_CARRIED = frozenset({"flame"})
 """Face models whose licence does not allow them to be passed on inside an avatar."""
 
@@ -68,7 +69,7 @@ def load_avatar(folder: Path) -> Avatar:
     where = str(folder / "avatar.json")
     stored = read_json(folder / "avatar.json", _AVATAR, _VERSION)
     named = {name: value for name, value in stored.items() if name not in ("format", "version")}
-    content: _Content = decode(_Content, named, where)
+    content: _Content = decode(_Content, named, where, _REMEDY)
     if content.gaussians < 0:
         raise UserError(f"{where}: {content.gaussians} Gaussians; train it again")
     method = method_named(content.kind)
@@ -76,7 +77,7 @@ def load_avatar(folder: Path) -> Avatar:
     if file_digest(folder / "avatar.safetensors") != content.tensors_sha256:
         raise UserError(f"{folder / 'avatar.safetensors'}: is not what was written; train it again")
     face_model = _face_model_of(folder, content)
-    config = decode(method.config, content.config, where)
+    config = decode(method.config, content.config, where, _REMEDY)
     subject = _with_prefix(tensors, "subject.")
     with torch.random.fork_rng(devices=[]):
         try:

@@ -5,6 +5,10 @@ from pathlib import Path
 
 from mien.commands.create import Command as Create
 from mien.commands.options import Preset, TrainOptions
+from mien.errors import UserError
+
+_LONGEST = 600.0
+"""Seconds: synthetic heads are drawn frame by frame."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +30,14 @@ class Command:
         """Write the video unless it is there, then create."""
         from dataclasses import replace
 
+        from mien.storage import check_writable
         from mien.synthetic import RECIPES, write_synthetic_video
 
+        if self.seconds and not 0 < self.seconds <= _LONGEST:
+            raise UserError(f"--seconds {self.seconds:g}: give up to {_LONGEST:g}, or leave it out")
+        check_writable(self.out, folder=True)
         recipe = RECIPES["demo"]
-        if self.seconds > 0:
+        if self.seconds:
             recipe = replace(recipe, seconds=self.seconds)
         video = self.out / f"synthetic-{self.seed}-{recipe.seconds:g}s.mp4"
         if not video.is_file():

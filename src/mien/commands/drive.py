@@ -29,6 +29,8 @@ class Command:
     """The head follows the driver's; with --no-head-pose it stays still and only the face moves."""
     alone: bool = False
     """Only the avatar, without the driver's pictures beside it."""
+    fps: float | None = None
+    """Frames a second that a .csv's timecode counts in (default: the smallest usual rate above its frame numbers)."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
     def run(self) -> None:
@@ -37,5 +39,5 @@ class Command:
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
-        options = DriveOptions(self.sequence, self.head_pose, self.alone)
+        options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps)
         drive_stage(run_dir, self.by, self.out, options, self.picture)

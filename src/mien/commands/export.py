@@ -40,8 +40,8 @@ class Command:
             raise UserError(f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply or .mien")
         if kind == ".mien" and (self.set or self.series):
             raise UserError(f"{self.out}: a .mien file holds every expression; leave --set and --series out")
-        if self.every < 1:
-            raise UserError(f"--every {self.every}: give 1 or more")
+        if self.every < 1 or (self.every > 1 and self.series is None):
+            raise UserError(f"--every {self.every}: give 1 or more, together with --series")
         check_writable(self.out if self.series is None else self._numbered(0))
         avatar = load_avatar(run_dir)
         if kind == ".mien":

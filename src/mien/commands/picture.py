@@ -26,9 +26,9 @@ class PictureOptions:
 
     size: int = 512
     """Width and height, pixels, 16..8192."""
-    width: int = 0
+    width: int | None = None
     """Pixels, instead of --size; the head keeps its shape."""
-    height: int = 0
+    height: int | None = None
     """Pixels, instead of --size."""
     background: str = "white"
     """white, black, grey, green, a colour like #3060a0, or transparent (for .png and .webm; colours are straight)."""
@@ -48,7 +48,8 @@ class PictureOptions:
 
     def shape(self) -> tuple[int, int]:
         """Width and height."""
-        return self.width or self.size, self.height or self.size
+        wide, high = (self.size if given is None else given for given in (self.width, self.height))
+        return wide, high
 
     def camera(self, camera: Camera, zoom: float = 1.0) -> Camera:
         """The view in pictures of this size."""

@@ -95,7 +95,13 @@ def read_cameras(path: Path) -> list[Camera]:
     Raises:
         UserError: the file is missing or damaged, or a camera is incomplete, not finite, or no rigid view.
     """
-    listed = read_json(path, FORMAT, VERSION).get("cameras")
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; name a json file of cameras (docs/using.md)")
+    try:
+        listed = read_json(path, FORMAT, VERSION).get("cameras")
+    except UserError as error:
+        # Written by the user, not by a stage that could be run again.
+        raise UserError(f"{str(error).split('; ')[0]}; write it as docs/using.md says") from None
     if not isinstance(listed, list) or not listed:
         raise UserError(f"{path}: has no list `cameras`; give one camera for every frame")
     return [_camera_of(entry, f"{path}: camera {index}") for index, entry in enumerate(listed)]

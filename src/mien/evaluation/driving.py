@@ -39,7 +39,7 @@ def drive(
         theirs, ours = getattr(driver, name).shape[1:], getattr(avatar_neutral, name).shape[1:]
         if theirs != ours:
             raise UserError(
-                f"the driver has {tuple(theirs)} {name} parameters, the avatar {tuple(ours)}: "
+                f"the driver has {_times(theirs)} {name} parameters, the avatar {_times(ours)}: "
                 "they were tracked with different face models; track the driver with the avatar's"
             )
     expression = avatar_neutral.expression + driver.expression - driver_neutral.expression
@@ -64,6 +64,10 @@ def drive(
         ),
         head_translation=avatar_neutral.head_translation + moved @ here[0].T,
     )
+
+
+def _times(shape: torch.Size) -> str:
+    return "x".join(str(size) for size in shape)
 
 
 def _relative_rotation(

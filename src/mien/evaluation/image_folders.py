@@ -118,7 +118,11 @@ def read_crops(path: Path) -> dict[str, Box]:
     Raises:
         UserError: it is missing or damaged.
     """
-    crops = read_json(path, CROPS_FORMAT, CROPS_VERSION).get("crops")
+    try:
+        crops = read_json(path, CROPS_FORMAT, CROPS_VERSION).get("crops")
+    except UserError as error:
+        # It lies beside the user's own pictures: no folder to delete, no stage to run.
+        raise UserError(f"{str(error).split('; ')[0]}; write it again, or leave it out") from None
     boxes: dict[str, Box] = {}
     for name, box in crops.items() if isinstance(crops, dict) else [("", None)]:
         if not isinstance(box, list) or len(box) != 4 or not all(isinstance(v, int) for v in box) or min(box[2:]) < 1:

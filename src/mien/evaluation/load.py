@@ -32,7 +32,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
         UserError: the run is not finished, or the sequences are not those that it was trained on.
     """
     config = read_run_config(run_dir)
-    settings = decode(TrainSettings, config["settings"], str(run_dir / "config.json"))
+    settings = decode(TrainSettings, config["settings"], str(run_dir / "config.json"), "train it again")
     wanted = [entry["sequence"] for entry in config["data"]]
     if [folder.name for folder in sequence_dirs] != wanted:
         given = ", ".join(folder.name for folder in sequence_dirs)

@@ -67,7 +67,7 @@ def plan_output(path: Path, frames: int, transparent: bool = False) -> Output:
         check_writable(path)
         if frames != 1:
             numbered = path.with_name(f"{path.stem}_%06d.png")
-            raise UserError(f"{path}: one picture, but there are {frames}; write --out {numbered} or --frames 1")
+            raise UserError(f"{path}: one picture, but there are {frames}; write --out {numbered}, or a folder")
     elif ending in (".mp4", ".webm"):
         output = Output(path, "mp4" if ending == ".mp4" else "webm", transparent)
         check_writable(path)

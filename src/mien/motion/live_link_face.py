@@ -1,8 +1,10 @@
 """Live Link Face: the csv that the iPhone app writes of ARKit's blend shapes.
 
 Columns: Timecode (HH:MM:SS:FF.fraction), BlendshapeCount, 52 coefficients with a capital first letter (EyeBlinkLeft),
-then optionally HeadYaw, HeadPitch, HeadRoll and Yaw, Pitch, Roll of LeftEye and RightEye. Angles are radians: yaw about
-the axis up (to the subject's left), pitch about the axis to the left (down), roll about the axis ahead.
+then optionally HeadYaw, HeadPitch, HeadRoll and Yaw, Pitch, Roll of LeftEye and RightEye. Angles are radians, in the
+order yaw, pitch, roll: yaw positive to the subject's right, pitch down, roll to the subject's left shoulder. These are
+Unreal's angles of ARKit's transforms; signs and order of the eyes' were checked on real takes, by the eyeLook
+coefficients beside them, and the head's are taken to be the same.
 """
 
 import csv
@@ -128,7 +130,7 @@ def _seconds(path: Path, timecodes: list[tuple[int, str]], fps: float | None) ->
 
 
 def _turned(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """Axis-angle of yaw, then pitch, then roll about the turned axes."""
+    """Axis-angle of yaw, then pitch, then roll about the turned axes, in the frame of `Motion`."""
     x, y, z = np.eye(3)
-    turn = [matrix_from_axis_angle(angle[:, None] * axis) for angle, axis in ((yaw, y), (pitch, x), (roll, z))]
+    turn = [matrix_from_axis_angle(angle[:, None] * axis) for angle, axis in ((yaw, -y), (pitch, x), (roll, -z))]
     return axis_angle_from_matrix(turn[0] @ turn[1] @ turn[2]).astype(np.float32)

@@ -61,7 +61,7 @@ def read_portable(path: Path) -> PortableAvatar:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: damaged ({error!r}); export it again with `mien export`") from None
     with jaxtyped("context"):
-        avatar: PortableAvatar = decode(PortableAvatar, tree, str(path))
+        avatar: PortableAvatar = decode(PortableAvatar, tree, str(path), "export it again with `mien export`")
     check(avatar, str(path))
     return avatar
 

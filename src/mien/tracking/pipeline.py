@@ -57,8 +57,8 @@ def track_subject(
     adds nothing to it. With one uncalibrated camera, metric scale comes from the identity prior.
 
     Raises:
-        UserError: a capture has several cameras without calibration or too few timesteps with a face, or the model
-            lacks the landmarks.
+        UserError: a capture has several cameras without calibration, too few timesteps with a face, or landmarks that
+            no face could have; or the model lacks the landmarks.
     """
     assert captures, "nothing to track"
     if "mediapipe" not in face_model.landmarks:
@@ -67,7 +67,11 @@ def track_subject(
     with torch.no_grad():
         model = reduce_face_model(face_model, layout_of(face_model))
         lenses = lenses_of(captures, settings)
-        fit = _fit_landmarks(model, shots, lenses, settings)
+        try:
+            fit = _fit_landmarks(model, shots, lenses, settings)
+        except torch.linalg.LinAlgError:
+            names = ", ".join(capture.name for capture in captures)
+            raise UserError(f"{names}: no face fits the landmarks; look at the pictures, and capture it again") from None
         if settings.schedule == "fast":
             fit = refine_photometrically(model, shots, lenses, fit, settings).fit
         return [

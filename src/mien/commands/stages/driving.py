@@ -20,15 +20,13 @@ from mien.export.pictures import plan_output, write_pictures
 from mien.face import FaceModel, FaceParams
 from mien.face.loading import cache_folder
 from mien.face.params import concatenate
-from mien.motion import Motion, read_blendshape_json, read_live_link_face
+from mien.motion import read_blendshape_json, read_live_link_face
 from mien.progress import say, track_progress
 from mien.storage import file_digest
 from mien.tracking import TrackingSettings
 from mien.training import read_sequence
 from mien.training.run import run_camera
 from mien.workspace import Workspace, open_workspace
-
-_READERS: dict[str, Callable[[Path], Motion]] = {".csv": read_live_link_face, ".json": read_blendshape_json}
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,22 +41,34 @@ class Driver:
     """The driver's picture at a timestep; None where there are none."""
 
 
-def open_driver(by: Path, sequence: str | None, face_model: FaceModel) -> Driver:
+def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None) -> Driver:
     """A driver from a workspace, a video (captured and tracked, and kept for the next time), a csv or a json file.
+
+    Args:
+        by: whichever of these.
+        sequence: of the workspace; of a video with cuts, one of its parts instead of all in a row.
+        face_model: the avatar's.
+        fps: that the timecode of a csv counts in.
 
     Raises:
         UserError: it is none of these, or its stages fail.
     """
+    suffix = by.suffix.lower() if by.is_file() else ""
+    if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
+        raise UserError(f"--fps {fps:g}: only the timecode of a .csv has one to give, above 0 and up to 1000")
     if not by.exists():
         raise UserError(f"{by}: no such file or folder; give a workspace, a video, a csv of Live Link Face, or a json")
-    if by.suffix.lower() in _READERS and by.is_file():
-        motion = _READERS[by.suffix.lower()](by)
+    if suffix in (".csv", ".json"):
+        if sequence is not None:
+            raise UserError(f"--sequence {sequence}: {by} has none to choose from; leave it out")
+        motion = read_live_link_face(by, fps) if suffix == ".csv" else read_blendshape_json(by)
         if motion.lost:
             say(f"{by}: no face in {motion.lost} of {len(motion)} frames; they repeat the one before")
         face, at_rest = face_of_motion(motion, face_model)
         return Driver(face, at_rest, motion.fps, None)
     if by.is_file():
         workspace, names = _tracked_video(by, face_model.name)
+        names = names if sequence is None else [workspace.pick_sequence(sequence)]
     else:
         workspace = open_workspace(by)
         names = [workspace.pick_sequence(sequence)]
@@ -69,7 +79,8 @@ def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[s
     """Names of a video's sequences in this user's cache, captured and tracked unless they are there."""
     workspace = Workspace(cache_folder() / "drivers" / f"{video.stem}-{file_digest(video)[:12]}")
     capture_stage(workspace, video, None, CaptureSettings())
-    names = list(tracking_stage(workspace, face_model_name, TrackingSettings()))
+    # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
+    names = sorted(tracking_stage(workspace, face_model_name, TrackingSettings()), key=lambda name: (len(name), name))
     say(f"{video}: tracked in {workspace.root}, kept for the next time")
     return workspace, names
 
@@ -95,6 +106,8 @@ class DriveOptions:
     """Which of the driver's sequences."""
     head_pose: bool = True
     alone: bool = False
+    fps: float | None = None
+    """That the timecode of a csv counts in."""
 
 
 def drive_stage(
@@ -105,7 +118,7 @@ def drive_stage(
     # Whether it is many frames is not known before the driver is tracked, but a film or a sequence takes any number.
     output = look.plan(out, 2)
     avatar = load_avatar(run_dir)
-    driver = open_driver(by, options.sequence, avatar.face_model)
+    driver = open_driver(by, options.sequence, avatar.face_model, options.fps)
     bounds = avatar.face_model.expression_bounds
     driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, with_head_pose=options.head_pose)
     if output.kind == "sequence":
