@@ -46,7 +46,7 @@ def test_values_times_and_turns(tmp_path: Path) -> None:
                                            row("12:00:00:00.5", JawOpen=1, HeadPitch=-0.2)))  # fmt: skip
     assert motion.fps == pytest.approx(60)
     assert jaw(motion) == [0.25, 0.5, 1]
-    np.testing.assert_allclose(motion.head_rotation[0], [0, 0.3, 0], atol=1e-6)
+    np.testing.assert_allclose(motion.head_rotation[0], [0, -0.3, 0], atol=1e-6)
     np.testing.assert_allclose(motion.head_rotation[2], [-0.2, 0, 0], atol=1e-6)
     # Both eyes to the subject's left, the left one down as well.
     np.testing.assert_allclose(motion.eyes[0], [[LOOK_ANGLE / 2, LOOK_ANGLE, 0], [0, LOOK_ANGLE, 0]], atol=1e-6)
@@ -63,7 +63,43 @@ def test_dropped_rows_are_interpolated_and_lost_faces_held(tmp_path: Path) -> No
 
 def test_eye_angles_count_where_coefficients_do_not(tmp_path: Path) -> None:
     motion = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", LeftEyeYaw=0.2, RightEyePitch=0.1)))
-    np.testing.assert_allclose(motion.eyes[0], [[0, 0.2, 0], [0.1, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(motion.eyes[0], [[0, -0.2, 0], [0.1, 0, 0]], atol=1e-6)
+
+
+REAL_LOOKS = (
+    # LookDown, In, Out, Up of the left eye, then of the right; yaw, pitch, roll of the left eye, then of the right.
+    ((0, 0, 0.9879, 0.6407), (0, 1.0528, 0, 0.6236), (-0.6158, -0.3355, 0.1987), (-0.5769, -0.3355, 0.1879)),
+    ((0, 0, 0.4733, 0.3900), (0, 0.5690, 0, 0.3827), (-0.3425, -0.1774, 0.0601), (-0.2848, -0.1774, 0.0503)),
+    ((0.2948, 0.0970, 0, 0), (0.2953, 0.0095, 0, 0), (-0.0057, 0.1804, -0.0010), (0.0583, 0.1804, 0.0106)),
+)
+"""Rounded rows of real takes, in which both ways to tell the gaze are filled."""
+
+
+def test_angles_have_the_signs_of_real_takes(tmp_path: Path) -> None:
+    """Yaw to the right, pitch down: the angles beside real eyeLook coefficients say the same as these."""
+    columns = ("EyeLookDown", "EyeLookIn", "EyeLookOut", "EyeLookUp")
+    for left, right, left_angles, right_angles in REAL_LOOKS:
+        looks, angles = {}, {}
+        for side, coefficients, turns in (("Left", left, left_angles), ("Right", right, right_angles)):
+            looks |= {f"{name}{side}": value for name, value in zip(columns, coefficients, strict=True)}
+            angles |= {f"{side}Eye{name}": value for name, value in zip(("Yaw", "Pitch", "Roll"), turns, strict=True)}
+        by_looks = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", **looks))).eyes[0]
+        by_angles = read_live_link_face(write_csv(tmp_path / "b.csv", row("0:0:0:0", **angles))).eyes[0]
+        # Where the eyes are straight ahead is a matter of calibration: up to 7 degrees on these takes.
+        assert np.abs(by_looks - by_angles).max() < math.radians(9)
+        # A gaze up and to the side has hardly any torsion, once its roll is taken the right way.
+        assert np.abs(by_angles[:, 2]).max() < 0.12
+
+
+def test_head_angles_are_unreals(tmp_path: Path) -> None:
+    """Yaw to the subject's right, pitch down, roll to the left shoulder: +x left, +y up, +z ahead."""
+    turns = {"HeadYaw": 0.3, "HeadPitch": 0.2, "HeadRoll": 0.1}
+    rotation = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", **turns))).head_rotation[0]
+    turned = matrix_from_axis_angle(torch.from_numpy(rotation)).numpy()
+    ahead, left = turned[:, 2], turned[:, 0]
+    assert ahead[0] == pytest.approx(-math.sin(0.3) * math.cos(0.2), abs=1e-6)
+    assert ahead[1] == pytest.approx(-math.sin(0.2), abs=1e-6)
+    assert left[1] == pytest.approx(-math.sin(0.1) * math.cos(0.2), abs=1e-6)
 
 
 def test_bad_csv_files(tmp_path: Path) -> None:
@@ -159,8 +195,8 @@ def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
     up = torch.tensor([-math.radians(30), 0, 0])
     for joint in ("left_eye", "right_eye"):
         torch.testing.assert_close(driven.joints[0, model.free_joint_names.index(joint)], up, atol=1e-5, rtol=0)
-    # The head is at rest where it mostly is: the middle of the turn.
-    torch.testing.assert_close(driven.head_rotation[:, 1], torch.tensor([-0.1, 0, 0.1]), atol=1e-5, rtol=0)
+    # The head is at rest where it mostly is: the middle of the turn, which goes to the right.
+    torch.testing.assert_close(driven.head_rotation[:, 1], torch.tensor([0.1, 0, -0.1]), atol=1e-5, rtol=0)
     torch.testing.assert_close(driven.head_translation, rest.head_translation.expand(3, -1))
     with pytest.raises(UserError, match="none of ARKit's"):
         face_of_motion(motion, toy_face_model())

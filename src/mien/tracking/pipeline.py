@@ -71,7 +71,9 @@ def track_subject(
             fit = _fit_landmarks(model, shots, lenses, settings)
         except torch.linalg.LinAlgError:
             names = ", ".join(capture.name for capture in captures)
-            raise UserError(f"{names}: no face fits the landmarks; look at the pictures, and capture it again") from None
+            raise UserError(
+                f"{names}: no face fits the landmarks; look at the pictures, and capture it again"
+            ) from None
         if settings.schedule == "fast":
             fit = refine_photometrically(model, shots, lenses, fit, settings).fit
         return [

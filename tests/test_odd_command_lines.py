@@ -1,0 +1,140 @@
+"""What people type: one line that names the value and the remedy, exit code 2, and nothing written."""
+
+import json
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from damage import edit_json
+from mien.cli import main
+from toy_workspace import write_toy_workspace
+
+CAMERA = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
+SKEWED = {**CAMERA, "viewmat": (2 * np.eye(4)).tolist()}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a workspace W, whose name has a space and an umlaut, and odd files."""
+    place = tmp_path_factory.mktemp("ein Köpfchen, bitte")
+    write_toy_workspace(place / "W")
+    for name in ("empty.csv", "empty.json", "empty.mp4"):
+        (place / name).write_bytes(b"")
+    (place / "text.txt").write_text("Dear reader")
+    (place / "bytes.csv").write_bytes(bytes(range(256)))
+    (place / "list.json").write_text("[]")
+    (place / "cameras.json").write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": [SKEWED]}))
+    (place / "folder.png").mkdir()
+    (place / "link").symlink_to("/nowhere")
+    return place
+
+
+ODD = [
+    ("rendr W --out a.png", "did you mean render?"),
+    ("render W --out ''", "argument 3 after render is empty"),
+    ("render W --out a.png --width 0", "--width 0 --height 512: pictures are 16..8192"),
+    ("render W --out a.png --width 8193", "--width 8193 --height 512"),
+    ("render W --out a.png --height -1", "--height -1"),
+    ("render W --out a.png --size 1e3", "--size"),
+    ("render W --out a.txt", "cannot write .txt; use .png"),
+    ("render W --out text.txt/a.png", "text.txt is a file, not a folder"),
+    ("render W --out folder.png", "is a folder, but a file is to be written there"),
+    ("render W --out link/a.png", "is a link to nowhere"),
+    ("render W --out /proc/a.png", "cannot be written"),
+    ("render W --out /dev/null", "is a file, but a folder"),
+    (f"render W --out {'a' * 300}.png", "cannot be written"),
+    ("render W --out a.mp4 --background transparent", "an .mp4 cannot be transparent"),
+    ("render W --out a.png --background #12", "--background #12"),
+    ("render W --out a.mp4 --frames 0", "--frames 0"),
+    ("render W --out a.mp4 --fps nan", "--fps nan"),
+    ("render W --out a.mp4 --zoom 0", "--zoom 0"),
+    ("render W --out a.mp4 --span inf", "--span inf"),
+    ("render W --out a.mp4 --path loop", "'loop'"),
+    ("render W --out a.png --set drop=nan", "--set drop=nan: drop goes from 0 to 1"),
+    ("render W --out a.png --set drop=1e300", "--set drop=1e300"),
+    ("render W --out a.png --set drop=0,5", "'0,5' is no number"),
+    ("render W --out a.png --set dorp=1", "did you mean drop?"),
+    ("render W --out a.png --run ../toy", "no run '../toy'; there are: toy"),
+    ("render W --out a.png --sequence a/b", "no sequence 'a/b'; there are: clip"),
+    ("render W --out a.png --cameras none.json", "none.json: no such file"),
+    ("render W --out a.png --cameras empty.json", "cannot be read as json"),
+    ("render W --out a.png --cameras cameras.json", "viewmat is no rotation"),
+    ("render text.txt --out a.png", "text.txt: no such folder"),
+    ("drive W --by none.csv --out a.mp4", "none.csv: no such file or folder"),
+    ("drive W --by empty.csv --out a.mp4", "empty.csv: has no frames"),
+    ("drive W --by bytes.csv --out a.mp4", "bytes.csv: cannot be read as csv"),
+    ("drive W --by empty.json --out a.mp4", "empty.json: cannot be read as json"),
+    ("drive W --by list.json --out a.mp4", "list.json: give a list of frames"),
+    ("drive W --by empty.mp4 --out a.mp4", "empty.mp4: is empty"),
+    ("drive W --by text.txt --out a.mp4", "text.txt: cannot be read as a video"),
+    ("drive W --by folder.png --out a.mp4", "not a mien workspace"),
+    ("drive W --by W --out a.png", "one picture"),
+    ("drive W --by W --out a.mp4 --fps 30", "--fps 30: only the timecode of a .csv"),
+    ("drive W --by empty.csv --out a.mp4 --fps 0", "--fps 0"),
+    ("drive W --by list.json --out a.mp4 --sequence clip", "--sequence clip"),
+    ("export W --out a.obj", "cannot write .obj; use .ply or .mien"),
+    ("export W --out a.mien --set drop=1", "leave --set and --series out"),
+    ("export W --out a.mien --every 3", "--every 3"),
+    ("export W --out a.ply --series none", "none: no such file or folder"),
+    ("evaluate", "nothing to evaluate"),
+    ("evaluate W W", "2 workspaces"),
+    ("evaluate W --perceptual-frames -1", "--perceptual-frames -1"),
+    ("evaluate --images W", "belong together"),
+    ("evaluate W --compare", "no evaluated run to compare"),
+    ("train W --run a/b", "'a/b' cannot be the name of a folder"),
+    ("train W --hold-out none", "--hold-out none: no such sequence"),
+    ("train W --hold-out clip", "leaves no sequence to train on"),
+    ("track W --face-model none", "no face model 'none'"),
+    ("capture empty.mp4 --out text.txt", "is a file, but a folder"),
+    ("capture /dev/null --out new", "/dev/null: is no file"),
+    ("create empty.mp4 --out new --capture.size 0", "--capture.size 0"),
+    ("create empty.mp4 --out new --capture.landmarks none.csv", "--capture.landmarks none.csv: no such file"),
+    ("demo --out text.txt", "text.txt: is a file"),
+    ("demo --out new --seconds nan", "--seconds nan"),
+    ("demo --out new --seconds -3", "--seconds -3"),
+]
+
+
+@pytest.mark.parametrize(("line", "words"), ODD, ids=[line[:60] for line, _ in ODD])
+def test_odd_command_lines_are_told_in_one_line(
+    line: str, words: str, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(place)
+    before = sorted(place.rglob("*"))
+    assert main(shlex.split(line)) == 2
+    told = [text for text in capsys.readouterr().err.splitlines() if text.strip()]
+    assert len(told) == 1, told
+    assert told[0].startswith("mien: ")
+    assert words in told[0]
+    assert sorted(place.rglob("*")) == before
+
+
+def test_landmarks_that_no_face_could_have(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The toy capture's landmarks all lie in one point."""
+    monkeypatch.chdir(place)
+    assert main(["track", "W", "--again"]) == 2
+    assert "no face fits the landmarks" in capsys.readouterr().err
+
+
+def test_an_avatar_of_an_older_version_says_train_again(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before checksums, avatar.json did not name the hash of its tensors."""
+    monkeypatch.chdir(place)
+    path = place / "W/runs/toy/avatar/avatar.json"
+    whole = path.read_bytes()
+    try:
+        edit_json(path, lambda content: content.pop("tensors_sha256"))
+        assert main(["render", "W", "--out", "a.png"]) == 2
+        assert "train it again with `mien train`" in capsys.readouterr().err
+        edit_json(path, lambda content: content.update(tensors_sha256="0", future=1))
+        assert main(["export", "W", "--out", "a.ply"]) == 2
+        assert "unknown ['future']" in capsys.readouterr().err
+    finally:
+        path.write_bytes(whole)
+    assert main(["render", "W", "--out", "größer.png", "--size", "16"]) == 0
+    assert (place / "größer.png").is_file()

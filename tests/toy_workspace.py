@@ -1,0 +1,24 @@
+"""A workspace on disk around the toy head: one sequence, one run."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import train_toy
+from mien.capture import write_capture
+from mien.tracking import Scoring, write_scoring, write_tracking
+from mien.training import read_sequence, train
+from toy_scene import toy_sequence
+
+
+def write_toy_workspace(root: Path, timesteps: int = 5) -> None:
+    """`root/sequences/clip` and `root/runs/toy`, as `mien create` would leave them; the last fifth is held out."""
+    face_model, sequence = toy_sequence(timesteps, 32)
+    folder = root / "sequences" / "clip"
+    write_capture(folder / "capture", sequence.capture)
+    write_tracking(folder / "tracking", sequence.tracking)
+    crops = np.tile(np.array([4, 4, 20, 20], np.int64), (timesteps, 1, 1))
+    write_scoring(folder / "scoring", Scoring(sequence.scoring, crops))
+    settings = replace(train_toy.SETTINGS, split="tail")
+    train([read_sequence(folder)], face_model, train_toy.CONFIG, settings, root / "runs" / "toy")
