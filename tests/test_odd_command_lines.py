@@ -18,7 +18,7 @@ SKEWED = {**CAMERA, "viewmat": (2 * np.eye(4)).tolist()}
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a workspace W, whose name has a space and an umlaut, and odd files."""
-    place = tmp_path_factory.mktemp("ein Köpfchen, bitte")
+    place = tmp_path_factory.mktemp("Köpfe und Leute")
     write_toy_workspace(place / "W")
     for name in ("empty.csv", "empty.json", "empty.mp4"):
         (place / name).write_bytes(b"")
