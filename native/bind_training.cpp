@@ -75,6 +75,12 @@ std::tuple<int, int, int, int> box_of_nonzero(const Array<const float, nb::ndim<
   return {box.left, box.top, box.right - box.left, box.bottom - box.top};
 }
 
+double mean_squared_difference(const Array<const float>& image, const Array<const uint8_t>& target) {
+  require(image.size() == target.size(), "the pictures must be equally large");
+  const nb::gil_scoped_release release;
+  return mien::mean_squared_difference(image.data(), target.data(), static_cast<int64_t>(image.size()));
+}
+
 }  // namespace
 
 void bind_training(nb::module_& module) {
@@ -87,5 +93,7 @@ void bind_training(nb::module_& module) {
   module.def("observe_view", &observe_view, "grad_means2d"_a.noconvert(), "radii"_a.noconvert(),
              "opacities"_a.noconvert(), "scale"_a, "pull"_a.noconvert(), "seen"_a.noconvert(), "radius"_a.noconvert(),
              "opacity"_a.noconvert(), "Adds a step to the statistics of density control.");
+  module.def("mean_squared_difference", &mean_squared_difference, "image"_a.noconvert(), "target"_a.noconvert(),
+             "Of a picture and one of bytes, where 255 is 1.");
   module.def("box_of_nonzero", &box_of_nonzero, "values"_a.noconvert(), "Left, top, width and height; 0 where all is.");
 }

@@ -10,10 +10,11 @@
 
 namespace mien {
 
-MIEN_CHOOSE_KERNELS(PhotometricKernel, photometric_band)
+MIEN_CHOOSE_KERNELS(PhotometricKernels, photometric_kernels)
 
 namespace {
 
+constexpr int kRowsAtATime = 64;  // of bytes that are turned into floats: worth a piece of the pool's work
 constexpr int kTaps = 2 * kPhotometricRadius + 1;
 
 struct Window {
@@ -37,9 +38,11 @@ struct Workspace {
 
 void set_row_buffers(PhotometricBand& band) {
   thread_local std::vector<float> storage;
-  const size_t row = static_cast<size_t>(band.limit - band.origin) + 2 * kPhotometricPad;
-  storage.assign(row * (4 + 3 * kPhotometricRing), 0.0f);
-  float* next = storage.data() + kPhotometricPad;
+  const size_t columns = static_cast<size_t>(band.limit - band.origin);
+  const size_t row = (columns + kPhotometricLine - 1) / kPhotometricLine * kPhotometricLine + 2 * kPhotometricPad;
+  storage.assign(row * (4 + 3 * kPhotometricRing) + kPhotometricLine, 0.0f);
+  const size_t beyond = reinterpret_cast<uintptr_t>(storage.data()) / sizeof(float) % kPhotometricLine;
+  float* next = storage.data() + (kPhotometricLine - beyond) % kPhotometricLine + kPhotometricPad;
   const auto take = [&](float*& buffer) { buffer = next, next += row; };
   for (float*& buffer : band.rows) take(buffer);
   for (auto& map : band.ring) {
@@ -51,7 +54,7 @@ void set_row_buffers(PhotometricBand& band) {
 
 double photometric_loss(const PhotometricTask& task) {
   static const Window window;
-  const PhotometricKernel kernel = photometric_band();
+  const PhotometricKernels& kernels = photometric_kernels();
   thread_local Workspace work;
   const int stride = task.width * kPhotometricChannels;
   const double count = static_cast<double>(stride) * task.height;
@@ -69,7 +72,7 @@ double photometric_loss(const PhotometricTask& task) {
   whole.bottom = task.box.bottom;
   whole.left = task.box.left * kPhotometricChannels;
   whole.right = task.box.right * kPhotometricChannels;
-  whole.origin = std::max(whole.left - kPhotometricReach, 0);
+  whole.origin = std::max(whole.left - kPhotometricReach, 0) / kPhotometricLine * kPhotometricLine;
   whole.limit = std::min(whole.right + kPhotometricReach, stride);
   whole.l1_factor = static_cast<float>(task.l1_weight / count);
   whole.ssim_factor = static_cast<float>(task.ssim_weight / count);
@@ -78,9 +81,16 @@ double photometric_loss(const PhotometricTask& task) {
   whole.ssim_sums = work.sums.data() + task.height;
   if (!task.target) {
     work.target.resize(static_cast<size_t>(stride) * task.height);
-    const int64_t begin = static_cast<int64_t>(std::max(first_row - kPhotometricRadius, 0)) * stride;
-    const int64_t end = static_cast<int64_t>(std::min(last_row + kPhotometricRadius, task.height)) * stride;
-    for (int64_t i = begin; i < end; ++i) work.target[i] = task.target_bytes[i] * (1.0f / 255);
+    float* const floats = work.target.data();
+    const int begin = std::max(first_row - kPhotometricRadius, 0);
+    const int rows = std::min(last_row + kPhotometricRadius, task.height) - begin;
+    parallel_for((rows + kRowsAtATime - 1) / kRowsAtATime, [&](int64_t piece) {
+      const int last = std::min(rows, static_cast<int>(piece + 1) * kRowsAtATime);
+      for (int row = static_cast<int>(piece) * kRowsAtATime; row < last; ++row) {
+        const int64_t from = static_cast<int64_t>(begin + row) * stride + whole.origin;
+        kernels.bytes_to_floats(task.target_bytes + from, whole.limit - whole.origin, floats + from);
+      }
+    });
     whole.target = work.target.data();
   }
 
@@ -92,7 +102,7 @@ double photometric_loss(const PhotometricTask& task) {
     band.begin = first_row + static_cast<int>(rows * index / bands);
     band.end = first_row + static_cast<int>(rows * (index + 1) / bands);
     set_row_buffers(band);
-    kernel(band);
+    kernels.band(band);
   });
 
   double l1 = 0, ssim = 0;

@@ -10,6 +10,7 @@ constexpr int kPhotometricRadius = 5;
 constexpr int kPhotometricChannels = 3;
 constexpr int kPhotometricReach = kPhotometricRadius * kPhotometricChannels;
 constexpr int kPhotometricRing = 16;  // rows of derivatives that stay in reach of the window; a power of two
+constexpr int kPhotometricLine = 16;  // floats in a cache line: vectors that straddle two cost twice
 constexpr int kPhotometricPad = 64;   // room at both ends of a row buffer: the window's reach and whole vectors
 
 // Some rows of a picture. Columns count floats; `left..right` is the box and `origin..limit` the box grown by the
@@ -34,6 +35,9 @@ struct PhotometricBand {
   double* ssim_sums;                 // [h]
 };
 
-using PhotometricKernel = void (*)(const PhotometricBand&);
+struct PhotometricKernels {
+  void (*band)(const PhotometricBand&);
+  void (*bytes_to_floats)(const uint8_t* from, int64_t count, float* to);  // 255 becomes 1
+};
 
 }  // namespace mien

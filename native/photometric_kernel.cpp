@@ -53,11 +53,33 @@ void filter_pictures_vertically(const PhotometricBand& band, int y) {
   for (; x < count; x += W) filter_block<1>(band, weights, from, taps, smaller(x, count - W));
 }
 
+// The floats that begin OFFSET before or after those at `row`, which is aligned with the vectors of its buffer. Loads
+// that straddle two cache lines cost twice: with wide vectors nearly all would, so they are put together of aligned
+// ones.
+template <int OFFSET>
+MIEN_INLINE F shifted(const float* row) {
+#if defined(__AVX512F__)
+  const int first = OFFSET < 0 ? -W : 0;
+  const __m512i low = (__m512i)load(row + first), high = (__m512i)load(row + first + W);
+  return (F)_mm512_alignr_epi32(high, low, OFFSET - first);
+#else
+  return load(row + OFFSET);
+#endif
+}
+
+template <int K>
+MIEN_INLINE F pair_sum(const float* row) {
+  return shifted<-K * mien::kPhotometricChannels>(row) + shifted<K * mien::kPhotometricChannels>(row);
+}
+
 MIEN_INLINE F filter_horizontally(const float* row, const float* weights) {
-  F sum{};
-#pragma GCC unroll 11
-  for (int k = 0; k < TAPS; ++k) sum += load(row + (k - RADIUS) * mien::kPhotometricChannels) * weights[k];
-  return sum;
+  static_assert(RADIUS == 5, "the window is written out");
+  F sum = load(row) * weights[RADIUS];
+  sum += pair_sum<1>(row) * weights[RADIUS - 1];
+  sum += pair_sum<2>(row) * weights[RADIUS - 2];
+  sum += pair_sum<3>(row) * weights[RADIUS - 3];
+  sum += pair_sum<4>(row) * weights[RADIUS - 4];
+  return sum + pair_sum<5>(row) * weights[RADIUS - 5];
 }
 
 // One row of the SSIM map inside the box: its sum, and its derivatives into the ring.
@@ -65,9 +87,9 @@ void map_row(const PhotometricBand& band, int y) {
   filter_pictures_vertically(band, y);
   const int slot = y & (RING - 1);
   float *by_mean = band.ring[0][slot], *by_squares = band.ring[1][slot], *by_products = band.ring[2][slot];
-  const int end = band.right - band.origin;
+  const int begin = band.left - band.origin, aligned = begin / W * W, end = band.right - band.origin;
   F map_sum{};
-  for (int x = band.left - band.origin; x < end; x += W) {
+  for (int x = aligned; x < end; x += W) {
     const F mean_x = filter_horizontally(band.rows[0] + x, band.weights);
     const F mean_y = filter_horizontally(band.rows[1] + x, band.weights);
     const F squares = filter_horizontally(band.rows[2] + x, band.weights);
@@ -81,9 +103,12 @@ void map_row(const PhotometricBand& band, int y) {
     store(by_mean + x, 2.0f * (mean_y * (a2 - a1) * inverse - mean_x * (map * inverse * b2 + square_slope)));
     store(by_squares + x, square_slope);
     store(by_products + x, 2.0f * a1 * inverse);
-    map_sum += keep(less(iota(), set1((float)(end - x))), map);
+    map_sum += keep(both(less_equal(set1((float)(begin - x)), iota()), less(iota(), set1((float)(end - x)))), map);
   }
-  // What whole vectors wrote past the box.
+  // What whole vectors wrote beside the box.
+  clear(by_mean + aligned, by_mean + begin);
+  clear(by_squares + aligned, by_squares + begin);
+  clear(by_products + aligned, by_products + begin);
   clear(by_mean + end, by_mean + end + 2 * W);
   clear(by_squares + end, by_squares + end + 2 * W);
   clear(by_products + end, by_products + end + 2 * W);
@@ -112,7 +137,7 @@ void sum_l1(const PhotometricBand& band, int y) {
 // hold zeros.
 void filter_derivatives_vertically(const PhotometricBand& band, int y) {
   const int first = larger(y - RADIUS, band.top), last = smaller(y + RADIUS, band.bottom - 1);
-  const int begin = band.left - band.origin, end = band.right - band.origin;
+  const int begin = (band.left - band.origin) / W * W, end = band.right - band.origin;
   const float* weights = band.weights + (first - y + RADIUS);
   const float* taps[TAPS][3];
   for (int k = 0; k <= last - first; ++k)
@@ -176,9 +201,13 @@ void run_band(const PhotometricBand& band) {
   }
 }
 
+void bytes_to_floats(const uint8_t* from, int64_t count, float* to) {
+  for (int64_t i = 0; i < count; ++i) to[i] = (float)from[i] * (1.0f / 255);
+}
+
 }  // namespace
 
-extern const PhotometricKernel photometric_band;
-const PhotometricKernel photometric_band = run_band;
+extern const PhotometricKernels photometric_kernels;
+const PhotometricKernels photometric_kernels = {run_band, bytes_to_floats};
 
 }  // namespace mien::MIEN_ISA

@@ -77,4 +77,13 @@ PixelBox box_of_nonzero(const float* values, int width, int height) {
   return {left, top, right, bottom};
 }
 
+double mean_squared_difference(const float* image, const uint8_t* bytes, int64_t count) {
+  double total = 0;  // by pieces, in their order: float sums within a piece stay exact enough
+  for (int64_t first = 0; first < count; first += kElements) {
+    const int64_t piece = std::min(kElements, count - first);
+    total += training_kernels().squared_difference(image + first, bytes + first, piece);
+  }
+  return total / static_cast<double>(std::max<int64_t>(count, 1));
+}
+
 }  // namespace mien

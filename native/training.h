@@ -57,4 +57,7 @@ struct PixelBox {
 };
 PixelBox box_of_nonzero(const float* values, int width, int height);
 
+// The mean of (image - bytes / 255)^2 over all values of a picture.
+double mean_squared_difference(const float* image, const uint8_t* bytes, int64_t count);
+
 }  // namespace mien

@@ -101,9 +101,26 @@ bool any_nonzero(const float* values, int64_t count) {
   return false;
 }
 
+double squared_difference(const float* image, const uint8_t* bytes, int64_t count) {
+  F sums{};
+  int64_t i = 0;
+  for (; i + W <= count; i += W) {
+    F target;
+    for (int lane = 0; lane < W; ++lane) target[lane] = (float)bytes[i + lane];
+    const F difference = load(image + i) - target * (1.0f / 255);
+    sums = sums + difference * difference;
+  }
+  double total = sum(sums);
+  for (; i < count; ++i) {
+    const float difference = image[i] - (float)bytes[i] * (1.0f / 255);
+    total += difference * difference;
+  }
+  return total;
+}
+
 }  // namespace
 
 extern const TrainingKernels training_kernels;
-const TrainingKernels training_kernels = {adam, penalties, observe, any_nonzero};
+const TrainingKernels training_kernels = {adam, penalties, observe, any_nonzero, squared_difference};
 
 }  // namespace mien::MIEN_ISA

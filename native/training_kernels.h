@@ -13,6 +13,8 @@ struct TrainingKernels {
   void (*observe)(const ViewStatistics&, int64_t first, int64_t last);
   // Whether any of `count` values is not zero.
   bool (*any_nonzero)(const float* values, int64_t count);
+  // The sum of (image - bytes / 255)^2 over `count` values.
+  double (*squared_difference)(const float* image, const uint8_t* bytes, int64_t count);
 };
 
 }  // namespace mien

@@ -92,6 +92,13 @@ def test_box_of_nonzero(isa: str, size: tuple[int, int]) -> None:
         assert box_of_nonzero(values) == box_of_nonzero(values.double())
 
 
+@pytest.mark.parametrize("size", [(0, 5), (1, 1), (40, 130)])
+def test_mean_squared_difference(isa: str, size: tuple[int, int]) -> None:
+    image, picture = random(*size, 3), (255 * random(*size, 3, seed=1).sigmoid()).to(torch.uint8)
+    expected = (image.double() - picture.double() / 255).square().sum() / max(image.numel(), 1)
+    assert _native.mean_squared_difference(image, picture) == pytest.approx(float(expected), rel=1e-5)
+
+
 def test_the_same_bits_for_any_number_of_threads() -> None:
     means, log_scales, radii = random(20_000, 3), random(20_000, 3, seed=1), torch.ones(20_000, dtype=torch.int32)
     before, results = _native.thread_count(), []

@@ -39,7 +39,7 @@ class Gaussians:
             return self
         names = ("means", "quats", "scales", "opacities", "sh", "T_world_local")
         picked = {
-            name: tensor[index] if tensor.ndim > ndim else tensor
+            name: _entry(tensor, index) if tensor.ndim > ndim else tensor
             for name, (tensor, ndim) in zip(names, self._tensors_with_ndim(), strict=False)
         }
         return Gaussians(**picked)
@@ -71,6 +71,11 @@ class Gaussians:
         """Each tensor that is there with its number of axes when unbatched, in the order of the fields."""
         entries = [(self.means, 2), (self.quats, 2), (self.scales, 2), (self.opacities, 1), (self.sh, 3)]
         return entries if self.T_world_local is None else [*entries, (self.T_world_local, 2)]
+
+
+def _entry(tensor: Tensor, index: int) -> Tensor:
+    # The only entry as a view: the gradient of an index would be written into zeros of the whole batch.
+    return tensor.squeeze(0) if len(tensor) == 1 and index in (0, -1) else tensor[index]
 
 
 def world_means(gaussians: Gaussians) -> Float[Tensor, "... n 3"]:

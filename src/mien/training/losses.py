@@ -1,5 +1,7 @@
 """Losses that compare a rendering with its target: pure functions, means over the whole picture."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,8 +27,12 @@ def picture_losses(rendering: Rendering, target: Target, weights: Photometric) -
 
 def train_psnr(rendering: Rendering, target: Target) -> float:
     """Peak signal-to-noise ratio of a training picture in dB, on the whole picture."""
-    difference = rendering.image.detach() - target.picture.to(rendering.image.dtype) / 255
-    return float(-10 * torch.log10((difference * difference).mean().clamp_min(1e-10)))
+    image, picture = rendering.image.detach(), target.picture
+    if image.dtype == torch.float32 and image.device.type == "cpu":
+        error = _native.mean_squared_difference(image.contiguous(), picture.contiguous())
+    else:
+        error = float((image - picture.to(image) / 255).square().mean())
+    return -10 * math.log10(max(error, 1e-10))
 
 
 def box_of_nonzero(values: Float[Tensor, "h w"]) -> Box:
