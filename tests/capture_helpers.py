@@ -46,7 +46,9 @@ def tree_bytes(folder: Path) -> dict[str, bytes]:
 def scan_texture(test_data: Path) -> np.ndarray:
     """The Lee Perry-Smith scan's photo texture: a flat, frontal face that the detectors find."""
     path = test_data / "leeperrysmith" / "Map-COL.jpg"
-    return cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+    texture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+    assert texture is not None
+    return texture
 
 
 def write_gradient_video(

@@ -15,13 +15,13 @@ from mien.gaussians import sh_from_rgb
 from mien.render import rasterize
 from mien.tracking import Scoring, Tracking
 from mien.training.sequence import Sequence
-from mien.training.split import held_out
+from mien.training.split import Split, held_out
 from small_face_model import make_small_face_model
 
 SIZE = 72
 
 
-def make_experiment(timesteps: int = 50, split: str = "blocks", seed: int = 0) -> Experiment:
+def make_experiment(timesteps: int = 50, split: Split = "blocks", seed: int = 0) -> Experiment:
     """A head that turns and moves its face; every pixel that the avatar covers is scored."""
     torch.manual_seed(seed)
     face_model = make_small_face_model()

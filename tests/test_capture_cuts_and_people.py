@@ -1,5 +1,7 @@
 """Several shots, several people: each part and each face in its place."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import pytest
@@ -167,7 +169,7 @@ def test_false_detections_are_nobody():
 class _ScriptedDetector(LandmarkDetector):
     """Finds what it is told."""
 
-    def __init__(self, script: list[list[float]]) -> None:
+    def __init__(self, script: Sequence[Sequence[float]]) -> None:
         self._script = iter(script)
 
     def detect(self, image: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ def test_clean_plate_cuts_on_the_border_of_what_is_new():
     plate = cv2.GaussianBlur(random.integers(60, 200, (160, 160, 3)).astype(np.uint8), (0, 0), 3)
     truth = np.zeros((160, 160), np.uint8)
     cv2.ellipse(truth, (80, 90), (36, 50), 0, 0, 360, 255, -1)
-    picture = np.where(truth[..., None] > 0, np.uint8([220, 60, 60]), plate)
+    picture = np.where(truth[..., None] > 0, np.array([220, 60, 60], np.uint8), plate)
     mask = cv2.GaussianBlur(np.roll(truth, 4, axis=1), (0, 0), 6).astype(np.float32) / 255
     shifted = np.roll(plate, (1, 2), axis=(0, 1))
     for scene in (plate, shifted, (plate * 0.85).astype(np.uint8)):

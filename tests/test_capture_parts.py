@@ -36,7 +36,8 @@ def test_one_false_detection_does_not_widen_the_crop():
 
 @pytest.mark.parametrize("centre", [(30, 30), (1900, 1060), (960, 1070)])
 def test_crop_stays_inside_the_picture(centre):
-    crop = choose_crop(face_box(*centre, 300, 1920, 1080)[None], 1920, 1080, 512)
+    x, y = centre
+    crop = choose_crop(face_box(x, y, 300, 1920, 1080)[None], 1920, 1080, 512)
     assert crop.left >= 0
     assert crop.top >= 0
     assert crop.left + crop.crop_width <= 1920

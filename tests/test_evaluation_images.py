@@ -60,6 +60,7 @@ def test_mattes_cut_the_truth_and_give_the_head_crop(folders: ImageFolders, tmp_
     (tmp_path / "mattes").mkdir()
     for name in "abc":
         truth = cv2.imread(str(folders.truth / f"{name}.png"))
+        assert truth is not None
         cv2.imwrite(str(tmp_path / "mattes" / f"{name}.png"), matte)
         cv2.imwrite(str(folders.images / f"{name}.png"), np.where(matte[..., None] > 0, truth, 0))
     black = score_folders(ImageFolders(folders.images, folders.truth, tmp_path / "mattes", background="black"), PLAIN)
@@ -93,7 +94,9 @@ def test_figures_are_those_of_the_metrics(folders: ImageFolders) -> None:
     import torch
 
     def floats(path: Path) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])).float() / 255
+        picture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+        assert picture is not None
+        return torch.from_numpy(picture).float() / 255
 
     figures = [psnr(floats(folders.images / f"{n}.png"), floats(folders.truth / f"{n}.png")) for n in "abc"]
     assert scores["per_frame"]["psnr"] == pytest.approx(figures, abs=1e-9)

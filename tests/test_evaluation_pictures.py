@@ -49,7 +49,8 @@ def test_data_uri_is_a_picture() -> None:
     for quality in (None, 95):
         head, body = data_uri(picture, quality).split(",")
         assert head == f"data:image/{'png' if quality is None else 'jpeg'};base64"
-        decoded = cv2.imdecode(np.frombuffer(base64.b64decode(body), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+        decoded = cv2.imdecode(np.frombuffer(base64.b64decode(body), np.uint8), cv2.IMREAD_COLOR_RGB)
+        assert decoded is not None
         assert decoded.shape == picture.shape
         if quality is None:
             assert (decoded == picture).all()

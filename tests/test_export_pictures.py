@@ -26,7 +26,7 @@ def disc(size: int = 64) -> np.ndarray:
     rows, columns = np.mgrid[:size, :size] + 0.5
     distance = np.hypot(rows - size / 2, columns - size / 2)
     alpha = np.clip((size / 3 - distance) / 4 + 0.5, 0, 1).astype(np.float32)
-    colours = np.broadcast_to(np.float32([0.8, 0.3, 0.2]), (size, size, 3))
+    colours = np.broadcast_to(np.array([0.8, 0.3, 0.2], np.float32), (size, size, 3))
     return to_rgba(colours * alpha[..., None], alpha)
 
 
@@ -40,8 +40,9 @@ def test_colours_are_straight() -> None:
 
 def test_png_keeps_every_value(tmp_path: Path) -> None:
     write_pictures(plan_output(tmp_path / "a.png", 1, True), [disc()], 25)
-    read = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA)
-    assert np.array_equal(read, disc())
+    read = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    assert read is not None
+    assert np.array_equal(cv2.cvtColor(read, cv2.COLOR_BGRA2RGBA), disc())
 
 
 def test_webm_keeps_alpha_and_outlines_have_no_fringe(tmp_path: Path) -> None:

@@ -52,6 +52,8 @@ def test_colour_and_opacity_are_the_networks_of_features_and_place() -> None:
     fill(avatar.store["neutral_features"], 2)
     gaussians = avatar.pose(face).gaussians
     first, _, last = avatar.network
+    assert isinstance(first, torch.nn.Linear)
+    assert isinstance(last, torch.nn.Linear)
     points = avatar.store["means"].detach() / SMALL.encoding_length
     features = (avatar.store["feature_bases"] @ inputs_of(face)[0]) + avatar.store["neutral_features"]
     values = torch.cat([features, positional_encoding(points, SMALL.encoding_bands)], dim=-1) @ first.weight.T

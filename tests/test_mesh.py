@@ -1,5 +1,6 @@
 """The mesh rasterizer: coverage, perspective, depth order, near plane, and the pictures made from it."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import torch
 import trimesh
 from PIL import Image
 from torch import Tensor
+from trimesh.visual import TextureVisuals
 
 from mien.camera import Camera, camera_from_fov, look_at
 from mien.render.mesh import (
@@ -30,7 +32,7 @@ def pixel_camera(width: int = 16, height: int = 12) -> Camera:
     return Camera(torch.eye(3), torch.eye(4), width, height)
 
 
-def at_depth(pixels: list[tuple[float, float, float]]) -> Tensor:
+def at_depth(pixels: Sequence[tuple[float, float, float]]) -> Tensor:
     """World points of (x, y, depth) for `pixel_camera`."""
     points = torch.tensor(pixels, dtype=torch.float32)
     return torch.cat([points[:, :2] * points[:, 2:], points[:, 2:]], dim=-1)
@@ -175,6 +177,8 @@ def test_native_interpolation_equals_the_reference():
         exact = torch.autograd.functional.vjp(
             lambda a, corners=corners: interpolate_reference(fragments, a, corners), rows.double(), weights.double()
         )[1]
+        assert isinstance(grad, Tensor)
+        assert isinstance(exact, Tensor)
         torch.testing.assert_close(grad.double().view(exact.shape), exact, atol=1e-4, rtol=1e-5)
 
 
@@ -260,6 +264,8 @@ def test_threads_draw_the_same_pictures():
 def test_a_scanned_head_looks_like_its_texture(test_data: Path):
     folder = test_data / "leeperrysmith"
     mesh = trimesh.load(folder / "LeePerrySmith.glb", force="mesh", process=False)
+    assert isinstance(mesh, trimesh.Trimesh)
+    assert isinstance(mesh.visual, TextureVisuals)
     vertices, faces = torch.tensor(np.array(mesh.vertices)).float(), torch.tensor(np.array(mesh.faces)).long()
     uv = torch.tensor(np.array(mesh.visual.uv)).float() * torch.tensor([1.0, -1.0]) + torch.tensor([0.0, 1.0])
     texture = torch.tensor(np.array(Image.open(folder / "Map-COL.jpg"))).float() / 255

@@ -76,7 +76,9 @@ def test_ssim_in_a_box_is_that_of_the_cut_images(pair: tuple[torch.Tensor, torch
 
 
 def _read(path: str) -> torch.Tensor:
-    return torch.from_numpy(cv2.imread(path)[:, :, ::-1].copy()).float() / 255
+    picture = cv2.imread(path)
+    assert picture is not None
+    return torch.from_numpy(picture[:, :, ::-1].copy()).float() / 255
 
 
 def test_st_lpips_gives_the_published_figure(test_data) -> None:

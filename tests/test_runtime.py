@@ -107,7 +107,7 @@ def test_names_and_their_mistakes(tmp_path: Path) -> None:
         ({"head_rotation": (0, 1)}, "three finite numbers"),
     ):
         with pytest.raises(ValueError, match=part):
-            portable.pose(**wrong)
+            portable.pose(**wrong)  # pyright: ignore[reportArgumentType]
 
 
 def test_no_torch_is_imported(tmp_path: Path) -> None:
