@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -25,6 +26,7 @@ from mien.tracking.settings import TrackingSettings
 from mien.tracking.shared_fit import fit_shared
 from mien.tracking.shot import Shot, lenses_of, shot_of
 from mien.tracking.stages import (
+    SEQUENCE_ITERATIONS,
     Fit,
     SequenceFit,
     all_landmarks,
@@ -37,6 +39,8 @@ from mien.tracking.stages import (
 from mien.tracking.tracking import Tracking
 
 DEFAULTS = TrackingSettings()
+_COSTS = {"head pose": 10, "identity": 10, "frames": 140, "sequence": 100}
+"""About how long each stage takes a timestep, for the progress bar: so in a clip of 15,000; multiples of ten."""
 
 
 def track(capture: Capture, face_model: FaceModel, settings: TrackingSettings = DEFAULTS) -> Tracking:
@@ -86,12 +90,17 @@ def _fit_landmarks(
     model: LandmarkModel, shots: Sequence[Shot], lenses: Sequence[int | None], settings: TrackingSettings
 ) -> Fit:
     subject = Subject(torch.zeros(len(model.identity_basis)).double(), torch.zeros(LANDMARKS, 3).double())
-    with progress_bar("Tracking", total=3 * len(shots) + 1) as advance:
+    frames = sum(int(shot.valid.sum()) for shot in shots)
+    with progress_bar("Tracking", total=frames * sum(_COSTS.values())) as advance:
+
+        def advance_by(stage: str, timesteps: int, share: int = 1) -> None:
+            advance(timesteps * _COSTS[stage] // share, status=stage)
+
         starts = []
         for shot in shots:
             pose = fit_head_pose(model, shot.views, shot.cameras, subject, settings)
             starts.append(SequenceFit(shot.cameras, widen(pose, model.layout)))
-            advance(status="head pose")
+            advance_by("head pose", len(pose))
 
         terms, keyframes = [], []
         for shot, own in zip(shots, starts, strict=True):
@@ -99,21 +108,19 @@ def _fit_landmarks(
             terms.append(all_landmarks(model, shot.views, own, settings).at(chosen))
             keyframes.append(replace(own, state=own.state[chosen]))
         known = fit_shared(terms, Fit(subject, tuple(keyframes)), lenses, settings)
-        advance(status="identity")
+        advance_by("identity", frames)
 
         terms, sequences = [], []
         for shot, key in zip(shots, known.sequences, strict=True):
             pose = fit_head_pose(model, shot.views, key.cameras, known.subject, settings)
             own = SequenceFit(key.cameras, widen(pose, model.layout))
             terms.append(all_landmarks(model, shot.views, own, settings))
-            sequences.append(fit_frames(terms[-1], known.subject, own))
-            advance(status="frames")
+            sequences.append(fit_frames(terms[-1], known.subject, own, partial(advance_by, "frames")))
 
         smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
                       for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
-        fit = fit_sequences(terms, Fit(known.subject, tuple(sequences)), smoothness, settings)
-        advance(amount=len(shots), status="sequence")
-    return fit
+        advance_one = partial(advance_by, "sequence", share=SEQUENCE_ITERATIONS)
+        return fit_sequences(terms, Fit(known.subject, tuple(sequences)), smoothness, settings, advance_one)
 
 
 def _as_tracking(

@@ -1,7 +1,7 @@
 """The stages of tracking from landmarks: each takes what is known so far and returns it refined."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -27,7 +27,9 @@ from mien.tracking.views import CameraBatch, Views
 _FRAME_ITERATIONS = 12
 _FRAMES_AT_ONCE = 512
 """Timesteps fitted side by side, each alone: bounds the memory to some 100 MB."""
-_SEQUENCE_ROUNDS, _SEQUENCE_ITERATIONS = 2, 5
+_ROUNDS = 2
+SEQUENCE_ITERATIONS = 10
+"""At most, in all rounds together."""
 _RIM_BIAS_SHARE = 0.25
 """Of other landmarks' standard deviation of the static offset: for lids and lips."""
 _LINE_SEARCH = (1.0, 0.5, 0.25, 0.1)
@@ -99,8 +101,10 @@ def _without_similarity(
     return (offsets - (basis @ amount)[..., 0]) * moving[:, None]
 
 
-def fit_frames(term: LandmarkTerm, subject: Subject, own: SequenceFit) -> SequenceFit:
-    """Pose, expression and eyes of every timestep alone."""
+def fit_frames(
+    term: LandmarkTerm, subject: Subject, own: SequenceFit, advance: Callable[[int], None] = lambda timesteps: None
+) -> SequenceFit:
+    """Pose, expression and eyes of every timestep alone; `advance` is told of timesteps that are done."""
     parts = []
     for rows in torch.arange(len(own.state)).split(_FRAMES_AT_ONCE):
         part = term.at(rows)
@@ -109,37 +113,56 @@ def fit_frames(term: LandmarkTerm, subject: Subject, own: SequenceFit) -> Sequen
             lambda state, part=part: part.cost(state, subject, own.cameras),
             own.state[rows], box_of(term.model.layout), _FRAME_ITERATIONS,
         ))  # fmt: skip
+        advance(len(rows))
     return replace(own, state=torch.cat(parts))
 
 
 def fit_sequences(
-    terms: Sequence[LandmarkTerm], fit: Fit, smoothness: Sequence[Smoothness], settings: TrackingSettings
+    terms: Sequence[LandmarkTerm],
+    fit: Fit,
+    smoothness: Sequence[Smoothness],
+    settings: TrackingSettings,
+    advance: Callable[[int], None] = lambda timesteps: None,
 ) -> Fit:
-    """All timesteps of each sequence together under its smoothness cost, alternating with the landmarks' bias."""
-    for _ in range(_SEQUENCE_ROUNDS):
+    """All timesteps of each sequence together under its smoothness cost, alternating with the landmarks' bias.
+
+    `advance` is told of timesteps that are done, of all iterations (`SEQUENCE_ITERATIONS`) together.
+    """
+    for _ in range(_ROUNDS):
         fit = fit_bias(terms, fit, settings)
         parts = zip(terms, fit.sequences, smoothness, strict=True)
-        fit = replace(fit, sequences=tuple(_fit_chain(term, fit.subject, own, smooth) for term, own, smooth in parts))
+        fit = replace(
+            fit,
+            sequences=tuple(_fit_chain(term, fit.subject, own, smooth, advance) for term, own, smooth in parts),
+        )
     return fit
 
 
-def _fit_chain(term: LandmarkTerm, subject: Subject, own: SequenceFit, smoothness: Smoothness) -> SequenceFit:
-    box = box_of(term.model.layout)
+def _fit_chain(
+    term: LandmarkTerm,
+    subject: Subject,
+    own: SequenceFit,
+    smoothness: Smoothness,
+    advance: Callable[[int], None],
+) -> SequenceFit:
+    box, iterations = box_of(term.model.layout), SEQUENCE_ITERATIONS // _ROUNDS
 
     def cost(state: Float[Tensor, "v p"]) -> float:
         return float(term.cost(state, subject, own.cameras).sum() + smoothness.cost(state))
 
-    state, best = own.state, cost(own.state)
-    for _ in range(_SEQUENCE_ITERATIONS):
+    def step_from(state: Float[Tensor, "v p"]) -> Float[Tensor, "v p"]:
         equations = term.equations(state, subject, own.cameras)
         held = box.held(state, equations.gradient + smoothness.gradient(state))
-        step = solve_chain(equations, smoothness, state, held)
+        return solve_chain(equations, smoothness, state, held)
+
+    state, best = own.state, cost(own.state)
+    for done in range(iterations):
+        step = step_from(state)
         candidates = (box.clip(state + fraction * step) for fraction in _LINE_SEARCH)
         improved = next(((c, value) for c in candidates if (value := cost(c)) < best), None)
-        if improved is None:
-            break
-        converged = best - improved[1] < 1e-4 * best
-        state, best = improved
+        converged = improved is None or best - improved[1] < 1e-4 * best
+        state, best = improved or (state, best)
+        advance(len(state) * (iterations - done if converged else 1))
         if converged:
             break
     return replace(own, state=state)
