@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from capture_helpers import face_picture, to_planes, write_face_clip, write_planes
-from mien.capture import CaptureSettings, capture_video
+from mien.capture import CaptureSettings, capture_video, read_capture
 from mien.capture.tone import HLG, PQ, hlg_scene_light, pq_light, roll_off
 from mien.capture.video import count_frames, probe_video, read_video_frames
+from mien.cli import main
 
 BT2020, BT709 = (0.2627, 0.0593), (0.2126, 0.0722)
 COLOURS = np.array([[200, 120, 100], [90, 60, 50], [40, 90, 60], [20, 30, 120], [128, 128, 128], [0, 0, 0]])
@@ -154,3 +155,43 @@ def test_frames_are_counted_without_decoding(test_data, tmp_path):
     path = tmp_path / "clip.mp4"
     write_face_clip(path, test_data, frames=7)
     assert count_frames(path) == 7
+
+
+def test_a_clip_of_a_telephone_is_captured(test_data, tmp_path, capsys):
+    """HEVC, ten bits, HLG, stored on its side with a rotation flag, at a variable rate, in a .mov: all at once."""
+    path = tmp_path / "IMG_0001.mov"
+    upright = np.pad(face_picture(test_data, 160), ((70, 90), (10, 10), (0, 0)), mode="edge")
+    stored = np.ascontiguousarray(np.rot90(upright, 3))
+    signal = hdr_signal(to_bt2020(light_of(stored)), HLG)
+    luma, *chroma = to_planes(signal, BT2020, 10)
+    small = [cv2.resize(plane, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for plane in chroma]
+    ticks = [0, 20, 40, 50, 90, 110, 130, 150]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx265", rate=600, options={"x265-params": "log-level=none:crf=10"})
+        stream.width, stream.height, stream.pix_fmt = stored.shape[1], stored.shape[0], "yuv420p10le"
+        stream.codec_tag = "hvc1"
+        stream.set_display_rotation(90)
+        context = stream.codec_context
+        context.colorspace, context.color_primaries, context.color_trc, context.color_range = 9, 9, HLG, 1
+        for tick in ticks:
+            frame = av.VideoFrame(stored.shape[1], stored.shape[0], "yuv420p10le")
+            frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range = 9, 9, HLG, 1
+            frame.pts = tick
+            for plane, values in zip(frame.planes, (luma, *small), strict=True):
+                padded = np.zeros((values.shape[0], plane.line_size // 2), np.uint16)
+                padded[:, : values.shape[1]] = values
+                plane.update(padded.tobytes())
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    assert main(["capture", str(path), "--out", str(tmp_path / "me"), "--capture.crop", "none"]) == 0
+    said = capsys.readouterr().err
+    assert "HDR video (HLG); its pictures are tone-mapped" in said
+    assert "(variable rate); all are kept, each with its own time" in said
+    assert "warning" not in said
+    capture = read_capture(tmp_path / "me/sequences/IMG_0001/capture")
+    assert capture.images.shape == (8, 1, *upright.shape)
+    assert capture.valid.all()
+    np.testing.assert_allclose(capture.timestamps, np.array(ticks) / 600, atol=1e-4)
+    # Highlights are pressed together; below, colours come back.
+    ordinary = upright.max(axis=-1) < 200
+    assert np.abs(capture.images[4, 0].astype(int) - upright)[ordinary].mean() < 3
