@@ -25,6 +25,8 @@ class Subject:
     bias: Float[Tensor, "l 3"]
     """How far each landmark lies from where the model has it, at rest, in the head frame, metres: the detector means
     other points than the embedding, and no identity basis spans every face."""
+    vertex_offsets: Float[Tensor, "v 3"] | None = None
+    """Static offsets of the mesh, where pixels told them; the bias then holds what they move of landmarks."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from mien.tracking.landmark_groups import LANDMARKS
 from mien.tracking.landmark_model import LandmarkModel, reduce_face_model
 from mien.tracking.landmark_term import Subject
 from mien.tracking.neck_line import fit_neck_lines
+from mien.tracking.paper import fit_by_descent
 from mien.tracking.parameters import layout_of
 from mien.tracking.photometric import refine_photometrically
 from mien.tracking.settings import TrackingSettings
@@ -80,6 +81,8 @@ def track_subject(
             ) from None
         if settings.schedule == "fast":
             fit = refine_photometrically(model, shots, lenses, fit, settings).fit
+        if settings.schedule == "paper":
+            fit = fit_by_descent(model, shots, lenses, fit, settings)
         return [
             _as_tracking(shot, face_model, model, fit.subject, own, settings)
             for shot, own in zip(shots, fit.sequences, strict=True)
@@ -136,6 +139,7 @@ def _as_tracking(
     distances = all_landmarks(model, views, own, settings).residuals(own.state, subject, own.cameras)
     residuals[shot.valid.nonzero()[views.row, 0], views.camera] = distances.median(1).values.float()
     face = fill_gaps(model.layout.face_params(own.state, subject.identity), shot.valid)
+    face = replace(face, vertex_offsets=subject.vertex_offsets)
     face = _in_world(face, shot.T_world_fit).to(torch.zeros(()))
     cameras = shot.cameras_in_world(own.cameras)
     return Tracking(

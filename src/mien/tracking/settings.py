@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from mien.tracking.paper_settings import PaperSettings
 from mien.tracking.photometric_settings import PhotometricSettings
 
 
@@ -44,7 +45,10 @@ class TrackingSettings:
     """How far a landmark's point on the subject may lie from the model's, metres; one offset for all sequences."""
     smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
     """Over time."""
-    schedule: Literal["landmarks", "fast"] = "landmarks"
-    """landmarks: fit landmarks alone. fast: then fit the pixels, by a texture common to all pictures."""
+    schedule: Literal["landmarks", "fast", "paper"] = "landmarks"
+    """landmarks: fit landmarks alone. fast: then fit the pixels, by a texture common to all pictures. paper: fit the
+    pixels frame after frame by gradient descent, then all together (GaussianAvatars), which takes much longer."""
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
-    """Of the fit to pixels."""
+    """Of the fast fit to pixels."""
+    paper: PaperSettings = field(default_factory=PaperSettings)
+    """Of the paper's fit to pixels."""

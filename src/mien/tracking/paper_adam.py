@@ -1,0 +1,51 @@
+"""Adam for tensors and for single rows of tensors, with its state where a file can hold it."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-12
+
+
+@dataclass(eq=False)
+class Moments:
+    """Running means of gradients and of their squares. Mutable."""
+
+    first: Tensor
+    second: Tensor
+    count: int = 0
+
+    @staticmethod
+    def like(values: Tensor) -> "Moments":
+        """For values that have not moved yet."""
+        return Moments(torch.zeros_like(values), torch.zeros_like(values))
+
+    def step(self, values: Tensor, gradient: Tensor, rate: Tensor | float) -> None:
+        """Move the values in place (Kingma and Ba 2015); `rate` may differ between entries."""
+        self.count += 1
+        self.first.lerp_(gradient, 1 - _BETA1)
+        self.second.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
+        root = (self.second / (1 - _BETA2**self.count)).sqrt_().add_(_EPSILON)
+        moved = self.first / root
+        values.sub_(moved.mul_(rate).mul_(1 / (1 - _BETA1**self.count)))
+
+
+@dataclass(frozen=True, eq=False)
+class RowStepper:
+    """Moves a timestep's parameters by Adam, in coordinates in which landmarks tell all of them equally well."""
+
+    row: Float[Tensor, " p"]
+    """Moved in place."""
+    whitening: Float[Tensor, "p p"]
+    moments: Moments
+    bounds: tuple[Float[Tensor, " p"], Float[Tensor, " p"]]
+
+    @torch.no_grad()
+    def step(self, gradient: Float[Tensor, " p"], rate: float) -> None:
+        """One step; within the bounds."""
+        move = torch.zeros_like(self.row)
+        self.moments.step(move, gradient @ self.whitening, rate)
+        self.row.add_(self.whitening @ move)
+        self.row.copy_(torch.minimum(torch.maximum(self.row, self.bounds[0]), self.bounds[1]))

@@ -1,0 +1,187 @@
+"""What the `paper` schedule fits: the parameters, and what stays the same while they move."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.face import FaceModel, Landmarks
+from mien.render.mesh_gradients import LitMesh, mesh_edges
+from mien.tracking.landmark_groups import LEFT_IRIS, RIGHT_IRIS
+from mien.tracking.landmark_model import LandmarkModel
+from mien.tracking.landmark_term import LandmarkTerm, Subject
+from mien.tracking.paper_settings import PaperSettings
+from mien.tracking.parameters import ParameterLayout
+from mien.tracking.photometric_pictures import Pictures
+from mien.tracking.photometric_texture import HIDING_REGIONS, even_light
+from mien.tracking.settings import TrackingSettings
+from mien.tracking.shot import Shot
+from mien.tracking.solver import Smoothness
+from mien.tracking.stages import Fit, all_landmarks, smoothness_of
+from mien.tracking.views import CameraBatch
+
+_STIFF_REGIONS = ("eyes", "irises", "eyelids", "teeth", "tongue", "mouth", "eye_sockets", "scalp", "neck", "ears")
+"""Regions without offsets: they close on each other, or nothing shows where they are."""
+
+
+@dataclass(eq=False)
+class PaperState:
+    """All that is fitted; float32. Mutable: Adam writes into it."""
+
+    identity: Float[Tensor, " i"]
+    offsets: Float[Tensor, "v 3"]
+    texture: Float[Tensor, "th tw 3"]
+    lights: Float[Tensor, "s 9 3"]
+    log_focals: Float[Tensor, " g"]
+    frames: list[Float[Tensor, "t p"]]
+    """Of each sequence, a row a timestep with a face."""
+    sight: Float[Tensor, " f"]
+    """The best cosine between a triangle's normal and the direction to a camera of a frame that its texels are from."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """By name, for a file."""
+        frames = {f"frames_{index}": rows for index, rows in enumerate(self.frames)}
+        names = ("identity", "offsets", "texture", "lights", "log_focals", "sight")
+        return {name: getattr(self, name) for name in names} | frames
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceScene:
+    """One sequence as it was found."""
+
+    timesteps: Int[Tensor, " t"]
+    pictures: Pictures
+    cameras: CameraBatch
+    """float32, with the focal length of the fit to landmarks."""
+    detected: dict[int, dict[int, Float[Tensor, "l 2"]]]
+    """Of each row, by camera."""
+    sigma: Float[Tensor, " c"]
+    smoothness: Smoothness
+    lens: int | None
+    term: LandmarkTerm
+    """float64."""
+
+
+@dataclass(frozen=True, eq=False)
+class PaperScene:
+    """Everything that does not move."""
+
+    face_model: FaceModel
+    layout: ParameterLayout
+    precision: Float[Tensor, "p p"]
+    landmarks: Landmarks
+    landmark_weights: Float[Tensor, " l"]
+    outlier: float
+    bias: Float[Tensor, "l 3"]
+    mesh: LitMesh
+    used: Float[Tensor, " f"]
+    identity: Float[Tensor, " i"]
+    """Where landmarks had it."""
+    offset_share: Float[Tensor, "v 1"]
+    """0 for vertices that get no offset."""
+    neighbours: tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, "v 1"]]
+    """Pairs of vertices along edges, and one over the number of each vertex's neighbours."""
+    sequences: tuple[SequenceScene, ...]
+    settings: PaperSettings
+
+    def whitening(
+        self, sequence: int, row: int, state: Float[Tensor, " p"], differences: float
+    ) -> Float[Tensor, "p p"]:
+        """Turns independent steps of one standard deviation, which landmarks and smoothness leave, into parameters.
+
+        `differences` is the sum of squares of the timestep's factors in the second differences that count.
+        """
+        own = self.sequences[sequence]
+        subject = Subject(self.identity.double(), self.bias.double())
+        cameras = CameraBatch(own.cameras.K.double(), own.cameras.viewmat.double())
+        with torch.no_grad():
+            here = own.term.at(torch.tensor([row])).equations(state.double()[None], subject, cameras)
+            hessian = here.hessian[0] + torch.diag(differences * own.smoothness.precision.double())
+            hessian += 1e-9 * torch.diag(hessian.diagonal())
+            return torch.linalg.inv(torch.linalg.cholesky(hessian)).T.float().contiguous()
+
+    def camera(self, sequence: int, camera: int, log_focals: Float[Tensor, " g"]) -> Camera:
+        """Of a picture of the capture's size, with the present focal length."""
+        own = self.sequences[sequence]
+        K, capture = own.cameras.K[camera], own.pictures.capture
+        if own.lens is not None:
+            factor = log_focals[own.lens].exp()
+            K = torch.stack([torch.cat([K[0, :1] * factor, K[0, 1:]]),
+                             torch.cat([K[1, :1], K[1, 1:2] * factor, K[1, 2:]]), K[2]])  # fmt: skip
+        return Camera(K, own.cameras.viewmat[camera], capture.width, capture.height)
+
+
+def paper_scene(
+    model: LandmarkModel, shots: Sequence[Shot], lenses: Sequence[int | None], fit: Fit, settings: TrackingSettings
+) -> PaperScene:
+    """Constants of the fit, from what landmarks led to."""
+    face_model = model.face_model.to(torch.zeros(()))
+    used = ~face_model.region_mask(*HIDING_REGIONS)
+    mesh = LitMesh(
+        face_model.faces.contiguous(), face_model.uv[face_model.uv_faces].contiguous(), used.float(),
+        mesh_edges(face_model.faces, used),
+    )  # fmt: skip
+    terms = [all_landmarks(model, shot.views, own, settings) for shot, own in zip(shots, fit.sequences, strict=True)]
+    sequences = [
+        _sequence(model, shot, own.cameras, term, lens, settings)
+        for shot, own, term, lens in zip(shots, fit.sequences, terms, lenses, strict=True)
+    ]
+    return PaperScene(
+        face_model, model.layout, model.layout.precision.float(), face_model.landmarks["mediapipe"],
+        terms[0].weights.float(), terms[0].outlier, fit.subject.bias.float(), mesh, used.float(),
+        fit.subject.identity.float(), _offset_share(face_model), _neighbours(face_model), tuple(sequences),
+        settings.paper,
+    )  # fmt: skip
+
+
+def first_state(scene: PaperScene, fit: Fit, lenses: Sequence[int | None]) -> PaperState:
+    """Where landmarks led to, with nothing known about texture and light."""
+    size = scene.settings.texture_size
+    lens_count = len({lens for lens in lenses if lens is not None})
+    return PaperState(
+        identity=scene.identity.clone(),
+        offsets=torch.zeros_like(scene.face_model.template),
+        texture=torch.full((size, size, 3), 0.5),
+        lights=torch.stack([even_light() for _ in scene.sequences]),
+        log_focals=torch.zeros(lens_count),
+        frames=[own.state.float() for own in fit.sequences],
+        sight=torch.zeros(len(scene.mesh.faces)),
+    )
+
+
+def _sequence(
+    model: LandmarkModel,
+    shot: Shot,
+    cameras: CameraBatch,
+    term: LandmarkTerm,
+    lens: int | None,
+    settings: TrackingSettings,
+) -> SequenceScene:
+    detected: dict[int, dict[int, Tensor]] = {}
+    views = shot.views
+    for picture, (row, camera) in enumerate(zip(views.row.tolist(), views.camera.tolist(), strict=True)):
+        detected.setdefault(row, {})[camera] = views.detected[picture].float()
+    smoothness = smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, cameras)
+    return SequenceScene(
+        shot.valid.nonzero()[:, 0], Pictures(shot.capture, settings.paper.shrink),
+        CameraBatch(cameras.K.float(), cameras.viewmat.float()), detected, term.sigma.float(),
+        Smoothness(smoothness.precision.float(), smoothness.linked), lens, term,
+    )  # fmt: skip
+
+
+def _offset_share(face_model: FaceModel) -> Float[Tensor, "v 1"]:
+    share = torch.ones(len(face_model.template), 1)
+    share[face_model.faces[face_model.region_mask(*_STIFF_REGIONS)].flatten()] = 0
+    marks = face_model.landmarks["mediapipe"]
+    share[face_model.faces[marks.faces[list(LEFT_IRIS + RIGHT_IRIS)]].flatten()] = 0
+    return share
+
+
+def _neighbours(face_model: FaceModel) -> tuple[Tensor, Tensor, Tensor]:
+    edges = mesh_edges(face_model.faces).vertices.long().unique(dim=0)
+    first, second = torch.cat([edges, edges.flip(1)]).unbind(1)
+    count = torch.zeros(len(face_model.template), 1).index_add(0, first, torch.ones(len(first), 1))
+    return first, second, 1 / count.clamp_min(1)

@@ -1,0 +1,146 @@
+"""The costs of the `paper` schedule. One unit is one squared standard deviation, as in the fit to landmarks."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.face import FaceParams
+from mien.render.mesh import MeshFragments, rasterize_mesh, vertex_normals
+from mien.render.mesh_gradients import image_points, mesh_loss
+from mien.rotation import matrix_from_axis_angle
+from mien.tracking.paper_scene import PaperScene, SequenceScene
+from mien.tracking.solver import Smoothness
+
+GAPS = (
+    (159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 373),  # lids
+    (13, 14), (82, 87), (312, 317), (81, 178), (311, 402),  # lips
+)  # fmt: skip
+"""Pairs of landmarks, upper and lower, whose distance tells how far eyes and mouth are open."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """The parameters that a step may move, as leaves or constants."""
+
+    row: Float[Tensor, " p"]
+    identity: Float[Tensor, " i"]
+    offsets: Float[Tensor, "v 3"]
+    texture: Float[Tensor, "th tw 3"]
+    light: Float[Tensor, "9 3"]
+    log_focals: Float[Tensor, " g"]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A picture that is fitted to."""
+
+    sequence: int
+    row: int
+    camera: int
+    image: Float[Tensor, "h w 3"]
+    mask: Float[Tensor, "h w"]
+
+
+def show(scene: PaperScene, sequence: int, row: int, camera: int) -> Shown:
+    """Read a picture."""
+    own = scene.sequences[sequence]
+    image = own.pictures.picture(int(own.timesteps[row]), camera, own.cameras).image
+    return Shown(sequence, row, camera, image, torch.ones(image.shape[:2]))
+
+
+def posed(scene: PaperScene, moving: Moving) -> tuple[Float[Tensor, "v 3"], FaceParams]:
+    """Vertices in the world of the fit."""
+    face = scene.layout.face_params(moving.row[None], moving.identity)
+    face = replace(face, vertex_offsets=moving.offsets)
+    return scene.face_model(face)[0], face
+
+
+def color_term(
+    scene: PaperScene, shown: Shown, moving: Moving, vertices: Float[Tensor, "v 3"], weights: Float[Tensor, " f"]
+) -> Float[Tensor, ""]:
+    """The difference between picture and rendering, over the triangles that count."""
+    camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
+    height, width = shown.mask.shape
+    camera = camera.resized(width, height)
+    fragments = see(vertices, scene, camera)
+    mesh = replace(scene.mesh, face_weights=weights)
+    return scene.settings.color_weight * mesh_loss(
+        fragments, image_points(camera, vertices), vertex_normals(vertices, mesh.faces), mesh, moving.texture,
+        moving.light, (shown.image, shown.mask, scene.settings.color_epsilon),
+    )  # fmt: skip
+
+
+def see(vertices: Float[Tensor, "v 3"], scene: PaperScene, camera: Camera) -> MeshFragments:
+    """What a camera sees of the mesh."""
+    fixed = replace(camera, K=camera.K.detach())
+    return rasterize_mesh(vertices.detach(), scene.mesh.faces, fixed)
+
+
+def landmark_terms(
+    scene: PaperScene, shown: Shown, moving: Moving, vertices: Float[Tensor, "v 3"]
+) -> Float[Tensor, ""]:
+    """Landmarks in all pictures of the timestep, and the gaps between lids and lips."""
+    own = scene.sequences[shown.sequence]
+    marks = scene.landmarks.positions(vertices, scene.mesh.faces)
+    marks = marks + scene.bias @ matrix_from_axis_angle(moving.row[:3]).T
+    upper, lower = (torch.tensor(column) for column in zip(*GAPS, strict=True))
+    total = vertices.new_zeros(())
+    for camera, detected in own.detected[shown.row].items():
+        pixels = scene.camera(shown.sequence, camera, moving.log_focals).project(marks)[0]
+        residual = (pixels - detected) / own.sigma[camera]
+        total = total + _robust(residual, scene.landmark_weights, scene.outlier)
+        gaps = residual[upper] - residual[lower]
+        weights = scene.settings.gap_weight * scene.landmark_weights[upper]
+        total = total + _robust(gaps, weights, scene.outlier)
+    return scene.settings.landmark_share * total
+
+
+def _robust(residual: Float[Tensor, "n 2"], weights: Float[Tensor, " n"], outlier: float) -> Float[Tensor, ""]:
+    squared, least = residual.square().sum(-1), outlier**2
+    return (weights * least * squared / (least + squared)).sum()
+
+
+def prior_term(scene: PaperScene, row: Float[Tensor, " p"]) -> Float[Tensor, ""]:
+    """Of a timestep's own parameters."""
+    return (row * (scene.precision @ row)).sum()
+
+
+def smoothness_term(
+    own: SequenceScene, rows: Float[Tensor, "t p"], index: int, row: Float[Tensor, " p"], past_only: bool
+) -> Float[Tensor, ""]:
+    """Accelerations that the timestep has a part in; with `past_only`, of the two before it alone."""
+    first, last = max(index - 2, 0), index + 1 if past_only else min(index + 3, len(rows))
+    window = torch.cat([rows[first:index], row[None], rows[index + 1 : last]])
+    return Smoothness(own.smoothness.precision, own.smoothness.linked[first:last]).cost(window)
+
+
+def shared_terms(scene: PaperScene, moving: Moving) -> Float[Tensor, ""]:
+    """Of identity, offsets, light and focal lengths."""
+    settings = scene.settings
+    total = ((moving.identity - scene.identity) / settings.identity_sigma).square().sum()
+    total = total + (moving.log_focals / settings.focal_sigma).square().sum()
+    return total + light_term(scene, moving.light) + offset_term(scene, moving.offsets)
+
+
+def light_term(scene: PaperScene, light: Float[Tensor, "9 3"]) -> Float[Tensor, ""]:
+    """Pulls light to be even and grey."""
+    settings = scene.settings
+    even = light.new_zeros(9, 1)
+    even[0] = math.sqrt(4 * math.pi)
+    tinted = light - light.mean(1, keepdim=True)
+    return ((light - even) / settings.light_sigma).square().sum() + (tinted / settings.grey_sigma).square().sum()
+
+
+def offset_term(scene: PaperScene, offsets: Float[Tensor, "v 3"]) -> Float[Tensor, ""]:
+    """Keeps vertex offsets small and smooth (uniform Laplacian); a patch of about 100 vertices counts as one."""
+    if scene.settings.offset_sigma == 0:
+        return offsets.new_zeros(())
+    first, second, share = scene.neighbours
+    mean = torch.zeros_like(offsets).index_add(0, first, offsets[second]) * share
+    small = (offsets / scene.settings.offset_sigma).square().sum()
+    smooth = ((offsets - mean) / scene.settings.offset_bend).square().sum()
+    return (small + smooth) / 100
