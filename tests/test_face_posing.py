@@ -113,3 +113,18 @@ def test_head_poses_and_gradients_equal_the_reference() -> None:
     for ours, theirs in zip(*results, strict=True):
         torch.testing.assert_close(ours, theirs.float(), atol=2e-6, rtol=2e-6)
     assert head_poses(face.to(torch.zeros((), dtype=torch.float64))).dtype == torch.float64
+
+
+def test_more_blendshapes_than_the_core_takes_are_posed_by_the_reference() -> None:
+    model = make_small_face_model()
+    many = 40 * len(model.expression_names)
+    model = replace(
+        model,
+        expression_basis=model.expression_basis.repeat(40, 1, 1),
+        expression_bounds=model.expression_bounds.repeat(40, 1),
+        expression_names=tuple(f"e{index}" for index in range(many)),
+        joint_rotation_basis=model.joint_rotation_basis.repeat(40, 1, 1),
+        joint_translation_basis=model.joint_translation_basis.repeat(40, 1, 1),
+    )  # fmt: skip
+    face = random_face(model, 2)
+    assert torch.equal(model(face), model.vertices_reference(face))
