@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         return _complain(str(error))
     except KeyboardInterrupt:
-        print("mien: stopped; the same command goes on where it was", file=sys.stderr)
+        print("mien: stopped; the same command goes on where it was, or begins anew", file=sys.stderr)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         return 0
