@@ -25,7 +25,7 @@ from small_face_model import make_small_face_model
 from tracking_case import still_camera
 
 
-def _tracking(offsets: bool = False) -> Tracking:
+def _tracking(offsets: bool = False, pixels: bool = False) -> Tracking:
     model = make_small_face_model()
     face = model.neutral(4)
     random = torch.Generator().manual_seed(0)
@@ -37,13 +37,15 @@ def _tracking(offsets: bool = False) -> Tracking:
     return Tracking(
         face_model="small", face_model_hash="abc", face=face, valid=torch.tensor([True, False, True, True]),
         cameras=(still_camera().to(torch.zeros(())),), neck_lines=torch.tensor([0.0, -1.0, 300.0]).expand(4, 1, 3),
-        residuals=torch.tensor([[0.5], [torch.nan], [0.7], [0.6]]), settings={"focal": None, "keyframes": 20},
+        residuals=torch.tensor([[0.5], [torch.nan], [0.7], [0.6]]),
+        pixel_residuals=torch.tensor([[0.02], [torch.nan], [torch.nan], [0.03]]) if pixels else None,
+        settings={"focal": None, "keyframes": 20},
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("offsets", [False, True])
 def test_round_trip(tmp_path, offsets):
-    tracking = _tracking(offsets)
+    tracking = _tracking(offsets, pixels=offsets)
     write_tracking(tmp_path / "tracking", tracking)
     again = read_tracking(tmp_path / "tracking")
     assert again.face.tensors().keys() == tracking.face.tensors().keys()
@@ -53,6 +55,10 @@ def test_round_trip(tmp_path, offsets):
     assert torch.equal(again.valid, tracking.valid)
     assert torch.equal(again.neck_lines, tracking.neck_lines)
     torch.testing.assert_close(again.residuals, tracking.residuals, equal_nan=True, atol=0, rtol=0)
+    if not offsets:
+        assert again.pixel_residuals is None
+    else:
+        torch.testing.assert_close(again.pixel_residuals, tracking.pixel_residuals, equal_nan=True, atol=0, rtol=0)
     camera, expected = again.cameras[0], tracking.cameras[0]
     assert torch.equal(camera.K, expected.K)
     assert torch.equal(camera.viewmat, expected.viewmat)

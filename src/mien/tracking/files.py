@@ -15,10 +15,11 @@ from mien.tracking.tracking import Tracking
 _FORMAT, _VERSION = "mien.tracking", 1
 _JSON, _TENSORS = "tracking.json", "tracking.safetensors"
 _FACE = ("identity", "expression", "joints", "head_rotation", "head_translation", "vertex_offsets")
+_OPTIONAL = ("vertex_offsets", "pixel_residuals")
 _AXES = {
     "identity": "i", "expression": "te", "joints": "tj3", "head_rotation": "t3", "head_translation": "t3",
     "vertex_offsets": "v3", "valid": "t", "neck_lines": "tc3", "residuals": "tc", "camera_K": "c33",
-    "camera_viewmats": "c44",
+    "camera_viewmats": "c44", "pixel_residuals": "tc",
 }  # fmt: skip
 _STAGE = "`mien track`"
 _REMEDY = "delete the folder and run `mien track` again"
@@ -34,6 +35,8 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
         "camera_K": torch.stack([camera.K for camera in tracking.cameras]),
         "camera_viewmats": torch.stack([camera.viewmat for camera in tracking.cameras]),
     }
+    if tracking.pixel_residuals is not None:
+        tensors["pixel_residuals"] = tracking.pixel_residuals
     write_tensors(path / _TENSORS, tensors)
     content = {
         "face_model": tracking.face_model,
@@ -73,6 +76,7 @@ def read_tracking(path: Path) -> Tracking:
             cameras=cameras,
             neck_lines=tensors["neck_lines"],
             residuals=tensors["residuals"],
+            pixel_residuals=tensors.get("pixel_residuals"),
             settings=dict(content["settings"]),
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -84,7 +88,7 @@ def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
     sizes: dict[str, int] = {"3": 3, "4": 4}
     for name, axes in _AXES.items():
         if name not in tensors:
-            if name == "vertex_offsets":
+            if name in _OPTIONAL:
                 continue
             raise UserError(f"{path / _TENSORS}: lacks {name!r}; {_REMEDY}")
         shape = tuple(tensors[name].shape)
@@ -94,6 +98,8 @@ def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
         if not agrees:
             raise UserError(f"{path / _TENSORS}: {name!r} has the shape {list(shape)}; {_REMEDY}")
         finite = tensors[name].isfinite()
+        if name == "pixel_residuals":
+            finite |= tensors[name].isnan()
         if name == "residuals":
             finite |= tensors[name].isnan() & ((tensors["valid"][:, None] == 0) | finite.any(1, keepdim=True))
         if not finite.all():

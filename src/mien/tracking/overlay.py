@@ -60,6 +60,9 @@ def draw_overlay(
     residual = float(tracking.residuals[timestep, camera_index])
     missing = "no face found" if tracking.valid[timestep] else "no face, interpolated"
     text = f"{timestep}: {residual:.2f} px" if np.isfinite(residual) else f"{timestep}: {missing}"
+    if tracking.pixel_residuals is not None and tracking.valid[timestep]:
+        colors = float(tracking.pixel_residuals[timestep, camera_index])
+        text += f", colours {100 * colors:.1f} %" if np.isfinite(colors) else ", landmarks only"
     text = text if len(tracking.cameras) == 1 else f"{capture.camera_ids[camera_index]} {text}"
     for color, thickness in ((_BLACK, 3), (_WHITE, 1)):
         cv2.putText(left, text, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, thickness, cv2.LINE_AA)

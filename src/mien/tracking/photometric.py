@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.progress import progress_bar
+from mien.progress import progress_bar, say
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.photometric_pictures import Pictures
@@ -47,6 +47,8 @@ class PhotometricFit:
     """Of each sequence."""
     improved: tuple[Bool[Tensor, " v"], ...]
     """Of each sequence, timesteps that pixels made better; the others stay as landmarks had them."""
+    residuals: tuple[Float[Tensor, "v c"], ...] = ()
+    """Of each sequence: `PhotometricTerm.residuals`, NaN where not improved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,7 @@ class _Round:
         return [
             PhotometricTerm(
                 self.model, marks, Pictures(shot.capture, self.shrink), shot.valid.nonzero()[:, 0], surface, light,
-                self.light_radius(own), self.settings.independent_pixels,
+                self.light_radius(own), self.settings.independent_pixels, at.appearance.sigma,
             )
             for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
         ]  # fmt: skip
@@ -155,9 +157,21 @@ def refine_photometrically(
                 at = now.look(at)
                 moved = step_shared(now.terms(at), at.fit, prior, own_settings.keyframes)
                 at = replace(at, fit=fit_bias(landmarks, moved, settings))
-            at = _step_sequences(now, now.look(at), settings)
+            at = now.look(at)
+            if not (at.appearance.trust > 0).any():
+                say(f"{surface.face_model.name}: pictures give its texture nothing, so faces are as landmarks put them")
+                return replace(at, fit=fit)
+            at = _step_sequences(now, at, settings)
             advance(status=f"pictures {shots[0].capture.width // now.shrink} pixels wide")
-    return rounds[-1].look(at)
+    return _with_residuals(rounds[0], rounds[0].look(at))
+
+
+def _with_residuals(now: _Round, at: PhotometricFit) -> PhotometricFit:
+    found = [
+        term.residuals(own.state, at.fit.subject, own.cameras).where(improved[:, None], torch.nan)
+        for term, own, improved in zip(now.terms(at), at.fit.sequences, at.improved, strict=True)
+    ]
+    return replace(at, residuals=tuple(found))
 
 
 def _quiet(term: LandmarkTerm, share: float) -> LandmarkTerm:

@@ -28,5 +28,6 @@ class PhotometricSettings:
     """Weight of landmarks, of theirs in the fit to landmarks alone."""
     light_extent: float = 0.012
     """Metres on the face over which a smooth difference counts as light that the model does not explain."""
-    outlier: float = 3.0
-    """Beyond this many standard deviations of its colour a pixel's pull fades."""
+    outlier: float = 10.0
+    """Beyond this many standard deviations of its colour a pixel's pull fades. Faces that are off by some pixels make
+    most of them differ by several: those are what there is to learn from."""

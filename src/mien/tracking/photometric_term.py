@@ -16,6 +16,9 @@ from mien.tracking.photometric_threads import in_threads
 from mien.tracking.solver import NormalEquations, SharedEquations, joined
 from mien.tracking.views import CameraBatch
 
+_LEAST_PIXELS = 100.0
+"""Fewer show nothing of a face."""
+
 
 @dataclass(frozen=True, eq=False)
 class PhotometricTerm:
@@ -36,6 +39,8 @@ class PhotometricTerm:
     """Pixels over which a smooth difference counts as light."""
     weight: float
     """What the pixels of a picture are worth."""
+    sigma: float
+    """Of the texture: the expected difference of a colour."""
 
     @property
     def layout(self) -> ParameterLayout:
@@ -60,6 +65,22 @@ class PhotometricTerm:
 
         pixels = torch.tensor(in_threads(of_row, list(range(len(state)))), dtype=torch.float64)
         return self.landmarks.cost(state, subject, cameras) + self.weight * pixels
+
+    def residuals(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "v c"]:
+        """Root mean square difference of colours, outliers faded; NaN where a camera compared nothing."""
+        found = torch.full((len(state), len(cameras)), torch.nan)
+
+        def of_row(row: int) -> None:
+            posed = self.model.pose(state[row], subject.identity, derive=False)
+            for camera in self._seen_by(row):
+                picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
+                seen = Sighting(posed, picture, self.light).arguments()
+                cost, weight = _native.align_mesh(self.surface, *seen, self.light_radius, None, None, None, None, None)
+                if weight >= _LEAST_PIXELS:
+                    found[row, camera] = self.sigma * cost**0.5
+
+        in_threads(of_row, list(range(len(state))))
+        return found
 
     def joint_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch

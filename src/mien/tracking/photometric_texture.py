@@ -119,6 +119,8 @@ def estimate_appearance(
     lights = [own[0].light for own in sightings]
     for turn in range(_ROUNDS):
         appearance = _bake(space, sightings, lights, appearance, outlier)
+        if not appearance.trust.any():
+            return appearance, lights
         if turn == 0 and not known:
             appearance = _one_color(appearance)
         lights = [

@@ -13,7 +13,7 @@ from torch import Tensor
 from mien.capture.capture import Capture
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
-from mien.progress import progress_bar
+from mien.progress import progress_bar, say
 from mien.tracking.head_pose import fit_head_pose, relative_rotation
 from mien.tracking.interpolation import fill_gaps
 from mien.tracking.landmark_groups import LANDMARKS
@@ -42,6 +42,8 @@ from mien.tracking.tracking import Tracking
 DEFAULTS = TrackingSettings()
 _COSTS = {"head pose": 10, "identity": 10, "frames": 140, "sequence": 100}
 """About how long each stage takes a timestep, for the progress bar: so in a clip of 15,000; multiples of ten."""
+_SOME = 8
+"""Frames that are named where there are many."""
 
 
 def track(capture: Capture, face_model: FaceModel, settings: TrackingSettings = DEFAULTS) -> Tracking:
@@ -52,10 +54,11 @@ def track(capture: Capture, face_model: FaceModel, settings: TrackingSettings = 
 def track_subject(
     captures: Sequence[Capture], face_model: FaceModel, settings: TrackingSettings = DEFAULTS
 ) -> list[Tracking]:
-    """The face model fitted to the landmarks of all sequences of one person, with one identity.
+    """The face model fitted to landmarks and pixels of all sequences of one person, with one identity.
 
     Stages: head pose of every timestep alone; identity (and unknown focal lengths) from keyframes of all sequences;
-    every timestep alone; all timesteps of each sequence together, smooth over time. Deterministic.
+    every timestep alone; all timesteps of each sequence together, smooth over time; then, unless the schedule is
+    `landmarks`, the fit to pixels (`refine_photometrically`). Deterministic.
 
     Sequences may differ in size, frame rate and number of cameras. Several cameras have to be calibrated
     (`Capture.calibration`): they stay as they are, give the metric scale, and a camera that found no face at a timestep
@@ -79,14 +82,29 @@ def track_subject(
             raise UserError(
                 f"{names}: no face fits the landmarks; look at the pictures, and capture it again"
             ) from None
+        pixel_residuals: Sequence[Tensor] = ()
         if settings.schedule == "fast":
-            fit = refine_photometrically(model, shots, lenses, fit, settings).fit
+            refined = refine_photometrically(model, shots, lenses, fit, settings)
+            fit, pixel_residuals = refined.fit, refined.residuals
         if settings.schedule == "paper":
             fit = fit_by_descent(model, shots, lenses, fit, settings)
-        return [
+        trackings = [
             _as_tracking(shot, face_model, model, fit.subject, own, settings)
             for shot, own in zip(shots, fit.sequences, strict=True)
         ]
+    parts = zip(trackings, shots, pixel_residuals, strict=True) if pixel_residuals else ()
+    return [_with_pixel_residuals(*part) for part in parts] or trackings
+
+
+def _with_pixel_residuals(tracking: Tracking, shot: Shot, found: Float[Tensor, "v c"]) -> Tracking:
+    residuals = torch.full_like(tracking.residuals, torch.nan)
+    residuals[shot.valid] = found
+    left = (shot.valid & residuals.isnan().all(1)).nonzero()[:, 0].tolist()
+    if left:
+        some = ", ".join(map(str, left[:_SOME])) + (", ..." if len(left) > _SOME else "")
+        say(f"{shot.capture.name}: in {len(left)} of {int(shot.valid.sum())} frames with a face pixels were no help, "
+            f"so landmarks alone decided: {some}")  # fmt: skip
+    return replace(tracking, pixel_residuals=residuals)
 
 
 def _fit_landmarks(

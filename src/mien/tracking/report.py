@@ -34,6 +34,8 @@ _NEAR_FRONTAL = 0.26
 _MOVED = 0.03
 """Standard deviation from which a coefficient counts as used."""
 _CHUNK = 32
+_LEAST_COLOR = 0.005
+"""By which colours must stand out, 0..1."""
 
 
 def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel) -> dict:
@@ -57,8 +59,10 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
     return {
         "frames": len(valid),
         "frames_without_face": (~valid).nonzero()[:, 0].tolist(),
-        "flagged_frames": flagged_frames(_timestep_residuals(tracking)).nonzero()[:, 0].tolist(),
+        "flagged_frames": _flagged(tracking).nonzero()[:, 0].tolist(),
+        "landmarks_only_frames": _landmarks_only(tracking).nonzero()[:, 0].tolist(),
         "residual_px": _summary(tracking.residuals),
+        "residual_colors": None if tracking.pixel_residuals is None else _summary(tracking.pixel_residuals),
         "cameras": _of_cameras(capture, tracking),
         "frontal_camera": capture.camera_ids[frontal],
         "mesh_distance_px": {name: float(distance[:, list(group)].median()) for name, group in _GROUPS.items()},
@@ -101,6 +105,21 @@ def _timestep_residuals(tracking: Tracking) -> Float[Tensor, " t"]:
     return tracking.residuals.nanmedian(1).values
 
 
+def _flagged(tracking: Tracking) -> Bool[Tensor, " t"]:
+    """Frames whose landmarks or colours stand out."""
+    flagged = flagged_frames(_timestep_residuals(tracking))
+    if tracking.pixel_residuals is not None:
+        flagged |= flagged_frames(tracking.pixel_residuals.nanmedian(1).values, _LEAST_COLOR)
+    return flagged
+
+
+def _landmarks_only(tracking: Tracking) -> Bool[Tensor, " t"]:
+    """Frames with a face whose pixels were no help."""
+    if tracking.pixel_residuals is None:
+        return tracking.valid
+    return tracking.valid & tracking.pixel_residuals.isnan().all(1)
+
+
 def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
     """Write residuals.json and residuals.png into `folder`."""
     report = residual_report(capture, tracking, face_model)
@@ -119,14 +138,14 @@ def iris_distances(
     return apart * (depth[:, left] + depth[:, right]) / 2 / focal / across
 
 
-def flagged_frames(residuals: Float[Tensor, " t"]) -> Bool[Tensor, " t"]:
-    """Frames whose residual stands out: above median + 4 robust standard deviations; missing frames are not flagged."""
+def flagged_frames(residuals: Float[Tensor, " t"], least: float = 0.1) -> Bool[Tensor, " t"]:
+    """Frames whose residual stands out: above median + 4 robust standard deviations + `least`; never missing ones."""
     known = residuals[residuals.isfinite()]
     if len(known) == 0:
         return torch.zeros_like(residuals, dtype=torch.bool)
     median = known.median()
     spread = 1.4826 * (known - median).abs().median()
-    return residuals > median + 4 * spread + 0.1
+    return residuals > median + 4 * spread + least
 
 
 def _landmarks(face_model: FaceModel, tracking: Tracking) -> Float[Tensor, "t l 3"]:
@@ -157,8 +176,10 @@ def _correlations(tracking: Tracking, face_model: FaceModel, angle: Float[Tensor
             for i in moved}  # fmt: skip
 
 
-def _summary(values: Float[Tensor, "*n"]) -> dict[str, float]:
+def _summary(values: Float[Tensor, "*n"]) -> dict[str, float | None]:
     values = values[values.isfinite()].double()
+    if len(values) == 0:
+        return {"median": None, "p95": None, "max": None}
     return {"median": float(values.median()), "p95": float(values.quantile(0.95)), "max": float(values.max())}
 
 

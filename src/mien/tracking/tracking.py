@@ -32,5 +32,8 @@ class Tracking:
     """(a, b, d) with a^2 + b^2 = 1: pixels with a x + b y + d >= 0 are above the neck line, and kept."""
     residuals: Float[Tensor, "t c"]
     """Median distance of landmarks from their fit, pixels; NaN where the camera found no face."""
+    pixel_residuals: Float[Tensor, "t c"] | None = None
+    """Root mean square by which colours differ from the texture that all pictures share, 0..1, outliers faded; NaN
+    where pixels were no help and landmarks alone decided. None: pixels were not looked at."""
     settings: dict = field(default_factory=dict)
     """How it was made, for the report."""
