@@ -77,9 +77,9 @@ MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const ui
     const F power = (s.log2_opacity - (s.sharpness * across) * across) - (s.falloff * dy) * dy;
     const M seen = less_equal(set1(kLog2AlphaMin), power);
     const F alpha = keep(seen, minimum(exp2_fast(power), set1(kAlphaMax)));
-    const F next = maximum(product - product * alpha, set1(1e-20f));  // no denormals
+    const F share = product * alpha, next = product - share;
     const M open = less(set1(kTransmittanceMin), next);
-    const F weight = keep(open, product * alpha);
+    const F weight = keep(open, share);
     red = red + weight * s.red;
     green = green + weight * s.green;
     blue = blue + weight * s.blue;
@@ -188,6 +188,7 @@ void blend(const Splat* splats, const TileLists& lists, const View& view, int ti
     return;
   }
   for (int i = begin; i < end && i < begin + kChunk; ++i) __builtin_prefetch(&splats[lists.entries[i].gaussian]);
+  const NoDenormals guard;
   TilePixels pixels;
   memset(pixels.color, 0, sizeof pixels.color);
   for (int block = 0; block < kBlocks; ++block) {

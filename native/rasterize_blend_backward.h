@@ -91,9 +91,9 @@ MIEN_INLINE void add_vector(const Splat& s, F px, F py, int block, int v, TileGr
   const M seen = less_equal(set1(kLog2AlphaMin), power);
   const F raw = exp2_fast(power);
   const F alpha = keep(seen, minimum(raw, set1(kAlphaMax)));
-  const F next = maximum(product - product * alpha, set1(1e-20f));
+  const F share = product * alpha, next = product - share;
   const M open = less(set1(kTransmittanceMin), next);
-  const F weight = keep(open, product * alpha);
+  const F weight = keep(open, share);
   const F own = weight * (s.red * red + s.green * green + s.blue * blue);
   const F behind = before - own;
   const M sensitive = both(open, less_equal(raw, set1(kAlphaMax)));
@@ -125,6 +125,7 @@ void blend_backward(const Splat* splats, const TileLists& lists, const View& vie
   const int left = tile % lists.columns * kTile, top = tile / lists.columns * kTile;
   const int begin = lists.begins[tile], end = lists.begins[tile + 1];
   if (begin == end) return;
+  const NoDenormals guard;
   TileGradients gradients;
   const bool needed = load_gradients(picture, view, left, top, gradients);
   F px[kTileBlocks], py[kTileBlocks][kVectors];

@@ -1,7 +1,7 @@
-// Compiled once per instruction set; one Gaussian at a time, since its triangle's frame is gathered anyway.
+// Compiled once per instruction set: triangles one at a time, Gaussians one a lane.
 #include "rig_kernels.h"
 
-#include "simd.h"
+#include "simd_columns.h"
 
 namespace mien::MIEN_ISA {
 namespace {
@@ -20,7 +20,6 @@ MIEN_INLINE float dot(Vec a, Vec b) { return a.x * b.x + a.y * b.y + a.z * b.z; 
 MIEN_INLINE Vec cross(Vec a, Vec b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
 MIEN_INLINE float length(Vec a) { return __builtin_sqrtf(dot(a, a)); }
 MIEN_INLINE void put(float* to, Vec a) { to[0] = a.x, to[1] = a.y, to[2] = a.z; }
-MIEN_INLINE void add(float* to, Vec a) { to[0] += a.x, to[1] += a.y, to[2] += a.z; }
 
 // The same four formulas as mien.rotation.quaternion_from_matrix: the one with the largest divisor.
 MIEN_INLINE void quaternion_from_matrix(const float* m, float* q) {
@@ -65,83 +64,123 @@ void frames(const RigArrays& rig, int64_t first, int64_t last, TriangleFrame* ou
   }
 }
 
-// exp over `count` floats, in place of a library call for each.
-MIEN_INLINE void exponentials(const float* from, int count, float* to) {
-  for (int x = 0; x < count; x += W) {
-    F value{};
-    if (x + W <= count) {
-      value = load(from + x);
-    } else {
-      for (int lane = 0; lane < count - x; ++lane) value[lane] = from[x + lane];
-    }
-    store(to + x, exp2_fast(clamp(value * 1.44269504f, set1(-99.0f), set1(99.0f))));
-  }
+// Vectors of three and of four whose components are vectors of W lanes: one Gaussian a lane.
+MIEN_INLINE void turn(const F* R, const F* v, F* out) {
+  for (int row = 0; row < 3; ++row) out[row] = R[3 * row] * v[0] + R[3 * row + 1] * v[1] + R[3 * row + 2] * v[2];
 }
+MIEN_INLINE void turn_back(const F* R, const F* v, F* out) {
+  for (int column = 0; column < 3; ++column)
+    out[column] = R[column] * v[0] + R[3 + column] * v[1] + R[6 + column] * v[2];
+}
+MIEN_INLINE void cross(const F* a, const F* b, F* out) {
+  out[0] = a[1] * b[2] - a[2] * b[1];
+  out[1] = a[2] * b[0] - a[0] * b[2];
+  out[2] = a[0] * b[1] - a[1] * b[0];
+}
+MIEN_INLINE void multiply_quaternions(const F* p, const F* q, F* out) {
+  out[0] = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3];
+  out[1] = p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2];
+  out[2] = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1];
+  out[3] = p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0];
+}
+// Scales a quaternion to length 1 and returns by what; as torch's normalize: a zero quaternion stays zero.
+MIEN_INLINE F normalize(F* q) {
+  const F norm = square_root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  const F unit = 1.0f / maximum(norm, set1(1e-12f));
+  for (int i = 0; i < 4; ++i) q[i] = q[i] * unit;
+  return unit;
+}
+
+// The frames of the triangles that Gaussians i .. i + valid - 1 ride on; lanes from `valid` on repeat the last one.
+struct FrameColumns {
+  F columns[sizeof(TriangleFrame) / sizeof(float)];
+  const F *R = columns, *T = columns + 9, *k = columns + 12, *q = columns + 13;
+
+  MIEN_INLINE FrameColumns(const RigArrays& rig, int64_t i, int valid, const TriangleFrame* frames) {
+    static_assert(__builtin_offsetof(TriangleFrame, T) == 9 * sizeof(float));
+    static_assert(__builtin_offsetof(TriangleFrame, q) == 13 * sizeof(float));
+    const float* rows[W];
+    for (int lane = 0; lane < W; ++lane) rows[lane] = frames[rig.face_index[i + (lane < valid ? lane : valid - 1)]].R;
+    gather_columns<17>(rows, columns);
+  }
+};
 
 void to_world(const RigArrays& rig, int64_t first, int64_t last, const TriangleFrame* frames, const RigWorld& world) {
-  constexpr int CHUNK = 64;
-  float local_scales[3 * CHUNK + W];
-  for (int64_t begin = first; begin < last; begin += CHUNK) {
-    const int64_t end = begin + CHUNK < last ? begin + CHUNK : last;
-    exponentials(rig.log_scales + 3 * begin, (int)(3 * (end - begin)), local_scales);
-    for (int64_t i = begin; i < end; ++i) {
-      const TriangleFrame& frame = frames[rig.face_index[i]];
-      const float *R = frame.R, *p = frame.q, *q = rig.local_quats + 4 * i;
-      const Vec m = at(rig.local_means + 3 * i);
-      const Vec turned = {dot(at(R), m), dot(at(R + 3), m), dot(at(R + 6), m)};
-      put(world.means + 3 * i, frame.k * turned + at(frame.T));
-      put(world.scales + 3 * i, frame.k * at(local_scales + 3 * (i - begin)));
-      // As torch's normalize: a zero quaternion stays zero.
-      const float norm = __builtin_sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-      const float unit = 1 / (norm > 1e-12f ? norm : 1e-12f);
-      const float w = q[0] * unit, x = q[1] * unit, y = q[2] * unit, z = q[3] * unit;
-      float* out = world.quats + 4 * i;
-      out[0] = p[0] * w - p[1] * x - p[2] * y - p[3] * z;
-      out[1] = p[0] * x + p[1] * w + p[2] * z - p[3] * y;
-      out[2] = p[0] * y - p[1] * z + p[2] * w + p[3] * x;
-      out[3] = p[0] * z + p[1] * y - p[2] * x + p[3] * w;
-    }
+  for (int64_t i = first; i < last; i += W) {
+    const int valid = last - i < W ? (int)(last - i) : W;
+    const FrameColumns frame(rig, i, valid, frames);
+    F local[4], out[4];
+    load_columns<3>(rig.local_means + 3 * i, 3, valid, local);
+    turn(frame.R, local, out);
+    for (int axis = 0; axis < 3; ++axis) out[axis] = *frame.k * out[axis] + frame.T[axis];
+    store_columns<3>(world.means + 3 * i, 3, valid, out);
+    load_columns<3>(rig.log_scales + 3 * i, 3, valid, local);
+    for (int axis = 0; axis < 3; ++axis)
+      out[axis] = *frame.k * exp2_fast(clamp(local[axis] * 1.44269504f, set1(-99.0f), set1(99.0f)));
+    store_columns<3>(world.scales + 3 * i, 3, valid, out);
+    load_columns<4>(rig.local_quats + 4 * i, 4, valid, local);
+    normalize(local);
+    multiply_quaternions(frame.q, local, out);
+    store_columns<4>(world.quats + 4 * i, 4, valid, out);
   }
 }
 
-// d loss / d local quaternion, added; returns the torque that the world quaternion's gradient exerts.
-MIEN_INLINE Vec quaternion_to_local(const float* p, const float* local, const float* g, float* gradient) {
-  const float norm =
-      __builtin_sqrtf(local[0] * local[0] + local[1] * local[1] + local[2] * local[2] + local[3] * local[3]);
-  const float unit = 1 / (norm > 1e-12f ? norm : 1e-12f);
-  const float q[4] = {local[0] * unit, local[1] * unit, local[2] * unit, local[3] * unit};
+// Adds to some columns in memory.
+template <int COUNT>
+MIEN_INLINE void add_columns(float* rows, int valid, const F* columns) {
+  F sums[COUNT];
+  load_columns<COUNT>(rows, COUNT, valid, sums);
+  for (int j = 0; j < COUNT; ++j) sums[j] = sums[j] + columns[j];
+  store_columns<COUNT>(rows, COUNT, valid, sums);
+}
+
+// d loss / d local quaternion; and the torque that the world quaternion's gradient `g` exerts.
+MIEN_INLINE void quaternion_to_local(const F* p, F* q, const F* g, F* gradient, F* torque) {
+  const F unit = normalize(q);
   // Multiplication by p is orthogonal: its adjoint is multiplication by p's conjugate.
-  const float h[4] = {
-      p[0] * g[0] + p[1] * g[1] + p[2] * g[2] + p[3] * g[3], p[0] * g[1] - p[1] * g[0] - p[2] * g[3] + p[3] * g[2],
-      p[0] * g[2] + p[1] * g[3] - p[2] * g[0] - p[3] * g[1], p[0] * g[3] - p[1] * g[2] + p[2] * g[1] - p[3] * g[0]};
-  const float radial = q[0] * h[0] + q[1] * h[1] + q[2] * h[2] + q[3] * h[3];
-  for (int i = 0; i < 4; ++i) gradient[i] += (h[i] - radial * q[i]) * unit;
-  // A small rotation omega changes the world quaternion r = p q by (0, omega) r / 2.
-  const float w = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3];
-  const Vec v = {p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-                 p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-                 p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0]};
-  return 0.5f * (w * at(g + 1) - g[0] * v + cross(v, at(g + 1)));
+  const F conjugate[4] = {p[0], -p[1], -p[2], -p[3]};
+  F h[4], world[4];
+  multiply_quaternions(conjugate, g, h);
+  const F radial = q[0] * h[0] + q[1] * h[1] + q[2] * h[2] + q[3] * h[3];
+  for (int i = 0; i < 4; ++i) gradient[i] = (h[i] - radial * q[i]) * unit;
+  // A small rotation omega changes the world quaternion by (0, omega) world / 2.
+  multiply_quaternions(p, q, world);
+  cross(world + 1, g + 1, torque);
+  for (int axis = 0; axis < 3; ++axis)
+    torque[axis] = 0.5f * (world[0] * g[1 + axis] - g[0] * world[1 + axis] + torque[axis]);
 }
 
 void to_local(const RigArrays& rig, int64_t first, int64_t last, const TriangleFrame* frames, const float* scales,
               const RigGradients& gradients, FrameGradient* out) {
-  for (int64_t i = first; i < last; ++i) {
-    const TriangleFrame& frame = frames[rig.face_index[i]];
-    const float* R = frame.R;
-    const Vec m = at(rig.local_means + 3 * i), g = at(gradients.means + 3 * i);
-    const Vec turned = {dot(at(R), m), dot(at(R + 3), m), dot(at(R + 6), m)};
-    const Vec turned_back = {R[0] * g.x + R[3] * g.y + R[6] * g.z, R[1] * g.x + R[4] * g.y + R[7] * g.z,
-                             R[2] * g.x + R[5] * g.y + R[8] * g.z};
-    add(gradients.local_means + 3 * i, frame.k * turned_back);
-    const float *scale = scales + 3 * i, *scale_gradient = gradients.scales + 3 * i;
-    const Vec by_log = {scale[0] * scale_gradient[0], scale[1] * scale_gradient[1], scale[2] * scale_gradient[2]};
-    add(gradients.log_scales + 3 * i, by_log);
-    const Vec torque =
-        quaternion_to_local(frame.q, rig.local_quats + 4 * i, gradients.quats + 4 * i, gradients.local_quats + 4 * i);
-    put(out[i].T, g);
-    put(out[i].torque, torque + frame.k * cross(turned, g));
-    out[i].k = dot(turned, g) + (by_log.x + by_log.y + by_log.z) / frame.k;
+  static_assert(sizeof(FrameGradient) == 8 * sizeof(float));
+  for (int64_t i = first; i < last; i += W) {
+    const int valid = last - i < W ? (int)(last - i) : W;
+    const FrameColumns frame(rig, i, valid, frames);
+    F local[4], g[4], turned[3], by_local[4], share[8], about[3];
+    load_columns<3>(rig.local_means + 3 * i, 3, valid, local);
+    load_columns<3>(gradients.means + 3 * i, 3, valid, g);
+    turn(frame.R, local, turned);
+    turn_back(frame.R, g, by_local);
+    for (int axis = 0; axis < 3; ++axis) by_local[axis] = *frame.k * by_local[axis];
+    add_columns<3>(gradients.local_means + 3 * i, valid, by_local);
+    cross(turned, g, about);
+    for (int axis = 0; axis < 3; ++axis) share[axis] = g[axis];
+    F by_size = turned[0] * g[0] + turned[1] * g[1] + turned[2] * g[2];
+
+    load_columns<3>(scales + 3 * i, 3, valid, local);
+    load_columns<3>(gradients.scales + 3 * i, 3, valid, g);
+    for (int axis = 0; axis < 3; ++axis) by_local[axis] = local[axis] * g[axis];
+    add_columns<3>(gradients.log_scales + 3 * i, valid, by_local);
+    by_size = by_size + (by_local[0] + by_local[1] + by_local[2]) / *frame.k;
+
+    load_columns<4>(rig.local_quats + 4 * i, 4, valid, local);
+    load_columns<4>(gradients.quats + 4 * i, 4, valid, g);
+    quaternion_to_local(frame.q, local, g, by_local, share + 3);
+    add_columns<4>(gradients.local_quats + 4 * i, valid, by_local);
+    for (int axis = 0; axis < 3; ++axis) share[3 + axis] = share[3 + axis] + *frame.k * about[axis];
+    share[6] = by_size;
+    share[7] = F{};
+    store_columns<8>(out[i].T, 8, valid, share);
   }
 }
 

@@ -123,6 +123,15 @@ MIEN_INLINE bool any(M mask) { return lane_bits(mask) != 0; }
 
 #endif
 
+// While one of these lives, results that would be denormal are 0: they would be slow on some processors.
+struct NoDenormals {
+#if defined(__x86_64__)
+  const unsigned before = _mm_getcsr();
+  NoDenormals() { _mm_setcsr(before | 0x8040); }
+  ~NoDenormals() { _mm_setcsr(before); }
+#endif
+};
+
 MIEN_INLINE F clamp(F value, F low, F high) { return minimum(maximum(value, low), high); }
 
 // An upper bound of sqrt(a), at most 1e-3 too large; for a = 0 a tiny positive number.

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
+from mien.arrays import unpacked
 
 
 def sigmoid(values: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
@@ -22,7 +23,7 @@ class _Sigmoid(torch.autograd.Function):
     def forward(ctx: Any, values: Tensor) -> Tensor:
         values = values.detach().contiguous()
         out = torch.empty_like(values)
-        _native.sigmoid(values, out)
+        _native.sigmoid(*unpacked(values, out))
         ctx.save_for_backward(out)
         return out
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from mien import _native
+from mien.arrays import unpacked
 from mien.rotation import multiply_quaternions, quaternion_from_matrix
 
 DEGENERATE_LENGTH = 1e-7
@@ -92,7 +93,7 @@ class _BindToWorld(torch.autograd.Function):
         batch, count = len(vertices), len(gaussians[0])
         frames = torch.empty(batch, len(faces), _native.TRIANGLE_FRAME_FLOATS)
         means, quats, scales = (torch.empty(batch, count, width) for width in (3, 4, 3))
-        _native.rig_forward(*inputs, frames=frames, means=means, quats=quats, scales=scales)
+        _native.rig_forward(*unpacked(*inputs, frames, means, quats, scales))
         ctx.save_for_backward(*inputs, frames, scales)
         return means, quats, scales
 
@@ -103,8 +104,8 @@ class _BindToWorld(torch.autograd.Function):
         local_gradients = [torch.zeros_like(tensor) for tensor in local]
         vertex_gradient = torch.zeros_like(vertices) if ctx.needs_input_grad[0] else None
         world = [gradient.contiguous() for gradient in world_gradients]
-        arguments = (*inputs, frames, scales, *world, *local_gradients)
-        _native.rig_backward(*arguments, grad_vertices=vertex_gradient)
+        known = (tensor.detach() for tensor in (*inputs, frames, scales, *world))
+        _native.rig_backward(*unpacked(*known, *local_gradients, vertex_gradient))
         return vertex_gradient, None, None, *local_gradients
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
+from mien.arrays import unpacked
 from mien.face.params import FaceParams
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ class _PoseVertices(torch.autograd.Function):
         assert joints is not None
         shaped, vertices = (rest.new_empty(len(expression), *rest.shape) for _ in range(2))
         arrays = (rest, joint_rest, expression, joints, rotation, translation)
-        _native.pose_face(data, *arrays, shaped=shaped, vertices=vertices)
+        _native.pose_face(data, *unpacked(*arrays, shaped, vertices))
         ctx.data = data
         ctx.save_for_backward(*arrays, shaped)
         return vertices
@@ -135,9 +136,9 @@ class _PoseVertices(torch.autograd.Function):
         grad_expression, grad_joints = torch.empty_like(expression), torch.empty_like(joints)
         grad_head = rest.new_empty(b, 3), rest.new_empty(b, 3)
         _native.pose_face_backward(
-            ctx.data, *arrays, shaped=shaped, grad_vertices=grad_vertices.contiguous(), grad_rest=grad_rest,
-            grad_joint_rest=grad_joint_rest, grad_expression=grad_expression, grad_joints=grad_joints,
-            grad_head_rotation=grad_head[0], grad_head_translation=grad_head[1],
+            ctx.data,
+            *unpacked(*(None if array is None else array.detach() for array in (*arrays, shaped))),
+            *unpacked(grad_vertices.contiguous(), grad_rest, grad_joint_rest, grad_expression, grad_joints, *grad_head),
         )  # fmt: skip
         needs = ctx.needs_input_grad
         return (

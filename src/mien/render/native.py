@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.utils.dlpack import to_dlpack
 
 from mien import _native
+from mien.arrays import unpacked
 from mien.render.rendering import Rendering, View
 from mien.render.validation import check_finite
 
@@ -65,7 +65,7 @@ class _Rasterize(torch.autograd.Function):
             own = [tensor.detach() for tensor in inputs[_INPUTS * index + 1 : _INPUTS * (index + 1)]]
             count = len(own[0])
             view = (torch.empty(*size, 3), torch.empty(size), torch.empty(count, dtype=torch.int32))
-            tasks.append((*map(to_dlpack, own), *map(to_dlpack, view)))
+            tasks.append(tuple(unpacked(*own, *view)))
             outputs += view
         ctx.frames = _native.rasterize_views(tasks)
         if None in ctx.frames:
@@ -86,10 +86,10 @@ class _Rasterize(torch.autograd.Function):
             image, alpha = pictures[2 * index : 2 * index + 2]
             grad_image, grad_alpha, _ = gradients[3 * index : 3 * index + 3]
             grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
-            grad_alpha = None if grad_alpha is None else to_dlpack(grad_alpha.contiguous())
+            grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
             found = [torch.empty_like(t) for t in own] + [torch.empty(len(own[0]), 2), torch.empty(16)]
             known = (*own, image.detach(), alpha.detach(), grad_image)
-            tasks.append((frame, *map(to_dlpack, known), grad_alpha, *map(to_dlpack, found)))
+            tasks.append((frame, *unpacked(*known, grad_alpha, *found)))
             views.append((grad_image, alpha, *found))
         _native.rasterize_views_backward(tasks)
         result: list[Tensor | None] = [None]
