@@ -160,6 +160,7 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
     whole = export(new_avatar("gaussian_avatars"), path).portable
     bound = whole.baked
     assert isinstance(bound, model.MeshBound)
+    many = replace(bound.rig, expression_names=tuple(f"e{index}" for index in range(300)))
     nan = np.full_like(whole.neutral.expression, np.nan)
     for wrong, part in (
         (replace(whole, neutral=replace(whole.neutral, expression=nan)), "NaN"),
@@ -167,6 +168,7 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
         (replace(whole, expression_names=("drop",)), "1 expression names"),
         (replace(whole, joint_names=()), "0 joint names"),
         (replace(whole, baked=replace(bound, rig=replace(bound.rig, joint_parents=(2, 0, 0)))), "before its parent"),
+        (replace(whole, baked=replace(bound, rig=many)), "300 expressions and 1 free joints, more than can be posed"),
     ):
         with pytest.raises(UserError, match=part):
             runtime.write_portable(path, wrong)
