@@ -8,7 +8,7 @@ namespace {
 using mien::PhotometricBand;
 
 constexpr int RADIUS = mien::kPhotometricRadius, TAPS = 2 * RADIUS + 1;
-constexpr int REACH = mien::kPhotometricReach, RING = mien::kPhotometricRing;
+constexpr int RING = mien::kPhotometricRing;
 constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
 
 MIEN_INLINE int smaller(int a, int b) { return a < b ? a : b; }

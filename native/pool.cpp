@@ -13,7 +13,9 @@
 namespace mien {
 namespace {
 
-constexpr std::chrono::microseconds kSpin{100};  // waking a parked thread costs about 50 us
+// Waking a parked thread costs about 50 us, so waiting threads spin at first: the longer the more often that was of
+// use. Where others want the cores, spinning in vain would only take them away.
+constexpr std::chrono::microseconds kLeastSpin{5}, kMostSpin{100};
 
 void relax() {
 #if defined(__x86_64__)
@@ -23,16 +25,20 @@ void relax() {
 #endif
 }
 
-// Waits until `done()`, spinning for kSpin; false if it was not done by then.
+// Waits until `done()`, spinning for `spin`, which follows what came of it; false if it was not done by then.
 template <typename Done>
-bool spin_until(Done&& done) {
-  const auto end = std::chrono::steady_clock::now() + kSpin;
+bool spin_until(Done&& done, std::chrono::microseconds& spin) {
+  const auto end = std::chrono::steady_clock::now() + spin;
   while (std::chrono::steady_clock::now() < end) {
     for (int i = 0; i < 32; ++i) {
-      if (done()) return true;
+      if (done()) {
+        spin = std::min(2 * spin, kMostSpin);
+        return true;
+      }
       relax();
     }
   }
+  spin = std::max(spin / 2, kLeastSpin);
   return done();
 }
 
@@ -72,7 +78,10 @@ class Pool {
     // From here on no worker enters; wait for those inside.
     state_.fetch_and(~kOpen, std::memory_order_acq_rel);
     const auto left = [this] { return state_.load(std::memory_order_acquire) == 0; };
-    while (!spin_until(left)) std::this_thread::yield();
+    if (spin_until(left, spin_)) return;
+    for (uint32_t inside; (inside = state_.load(std::memory_order_acquire)) != 0;) {
+      state_.wait(inside, std::memory_order_acquire);
+    }
   }
 
  private:
@@ -98,20 +107,22 @@ class Pool {
   void serve() {
     t_in_loop = true;
     uint32_t seen = 0;
+    std::chrono::microseconds spin = kMostSpin;
     while (!stop_) {
       const auto announced = [this, seen] { return signal_.load(std::memory_order_acquire) != seen; };
-      if (!spin_until(announced)) signal_.wait(seen, std::memory_order_acquire);
+      if (!spin_until(announced, spin)) signal_.wait(seen, std::memory_order_acquire);
       seen = signal_.load(std::memory_order_acquire);
       if (stop_) return;
       if (enter()) {
         work();
-        state_.fetch_sub(1, std::memory_order_acq_rel);
+        if (state_.fetch_sub(1, std::memory_order_acq_rel) == 1) state_.notify_one();
       }
     }
   }
 
   std::vector<std::thread> workers_;
   std::mutex busy_;
+  std::chrono::microseconds spin_ = kMostSpin;  // of whoever runs a loop
   detail::LoopBody body_ = nullptr;
   void* context_ = nullptr;
   int64_t count_ = 0;

@@ -188,7 +188,7 @@ void blend(const Splat* splats, const TileLists& lists, const View& view, int ti
     return;
   }
   for (int i = begin; i < end && i < begin + kChunk; ++i) __builtin_prefetch(&splats[lists.entries[i].gaussian]);
-  const NoDenormals guard;
+  [[maybe_unused]] const NoDenormals guard;
   TilePixels pixels;
   memset(pixels.color, 0, sizeof pixels.color);
   for (int block = 0; block < kBlocks; ++block) {

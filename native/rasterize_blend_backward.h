@@ -125,7 +125,7 @@ void blend_backward(const Splat* splats, const TileLists& lists, const View& vie
   const int left = tile % lists.columns * kTile, top = tile / lists.columns * kTile;
   const int begin = lists.begins[tile], end = lists.begins[tile + 1];
   if (begin == end) return;
-  const NoDenormals guard;
+  [[maybe_unused]] const NoDenormals guard;
   TileGradients gradients;
   const bool needed = load_gradients(picture, view, left, top, gradients);
   F px[kTileBlocks], py[kTileBlocks][kVectors];
