@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.progress import progress_bar, say
+from mien.tracking.landmark_groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_EYELIDS, RIGHT_IRIS
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.photometric_pictures import Pictures
@@ -175,7 +176,10 @@ def _with_residuals(now: _Round, at: PhotometricFit) -> PhotometricFit:
 
 
 def _quiet(term: LandmarkTerm, share: float) -> LandmarkTerm:
-    return replace(term, weights=term.weights * share)
+    """With a share of the weight, but for what opens and closes: no texture shows a closed mouth and an open one."""
+    kept = torch.full_like(term.weights, share)
+    kept[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS + LEFT_IRIS + RIGHT_IRIS)] = 1
+    return replace(term, weights=term.weights * kept)
 
 
 def _step_sequences(now: _Round, at: PhotometricFit, settings: TrackingSettings) -> PhotometricFit:

@@ -50,6 +50,7 @@ def step_shared(terms: Sequence[PhotometricTerm], fit: Fit, prior: SharedPrior, 
     equations = joined(frames)
     state = torch.cat([own.state[chosen] for own, chosen in zip(fit.sequences, rows, strict=True)])
     held = box.held(state, equations.gradient)
+    held[:, 6:] = True  # an expression that all frames share belongs to identity, but would drift here
     step, shared_step = solve_arrow(equations, joined_shared(shared).with_prior(precision, values), held, _DAMPING)
     sequences = []
     steps = step.split([len(chosen) for chosen in rows])
