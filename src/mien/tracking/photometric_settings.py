@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class PhotometricSettings:
     """How faces are fitted to pixels, after the fit to landmarks."""
 
-    shrinks: tuple[int, ...] = (2, 2, 1)
+    shrinks: tuple[int, ...] = (2, 2)
     """Rounds from coarse to fine, each at pictures shrunk by this; the texture is made anew before each."""
     texture_size: int = 512
     """Texels along each side."""
