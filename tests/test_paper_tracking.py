@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mien.tracking import Tracking, TrackingSettings, track
+from mien.tracking import Tracking, TrackingSettings, paper_resume, track, track_subject
 from mien.tracking.paper_adam import Moments
+from mien.tracking.paper_resume import Keeper
 from mien.tracking.paper_settings import PaperSettings
 from photometric_case import FOCAL, PhotometricCase, make_photometric_case
 from test_photometric_tracking import turn_error, wobble
@@ -59,3 +60,37 @@ def test_adam_is_that_of_torch():
         optimizer.step()
         moments.step(values, gradient, 0.1)
     torch.testing.assert_close(values, expected.detach(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("interrupted_at", [3, 9])
+def test_an_interrupted_fit_goes_on(case, tmp_path, monkeypatch, interrupted_at: int):
+    """Interrupted on its way through the frames, or in the epochs: the same numbers as without."""
+    short = replace(QUICK, first_steps=10, steps=3, epochs=3)
+    settings = replace(LANDMARKS, schedule="paper", paper=short)
+    expected = track_subject([case.capture], case.model, settings)[0]
+    monkeypatch.setattr(paper_resume, "_INTERVAL_SECONDS", 0.0)
+    offer, offers = Keeper.offer, []
+
+    def offer_then_stop(self: Keeper, tensors: dict) -> None:
+        offer(self, tensors)
+        offers.append(None)
+        if len(offers) == interrupted_at:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Keeper, "offer", offer_then_stop)
+    keep = tmp_path / "kept.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        track_subject([case.capture], case.model, settings, keep)
+    assert keep.is_file()
+    resumed = track_subject([case.capture], case.model, settings, keep)[0]
+    assert not keep.exists()
+    for name, tensor in expected.face.tensors().items():
+        assert torch.equal(tensor, resumed.face.tensors()[name]), name
+
+
+def test_a_damaged_file_means_a_fresh_start(tmp_path, capsys):
+    damaged = tmp_path / "kept.safetensors"
+    damaged.write_bytes(b"nothing of sense")
+    assert Keeper(damaged).read() is None
+    assert "damaged" in capsys.readouterr().err
+    assert Keeper(None).read() is None

@@ -4,47 +4,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from mien.progress import Advance, progress_bar
+from mien.progress import progress_bar, say
 from mien.tracking.landmark_model import LandmarkModel
-from mien.tracking.paper_adam import Moments, RowStepper
-from mien.tracking.paper_looks import guess_texture, roughness_gradient, sight_of
+from mien.tracking.paper_descent import Descent
+from mien.tracking.paper_resume import Keeper
 from mien.tracking.paper_scene import PaperScene, PaperState, first_state, paper_scene
-from mien.tracking.paper_terms import (
-    Moving,
-    Shown,
-    color_term,
-    landmark_terms,
-    light_term,
-    posed,
-    prior_term,
-    shared_terms,
-    show,
-    smoothness_term,
-)
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
 from mien.tracking.stages import Fit
-
-_GLOBAL_RATE, _EPOCH_DECAY = 0.1, 0.9
-"""Of the first rates in the first epoch, and from one to the next."""
-_LAST_RATE = 0.1
-"""Of the first rates at the last of a frame's steps."""
-_GOOD_COSINE = 0.5
-"""Of triangles seen less frontally, texels count in proportion."""
-_BETTER_SIGHT = 0.15
-"""By this much a frame must see a triangle more frontally than those before, to have its texels learned anew."""
-_LEAST_COSINE = 0.1
-_TEXTURE_EVERY = 4
-"""Global steps whose gradients by the texture are taken together: a step of all texels costs as much as a picture."""
-_TEXTURE_FRAMES, _TEXTURE_ROUNDS = 40, 6
-"""Frames of each sequence, and steps at each, from which texture and light are made anew before the epochs."""
-_OTHER_FIRST = 5
-"""Part of the first frame's steps that the first frames of further sequences get."""
 
 
 def fit_by_descent(
@@ -55,227 +24,33 @@ def fit_by_descent(
     settings: TrackingSettings,
     keep: Path | None = None,
 ) -> Fit:
-    """A fit to landmarks refined as in the supplement of GaussianAvatars, section A."""
+    """A fit to landmarks refined as in the supplement of GaussianAvatars, section A.
+
+    Frames whose landmarks a fit to pixels lost go back to where landmarks had them; how many is said.
+
+    Args:
+        model: The face model reduced to its landmarks.
+        shots: The sequences.
+        lenses: The unknown focal length of each (`lenses_of`).
+        fit: What landmarks led to.
+        settings: Of the whole tracking.
+        keep: File that an interrupted fit of the same input goes on from. Removed at the end.
+    """
     scene = paper_scene(model, shots, lenses, fit, settings)
-    descent = Descent(scene, first_state(scene, fit, lenses))
-    frames = sum(len(rows) for rows in descent.state.frames)
-    with torch.enable_grad(), progress_bar("Fitting to pixels", total=frames * (1 + settings.paper.epochs)) as advance:
+    descent, keeper = Descent(scene, first_state(scene, fit, lenses), fit), Keeper(keep)
+    descent.resume(keeper)
+    total = descent.frames * (1 + settings.paper.epochs)
+    with torch.enable_grad(), progress_bar("Fitting to pixels", total, min(descent.done, total)) as advance:
         for sequence in range(len(shots)):
-            descent.fit_sequence(sequence, advance)
-        descent.recentre(fit)
+            descent.fit_sequence(sequence, advance, keeper)
+        if descent.done == descent.frames:
+            descent.recentre()
         for epoch in range(settings.paper.epochs):
-            descent.fit_epoch(epoch, advance)
+            descent.fit_epoch(epoch, advance, keeper)
+    if descent.lost:
+        say(f"{len(descent.lost)} of {descent.frames} frames could not be fitted to pixels and stay near landmarks")
+    keeper.forget()
     return _as_fit(scene, descent.state, fit)
-
-
-class Descent:
-    """A fit on its way: the parameters and what Adam knows of them."""
-
-    def __init__(self, scene: PaperScene, state: PaperState) -> None:
-        self.scene, self.state = scene, state
-        self._steppers: dict[tuple[int, int], RowStepper] = {}
-        self._moments: dict[str, Moments] = {}
-        self._texture_gradient: Tensor | None = None
-
-    # One sequence, forward in time.
-
-    def fit_sequence(self, sequence: int, advance: Advance) -> None:
-        """The first frame to convergence, then each next frame from the one before it, moved as its landmarks did."""
-        rows = self.state.frames[sequence]
-        by_landmarks = rows.clone()
-        for row in range(len(rows)):
-            cameras = self._cameras(sequence, row)
-            shown = [show(self.scene, sequence, row, camera) for camera in cameras]
-            if row == 0:
-                self._fit_first(shown[0], first_of_all=sequence == 0)
-            else:
-                rows[row] = self._within(rows[row - 1] + by_landmarks[row] - by_landmarks[row - 1])
-                self._fit_row(shown, self.scene.settings.steps)
-            for one in shown:
-                self._learn_texture(one)
-            advance(status=f"frame {row + 1} of {len(rows)}")
-
-    def _fit_first(self, shown: Shown, first_of_all: bool) -> None:
-        settings = self.scene.settings
-        if first_of_all:
-            guess_texture(self.scene, shown, self._moving(shown, ())[0], self.state.texture)
-        steps = settings.first_steps if first_of_all else settings.first_steps // _OTHER_FIRST
-        moments = {name: Moments.like(value) for name, value in self._leaves(shown.sequence).items()}
-        stepper = self._stepper(shown)
-        weights = self.scene.used
-        for step in range(steps):
-            rate = _fading(step, steps)
-            moving, leaves = self._moving(
-                shown, ("row", "texture", "light") if 2 * step >= steps else ("texture", "light")
-            )
-            loss = self._frame_cost(shown, moving, weights, past_only=True) + light_term(self.scene, moving.light)
-            gradients = dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
-            with torch.no_grad():
-                for name in ("texture", "light"):
-                    own = (
-                        gradients[name] + roughness_gradient(self.scene, moving.texture)
-                        if name == "texture"
-                        else gradients[name]
-                    )
-                    moments[name].step(self._value(name, shown.sequence), own, rate * getattr(settings.rates, name))
-                if "row" in leaves:
-                    stepper.step(gradients["row"], rate)
-
-    def _fit_row(self, shown: Sequence[Shown], steps: int) -> None:
-        stepper, weights = self._stepper(shown[0]), self._trusted()
-        for step in range(steps):
-            one = shown[step % len(shown)]
-            moving, leaves = self._moving(one, ("row",))
-            loss = self._frame_cost(one, moving, weights, past_only=True)
-            (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
-            stepper.step(gradient, _fading(step, steps))
-
-    def _learn_texture(self, shown: Shown) -> None:
-        """Texels of triangles that this frame shows better than those before it."""
-        with torch.no_grad():
-            moving, _ = self._moving(shown, ())
-            sight = sight_of(self.scene, shown, moving)
-            better = (sight > self.state.sight + _BETTER_SIGHT) & (sight > _LEAST_COSINE)
-        if shown.row > 0 and better.any():
-            moments = Moments.like(self.state.texture)
-            steps = self.scene.settings.texture_steps
-            for step in range(steps):
-                moving, leaves = self._moving(shown, ("texture",))
-                vertices, _ = posed(self.scene, moving)
-                loss = color_term(self.scene, shown, moving, vertices, self.scene.used * better)
-                (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
-                moments.step(self.state.texture, gradient, 3 * self.scene.settings.rates.texture * _fading(step, steps))
-        seen = sight > _LEAST_COSINE
-        self.state.sight = torch.where(better | (seen & (self.state.sight == 0)), sight, self.state.sight)
-
-    # All frames in random order.
-
-    def recentre(self, fit: Fit) -> None:
-        """What all frames inherited from the first one's error, taken back; and texture and light for that.
-
-        Each frame was fitted to a texture that began with the first one, and with how its landmarks happened to err.
-        The middle difference from landmarks over all frames is that error; theirs averages out.
-        """
-        steps = []
-        for sequence, (rows, own) in enumerate(zip(self.state.frames, fit.sequences, strict=True)):
-            rows.copy_(self._within(rows + (own.state.float() - rows).median(0).values))
-            count = min(len(rows), _TEXTURE_FRAMES)
-            chosen = torch.linspace(0, len(rows) - 1, count).round().long().unique().tolist()
-            steps += [(sequence, row) for row in chosen]
-        moments: dict[str, Moments] = {}
-        order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(steps)), _TEXTURE_ROUNDS))
-        for number, index in enumerate(order):
-            sequence, row = steps[index]
-            camera = self._cameras(sequence, row)[number % len(self._cameras(sequence, row))]
-            shown = show(self.scene, sequence, row, camera)
-            self._step_appearance(shown, moments, _fading(number, len(order)))
-
-    def _cameras(self, sequence: int, row: int) -> list[int]:
-        return sorted(self.scene.sequences[sequence].detected[row])
-
-    def _step_appearance(self, shown: Shown, moments: dict[str, Moments], rate: float) -> None:
-        """One step of texture and light alone."""
-        moving, leaves = self._moving(shown, ("texture", "light"))
-        vertices, _ = posed(self.scene, moving)
-        loss = color_term(self.scene, shown, moving, vertices, self._trusted()) + light_term(self.scene, moving.light)
-        by_texture, by_light = torch.autograd.grad(loss, list(leaves.values()))
-        rates = self.scene.settings.rates
-        with torch.no_grad():
-            by_texture += roughness_gradient(self.scene, self.state.texture)
-            moments.setdefault("texture", Moments.like(by_texture)).step(
-                self.state.texture, by_texture, rate * rates.texture
-            )
-            light = self.state.lights[shown.sequence]
-            moments.setdefault(f"light_{shown.sequence}", Moments.like(light)).step(light, by_light, rate * rates.light)
-
-    def fit_epoch(self, epoch: int, advance: Advance) -> None:
-        """A step at every frame, which moves what is shared as well."""
-        pairs = [(sequence, row) for sequence, rows in enumerate(self.state.frames) for row in range(len(rows))]
-        random = np.random.default_rng((7, epoch))
-        scale = _GLOBAL_RATE * _EPOCH_DECAY**epoch
-        for number, index in enumerate(random.permutation(len(pairs))):
-            sequence, row = pairs[index]
-            cameras = self._cameras(sequence, row)
-            shown = show(self.scene, sequence, row, int(random.choice(cameras)))
-            self._global_step(shown, scale, 1 / len(pairs), number % _TEXTURE_EVERY == _TEXTURE_EVERY - 1)
-            advance(status=f"epoch {epoch + 1}")
-
-    def _global_step(self, shown: Shown, scale: float, share: float, with_texture: bool) -> None:
-        settings = self.scene.settings
-        names = ["row", "identity", "texture", "light"]
-        names += ["offsets"] if settings.offset_sigma > 0 else []
-        names += ["log_focals"] if len(self.state.log_focals) else []
-        moving, leaves = self._moving(shown, tuple(names))
-        loss = self._frame_cost(shown, moving, self._trusted(), past_only=False)
-        loss = loss + share * shared_terms(self.scene, moving)
-        gradients = dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values()), allow_unused=True), strict=True))
-        key = (shown.sequence, shown.row)
-        if key not in self._steppers:
-            self._steppers[key] = self._stepper(shown, past_only=False)
-        self._steppers[key].step(gradients.pop("row"), scale)
-        by_texture = gradients.pop("texture")
-        summed = by_texture if self._texture_gradient is None else self._texture_gradient + by_texture
-        self._texture_gradient = None if with_texture else summed
-        if with_texture:
-            gradients["texture"] = summed + roughness_gradient(self.scene, self.state.texture)
-        with torch.no_grad():
-            for name, gradient in gradients.items():
-                if gradient is None:
-                    continue
-                value = self._value(name, shown.sequence)
-                moment_name = f"{name}_{shown.sequence}" if name == "light" else name
-                moments = self._moments.setdefault(moment_name, Moments.like(value))
-                if name == "offsets":
-                    gradient = gradient * self.scene.offset_share
-                rate = settings.rates.focal if name == "log_focals" else getattr(settings.rates, name)
-                moments.step(value, gradient, scale * rate)
-
-    # What both share.
-
-    def _frame_cost(
-        self, shown: Shown, moving: Moving, weights: Float[Tensor, " f"], past_only: bool
-    ) -> Float[Tensor, ""]:
-        scene = self.scene
-        vertices, _ = posed(scene, moving)
-        own, rows = scene.sequences[shown.sequence], self.state.frames[shown.sequence]
-        return (
-            color_term(scene, shown, moving, vertices, weights)
-            + landmark_terms(scene, shown, moving, vertices)
-            + prior_term(scene, moving.row)
-            + smoothness_term(own, rows, shown.row, moving.row, past_only)
-        )
-
-    def _leaves(self, sequence: int) -> dict[str, Tensor]:
-        return {name: self._value(name, sequence) for name in ("identity", "offsets", "texture", "light", "log_focals")}
-
-    def _value(self, name: str, sequence: int) -> Tensor:
-        return self.state.lights[sequence] if name == "light" else getattr(self.state, name)
-
-    def _moving(self, shown: Shown, names: Sequence[str]) -> tuple[Moving, dict[str, Tensor]]:
-        """The parameters at a picture; those named are leaves."""
-        values = {"row": self.state.frames[shown.sequence][shown.row], **self._leaves(shown.sequence)}
-        leaves = {name: values[name].detach().clone().requires_grad_() for name in names}
-        return Moving(**(values | leaves)), leaves
-
-    def _within(self, row: Float[Tensor, "*t p"]) -> Float[Tensor, "*t p"]:
-        layout = self.scene.layout
-        return torch.minimum(torch.maximum(row, layout.lower.to(row)), layout.upper.to(row))
-
-    def _stepper(self, shown: Shown, past_only: bool = True) -> RowStepper:
-        row = self.state.frames[shown.sequence][shown.row]
-        layout, rate = self.scene.layout, self.scene.settings.rates.frame
-        linked = torch.cat([torch.zeros(1), self.scene.sequences[shown.sequence].smoothness.linked, torch.zeros(1)])
-        around = linked[shown.row : shown.row + 3] * torch.tensor([1.0, 0.0, 0.0] if past_only else [1.0, 4.0, 1.0])
-        whitening = self.scene.whitening(shown.sequence, shown.row, row, float(around.sum()))
-        return RowStepper(row, whitening * rate, Moments.like(row), (layout.lower.float(), layout.upper.float()))
-
-    def _trusted(self) -> Float[Tensor, " f"]:
-        return self.scene.used * (self.state.sight / _GOOD_COSINE).clamp_max(1.0)
-
-
-def _fading(step: int, steps: int) -> float:
-    """Of the first rate at a step."""
-    return 1 - (1 - _LAST_RATE) * step / max(steps - 1, 1)
 
 
 def _as_fit(scene: PaperScene, state: PaperState, fit: Fit) -> Fit:

@@ -42,6 +42,8 @@ class PaperSettings:
     """Of the mean difference between picture and rendering (0..1); squared standard deviations count 1 each."""
     color_epsilon: float = 0.02
     """Differences of colours smaller than this pull less and less."""
+    light_extent: float = 0.012
+    """Metres on the face over which a smooth difference counts as light that the model does not explain."""
     landmark_share: float = 0.3
     """Weight of landmarks, of theirs in the fit to landmarks alone."""
     gap_weight: float = 1.0

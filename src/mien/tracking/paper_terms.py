@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass, replace
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -20,6 +22,9 @@ GAPS = (
     (13, 14), (82, 87), (312, 317), (81, 178), (311, 402),  # lips
 )  # fmt: skip
 """Pairs of landmarks, upper and lower, whose distance tells how far eyes and mouth are open."""
+
+_LIGHT = 0.1
+"""Differences of colours of more than this are not taken for light."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,16 +67,42 @@ def posed(scene: PaperScene, moving: Moving) -> tuple[Float[Tensor, "v 3"], Face
 def color_term(
     scene: PaperScene, shown: Shown, moving: Moving, vertices: Float[Tensor, "v 3"], weights: Float[Tensor, " f"]
 ) -> Float[Tensor, ""]:
-    """The difference between picture and rendering, over the triangles that count."""
+    """The difference between picture and rendering, over the triangles that count.
+
+    Vertices are not moved for the sake of shading: what a few harmonics do not explain of light would turn heads.
+    """
     camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
     height, width = shown.mask.shape
     camera = camera.resized(width, height)
     fragments = see(vertices, scene, camera)
     mesh = replace(scene.mesh, face_weights=weights)
     return scene.settings.color_weight * mesh_loss(
-        fragments, image_points(camera, vertices), vertex_normals(vertices, mesh.faces), mesh, moving.texture,
-        moving.light, (shown.image, shown.mask, scene.settings.color_epsilon),
+        fragments, image_points(camera, vertices), vertex_normals(vertices.detach(), mesh.faces), mesh,
+        moving.texture, moving.light, (shown.image, shown.mask, scene.settings.color_epsilon),
     )  # fmt: skip
+
+
+@torch.no_grad()
+def without_smooth_difference(scene: PaperScene, shown: Shown, moving: Moving, weights: Float[Tensor, " f"]) -> Shown:
+    """The picture less what differs from its rendering over many pixels: light that harmonics do not explain."""
+    vertices, _ = posed(scene, moving)
+    height, width = shown.mask.shape
+    camera = scene.camera(shown.sequence, shown.camera, moving.log_focals).resized(width, height)
+    fragments, picture = see(vertices, scene, camera), torch.empty_like(shown.image)
+    mesh_loss(
+        fragments, image_points(camera, vertices), vertex_normals(vertices, scene.mesh.faces),
+        replace(scene.mesh, face_weights=weights), moving.texture, moving.light,
+        (shown.image, shown.mask, scene.settings.color_epsilon), picture,
+    )  # fmt: skip
+    lit = torch.cat([weights, weights.new_zeros(1)])[fragments.face_index.long()][..., None]
+    difference = shown.image - picture
+    # Outliers, as where hair hides skin, say nothing about the light beside them.
+    lit = lit * (_LIGHT**2 / (_LIGHT**2 + difference.square().sum(-1, keepdim=True)))
+    depth = float(camera.project(vertices.mean(0, keepdim=True))[1])
+    sigma = max(scene.settings.light_extent * float(camera.K[0, 0]) / depth, 1.0)
+    sums = cv2.GaussianBlur(torch.cat([difference * lit, lit], dim=-1).numpy(), (0, 0), sigma)
+    smooth = torch.from_numpy(sums[..., :3] / np.maximum(sums[..., 3:], 1e-3)) * (lit > 0)
+    return replace(shown, image=shown.image - smooth)
 
 
 def see(vertices: Float[Tensor, "v 3"], scene: PaperScene, camera: Camera) -> MeshFragments:

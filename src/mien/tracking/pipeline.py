@@ -5,6 +5,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -52,7 +53,10 @@ def track(capture: Capture, face_model: FaceModel, settings: TrackingSettings = 
 
 
 def track_subject(
-    captures: Sequence[Capture], face_model: FaceModel, settings: TrackingSettings = DEFAULTS
+    captures: Sequence[Capture],
+    face_model: FaceModel,
+    settings: TrackingSettings = DEFAULTS,
+    keep: Path | None = None,
 ) -> list[Tracking]:
     """The face model fitted to landmarks and pixels of all sequences of one person, with one identity.
 
@@ -63,6 +67,8 @@ def track_subject(
     Sequences may differ in size, frame rate and number of cameras. Several cameras have to be calibrated
     (`Capture.calibration`): they stay as they are, give the metric scale, and a camera that found no face at a timestep
     adds nothing to it. With one uncalibrated camera, metric scale comes from the identity prior.
+
+    `keep` is a file that the `paper` schedule goes on from if it was interrupted, with the same captures and settings.
 
     Raises:
         UserError: a capture has several cameras without calibration, too few timesteps with a face, or landmarks that
@@ -87,7 +93,7 @@ def track_subject(
             refined = refine_photometrically(model, shots, lenses, fit, settings)
             fit, pixel_residuals = refined.fit, refined.residuals
         if settings.schedule == "paper":
-            fit = fit_by_descent(model, shots, lenses, fit, settings)
+            fit = fit_by_descent(model, shots, lenses, fit, settings, keep)
         trackings = [
             _as_tracking(shot, face_model, model, fit.subject, own, settings)
             for shot, own in zip(shots, fit.sequences, strict=True)

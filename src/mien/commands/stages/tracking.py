@@ -101,7 +101,11 @@ def _track(
     usable = {name: capture for name, capture in captures.items() if has_enough_faces(capture)} or captures
     for name in captures.keys() - usable.keys():
         say(f"{name}: left out, there are too few faces in it")
-    tracked = track_subject(list(usable.values()), face_model, settings)
+    keep = workspace.root / "sequences" / f".tracking-{fingerprint}.safetensors"
+    for other in workspace.root.glob("sequences/.tracking-*.safetensors"):
+        if other != keep:
+            other.unlink()  # of other captures or settings
+    tracked = track_subject(list(usable.values()), face_model, settings, keep)
     trackings = {}
     for name, tracking in zip(usable, tracked, strict=True):
         made_from = {"fingerprint": fingerprint, "tracked_together": list(usable)}
