@@ -141,10 +141,10 @@ def prior_term(scene: PaperScene, row: Float[Tensor, " p"]) -> Float[Tensor, ""]
 
 
 def smoothness_term(
-    own: SequenceScene, rows: Float[Tensor, "t p"], index: int, row: Float[Tensor, " p"], past_only: bool
+    own: SequenceScene, rows: Float[Tensor, "t p"], index: int, row: Float[Tensor, " p"]
 ) -> Float[Tensor, ""]:
-    """Accelerations that the timestep has a part in; with `past_only`, of the two before it alone."""
-    first, last = max(index - 2, 0), index + 1 if past_only else min(index + 3, len(rows))
+    """Accelerations that the timestep has a part in."""
+    first, last = max(index - 2, 0), min(index + 3, len(rows))
     window = torch.cat([rows[first:index], row[None], rows[index + 1 : last]])
     return Smoothness(own.smoothness.precision, own.smoothness.linked[first:last]).cost(window)
 
