@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking import Tracking, TrackingSettings, residual_report, track
+from mien.tracking import Tracking, TrackingSettings, residual_report, track, track_subject
 from mien.tracking.parameters import layout_of
 from mien.tracking.photometric_settings import PhotometricSettings
 from mien.tracking.photometric_surface import surface_model
@@ -97,6 +97,17 @@ def test_pictures_that_show_something_else_fall_back_to_landmarks_and_say_so(cas
     assert 2 not in report["flagged_frames"]
     kept = [case.model.landmark_positions(case.model(t.face[[5, 9]]), "mediapipe") for t in (found, by_landmarks)]
     assert (kept[0] - kept[1]).norm(dim=-1).median() < 0.003
+
+
+def test_sequences_of_one_subject_share_texture_and_identity(case):
+    short = make_photometric_case(timesteps=7)
+    found = track_subject([case.capture, short.capture], case.model, FAST)
+    assert [len(tracking.face) for tracking in found] == [16, 7]
+    assert torch.equal(found[0].face.identity, found[1].face.identity)
+    for own, tracking in zip((case, short), found, strict=True):
+        assert wobble(own, tracking) < 0.2
+        assert tracking.pixel_residuals is not None
+        assert tracking.pixel_residuals.median() < 0.06
 
 
 def test_residuals_tell_how_well_colours_agree(by_pixels, by_landmarks):

@@ -46,9 +46,9 @@ class PhotometricFit:
     appearance: Appearance
     lights: tuple[Float[Tensor, "9 3"], ...]
     """Of each sequence."""
-    improved: tuple[Bool[Tensor, " v"], ...]
+    improved: tuple[Bool[Tensor, " _"], ...]
     """Of each sequence, timesteps that pixels made better; the others stay as landmarks had them."""
-    residuals: tuple[Float[Tensor, "v c"], ...] = ()
+    residuals: tuple[Float[Tensor, "_ _"], ...] = ()
     """Of each sequence: `PhotometricTerm.residuals`, NaN where not improved."""
 
 
