@@ -18,6 +18,7 @@ setup: .venv/.built
 
 # An editable install: Python from src/, the native core built into .venv.
 .venv/.built: .venv/.packages pyproject.toml $(NATIVE)
+	@echo "compiling the C++ core: one to four minutes ..."
 	VIRTUAL_ENV=.venv $(BIN)/uv pip install --no-build-isolation --no-deps --reinstall-package mien -e .
 	touch $@
 

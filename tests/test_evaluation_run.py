@@ -12,6 +12,7 @@ from mien.avatar import FaceTuning, GaussianAvatarsConfig
 from mien.capture import write_capture
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, read_metrics
+from mien.evaluation.evaluate import is_evaluated
 from mien.evaluation.load import load_experiments
 from mien.evaluation.scoring import METRICS
 from mien.storage import read_tensors, write_tensors
@@ -54,6 +55,19 @@ def test_evaluate_writes_metrics_and_report(workspace: tuple[Path, Path]) -> Non
     page = (run_dir / "report.html").read_text()
     assert page.count("<img") == 28
     assert f"{entry['psnr']:.2f} dB" in page
+
+
+def test_what_is_scored_is_known_to_be(workspace: tuple[Path, Path]) -> None:
+    folder, run_dir = workspace
+    quick = EvaluationSettings(perceptual=False, video_frames=0)
+    (run_dir / "metrics.json").unlink(missing_ok=True)
+    assert not is_evaluated(run_dir, [folder], quick)
+    evaluate(run_dir, [folder], quick)
+    assert is_evaluated(run_dir, [folder], quick)
+    assert not is_evaluated(run_dir, [folder], EvaluationSettings(perceptual=False, baselines=False))
+    (run_dir / "report.html").unlink()
+    assert not is_evaluated(run_dir, [folder], quick)
+    evaluate(run_dir, [folder])
 
 
 def test_held_out_frames_are_those_training_left_out(workspace: tuple[Path, Path]) -> None:

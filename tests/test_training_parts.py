@@ -28,6 +28,11 @@ def test_blocks_hold_out_every_fifth_block_of_ten() -> None:
     assert held == [*range(40, 50), *range(90, 100)]
 
 
+@pytest.mark.parametrize(("timesteps", "expected"), [(5, [4]), (30, [*range(24, 30)]), (49, [*range(36, 45)])])
+def test_short_clips_have_a_fifth_block_too(timesteps: int, expected: list[int]) -> None:
+    assert held_out(timesteps, "blocks").nonzero()[:, 0].tolist() == expected
+
+
 def test_tail_holds_out_the_last_fifth() -> None:
     assert held_out(101, "tail").nonzero()[:, 0].tolist() == list(range(81, 101))
     assert not held_out(101, "none").any()

@@ -64,5 +64,5 @@ class Command:
         trackings = tracking_stage(workspace, self.face_model, self.tracking)
         training_stage(workspace, [name for name in captured if name in trackings], run, method, settings)
         if settings.holds_out:
-            evaluation_stage(workspace, run)
+            evaluation_stage(workspace, run, again=False)
         say(f"Done in {time.monotonic() - began:.0f} s. Next: mien render {self.out} --out turntable.mp4")

@@ -39,5 +39,6 @@ class Command:
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
+        self.picture.warn_of_white(run_dir)
         options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps)
         drive_stage(run_dir, self.by, self.out, options, self.picture)

@@ -13,7 +13,9 @@ from mien.errors import UserError
 from mien.evaluation.cameras import LARGEST_SIDE, fitted
 from mien.export.pictures import Output, plan_output, to_rgb, to_rgba
 from mien.gaussians import Gaussians
+from mien.progress import say
 from mien.render import rasterize
+from mien.training import read_run_config
 
 _NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "green": (0.0, 1.0, 0.0)}
 _SMALLEST_SIDE = 16
@@ -45,6 +47,14 @@ class PictureOptions:
             raise UserError(f"{given}: pictures are {_SMALLEST_SIDE}..{LARGEST_SIDE} pixels wide and high")
         self.colour()
         return plan_output(out, frames, self.background == "transparent")
+
+    def warn_of_white(self, run_dir: Path) -> None:
+        """Say so where transparency is asked of a run that has learned to lean on white."""
+        if self.background == "transparent" and read_run_config(run_dir)["settings"].get("background") == "white":
+            say(
+                "this avatar was trained over white, and bright skin and outlines may let light through; "
+                "`mien train --background random` makes one that does not"
+            )
 
     def shape(self) -> tuple[int, int]:
         """Width and height."""

@@ -63,6 +63,7 @@ class Command:
         timesteps = None if motion is None else len(motion)
         cameras = self._given_cameras(workspace, timesteps)
         output = self.picture.plan(self.out, self._frames(timesteps) if cameras is None else len(cameras))
+        self.picture.warn_of_white(run_dir)
         avatar = load_avatar(run_dir)
         subject = avatar.subject
         face = with_expression(subject if motion is None else motion, avatar.face_model, self.set)

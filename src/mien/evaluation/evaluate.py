@@ -49,7 +49,8 @@ def evaluate(
     experiments = load_experiments(run_dir, sequence_dirs)
     if not experiments and not driver_dirs:
         raise UserError(
-            f"{run_dir}: nothing was held out, so nothing can be scored; train with the split `blocks` or `tail`"
+            f"{run_dir}: nothing was held out, so nothing can be scored; train with `--split blocks` or `tail`, on 5 "
+            "frames or more"
         )
     partials = {
         name: PartialScores(run_dir / f".{name}.partial", _fingerprint(run_dir, name, experiment, settings))
@@ -64,7 +65,8 @@ def evaluate(
     if driver_dirs:
         entry, driven_videos = cross_reenactment(run_dir, sequence_dirs[0], driver_dirs, settings.video_frames)
         driven = {"cross_reenactment": entry}
-    content = {"protocols": {**protocols, **driven}, "training": summary}
+    fingerprints = {name: partial.fingerprint for name, partial in partials.items()}
+    content = {"protocols": {**protocols, **driven}, "training": summary, "fingerprints": fingerprints}
     videos = {
         name: _video(run_dir, name, experiment, evaluation, settings)
         for name, (experiment, evaluation) in results.items()
@@ -80,6 +82,22 @@ def evaluate(
     for partial in partials.values():
         partial.remove()
     return content
+
+
+def is_evaluated(run_dir: Path, sequence_dirs: Items[Path], settings: EvaluationSettings | None = None) -> bool:
+    """Whether metrics.json holds the figures that `evaluate` would write: same avatar, data and settings.
+
+    Raises:
+        UserError: the run is not finished, or the sequences are others.
+    """
+    settings = settings or EvaluationSettings()
+    try:
+        known = read_metrics(run_dir).get("fingerprints")
+    except UserError:
+        return False
+    experiments = load_experiments(run_dir, sequence_dirs)
+    expected = {name: _fingerprint(run_dir, name, each, settings) for name, each in experiments.items()}
+    return bool(expected) and known == expected and (run_dir / "report.html").is_file()
 
 
 def _video(

@@ -6,7 +6,7 @@ from typing import Any
 
 from mien.evaluation.compare import Comparison, compare_runs
 from mien.evaluation.compare_report import write_comparison
-from mien.evaluation.evaluate import evaluate
+from mien.evaluation.evaluate import evaluate, is_evaluated, read_metrics
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.words import driven_line, protocol_line
 from mien.progress import say
@@ -15,11 +15,28 @@ from mien.workspace import Workspace, open_workspace
 
 
 def evaluation_stage(
-    workspace: Workspace, run: str, settings: EvaluationSettings | None = None, drivers: Items[Path] = ()
+    workspace: Workspace,
+    run: str,
+    settings: EvaluationSettings | None = None,
+    drivers: Items[Path] = (),
+    *,
+    again: bool = True,
 ) -> dict[str, Any]:
-    """Evaluate a run on what it held out, and on other sequences' motion; returns the content of metrics.json."""
+    """Evaluate a run on what it held out, and on other sequences' motion; returns the content of metrics.json.
+
+    Args:
+        workspace: Where the run is.
+        run: Its name.
+        settings: What to compute; None for the defaults.
+        drivers: Workspaces or folders of sequences whose motion drives the avatar as well.
+        again: Whether to score again what was scored with the same settings.
+    """
     run_dir = workspace.run_dir(run)
-    metrics = evaluate(run_dir, run_sequences(workspace, run_dir), settings, _driver_folders(drivers))
+    folders = run_sequences(workspace, run_dir)
+    if not again and not drivers and is_evaluated(run_dir, folders, settings):
+        metrics = read_metrics(run_dir)
+    else:
+        metrics = evaluate(run_dir, folders, settings, _driver_folders(drivers))
     for name, entry in metrics["protocols"].items():
         say(driven_line(entry) if name == "cross_reenactment" else protocol_line(name, entry))
     say(f"Look at {run_dir / 'report.html'}")
