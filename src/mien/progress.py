@@ -14,6 +14,7 @@ console = Console(stderr=True, highlight=False)
 """Where people read: standard error, so that standard output stays for results."""
 
 _PLAIN_INTERVAL_SECONDS = 10.0
+_CALLS_BEFORE_ETA = 3
 
 
 @runtime_checkable  # for beartype, which checks annotations during tests
@@ -54,18 +55,26 @@ def progress_bar(title: str, total: int, completed: int = 0) -> Iterator[Advance
 
 @contextmanager
 def _plain_progress(title: str, total: int, completed: int) -> Iterator[Advance]:
-    start = last = time.monotonic()
-    done, latest = completed, ""
+    start = last = first = time.monotonic()
+    done = at_first = completed
+    latest, told, calls = "", "", 0
 
     def report() -> None:
-        elapsed = time.monotonic() - start
-        rate = (done - completed) / elapsed if elapsed > 0 else 0.0
+        nonlocal told
+        elapsed, since_first = time.monotonic() - start, time.monotonic() - first
+        # The first item also loads and warms up what the others use.
+        rate = (done - at_first) / since_first if calls >= _CALLS_BEFORE_ETA and since_first > 0 else 0.0
         eta = f", ETA {(total - done) / rate:.0f} s" if rate > 0 and done < total else ""
-        print(f"{title}: {done}/{total} in {elapsed:.0f} s{eta} {latest}".rstrip(), file=sys.stderr, flush=True)
+        line = f"{title}: {done}/{total} in {elapsed:.0f} s{eta} {latest}".rstrip()
+        if told != f"{done} {latest}":
+            print(line, file=sys.stderr, flush=True)
+        told = f"{done} {latest}"
 
     def advance(amount: int = 1, status: str = "") -> None:
-        nonlocal done, last, latest
-        done, latest = done + amount, status or latest
+        nonlocal done, last, latest, calls, first, at_first
+        done, latest, calls = done + amount, status or latest, calls + 1
+        if calls == 1:
+            first, at_first = time.monotonic(), done
         if time.monotonic() - last >= _PLAIN_INTERVAL_SECONDS:
             last = time.monotonic()
             report()
