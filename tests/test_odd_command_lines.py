@@ -9,6 +9,8 @@ import pytest
 
 from damage import edit_json
 from mien.cli import main
+from mien.commands.stages import doubled_videos
+from mien.tracking import read_tracking
 from toy_workspace import write_toy_workspace
 
 CAMERA = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
@@ -47,20 +49,24 @@ ODD = [
     (f"render W --out {'a' * 300}.png", "cannot be written"),
     ("render W --out a.mp4 --background transparent", "an .mp4 cannot be transparent"),
     ("render W --out a.png --background #12", "--background #12"),
-    ("render W --out a.mp4 --frames 0", "--frames 0"),
+    ("render W --out a.mp4 --frames 0", "--frames 0: give 1 or more"),
     ("render W --out a.mp4 --fps nan", "--fps nan"),
-    ("render W --out a.mp4 --zoom 0", "--zoom 0"),
+    ("render W --out a.mp4 --zoom 0", "--zoom 0: give 0.01..100"),
     ("render W --out a.mp4 --span inf", "--span inf"),
     ("render W --out a.mp4 --path loop", "'loop'"),
     ("render W --out a.png --set drop=nan", "--set drop=nan: drop goes from 0 to 1"),
     ("render W --out a.png --set drop=1e300", "--set drop=1e300"),
     ("render W --out a.png --set drop=0,5", "'0,5' is no number"),
+    ("render W --out a.png --set drop 0.5", "--set drop 0.5: write drop=0.5"),
+    ("render W --out a.png --set drop", "--set drop: write drop=0.6"),
     ("render W --out a.png --set dorp=1", "did you mean drop?"),
     ("render W --out a.png --run ../toy", "no run '../toy'; there are: toy"),
     ("render W --out a.png --sequence a/b", "no sequence 'a/b'; there are: clip"),
     ("render W --out a.png --cameras none.json", "none.json: no such file"),
     ("render W --out a.png --cameras empty.json", "cannot be read as json"),
     ("render W --out a.png --cameras cameras.json", "viewmat is no rotation"),
+    ("render W/runs/toy --out a.png", "did you mean W --run toy?"),
+    ("render 'not there' --out a.png", "--out 'not there'`"),
     ("render text.txt --out a.png", "text.txt: no such folder"),
     ("drive W --by none.csv --out a.mp4", "none.csv: no such file or folder"),
     ("drive W --by empty.csv --out a.mp4", "empty.csv: has no frames"),
@@ -109,6 +115,29 @@ def test_odd_command_lines_are_told_in_one_line(
     assert told[0].startswith("mien: ")
     assert words in told[0]
     assert sorted(place.rglob("*")) == before
+
+
+def test_a_current_tracking_is_said(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(place)
+    current = {"clip": read_tracking(place / "W/sequences/clip/tracking")}
+    monkeypatch.setattr("mien.commands.stages.tracking._current_trackings", lambda *_: current)
+    monkeypatch.setattr("mien.commands.stages.tracking._show_tracking", lambda *_: None)
+    assert main(["track", "W"]) == 0
+    assert "Tracking is current, nothing to do: clip" in capsys.readouterr().err
+
+
+def test_the_same_video_twice_is_warned_of(place: Path) -> None:
+    videos = [place / "text.txt", place / "copy.txt", place / "bytes.csv"]
+    videos[1].write_bytes(videos[0].read_bytes())
+    names = ["a", "b", "c"]
+    assert list(doubled_videos(videos, names, ())) == [
+        "a and b are the same video, which counts twice and shows nothing more"
+    ]
+    (warning,) = doubled_videos(videos, names, ("b-1",))
+    assert warning == "a and b are the same video: b is held out, but a trains on its frames"
+    assert list(doubled_videos(videos[1:], names[1:], ())) == []
 
 
 def test_landmarks_that_no_face_could_have(

@@ -7,6 +7,7 @@ import importlib
 import inspect
 import io
 import os
+import shlex
 import sys
 import tempfile
 import traceback
@@ -157,7 +158,7 @@ def _complain(message: str) -> int:
 def _write_crash_log() -> Path:
     handle, name = tempfile.mkstemp(prefix="mien-crash-", suffix=".log")
     with os.fdopen(handle, "w", encoding="utf-8") as log:
-        log.write(f"mien {mien.__version__}\n{' '.join(sys.argv)}\n\n{traceback.format_exc()}")
+        log.write(f"mien {mien.__version__}\n{shlex.join(sys.argv)}\n\n{traceback.format_exc()}")
     return Path(name)
 
 

@@ -1,5 +1,6 @@
 """Where things lie on disk: one workspace folder is one subject (design: sequences/NAME/..., runs/NAME/)."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,11 +60,16 @@ def open_workspace(root: Path) -> Workspace:
     """
     workspace = Workspace(root)
     if not root.is_dir():
-        raise UserError(f"{root}: no such folder; make a workspace with `mien create VIDEO --out {root}`")
-    if not workspace.sequence_names() and not workspace.run_names():
         raise UserError(
-            f"{root}: not a mien workspace (no sequences/NAME/capture, no runs/NAME); see `mien create --help`"
+            f"{root}: no such folder; make a workspace with `mien create VIDEO --out {shlex.quote(str(root))}`"
         )
+    if not workspace.sequence_names() and not workspace.run_names():
+        told = f"{root}: not a mien workspace (no sequences/NAME/capture, no runs/NAME)"
+        whole = root.resolve()
+        if whole.parent.name == "runs" and whole.name in Workspace(whole.parent.parent).run_names():
+            typed = root.parent.parent if len(root.parts) > 2 else whole.parent.parent
+            raise UserError(f"{told}; did you mean {shlex.join([str(typed), '--run', whole.name])}?")
+        raise UserError(f"{told}; see `mien create --help`")
     return workspace
 
 

@@ -25,6 +25,7 @@ from mien.storage import write_atomically
 
 _THREADS = 2
 _DEFAULT_FPS = 25.0
+_VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
 @dataclass(frozen=True)
@@ -172,9 +173,9 @@ def _open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     try:
         container = av.open(str(path), "r")
     except (av.error.FFmpegError, OSError) as error:
-        raise UserError(
-            f"{path}: cannot be read as a video ({error.strerror or error}); give a video file, such as .mp4 or .mov"
-        ) from None
+        named_so = path.suffix.lower() in _VIDEO_ENDINGS
+        remedy = "incomplete? copy it again" if named_so else "give a video file, such as .mp4 or .mov"
+        raise UserError(f"{path}: cannot be read as a video ({error.strerror or error}); {remedy}") from None
     with container:
         if not container.streams.video:
             raise UserError(f"{path}: has no video stream; give a file with pictures in it")

@@ -1,5 +1,6 @@
 """`mien create`."""
 
+import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,6 +40,7 @@ class Command:
         """All stages, each skipped if its result is current; what can be told before any work is told then."""
         from mien.commands.stages import (
             capture_stage,
+            doubled_videos,
             evaluation_stage,
             run_name,
             sequence_names,
@@ -57,6 +59,8 @@ class Command:
         check_writable(self.out, folder=True)
         check_run(workspace.run_dir(run), method, settings)
         load_face_model(self.face_model)
+        for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
+            say(f"warning: {warning}")
 
         videos = zip(self.videos, names, strict=True)
         captured = [part for video, name in videos for part in capture_stage(workspace, video, name, self.capture)]
@@ -65,4 +69,6 @@ class Command:
         training_stage(workspace, [name for name in captured if name in trackings], run, method, settings)
         if settings.holds_out:
             evaluation_stage(workspace, run, again=False)
-        say(f"Done in {time.monotonic() - began:.0f} s. Next: mien render {self.out} --out turntable.mp4")
+        which = ["--run", run] if len(workspace.run_names()) > 1 else []
+        command = shlex.join(["mien", "render", str(self.out), *which, "--out", "turntable.mp4"])
+        say(f"Done in {time.monotonic() - began:.0f} s. Next: {command}")

@@ -16,9 +16,13 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
             out of that expression's range.
     """
     expression = face.expression.clone()
-    for assignment in assignments:
-        name, _, text = assignment.partition("=")
+    for position, assignment in enumerate(assignments):
+        name, equals, text = assignment.partition("=")
         index = _index_of(name, model, assignment)
+        if not equals:
+            apart = "".join(assignments[position + 1 : position + 2])
+            number = apart if _is_number(apart) else ""
+            raise UserError(f"--set {f'{name} {number}'.rstrip()}: write {name}={number or '0.6'}")
         try:
             value = float(text)
         except ValueError:
@@ -30,6 +34,13 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
             raise UserError(f"--set {assignment}: {name} goes from {lower:g} to {upper:g}; 1 is the full expression")
         expression[:, index] = value
     return replace(face, expression=expression)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def _index_of(name: str, model: FaceModel, assignment: str) -> int:

@@ -84,12 +84,16 @@ class Command:
         say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
 
     def _check(self) -> None:
-        if self.frames < 1 or not 0 < self.fps <= 1000 or not 0.01 <= self.zoom <= 100:
-            raise UserError(
-                f"--frames {self.frames} --fps {self.fps:g} --zoom {self.zoom:g}: use 1 or more, 0..1000, 0.01..100"
-            )
-        if not (math.isfinite(self.span) and abs(self.tilt) < 180):
-            raise UserError(f"--span {self.span:g} --tilt {self.tilt:g}: give degrees, --tilt below 180")
+        if self.frames < 1:
+            raise UserError(f"--frames {self.frames}: give 1 or more")
+        if not 0 < self.fps <= 1000:
+            raise UserError(f"--fps {self.fps:g}: give more than 0 and up to 1000")
+        if not 0.01 <= self.zoom <= 100:
+            raise UserError(f"--zoom {self.zoom:g}: give 0.01..100")
+        if not math.isfinite(self.span):
+            raise UserError(f"--span {self.span:g}: give degrees")
+        if not abs(self.tilt) < 180:
+            raise UserError(f"--tilt {self.tilt:g}: give degrees, below 180")
 
     def _is_still(self) -> bool:
         return self.out.suffix.lower() == ".png" and "%" not in self.out.name

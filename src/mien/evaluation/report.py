@@ -2,6 +2,7 @@
 
 import json
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -103,7 +104,7 @@ def report_html(
 
 
 def _heading(title: str, run: RunRecord) -> str:
-    command = " ".join(_shortened(run.config["command_line"]))
+    command = shlex.join(_shortened(run.config["command_line"]))
     version = escape(str(run.config["mien"]))
     return (
         f"<h1>{escape(title)}</h1>"

@@ -1,10 +1,12 @@
 """Names that become folders."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import combinations
 from pathlib import Path
 
 from mien.errors import UserError
+from mien.storage import file_digest
 
 
 def sequence_name(video: Path, name: str | None) -> str:
@@ -46,3 +48,29 @@ def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
     if twice:
         raise UserError(f"two videos would both be the sequence {twice[0]!r}; name all of them with --name")
     return found
+
+
+def doubled_videos(videos: Sequence[Path], names: Sequence[str], held_out: Sequence[str]) -> Iterator[str]:
+    """What to tell of videos with the same content: they add nothing, and one that is held out is trained on."""
+
+    def is_held_out(name: str) -> bool:
+        # A part of a video with cuts is called NAME-1.
+        return any(part == name or part.rpartition("-")[0] == name for part in held_out)
+
+    for (first, name), (second, other) in combinations(zip(videos, names, strict=True), 2):
+        if not _same_content(first, second):
+            continue
+        outside = [n for n in (name, other) if is_held_out(n)]
+        if len(outside) == 1:
+            trained = other if outside == [name] else name
+            yield f"{name} and {other} are the same video: {outside[0]} is held out, but {trained} trains on its frames"
+        else:
+            yield f"{name} and {other} are the same video, which counts twice and shows nothing more"
+
+
+def _same_content(first: Path, second: Path) -> bool:
+    if first.samefile(second):
+        return True
+    if not (first.is_file() and second.is_file()) or first.stat().st_size != second.stat().st_size:
+        return False
+    return file_digest(first) == file_digest(second)

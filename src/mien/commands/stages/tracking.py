@@ -47,6 +47,8 @@ def tracking_stage(
     trackings = None if again else _current_trackings(workspace, names, fingerprint)
     if trackings is None:
         trackings = _track(workspace, names, face_model, settings, fingerprint)
+    else:
+        say(f"Tracking is current, nothing to do: {', '.join(trackings)}")
     for name, tracking in trackings.items():
         folder = workspace.sequence_dir(name)
         capture_hash = read_capture_hash(folder / "capture")
