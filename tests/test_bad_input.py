@@ -3,6 +3,7 @@
 import errno
 import re
 import resource
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +23,7 @@ from mien.evaluation import read_metrics
 from mien.export import in_world, read_ply, write_ply
 from mien.storage import read_json, read_tensors, write_arrays, write_json, write_tensors
 from mien.tracking import Scoring, write_scoring, write_tracking
-from mien.training import read_run_config
+from mien.training import read_run_config, read_training_summary
 from mien.training.checkpoint import checkpoint_files
 from mien.training.run import run_camera
 from toy_scene import toy_sequence
@@ -166,6 +167,39 @@ def test_incomplete_metrics_are_named(tmp_path: Path) -> None:
     write_json(tmp_path / "metrics.json", "mien.metrics", 1, {"protocols": {}})
     with pytest.raises(UserError, match=r"metrics\.json: incomplete.*mien evaluate"):
         read_metrics(tmp_path)
+
+
+def test_no_advice_to_delete_a_folder_that_holds_an_avatar(run_dir: Path, tmp_path: Path) -> None:
+    readers = {"config.json": read_run_config, "metrics.json": read_metrics, "training.json": read_training_summary}
+    for name, read in readers.items():
+        (tmp_path / name).touch()
+        with pytest.raises(UserError, match="cannot be read as json") as error:
+            read(tmp_path)
+        assert "delete its folder" not in str(error.value)
+    with pytest.raises(UserError, match="delete this file, not its folder, and run `mien evaluate` again"):
+        read_metrics(tmp_path)
+    shutil.copytree(run_dir / "avatar", tmp_path / "avatar")
+    for name in ("face_model.safetensors", "face_model.json", "avatar.safetensors", "avatar.json"):
+        path = tmp_path / "avatar" / name
+        path.write_bytes(path.read_bytes()[:40])
+        with pytest.raises(
+            UserError, match=rf"{name}: .*; delete the run's training.json, .* train it again with `mien train`"
+        ):
+            load_avatar(tmp_path)
+    (tmp_path / "avatar" / "avatar.json").write_bytes((run_dir / "avatar" / "avatar.json").read_bytes())
+    (tmp_path / "avatar" / "avatar.safetensors").unlink()
+    with pytest.raises(UserError, match=r"avatar\.safetensors: missing; .* train it again"):
+        load_avatar(tmp_path)
+
+
+def test_a_damaged_avatar_is_made_again_as_advised(run_dir: Path, tmp_path: Path) -> None:
+    shutil.copytree(run_dir, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "avatar" / "face_model.safetensors").unlink()
+    (tmp_path / "avatar" / "avatar.safetensors").write_bytes(b"")
+    (tmp_path / "training.json").unlink()
+    train_toy.main(tmp_path, train_toy.SETTINGS.steps)
+    for name in ("avatar.safetensors", "face_model.safetensors"):
+        assert (tmp_path / "avatar" / name).read_bytes() == (run_dir / "avatar" / name).read_bytes()
 
 
 def test_the_command_line_tells_damage_in_one_line(

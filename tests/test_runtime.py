@@ -177,11 +177,13 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="version 9"):
         runtime.load(path)
     safetensors.numpy.save_file(arrays, path)
-    with pytest.raises(UserError, match="has format None"):
+    with pytest.raises(UserError, match=r"is no \.mien file; write one with `mien export"):
         runtime.load(path)
     (tmp_path / "b.mien").write_text(json.dumps({}))
-    with pytest.raises(UserError, match="damaged"):
+    with pytest.raises(UserError, match=r"is no \.mien file, or a damaged one .*; write one with `mien export"):
         runtime.load(tmp_path / "b.mien")
+    with pytest.raises(UserError, match="no such file; write one with `mien export"):
+        runtime.load(tmp_path / "none.mien")
 
 
 def test_face_models_that_may_not_be_passed_on_are_not() -> None:

@@ -119,8 +119,12 @@ def write_json(path: Path, format_name: str, version: int, content: Mapping[str,
     write_atomically(path, lambda temporary: temporary.write_text(text + "\n", encoding="utf-8"))
 
 
-def read_json(path: Path, format_name: str, version: int, stage: str = _ANY_STAGE) -> dict[str, Any]:
+def read_json(
+    path: Path, format_name: str, version: int, stage: str = _ANY_STAGE, remedy: str | None = None
+) -> dict[str, Any]:
     """Read what `write_json` wrote; `stage` is the command to name where that fails.
+
+    Where the file's folder holds more than that stage makes in a moment, `remedy` says what to do instead.
 
     Raises:
         UserError: the file is missing, is no json, has another format or version, or was changed since.
@@ -130,18 +134,21 @@ def read_json(path: Path, format_name: str, version: int, stage: str = _ANY_STAG
             raise ValueError(f"{path.stat().st_size} bytes are too many")
         content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except FileNotFoundError:
-        raise UserError(f"{path}: missing; run {stage} again") from None
+        raise UserError(f"{path}: missing; {remedy or f'run {stage} again'}") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{path}: cannot be read as json ({error}); delete its folder and run {stage} again") from None
+        raise UserError(
+            f"{path}: cannot be read as json ({error}); {remedy or f'delete its folder and run {stage} again'}"
+        ) from None
     found = (content.get("format"), content.get("version")) if isinstance(content, dict) else (None, None)
     if found != (format_name, version):
         raise UserError(
             f"{path}: has format {found[0]!r} version {found[1]!r}, expected {format_name!r} version {version}; "
-            f"run {stage} again"
+            + (remedy or f"run {stage} again")
         )
     if _CHECKSUM in content and content.pop(_CHECKSUM) != _json_checksum(content):
+        remedy = remedy or f"delete its folder and run {stage} again"
         raise UserError(
-            f"{path}: was damaged or edited after it was written; delete its folder and run {stage} again "
+            f"{path}: was damaged or edited after it was written; {remedy} "
             f"(or, if you know what you changed, remove its {_CHECKSUM!r})"
         )
     return content
@@ -194,20 +201,25 @@ def read_arrays(path: Path, stage: str = _ANY_STAGE) -> dict[str, np.ndarray]:
     return read_safetensors(path, safetensors.numpy.load_file, stage)
 
 
-def read_safetensors(path: Path, load: Callable[[Path], Any], stage: str = _ANY_STAGE) -> Any:
+def read_safetensors(
+    path: Path, load: Callable[[Path], Any], stage: str = _ANY_STAGE, remedy: str | None = None
+) -> Any:
     """What `load` reads from a safetensors file, with the errors of a missing or damaged one in words.
+
+    `remedy` replaces "run `stage` again".
 
     Raises:
         UserError: the file is missing or damaged.
     """
     if not path.is_file():
-        raise UserError(f"{path}: missing; run {stage} again")
+        raise UserError(f"{path}: missing; {remedy or f'run {stage} again'}")
     try:
         _check_safetensors(path)
         return load(path)
     except (safetensors.SafetensorError, OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: damaged safetensors file ({reason}); delete it and run {stage} again") from None
+        remedy = remedy or f"delete it and run {stage} again"
+        raise UserError(f"{path}: damaged safetensors file ({reason}); {remedy}") from None
 
 
 def _check_safetensors(path: Path) -> None:

@@ -41,10 +41,10 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     write_safetensors(path, safetensors.torch.save(contiguous), metadata)
 
 
-def read_tensors(path: Path, stage: str = "the stage that writes it") -> dict[str, Tensor]:
-    """Read safetensors as torch tensors on the CPU; `stage` is the command to name where that fails.
+def read_tensors(path: Path, stage: str = "the stage that writes it", remedy: str | None = None) -> dict[str, Tensor]:
+    """Read safetensors as torch tensors on the CPU; `stage`, or else `remedy`, is what to name where that fails.
 
     Raises:
         UserError: the file is missing or damaged.
     """
-    return read_safetensors(path, safetensors.torch.load_file, stage)
+    return read_safetensors(path, safetensors.torch.load_file, stage, remedy)

@@ -16,7 +16,7 @@ from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
-_REMEDY = "train it again with `mien train`"
+_REMEDY = "delete the run's training.json, if it is there, and train it again with `mien train`"
 NOT_CARRIED = frozenset({"flame"})
 """Face models whose licence does not allow them to be passed on inside an avatar."""
 
@@ -67,15 +67,15 @@ def load_avatar(folder: Path) -> Avatar:
             f"{folder}: holds no trained avatar (no avatar.json); train one with `mien train` or `mien create`"
         )
     where = str(folder / "avatar.json")
-    stored = read_json(folder / "avatar.json", _AVATAR, _VERSION)
+    stored = read_json(folder / "avatar.json", _AVATAR, _VERSION, remedy=_REMEDY)
     named = {name: value for name, value in stored.items() if name not in ("format", "version")}
     content: _Content = decode(_Content, named, where, _REMEDY)
     if content.gaussians < 0:
-        raise UserError(f"{where}: {content.gaussians} Gaussians; train it again")
+        raise UserError(f"{where}: {content.gaussians} Gaussians; {_REMEDY}")
     method = method_named(content.kind)
-    tensors = read_tensors(folder / "avatar.safetensors")
+    tensors = read_tensors(folder / "avatar.safetensors", remedy=_REMEDY)
     if file_digest(folder / "avatar.safetensors") != content.tensors_sha256:
-        raise UserError(f"{folder / 'avatar.safetensors'}: is not what was written; train it again")
+        raise UserError(f"{folder / 'avatar.safetensors'}: is not what was written; {_REMEDY}")
     face_model = _face_model_of(folder, content)
     config = decode(method.config, content.config, where, _REMEDY)
     subject = _with_prefix(tensors, "subject.")
@@ -107,7 +107,7 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
 def _face_model_of(folder: Path, content: _Content) -> FaceModel:
     name = content.face_model
     if content.face_model_carried:
-        bare = read_face_model(folder / "face_model")
+        bare = read_face_model(folder / "face_model", _REMEDY)
         face_model = replace(bare, landmarks=read_landmarks(name, bare))
     else:
         face_model = load_face_model(name)

@@ -21,6 +21,7 @@ from mien.training import read_curves, read_run_config, read_training_summary
 
 _FORMAT, _VERSION = "mien.metrics", 1
 _RECIPE = 2
+_REMEDY = "delete this file, not its folder, and run `mien evaluate` again"
 """Raised whenever the same frame would be scored otherwise."""
 
 
@@ -125,7 +126,7 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
         UserError: the run was not evaluated, or the file is damaged.
     """
     path = run_dir / "metrics.json"
-    content = read_json(path, _FORMAT, _VERSION, "`mien evaluate`")
-    with expect_whole(path, "run `mien evaluate` again"):
+    content = read_json(path, _FORMAT, _VERSION, remedy=_REMEDY)
+    with expect_whole(path, _REMEDY):
         _ = content["protocols"].keys(), content["training"].keys()
     return {name: value for name, value in content.items() if name not in ("format", "version")}

@@ -96,22 +96,22 @@ def write_face_model(stem: Path, model: FaceModel) -> None:
     write_json(_json_file(stem), FORMAT, VERSION, content)
 
 
-def read_face_model(stem: Path) -> FaceModel:
-    """Read what `write_face_model` wrote.
+def read_face_model(stem: Path, remedy: str = "delete it and load the model again") -> FaceModel:
+    """Read what `write_face_model` wrote; `remedy` is what to say where that fails.
 
     Raises:
         UserError: a file is missing, damaged or of another version.
     """
-    content = read_json(_json_file(stem), FORMAT, VERSION)
-    tensors = read_tensors(_tensor_file(stem))
+    content = read_json(_json_file(stem), FORMAT, VERSION, remedy=remedy)
+    tensors = read_tensors(_tensor_file(stem), remedy=remedy)
     try:
         values: dict[str, Any] = {name: tuple(content[name]) for name in _LISTS}
         values.update({name: _widened(tensors[name]) for name in _TENSORS if name in tensors})
         model = FaceModel(name=content["name"], landmarks={}, **values)
     except (KeyError, TypeError) as error:
-        raise UserError(f"{stem}: incomplete face model ({error}); delete it and load the model again") from None
+        raise UserError(f"{stem}: incomplete face model ({error}); {remedy}") from None
     if model.content_hash != content.get("content_hash"):
-        raise UserError(f"{stem}: the face model's content does not match its hash; delete it and load the model again")
+        raise UserError(f"{stem}: the face model's content does not match its hash; {remedy}")
     return model
 
 

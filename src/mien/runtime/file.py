@@ -23,6 +23,7 @@ from mien.runtime.model import PortableAvatar
 
 FORMAT, VERSION = "mien.baked", 1
 ENDING = ".mien"
+_REMEDY = "write one with `mien export DIR --out me.mien`"
 
 
 def write_portable(path: Path, avatar: PortableAvatar) -> None:
@@ -46,10 +47,18 @@ def read_portable(path: Path) -> PortableAvatar:
     Raises:
         UserError: the file is missing, damaged, of another version, or no .mien file.
     """
-    metadata, arrays = read_safetensors(path, _load)
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; {_REMEDY}")
+    try:
+        metadata, arrays = read_safetensors(path, _load)
+    except UserError as error:
+        reason = str(error).split("; ")[0].partition("file (")[2].removesuffix(")")
+        raise UserError(f"{path}: is no .mien file, or a damaged one ({reason}); {_REMEDY}") from None
     try:
         header = json.loads(metadata.get("mien", "{}"))
         found = (header.get("format"), header.get("version"))
+        if found == (None, None):
+            raise UserError(f"{path}: is no .mien file; {_REMEDY}")
         if found != (FORMAT, VERSION):
             raise UserError(
                 f"{path}: has format {found[0]!r} version {found[1]!r}, expected {FORMAT!r} version {VERSION}; "

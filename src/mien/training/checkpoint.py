@@ -71,7 +71,7 @@ def resume(folder: Path, state: TrainingState) -> None:
         try:
             tensors = read_tensors(path)
         except UserError as error:
-            say(f"warning: {error}")
+            say(f"warning: {str(error).split('; ')[0]}")
             damaged = True
             continue
         with expect_whole(path, "delete it and run the same command again"):

@@ -25,8 +25,8 @@ from mien.training.settings import TrainSettings
 
 _FORMAT, _VERSION = "mien.run", 1
 _SUMMARY = "mien.training"
-_STAGE = "`mien train`"
-_REMEDY = "delete the run's folder and train again"
+_REMEDY = "put a copy back, or train again under another name (--run NAME); the run's folder holds the trained avatar"
+_AGAIN = "delete the run's training.json and run the same `mien train` again, which goes on from the last checkpoint"
 _FREE_TO_CHANGE = ("threads", "checkpoint_every")
 """Settings that do not change the result: a run may go on with others."""
 
@@ -100,7 +100,7 @@ def read_run_config(run_dir: Path) -> dict[str, Any]:
         UserError: it is missing or damaged.
     """
     path = run_dir / "config.json"
-    content = read_json(path, _FORMAT, _VERSION, _STAGE)
+    content = read_json(path, _FORMAT, _VERSION, remedy=_REMEDY)
     with expect_whole(path, _REMEDY):
         _ = content["method"]["kind"], content["settings"]["split"], [entry["sequence"] for entry in content["data"]]
     return content
@@ -146,7 +146,7 @@ def read_training_summary(run_dir: Path) -> dict[str, Any]:
     Raises:
         UserError: the run was not trained to its end.
     """
-    content = read_json(run_dir / "training.json", _SUMMARY, _VERSION, _STAGE)
+    content = read_json(run_dir / "training.json", _SUMMARY, _VERSION, remedy=_AGAIN)
     return {name: value for name, value in content.items() if name not in ("format", "version")}
 
 
@@ -156,7 +156,7 @@ def read_curves(run_dir: Path) -> dict[str, np.ndarray]:
     Raises:
         UserError: they are missing or damaged.
     """
-    return {name: curve.numpy() for name, curve in read_tensors(run_dir / "curves.safetensors", _STAGE).items()}
+    return {name: curve.numpy() for name, curve in read_tensors(run_dir / "curves.safetensors", remedy=_AGAIN).items()}
 
 
 def _choices(method_config: MethodConfig, settings: TrainSettings) -> dict[str, Any]:
