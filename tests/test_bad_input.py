@@ -171,6 +171,8 @@ def test_incomplete_metrics_are_named(tmp_path: Path) -> None:
 
 def test_no_advice_to_delete_a_folder_that_holds_an_avatar(run_dir: Path, tmp_path: Path) -> None:
     readers = {"config.json": read_run_config, "metrics.json": read_metrics, "training.json": read_training_summary}
+    with pytest.raises(UserError, match=r"metrics\.json: missing; run `mien evaluate` again"):
+        read_metrics(tmp_path)
     for name, read in readers.items():
         (tmp_path / name).touch()
         with pytest.raises(UserError, match="cannot be read as json") as error:

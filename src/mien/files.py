@@ -124,7 +124,8 @@ def read_json(
 ) -> dict[str, Any]:
     """Read what `write_json` wrote; `stage` is the command to name where that fails.
 
-    Where the file's folder holds more than that stage makes in a moment, `remedy` says what to do instead.
+    `remedy` says what to do instead, where the file's folder holds more than that stage makes in a moment; a file that
+    is missing still asks for its stage, if there is one.
 
     Raises:
         UserError: the file is missing, is no json, has another format or version, or was changed since.
@@ -134,7 +135,8 @@ def read_json(
             raise ValueError(f"{path.stat().st_size} bytes are too many")
         content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except FileNotFoundError:
-        raise UserError(f"{path}: missing; {remedy or f'run {stage} again'}") from None
+        asked = remedy if remedy and stage == _ANY_STAGE else f"run {stage} again"
+        raise UserError(f"{path}: missing; {asked}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{path}: cannot be read as json ({error}); {remedy or f'delete its folder and run {stage} again'}"

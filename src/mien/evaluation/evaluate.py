@@ -126,7 +126,7 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
         UserError: the run was not evaluated, or the file is damaged.
     """
     path = run_dir / "metrics.json"
-    content = read_json(path, _FORMAT, _VERSION, remedy=_REMEDY)
+    content = read_json(path, _FORMAT, _VERSION, "`mien evaluate`", _REMEDY)
     with expect_whole(path, _REMEDY):
         _ = content["protocols"].keys(), content["training"].keys()
     return {name: value for name, value in content.items() if name not in ("format", "version")}

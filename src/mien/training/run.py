@@ -146,7 +146,7 @@ def read_training_summary(run_dir: Path) -> dict[str, Any]:
     Raises:
         UserError: the run was not trained to its end.
     """
-    content = read_json(run_dir / "training.json", _SUMMARY, _VERSION, remedy=_AGAIN)
+    content = read_json(run_dir / "training.json", _SUMMARY, _VERSION, "`mien train`", _AGAIN)
     return {name: value for name, value in content.items() if name not in ("format", "version")}
 
 
