@@ -125,7 +125,7 @@ def test_a_current_tracking_is_said(
     monkeypatch.setattr("mien.commands.stages.tracking._current_trackings", lambda *_: current)
     monkeypatch.setattr("mien.commands.stages.tracking._show_tracking", lambda *_: None)
     assert main(["track", "W"]) == 0
-    assert "Tracking is current, nothing to do: clip" in capsys.readouterr().err
+    assert "clip: the tracking is current, nothing to do" in capsys.readouterr().err
 
 
 def test_the_same_video_twice_is_warned_of(place: Path) -> None:

@@ -48,7 +48,7 @@ def tracking_stage(
     if trackings is None:
         trackings = _track(workspace, names, face_model, settings, fingerprint)
     else:
-        say(f"Tracking is current, nothing to do: {', '.join(trackings)}")
+        say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
     for name, tracking in trackings.items():
         folder = workspace.sequence_dir(name)
         capture_hash = read_capture_hash(folder / "capture")
