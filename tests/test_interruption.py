@@ -22,7 +22,7 @@ FRAMES = 6
 LOOK = ["--frames", str(FRAMES), "--size", "32"]
 EVALUATE = ["--no-perceptual", "--json"]
 SLOWLY = """
-import sys, time
+import signal, sys, time
 from mien.capture.video import read_video_frames
 from mien.cli import main
 from mien.commands.picture import PictureOptions
@@ -36,6 +36,7 @@ def slowed(original):
         return result
     return step
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell starts in the background
 PictureOptions.picture, PartialScores.add = slowed(PictureOptions.picture), slowed(PartialScores.add)
 sys.exit(main(sys.argv[1:]))
 """

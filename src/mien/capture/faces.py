@@ -67,6 +67,8 @@ class LandmarkDetector:
         module = load_solution("face_mesh")
         with quiet_mediapipe():
             self._mesh = module.FaceMesh(max_num_faces=_MOST_FACES if self._several_faces else 1, refine_landmarks=True)
+            # The graph starts in threads of its own, with warnings; when it has seen a picture it has started.
+            self._mesh.process(np.zeros((64, 64, 3), np.uint8))
         self._has_seen_face = False
         return self
 
