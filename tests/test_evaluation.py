@@ -120,7 +120,7 @@ def test_report_stands_alone_and_shows_everything(experiment: Experiment, evalua
     page = report_html(_run_record(), protocols, {"self_reenactment": (experiment, evaluation)})
     for forbidden in ("http://", "https://", "<script", "<link", "url(", "/somewhere"):
         assert forbidden not in page
-    assert "mien create &lt;clip&gt;.mp4" in page, "the command must be there, escaped"
+    assert "mien create &#x27;&lt;clip&gt;.mp4&#x27;" in page, "the command must be there, quoted and escaped"
     for wanted in ("Held out", "best", "median", "worst", "Mean training picture", "Gaussians", "1 min 11 s"):
         assert wanted in page
     figures = _Tags()

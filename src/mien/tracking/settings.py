@@ -45,7 +45,7 @@ class TrackingSettings:
     """How far a landmark's point on the subject may lie from the model's, metres; one offset for all sequences."""
     smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
     """Over time."""
-    schedule: Literal["landmarks", "fast", "paper"] = "landmarks"
+    schedule: Literal["landmarks", "fast", "paper"] = "fast"
     """landmarks: fit landmarks alone. fast: then fit the pixels, by a texture common to all pictures. paper: fit the
     pixels frame after frame by gradient descent, then all together (GaussianAvatars), which takes much longer."""
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
