@@ -6,6 +6,7 @@
 #include <optional>
 #include <vector>
 
+#include "arrays.h"
 #include "face.h"
 #include "pool.h"
 
@@ -13,17 +14,6 @@ namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
-
-template <typename T, typename... Shape>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
-template <int... Shape>
-using In = Array<const float, nb::shape<Shape...>>;
-template <int... Shape>
-using Out = Array<float, nb::shape<Shape...>>;
-
-void require(bool condition, const char* message) {
-  if (!condition) throw nb::value_error(message);
-}
 
 mien::FaceModelData make_model(const In<-1, -1, 3>& expression_basis, const std::optional<In<-1, -1, 3>>& pose_basis,
                                const In<-1, -1, 3>& rotation_basis, const In<-1, -1, 3>& translation_basis,

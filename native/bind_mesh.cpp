@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <stdexcept>
 
+#include "arrays.h"
 #include "mesh.h"
 
 namespace nb = nanobind;
@@ -11,8 +12,6 @@ using namespace nb::literals;
 
 namespace {
 
-template <typename T, typename... Shape>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
 using Vertices = Array<const float, nb::shape<-1, 3>>;
 using Faces = Array<const int64_t, nb::shape<-1, 3>>;
 

@@ -8,6 +8,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include "arrays.h"
 #include "mesh_align.h"
 
 namespace nb = nanobind;
@@ -15,8 +16,6 @@ using namespace nb::literals;
 
 namespace {
 
-template <typename T, typename... Shape>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
 using Points = Array<const float, nb::shape<-1, 3>>;
 using Faces = Array<const int64_t, nb::shape<-1, 3>>;
 using Picture = Array<const float, nb::shape<-1, -1, 3>>;

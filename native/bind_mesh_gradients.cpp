@@ -8,6 +8,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include "arrays.h"
 #include "mesh_gradients.h"
 #include "mesh_loss.h"
 
@@ -16,8 +17,6 @@ using namespace nb::literals;
 
 namespace {
 
-template <typename T, typename... Shape>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
 using Rows = Array<const float, nb::ndim<2>>;
 using Image = Array<const float, nb::ndim<3>>;
 using Gray = Array<const float, nb::ndim<2>>;

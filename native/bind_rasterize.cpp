@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "arrays.h"
 #include "pool.h"
 #include "rasterize.h"
 
@@ -16,23 +17,12 @@ using namespace nb::literals;
 
 namespace {
 
-template <typename T, typename... Shape>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
-template <int... Shape>
-using In = Array<const float, nb::shape<Shape...>>;
-template <int... Shape>
-using Out = Array<float, nb::shape<Shape...>>;
-
 // Keeps a forward pass's buffers until its backward pass, or until nobody can ask for one.
 struct RasterizeFrame {
   mien::FramePtr frame;
   mien::View view;
   int64_t count;
 };
-
-void require(bool condition, const char* message) {
-  if (!condition) throw nb::value_error(message);
-}
 
 mien::GaussianArrays gaussian_arrays(const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1, 3>& scales,
                                      const In<-1>& opacities, const In<-1, -1, 3>& sh) {

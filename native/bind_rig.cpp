@@ -6,6 +6,7 @@
 #include <optional>
 #include <stdexcept>
 
+#include "arrays.h"
 #include "rig.h"
 
 namespace nb = nanobind;
@@ -13,8 +14,6 @@ using namespace nb::literals;
 
 namespace {
 
-template <typename T, typename... Shape>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
 using Faces = Array<const int64_t, nb::shape<-1, 3>>;
 using FaceIndex = Array<const int64_t, nb::ndim<1>>;
 using Rows3 = Array<const float, nb::shape<-1, 3>>;

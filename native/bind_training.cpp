@@ -8,6 +8,7 @@
 #include <tuple>
 #include <vector>
 
+#include "arrays.h"
 #include "training.h"
 
 namespace nb = nanobind;
@@ -15,15 +16,9 @@ using namespace nb::literals;
 
 namespace {
 
-template <typename T, typename... Shape>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
 using Floats = Array<float, nb::ndim<1>>;
 using Rows3 = Array<const float, nb::shape<-1, 3>>;
 using Radii = Array<const int32_t, nb::ndim<1>>;
-
-void require(bool condition, const char* message) {
-  if (!condition) throw nb::value_error(message);
-}
 
 // Addresses instead of arrays: unpacking forty arrays would cost as much as the update itself.
 using AdamArguments = std::tuple<uintptr_t, uintptr_t, uintptr_t, uintptr_t, int64_t, double, double>;

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "mesh_align.h"
+#include "sh_basis.h"
 
 namespace mien {
 
@@ -23,22 +24,9 @@ struct DrawnMesh {
   std::vector<float> barycentric, depth;
 };
 
-inline void basis(const float* n, float* out) {
-  const float x = n[0], y = n[1], z = n[2];
-  out[0] = 0.28209479177387814f;
-  out[1] = 0.4886025119029199f * y;
-  out[2] = 0.4886025119029199f * z;
-  out[3] = 0.4886025119029199f * x;
-  out[4] = 1.0925484305920792f * x * y;
-  out[5] = 1.0925484305920792f * y * z;
-  out[6] = 0.31539156525252005f * (3 * z * z - 1);
-  out[7] = 1.0925484305920792f * x * z;
-  out[8] = 0.5462742152960396f * (x * x - y * y);
-}
-
 inline Color shade(const float* normal, const float* light) {
   float b[9];
-  basis(normal, b);
+  sh_basis(normal, b);
   Color out{};
   for (int k = 0; k < 9; ++k)
     for (int c = 0; c < 3; ++c) out.c[c] += b[k] * light[3 * k + c];

@@ -78,7 +78,7 @@ void light_equations(const Mesh& mesh, const TexturedSurface& surface, const Ali
       mesh, surface, frame, options, drawn,
       [&](int64_t pixel, int32_t, const float*, const SurfacePoint& point, const Sample& sample, const Color& light) {
         float b[9], squared = 0;
-        basis(point.normal, b);
+        sh_basis(point.normal, b);
         const float* seen = frame.image + 3 * pixel;
         for (int c = 0; c < 3; ++c) {
           const float difference = seen[c] - sample.color.c[c] * light.c[c];

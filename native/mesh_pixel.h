@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "mesh_gradients.h"
+#include "sh_basis.h"
 
 namespace mien {
 
@@ -102,21 +103,7 @@ inline Texel texel_at(int width, int height, float u, float v) {
   return texel;
 }
 
-// The nine real spherical harmonics of mien.render.mesh.sh_basis at a direction.
-inline void sh_basis(const float* n, float out[9]) {
-  const float x = n[0], y = n[1], z = n[2];
-  out[0] = 0.28209479f;
-  out[1] = 0.48860251f * y;
-  out[2] = 0.48860251f * z;
-  out[3] = 0.48860251f * x;
-  out[4] = 1.09254843f * x * y;
-  out[5] = 1.09254843f * y * z;
-  out[6] = 0.31539157f * (3 * z * z - 1);
-  out[7] = 1.09254843f * x * z;
-  out[8] = 0.54627422f * (x * x - y * y);
-}
-
-// Their derivatives times `gradient` [9], added up.
+// Derivatives of `sh_basis` times `gradient` [9], added up.
 inline void sh_basis_backward(const float* n, const float gradient[9], float out[3]) {
   const float x = n[0], y = n[1], z = n[2];
   const float* g = gradient;
