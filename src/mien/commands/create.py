@@ -4,7 +4,7 @@ import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -32,6 +32,8 @@ class Command:
     """Name of the run (default: the method's)."""
     face_model: str = "anny"
     """See `mien face-models`."""
+    overlay: Literal["auto", "all", "none"] = "auto"
+    """Frames in overlay.mp4: all of them, or of long clips every n-th so that there are at most 3,000 (auto)."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
@@ -65,7 +67,7 @@ class Command:
         videos = zip(self.videos, names, strict=True)
         captured = [part for video, name in videos for part in capture_stage(workspace, video, name, self.capture)]
         check_held_out(captured, settings)
-        trackings = tracking_stage(workspace, self.face_model, self.tracking)
+        trackings = tracking_stage(workspace, self.face_model, self.tracking, overlay=self.overlay)
         training_stage(workspace, [name for name in captured if name in trackings], run, method, settings)
         if settings.holds_out:
             evaluation_stage(workspace, run, again=False)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -24,10 +24,14 @@ class Command:
     """See `mien face-models`."""
     again: bool = False
     """Track again even if nothing changed. The scoring masks stay as they are."""
+    overlay: Literal["auto", "all", "none"] = "auto"
+    """Frames in overlay.mp4: all of them, or of long clips every n-th so that there are at most 3,000 (auto)."""
     settings: Annotated[TrackingSettings, tyro.conf.arg(name="tracking")] = field(default_factory=TrackingSettings)
 
     def run(self) -> None:
         """Track and write overlays and reports."""
         from mien.commands.stages import tracking_stage
 
-        tracking_stage(open_workspace(self.workspace), self.face_model, self.settings, again=self.again)
+        tracking_stage(
+            open_workspace(self.workspace), self.face_model, self.settings, again=self.again, overlay=self.overlay
+        )

@@ -1,16 +1,17 @@
 """The face model fitted to a capture: tracking, its files, the neck line and the frozen scoring mask."""
 
 from mien.tracking.files import read_tracking, write_tracking
-from mien.tracking.overlay import draw_overlay, draw_overlay_grid, frontal_camera, write_overlay
+from mien.tracking.overlay import draw_overlay, draw_overlay_grid, frontal_camera, overlay_stride, write_overlay
 from mien.tracking.pipeline import track, track_subject
 from mien.tracking.report import residual_report, write_residual_report
 from mien.tracking.scoring import Scoring, make_scoring
 from mien.tracking.scoring_files import read_scoring, read_scoring_hash, scoring_exists, write_scoring
 from mien.tracking.settings import SmoothnessSettings, TrackingSettings
 from mien.tracking.shot import has_enough_faces
-from mien.tracking.tracking import Tracking
+from mien.tracking.tracking import Looks, Tracking
 
 __all__ = [
+    "Looks",
     "Scoring",
     "SmoothnessSettings",
     "Tracking",
@@ -20,6 +21,7 @@ __all__ = [
     "frontal_camera",
     "has_enough_faces",
     "make_scoring",
+    "overlay_stride",
     "read_scoring",
     "read_scoring_hash",
     "read_tracking",

@@ -10,16 +10,17 @@ from mien.camera import Camera
 from mien.errors import UserError
 from mien.face import FaceParams
 from mien.storage import read_json, read_tensors, write_json, write_tensors
-from mien.tracking.tracking import Tracking
+from mien.tracking.tracking import Looks, Tracking
 
 _FORMAT, _VERSION = "mien.tracking", 1
 _JSON, _TENSORS = "tracking.json", "tracking.safetensors"
 _FACE = ("identity", "expression", "joints", "head_rotation", "head_translation", "vertex_offsets")
-_OPTIONAL = ("vertex_offsets", "pixel_residuals")
+_LOOKS = ("texture", "trust", "light")
+_OPTIONAL = ("vertex_offsets", "pixel_residuals", *_LOOKS)
 _AXES = {
     "identity": "i", "expression": "te", "joints": "tj3", "head_rotation": "t3", "head_translation": "t3",
     "vertex_offsets": "v3", "valid": "t", "neck_lines": "tc3", "residuals": "tc", "camera_K": "c33",
-    "camera_viewmats": "c44", "pixel_residuals": "tc",
+    "camera_viewmats": "c44", "pixel_residuals": "tc", "texture": "yx3", "trust": "yx", "light": "93",
 }  # fmt: skip
 _STAGE = "`mien track`"
 _REMEDY = "delete the folder and run `mien track` again"
@@ -37,6 +38,8 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
     }
     if tracking.pixel_residuals is not None:
         tensors["pixel_residuals"] = tracking.pixel_residuals
+    if tracking.looks is not None:
+        tensors |= {name: getattr(tracking.looks, name) for name in _LOOKS}
     write_tensors(path / _TENSORS, tensors)
     content = {
         "face_model": tracking.face_model,
@@ -45,6 +48,7 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
         "valid_timesteps": int(tracking.valid.sum()),
         "cameras": [{"width": camera.width, "height": camera.height} for camera in tracking.cameras],
         "residual": _residual_summary(tracking.residuals),
+        "looks": None if tracking.looks is None else _numbers_of(tracking.looks),
         "settings": tracking.settings,
         "tensors_sha256": _digest(path / _TENSORS),
     }
@@ -77,6 +81,7 @@ def read_tracking(path: Path) -> Tracking:
             neck_lines=tensors["neck_lines"],
             residuals=tensors["residuals"],
             pixel_residuals=tensors.get("pixel_residuals"),
+            looks=_read_looks(content.get("looks"), tensors),
             settings=dict(content["settings"]),
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -85,7 +90,7 @@ def read_tracking(path: Path) -> Tracking:
 
 def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
     """Every tensor is there, its axes agree with the others', and its numbers are finite."""
-    sizes: dict[str, int] = {"3": 3, "4": 4}
+    sizes: dict[str, int] = {"3": 3, "4": 4, "9": 9}
     for name, axes in _AXES.items():
         if name not in tensors:
             if name in _OPTIONAL:
@@ -104,6 +109,17 @@ def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
             finite |= tensors[name].isnan() & ((tensors["valid"][:, None] == 0) | finite.any(1, keepdim=True))
         if not finite.all():
             raise UserError(f"{path / _TENSORS}: {name!r} holds numbers that are not finite; {_REMEDY}")
+
+
+def _numbers_of(looks: Looks) -> dict[str, float]:
+    return {"sigma": looks.sigma, "light_extent": looks.light_extent}
+
+
+def _read_looks(numbers: dict[str, float] | None, tensors: dict[str, Tensor]) -> Looks | None:
+    if numbers is None:
+        return None
+    sigma, light_extent = float(numbers["sigma"]), float(numbers["light_extent"])
+    return Looks(tensors["texture"], tensors["trust"], tensors["light"], sigma, light_extent)
 
 
 def _residual_summary(residuals: Tensor) -> dict[str, float | None]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,9 @@ from mien.capture.video import write_video
 from mien.face import FaceModel
 from mien.progress import track_progress
 from mien.render.mesh import Headlight, render_mesh
+from mien.tracking.heat import dimmed, draw_legend, heat_map, write_text
+from mien.tracking.model_pictures import model_pictures, window_of
+from mien.tracking.photometric_threads import stream_in_threads
 from mien.tracking.tracking import Tracking
 
 _REGION_COLORS = {
@@ -24,49 +28,126 @@ _REGION_COLORS = {
 }  # fmt: skip
 _SKIN = (0.8, 0.78, 0.75)
 _MESH_OPACITY = 0.6
-_GREEN, _RED, _BLUE, _WHITE, _BLACK = (60, 255, 60), (255, 60, 40), (60, 160, 255), (255, 255, 255), (0, 0, 0)
+_GREEN, _RED, _BLUE = (60, 255, 60), (255, 60, 40), (60, 160, 255)
 _SUBPIXEL_BITS = 4
 _GRID_WIDTH = 1920
 """Pixels."""
+_MOST_PICTURES = 3000
+_CRF, _PRESET = 21, "veryfast"
+"""To look at, not to measure: a quarter of the time that `write_video` takes by default."""
 
 
-def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
-    """Write a video: on the left detected (green) and mesh (red) landmarks and the neck line, on the right the mesh.
+def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, every: int = 1) -> None:
+    """Write a video of `OverlayPainter.picture`; of every n-th timestep, if so wished, at as many frames a second less.
 
     Several cameras come as a grid, in the order of the capture, shrunk to at most 1920 pixels across.
     """
-    write_video(path, _pictures(capture, tracking, face_model), capture.fps)
+    write_video(path, _pictures(capture, tracking, face_model, every), capture.fps / every, _CRF, _PRESET)
+
+
+def overlay_stride(timesteps: int) -> int:
+    """Of how many timesteps a long clip's overlay shows one: so that there are at most 3,000 pictures."""
+    return math.ceil(timesteps / _MOST_PICTURES)
 
 
 def draw_overlay(
     capture: Capture, tracking: Tracking, face_model: FaceModel, timestep: int, camera_index: int = 0
-) -> UInt8[np.ndarray, "h w2 3"]:
-    """One picture of the overlay video, twice as wide as the capture's."""
-    camera = tracking.cameras[camera_index]
-    image = np.asarray(capture.images[timestep, camera_index])
-    with torch.no_grad():
-        vertices = face_model(tracking.face[timestep])[0]
-        light = Headlight()
-        mesh, alpha = render_mesh(vertices, face_model.faces, camera, region_colors(face_model), light=light)
-        marks = camera.project(face_model.landmark_positions(vertices, "mediapipe"))[0].numpy()
-    opacity = _MESH_OPACITY * alpha.numpy()[..., None]
-    blended = image * (1 - opacity) + mesh.clamp(0, 1).numpy() * 255 * opacity
-    left = image.copy()  # a capture read from disk is read-only
-    detected = np.asarray(capture.landmarks[timestep, camera_index])
-    if np.isfinite(detected).all():
-        _draw_points(left, detected, _GREEN)
-    _draw_points(left, marks, _RED)
-    _draw_line(left, tracking.neck_lines[timestep, camera_index].numpy(), camera)
-    residual = float(tracking.residuals[timestep, camera_index])
-    missing = "no face found" if tracking.valid[timestep] else "no face, interpolated"
-    text = f"{timestep}: {residual:.2f} px" if np.isfinite(residual) else f"{timestep}: {missing}"
-    if tracking.pixel_residuals is not None and tracking.valid[timestep]:
-        colors = float(tracking.pixel_residuals[timestep, camera_index])
-        text += f", colours {100 * colors:.1f} %" if np.isfinite(colors) else ", landmarks only"
-    text = text if len(tracking.cameras) == 1 else f"{capture.camera_ids[camera_index]} {text}"
-    for color, thickness in ((_BLACK, 3), (_WHITE, 1)):
-        cv2.putText(left, text, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, thickness, cv2.LINE_AA)
-    return np.concatenate([left, np.round(blended).astype(np.uint8)], axis=1)
+) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """One picture of the overlay video (`OverlayPainter.picture`)."""
+    return OverlayPainter(capture, tracking, face_model).picture(timestep, camera_index)
+
+
+class OverlayPainter:
+    """Draws a tracking over its capture. Immutable; safe to call from several threads at once."""
+
+    def __init__(self, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
+        self._capture, self._tracking, self._face_model = capture, tracking, face_model
+        self._colors = region_colors(face_model)
+        self._models = model_pictures(capture, tracking, face_model)
+
+    def picture(self, timestep: int, camera_index: int = 0) -> UInt8[np.ndarray, "h2 w2 3"]:
+        """The panels in one picture: two side by side, or four as a square."""
+        panels = self.panels(timestep, camera_index)
+        write_text(panels[0], self._caption(timestep, camera_index), (8, 20))
+        for panel, name in zip(panels[2:], ("model", "difference"), strict=False):
+            write_text(panel, name, (8, 20))
+        if len(panels) > 2:
+            draw_legend(panels[-1])
+        rows = [np.concatenate(panels[row : row + 2], axis=1) for row in range(0, len(panels), 2)]
+        return np.concatenate(rows, axis=0)
+
+    @torch.no_grad()
+    def panels(self, timestep: int, camera_index: int = 0) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """Pictures of the capture's size.
+
+        First with detected (green) and mesh (red) landmarks and the neck line; second with the mesh; and, where pixels
+        were looked at, third the model's own picture, and fourth how much its colours differ from the first.
+        """
+        image = np.asarray(self._capture.images[timestep, camera_index])
+        vertices = self._face_model(self._tracking.face[timestep])[0]
+        panels = [self._landmarks(image, vertices, timestep, camera_index), self._mesh(image, vertices, camera_index)]
+        if self._models is not None:
+            panels += self._model(image, vertices, timestep, camera_index)
+        return panels
+
+    @torch.no_grad()
+    def head_box(self, timestep: int, camera_index: int = 0) -> tuple[slice, slice]:
+        """Rows and columns of a square around the head, as far as the picture goes."""
+        camera = self._tracking.cameras[camera_index]
+        window = window_of(camera, self._face_model(self._tracking.face[timestep])[0])
+        side = min(round(1.15 * max(window.camera.width, window.camera.height)), camera.width, camera.height)
+        middle = ((part.start + part.stop) // 2 for part in (window.rows, window.columns))
+        sizes = (camera.height, camera.width)
+        first = [min(max(at - side // 2, 0), size - side) for at, size in zip(middle, sizes, strict=True)]
+        return slice(first[0], first[0] + side), slice(first[1], first[1] + side)
+
+    def _landmarks(
+        self, image: UInt8[np.ndarray, "h w 3"], vertices: Float[torch.Tensor, "v 3"], timestep: int, camera_index: int
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        tracking, camera = self._tracking, self._tracking.cameras[camera_index]
+        marks = camera.project(self._face_model.landmark_positions(vertices, "mediapipe"))[0].numpy()
+        picture = image.copy()  # a capture read from disk is read-only
+        detected = np.asarray(self._capture.landmarks[timestep, camera_index])
+        if np.isfinite(detected).all():
+            _draw_points(picture, detected, _GREEN)
+        _draw_points(picture, marks, _RED)
+        _draw_line(picture, tracking.neck_lines[timestep, camera_index].numpy(), camera)
+        return picture
+
+    def _caption(self, timestep: int, camera_index: int) -> str:
+        tracking = self._tracking
+        residual = float(tracking.residuals[timestep, camera_index])
+        missing = "no face found" if tracking.valid[timestep] else "no face, interpolated"
+        text = f"{timestep}: {residual:.2f} px" if np.isfinite(residual) else f"{timestep}: {missing}"
+        if tracking.pixel_residuals is not None and tracking.valid[timestep]:
+            colors = float(tracking.pixel_residuals[timestep, camera_index])
+            text += f", colours {100 * colors:.1f} %" if np.isfinite(colors) else ", landmarks only"
+        return text if len(tracking.cameras) == 1 else f"{self._capture.camera_ids[camera_index]} {text}"
+
+    def _mesh(
+        self, image: UInt8[np.ndarray, "h w 3"], vertices: Float[torch.Tensor, "v 3"], camera_index: int
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        window, faces = window_of(self._tracking.cameras[camera_index], vertices), self._face_model.faces
+        mesh, alpha = render_mesh(vertices, faces, window.camera, self._colors, light=Headlight())
+        drawn, picture = (255 * mesh.clamp_(0, 1)).to(torch.uint8).numpy(), image.copy()
+        part = picture[window.rows, window.columns]
+        blended = cv2.addWeighted(part, 1 - _MESH_OPACITY, drawn, _MESH_OPACITY, 0)
+        np.copyto(part, blended, where=alpha.numpy()[..., None] > 0)
+        return picture
+
+    def _model(
+        self, image: UInt8[np.ndarray, "h w 3"], vertices: Float[torch.Tensor, "v 3"], timestep: int, camera_index: int
+    ) -> list[UInt8[np.ndarray, "h w 3"]]:
+        assert self._models is not None
+        compared = self._models.compare(timestep, camera_index, vertices)
+        part = compared.window.rows, compared.window.columns
+        difference, behind = compared.difference.numpy(), dimmed(image)
+        known = np.isfinite(difference)[..., None]
+        own = (255 * compared.image.nan_to_num(0).clamp_(0, 1)).to(torch.uint8).numpy()
+        panels = [behind, behind.copy()]
+        for panel, drawn in zip(panels, (own, heat_map(difference)), strict=True):
+            np.copyto(panel[part], drawn, where=known)
+        return panels
 
 
 def frontal_camera(tracking: Tracking) -> int:
@@ -90,26 +171,33 @@ def draw_overlay_grid(
     capture: Capture, tracking: Tracking, face_model: FaceModel, timestep: int
 ) -> UInt8[np.ndarray, "h w 3"]:
     """A timestep of the overlay video: the pictures of all cameras side by side, in about a square."""
-    cameras = len(tracking.cameras)
+    return _grid(OverlayPainter(capture, tracking, face_model), len(tracking.cameras), timestep)
+
+
+def _grid(painter: OverlayPainter, cameras: int, timestep: int) -> UInt8[np.ndarray, "h w 3"]:
     if cameras == 1:
-        return draw_overlay(capture, tracking, face_model, timestep)
-    columns = math.ceil(math.sqrt(cameras / 2))
+        return painter.picture(timestep)
+    pictures = [painter.picture(timestep, index) for index in range(cameras)]
+    tall, wide = pictures[0].shape[:2]
+    columns = math.ceil(math.sqrt(cameras * tall / wide))
     rows = math.ceil(cameras / columns)
-    scale = min(1.0, _GRID_WIDTH / (columns * 2 * capture.width))
+    scale = min(1.0, _GRID_WIDTH / (columns * wide))
     # Even sizes, as video codecs want them.
-    width, height = (max(2, round(side * scale / 2) * 2) for side in (2 * capture.width, capture.height))
+    width, height = (max(2, round(side * scale / 2) * 2) for side in (wide, tall))
     grid = np.zeros((rows * height, columns * width, 3), np.uint8)
-    for index in range(cameras):
+    for index, picture in enumerate(pictures):
         row, column = divmod(index, columns)
-        picture = draw_overlay(capture, tracking, face_model, timestep, index)
         tile = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
         grid[row * height : (row + 1) * height, column * width : (column + 1) * width] = tile
     return grid
 
 
-def _pictures(capture: Capture, tracking: Tracking, face_model: FaceModel) -> Iterator[UInt8[np.ndarray, "h w2 3"]]:
-    for timestep in track_progress(range(capture.timesteps), "Overlay", capture.timesteps):
-        yield draw_overlay_grid(capture, tracking, face_model, timestep)
+def _pictures(
+    capture: Capture, tracking: Tracking, face_model: FaceModel, every: int
+) -> Iterator[UInt8[np.ndarray, "h w2 3"]]:
+    painter, timesteps = OverlayPainter(capture, tracking, face_model), range(0, capture.timesteps, every)
+    pictures = stream_in_threads(partial(_grid, painter, len(tracking.cameras)), timesteps)
+    yield from track_progress(pictures, "Overlay", len(timesteps))
 
 
 def _draw_points(image: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "l 2"], color: tuple) -> None:

@@ -11,6 +11,8 @@ from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.paper_descent import Descent
 from mien.tracking.paper_resume import Keeper
 from mien.tracking.paper_scene import PaperScene, PaperState, first_state, paper_scene
+from mien.tracking.photometric import PhotometricFit
+from mien.tracking.photometric_texture import Appearance, texture_space
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
 from mien.tracking.stages import Fit
@@ -23,7 +25,7 @@ def fit_by_descent(
     fit: Fit,
     settings: TrackingSettings,
     keep: Path | None = None,
-) -> Fit:
+) -> PhotometricFit:
     """A fit to landmarks refined as in the supplement of GaussianAvatars, section A.
 
     Frames whose landmarks a fit to pixels lost go back to where landmarks had them; how many is said.
@@ -50,7 +52,19 @@ def fit_by_descent(
     if descent.lost:
         say(f"{len(descent.lost)} of {descent.frames} frames could not be fitted to pixels and stay near landmarks")
     keeper.forget()
-    return _as_fit(scene, descent.state, fit)
+    return _as_photometric(scene, descent, _as_fit(scene, descent.state, fit))
+
+
+def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit) -> PhotometricFit:
+    """The fit with texture and light; texels are trusted as the triangles that they are on."""
+    state = descent.state
+    fragments = texture_space(scene.face_model, scene.settings.texture_size).fragments
+    trust = torch.cat([descent.trusted(), torch.zeros(1)])[fragments.face_index.long()]
+    improved = [torch.ones(len(rows), dtype=torch.bool) for rows in state.frames]
+    for sequence, row in descent.lost:
+        improved[sequence][row] = False
+    appearance = Appearance(state.texture, trust, scene.settings.color_epsilon)
+    return PhotometricFit(fit, appearance, tuple(state.lights), tuple(improved))
 
 
 def _as_fit(scene: PaperScene, state: PaperState, fit: Fit) -> Fit:

@@ -142,7 +142,7 @@ class Descent:
                     stepper.step(gradients["row"], rate)
 
     def _fit_row(self, shown: Sequence[Shown], steps: int) -> None:
-        stepper, weights = self._stepper(shown[0].sequence, shown[0].row), self._trusted()
+        stepper, weights = self._stepper(shown[0].sequence, shown[0].row), self.trusted()
         even = list(shown)
         for step in range(steps):
             index = step % len(shown)
@@ -201,7 +201,7 @@ class Descent:
         """One step of texture and light alone."""
         moving, leaves = self._moving(shown, ("texture", "light"))
         vertices, _ = posed(self.scene, moving)
-        loss = color_term(self.scene, shown, moving, vertices, self._trusted()) + light_term(self.scene, moving.light)
+        loss = color_term(self.scene, shown, moving, vertices, self.trusted()) + light_term(self.scene, moving.light)
         by_texture, by_light = torch.autograd.grad(loss, list(leaves.values()))
         rates = self.scene.settings.rates
         with torch.no_grad():
@@ -235,7 +235,7 @@ class Descent:
         names += ["offsets"] if settings.offset_sigma > 0 else []
         names += ["log_focals"] if len(self.state.log_focals) else []
         moving, leaves = self._moving(shown, tuple(names))
-        weights = self._trusted()
+        weights = self.trusted()
         shown = without_smooth_difference(self.scene, shown, moving, weights)
         loss = self._frame_cost(shown, moving, weights, past_only=False)
         loss = loss + share * shared_terms(self.scene, moving)
@@ -298,7 +298,8 @@ class Descent:
         whitening = self.scene.whitening(sequence, row, values, float(around.sum()))
         return RowStepper(values, whitening * rate, Moments.like(values), (layout.lower.float(), layout.upper.float()))
 
-    def _trusted(self) -> Float[Tensor, " f"]:
+    def trusted(self) -> Float[Tensor, " f"]:
+        """How far the texels of each triangle were seen frontally, 0..1."""
         return self.scene.used * (self.state.sight / _GOOD_COSINE).clamp_max(1.0)
 
 

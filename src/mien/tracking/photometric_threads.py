@@ -1,19 +1,22 @@
 """Frames side by side: one thread each."""
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 import torch
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+_AHEAD = 2
+"""Results that may wait beside those being made."""
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """The function's results in order, by up to MIEN_THREADS threads (all cores) that share no work between them."""
-    threads = min(int(os.environ.get("MIEN_THREADS", 0)) or os.cpu_count() or 1, len(items))
+    threads = min(_threads(), len(items))
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -23,6 +26,26 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
             return list(pool.map(function, items))
     finally:
         torch.set_num_threads(before)
+
+
+def stream_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+    """As `in_threads`, one result after another: only a few more than there are threads wait to be taken."""
+    with ThreadPoolExecutor(_threads(), initializer=_prepare) as pool:
+        waiting: deque[Future[Result]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > _threads() + _AHEAD:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def _threads() -> int:
+    return int(os.environ.get("MIEN_THREADS", 0)) or os.cpu_count() or 1
 
 
 def _prepare() -> None:

@@ -20,10 +20,12 @@ from mien.tracking.interpolation import fill_gaps
 from mien.tracking.landmark_groups import LANDMARKS
 from mien.tracking.landmark_model import LandmarkModel, reduce_face_model
 from mien.tracking.landmark_term import Subject
+from mien.tracking.model_pictures import looks_in_world, model_pictures
 from mien.tracking.neck_line import fit_neck_lines
 from mien.tracking.paper import fit_by_descent
 from mien.tracking.parameters import layout_of
-from mien.tracking.photometric import refine_photometrically
+from mien.tracking.photometric import PhotometricFit, refine_photometrically
+from mien.tracking.photometric_threads import in_threads
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shared_fit import fit_shared
 from mien.tracking.shot import Shot, lenses_of, shot_of
@@ -88,18 +90,54 @@ def track_subject(
             raise UserError(
                 f"{names}: no face fits the landmarks; look at the pictures, and capture it again"
             ) from None
-        pixel_residuals: Sequence[Tensor] = ()
+        refined: PhotometricFit | None = None
         if settings.schedule == "fast":
             refined = refine_photometrically(model, shots, lenses, fit, settings)
-            fit, pixel_residuals = refined.fit, refined.residuals
         if settings.schedule == "paper":
-            fit = fit_by_descent(model, shots, lenses, fit, settings, keep)
+            refined = fit_by_descent(model, shots, lenses, fit, settings, keep)
+        fit = fit if refined is None else refined.fit
         trackings = [
             _as_tracking(shot, face_model, model, fit.subject, own, settings)
             for shot, own in zip(shots, fit.sequences, strict=True)
         ]
-    parts = zip(trackings, shots, pixel_residuals, strict=True) if pixel_residuals else ()
-    return [_with_pixel_residuals(*part) for part in parts] or trackings
+        if refined is None or not (refined.appearance.trust > 0).any():
+            return trackings
+        return _with_pixels(trackings, shots, refined, face_model, settings)
+
+
+def _with_pixels(
+    trackings: Sequence[Tracking],
+    shots: Sequence[Shot],
+    refined: PhotometricFit,
+    face_model: FaceModel,
+    settings: TrackingSettings,
+) -> list[Tracking]:
+    """The trackings with what pixels said."""
+    extent = settings.photometric.light_extent if settings.schedule == "fast" else settings.paper.light_extent
+    complete = []
+    for index, (tracking, shot) in enumerate(zip(trackings, shots, strict=True)):
+        looks = looks_in_world(refined.appearance, refined.lights[index], shot.T_world_fit, extent)
+        tracking = replace(tracking, looks=looks)
+        found = refined.residuals[index] if refined.residuals else _residuals(tracking, shot, face_model)
+        found = found.where(refined.improved[index][:, None], torch.nan)
+        complete.append(_with_pixel_residuals(tracking, shot, found))
+    return complete
+
+
+def _residuals(tracking: Tracking, shot: Shot, face_model: FaceModel) -> Float[Tensor, "v c"]:
+    """By how much colours differ in pictures with a face; NaN where a camera found none."""
+    pictures = model_pictures(shot.capture, tracking, face_model)
+    assert pictures is not None
+    found = torch.full((int(shot.valid.sum()), len(tracking.cameras)), torch.nan)
+    timesteps, views = shot.valid.nonzero()[:, 0].tolist(), shot.views
+
+    def compare(row: int) -> None:
+        vertices = face_model(tracking.face[timesteps[row]])[0]
+        for camera in views.camera[views.row == row].tolist():
+            found[row, camera] = pictures.compare(timesteps[row], camera, vertices).rms
+
+    in_threads(compare, list(range(len(found))))
+    return found
 
 
 def _with_pixel_residuals(tracking: Tracking, shot: Shot, found: Float[Tensor, "v c"]) -> Tracking:

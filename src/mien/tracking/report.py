@@ -1,6 +1,7 @@
 """The residual report: figures and a plot that tell whether a tracking can be trusted."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from mien.capture.capture import Capture
 from mien.face import FaceModel
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.storage import write_atomically, write_json
+from mien.tracking.contact_sheet import worst_of_runs
 from mien.tracking.landmark_groups import (
     BROWS,
     LEFT_EYELIDS,
@@ -22,7 +24,11 @@ from mien.tracking.landmark_groups import (
     RIGHT_IRIS,
 )
 from mien.tracking.overlay import frontal_camera
+from mien.tracking.report_page import findings, write_report_page
 from mien.tracking.tracking import Tracking
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _FORMAT, _VERSION = "mien.residual_report", 1
 _GROUPS = {
@@ -34,6 +40,8 @@ _NEAR_FRONTAL = 0.26
 _MOVED = 0.03
 """Standard deviation from which a coefficient counts as used."""
 _CHUNK = 32
+_NAMED = 10
+"""Runs of flagged frames whose worst the plot names."""
 _LEAST_COLOR = 0.005
 """By which colours must stand out, 0..1."""
 
@@ -120,11 +128,13 @@ def _landmarks_only(tracking: Tracking) -> Bool[Tensor, " t"]:
     return tracking.valid & tracking.pixel_residuals.isnan().all(1)
 
 
-def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
-    """Write residuals.json and residuals.png into `folder`."""
+def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> str:
+    """Write residuals.json, residuals.png and report.html into `folder`; returns what to know first in a few words."""
     report = residual_report(capture, tracking, face_model)
     write_json(folder / "residuals.json", _FORMAT, _VERSION, report)
     write_atomically(folder / "residuals.png", lambda path: _plot(path, capture, tracking, face_model, report))
+    write_report_page(folder, capture, tracking, face_model, report)
+    return " ".join(text for _, text in findings(tracking, report))
 
 
 def iris_distances(
@@ -191,23 +201,37 @@ def _plot(path: Path, capture: Capture, tracking: Tracking, face_model: FaceMode
     detected = torch.from_numpy(np.asarray(capture.landmarks[:, frontal], dtype=np.float32))
     depth = tracking.cameras[frontal].project(_landmarks(face_model, tracking))[1]
     iris = iris_distances(tracking, detected, depth, frontal)
-    figure = Figure(figsize=(9, 9), layout="constrained")
-    axes = figure.subplots(4, 1, sharex=True)
-    axes[0].plot(time, residuals.numpy(), label="median residual")
-    flagged = report["flagged_frames"]
-    axes[0].plot(time[flagged], residuals[flagged].numpy(), "rx", label="flagged")
-    axes[0].set_ylabel("residual, px")
-    axes[0].legend(loc="upper right")
-    axes[1].plot(time, seen_rotation(tracking, frontal).rad2deg().numpy(), label=["pitch", "yaw", "roll"])
-    axes[1].set_ylabel("head rotation, degrees")
-    axes[1].legend(loc="upper right")
-    axes[2].plot(time, _depth(tracking, frontal).numpy())
-    axes[2].set_ylabel("depth, m")
-    axes[3].plot(time, 1e3 * iris.numpy())
-    axes[3].set_ylabel("iris distance, mm")
-    axes[3].set_xlabel("time, s")
+    figure = Figure(figsize=(9, 10), layout="constrained")
+    axes = figure.subplots(5, 1, sharex=True)
+    _plot_flagged(axes[0], time, residuals.numpy(), report["flagged_frames"], "landmarks, px")
+    if tracking.pixel_residuals is not None:
+        colors = 100 * tracking.pixel_residuals.nanmedian(1).values
+        _plot_flagged(axes[1], time, colors.numpy(), report["flagged_frames"], "colours, %")
+    else:
+        axes[1].text(0.5, 0.5, "pixels were not looked at", ha="center", transform=axes[1].transAxes)
+    axes[2].plot(time, seen_rotation(tracking, frontal).rad2deg().numpy(), label=["pitch", "yaw", "roll"])
+    axes[2].set_ylabel("head rotation, degrees")
+    axes[2].legend(loc="upper right")
+    axes[3].plot(time, _depth(tracking, frontal).numpy())
+    axes[3].set_ylabel("depth, m")
+    axes[4].plot(time, 1e3 * iris.numpy())
+    axes[4].set_ylabel("iris distance, mm")
+    axes[4].set_xlabel("time, s")
     for axis in axes:
         for missing in report["frames_without_face"]:
             axis.axvspan(time[missing], time[min(missing + 1, len(time) - 1)], color="0.85")
     figure.suptitle(f"{capture.name}: landmarks against the tracked {tracking.face_model} head")
     figure.savefig(path, dpi=100)
+
+
+def _plot_flagged(axis: "Axes", time: np.ndarray, values: np.ndarray, flagged: list[int], label: str) -> None:
+    """A curve; the worst of the flagged frames are named."""
+    axis.plot(time, values)
+    axis.set_ylabel(label)
+    if not flagged:
+        return
+    axis.plot(time[flagged], values[flagged], "rx", label="flagged")
+    for timestep in worst_of_runs(flagged, values)[:_NAMED]:
+        axis.annotate(str(timestep), (time[timestep], values[timestep]), fontsize=8, color="tab:red",
+                      xytext=(3, 3), textcoords="offset points", annotation_clip=True)  # fmt: skip
+    axis.legend(loc="upper right")

@@ -10,6 +10,22 @@ from mien.face import FaceParams
 
 
 @dataclass(frozen=True, eq=False)
+class Looks:
+    """What a fit to pixels found out about the subject's skin, and about the light of one sequence."""
+
+    texture: Float[Tensor, "th tw 3"]
+    """Albedo, by the face model's texture coordinates: a colour (0..1, sRGB) is albedo times light."""
+    trust: Float[Tensor, "th tw"]
+    """0 where a texel is not known; less than 1 where pictures contradict each other."""
+    light: Float[Tensor, "9 3"]
+    """SH coefficients over world-space normals (`mien.render.mesh.shade`)."""
+    sigma: float
+    """Expected difference between the colours of a picture and of the model."""
+    light_extent: float
+    """Metres on the face over which a smooth difference counts as light that the model does not explain."""
+
+
+@dataclass(frozen=True, eq=False)
 class Tracking:
     """Face parameters and cameras of one sequence of t timesteps and c cameras.
 
@@ -35,5 +51,7 @@ class Tracking:
     pixel_residuals: Float[Tensor, "t c"] | None = None
     """Root mean square by which colours differ from the texture that all pictures share, 0..1, outliers faded; NaN
     where pixels were no help and landmarks alone decided. None: pixels were not looked at."""
+    looks: Looks | None = None
+    """How the model looks; None: pixels were not looked at, or gave nothing."""
     settings: dict = field(default_factory=dict)
     """How it was made, for the report."""

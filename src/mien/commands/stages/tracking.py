@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Literal
 
 from mien.capture import Capture, read_capture, read_capture_hash
+from mien.capture.video import count_frames
 from mien.errors import UserError
 from mien.face import FaceModel, load_face_model
 from mien.progress import say
@@ -16,6 +18,7 @@ from mien.tracking import (
     TrackingSettings,
     has_enough_faces,
     make_scoring,
+    overlay_stride,
     read_tracking,
     scoring_exists,
     track_subject,
@@ -31,8 +34,16 @@ _TRACKING_RECIPE = 4
 """Raised whenever the same captures would be tracked otherwise, so that old trackings are not taken for current."""
 
 
+Overlay = Literal["auto", "all", "none"]
+"""Which frames overlay.mp4 shows."""
+
+
 def tracking_stage(
-    workspace: Workspace, face_model_name: str, settings: TrackingSettings, again: bool = False
+    workspace: Workspace,
+    face_model_name: str,
+    settings: TrackingSettings,
+    again: bool = False,
+    overlay: Overlay = "auto",
 ) -> dict[str, Tracking]:
     """Track all sequences of a workspace together, with one identity; current trackings are read back.
 
@@ -58,7 +69,7 @@ def tracking_stage(
             capture = read_capture(folder / "capture")
             scoring = make_scoring(capture, tracking, face_model, scratch=folder)
             write_scoring(folder / "scoring", scoring, capture_hash)
-        _show_tracking(folder, tracking, face_model)
+        _show_tracking(folder, tracking, face_model, overlay)
     return trackings
 
 
@@ -132,11 +143,23 @@ def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking])
         )
 
 
-def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel) -> None:
-    """Write overlay.mp4 and the residual report, unless those there are newer than the tracking."""
-    overlay, written = folder / "tracking" / "overlay.mp4", folder / "tracking" / "tracking.json"
-    if overlay.is_file() and overlay.stat().st_mtime >= written.stat().st_mtime:
+def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, overlay: Overlay) -> None:
+    """Write the residual report and overlay.mp4, unless those there are newer than the tracking."""
+    video, report, written = (folder / "tracking" / name for name in ("overlay.mp4", "report.html", "tracking.json"))
+    every = overlay_stride(len(tracking.valid)) if overlay == "auto" else 1
+    shown = _is_newer(video, written) and count_frames(video) == len(range(0, len(tracking.valid), every))
+    if _is_newer(report, written) and (shown or overlay == "none"):
         return
     capture: Capture = read_capture(folder / "capture")
-    write_residual_report(folder / "tracking", capture, tracking, face_model)
-    write_overlay(overlay, capture, tracking, face_model)
+    if not _is_newer(report, written):
+        findings = write_residual_report(folder / "tracking", capture, tracking, face_model)
+        say(f"{capture.name}: {findings} See {report}")
+    if not shown and overlay != "none":
+        if every > 1:
+            say(f"{capture.name}: the overlay shows every {every}th frame of {len(tracking.valid)}; `--overlay all` "
+                "shows them all")  # fmt: skip
+        write_overlay(video, capture, tracking, face_model, every)
+
+
+def _is_newer(path: Path, than: Path) -> bool:
+    return path.is_file() and path.stat().st_mtime >= than.stat().st_mtime

@@ -1,0 +1,99 @@
+"""A contact sheet: frames spread over the capture, and those that stand out, each in all its panels."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from mien.capture.capture import Capture
+from mien.face import FaceModel
+from mien.tracking.heat import draw_legend, write_text
+from mien.tracking.overlay import OverlayPainter, frontal_camera
+from mien.tracking.tracking import Tracking
+
+_EVEN, _MOST_FLAGGED, _MOST_ALONE = 8, 8, 4
+"""Frames spread evenly, those that stand out most, and those that landmarks alone decided."""
+_TILE = 240
+"""Pixels of each side."""
+_STRIPS = 2
+"""Frames beside each other."""
+_GAP = 4
+_PAPER = 255
+
+
+@dataclass(frozen=True)
+class SheetFrame:
+    """One frame on a contact sheet."""
+
+    timestep: int
+    camera: int
+    why: str = ""
+    """What is odd about it."""
+
+
+def sheet_frames(tracking: Tracking, flagged: Sequence[int], alone: Sequence[int]) -> list[SheetFrame]:
+    """Which frames to show, in the order of time: evenly spread ones as the frontal camera saw them, and odd ones.
+
+    Args:
+        tracking: With a frame at least that has a face.
+        flagged: Timesteps that stand out; those with the largest residuals are shown, as the worst camera saw them.
+        alone: Timesteps that landmarks alone decided; where these are most of them all, they are not odd.
+    """
+    frontal, valid = frontal_camera(tracking), tracking.valid.nonzero()[:, 0]
+    even = valid[torch.linspace(0, len(valid) - 1, min(_EVEN, len(valid))).round().long()].tolist()
+    chosen = {timestep: SheetFrame(timestep, frontal) for timestep in even}
+    if 2 * len(alone) < len(valid):
+        for timestep in alone[:: max(len(alone) // _MOST_ALONE, 1)][:_MOST_ALONE]:
+            chosen[timestep] = SheetFrame(timestep, _camera_of_face(tracking.residuals[timestep]), "landmarks only")
+    worst = tracking.residuals if tracking.pixel_residuals is None else tracking.pixel_residuals
+    size = worst.nan_to_num(-1).amax(1)
+    for timestep in worst_of_runs(flagged, size.numpy())[:_MOST_FLAGGED]:
+        chosen[timestep] = SheetFrame(timestep, int(worst[timestep].nan_to_num(-1).argmax()), "flagged")
+    return [chosen[timestep] for timestep in sorted(chosen)]
+
+
+def worst_of_runs(timesteps: Sequence[int], values: Float[np.ndarray, " t"]) -> list[int]:
+    """Of neighbouring timesteps the one with the largest value; the worst first."""
+    known = np.nan_to_num(values, nan=-np.inf)
+    runs = np.split(np.array(timesteps, dtype=np.int64), np.nonzero(np.diff(timesteps) > 1)[0] + 1)
+    worst = [int(run[known[run].argmax()]) for run in runs if len(run)]
+    return sorted(worst, key=lambda one: -known[one])
+
+
+def contact_sheet(
+    capture: Capture, tracking: Tracking, face_model: FaceModel, frames: Sequence[SheetFrame]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Each frame as a strip: the picture, the mesh over it and, where pixels were looked at, the model's, and heat."""
+    painter = OverlayPainter(capture, tracking, face_model)
+    strips = [_strip(painter, capture, frame) for frame in frames]
+    columns = min(_STRIPS, len(strips))
+    strips += [np.full_like(strips[0], _PAPER)] * (-len(strips) % columns)
+    rows = [_joined(strips[first : first + columns], 1) for first in range(0, len(strips), columns)]
+    return _joined(rows, 0)
+
+
+def _strip(painter: OverlayPainter, capture: Capture, frame: SheetFrame) -> UInt8[np.ndarray, "h w 3"]:
+    image = np.asarray(capture.images[frame.timestep, frame.camera])
+    rows, columns = painter.head_box(frame.timestep, frame.camera)
+    panels = [image, *painter.panels(frame.timestep, frame.camera)[1:]]
+    tiles = [cv2.resize(panel[rows, columns], (_TILE, _TILE), interpolation=cv2.INTER_AREA) for panel in panels]
+    camera = "" if len(capture.camera_ids) == 1 else f"{capture.camera_ids[frame.camera]} "
+    write_text(tiles[0], f"{frame.timestep} {camera}{frame.why}".rstrip(), (6, 16), 0.45)
+    if len(tiles) > 2:
+        draw_legend(tiles[-1])
+    return np.concatenate(tiles, axis=1)
+
+
+def _joined(pictures: Sequence[UInt8[np.ndarray, "_ _ 3"]], axis: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    shape = list(pictures[0].shape)
+    shape[axis] = _GAP
+    between = np.full(shape, _PAPER, np.uint8)
+    return np.concatenate([part for picture in pictures for part in (between, picture)][1:], axis=axis)
+
+
+def _camera_of_face(residuals: Float[torch.Tensor, " c"]) -> int:
+    """One that found a face, if any did."""
+    return int(residuals.isfinite().int().argmax())

@@ -1,0 +1,51 @@
+"""Differences of colours as heat, with a legend."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+_HOTTEST = 0.15
+"""Length of a difference of colours (each 0..1) that is drawn brightest."""
+_DIMMED = 0.35
+"""Brightness of what is not compared."""
+_MARGIN, _BAR = 8, 8
+_WHITE, _BLACK = (255, 255, 255), (0, 0, 0)
+
+
+def heat_map(difference: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Differences in the colours of `inferno`: black is none, or not known (NaN)."""
+    levels = np.clip(np.nan_to_num(difference) * (255 / _HOTTEST), 0, 255).astype(np.uint8)
+    return _inferno(levels)
+
+
+def dimmed(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture in dark grey, as what does not matter."""
+    grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(cv2.convertScaleAbs(grey, alpha=_DIMMED), cv2.COLOR_GRAY2RGB)
+
+
+def draw_legend(picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    """A bar of colours at the lower left, from no difference to the largest that is told apart."""
+    height, width = picture.shape[:2]
+    length = min(160, width // 2)
+    if length < 32 or height < 64:
+        return
+    top = height - _MARGIN - _BAR
+    bar = np.broadcast_to(np.linspace(0, 255, length).astype(np.uint8), (_BAR, length))
+    picture[top : top + _BAR, _MARGIN : _MARGIN + length] = _inferno(bar)
+    cv2.rectangle(picture, (_MARGIN - 1, top - 1), (_MARGIN + length, top + _BAR), _WHITE, 1)
+    write_text(picture, "0", (_MARGIN, top - 5), 0.4)
+    write_text(picture, f"{100 * _HOTTEST:.0f} %", (_MARGIN + length - 26, top - 5), 0.4)
+
+
+def write_text(picture: UInt8[np.ndarray, "h w 3"], text: str, at: tuple[int, int], size: float = 0.5) -> None:
+    """White letters with a black rim; `at` is the left end of their foot."""
+    left, foot = at
+    # A thicker letter is wider, too: the rim is the same letter shifted.
+    rim = [(left + x, foot + y, _BLACK) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    for x, y, color in (*rim, (left, foot, _WHITE)):
+        cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)
+
+
+def _inferno(levels: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    return cv2.applyColorMap(np.ascontiguousarray(levels), cv2.COLORMAP_INFERNO)[..., ::-1]

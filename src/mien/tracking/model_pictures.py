@@ -1,0 +1,115 @@
+"""What the tracked model looks like beside a picture: its texture in its light, and by how much colours differ."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien import _native
+from mien.camera import Camera
+from mien.capture.capture import Capture
+from mien.face import FaceModel
+from mien.render.mesh import sh_basis, vertex_normals
+from mien.tracking.photometric_pictures import Picture, Pictures
+from mien.tracking.photometric_surface import PosedSurface
+from mien.tracking.photometric_texture import Appearance, Sighting, texture_space
+from mien.tracking.tracking import Looks, Tracking
+from mien.tracking.views import CameraBatch, batch_of
+
+_OUTLIER = 10.0
+"""Beyond this many standard deviations a pixel hardly counts for `Comparison.rms`."""
+_LEAST_PIXELS = 100.0
+"""Fewer show nothing of a face."""
+_MARGIN, _LEAST_WINDOW = 3, 8
+"""Pixels around a mesh, and the least size of a window."""
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """The part of a picture that a mesh may cover: a head leaves most of a picture empty."""
+
+    camera: Camera
+    """For that part alone."""
+    rows: slice
+    columns: slice
+
+
+def window_of(camera: Camera, vertices: Float[Tensor, "v 3"]) -> Window:
+    """Where a mesh is in a picture; at least some pixels of it."""
+    points, depth = camera.project(vertices)
+    points = points[depth > 0] if (depth > 0).any() else points.new_zeros(1, 2)
+    size = torch.tensor([camera.width, camera.height])
+    first = torch.minimum((points.amin(0).floor().long() - _MARGIN).clamp_min(0), size - _LEAST_WINDOW)
+    last = torch.minimum(points.amax(0).ceil().long() + _MARGIN, size).maximum(first + _LEAST_WINDOW)
+    (left, top), (right, bottom) = first.tolist(), last.tolist()
+    part = camera.cropped(float(left), float(top), right - left, bottom - top)
+    return Window(part, slice(top, bottom), slice(left, right))
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A picture and the model's, in the part that the mesh may cover."""
+
+    window: Window
+
+    image: Float[Tensor, "h w 3"]
+    """The model's colours, 0..1, smooth differences of light taken from the picture; NaN where nothing was compared."""
+    difference: Float[Tensor, "h w"]
+    """Length of the difference of the three colours; NaN where nothing was compared."""
+    rms: float
+    """Root mean square of the differences, outliers faded; NaN where there are too few."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelPictures:
+    """The model's pictures of one tracked capture."""
+
+    pictures: Pictures
+    cameras: CameraBatch
+    looks: Looks
+    surface: "_native.AlignSurface"
+    face_model: FaceModel
+
+    @torch.no_grad()
+    def compare(self, timestep: int, camera: int, vertices: Float[Tensor, "v 3"]) -> Comparison:
+        """One picture with the model's. Safe to call from several threads at once."""
+        picture = self.pictures.picture(timestep, camera, self.cameras)
+        window = window_of(picture.camera, vertices)
+        part = window.rows, window.columns
+        picture = Picture(window.camera, picture.image[part].contiguous(), picture.mask[part].contiguous())
+        posed = PosedSurface(vertices.contiguous(), vertex_normals(vertices, self.face_model.faces), None)
+        view, residual = picture.camera, torch.empty_like(picture.image)
+        depth = float(view.project(vertices.mean(0, keepdim=True))[1])
+        radius = max(round(self.looks.light_extent * float(view.K[0, 0]) / max(depth, 1e-3)), 2)
+        seen = Sighting(posed, picture, self.looks.light).arguments()
+        cost, weight = _native.align_mesh(self.surface, *seen, radius, None, None, None, residual, None)
+        rms = self.looks.sigma * cost**0.5 if weight >= _LEAST_PIXELS else float("nan")
+        return Comparison(window, picture.image - residual, residual.norm(dim=-1), rms)
+
+
+def model_pictures(capture: Capture, tracking: Tracking, face_model: FaceModel) -> ModelPictures | None:
+    """What draws the model's pictures; None where pixels were not looked at (`Tracking.looks`)."""
+    looks = tracking.looks
+    if looks is None:
+        return None
+    appearance = Appearance(looks.texture.contiguous(), looks.trust.contiguous(), looks.sigma)
+    surface = texture_space(face_model, looks.texture.shape[0]).native(appearance, _OUTLIER)
+    return ModelPictures(Pictures(capture, 1), batch_of(tracking.cameras), looks, surface, face_model)
+
+
+def looks_in_world(
+    appearance: Appearance, light: Float[Tensor, "9 3"], T_world_fit: Float[Tensor, "4 4"] | None, light_extent: float
+) -> Looks:
+    """What a fit found, its light turned from the frame of the fit into the world's."""
+    if T_world_fit is not None:
+        light = turn_light(light, T_world_fit[:3, :3].to(light))
+    return Looks(appearance.albedo, appearance.trust, light, appearance.sigma, light_extent)
+
+
+def turn_light(light: Float[Tensor, "9 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "9 3"]:
+    """SH light that shines on turned normals as `light` does on these: both frames see the same light."""
+    normals = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    turned = sh_basis(normals.double() @ rotation.double().T)
+    # Rotations map the harmonics of a degree to themselves, so that the fit is exact.
+    return torch.linalg.lstsq(turned, sh_basis(normals.double()) @ light.double()).solution.to(light)
