@@ -87,10 +87,12 @@ void rig_backward(const Array<const float, nb::shape<-1, -1, 3>>& vertices, cons
   if (grad_local_means.shape(0) != count || grad_local_quats.shape(0) != count || grad_log_scales.shape(0) != count) {
     throw std::invalid_argument("one row of every gradient a Gaussian");
   }
+  require(batch > 0, "a batch of no timesteps");
   for (size_t b = 0; b < batch; ++b) {
     const mien::RigGradients gradients{grad_means.data() + b * count * 3,
                                        grad_quats.data() + b * count * 4,
                                        grad_scales.data() + b * count * 3,
+                                       b > 0,
                                        grad_local_means.data(),
                                        grad_local_quats.data(),
                                        grad_log_scales.data(),

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <vector>
 
 #include "isa.h"
@@ -47,6 +48,16 @@ void set_row_buffers(PhotometricBand& band) {
   for (float*& buffer : band.rows) take(buffer);
   for (auto& map : band.ring) {
     for (float*& buffer : map) take(buffer);
+  }
+}
+
+// Part `index` of `parts` of the gradient's rows above and below first_row .. last_row - 1.
+void clear_beyond(const PhotometricTask& task, int first_row, int last_row, int64_t index, int parts) {
+  if (!task.gradient) return;
+  const int rows = first_row + task.height - last_row;
+  for (int64_t i = rows * index / parts; i < rows * (index + 1) / parts; ++i) {
+    const int64_t row = i < first_row ? i : i - first_row + last_row, stride = task.width * kPhotometricChannels;
+    std::memset(task.gradient + row * stride, 0, sizeof(float) * static_cast<size_t>(stride));
   }
 }
 
@@ -103,6 +114,7 @@ double photometric_loss(const PhotometricTask& task) {
     band.end = first_row + static_cast<int>(rows * (index + 1) / bands);
     set_row_buffers(band);
     kernels.band(band);
+    clear_beyond(task, first_row, last_row, index, bands);
   });
 
   double l1 = 0, ssim = 0;

@@ -19,7 +19,7 @@ struct PhotometricTask {
   Box box;
   float l1_weight;
   float ssim_weight;
-  float* gradient;  // [h,w,3] d loss / d image, or null; written only within 5 rows and 11 columns of the box
+  float* gradient;  // [h,w,3] d loss / d image, or null; 0 where no window reaches into the box
 };
 
 // l1_weight * mean |image - target| + ssim_weight * (1 - mean SSIM), means over all pixels and channels of the picture.

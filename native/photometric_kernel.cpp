@@ -182,6 +182,8 @@ void gradient_row(const PhotometricBand& band, int y) {
     const F l1 = keep(both(less_equal(left, column), less(column, right)), sign * l1_factor);
     store(gradient + x, l1 - band.ssim_factor * (by_mean + 2.0f * a * by_squares + b * by_products));
   }
+  memset(gradient - band.origin, 0, sizeof(float) * (size_t)band.origin);
+  memset(gradient + columns, 0, sizeof(float) * (size_t)(band.stride - band.limit));
 }
 
 }  // namespace

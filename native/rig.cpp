@@ -1,6 +1,7 @@
 #include "rig.h"
 
 #include <algorithm>
+#include <cstring>
 #include <vector>
 
 #include "isa.h"
@@ -28,11 +29,15 @@ Vec operator+(Vec a, Vec b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 Vec operator*(float s, Vec a) { return {s * a.x, s * a.y, s * a.z}; }
 void add(float* to, Vec a) { to[0] += a.x, to[1] += a.y, to[2] += a.z; }
 
+// What a triangle passes to its three corners.
+struct CornerGradients {
+  Vec corners[3];
+};
+
 // With e1 = v1 - v0 = L a0 and e2 = v2 - v0 = p a0 - h a2, a motion of the edges turns the frame by omega, where
 // omega . a0 = (a1 . de2 - p / L a1 . de1) / h,  omega . a1 = -(a2 . de1) / L,  omega . a2 = (a1 . de1) / L,
 // and changes the lengths by dL = a0 . de1, dh = p / L a2 . de1 - a2 . de2.
-void frame_to_vertices(const TriangleFrame& frame, const FrameGradient& gradient, const int64_t* face,
-                       float* vertices) {
+CornerGradients frame_to_corners(const TriangleFrame& frame, const FrameGradient& gradient) {
   const Vec third = (1.0f / 3) * Vec{gradient.T[0], gradient.T[1], gradient.T[2]};
   Vec by_edge1{}, by_edge2{};
   if (frame.edge_length > 0) {
@@ -47,9 +52,14 @@ void frame_to_vertices(const TriangleFrame& frame, const FrameGradient& gradient
                (half * slant - torque(a1) / frame.edge_length) * a2;
     by_edge2 = about_edge * a1 + -half * a2;
   }
-  add(vertices + 3 * face[0], third + -1.0f * (by_edge1 + by_edge2));
-  add(vertices + 3 * face[1], third + by_edge1);
-  add(vertices + 3 * face[2], third + by_edge2);
+  return {{third + -1.0f * (by_edge1 + by_edge2), third + by_edge1, third + by_edge2}};
+}
+
+void clear_gaussians(const RigGradients& gradients, int64_t first, int64_t last) {
+  const size_t bytes = sizeof(float) * static_cast<size_t>(last - first);
+  std::memset(gradients.local_means + 3 * first, 0, 3 * bytes);
+  std::memset(gradients.local_quats + 4 * first, 0, 4 * bytes);
+  std::memset(gradients.log_scales + 3 * first, 0, 3 * bytes);
 }
 
 }  // namespace
@@ -64,11 +74,14 @@ void rig_backward(const RigArrays& rig, const TriangleFrame* frames, const float
                   const RigGradients& gradients) {
   // Kept between calls: fresh pages cost as much as the work.
   thread_local std::vector<FrameGradient> per_gaussian, per_face;
+  thread_local std::vector<CornerGradients> per_corner;
   per_gaussian.resize(rig.count);
   FrameGradient* const shares = per_gaussian.data();
   const RigKernels& kernel = rig_kernels();
-  in_pieces(rig.count,
-            [&](int64_t first, int64_t last) { kernel.to_local(rig, first, last, frames, scales, gradients, shares); });
+  in_pieces(rig.count, [&](int64_t first, int64_t last) {
+    if (!gradients.add) clear_gaussians(gradients, first, last);
+    kernel.to_local(rig, first, last, frames, scales, gradients, shares);
+  });
   if (!gradients.vertices) return;
   // In the order of Gaussians, then of triangles: the same sums for any number of threads.
   per_face.assign(rig.face_count, FrameGradient{});
@@ -80,8 +93,17 @@ void rig_backward(const RigArrays& rig, const TriangleFrame* frames, const float
     }
     sum.k += shares[i].k;
   }
+  per_corner.resize(rig.face_count);
+  CornerGradients* const corners = per_corner.data();
+  const FrameGradient* const sums = per_face.data();
+  in_pieces(rig.face_count, [&](int64_t first, int64_t last) {
+    for (int64_t face = first; face < last; ++face) corners[face] = frame_to_corners(frames[face], sums[face]);
+  });
+  std::memset(gradients.vertices, 0, sizeof(float) * 3 * static_cast<size_t>(rig.vertex_count));
   for (int64_t face = 0; face < rig.face_count; ++face) {
-    frame_to_vertices(frames[face], per_face[face], rig.faces + 3 * face, gradients.vertices);
+    for (int corner = 0; corner < 3; ++corner) {
+      add(gradients.vertices + 3 * rig.faces[3 * face + corner], corners[face].corners[corner]);
+    }
   }
 }
 

@@ -40,7 +40,7 @@ struct RigGradients {
   const float* means;  // d loss / d RigWorld
   const float* quats;
   const float* scales;
-  // Added to, not overwritten.
+  bool add;  // to what the next three hold, instead of overwriting it
   float* local_means;
   float* local_quats;
   float* log_scales;

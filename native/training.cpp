@@ -20,6 +20,26 @@ struct Piece {
   int64_t first, last;
 };
 
+// The same of rows top .. bottom - 1; all 0 where they hold nothing.
+PixelBox box_of_rows(const float* values, int width, int top, int bottom) {
+  const auto any_nonzero = training_kernels().any_nonzero;
+  const auto row = [&](int y) { return values + static_cast<int64_t>(y) * width; };
+  while (top < bottom && !any_nonzero(row(top), width)) ++top;
+  if (top == bottom) return {0, 0, 0, 0};
+  while (!any_nonzero(row(bottom - 1), width)) --bottom;
+  int left = width, right = 0;
+  for (int y = top; y < bottom; ++y) {
+    const float* from = row(y);
+    for (int x = 0; x < left; ++x) {
+      if (from[x] != 0) left = x;
+    }
+    for (int x = width; x > right; --x) {
+      if (from[x - 1] != 0) right = x;
+    }
+  }
+  return {left, top, right, bottom};
+}
+
 }  // namespace
 
 void adam_update(const AdamTask* tasks, int count) {
@@ -55,26 +75,30 @@ Penalties triangle_penalties(const PenaltyTask& task) {
   return {task.position_weight * share * total.position, task.scale_weight * share * total.scale};
 }
 
-void observe_view(const ViewStatistics& task) { training_kernels().observe(task, 0, task.count); }
+void observe_view(const ViewStatistics& task) {
+  const TrainingKernels& kernels = training_kernels();
+  parallel_for((task.count + kGaussians - 1) / kGaussians, [&](int64_t index) {
+    kernels.observe(task, index * kGaussians, std::min((index + 1) * kGaussians, task.count));
+  });
+}
 
 PixelBox box_of_nonzero(const float* values, int width, int height) {
-  const auto any_nonzero = training_kernels().any_nonzero;
-  const auto row = [&](int y) { return values + static_cast<int64_t>(y) * width; };
-  int top = 0, bottom = height;
-  while (top < bottom && !any_nonzero(row(top), width)) ++top;
-  if (top == bottom) return {0, 0, 0, 0};
-  while (!any_nonzero(row(bottom - 1), width)) --bottom;
-  int left = width, right = 0;
-  for (int y = top; y < bottom; ++y) {
-    const float* from = row(y);
-    for (int x = 0; x < left; ++x) {
-      if (from[x] != 0) left = x;
-    }
-    for (int x = width; x > right; --x) {
-      if (from[x - 1] != 0) right = x;
-    }
+  constexpr int kRows = 64;
+  const int pieces = (height + kRows - 1) / kRows;
+  thread_local std::vector<PixelBox> boxes;
+  boxes.resize(pieces);
+  PixelBox* const parts = boxes.data();
+  parallel_for(pieces, [&](int64_t piece) {
+    const int first = static_cast<int>(piece) * kRows;
+    parts[piece] = box_of_rows(values, width, first, std::min(first + kRows, height));
+  });
+  PixelBox whole{width, height, 0, 0};
+  for (const PixelBox& part : boxes) {
+    if (part.right == 0) continue;
+    whole = {std::min(whole.left, part.left), std::min(whole.top, part.top), std::max(whole.right, part.right),
+             std::max(whole.bottom, part.bottom)};
   }
-  return {left, top, right, bottom};
+  return whole.right == 0 ? PixelBox{0, 0, 0, 0} : whole;
 }
 
 double mean_squared_difference(const float* image, const uint8_t* bytes, int64_t count) {

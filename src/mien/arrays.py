@@ -1,9 +1,26 @@
 """Tensors on their way into the native core."""
 
+import math
 from typing import Any
 
+import torch
 from torch import Tensor
 from torch.utils.dlpack import to_dlpack
+
+from mien import _native
+
+_LARGE = 1 << 18
+"""Numbers. Memory for fewer comes back from the allocator without fresh pages."""
+
+
+def recycled(*shape: int) -> Tensor:
+    """An uninitialised float32 tensor on the CPU; if it is large, its memory has been in use before.
+
+    The kernel clears fresh pages, which at 2048x2048 takes longer than drawing the picture.
+    """
+    if math.prod(shape) < _LARGE:
+        return torch.empty(shape)
+    return _native.recycled(shape)
 
 
 def unpacked(*tensors: Tensor | None) -> list[Any]:

@@ -31,4 +31,6 @@ class _Sigmoid(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (out,) = ctx.saved_tensors
-        return gradient * out * (1 - out)
+        result = torch.empty_like(out)
+        _native.sigmoid_backward(*unpacked(out, gradient.contiguous(), result))
+        return result

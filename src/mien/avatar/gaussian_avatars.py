@@ -97,7 +97,7 @@ class GaussianAvatars(Avatar):
         position, scale = triangle_penalties(
             self.store["means"],
             self.store["log_scales"],
-            rendering.radii.reshape(-1, rendering.radii.shape[-1]).amax(0),
+            rendering.radii if rendering.radii.ndim == 1 else rendering.radii.amax(0),
             thresholds=(config.position_threshold, config.scale_threshold),
             weights=(config.position_weight, config.scale_weight),
         )

@@ -101,8 +101,10 @@ class _BindToWorld(torch.autograd.Function):
     def backward(ctx, *world_gradients: Tensor):
         *inputs, frames, scales = ctx.saved_tensors
         vertices, _, _, *local = inputs
-        local_gradients = [torch.zeros_like(tensor) for tensor in local]
-        vertex_gradient = torch.zeros_like(vertices) if ctx.needs_input_grad[0] else None
+        if len(vertices) == 0:
+            return torch.zeros_like(vertices), None, None, *(torch.zeros_like(tensor) for tensor in local)
+        local_gradients = [torch.empty_like(tensor) for tensor in local]
+        vertex_gradient = torch.empty_like(vertices) if ctx.needs_input_grad[0] else None
         world = [gradient.contiguous() for gradient in world_gradients]
         known = (tensor.detach() for tensor in (*inputs, frames, scales, *world))
         _native.rig_backward(*unpacked(*known, *local_gradients, vertex_gradient))

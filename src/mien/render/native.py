@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import unpacked
+from mien.arrays import recycled, unpacked
 from mien.render.rendering import Rendering, View
 from mien.render.validation import check_finite
 
@@ -64,7 +64,7 @@ class _Rasterize(torch.autograd.Function):
         for index, size in enumerate(sizes):
             own = [tensor.detach() for tensor in inputs[_INPUTS * index + 1 : _INPUTS * (index + 1)]]
             count = len(own[0])
-            view = (torch.empty(*size, 3), torch.empty(size), torch.empty(count, dtype=torch.int32))
+            view = (recycled(*size, 3), recycled(*size), torch.empty(count, dtype=torch.int32))
             tasks.append(tuple(unpacked(*own, *view)))
             outputs += view
         ctx.frames = _native.rasterize_views(tasks)

@@ -6,6 +6,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from mien import _native
+from mien.arrays import recycled
 
 WINDOW_RADIUS = 5
 """Pixels: the SSIM window is 11x11."""
@@ -78,8 +79,7 @@ class _PhotometricLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, image: Tensor, target: Tensor, box: Box, weights: tuple[float, float]) -> Tensor:
-        whole = box == (0, 0, image.shape[1], image.shape[0])
-        gradient = torch.empty(image.shape) if whole else torch.zeros(image.shape)
+        gradient = recycled(*image.shape)
         loss = _native_loss(image, target, box, weights, gradient)
         ctx.save_for_backward(gradient)
         return image.new_tensor(loss)

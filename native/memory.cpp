@@ -1,0 +1,57 @@
+#include "memory.h"
+
+#include <cstdlib>
+#include <deque>
+#include <mutex>
+
+namespace mien {
+namespace {
+
+constexpr size_t kMostBytes = size_t{256} << 20;  // kept unused
+
+struct Block {
+  void* memory;
+  size_t bytes;
+};
+
+// Blocks that nobody uses, the most recent last. Never destroyed: arrays may outlive static destructors.
+struct Spare {
+  std::mutex mutex;
+  std::deque<Block> blocks;
+  size_t bytes = 0;
+};
+Spare& spare() {
+  static auto* one = new Spare;
+  return *one;
+}
+
+}  // namespace
+
+void* take_memory(size_t bytes) {
+  {
+    Spare& kept = spare();
+    const std::lock_guard<std::mutex> lock(kept.mutex);
+    for (auto block = kept.blocks.rbegin(); block != kept.blocks.rend(); ++block) {
+      if (block->bytes != bytes) continue;
+      void* const memory = block->memory;
+      kept.blocks.erase(std::next(block).base());
+      kept.bytes -= bytes;
+      return memory;
+    }
+  }
+  return std::aligned_alloc(64, (bytes + 63) / 64 * 64);
+}
+
+void give_memory(void* memory, size_t bytes) {
+  Spare& kept = spare();
+  const std::lock_guard<std::mutex> lock(kept.mutex);
+  kept.blocks.push_back({memory, bytes});
+  kept.bytes += bytes;
+  while (kept.bytes > kMostBytes) {
+    std::free(kept.blocks.front().memory);
+    kept.bytes -= kept.blocks.front().bytes;
+    kept.blocks.pop_front();
+  }
+}
+
+}  // namespace mien
