@@ -11,6 +11,7 @@ from mien.camera import Camera
 from mien.capture import Capture
 from mien.face import FaceModel, FaceParams
 from mien.render.mesh import Texture, render_mesh
+from mien.tracking import Tracking
 from mien.tracking.parameters import layout_of
 from small_face_model import make_small_face_model
 from tracking_case import capture_of
@@ -76,6 +77,20 @@ def make_photometric_case(timesteps: int = 16, shake: float = 0.5) -> Photometri
         principal_point=np.full((1, 2), SIZE / 2, np.float32),
     )  # fmt: skip
     return PhotometricCase(model, face, camera, marks, capture)
+
+
+def assert_alike(expected: Tracking, found: Tracking) -> None:
+    """The same to the bit."""
+    for name, tensor in expected.face.tensors().items():
+        assert torch.equal(tensor, found.face.tensors()[name]), name
+    for name in ("residuals", "pixel_residuals"):
+        one, other = getattr(expected, name), getattr(found, name)
+        assert torch.equal(one.nan_to_num(-1), other.nan_to_num(-1)), name
+    assert expected.looks is not None
+    assert found.looks is not None
+    for name in ("texture", "trust", "light"):
+        assert torch.equal(getattr(expected.looks, name), getattr(found.looks, name)), name
+    assert torch.equal(expected.cameras[0].K, found.cameras[0].K)
 
 
 def _draw(model: FaceModel, vertices: Tensor, texture: Texture, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

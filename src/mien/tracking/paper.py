@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
 from mien.progress import progress_bar, say
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.paper_descent import Descent
-from mien.tracking.paper_resume import Keeper
 from mien.tracking.paper_scene import PaperScene, PaperState, first_state, paper_scene
 from mien.tracking.photometric import PhotometricFit
 from mien.tracking.photometric_texture import Appearance, texture_space
+from mien.tracking.resume import Keeper
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
 from mien.tracking.stages import Fit
@@ -24,7 +23,7 @@ def fit_by_descent(
     lenses: Sequence[int | None],
     fit: Fit,
     settings: TrackingSettings,
-    keep: Path | None = None,
+    keeper: Keeper,
 ) -> PhotometricFit:
     """A fit to landmarks refined as in the supplement of GaussianAvatars, section A.
 
@@ -36,10 +35,10 @@ def fit_by_descent(
         lenses: The unknown focal length of each (`lenses_of`).
         fit: What landmarks led to.
         settings: Of the whole tracking.
-        keep: File that an interrupted fit of the same input goes on from. Removed at the end.
+        keeper: Of what an interrupted fit of the same input goes on from.
     """
     scene = paper_scene(model, shots, lenses, fit, settings)
-    descent, keeper = Descent(scene, first_state(scene, fit, lenses), fit), Keeper(keep)
+    descent = Descent(scene, first_state(scene, fit, lenses), fit)
     descent.resume(keeper)
     total = descent.frames * (1 + settings.paper.epochs)
     with torch.enable_grad(), progress_bar("Fitting to pixels", total, min(descent.done, total)) as advance:
@@ -51,7 +50,6 @@ def fit_by_descent(
             descent.fit_epoch(epoch, advance, keeper)
     if descent.lost:
         say(f"{len(descent.lost)} of {descent.frames} frames could not be fitted to pixels and stay near landmarks")
-    keeper.forget()
     return _as_photometric(scene, descent, _as_fit(scene, descent.state, fit))
 
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from mien.progress import Advance
 from mien.tracking.paper_adam import Moments, RowStepper
 from mien.tracking.paper_looks import guess_texture, roughness_gradient, sight_of
-from mien.tracking.paper_resume import Keeper, pack, unpack_moments, unpack_state
 from mien.tracking.paper_scene import PaperScene, PaperState
+from mien.tracking.paper_state import pack, unpack_moments, unpack_state
 from mien.tracking.paper_terms import (
     Moving,
     Shown,
@@ -26,8 +26,10 @@ from mien.tracking.paper_terms import (
     smoothness_term,
     without_smooth_difference,
 )
+from mien.tracking.resume import Keeper
 from mien.tracking.stages import Fit
 
+_PIECE = "descent"
 _GLOBAL_RATE, _EPOCH_DECAY = 0.1, 0.9
 """Of the first rates in the first epoch, and from one to the next."""
 _LAST_RATE = 0.1
@@ -65,7 +67,7 @@ class Descent:
 
     def resume(self, keeper: Keeper) -> None:
         """Go on from what a keeper has."""
-        tensors = keeper.read()
+        tensors = keeper.read(_PIECE)
         if tensors is None:
             return
         unpack_state(self.state, tensors)
@@ -103,7 +105,7 @@ class Descent:
                 self._learn_texture(one)
             self.done += 1
             advance(status=f"frame {row + 1} of {len(rows)}")
-            keeper.offer(self._pack())
+            keeper.offer(_PIECE, self._pack)
 
     @torch.no_grad()
     def _is_lost(self, shown: Shown, by_landmarks: Float[Tensor, " p"]) -> bool:
@@ -227,7 +229,7 @@ class Descent:
             advance(status=f"epoch {epoch + 1}")
         self._texture_gradient = None
         self.done += self.frames
-        keeper.offer(self._pack())
+        keeper.offer(_PIECE, self._pack)
 
     def _global_step(self, shown: Shown, scale: float, share: float, with_texture: bool) -> None:
         settings = self.scene.settings

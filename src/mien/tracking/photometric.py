@@ -1,10 +1,11 @@
 """The photometric stage: faces tracked from landmarks are moved until one texture fits all pictures."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.progress import progress_bar, say
@@ -26,14 +27,17 @@ from mien.tracking.photometric_texture import (
     unknown_appearance,
 )
 from mien.tracking.photometric_threads import in_threads
+from mien.tracking.resume import Keeper
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
-from mien.tracking.solver import Smoothness, solve_chain
-from mien.tracking.stages import Fit, SequenceFit, all_landmarks, box_of, fit_bias, smoothness_of
+from mien.tracking.solver import NormalEquations, Smoothness, joined, solve_chain
+from mien.tracking.stages import Fit, SequenceFit, all_landmarks, box_of, fit_bias, fit_of, smoothness_of
 
 _DAMPING = 1e-3
 _WORSE = 1.02
 """A frame whose cost grows by more than this factor in a step goes back to where it was."""
+_FRAMES_AT_ONCE = 256
+"""Timesteps whose equations are kept together: some seconds of work, and some 10 MB."""
 _LEAST_SHARE = 0.03
 """Of a frame in the texture, however far it is from the middle pose: it may be the only one that sees an ear."""
 
@@ -50,6 +54,25 @@ class PhotometricFit:
     """Of each sequence, timesteps that pixels made better; the others stay as landmarks had them."""
     residuals: tuple[Float[Tensor, "_ _"], ...] = ()
     """Of each sequence: `PhotometricTerm.residuals`, NaN where not improved."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """By name, for a file: all but the residuals."""
+        tensors = self.fit.tensors() | {"albedo": self.appearance.albedo, "trust": self.appearance.trust}
+        tensors["sigma"] = torch.tensor([self.appearance.sigma], dtype=torch.float64)
+        for index, (light, improved) in enumerate(zip(self.lights, self.improved, strict=True)):
+            tensors |= {f"light_{index}": light, f"improved_{index}": improved.to(torch.uint8)}
+        return tensors
+
+
+def photometric_fit_of(tensors: Mapping[str, Tensor]) -> PhotometricFit:
+    """The fit with these tensors (`PhotometricFit.tensors`)."""
+    fit = fit_of(tensors)
+    count = range(len(fit.sequences))
+    return PhotometricFit(
+        fit, Appearance(tensors["albedo"], tensors["trust"], float(tensors["sigma"])),
+        tuple(tensors[f"light_{index}"] for index in count),
+        tuple(tensors[f"improved_{index}"].bool() for index in count),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +147,7 @@ def refine_photometrically(
     lenses: Sequence[int | None],
     fit: Fit,
     settings: TrackingSettings,
+    keeper: Keeper,
 ) -> PhotometricFit:
     """A fit to landmarks refined until pictures agree with a texture that all of them share.
 
@@ -137,6 +161,7 @@ def refine_photometrically(
         lenses: The unknown focal length of each (`lenses_of`).
         fit: What landmarks led to.
         settings: Of the whole tracking.
+        keeper: Of what an interrupted fit of the same input goes on from.
     """
     own_settings = settings.photometric
     landmarks = [
@@ -152,17 +177,25 @@ def refine_photometrically(
         tuple(torch.zeros(len(own.state), dtype=torch.bool) for own in fit.sequences),
     )  # fmt: skip
     rounds = [_Round(surface, space, shots, landmarks, own_settings, shrink) for shrink in own_settings.shrinks]
+
+    def kept(name: str, make: Callable[[], PhotometricFit]) -> PhotometricFit:
+        return photometric_fit_of(keeper.once(name, lambda: make().tensors()))
+
+    def step_identity(now: _Round, at: PhotometricFit) -> PhotometricFit:
+        at = now.look(at)
+        moved = step_shared(now.terms(at), at.fit, prior, own_settings.keyframes)
+        return replace(at, fit=fit_bias(landmarks, moved, settings))
+
     with progress_bar("Fitting to pixels", total=len(own_settings.shrinks)) as advance:
         for number, now in enumerate(rounds):
-            for _ in range(own_settings.shared_steps if number > 0 else 0):
-                at = now.look(at)
-                moved = step_shared(now.terms(at), at.fit, prior, own_settings.keyframes)
-                at = replace(at, fit=fit_bias(landmarks, moved, settings))
-            at = now.look(at)
+            for step in range(own_settings.shared_steps if number > 0 else 0):
+                at = kept(f"round-{number}-shared-{step}", partial(step_identity, now, at))
+            at = kept(f"round-{number}-looks", partial(now.look, at))
             if not (at.appearance.trust > 0).any():
                 say(f"{surface.face_model.name}: pictures give its texture nothing, so faces are as landmarks put them")
                 return replace(at, fit=fit)
-            at = _step_sequences(now, at, settings)
+            at = kept(f"round-{number}", partial(_step_sequences, now, at, settings, keeper, f"step-{number}"))
+            keeper.drop(f"step-{number}")
             advance(status=f"pictures {shots[0].capture.width // now.shrink} pixels wide")
     return _with_residuals(rounds[0], rounds[0].look(at))
 
@@ -182,24 +215,36 @@ def _quiet(term: LandmarkTerm, share: float) -> LandmarkTerm:
     return replace(term, weights=term.weights * kept)
 
 
-def _step_sequences(now: _Round, at: PhotometricFit, settings: TrackingSettings) -> PhotometricFit:
-    """One step of all timesteps of every sequence."""
+def _step_sequences(
+    now: _Round, at: PhotometricFit, settings: TrackingSettings, keeper: Keeper, name: str
+) -> PhotometricFit:
+    """One step of all timesteps of every sequence; its parts are kept by names that begin with `name`."""
     sequences, improved = [], []
     parts = zip(now.terms(at), now.shots, at.fit.sequences, at.improved, strict=True)
-    for term, shot, own, before in parts:
+    for number, (term, shot, own, before) in enumerate(parts):
         smoothness = smoothness_of(term.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
-        state, better = _step(term, at.fit.subject, own, smoothness)
+        state, better = _step(term, at.fit.subject, own, smoothness, keeper, f"{name}-{number}")
         sequences.append(replace(own, state=state))
         improved.append(before | better)
     return replace(at, fit=replace(at.fit, sequences=tuple(sequences)), improved=tuple(improved))
 
 
 def _step(
-    term: PhotometricTerm, subject: Subject, own: SequenceFit, smoothness: Smoothness
+    term: PhotometricTerm, subject: Subject, own: SequenceFit, smoothness: Smoothness, keeper: Keeper, name: str
 ) -> tuple[Float[Tensor, "v p"], Bool[Tensor, " v"]]:
     """All timesteps moved by one Gauss-Newton step, except those that it would make worse; and which ones moved."""
     box, state = box_of(term.layout), own.state
-    equations = term.equations(state, subject, own.cameras)
+    chunks = torch.arange(len(state)).split(_FRAMES_AT_ONCE)
+
+    def equations_at(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
+        found = term.equations(state, rows, subject, own.cameras)
+        return {"cost": found.cost, "gradient": found.gradient, "hessian": found.hessian}
+
+    parts = [
+        NormalEquations(**keeper.once(f"{name}-equations-{index}", partial(equations_at, rows)))
+        for index, rows in enumerate(chunks)
+    ]
+    equations = joined(parts)
     damping = torch.diag_embed(_DAMPING * equations.hessian.diagonal(dim1=1, dim2=2))
     held = box.held(state, equations.gradient + smoothness.gradient(state))
     damped = replace(equations, hessian=equations.hessian + damping)

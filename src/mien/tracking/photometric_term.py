@@ -47,11 +47,12 @@ class PhotometricTerm:
         """Of the timesteps' parameters."""
         return self.model.layout
 
-    def equations(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> NormalEquations:
-        """Of each timestep on its own, the shared parameters fixed."""
-        rows = torch.arange(len(state))
+    def equations(
+        self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch
+    ) -> NormalEquations:
+        """Of some timesteps, each on its own, the shared parameters fixed."""
         pixels = self._pixel_equations(state, rows, subject, cameras, shared=False)
-        marks = self.landmarks.equations(state, subject, cameras)
+        marks = self.landmarks.at(rows).equations(state[rows], subject, cameras)
         return NormalEquations(
             marks.cost + pixels.cost, marks.gradient + pixels.gradient, marks.hessian + pixels.hessian
         )

@@ -26,6 +26,7 @@ from mien.tracking.paper import fit_by_descent
 from mien.tracking.parameters import layout_of
 from mien.tracking.photometric import PhotometricFit, refine_photometrically
 from mien.tracking.photometric_threads import in_threads
+from mien.tracking.resume import Keeper
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shared_fit import fit_shared
 from mien.tracking.shot import Shot, lenses_of, shot_of
@@ -36,6 +37,7 @@ from mien.tracking.stages import (
     all_landmarks,
     choose_keyframes,
     fit_frames,
+    fit_of,
     fit_sequences,
     smoothness_of,
     widen,
@@ -70,7 +72,8 @@ def track_subject(
     (`Capture.calibration`): they stay as they are, give the metric scale, and a camera that found no face at a timestep
     adds nothing to it. With one uncalibrated camera, metric scale comes from the identity prior.
 
-    `keep` is a file that the `paper` schedule goes on from if it was interrupted, with the same captures and settings.
+    `keep` is a folder of its own for finished parts, from which interrupted tracking of the same captures with the
+    same settings goes on, to the same numbers. It is removed at the end.
 
     Raises:
         UserError: a capture has several cameras without calibration, too few timesteps with a face, or landmarks that
@@ -79,12 +82,12 @@ def track_subject(
     assert captures, "nothing to track"
     if "mediapipe" not in face_model.landmarks:
         raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; calibrate them for it first")
-    shots = [shot_of(capture, settings) for capture in captures]
+    shots, keeper = [shot_of(capture, settings) for capture in captures], Keeper(keep)
     with torch.no_grad():
         model = reduce_face_model(face_model, layout_of(face_model))
         lenses = lenses_of(captures, settings)
         try:
-            fit = _fit_landmarks(model, shots, lenses, settings)
+            fit = _fit_landmarks(model, shots, lenses, settings, keeper)
         except torch.linalg.LinAlgError:
             names = ", ".join(capture.name for capture in captures)
             raise UserError(
@@ -92,17 +95,18 @@ def track_subject(
             ) from None
         refined: PhotometricFit | None = None
         if settings.schedule == "fast":
-            refined = refine_photometrically(model, shots, lenses, fit, settings)
+            refined = refine_photometrically(model, shots, lenses, fit, settings, keeper)
         if settings.schedule == "paper":
-            refined = fit_by_descent(model, shots, lenses, fit, settings, keep)
+            refined = fit_by_descent(model, shots, lenses, fit, settings, keeper)
         fit = fit if refined is None else refined.fit
         trackings = [
             _as_tracking(shot, face_model, model, fit.subject, own, settings)
             for shot, own in zip(shots, fit.sequences, strict=True)
         ]
-        if refined is None or not (refined.appearance.trust > 0).any():
-            return trackings
-        return _with_pixels(trackings, shots, refined, face_model, settings)
+        if refined is not None and (refined.appearance.trust > 0).any():
+            trackings = _with_pixels(trackings, shots, refined, face_model, settings)
+    keeper.forget()
+    return trackings
 
 
 def _with_pixels(
@@ -152,7 +156,11 @@ def _with_pixel_residuals(tracking: Tracking, shot: Shot, found: Float[Tensor, "
 
 
 def _fit_landmarks(
-    model: LandmarkModel, shots: Sequence[Shot], lenses: Sequence[int | None], settings: TrackingSettings
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    lenses: Sequence[int | None],
+    settings: TrackingSettings,
+    keeper: Keeper,
 ) -> Fit:
     subject = Subject(torch.zeros(len(model.identity_basis)).double(), torch.zeros(LANDMARKS, 3).double())
     frames = sum(int(shot.valid.sum()) for shot in shots)
@@ -161,31 +169,34 @@ def _fit_landmarks(
         def advance_by(stage: str, timesteps: int, share: int = 1) -> None:
             advance(timesteps * _COSTS[stage] // share, status=stage)
 
-        starts = []
-        for shot in shots:
-            pose = fit_head_pose(model, shot.views, shot.cameras, subject, settings)
-            starts.append(SequenceFit(shot.cameras, widen(pose, model.layout)))
-            advance_by("head pose", len(pose))
+        def identify() -> dict[str, Tensor]:
+            starts = []
+            for shot in shots:
+                pose = fit_head_pose(model, shot.views, shot.cameras, subject, settings)
+                starts.append(SequenceFit(shot.cameras, widen(pose, model.layout)))
+                advance_by("head pose", len(pose))
+            terms, keyframes = [], []
+            for shot, own in zip(shots, starts, strict=True):
+                chosen = choose_keyframes(own.state[:, :6], settings.keyframes)
+                terms.append(all_landmarks(model, shot.views, own, settings).at(chosen))
+                keyframes.append(replace(own, state=own.state[chosen]))
+            return fit_shared(terms, Fit(subject, tuple(keyframes)), lenses, settings).tensors()
 
-        terms, keyframes = [], []
-        for shot, own in zip(shots, starts, strict=True):
-            chosen = choose_keyframes(own.state[:, :6], settings.keyframes)
-            terms.append(all_landmarks(model, shot.views, own, settings).at(chosen))
-            keyframes.append(replace(own, state=own.state[chosen]))
-        known = fit_shared(terms, Fit(subject, tuple(keyframes)), lenses, settings)
+        known = fit_of(keeper.once("identity", identify))
         advance_by("identity", frames)
 
         terms, sequences = [], []
-        for shot, key in zip(shots, known.sequences, strict=True):
+        for number, (shot, key) in enumerate(zip(shots, known.sequences, strict=True)):
             pose = fit_head_pose(model, shot.views, key.cameras, known.subject, settings)
             own = SequenceFit(key.cameras, widen(pose, model.layout))
             terms.append(all_landmarks(model, shot.views, own, settings))
-            sequences.append(fit_frames(terms[-1], known.subject, own, partial(advance_by, "frames")))
+            advance_frames, name = partial(advance_by, "frames"), f"frames-{number}"
+            sequences.append(fit_frames(terms[-1], known.subject, own, advance_frames, keeper, name))
 
         smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
                       for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
         advance_one = partial(advance_by, "sequence", share=SEQUENCE_ITERATIONS)
-        return fit_sequences(terms, Fit(known.subject, tuple(sequences)), smoothness, settings, advance_one)
+        return fit_sequences(terms, Fit(known.subject, tuple(sequences)), smoothness, settings, advance_one, keeper)
 
 
 def _as_tracking(

@@ -1,8 +1,9 @@
 """The stages of tracking from landmarks: each takes what is known so far and returns it refined."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,6 +21,7 @@ from mien.tracking.landmark_groups import (
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.parameters import ParameterLayout
+from mien.tracking.resume import Keeper
 from mien.tracking.settings import SmoothnessSettings, TrackingSettings
 from mien.tracking.solver import Box, Smoothness, minimize_frames, solve_chain
 from mien.tracking.views import CameraBatch, Views
@@ -50,6 +52,26 @@ class Fit:
 
     subject: Subject
     sequences: tuple[SequenceFit, ...]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """By name, for a file."""
+        tensors = {"identity": self.subject.identity, "bias": self.subject.bias}
+        if self.subject.vertex_offsets is not None:
+            tensors["vertex_offsets"] = self.subject.vertex_offsets
+        for index, own in enumerate(self.sequences):
+            named = {"K": own.cameras.K, "viewmat": own.cameras.viewmat, "state": own.state}
+            tensors |= {f"{name}_{index}": tensor for name, tensor in named.items()}
+        return tensors
+
+
+def fit_of(tensors: Mapping[str, Tensor]) -> Fit:
+    """The fit with these tensors (`Fit.tensors`)."""
+    subject = Subject(tensors["identity"], tensors["bias"], tensors.get("vertex_offsets"))
+    sequences: list[SequenceFit] = []
+    while f"state_{len(sequences)}" in tensors:
+        K, viewmat, state = (tensors[f"{name}_{len(sequences)}"] for name in ("K", "viewmat", "state"))
+        sequences.append(SequenceFit(CameraBatch(K, viewmat), state))
+    return Fit(subject, tuple(sequences))
 
 
 def choose_keyframes(pose: Float[Tensor, "v 6"], count: int) -> Int[Tensor, " k"]:
@@ -102,17 +124,27 @@ def _without_similarity(
 
 
 def fit_frames(
-    term: LandmarkTerm, subject: Subject, own: SequenceFit, advance: Callable[[int], None] = lambda timesteps: None
+    term: LandmarkTerm,
+    subject: Subject,
+    own: SequenceFit,
+    advance: Callable[[int], None] = lambda timesteps: None,
+    keeper: Keeper | None = None,
+    name: str = "frames",
 ) -> SequenceFit:
     """Pose, expression and eyes of every timestep alone; `advance` is told of timesteps that are done."""
-    parts = []
-    for rows in torch.arange(len(own.state)).split(_FRAMES_AT_ONCE):
+    keeper, parts = keeper or Keeper(), []
+
+    def fitted(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
         part = term.at(rows)
-        parts.append(minimize_frames(
-            lambda state, part=part: part.equations(state, subject, own.cameras),
-            lambda state, part=part: part.cost(state, subject, own.cameras),
+        state = minimize_frames(
+            lambda state: part.equations(state, subject, own.cameras),
+            lambda state: part.cost(state, subject, own.cameras),
             own.state[rows], box_of(term.model.layout), _FRAME_ITERATIONS,
-        ))  # fmt: skip
+        )  # fmt: skip
+        return {"state": state}
+
+    for index, rows in enumerate(torch.arange(len(own.state)).split(_FRAMES_AT_ONCE)):
+        parts.append(keeper.once(f"{name}-{index}", partial(fitted, rows))["state"])
         advance(len(rows))
     return replace(own, state=torch.cat(parts))
 
@@ -123,18 +155,22 @@ def fit_sequences(
     smoothness: Sequence[Smoothness],
     settings: TrackingSettings,
     advance: Callable[[int], None] = lambda timesteps: None,
+    keeper: Keeper | None = None,
 ) -> Fit:
     """All timesteps of each sequence together under its smoothness cost, alternating with the landmarks' bias.
 
     `advance` is told of timesteps that are done, of all iterations (`SEQUENCE_ITERATIONS`) together.
     """
-    for _ in range(_ROUNDS):
+    keeper = keeper or Keeper()
+
+    def round_from(fit: Fit) -> dict[str, Tensor]:
         fit = fit_bias(terms, fit, settings)
         parts = zip(terms, fit.sequences, smoothness, strict=True)
-        fit = replace(
-            fit,
-            sequences=tuple(_fit_chain(term, fit.subject, own, smooth, advance) for term, own, smooth in parts),
-        )
+        chains = tuple(_fit_chain(term, fit.subject, own, smooth, advance) for term, own, smooth in parts)
+        return replace(fit, sequences=chains).tensors()
+
+    for number in range(_ROUNDS):
+        fit = fit_of(keeper.once(f"sequence-{number}", partial(round_from, fit)))
     return fit
 
 

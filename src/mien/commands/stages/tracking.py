@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -114,10 +115,10 @@ def _track(
     usable = {name: capture for name, capture in captures.items() if has_enough_faces(capture)} or captures
     for name in captures.keys() - usable.keys():
         say(f"{name}: left out, there are too few faces in it")
-    keep = workspace.root / "sequences" / f".tracking-{fingerprint}.safetensors"
-    for other in workspace.root.glob("sequences/.tracking-*.safetensors"):
-        if other != keep:
-            other.unlink()  # of other captures or settings
+    keep = workspace.root / "sequences" / f".tracking-{fingerprint}"
+    for other in workspace.root.glob("sequences/.tracking-*"):
+        if other != keep and other.is_dir():
+            shutil.rmtree(other, ignore_errors=True)  # of other captures or settings
     tracked = track_subject(list(usable.values()), face_model, settings, keep)
     trackings = {}
     for name, tracking in zip(usable, tracked, strict=True):

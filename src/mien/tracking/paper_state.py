@@ -1,50 +1,10 @@
-"""What an interrupted `paper` fit goes on from: one file, written now and then."""
-
-import time
-from dataclasses import dataclass, field
-from pathlib import Path
+"""All that a fit of the `paper` schedule goes on from, as tensors by name."""
 
 import torch
 from torch import Tensor
 
-from mien.errors import UserError
-from mien.progress import say
-from mien.storage import read_tensors, write_tensors
 from mien.tracking.paper_adam import Moments, RowStepper
 from mien.tracking.paper_scene import PaperState
-
-_INTERVAL_SECONDS = 20.0
-
-
-@dataclass(eq=False)
-class Keeper:
-    """Writes a fit's state into a file, at most every 20 seconds; nowhere if there is no file. Mutable."""
-
-    path: Path | None
-    last: float = field(default_factory=time.monotonic)
-
-    def offer(self, tensors: dict[str, Tensor]) -> None:
-        """Write them, unless the last time is not long ago."""
-        if self.path is not None and time.monotonic() - self.last >= _INTERVAL_SECONDS:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            write_tensors(self.path, tensors)
-            self.last = time.monotonic()
-
-    def read(self) -> dict[str, Tensor] | None:
-        """What was written last, if it can be read."""
-        if self.path is None or not self.path.is_file():
-            return None
-        try:
-            # Copies lie where new tensors lie: matrix products take other paths where memory is aligned otherwise.
-            return {name: tensor.clone() for name, tensor in read_tensors(self.path).items()}
-        except UserError:
-            say(f"{self.path.name}: damaged, so the fit to pixels starts anew")
-            return None
-
-    def forget(self) -> None:
-        """The fit is done."""
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
 
 
 def pack(

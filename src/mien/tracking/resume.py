@@ -1,0 +1,83 @@
+"""What interrupted tracking goes on from: a folder of finished pieces, each a file that is written as a whole."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from shutil import rmtree
+
+from torch import Tensor
+
+from mien.errors import UserError
+from mien.progress import say
+from mien.storage import read_tensors, write_tensors
+
+_INTERVAL_SECONDS = 20.0
+_ENDING = ".safetensors"
+
+
+@dataclass(eq=False)
+class Keeper:
+    """Keeps pieces of a fit by name in a folder of their own; nowhere if there is no folder. Mutable.
+
+    What a piece holds has to follow from the fit's input and its name alone.
+    """
+
+    folder: Path | None = None
+    last: float = field(default_factory=time.monotonic)
+    resumed: bool = False
+
+    def once(self, name: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+        """The piece as `make` returns it, kept from then on; or as it was kept."""
+        found = self.read(name)
+        if found is not None:
+            return found
+        made = _as_read(make())
+        self._write(name, made)
+        return made
+
+    def offer(self, name: str, make: Callable[[], dict[str, Tensor]]) -> None:
+        """Keep the piece instead of its older version, unless the last time is less than 20 seconds ago."""
+        if self.folder is not None and time.monotonic() - self.last >= _INTERVAL_SECONDS:
+            self._write(name, make())
+            self.last = time.monotonic()
+
+    def read(self, name: str) -> dict[str, Tensor] | None:
+        """The piece, if it was kept and can be read."""
+        path = self._path(name)
+        if path is None or not path.is_file():
+            return None
+        try:
+            tensors = read_tensors(path)
+        except UserError:
+            say(f"{path.name}: damaged, so this part of tracking is done again")
+            return None
+        if not self.resumed:
+            say("Tracking goes on where it was interrupted")
+            self.resumed = True
+        return _as_read(tensors)
+
+    def drop(self, beginning: str) -> None:
+        """Forget the pieces whose names begin so: what was made of them is kept."""
+        if self.folder is not None:
+            for path in self.folder.glob(f"{beginning}*{_ENDING}"):
+                path.unlink(missing_ok=True)
+
+    def forget(self) -> None:
+        """The fit is done."""
+        if self.folder is not None:
+            rmtree(self.folder, ignore_errors=True)
+
+    def _path(self, name: str) -> Path | None:
+        return None if self.folder is None else self.folder / f"{name}{_ENDING}"
+
+    def _write(self, name: str, tensors: dict[str, Tensor]) -> None:
+        path = self._path(name)
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_tensors(path, tensors)
+
+
+def _as_read(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Whole copies, whether made or read: matrix products take other paths where memory is laid out otherwise."""
+    return {name: tensor.detach().clone().contiguous() for name, tensor in tensors.items()}

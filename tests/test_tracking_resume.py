@@ -1,0 +1,91 @@
+"""Tracking that was stopped goes on from what it had finished, to the same numbers; damaged pieces are made anew."""
+
+import pytest
+import torch
+
+from mien.tracking import Tracking, TrackingSettings, photometric, stages, track_subject
+from mien.tracking.photometric_settings import PhotometricSettings
+from mien.tracking.resume import Keeper
+from photometric_case import PhotometricCase, assert_alike, make_photometric_case
+
+FAST = TrackingSettings(photometric=PhotometricSettings(shrinks=(1, 1), texture_size=128, keyframes=4, shared_steps=1))
+"""The focal length is unknown, so that it has to be kept as well."""
+
+
+@pytest.fixture(scope="module")
+def case() -> PhotometricCase:
+    return make_photometric_case(timesteps=8)
+
+
+@pytest.fixture(autouse=True)
+def few_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages, "_FRAMES_AT_ONCE", 5)
+    monkeypatch.setattr(photometric, "_FRAMES_AT_ONCE", 3)
+
+
+@pytest.fixture(scope="module")
+def expected(case: PhotometricCase) -> Tracking:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(stages, "_FRAMES_AT_ONCE", 5)
+        patched.setattr(photometric, "_FRAMES_AT_ONCE", 3)
+        return track_subject([case.capture], case.model, FAST)[0]
+
+
+def stopped_after(pieces: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the pieces that are written; after so many, the next one stops the program."""
+    write, names = Keeper._write, []
+
+    def write_then_stop(self: Keeper, name: str, tensors: dict) -> None:
+        if len(names) == pieces:
+            raise KeyboardInterrupt
+        write(self, name, tensors)
+        names.append(name)
+
+    monkeypatch.setattr(Keeper, "_write", write_then_stop)
+    return names
+
+
+@pytest.mark.parametrize(("pieces", "last"), [
+    (1, "identity"), (2, "frames-0-0"), (4, "sequence-0"), (6, "round-0-looks"), (8, "step-0-0-equations-1"),
+    (10, "round-0"), (11, "round-1-shared-0"), (14, "step-1-0-equations-1"),
+])  # fmt: skip
+def test_goes_on_from_every_piece(case, expected, tmp_path, monkeypatch, capsys, pieces: int, last: str):
+    keep = tmp_path / "kept"
+    with monkeypatch.context() as patched:
+        names = stopped_after(pieces, patched)
+        with pytest.raises(KeyboardInterrupt):
+            track_subject([case.capture], case.model, FAST, keep)
+        assert names[-1] == last
+    before = {path.name for path in keep.iterdir()}
+    written = stopped_after(99, monkeypatch)
+    found = track_subject([case.capture], case.model, FAST, keep)[0]
+    assert not before & {f"{name}.safetensors" for name in written}, "what was finished is done again"
+    assert "goes on where it was interrupted" in capsys.readouterr().err
+    assert_alike(expected, found)
+    assert not keep.exists()
+
+
+def test_damaged_pieces_are_made_anew(case, expected, tmp_path, monkeypatch, capsys):
+    keep = tmp_path / "kept"
+    with monkeypatch.context() as patched:
+        stopped_after(11, patched)
+        with pytest.raises(KeyboardInterrupt):
+            track_subject([case.capture], case.model, FAST, keep)
+    for name in ("sequence-1", "round-0"):
+        whole = (keep / f"{name}.safetensors").read_bytes()
+        (keep / f"{name}.safetensors").write_bytes(whole[: len(whole) // 2])
+    assert_alike(expected, track_subject([case.capture], case.model, FAST, keep)[0])
+    assert "round-0.safetensors: damaged, so this part" in capsys.readouterr().err
+
+
+def test_pieces_are_the_same_made_or_read(tmp_path):
+    keeper, odd = Keeper(tmp_path / "kept"), torch.arange(6.0).reshape(2, 3).T[1:]
+    made = keeper.once("odd", lambda: {"odd": odd})
+    read = keeper.once("odd", lambda: pytest.fail("it was kept"))
+    assert torch.equal(made["odd"], read["odd"])
+    assert made["odd"].stride() == read["odd"].stride()
+    keeper.drop("od")
+    assert keeper.read("odd") is None
+    assert Keeper(None).once("odd", lambda: {"odd": odd})["odd"].is_contiguous()
+    keeper.forget()
+    assert not (tmp_path / "kept").exists()
