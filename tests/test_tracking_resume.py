@@ -1,12 +1,19 @@
 """Tracking that was stopped goes on from what it had finished, to the same numbers; damaged pieces are made anew."""
 
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 
+from mien.capture import write_capture
+from mien.cli import main
 from mien.tracking import Tracking, TrackingSettings, photometric, stages, track_subject
 from mien.tracking.photometric_settings import PhotometricSettings
 from mien.tracking.resume import Keeper
-from photometric_case import PhotometricCase, assert_alike, make_photometric_case
+from photometric_case import PhotometricCase, assert_alike, make_photometric_case, make_textured_model
 
 FAST = TrackingSettings(photometric=PhotometricSettings(shrinks=(1, 1), texture_size=128, keyframes=4, shared_steps=1))
 """The focal length is unknown, so that it has to be kept as well."""
@@ -46,8 +53,7 @@ def stopped_after(pieces: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.mark.parametrize(("pieces", "last"), [
-    (1, "identity"), (2, "frames-0-0"), (4, "sequence-0"), (6, "round-0-looks"), (8, "step-0-0-equations-1"),
-    (10, "round-0"), (11, "round-1-shared-0"), (14, "step-1-0-equations-1"),
+    (1, "identity"), (2, "frames-0-0"), (4, "sequence-0"), (8, "step-0-0-equations-1"), (11, "round-1-shared-0"),
 ])  # fmt: skip
 def test_goes_on_from_every_piece(case, expected, tmp_path, monkeypatch, capsys, pieces: int, last: str):
     keep = tmp_path / "kept"
@@ -63,6 +69,53 @@ def test_goes_on_from_every_piece(case, expected, tmp_path, monkeypatch, capsys,
     assert "goes on where it was interrupted" in capsys.readouterr().err
     assert_alike(expected, found)
     assert not keep.exists()
+
+
+SLOWLY = """
+import sys, time
+import mien.commands.stages.tracking as stage
+from mien.cli import main
+from mien.tracking.resume import Keeper
+from photometric_case import make_textured_model
+
+def slowly(self, name, tensors):
+    write(self, name, tensors)
+    print(name, flush=True)
+    time.sleep(0.3)
+
+write, Keeper._write = Keeper._write, slowly
+stage.load_face_model = lambda name: make_textured_model()
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_killed_tracking_goes_on(case, tmp_path, monkeypatch, capsys):
+    """The process is killed, not asked to stop; then the same command ends with the same file."""
+    monkeypatch.undo()  # the other process fits as many at once as ever
+    model = make_textured_model()
+    monkeypatch.setattr("mien.commands.stages.tracking.load_face_model", lambda name: model)
+    command = ["--overlay", "none", "--tracking.photometric.texture-size", "64"]
+    for name in ("killed", "undisturbed"):
+        write_capture(tmp_path / name / "sequences/clip/capture", case.capture)
+    assert main(["track", str(tmp_path / "undisturbed"), *command]) == 0
+    arguments = [sys.executable, "-c", SLOWLY, "track", str(tmp_path / "killed"), *command]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent) as process:
+        assert process.stdout is not None
+        while process.stdout.readline() != "round-0-looks\n":
+            assert process.poll() is None
+        process.send_signal(signal.SIGKILL)
+        assert process.wait(timeout=60) == -signal.SIGKILL
+    sequences = tmp_path / "killed/sequences"
+    assert not (sequences / "clip/tracking/tracking.json").exists()
+    assert len(list(sequences.glob(".tracking-*/*.safetensors"))) >= 5
+    capsys.readouterr()
+    assert main(["track", str(tmp_path / "killed"), *command]) == 0
+    assert "goes on where it was interrupted" in capsys.readouterr().err
+    assert not list(sequences.glob(".tracking-*"))
+    files = [tmp_path / name / "sequences/clip/tracking/tracking.safetensors" for name in ("killed", "undisturbed")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert (sequences / "clip/tracking/report.html").is_file()
+    assert not (sequences / "clip/tracking/overlay.mp4").exists()
 
 
 def test_damaged_pieces_are_made_anew(case, expected, tmp_path, monkeypatch, capsys):
