@@ -17,8 +17,6 @@ from mien.storage import file_digest, read_json, read_tensors, write_json, write
 
 _AVATAR, _VERSION = "mien.avatar", 1
 _REMEDY = "delete the run's training.json, if it is there, and train it again with `mien train`"
-NOT_CARRIED = frozenset({"flame"})
-"""Face models whose licence does not allow them to be passed on inside an avatar."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ def write_avatar(folder: Path, avatar: Avatar) -> None:
     tensors = {f"avatar.{name}": tensor for name, tensor in avatar.state_dict().items()}
     tensors |= {f"subject.{name}": tensor for name, tensor in avatar.subject.tensors().items()}
     write_tensors(folder / "avatar.safetensors", tensors)
-    carried = avatar.face_model.name not in NOT_CARRIED
+    carried = avatar.face_model.shareable
     if carried:
         write_face_model(folder / "face_model", avatar.face_model)
     content = _Content(

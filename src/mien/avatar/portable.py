@@ -12,7 +12,6 @@ import mien
 from mien.avatar import baked as torch_side
 from mien.avatar.avatar import Avatar
 from mien.avatar.baked import BakedAvatar
-from mien.avatar.files import NOT_CARRIED
 from mien.avatar.methods import method_of
 from mien.camera import Camera
 from mien.errors import UserError
@@ -35,7 +34,7 @@ def make_portable(avatar: Avatar, camera: Camera, name: str) -> PortableAvatar:
         UserError: its face model may not be passed on.
     """
     model, subject = avatar.face_model, avatar.subject
-    if model.name in NOT_CARRIED:
+    if not model.shareable:
         raise UserError(
             f"{name}: a .mien file holds parts of the face model {model.name!r}, whose licence does not allow them to "
             "be passed on; export a .ply instead, or train with another --face-model"

@@ -31,7 +31,7 @@ class Command:
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the method's)."""
     face_model: str = "anny"
-    """See `mien face-models`."""
+    """Name of a face model (see `mien face-models`), or a .npz or .pkl in FLAME's schema."""
     overlay: Literal["auto", "all", "none"] = "auto"
     """Frames in overlay.mp4: all of them, or of long clips every n-th so that there are at most 3,000 (auto)."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
@@ -44,12 +44,12 @@ class Command:
             capture_stage,
             doubled_videos,
             evaluation_stage,
+            face_model_of,
             run_name,
             sequence_names,
             tracking_stage,
             training_stage,
         )
-        from mien.face import load_face_model
         from mien.progress import say
         from mien.storage import check_writable
         from mien.training import check_held_out, check_run
@@ -60,7 +60,7 @@ class Command:
         workspace, run = Workspace(self.out), run_name(self.run_name or self.options.method)
         check_writable(self.out, folder=True)
         check_run(workspace.run_dir(run), method, settings)
-        load_face_model(self.face_model)
+        face_model_of(self.face_model)
         for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
             say(f"warning: {warning}")
 

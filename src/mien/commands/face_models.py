@@ -2,15 +2,25 @@
 
 import json
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from mien.errors import UserError
+
 
 @dataclass(frozen=True)
 class Command:
-    """List the face models; with --bake, make one ready (otherwise that happens at its first use)."""
+    """List the face models; with --add, take one of your own in; with --bake, make one ready before its first use."""
 
+    add: Path | None = None
+    """A head model in FLAME's schema (FLAME's own .pkl, or a .npz): it is kept with your other models, its landmarks
+    are placed (some minutes, once), and --face-model takes its name. A pickle is read without running anything."""
+    name: str | None = None
+    """Name of the added model (default: the file's)."""
+    shareable: bool = False
+    """The added model's licence lets avatars carry a copy of it (FLAME's does not, FLAME Open's does)."""
     bake: str | None = None
     """Name of a model to bake now."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -20,6 +30,12 @@ class Command:
         """Print the table."""
         from mien.face import available_face_models, load_face_model
 
+        if self.add is None and (self.name is not None or self.shareable):
+            raise UserError("--name and --shareable belong to a model that is added: give its file with --add FILE")
+        if self.add is not None:
+            from mien.commands.stages import add_face_model_stage
+
+            add_face_model_stage(self.add, self.name, self.shareable)
         if self.bake is not None:
             load_face_model(self.bake)
         rows = [asdict(info) for info in available_face_models()]

@@ -21,7 +21,7 @@ class Command:
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
     face_model: str = "anny"
-    """See `mien face-models`."""
+    """Name of a face model (see `mien face-models`), or a .npz or .pkl in FLAME's schema."""
     again: bool = False
     """Track again even if nothing changed. The scoring masks stay as they are."""
     overlay: Literal["auto", "all", "none"] = "auto"

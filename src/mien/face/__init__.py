@@ -1,6 +1,6 @@
 """Face models: parameters in, vertices out."""
 
-from mien.face.loading import FaceModelInfo, available_face_models, load_face_model
+from mien.face.loading import FaceModelInfo, add_face_model, added_from, available_face_models, load_face_model
 from mien.face.model import FaceModel, Landmarks
 from mien.face.params import FaceParams, concatenate
 from mien.face.posing import head_poses
@@ -10,6 +10,8 @@ __all__ = [
     "FaceModelInfo",
     "FaceParams",
     "Landmarks",
+    "add_face_model",
+    "added_from",
     "available_face_models",
     "concatenate",
     "head_poses",

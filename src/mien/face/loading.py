@@ -8,6 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,15 +16,18 @@ from mien.errors import UserError
 from mien.face.anny import bake_anny
 from mien.face.anny_source import anny_tag
 from mien.face.model import FaceModel, Landmarks
-from mien.storage import read_json, read_tensors, write_json, write_tensors
+from mien.storage import read_json, read_tensors, write_atomically, write_json, write_tensors
 
 FORMAT, VERSION = "mien.face_model", 1
 LANDMARK_FORMAT, LANDMARK_VERSION = "mien.landmark_embedding", 1
 _TENSORS = (
     "template", "faces", "uv", "uv_faces", "face_regions", "identity_basis", "expression_basis", "expression_bounds",
     "joint_template", "joint_identity_basis", "joint_rotation_basis", "joint_translation_basis", "skinning_weights",
-    "pose_basis",
+    "pose_basis", "expression_sigmas",
 )  # fmt: skip
+_SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
+ADDED_RECIPE = 1
+"""Raised whenever adding a user's file gives something else."""
 _LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
 
 
@@ -51,7 +55,8 @@ class _Source:
 def load_face_model(name: str = "anny") -> FaceModel:
     """The face model of that name, ready to use; its first load bakes it (about half a minute, with a progress bar).
 
-    Baked models are kept in the folder MIEN_CACHE names, or else in ~/.cache/mien (XDG_CACHE_HOME is honoured).
+    Baked models are kept in the folder MIEN_CACHE names, or else in ~/.cache/mien (XDG_CACHE_HOME is honoured), and so
+    are those that the user added (`mien face-models --add`).
 
     Raises:
         UserError: there is no such model, or its package is not installed.
@@ -62,7 +67,9 @@ def load_face_model(name: str = "anny") -> FaceModel:
 
 def load_face_model_without_landmarks(name: str) -> FaceModel:
     """`load_face_model` for who makes the landmarks."""
-    source = _source(name)
+    if name not in _SOURCES:
+        return _read_added(name)
+    source = _SOURCES[name]
     stem = _cached_file(name, source)
     model = _read_if_sound(stem)
     if model is None:
@@ -72,11 +79,39 @@ def load_face_model_without_landmarks(name: str) -> FaceModel:
 
 
 def available_face_models() -> list[FaceModelInfo]:
-    """Every face model there is."""
-    return [
+    """Every face model there is, those that the user added last."""
+    ours = [
         FaceModelInfo(name, source.licence, source.description, _is_baked(name, source))
         for name, source in _SOURCES.items()
     ]
+    return ours + [
+        FaceModelInfo(name, "its own: yours to obey", f"added from {added_from(name)['path']}", True)
+        for name in _added_names()
+    ]
+
+
+def add_face_model(model: FaceModel, source: Path, source_sha256: str) -> None:
+    """Keep a finished face model, landmarks and all, in the user's cache, to be loaded by its name from now on.
+
+    Args:
+        model: Its name takes the place of one added before under the same name.
+        source: The user's file, to be named in messages.
+        source_sha256: Of its content.
+    """
+    stem = _added_file(model.name)
+    write_face_model(stem, model)
+    write_landmarks(_landmark_file(stem), model, "mien face-models --add FILE")
+    content = {"path": str(source.absolute()), "sha256": source_sha256, "recipe": ADDED_RECIPE}
+    write_json(_source_file(stem), _SOURCE_FORMAT, 1, content)
+
+
+def added_from(name: str) -> dict[str, Any] | None:
+    """What a face model was added from (`path`, `sha256`), if the user added one of that name in today's way."""
+    try:
+        content = read_json(_source_file(_added_file(name)), _SOURCE_FORMAT, 1)
+    except UserError:
+        return None
+    return content if content.get("recipe") == ADDED_RECIPE and {"path", "sha256"} <= content.keys() else None
 
 
 def cache_folder() -> Path:
@@ -92,12 +127,12 @@ def write_face_model(stem: Path, model: FaceModel) -> None:
     tensors = {name: value for name in _TENSORS if (value := getattr(model, name)) is not None}
     integers = {name: value.to(torch.int32) for name, value in tensors.items() if not value.is_floating_point()}
     write_tensors(_tensor_file(stem), {**tensors, **integers})
-    content = {"name": model.name, "content_hash": model.content_hash, **{n: list(getattr(model, n)) for n in _LISTS}}
-    write_json(_json_file(stem), FORMAT, VERSION, content)
+    content = {"name": model.name, "content_hash": model.content_hash, "shareable": model.shareable}
+    write_json(_json_file(stem), FORMAT, VERSION, {**content, **{name: list(getattr(model, name)) for name in _LISTS}})
 
 
 def read_face_model(stem: Path, remedy: str = "delete it and load the model again") -> FaceModel:
-    """Read what `write_face_model` wrote; `remedy` is what to say where that fails.
+    """Read what `write_face_model` wrote, without landmarks; `remedy` is what to say where that fails.
 
     Raises:
         UserError: a file is missing, damaged or of another version.
@@ -107,6 +142,7 @@ def read_face_model(stem: Path, remedy: str = "delete it and load the model agai
     try:
         values: dict[str, Any] = {name: tuple(content[name]) for name in _LISTS}
         values.update({name: _widened(tensors[name]) for name in _TENSORS if name in tensors})
+        values["shareable"] = bool(content.get("shareable", True))
         model = FaceModel(name=content["name"], landmarks={}, **values)
     except (KeyError, TypeError) as error:
         raise UserError(f"{stem}: incomplete face model ({error}); {remedy}") from None
@@ -116,12 +152,14 @@ def read_face_model(stem: Path, remedy: str = "delete it and load the model agai
 
 
 def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
-    """The landmark sets that ship with mien for a face model (made by `python -m mien.tracking.landmark_embedding`).
+    """The landmark sets of a face model: those that ship with mien, or that were placed when the user added it.
 
     Raises:
         UserError: they were made for another mesh.
     """
-    file = resources.files("mien.face") / "data" / f"{name}_landmarks.json"
+    file: Any = resources.files("mien.face") / "data" / f"{name}_landmarks.json"
+    if not file.is_file():
+        file = _landmark_file(_added_file(name))
     if not file.is_file():
         return {}
     content = json.loads(file.read_text(encoding="utf-8"))
@@ -134,6 +172,49 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
         key: Landmarks(torch.tensor(marks["faces"]), torch.tensor(marks["barycentric"], dtype=model.template.dtype))
         for key, marks in content["landmarks"].items()
     }
+
+
+def write_landmarks(path: Path, model: FaceModel, command: str, error: float | None = None) -> None:
+    """Write a model's landmark sets as `read_landmarks` reads them; `error` is their median, pixels."""
+    content = {
+        "format": LANDMARK_FORMAT,
+        "version": LANDMARK_VERSION,
+        "face_model": model.name,
+        "topology_hash": model.topology_hash,
+        "content_hash": model.content_hash,
+        "command": command,
+        **({} if error is None else {"median_error_px": round(error, 3)}),
+        "landmarks": {
+            name: {"faces": marks.faces.tolist(), "barycentric": np.round(marks.barycentric.tolist(), 4).tolist()}
+            for name, marks in model.landmarks.items()
+        },
+    }
+    text = json.dumps(content, separators=(",", ":")).replace(',"', ',\n"') + "\n"
+
+    def write(temporary: Path) -> None:
+        temporary.write_text(text, encoding="utf-8")
+
+    write_atomically(path, write)
+
+
+def _added_file(name: str) -> Path:
+    return cache_folder() / "face_models" / "added" / name
+
+
+def _added_names() -> list[str]:
+    files = sorted((cache_folder() / "face_models" / "added").glob(f"*{_SOURCE_SUFFIX}"))
+    names = [file.name.removesuffix(_SOURCE_SUFFIX) for file in files]
+    return [name for name in names if added_from(name) is not None]
+
+
+def _read_added(name: str) -> FaceModel:
+    names = (*_SOURCES, *_added_names())
+    if name not in names:
+        raise UserError(
+            f"there is no face model {name!r}; choose one of: {', '.join(names)}, or give the path of a .npz or .pkl "
+            "in FLAME's schema"
+        )
+    return read_face_model(_added_file(name), f"add it again: mien face-models --add FILE --name {name}")
 
 
 def _read_if_sound(stem: Path) -> FaceModel | None:
@@ -156,10 +237,12 @@ def _tensor_file(stem: Path) -> Path:
     return stem.with_name(f"{stem.name}.safetensors")
 
 
-def _source(name: str) -> _Source:
-    if name not in _SOURCES:
-        raise UserError(f"there is no face model {name!r}; choose one of: {', '.join(_SOURCES)}")
-    return _SOURCES[name]
+def _landmark_file(stem: Path) -> Path:
+    return stem.with_name(f"{stem.name}.landmarks.json")
+
+
+def _source_file(stem: Path) -> Path:
+    return stem.with_name(f"{stem.name}{_SOURCE_SUFFIX}")
 
 
 def _cached_file(name: str, source: _Source) -> Path:

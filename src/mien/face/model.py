@@ -72,7 +72,11 @@ class FaceModel:
     landmarks: dict[str, Landmarks]
     """`mediapipe` (478 points) and `ibug68` (300-W's 68 points)."""
     pose_basis: Float[Tensor, "p v 3"] | None = None
-    """Pose correctives: p = 9 per free joint, times (R - I) of that joint."""
+    """Pose correctives: p = 9 per free joint, times (R - I) of that joint, row by row."""
+    expression_sigmas: Float[Tensor, " e"] | None = None
+    """Standard deviations of the coefficients over time, for trackers' priors; without, names tell (ARKit's)."""
+    shareable: bool = True
+    """Whether its licence lets an avatar carry a copy of it; else an avatar only names it, and is not exported."""
 
     @cached_property
     def content_hash(self) -> str:

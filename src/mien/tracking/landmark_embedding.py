@@ -5,7 +5,6 @@ look at the pictures, and take for each landmark the point of the surface that p
 The result ships with mien (src/mien/face/data), so that only who changes a face model's mesh has to run this.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -21,11 +20,10 @@ from mien.camera import Camera, camera_from_fov
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, Landmarks
-from mien.face.loading import LANDMARK_FORMAT, LANDMARK_VERSION, load_face_model_without_landmarks
+from mien.face.loading import load_face_model_without_landmarks, write_landmarks
 from mien.progress import say, track_progress
 from mien.render.mesh import Headlight, render_mesh
 from mien.rotation import rigid_transform
-from mien.storage import write_atomically
 from mien.tracking.landmark_groups import LANDMARKS, LEFT_IRIS, RIGHT_IRIS
 
 IBUG68 = (
@@ -106,29 +104,6 @@ def embed_landmarks(
     return {"mediapipe": mediapipe, "ibug68": Landmarks(faces[subset], barycentric[subset])}, errors
 
 
-def write_landmarks(path: Path, model: FaceModel, landmarks: dict[str, Landmarks], error: float) -> None:
-    """Write landmark sets as `mien.face.loading.read_landmarks` reads them; `error` is their median, pixels."""
-    content = {
-        "format": LANDMARK_FORMAT,
-        "version": LANDMARK_VERSION,
-        "face_model": model.name,
-        "topology_hash": model.topology_hash,
-        "content_hash": model.content_hash,
-        "command": f"python -m mien.tracking.landmark_embedding {model.name}",
-        "median_error_px": round(error, 3),
-        "landmarks": {
-            name: {"faces": marks.faces.tolist(), "barycentric": np.round(marks.barycentric.tolist(), 4).tolist()}
-            for name, marks in landmarks.items()
-        },
-    }
-    text = json.dumps(content, separators=(",", ":")).replace(',"', ',\n"') + "\n"
-
-    def write(temporary: Path) -> None:
-        temporary.write_text(text, encoding="utf-8")
-
-    write_atomically(path, write)
-
-
 def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.Generator) -> FaceParams:
     """One timestep of a random person with a mild expression, turned a little, at the world's origin.
 
@@ -142,6 +117,8 @@ def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.
     neutral = model.neutral()
     active = torch.rand(neutral.expression.shape, generator=generator) < 0.12
     strength = 0.35 * torch.rand(neutral.expression.shape, generator=generator)
+    if model.expression_sigmas is not None:
+        strength = 2 * strength * model.expression_sigmas * uniform(*neutral.expression.shape).sign()
     expression = active * strength
     opening, blink = _sometimes(0.5, generator), _sometimes(0.35, generator)
     for index, name in enumerate(model.expression_names):
@@ -280,7 +257,8 @@ def main(name: tyro.conf.Positional[str] = "anny", pictures: int = EmbeddingSett
     landmarks, errors = embed_landmarks(model, EmbeddingSettings(pictures=pictures))
     median = float(errors.median())
     path = Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
-    write_landmarks(path, model, landmarks, median)
+    command = f"python -m mien.tracking.landmark_embedding {name}"
+    write_landmarks(path, replace(model, landmarks=landmarks), command, median)
     say(f"{path}: median error {median:.2f} px, largest {float(errors.max()):.2f} px (landmark {int(errors.argmax())})")
 
 

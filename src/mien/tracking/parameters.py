@@ -8,9 +8,14 @@ from torch import Tensor
 
 from mien.face import FaceModel, FaceParams
 
-_JOINT_SIGMAS = {"eye": (0.4, 0.4, 0.0), "neck": (0.0, 0.0, 0.0)}
-"""Priors (radians) of joints by a word in their name: eyes do not roll, and a face shows nothing of its neck."""
+_JOINT_SIGMAS = {"eye": (0.4, 0.4, 0.0), "neck": (0.0, 0.0, 0.0), "jaw": (0.25, 0.05, 0.03)}
+"""Priors (radians) of joints by a word in their name: eyes do not roll, a face shows nothing of its neck, and a jaw
+opens (about x), shifts aside a little (about y) and hardly twists."""
+_JAW_BOUNDS = (-0.03, 0.6)
+"""Of the opening: teeth stop it one way, ligaments the other."""
 _OTHER_JOINT_SIGMAS = (0.2, 0.2, 0.2)
+_JAW_OPEN = 0.35
+"""Radians, of a wide open mouth."""
 _EYES_ALIKE_SIGMA = (0.1, 0.03)
 """How much the two eyes' angles (up-down, left-right) may differ, radians: they look at the same thing."""
 _EXPRESSION_SIGMAS = {
@@ -42,6 +47,8 @@ class ParameterLayout:
     upper: Float[Tensor, " p"]
     precision: Float[Tensor, "p p"]
     """Of the prior, whose mean is zero; zero for the head pose."""
+    units: Float[Tensor, " q"]
+    """What of each expression coefficient, then joint angle, moves a face about as much as 1 of ARKit's coefficients."""
 
     @property
     def size(self) -> int:
@@ -86,13 +93,16 @@ def layout_of(face_model: FaceModel) -> ParameterLayout:
     lower, upper = -free, free.clone()
     expression = slice(6, 6 + len(expression_index))
     lower[expression], upper[expression] = bounds[expression_index].unbind(-1)
-    prior_sigmas = [_expression_sigma(name) for name in names[expression]] + sigmas[joint_index].tolist()
+    for column, name in enumerate(names[6:], start=6):
+        if name == "jaw_x":
+            lower[column], upper[column] = _JAW_BOUNDS
+    prior_sigmas = _expression_sigmas(face_model)[expression_index].tolist() + sigmas[joint_index].tolist()
     precision = torch.zeros(len(names), len(names), dtype=torch.float64)
     precision.diagonal()[6:] = torch.tensor(prior_sigmas, dtype=torch.float64) ** -2
     _tie_eyes(precision, names)
     return ParameterLayout(
         tuple(names), expression_index, joint_index, expression_index[derived_column], derived_column,
-        len(bounds), len(joint_names), lower, upper, precision,
+        len(bounds), len(joint_names), lower, upper, precision, _units(face_model, expression_index, names),
     )  # fmt: skip
 
 
@@ -111,9 +121,24 @@ def _joint_sigmas(name: str) -> tuple[float, float, float]:
     return matches[0] if matches else _OTHER_JOINT_SIGMAS
 
 
+def _expression_sigmas(face_model: FaceModel) -> Float[Tensor, " e"]:
+    if face_model.expression_sigmas is not None:
+        return face_model.expression_sigmas.double()
+    return torch.tensor([_expression_sigma(name) for name in face_model.expression_names], dtype=torch.float64)
+
+
 def _expression_sigma(name: str) -> float:
     matches = [sigma for word, sigma in _EXPRESSION_SIGMAS.items() if name.startswith(word)]
     return matches[0] if matches else _OTHER_EXPRESSION_SIGMA
+
+
+def _units(face_model: FaceModel, expression_index: Int[Tensor, " n"], names: list[str]) -> Float[Tensor, " q"]:
+    units = torch.ones(len(names) - 6, dtype=torch.float64)
+    if face_model.expression_sigmas is not None:
+        relative = _expression_sigmas(face_model)[expression_index] / _OTHER_EXPRESSION_SIGMA
+        units[: len(expression_index)] = relative
+    units[len(expression_index) :] = _JAW_OPEN
+    return units
 
 
 def _tie_eyes(precision: Float[Tensor, "p p"], names: list[str]) -> None:
@@ -129,5 +154,5 @@ def pose_only(layout: ParameterLayout) -> ParameterLayout:
     none = torch.zeros(0, dtype=torch.long)
     return ParameterLayout(
         layout.names[:6], none, none, none, none, layout.expressions, layout.joints,
-        layout.lower[:6], layout.upper[:6], layout.precision[:6, :6],
+        layout.lower[:6], layout.upper[:6], layout.precision[:6, :6], layout.units[:0],
     )  # fmt: skip

@@ -226,9 +226,9 @@ def smoothness_of(
     if cameras is not None:
         along_sight = cameras.viewmat[0, 2, :3] ** 2 if len(cameras) == 1 else torch.zeros_like(along_sight)
     sigmas[3:6] = settings.translation + (settings.depth - settings.translation) * along_sight
-    names = layout.names[layout.expression_columns]
-    slow = torch.tensor([not name.startswith("eye") for name in names], dtype=torch.bool)
-    sigmas[layout.expression_columns][slow] = settings.expression
+    # Eyes and lids may jump; a neck is not moved by fits.
+    slow = torch.tensor(["eye" not in name.lower() for name in layout.names[6:]], dtype=torch.bool)
+    sigmas[6:] = torch.where(slow, settings.expression * layout.units, torch.inf)
     frames = valid.nonzero()[:, 0]
     linked = torch.zeros(len(frames), dtype=torch.bool)
     if len(frames) > 2:

@@ -11,8 +11,9 @@ from typing import Literal
 
 from mien.capture import Capture, read_capture, read_capture_hash
 from mien.capture.video import count_frames
+from mien.commands.stages.face_models import face_model_of
 from mien.errors import UserError
-from mien.face import FaceModel, load_face_model
+from mien.face import FaceModel
 from mien.progress import say
 from mien.tracking import (
     Tracking,
@@ -41,17 +42,17 @@ Overlay = Literal["auto", "all", "none"]
 
 def tracking_stage(
     workspace: Workspace,
-    face_model_name: str,
+    face_model_choice: str,
     settings: TrackingSettings,
     again: bool = False,
     overlay: Overlay = "auto",
 ) -> dict[str, Tracking]:
     """Track all sequences of a workspace together, with one identity; current trackings are read back.
 
-    Writes overlays and, once for ever, the scoring masks. Sequences with too few faces are left out, unless that leaves
+    The face model is given by its name or by a file (`face_model_of`). Writes overlays and, once for ever, the scoring masks. Sequences with too few faces are left out, unless that leaves
     none; returns the others' trackings by name.
     """
-    face_model = load_face_model(face_model_name)
+    face_model = face_model_of(face_model_choice)
     names = workspace.sequence_names()
     if not names:
         raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")

@@ -1,0 +1,118 @@
+"""Texture coordinates for a head that came without: its outside as seen from its middle, and the rest in cells."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+_HEAD_BOX = (0.005, 0.255, 0.99, 0.74)
+_CELLS_BOX = (0.005, 0.005, 0.99, 0.24)
+"""Where things go: left, bottom, width, height."""
+_FROM = (-0.03, 0.02)
+"""Height and depth of the point from which the outside is seen, metres in the head frame: mid-head, behind the mouth."""
+_FLAT = 0.02
+"""A triangle that fills less than so much of its cosine is seen from its edge."""
+
+
+def outside_of(template: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+    """Which triangles the outside of the head's largest piece has; not so what is inside mouth, nostrils and lids."""
+    return _outside(*_seen_from_within(template), faces)
+
+
+def unwrap(
+    template: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "u 2"], Int[np.ndarray, "f 3"]]:
+    """Texture coordinates (v upwards) without overlaps worth mentioning, and the indices of every triangle's.
+
+    The largest piece's outside is drawn by angle from a point in the head, which keeps neighbours together. What lies
+    behind something (inside of the mouth, of nostrils, of lids), turns its back, is a piece of its own (eyeballs) or
+    crosses the seam at the back of the head gets a cell for each triangle.
+    """
+    rays, flat = _seen_from_within(template)
+    outside = _outside(rays, flat, faces)
+    uv = _fit(flat, outside, faces)
+    boxed = faces.copy()
+    cells = np.flatnonzero(~outside)
+    boxed[cells] = len(template) + np.arange(3 * len(cells)).reshape(-1, 3)
+    return np.concatenate([uv, _cells(len(cells))]), boxed
+
+
+def _seen_from_within(template: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 2"]]:
+    """Rays from a point in the head to all vertices, and their angles."""
+    rays = template - np.array([0.0, *_FROM])
+    azimuth = np.arctan2(rays[:, 0], rays[:, 2])
+    elevation = np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))
+    # Texels where the face is: the back of the head gets half as many.
+    return rays, np.stack([np.sign(azimuth) * (np.abs(azimuth) - 0.08 * azimuth**2), elevation], axis=1)
+
+
+def _outside(
+    rays: Float[np.ndarray, "v 3"], flat: Float[np.ndarray, "v 2"], faces: Int[np.ndarray, "f 3"]
+) -> Bool[np.ndarray, " f"]:
+    pieces = _pieces(faces, len(rays))
+    a, b, c = rays[faces].swapaxes(0, 1)
+    normal = np.cross(b - a, c - a)
+    middle = (a + b + c) / 3
+    facing = (normal * middle).sum(1)
+    facing /= np.maximum(np.linalg.norm(normal, axis=1) * np.linalg.norm(middle, axis=1), 1e-12)
+    names, counts = np.unique(pieces, return_counts=True)
+    seen = (pieces == names[counts.argmax()]) & (facing > _FLAT) & (np.ptp(flat[faces, 0], axis=1) < 1.0)
+    # Inner layers (a mouth's back wall) face outwards as well, but turned triangles part them from the outside.
+    together = edge_connected(faces, seen)
+    names, counts = np.unique(together[seen], return_counts=True)
+    return together == names[counts.argmax()]
+
+
+def _pieces(faces: Int[np.ndarray, "f 3"], vertices: int) -> Int[np.ndarray, " f"]:
+    """Which connected piece of the mesh every triangle belongs to, by the lowest vertex in it."""
+    label = np.arange(vertices)
+    while True:
+        least = label[faces].min(1)
+        before = label.copy()
+        for corner in range(3):
+            np.minimum.at(label, faces[:, corner], least)
+        label = label[label]
+        if (label == before).all():
+            return label[faces[:, 0]]
+
+
+def edge_connected(faces: Int[np.ndarray, "f 3"], chosen: Bool[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
+    """Label of the component, over shared edges, of every chosen triangle; -1 for the others."""
+    every, faces = np.full(len(faces), -1), faces[chosen]
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    owner = np.tile(np.arange(len(faces)), 3)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    edges, owner = edges[order], owner[order]
+    same = (edges[1:] == edges[:-1]).all(1)
+    first, second = owner[:-1][same], owner[1:][same]
+    label = np.arange(len(faces))
+    while True:
+        before = label.copy()
+        least = np.minimum(label[first], label[second])
+        np.minimum.at(label, first, least)
+        np.minimum.at(label, second, least)
+        label = label[label]
+        if (label == before).all():
+            every[chosen] = label
+            return every
+
+
+def _fit(
+    flat: Float[np.ndarray, "v 2"], outside: Bool[np.ndarray, " f"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "v 2"]:
+    used = flat[np.unique(faces[outside])]
+    low, high = used.min(0), used.max(0)
+    box = np.array(_HEAD_BOX)
+    return np.clip(box[:2] + (flat - low) / (high - low) * box[2:], box[:2], box[:2] + box[2:])
+
+
+def _cells(count: int) -> Float[np.ndarray, "n 2"]:
+    """Corners of `count` right-angled triangles, two in a square cell."""
+    left, bottom, width, height = _CELLS_BOX
+    squares = max(1, (count + 1) // 2)
+    rows = max(1, int(np.sqrt(squares * height / width)))
+    columns = -(-squares // rows)
+    index = np.arange(count)
+    row, column = np.divmod(index // 2, columns)
+    lower = np.array([[0.1, 0.1], [0.7, 0.1], [0.1, 0.7]])
+    corners = np.where((index % 2 == 0)[:, None, None], lower, 1 - lower)
+    place = np.stack([column, row], axis=1)[:, None]
+    return (np.array([left, bottom]) + (place + corners) / np.array([columns, rows]) * [width, height]).reshape(-1, 2)

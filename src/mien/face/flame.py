@@ -1,0 +1,248 @@
+"""Reads a head model in FLAME's schema (Li et al. 2017, "Learning a model of facial shape and expression ...").
+
+The schema is that of SMPL: a template, one linear basis whose first columns are identity and whose last are expression,
+joints regressed from vertices, correctives linear in the joints' rotation matrices, linear blend skinning. FLAME's own
+files are its users' to fetch (flame.is.tue.mpg.de) and their licence's to obey; mien ships none of them, and any model
+in this schema will do.
+
+FLAME's chain starts at the shoulders: root, neck (which turns the whole head), then jaw and eyes. A mien head starts at
+the head, so that its pose is the head's pose. The same motions are reached from the other end: FLAME's neck joint turned
+by R is a mien head turned by R (after FLAME's root) whose neck is turned by the inverse of R, about the same point.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from mien.errors import UserError
+from mien.face.chart import unwrap
+from mien.face.inert_pickle import read_inert_pickle
+from mien.face.model import FaceModel
+
+JOINTS = ("head", "neck", "jaw", "left_eye", "right_eye")
+REGIONS = ("skin", "neck", "eyes", "irises")
+"""Those that skinning weights tell apart; `mien.tracking.regions` tells more, by landmarks."""
+
+_CHAIN = (-1, 0, 1, 1, 1)
+"""FLAME's: the root, the neck on it, jaw and eyes on the neck."""
+_SPLITS = {400: 300}
+"""Identity directions of a basis with so many columns: FLAME 2020 and 2023."""
+_LARGEST_COEFFICIENT = 3.0
+"""FLAME's coefficients are in standard deviations."""
+_EYE_BACK = 0.08
+"""Metres from the midpoint of the eyeballs' centres back to the origin of the head frame, as in the anny model."""
+_IRIS_RADIUS = 0.0061
+"""Metres; people hardly differ."""
+_SIZES = (0.1, 0.6)
+"""Metres that a head with its neck may be high."""
+_SHAPES = {
+    "v_template": "v 3", "f": "f 3", "shapedirs": "v 3 n", "posedirs": "v 3 36", "J_regressor": "5 v", "weights": "v 5",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class FlameFile:
+    """The arrays of a file in FLAME's schema, checked."""
+
+    template: Float[np.ndarray, "v 3"]
+    """Metres, +x to the subject's left, +y up, +z ahead."""
+    faces: Int[np.ndarray, "f 3"]
+    identity: Float[np.ndarray, "i v 3"]
+    expression: Float[np.ndarray, "e v 3"]
+    correctives: Float[np.ndarray, "36 v 3"]
+    """Times R - I, row by row, of neck, jaw, left eye, right eye."""
+    regressor: Float[np.ndarray, "5 v"]
+    weights: Float[np.ndarray, "v 5"]
+    uv: Float[np.ndarray, "u 2"] | None
+    """v upwards."""
+    uv_faces: Int[np.ndarray, "f 3"] | None
+
+
+def read_flame(path: Path) -> FlameFile:
+    """Read a .npz or .pkl in FLAME's schema; a pickle is read without running anything in it.
+
+    Raises:
+        UserError: the file is missing, damaged, or lacks something; the message names the key and what to do.
+    """
+    arrays = _arrays_of(path)
+    for key in _SHAPES:
+        if key not in arrays:
+            raise UserError(f"{path}: has no {key!r}, so it is not in FLAME's schema; {_remedy(arrays)}")
+    sizes: dict[str, int] = {}
+    for key, wanted in _SHAPES.items():
+        _check_shape(path, key, arrays[key], wanted, sizes)
+    _check_chain(path, arrays.get("kintree_table"))
+    split = _identities(path, arrays, sizes["n"])
+    faces = _indices(path, "f", arrays["f"], sizes["v"])
+    uv, uv_faces = arrays.get("vt"), arrays.get("ft")
+    if uv is not None and uv_faces is not None:
+        if uv.ndim != 2 or uv.shape[1] != 2 or uv_faces.shape != faces.shape:
+            raise UserError(f"{path}: 'vt' {uv.shape} and 'ft' {uv_faces.shape} are no texture coordinates of 'f' "
+                            f"{faces.shape}; leave both out, and they are made")  # fmt: skip
+        uv_faces = _indices(path, "ft", uv_faces, len(uv))
+    shapes = np.moveaxis(arrays["shapedirs"], 2, 0).astype(np.float64)
+    flame = FlameFile(
+        arrays["v_template"].astype(np.float64), faces, shapes[:split], shapes[split:],
+        np.moveaxis(arrays["posedirs"], 2, 0).astype(np.float64), arrays["J_regressor"].astype(np.float64),
+        arrays["weights"].astype(np.float64), uv if uv_faces is not None else None, uv_faces if uv is not None else None,
+    )  # fmt: skip
+    _check_sense(path, flame)
+    return flame
+
+
+def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> FaceModel:
+    """A file in FLAME's schema as a face model without landmarks; `shareable` as in `FaceModel`."""
+    joints = flame.regressor @ flame.template
+    eyes = [flame.weights[:, joint] > 0.5 for joint in (3, 4)]
+    centres = np.stack([flame.template[eye].mean(0) for eye in eyes])
+    origin = centres.mean(0) - np.array([0.0, 0.0, _EYE_BACK])
+    # FLAME's root segment is mien's neck, its neck segment mien's head; each turns about FLAME's neck joint.
+    order = [1, 0, 2, 3, 4]
+    pivots = joints[[1, 1, 2, 3, 4]] - origin
+    pivots[0] = 0
+    basis = np.einsum("kv,ivc->ikc", flame.regressor, flame.identity)[:, [1, 1, 2, 3, 4]]
+    basis[:, 0] = 0
+    correctives = flame.correctives.reshape(4, 3, 3, -1, 3).copy()
+    correctives[0] = correctives[0].swapaxes(0, 1)  # of the inverse of the neck's rotation
+    if flame.uv is None or flame.uv_faces is None:
+        uv, uv_faces = unwrap(flame.template - origin, flame.faces)
+    else:
+        uv, uv_faces = flame.uv, flame.uv_faces
+    e = len(flame.expression)
+    no_motion = torch.zeros(e, len(JOINTS), 3)
+    return FaceModel(
+        name=name,
+        template=_tensor(flame.template - origin),
+        faces=torch.from_numpy(flame.faces),
+        uv=_tensor(uv),
+        uv_faces=torch.from_numpy(uv_faces),
+        region_names=REGIONS,
+        face_regions=torch.from_numpy(_regions(flame, eyes, centres)),
+        identity_basis=_tensor(flame.identity),
+        expression_basis=_tensor(flame.expression),
+        expression_names=tuple(f"expression_{index:03d}" for index in range(e)),
+        expression_bounds=torch.tensor([[-_LARGEST_COEFFICIENT, _LARGEST_COEFFICIENT]]).repeat(e, 1),
+        expression_sigmas=torch.ones(e),
+        joint_names=JOINTS,
+        joint_parents=(-1, 0, 0, 0, 0),
+        joint_free=(False, True, True, True, True),
+        joint_template=_tensor(pivots),
+        joint_identity_basis=_tensor(basis),
+        joint_rotation_basis=no_motion,
+        joint_translation_basis=no_motion.clone(),
+        skinning_weights=_tensor(flame.weights[:, order]),
+        pose_basis=_tensor(correctives.reshape(36, -1, 3)),
+        landmarks={},
+        shareable=shareable,
+    )
+
+
+def _tensor(values: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+
+
+def _regions(flame: FlameFile, eyes: list[np.ndarray], centres: Float[np.ndarray, "2 3"]) -> Int[np.ndarray, " f"]:
+    regions = np.zeros(len(flame.faces), np.int64)
+    regions[(flame.weights[:, 0] > 0.5)[flame.faces].all(1)] = REGIONS.index("neck")
+    for ball, centre in zip(eyes, centres, strict=True):
+        rays = flame.template - centre
+        ahead = (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < _IRIS_RADIUS)
+        triangles = ball[flame.faces].all(1)
+        regions[triangles] = REGIONS.index("eyes")
+        regions[triangles & ahead[flame.faces].all(1)] = REGIONS.index("irises")
+    return regions
+
+
+def _arrays_of(path: Path) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz")
+    if path.suffix.lower() == ".npz":
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                return {key: file[key] for key in file.files}
+        except Exception as error:  # a damaged archive may fail in any way
+            raise UserError(f"{path}: cannot be read as .npz ({error}); save plain arrays with numpy.savez") from None
+    if path.suffix.lower() in (".pkl", ".pickle"):
+        return {key: np.asarray(value) for key, value in read_inert_pickle(path).items()}
+    raise UserError(f"{path}: is neither .npz nor .pkl; give a head model in FLAME's schema as one of these")
+
+
+def _remedy(arrays: dict[str, np.ndarray]) -> str:
+    if {"lmk_face_idx", "lmk_bary_coords"} & arrays.keys():
+        return "this is a landmark embedding: give the model itself (generic_model.pkl or flame2023.pkl)"
+    if {"mean", "tex_dir"} & arrays.keys():
+        return "this is FLAME's texture space: give the model itself (generic_model.pkl or flame2023.pkl)"
+    return f"it needs {', '.join(_SHAPES)} and kintree_table (here: {', '.join(sorted(arrays)) or 'nothing'})"
+
+
+def _check_shape(path: Path, key: str, array: np.ndarray, wanted: str, sizes: dict[str, int]) -> None:
+    fits = array.ndim == len(wanted.split()) and array.dtype.kind in "iuf"
+    for size, symbol in zip(array.shape, wanted.split(), strict=False):
+        fits = fits and size == (int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)) and size > 0
+    if not fits:
+        known = " ".join(str(sizes.get(symbol, symbol)) for symbol in wanted.split())
+        raise UserError(
+            f"{path}: {key!r} is {array.dtype} [{' '.join(map(str, array.shape))}], but has to be numbers [{known}]; "
+            "give a head model in FLAME's schema"
+        )
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise UserError(f"{path}: {key!r} holds numbers that are not finite; download it again")
+
+
+def _check_chain(path: Path, table: np.ndarray | None) -> None:
+    if table is None:
+        raise UserError(f"{path}: has no 'kintree_table', which says how its joints hang together; add FLAME's")
+    # The root's parent is -1, or 2**32 - 1 where it was written without a sign.
+    parents = table[0].astype(np.int64) if table.ndim == 2 and table.dtype.kind in "iuf" else np.zeros(0)
+    parents = np.where(parents == 2**32 - 1, -1, parents)
+    if tuple(parents) != _CHAIN:
+        raise UserError(
+            f"{path}: 'kintree_table' gives the joints the parents {tuple(parents.tolist())}, but FLAME's are {_CHAIN} "
+            "(root; neck; jaw, left and right eye on the neck); body models (SMPL, SMPL-X) do not fit: give a head"
+        )
+
+
+def _identities(path: Path, arrays: dict[str, np.ndarray], columns: int) -> int:
+    given = arrays.get("identities")
+    split = _SPLITS.get(columns) if given is None else int(given)
+    if split is None:
+        raise UserError(
+            f"{path}: 'shapedirs' has {columns} directions; FLAME's 400 are 300 of identity, then 100 of expression. "
+            "Say how many of yours are identity: add a number 'identities' to the .npz"
+        )
+    if not 0 < split < columns:
+        raise UserError(
+            f"{path}: {split} of the {columns} directions of 'shapedirs' would be identity, which leaves no expression "
+            "or no identity; correct 'identities'"
+        )
+    return split
+
+
+def _indices(path: Path, key: str, values: np.ndarray, count: int) -> Int[np.ndarray, "f 3"]:
+    values = values.astype(np.int64)
+    if values.min() < 0 or values.max() >= count:
+        raise UserError(f"{path}: {key!r} names vertex {values.max()} of {count}; download it again")
+    return values
+
+
+def _check_sense(path: Path, flame: FlameFile) -> None:
+    """Units, axes and joints, which shapes do not show."""
+    height = float(np.ptp(flame.template[:, 1]))
+    if not _SIZES[0] < height < _SIZES[1]:
+        raise UserError(
+            f"{path}: 'v_template' is {height:g} high; it has to be in metres with y upwards ({_SIZES[0]:g} to "
+            f"{_SIZES[1]:g}): scale it, and with it 'shapedirs' and 'posedirs'"
+        )
+    if not np.allclose(flame.weights.sum(1), 1, atol=1e-3) or flame.weights.min() < -1e-6:
+        raise UserError(f"{path}: 'weights' of a vertex do not add up to 1 or are negative; give FLAME's weights")
+    left, right = (flame.weights[:, joint] > 0.5 for joint in (3, 4))
+    if not left.any() or not right.any():
+        raise UserError(f"{path}: 'weights' give no vertex to an eye: the model needs both eyeballs")
+    ahead = flame.template[left | right].mean(0) - flame.template[flame.weights[:, 1] > 0.5].mean(0)
+    if flame.template[left, 0].mean() <= flame.template[right, 0].mean() or ahead[2] <= 0:
+        raise UserError(
+            f"{path}: the eyes are not where FLAME's are; 'v_template' needs +x to the subject's left, +y up, +z ahead"
+        )
