@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mien.face import FaceModel
+from mien.face import FaceModel, Landmarks
 from mien.rotation import matrix_from_axis_angle
 
 IDENTITIES, EXPRESSIONS = 40, 24
@@ -23,13 +23,7 @@ _SHIFT = np.array([0.003, -0.021, -0.044])
 
 def flame_like(anny: FaceModel) -> dict[str, np.ndarray]:
     """The arrays of a file in FLAME's schema."""
-    random = np.random.default_rng(5)
-    kept = ~anny.region_mask("teeth", "tongue").numpy()
-    faces = anny.faces.numpy()[kept]
-    order = random.permutation(np.unique(faces))
-    new_index = np.full(len(anny.template), -1)
-    new_index[order] = np.arange(len(order))
-    faces = np.roll(new_index[faces], 1, axis=1)[random.permutation(len(faces))]
+    order, faces, _ = _cut(anny)
     template = anny.template.double().numpy()[order]
     weights, jaw, hinge, residual = _joints(anny, order, template)
     posedirs = np.zeros((4, 3, 3, len(order), 3))
@@ -39,8 +33,7 @@ def flame_like(anny: FaceModel) -> dict[str, np.ndarray]:
     posedirs[2:] = eyes
     # A neck that twists its skin a little, so that a transposed rotation shows.
     posedirs[0, 0, 2] = 0.01 * weights[:, :1] * weights[:, 1:2] * np.array([1.0, 0.3, 0.2])
-    expression = _expression_basis(anny, order, random)
-    # In the skin that follows the jaw, an expression is what is left once the jaw is still.
+    expression = _expression_basis(anny, order)
     identity = anny.identity_basis.double().numpy()[:IDENTITIES, order]
     return {
         "v_template": template + _SHIFT,
@@ -52,6 +45,30 @@ def flame_like(anny: FaceModel) -> dict[str, np.ndarray]:
         "kintree_table": np.array([[2**32 - 1, 0, 1, 1, 1], [0, 1, 2, 3, 4]], np.int64),
         "identities": np.array(IDENTITIES),
     }
+
+
+def _cut(anny: FaceModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which vertices are there, in which order; their triangles; which of anny's each triangle was."""
+    random = np.random.default_rng(5)
+    kept = np.flatnonzero(~anny.region_mask("teeth", "tongue").numpy())
+    order = random.permutation(np.unique(anny.faces.numpy()[kept]))
+    new_index = np.full(len(anny.template), -1)
+    new_index[order] = np.arange(len(order))
+    source = random.permutation(kept)
+    return order, np.roll(new_index[anny.faces.numpy()[source]], 1, axis=1), source
+
+
+def exact_landmarks(anny: FaceModel) -> dict[str, Landmarks]:
+    """Where anny's landmarks are on the other mesh: what a detector need not be asked in a test."""
+    _, _, source = _cut(anny)
+    triangle = torch.full((len(anny.faces),), -1)
+    triangle[torch.from_numpy(source)] = torch.arange(len(source))
+    return {name: Landmarks(triangle[m.faces], m.barycentric.roll(1, 1)) for name, m in anny.landmarks.items()}
+
+
+def true_regions(anny: FaceModel) -> np.ndarray:
+    """The name of anny's region that every triangle is in."""
+    return np.array(anny.region_names)[anny.face_regions.numpy()[_cut(anny)[2]]]
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> Path:
@@ -128,8 +145,9 @@ def _regressor(template: np.ndarray, weights: np.ndarray, hinge: np.ndarray) -> 
     return regressor
 
 
-def _expression_basis(anny: FaceModel, order: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def _expression_basis(anny: FaceModel, order: np.ndarray) -> np.ndarray:
     """Principal directions, of unit variance, of random mixtures of what is neither jaw nor gaze."""
+    random = np.random.default_rng(6)
     names = anny.expression_names
     use = [i for i, n in enumerate(names) if not n.startswith(("jaw", "eyeLook", "mouthClose", "tongue"))]
     deltas = anny.expression_basis.double().numpy()[use][:, order].reshape(len(use), -1)
@@ -142,10 +160,15 @@ def _expression_basis(anny: FaceModel, order: np.ndarray, random: np.random.Gene
     return (mixtures @ deltas).reshape(EXPRESSIONS, -1, 3)
 
 
-def posed_as_flame(arrays: dict[str, np.ndarray], pose: np.ndarray, shape: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Vertices [v, 3] by FLAME's own formulas: pose [5, 3] axis-angles of root, neck, jaw, eyes; all coefficients."""
+def posed_as_flame(
+    arrays: dict[str, np.ndarray], pose: np.ndarray, shape: np.ndarray, shift: np.ndarray, rest: np.ndarray
+) -> np.ndarray:
+    """Vertices [v, 3] by FLAME's own formulas: pose [5, 3] axis-angles of root, neck, jaw, eyes; all coefficients.
+
+    `rest` is the person without expression, from which the joints are regressed.
+    """
     shaped = arrays["v_template"] + arrays["shapedirs"].astype(np.float64) @ shape
-    joints = arrays["J_regressor"] @ shaped
+    joints = arrays["J_regressor"] @ rest
     turns = matrix_from_axis_angle(torch.from_numpy(pose)).numpy()
     posed = shaped + arrays["posedirs"].astype(np.float64) @ (turns[1:] - np.eye(3)).ravel()
     chain: list[tuple[np.ndarray, np.ndarray]] = []

@@ -157,7 +157,7 @@ def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path: Path) -> None:
 
 
 def test_face_models_that_may_not_be_passed_on_are_not(tmp_path: Path) -> None:
-    write_avatar(tmp_path, new_avatar(face_model=replace(toy_face_model(), name="flame")))
+    write_avatar(tmp_path, new_avatar(face_model=replace(toy_face_model(), name="flame", shareable=False)))
     assert not list(tmp_path.glob("face_model*"))
     with pytest.raises(UserError, match="flame"):
         load_avatar(tmp_path)

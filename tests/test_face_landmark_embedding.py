@@ -1,6 +1,7 @@
 """Placing landmarks: exact where the answer is known, repeatable where a detector looks."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,7 +15,6 @@ from mien.tracking.landmark_embedding import (
     Views,
     _best_point,
     embed_landmarks,
-    write_landmarks,
 )
 from small_face_model import make_small_face_model
 
@@ -74,7 +74,7 @@ def test_written_landmarks_are_read_by_the_loader(few, tmp_path, monkeypatch):
     model, landmarks, _ = few
     (tmp_path / "data").mkdir()
     path = tmp_path / "data" / "anny_landmarks.json"
-    write_landmarks(path, model, landmarks, 2.5)
+    loading.write_landmarks(path, replace(model, landmarks=landmarks), "a command", 2.5)
     assert path.stat().st_size < 100_000
     assert json.loads(path.read_text())["topology_hash"] == model.topology_hash
     monkeypatch.setattr(loading.resources, "files", lambda package: tmp_path)

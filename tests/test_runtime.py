@@ -188,6 +188,6 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
 
 def test_face_models_that_may_not_be_passed_on_are_not() -> None:
     avatar = new_avatar("gaussian_avatars")
-    avatar.face_model = replace(avatar.face_model, name="flame")
-    with pytest.raises(UserError, match="does not allow"):
+    avatar.face_model = replace(avatar.face_model, name="flame", shareable=False)
+    with pytest.raises(UserError, match="not known to allow"):
         make_portable(avatar, toy_camera(SIZE), "toy")

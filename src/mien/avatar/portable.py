@@ -36,8 +36,9 @@ def make_portable(avatar: Avatar, camera: Camera, name: str) -> PortableAvatar:
     model, subject = avatar.face_model, avatar.subject
     if not model.shareable:
         raise UserError(
-            f"{name}: a .mien file holds parts of the face model {model.name!r}, whose licence does not allow them to "
-            "be passed on; export a .ply instead, or train with another --face-model"
+            f"{name}: a .mien file holds parts of the face model {model.name!r}, whose licence is not known to allow "
+            "that; export a .ply instead, train with another --face-model, or, if it does, say so: mien face-models "
+            f"--add FILE --name {model.name} --shareable"
         )
     licences = {info.name: info.licence for info in available_face_models()}
     return PortableAvatar(

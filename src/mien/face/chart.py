@@ -7,7 +7,7 @@ _HEAD_BOX = (0.005, 0.255, 0.99, 0.74)
 _CELLS_BOX = (0.005, 0.005, 0.99, 0.24)
 """Where things go: left, bottom, width, height."""
 _FROM = (-0.03, 0.02)
-"""Height and depth of the point from which the outside is seen, metres in the head frame: mid-head, behind the mouth."""
+"""Height and depth of the point from which the outside is seen, metres in the head frame: behind the mouth."""
 _FLAT = 0.02
 """A triangle that fills less than so much of its cosine is seen from its edge."""
 

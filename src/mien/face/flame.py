@@ -6,8 +6,9 @@ files are its users' to fetch (flame.is.tue.mpg.de) and their licence's to obey;
 in this schema will do.
 
 FLAME's chain starts at the shoulders: root, neck (which turns the whole head), then jaw and eyes. A mien head starts at
-the head, so that its pose is the head's pose. The same motions are reached from the other end: FLAME's neck joint turned
-by R is a mien head turned by R (after FLAME's root) whose neck is turned by the inverse of R, about the same point.
+the head, so that its pose is the head's pose. The same motions are reached from the other end: FLAME's neck joint
+turned by R is a mien head turned by R (after FLAME's root) whose neck is turned by the inverse of R, about the same
+point.
 """
 
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ _EYE_BACK = 0.08
 """Metres from the midpoint of the eyeballs' centres back to the origin of the head frame, as in the anny model."""
 _IRIS_RADIUS = 0.0061
 """Metres; people hardly differ."""
+_QUANTUM = 1e-7
 _SIZES = (0.1, 0.6)
 """Metres that a head with its neck may be high."""
 _SHAPES = {
@@ -77,7 +79,7 @@ def read_flame(path: Path) -> FlameFile:
     _check_chain(path, arrays.get("kintree_table"))
     split = _identities(path, arrays, sizes["n"])
     faces = _indices(path, "f", arrays["f"], sizes["v"])
-    uv, uv_faces = arrays.get("vt"), arrays.get("ft")
+    uv, uv_faces = (arrays["vt"], arrays["ft"]) if {"vt", "ft"} <= arrays.keys() else (None, None)
     if uv is not None and uv_faces is not None:
         if uv.ndim != 2 or uv.shape[1] != 2 or uv_faces.shape != faces.shape:
             raise UserError(f"{path}: 'vt' {uv.shape} and 'ft' {uv_faces.shape} are no texture coordinates of 'f' "
@@ -87,7 +89,7 @@ def read_flame(path: Path) -> FlameFile:
     flame = FlameFile(
         arrays["v_template"].astype(np.float64), faces, shapes[:split], shapes[split:],
         np.moveaxis(arrays["posedirs"], 2, 0).astype(np.float64), arrays["J_regressor"].astype(np.float64),
-        arrays["weights"].astype(np.float64), uv if uv_faces is not None else None, uv_faces if uv is not None else None,
+        arrays["weights"].astype(np.float64), uv, uv_faces,
     )  # fmt: skip
     _check_sense(path, flame)
     return flame
@@ -115,9 +117,9 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
     no_motion = torch.zeros(e, len(JOINTS), 3)
     return FaceModel(
         name=name,
-        template=_tensor(flame.template - origin),
+        template=_rounded(flame.template - origin),
         faces=torch.from_numpy(flame.faces),
-        uv=_tensor(uv),
+        uv=_rounded(uv),
         uv_faces=torch.from_numpy(uv_faces),
         region_names=REGIONS,
         face_regions=torch.from_numpy(_regions(flame, eyes, centres)),
@@ -129,8 +131,8 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
         joint_names=JOINTS,
         joint_parents=(-1, 0, 0, 0, 0),
         joint_free=(False, True, True, True, True),
-        joint_template=_tensor(pivots),
-        joint_identity_basis=_tensor(basis),
+        joint_template=_rounded(pivots),
+        joint_identity_basis=_rounded(basis),
         joint_rotation_basis=no_motion,
         joint_translation_basis=no_motion.clone(),
         skinning_weights=_tensor(flame.weights[:, order]),
@@ -142,6 +144,11 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
 
 def _tensor(values: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+
+
+def _rounded(values: np.ndarray) -> torch.Tensor:
+    """What was worked out, to 0.1 micrometres: the last digits depend on the machine, and would change the hash."""
+    return _tensor(np.round(values / _QUANTUM) * _QUANTUM + 0.0)
 
 
 def _regions(flame: FlameFile, eyes: list[np.ndarray], centres: Float[np.ndarray, "2 3"]) -> Int[np.ndarray, " f"]:

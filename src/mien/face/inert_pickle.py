@@ -24,14 +24,19 @@ class _StandIn(dict):
 
     name = ""
     """Module and name in the pickle."""
+    arguments: tuple[Any, ...] = ()
+    state: Any = None
 
     def __new__(cls, *arguments: Any, **_: Any) -> "_StandIn":
         made = super().__new__(cls)
-        made.arguments, made.state = arguments, None  # type: ignore[attr-defined]
+        made.arguments = arguments
         return made
 
     def __init__(self, *_: Any, **__: Any):
         super().__init__()
+
+    def __call__(self, *_: Any, **__: Any) -> "_StandIn":
+        return _StandIn()
 
     def __setstate__(self, state: Any) -> None:
         self.state = state
@@ -89,8 +94,9 @@ def _plain(value: Any) -> Any:
     if value.name.endswith("._reconstruct"):
         return _array(value.state)
     if value.name.endswith("._frombuffer"):
-        raw, kind, shape, order = value.arguments  # type: ignore[attr-defined]
-        return _array((1, shape, kind, order == "F", bytes(raw)))
+        raw, kind, shape, order, *axes = value.arguments
+        array = _array((1, shape, kind, order == "F", bytes(raw)))
+        return array.transpose(axes[0]) if array is not None and order == "K" and axes else array
     if not isinstance(value.state, dict):
         return None
     if {"data", "indices", "indptr"} <= value.state.keys():

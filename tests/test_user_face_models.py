@@ -1,0 +1,183 @@
+"""A face model of the user's from its file to an avatar: added once, then tracked, trained and exported by its name."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from flame_like import exact_landmarks, flame_like, write_npz
+from mien.avatar import load_avatar, make_portable
+from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
+from mien.capture import Capture, write_capture
+from mien.cli import main
+from mien.commands.stages import face_models as stage
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams, available_face_models, load_face_model
+from mien.face.loading import cache_folder
+from mien.runtime import load as load_portable
+from mien.synthetic import SyntheticRecipe, synthesize
+from mien.tracking import TrackingSettings, read_tracking, track
+from mien.tracking.paper_settings import PaperSettings
+from tracking_case import capture_of, still_camera
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory) -> Path:
+    """A cache of its own, with the anny model in it."""
+    load_face_model("anny")
+    folder = tmp_path_factory.mktemp("cache")
+    shutil.copytree(cache_folder() / "face_models", folder / "face_models")
+    return folder
+
+
+@pytest.fixture
+def added(cache, monkeypatch, tmp_path_factory):
+    """`mien face-models --add FILE`, with the landmarks that a detector would find in some minutes."""
+    monkeypatch.setenv("MIEN_CACHE", str(cache))
+    anny, calls = load_face_model("anny"), []
+
+    def embed(model, settings):
+        calls.append(settings.pictures)
+        return exact_landmarks(anny), torch.ones(478)
+
+    monkeypatch.setattr(stage, "embed_landmarks", embed)
+    path = tmp_path_factory.getbasetemp() / "My Head.npz"
+    if not path.is_file():
+        write_npz(path, flame_like(anny))
+    stage.add_face_model_stage(path)
+    return path, calls
+
+
+def test_it_is_added_once_and_then_goes_by_its_name(added):
+    path, calls = added
+    calls.clear()
+    model = load_face_model("my_head")
+    assert {"mediapipe", "ibug68"} == model.landmarks.keys()
+    assert {"lips", "neck", "irises", "mouth"} <= set(model.region_names)
+    for choice in (str(path), "my_head"):
+        assert stage.face_model_of(choice).content_hash == model.content_hash
+    assert not calls
+    info = next(info for info in available_face_models() if info.name == "my_head")
+    assert str(path) in info.description
+
+
+def test_choices_that_lead_nowhere(added, tmp_path, capsys):
+    path, _ = added
+    other = write_npz(tmp_path / "my_head.npz", {"weights": np.zeros(3)})
+    for choice, message in (
+        ("flame", r"there is no face model 'flame'; choose one of: anny, my_head, or give the path"),
+        (str(tmp_path / "none.npz"), "no such file"),
+        (str(tmp_path), "neither the name"),
+        (str(other), r"another file has the name 'my_head', .*My Head\.npz; .* --name NAME"),
+        (str(write_npz(tmp_path / "anny.npz", {"weights": np.zeros(3)})), "of mien's own"),
+        (str(write_npz(tmp_path / "x.npz", {"weights": np.zeros(3)})), "has no 'v_template'"),
+    ):
+        with pytest.raises(UserError, match=message):
+            stage.face_model_of(choice)
+    with pytest.raises(UserError, match="letters, digits"):
+        stage.add_face_model_stage(path, "../up")
+    assert main(["face-models", "--name", "x"]) != 0
+    assert "--add FILE" in capsys.readouterr().err
+
+
+# Tracking -------------------------------------------------------------------------------------------------------------
+
+
+def _speaking(model: FaceModel, timesteps: int) -> FaceParams:
+    """A person before the camera who turns, opens the mouth to 0.25 radians and looks about."""
+    time = torch.linspace(0, 1, timesteps, dtype=torch.float64)
+    face = model.neutral(timesteps).to(time)
+    random = torch.Generator().manual_seed(3)
+    joints = face.joints.clone()
+    joints[:, model.free_joint_names.index("jaw"), 0] = 0.125 * (1 - (12 * time).cos())
+    for side in ("left_eye", "right_eye"):
+        joints[:, model.free_joint_names.index(side), 1] = 0.2 * (7 * time).sin()
+    phase = torch.rand(face.expression.shape[1], generator=random, dtype=torch.float64) * 6
+    return replace(
+        face,
+        identity=0.7 * torch.randn(face.identity.shape, generator=random, dtype=torch.float64),
+        expression=0.6 * (9 * time[:, None] + phase).sin(),
+        joints=joints,
+        head_rotation=torch.stack([0.1 * (5 * time).sin(), 0.35 * (4 * time).cos(), 0.05 * (3 * time).sin()], 1),
+        head_translation=torch.tensor([0.0, 0.0, -0.9]).double().expand(timesteps, 3),
+    )
+
+
+def test_landmarks_give_its_jaw_and_shape(added):
+    double = torch.zeros((), dtype=torch.float64)
+    model = load_face_model("my_head")
+    face = _speaking(model, 40)
+    exact = model.to(double)
+    pixels = still_camera().project(exact.landmark_positions(exact(face), "mediapipe"))[0]
+    tracking = track(capture_of(pixels), model, TrackingSettings(schedule="landmarks", keyframes=10))
+    assert tracking.residuals.nanmedian() < 0.3
+    jaw = model.free_joint_names.index("jaw")
+    difference = tracking.face.joints[:, jaw, 0] - face.joints[:, jaw, 0]
+    assert difference.std() < 0.02
+    assert difference.abs().mean() < 0.05
+    gaze = tracking.face.joints[:, jaw + 1, 1] - face.joints[:, jaw + 1, 1]
+    assert gaze.std() < 0.03
+    assert (
+        torch.corrcoef(torch.stack([tracking.face.head_rotation[:, 1].double(), face.head_rotation[:, 1]]))[0, 1]
+        > 0.999
+    )
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    """Ten small pictures of a head that is drawn with another model, anny."""
+    recipe = SyntheticRecipe(
+        name="clip", width=96, height=96, seconds=0.4, hair="none", glasses=False, brows_and_lashes=False, clothes=False
+    )
+    return synthesize(recipe, seed=2)[0]
+
+
+@pytest.mark.slow
+def test_from_pixels_to_an_avatar_that_is_not_passed_on(added, capture, tmp_path, capsys):
+    path, _ = added
+    workspace, root = tmp_path, str(tmp_path)
+    write_capture(tmp_path / "sequences" / "clip" / "capture", capture)
+    assert main(["track", root, "--face-model", str(path)]) == 0
+    tracking = read_tracking(workspace / "sequences" / "clip" / "tracking")
+    assert tracking.face_model == "my_head"
+    assert tracking.pixel_residuals is not None
+    assert main(["train", root, "--steps", "6", "--run", "a"]) == 0
+    assert main(["evaluate", root, "--run", "a"]) == 0
+    picture = workspace / "a.png"
+    assert main(["render", root, "--run", "a", "--set", "expression_000=1", "--out", str(picture)]) == 0
+    assert main(["drive", root, "--run", "a", "--by", root, "--out", str(workspace / "a.mp4")]) == 0
+    assert main(["export", root, "--run", "a", "--out", str(workspace / "a.ply")]) == 0
+    avatar = load_avatar(workspace / "runs" / "a")
+    assert not list((workspace / "runs" / "a").rglob("face_model*"))
+    # Its licence is not known, until the user says that copies are allowed.
+    capsys.readouterr()
+    assert main(["export", root, "--run", "a", "--out", str(workspace / "a.mien")]) != 0
+    assert "--shareable" in capsys.readouterr().err
+    assert main(["face-models", "--add", str(path), "--shareable"]) == 0
+    assert main(["export", root, "--run", "a", "--out", str(workspace / "a.mien")]) == 0
+    face = tracking.face[[3]]
+    posed = load_portable(workspace / "a.mien").pose(
+        *(tensor[0].numpy() for tensor in (face.expression, face.joints, face.head_rotation, face.head_translation))
+    )
+    with torch.no_grad():
+        expected = avatar.pose(face).gaussians.timestep(0)
+    np.testing.assert_allclose(posed.means, expected.means.numpy(), atol=2e-6)
+
+
+@pytest.mark.slow
+def test_the_papers_schedule_takes_it_too(added, capture):
+    paper = PaperSettings(first_steps=4, steps=1, epochs=1, texture_size=64)
+    settings = TrackingSettings(schedule="paper", paper=paper)
+    tracking = track(capture, load_face_model("my_head"), settings)
+    assert tracking.face.vertex_offsets is not None
+    assert tracking.residuals.nanmedian() < 1.0
+
+
+def test_a_model_that_may_not_be_copied_is_named_with_ways_out(added):
+    model = replace(load_face_model("my_head"), shareable=False)
+    avatar = GaussianAvatars(GaussianAvatarsConfig(), model, model.neutral())
+    with pytest.raises(UserError, match=r"my_head.*\.ply.*--face-model.*--shareable"):
+        make_portable(avatar, still_camera(), "someone")
