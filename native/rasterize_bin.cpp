@@ -114,23 +114,29 @@ void place_chunks(Frame& frame) {
   }
   begins[tiles] = total;
   frame.pairs = total;
-  int64_t base = 0;
-  for (BinChunk& chunk : frame.chunks) {
-    chunk.base = base;
-    base += chunk.pairs.size();
+}
+
+// Slots in the order of the Gaussians, so that the projection's backward pass reads them one after the other.
+void place_slots(Frame& frame, int64_t count) {
+  uint32_t* begins = frame.slot_begins.data();
+  uint32_t* ends = frame.slot_ends.data();
+  uint32_t* shifts = frame.slot_shifts.reserve(count);
+  uint32_t total = 0;
+  for (int64_t i = 0; i < count; ++i) {
+    const uint32_t own = ends[i] - begins[i];
+    shifts[i] = total - begins[i];
+    begins[i] = total;
+    total += own;
+    ends[i] = total;
   }
 }
 
 void fill_lists(BinChunk& chunk, Frame& frame) {
   Entry* entries = frame.entries.data();
-  const uint32_t base = static_cast<uint32_t>(chunk.base);
+  const uint32_t* shifts = frame.slot_shifts.data();
   for (int64_t i = 0; i < chunk.pairs.size(); ++i) {
     const Pair pair = chunk.pairs[i];
-    entries[chunk.counts[pair.tile]++] = {pair.gaussian, base + static_cast<uint32_t>(i)};
-  }
-  for (int64_t rank = chunk.first; rank < chunk.last; ++rank) {
-    frame.slot_begins[frame.order[rank]] += base;
-    frame.slot_ends[frame.order[rank]] += base;
+    entries[chunk.counts[pair.tile]++] = {pair.gaussian, shifts[pair.gaussian] + static_cast<uint32_t>(i)};
   }
 }
 
@@ -177,6 +183,7 @@ void bin_into_tiles(Frame& frame, const Kernels& kernels, int64_t count, int wid
   }
   parallel_for(chunks, [&](int64_t c) { find_pairs(frame.chunks[c], frame, kernels); });
   place_chunks(frame);
+  place_slots(frame, count);
   frame.entries.reserve(frame.pairs);
   frame.masks.reserve(frame.pairs);
   parallel_for(chunks, [&](int64_t c) { fill_lists(frame.chunks[c], frame); });

@@ -8,7 +8,7 @@ namespace {
 constexpr int kVectors = kBlock * kBlock / W;  // vectors per block
 constexpr int kBlocks = kTileBlocks * kTileBlocks;
 constexpr int kAhead = 8;    // entries: how far ahead their splats are fetched into the cache
-constexpr int kChunk = 128;  // entries handled at a time: their splats stay in the L1 cache
+constexpr int kChunk = 256;  // entries handled at a time: their splats stay in the cache
 
 // Pixel centres of vector `v` of a block, relative to the block's first pixel centre.
 MIEN_INLINE F lane_x() {
@@ -22,35 +22,42 @@ MIEN_INLINE F lane_y(int v) {
   return y;
 }
 
-// 2^k for integers k >= 0.
-MIEN_INLINE F power_of_two(F k) { return from_bits((truncate(k) + 127) << 23); }
+// 2^high - 2^low for integers 0..8, 0 where high <= low.
+MIEN_INLINE I bits_between(F low, F high) {
+#if defined(__AVX2__)
+  const I one = set1i(1), bits = (one << truncate(high)) - (one << truncate(low));
+#else  // no shifts by lane: through the exponents
+  const I bits = truncate(from_bits((truncate(high) + 127) << 23) - from_bits((truncate(low) + 127) << 23));
+#endif
+  return bits & ~(bits >> 31);
+}
 
-// One bit per block of the tile at (left, top) pixels that the ellipse of a splat touches, for `count` entries.
-MIEN_INLINE void block_masks(const Splat* splats, const Entry* entries, int count, float left, float top,
-                             uint64_t* masks) {
+// The blocks of a tile that some entries of its list touch, one bit each.
+struct BlockBits {
+  alignas(64) uint8_t rows[kTileBlocks][kChunk];  // by row of blocks and entry; 0 from the last entry on
+  uint64_t masks[kChunk];                         // the same by entry, live blocks only
+};
+
+void find_blocks(const Splat* splats, const Entry* entries, int count, float left, float top, uint64_t live,
+                 BlockBits& found) {
   for (int i = 0; i < count; i += W) {
     const int valid = count - i < W ? count - i : W;
     const Splat* chosen[W];
     for (int lane = 0; lane < W; ++lane) chosen[lane] = &splats[entries[i + (lane < valid ? lane : 0)].gaussian];
     const SplatShape s = gather_shapes(chosen);
-    alignas(64) int32_t halves[kTileBlocks / 2][W];
-    for (int row = 0; row < kTileBlocks; row += 2) {
-      F both_rows{};
-      for (int part = 0; part < 2; ++part) {
-        const F first_y = (top + 0.5f + kBlock * (row + part)) - s.y;
-        const Columns c = columns_touched(s, first_y, first_y + (kBlock - 1.0f), (left + 0.5f) - s.x, kBlock);
-        const F low = clamp(c.low, F{}, set1(kTileBlocks)), high = clamp(c.high, set1(-1.0f), set1(kTileBlocks - 1));
-        const F row_bits = maximum(power_of_two(high + 1.0f) - power_of_two(low), F{});
-        both_rows = both_rows + row_bits * (part ? (float)(1 << kTileBlocks) : 1.0f);
-      }
-      store(halves[row / 2], truncate(both_rows));
+    const M there = less(iota(), set1((float)valid));
+    for (int row = 0; row < kTileBlocks; ++row) {
+      const F first_y = (top + 0.5f + kBlock * row) - s.y;
+      const Columns c = columns_touched(s, first_y, first_y + (kBlock - 1.0f), (left + 0.5f) - s.x, kBlock);
+      const F low = clamp(c.low, F{}, set1(kTileBlocks)), high = clamp(c.high + 1.0f, F{}, set1(kTileBlocks));
+      store_bytes(found.rows[row] + i, bits_between(low, keep(there, high)));
     }
-    for (int lane = 0; lane < valid; ++lane) {
-      uint64_t mask = 0;
-      for (int half = 0; half < kTileBlocks / 2; ++half)
-        mask |= (uint64_t)(uint32_t)halves[half][lane] << (2 * kTileBlocks * half);
-      masks[i + lane] = mask;
-    }
+  }
+  const int written = (count + W - 1) / W * W, used = (count + 63) / 64 * 64;
+  for (int row = 0; row < kTileBlocks; ++row) memset(found.rows[row] + written, 0, used - written);
+  for (int i = 0; i < count; i += 16) {
+    transpose_bytes(found.rows[0] + i, kChunk, found.masks + i);
+    for (int j = i; j < i + 16; ++j) found.masks[j] &= live;
   }
 }
 
@@ -62,21 +69,46 @@ struct TilePixels {
   alignas(64) float color[3][kBlocks][kBlock * kBlock];
 };
 
-// Blends `count` entries of one chunk into vector `v` of a block. Returns how many were looked at; fewer than `count`
-// means that all pixels of the vector have ended.
-MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const uint8_t* chosen, int count, float x,
-                             float y, int block, int v, TilePixels& pixels) {
+// The entries of a chunk that touch one block: 64 to a word, words without any left out.
+struct Chosen {
+  int words = 0, count = 0;
+  int begins[kChunk / 64 + 1];
+  uint64_t bits[kChunk / 64 + 1];
+
+  MIEN_INLINE Chosen(const BlockBits& found, int entries, int block) {
+    for (int i = 0; i < entries; i += 64) {
+      const uint64_t own = bit_column(found.rows[block / kTileBlocks] + i, block % kTileBlocks);
+      begins[words] = i;
+      bits[words] = own;
+      words += own != 0;
+      count += __builtin_popcountll(own);
+    }
+    begins[words] = 0;
+    bits[words] = 1;  // read, not used
+  }
+};
+
+// Blends entries of one chunk into vector `v` of a block. Returns the last one looked at if all pixels of the vector
+// ended there, otherwise kChunk.
+MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const Chosen& chosen, float x, float y,
+                             int block, int v, TilePixels& pixels) {
   F transmittance = load(pixels.transmittance[block] + v * W), product = load(pixels.product[block] + v * W);
   F red = load(pixels.color[0][block] + v * W), green = load(pixels.color[1][block] + v * W);
   F blue = load(pixels.color[2][block] + v * W);
   const F px = lane_x() + x, py = lane_y(v) + y;
-  int i = 0;
-  for (; i < count; ++i) {
-    const Splat& s = splats[entries[chosen[i]].gaussian];
+  int word = 0, ended = kChunk;
+  uint64_t bits = chosen.bits[0];
+  for (int left = chosen.count; left > 0; --left) {
+    const int entry = chosen.begins[word] + __builtin_ctzll(bits);
+    bits &= bits - 1;
+    word += bits == 0;
+    bits = bits ? bits : chosen.bits[word];
+    const Splat& s = splats[entries[entry].gaussian];
     const F dy = py - s.y, across = (px - s.x) - s.slope * dy;
-    const F power = (s.log2_opacity - (s.sharpness * across) * across) - (s.falloff * dy) * dy;
+    const F a = s.root_sharpness * across, b = s.root_falloff * dy;
+    const F power = (s.log2_opacity - a * a) - b * b;
     const M seen = less_equal(set1(kLog2AlphaMin), power);
-    const F alpha = keep(seen, minimum(exp2_fast(power), set1(kAlphaMax)));
+    const F alpha = keep(seen, minimum(exp2_alpha(power), set1(kAlphaMax)));
     const F share = product * alpha, next = product - share;
     const M open = less(set1(kTransmittanceMin), next);
     const F weight = keep(open, share);
@@ -86,7 +118,7 @@ MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const ui
     transmittance = select(open, next, transmittance);
     product = next;
     if (!any(open)) {
-      ++i;
+      ended = entry;
       break;
     }
   }
@@ -95,35 +127,26 @@ MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const ui
   store(pixels.color[0][block] + v * W, red);
   store(pixels.color[1][block] + v * W, green);
   store(pixels.color[2][block] + v * W, blue);
-  return i;
+  return ended;
 }
 
 // Blends one chunk into all blocks in `live`; takes ended blocks out of the later entries' masks; returns what is live.
-MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, uint64_t* masks, int count, float left,
-                                 float top, uint64_t live, TilePixels& pixels) {
-  uint8_t chosen[kBlocks][kChunk];
-  int lengths[kBlocks];
-  for (int block = 0; block < kBlocks; ++block) lengths[block] = 0;
-  for (int i = 0; i < count; ++i) {
-    masks[i] &= live;
-    for (uint64_t mask = masks[i]; mask; mask &= mask - 1) {
-      const int block = __builtin_ctzll(mask);
-      chosen[block][lengths[block]++] = (uint8_t)i;
-    }
-  }
+MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, int count, float left, float top,
+                                 uint64_t live, BlockBits& found, TilePixels& pixels) {
+  find_blocks(splats, entries, count, left, top, live, found);
   for (uint64_t blocks = live; blocks; blocks &= blocks - 1) {
     const int block = __builtin_ctzll(blocks);
+    const Chosen chosen(found, count, block);
+    if (chosen.count == 0) continue;
     const float x = left + 0.5f + kBlock * (block % kTileBlocks), y = top + 0.5f + kBlock * (block / kTileBlocks);
-    int looked_at = 0;
-    M open = no_lanes();
+    int ended = 0;
     for (int v = 0; v < kVectors; ++v) {
-      const int here = blend_vector(splats, entries, chosen[block], lengths[block], x, y, block, v, pixels);
-      looked_at = looked_at < here ? here : looked_at;
-      open = either(open, less(set1(kTransmittanceMin), load(pixels.product[block] + v * W)));
+      const int here = blend_vector(splats, entries, chosen, x, y, block, v, pixels);
+      ended = ended < here ? here : ended;
     }
-    if (any(open)) continue;
+    if (ended == kChunk) continue;
     live &= ~(1ull << block);
-    for (int i = looked_at; i < lengths[block]; ++i) masks[chosen[block][i]] &= ~(1ull << block);
+    for (int i = ended + 1; i < count; ++i) found.masks[i] &= ~(1ull << block);
   }
   return live;
 }
@@ -190,6 +213,7 @@ void blend(const Splat* splats, const TileLists& lists, const View& view, int ti
   for (int i = begin; i < end && i < begin + kChunk; ++i) __builtin_prefetch(&splats[lists.entries[i].gaussian]);
   [[maybe_unused]] const NoDenormals guard;
   TilePixels pixels;
+  BlockBits found;
   memset(pixels.color, 0, sizeof pixels.color);
   for (int block = 0; block < kBlocks; ++block) {
     for (int v = 0; v < kVectors; ++v) {
@@ -202,8 +226,8 @@ void blend(const Splat* splats, const TileLists& lists, const View& view, int ti
   int i = begin;
   while (i < end && live) {
     const int count = end - i < kChunk ? end - i : kChunk;
-    block_masks(splats, lists.entries + i, count, (float)left, (float)top, lists.masks + i);
-    live = blend_chunk(splats, lists.entries + i, lists.masks + i, count, (float)left, (float)top, live, pixels);
+    live = blend_chunk(splats, lists.entries + i, count, (float)left, (float)top, live, found, pixels);
+    memcpy(lists.masks + i, found.masks, sizeof(uint64_t) * count);
     i += count;
   }
   lists.ends[tile] = i;

@@ -82,42 +82,81 @@ struct Sums {
   F red, green, blue, one, x, y, xx, xy, yy;
 };
 
-MIEN_INLINE void add_vector(const Splat& s, F px, F py, int block, int v, TileGradients& t, Sums& sums) {
+// What adds to a splat's exponent, in one tile: with across and along the two roots at a pixel, alpha = 2^(log2_opacity
+// - across^2 - along^2). Both are linear in the pixel's place: a part for the place in a block and one for the block's.
+struct TileRoots {
+  F across[kVectors], along[kVectors];
+  float across_columns[kTileBlocks], across_rows[kTileBlocks], along_rows[kTileBlocks];
+
+  MIEN_INLINE TileRoots(const Splat& s, float left, float top) {
+    const float dy = top + 0.5f - s.y, slant = s.root_sharpness * s.slope;
+    const float first_across = s.root_sharpness * ((left + 0.5f - s.x) - s.slope * dy);
+    const float first_along = s.root_falloff * dy;
+    for (int v = 0; v < kVectors; ++v) {
+      across[v] = lane_x() * s.root_sharpness - lane_y(v) * slant;
+      along[v] = lane_y(v) * s.root_falloff;
+    }
+    for (int i = 0; i < kTileBlocks; ++i) {
+      across_columns[i] = first_across + s.root_sharpness * (float)(kBlock * i);
+      across_rows[i] = slant * (float)(-kBlock * i);
+      along_rows[i] = first_along + s.root_falloff * (float)(kBlock * i);
+    }
+  }
+};
+
+// CLAMPED: whether alpha can reach kAlphaMax, where it no longer depends on the exponent.
+template <bool CLAMPED>
+MIEN_INLINE void add_vector(const Splat& s, F across, F along, int block, int v, TileGradients& t, Sums& sums) {
   const F product = load(t.product[block] + v * W), before = load(t.behind[block] + v * W);
   const F red = load(t.color[0][block] + v * W), green = load(t.color[1][block] + v * W);
   const F blue = load(t.color[2][block] + v * W);
-  const F dy = py - s.y, across = (px - s.x) - s.slope * dy;
-  const F power = (s.log2_opacity - (s.sharpness * across) * across) - (s.falloff * dy) * dy;
+  const F power = (s.log2_opacity - across * across) - along * along;
   const M seen = less_equal(set1(kLog2AlphaMin), power);
-  const F raw = exp2_fast(power);
-  const F alpha = keep(seen, minimum(raw, set1(kAlphaMax)));
+  const F raw = exp2_alpha(power);
+  const F alpha = keep(seen, CLAMPED ? minimum(raw, set1(kAlphaMax)) : raw);
   const F share = product * alpha, next = product - share;
   const M open = less(set1(kTransmittanceMin), next);
   const F weight = keep(open, share);
   const F own = weight * (s.red * red + s.green * green + s.blue * blue);
   const F behind = before - own;
-  const M sensitive = both(open, less_equal(raw, set1(kAlphaMax)));
+  const M sensitive = CLAMPED ? both(open, less_equal(raw, set1(kAlphaMax))) : open;
   const F value = keep(sensitive, own - behind * alpha * reciprocal(1.0f - alpha));
   store(t.product[block] + v * W, next);
   store(t.behind[block] + v * W, behind);
   sums.red = sums.red + weight * red;
   sums.green = sums.green + weight * green;
   sums.blue = sums.blue + weight * blue;
-  const F value_x = value * across, value_y = value * dy;
+  const F value_x = value * across, value_y = value * along;
   sums.one = sums.one + value;
   sums.x = sums.x + value_x;
   sums.y = sums.y + value_y;
   sums.xx = sums.xx + value_x * across;
-  sums.xy = sums.xy + value_x * dy;
-  sums.yy = sums.yy + value_y * dy;
+  sums.xy = sums.xy + value_x * along;
+  sums.yy = sums.yy + value_y * along;
 }
 
 MIEN_INLINE void store_moments(const Sums& s, Moments& slot) {
-  const F4 first = sums_of_four(s.red, s.green, s.blue, s.one), second = sums_of_four(s.x, s.y, s.xx, s.xy);
-  const F4 third = sums_of_four(s.yy, F{}, F{}, F{});
-  memcpy(&slot.red, &first, sizeof first);
-  memcpy(&slot.x, &second, sizeof second);
-  memcpy(&slot.yy, &third, sizeof third);
+  const F eight[8] = {s.red, s.green, s.blue, s.one, s.x, s.y, s.xx, s.xy};
+  F4 sums[2];
+  sums_of_eight(eight, sums);
+  memcpy(&slot.red, &sums[0], sizeof sums[0]);
+  memcpy(&slot.x, &sums[1], sizeof sums[1]);
+  slot.yy = sum(s.yy);
+}
+
+// The moments of one splat in the blocks of its mask.
+template <bool CLAMPED>
+MIEN_INLINE void add_splat(const Splat& s, float left, float top, uint64_t mask, TileGradients& t, Moments& slot) {
+  const TileRoots roots(s, left, top);
+  Sums sums{};
+  for (; mask; mask &= mask - 1) {
+    const int block = __builtin_ctzll(mask), column = block % kTileBlocks, row = block / kTileBlocks;
+    for (int v = 0; v < kVectors; ++v) {
+      const F across = (roots.across[v] + roots.across_columns[column]) + roots.across_rows[row];
+      add_vector<CLAMPED>(s, across, roots.along[v] + roots.along_rows[row], block, v, t, sums);
+    }
+  }
+  store_moments(sums, slot);
 }
 
 void blend_backward(const Splat* splats, const TileLists& lists, const View& view, int tile,
@@ -128,24 +167,18 @@ void blend_backward(const Splat* splats, const TileLists& lists, const View& vie
   [[maybe_unused]] const NoDenormals guard;
   TileGradients gradients;
   const bool needed = load_gradients(picture, view, left, top, gradients);
-  F px[kTileBlocks], py[kTileBlocks][kVectors];
-  for (int i = 0; i < kTileBlocks; ++i) {
-    px[i] = lane_x() + (left + 0.5f + kBlock * i);
-    for (int v = 0; v < kVectors; ++v) py[i][v] = lane_y(v) + (top + 0.5f + kBlock * i);
-  }
   const int last = needed ? lists.ends[tile] : begin;
   for (int i = begin; i < last; ++i) {
     const Splat& s = splats[lists.entries[i].gaussian];
     const Entry& ahead = lists.entries[i + kAhead < last ? i + kAhead : i];
     __builtin_prefetch(&splats[ahead.gaussian]);
     __builtin_prefetch(&slots[ahead.slot], 1);
-    Sums sums{};
-    for (uint64_t mask = lists.masks[i]; mask; mask &= mask - 1) {
-      const int block = __builtin_ctzll(mask);
-      for (int v = 0; v < kVectors; ++v)
-        add_vector(s, px[block % kTileBlocks], py[block / kTileBlocks][v], block, v, gradients, sums);
+    Moments& slot = slots[lists.entries[i].slot];
+    if (s.log2_opacity < kLog2AlphaMax) {
+      add_splat<false>(s, (float)left, (float)top, lists.masks[i], gradients, slot);
+    } else {
+      add_splat<true>(s, (float)left, (float)top, lists.masks[i], gradients, slot);
     }
-    store_moments(sums, slots[lists.entries[i].slot]);
   }
   for (int i = last; i < end; ++i) memset(&slots[lists.entries[i].slot], 0, sizeof(Moments));
 }

@@ -72,7 +72,6 @@ struct Pair {
 // A part of the depth order that one thread bins.
 struct BinChunk {
   int64_t first, last;  // ranks in depth order
-  int64_t base;         // pairs in the chunks before
   Buffer<TileSpan> spans;
   Buffer<Pair> pairs;
   Buffer<int32_t> counts;  // per tile; then where the chunk's next entry of that tile goes
@@ -81,7 +80,8 @@ struct BinChunk {
 struct Frame {
   Buffer<Splat> splats;
   Buffer<uint32_t> depth_keys, sorted_keys, order, scratch_keys, scratch_order;
-  Buffer<uint32_t> slot_begins, slot_ends;  // per Gaussian
+  Buffer<uint32_t> slot_begins, slot_ends;  // per Gaussian; at first counted from the first pair of its chunk
+  Buffer<uint32_t> slot_shifts;             // per Gaussian: from a pair's place in its chunk to its slot
   Buffer<Entry> entries;
   Buffer<uint64_t> masks;
   Buffer<int32_t> tile_begins, tile_ends;

@@ -8,6 +8,8 @@ namespace {
 
 using namespace mien;
 
+constexpr float kHalfLog2E = 0.72134752044f;
+
 struct V3 {
   F x, y, z;
 };

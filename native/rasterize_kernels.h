@@ -17,19 +17,22 @@ constexpr float kDilation = 0.3f;
 constexpr float kAlphaMax = 0.999f;
 constexpr float kTransmittanceMin = 1e-4f;
 constexpr float kFovMargin = 0.3f;
+constexpr float kLog2AlphaMax = -0.00146f;      // a little below log2(kAlphaMax)
 constexpr float kLog2AlphaMin = -7.994353437f;  // log2(1 / 255)
 
 // A projected Gaussian: one cache line. At (dx, dy) pixels from its centre and with across = dx - slope * dy,
-// alpha = 2^(log2_opacity - (sharpness * across^2 + falloff * dy^2)). This is the usual inverse covariance with the
-// square completed: it does not cancel for needles, is never negative and takes an operation less.
+// alpha = 2^(log2_opacity - (root_sharpness * across)^2 - (root_falloff * dy)^2). This is the usual inverse covariance
+// with the square completed: it does not cancel for needles, is never negative and takes an operation less.
 struct alignas(64) Splat {
   float x, y;  // centre, pixels
   // Where alpha is 1/255: at height dy the ellipse spans slope * dy +- sqrt(width2 * (1 - (dy / half_height)^2)).
   float slope, width2;
   float half_height;
-  float y_rightmost;         // dy of the point that is farthest right; the leftmost is opposite
-  float depth, unused;       // camera z
-  float sharpness, falloff;  // log2(e) / 2 times 1 / variance of x given y, and times 1 / variance of y
+  float y_rightmost;  // dy of the point that is farthest right; the leftmost is opposite
+  float depth;        // camera z
+  float inverse_half_height;
+  // Roots of log2(e) / 2 times 1 / variance of x given y, and times 1 / variance of y.
+  float root_sharpness, root_falloff;
   float log2_opacity;
   float red, green, blue, unused2[2];
 };
@@ -40,8 +43,8 @@ struct Entry {
   uint32_t slot;  // where its gradient goes; the slots of a Gaussian are consecutive
 };
 
-// The sums over one tile's pixels, with v = dL/dalpha * alpha: the colours' gradients, then v times 1, across, dy,
-// across^2, across * dy and dy^2.
+// The sums over one tile's pixels, with v = dL/dalpha * alpha, x = root_sharpness * across and y = root_falloff * dy:
+// the colours' gradients, then v times 1, x, y, x^2, x y and y^2.
 struct Moments {
   float red, green, blue, one, x, y, xx, xy, yy, unused[3];
 };

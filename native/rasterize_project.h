@@ -31,8 +31,6 @@ MIEN_INLINE V3 colors_of(int count, const float* sh, int valid, V3 direction, M*
   return colors_of<16>(sh, valid, direction, bad);
 }
 
-constexpr float kHalfLog2E = 0.72134752044f;
-
 struct Outline {
   F cutoff2;  // the squared Mahalanobis distance where alpha is 1/255
   F half_width, half_height;
@@ -90,9 +88,9 @@ MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i
                          o.half_height,
                          p.xy * square_root(o.cutoff2 / p.xx),
                          p.camera.z,
-                         F{},
-                         p.yy * inverse * kHalfLog2E,
-                         inverse_yy * kHalfLog2E,
+                         1.0f / maximum(o.half_height, set1(1e-30f)),
+                         square_root(p.yy * inverse * kHalfLog2E),
+                         square_root(inverse_yy * kHalfLog2E),
                          log2_opacity,
                          color.x,
                          color.y,
@@ -121,15 +119,15 @@ bool project(const GaussianArrays& g, const View& view, int64_t first, int64_t l
 }
 
 struct SplatShape {
-  F x, y, slope, width2, half_height, y_rightmost;
+  F x, y, slope, width2, half_height, y_rightmost, inverse_half_height;
 };
 
 MIEN_INLINE SplatShape gather_shapes(const Splat* const* splats) {
   const float* rows[W];
   for (int lane = 0; lane < W; ++lane) rows[lane] = &splats[lane]->x;
-  F v[6];
-  gather_columns<6>(rows, v);
-  return {v[0], v[1], v[2], v[3], v[4], v[5]};
+  F v[8];
+  gather_columns<8>(rows, v);
+  return {v[0], v[1], v[2], v[3], v[4], v[5], v[7]};
 }
 
 // The columns of pixel groups of `size` pixels that the ellipse touches in the rows of pixel centres top..bottom (both
@@ -141,8 +139,7 @@ struct Columns {
 
 MIEN_INLINE Columns columns_touched(const SplatShape& s, F top, F bottom, F first, float size) {
   const F right_y = clamp(s.y_rightmost, top, bottom), left_y = clamp(-s.y_rightmost, top, bottom);
-  const F inverse = 1.0f / s.half_height;
-  const F right_t = right_y * inverse, left_t = left_y * inverse;
+  const F right_t = right_y * s.inverse_half_height, left_t = left_y * s.inverse_half_height;
   const F right = s.slope * right_y + root_bound(s.width2 * (1.0f - right_t * right_t));
   const F left = s.slope * left_y - root_bound(s.width2 * (1.0f - left_t * left_t));
   const M hit = both(less_equal(top, s.half_height), less_equal(-s.half_height, bottom));

@@ -17,15 +17,17 @@ struct ScreenGrad {
 };
 
 MIEN_INLINE ScreenGrad screen_gradient(const Projection& p, const F* moments) {
+  // The moments are of the roots of the exponent's two parts (TileRoots).
   const F inverse_yy = 1.0f / p.yy, sharpness = p.yy / p.determinant;
+  const F by_x = square_root(sharpness * (1 / kHalfLog2E)), by_y = square_root(inverse_yy * (1 / kHalfLog2E));
   const F mx = moments[4], my = moments[5], mxx = moments[6], mxy = moments[7], myy = moments[8];
   ScreenGrad s;
   s.slope = p.xy * inverse_yy;
-  s.x = sharpness * mx;
-  s.y = inverse_yy * my - s.slope * s.x;
-  s.variance_across = 0.5f * sharpness * sharpness * mxx;
-  s.slope_over_yy = inverse_yy * sharpness * mxy;
-  s.variance_y = 0.5f * inverse_yy * inverse_yy * myy;
+  s.x = by_x * mx;
+  s.y = by_y * my - s.slope * s.x;
+  s.variance_across = (0.5f / kHalfLog2E) * sharpness * mxx;
+  s.slope_over_yy = by_x * by_y * mxy;
+  s.variance_y = (0.5f / kHalfLog2E) * inverse_yy * myy;
   return s;
 }
 
@@ -135,7 +137,6 @@ MIEN_INLINE bool gather_moments(int64_t i, int valid, const uint32_t* begins, co
                                 const Moments* slots, F* moments) {
   alignas(64) float buffer[W][12];
   F4 size{};
-  for (int lane = 0; lane < valid; ++lane) __builtin_prefetch(&slots[begins[i + lane]]);
   for (int lane = 0; lane < W; ++lane) {
     F4 total[3] = {};
     for (uint32_t slot = lane < valid ? begins[i + lane] : 0; slot < (lane < valid ? ends[i + lane] : 0); ++slot) {

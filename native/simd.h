@@ -157,6 +157,46 @@ MIEN_INLINE F exp2_fast(F a) {
   return from_bits(bits(power) + (bits(shifted) << 23));
 }
 
+// 2^a for what is seen of a splat: -8 < a <= 0, anything beyond; to 4e-7 (relative) with AVX-512, 4e-6 otherwise. A
+// vector register holds the powers of 2 in steps of 1/16 (1/8), less the index where their exponent will be added, so
+// that a parabola does for the rest.
+#if defined(__AVX512F__) || defined(__AVX2__)
+alignas(64) constexpr int32_t kPowers[W] = {
+#if defined(__AVX512F__)
+    0x3f800000, 0x3f7daac3, 0x3f7b95c2, 0x3f79c3d3, 0x3f7837f0, 0x3f76f532, 0x3f75fed7, 0x3f75583f,
+    0x3f7504f3, 0x3f7508a4, 0x3f75672a, 0x3f76248c, 0x3f7744fd, 0x3f78ccdf, 0x3f7ac0c7, 0x3f7d257d};
+constexpr int kPowerBits = 4;
+constexpr float kPower1 = 6.9318783e-1f, kPower2 = 2.4021946e-1f;
+#else
+    0x3f800000, 0x3f7b95c2, 0x3f7837f0, 0x3f75fed7, 0x3f7504f3, 0x3f75672a, 0x3f7744fd, 0x3f7ac0c7};
+constexpr int kPowerBits = 3;
+constexpr float kPower1 = 6.9330976e-1f, kPower2 = 2.4019833e-1f;
+#endif
+
+MIEN_INLINE F exp2_alpha(F a) {
+  const float magic = 12582912.0f / (1 << kPowerBits);  // the sum's low bits are round(a * 2^kPowerBits)
+  const F shifted = a + magic, f = a - (shifted - magic);
+  I powers;
+  memcpy(&powers, kPowers, sizeof powers);
+#if defined(__AVX512F__)
+  const I power = (I)_mm512_permutexvar_epi32((__m512i)bits(shifted), (__m512i)powers);
+#else
+  const I power = (I)_mm256_permutevar8x32_epi32((__m256i)powers, (__m256i)bits(shifted));
+#endif
+  const F scale = from_bits(power + (bits(shifted) << (23 - kPowerBits)));
+  return scale + scale * (f * (f * kPower2 + kPower1));
+}
+#else
+MIEN_INLINE F exp2_alpha(F a) {
+  const F shifted = a + 12582912.0f, f = a - (shifted - 12582912.0f);
+  F power = f * 9.5701020e-3f + 5.5917861e-2f;
+  power = power * f + 2.4024745e-1f;
+  power = power * f + 6.9312181e-1f;
+  power = power * f + 0.99999926f;
+  return from_bits(bits(power) + (bits(shifted) << 23));
+}
+#endif
+
 // log2(a) to 1e-7 (absolute, near 1; relative elsewhere) for positive normal a: with a = m 2^e, m in 0.7..1.4 and
 // t = (m - 1) / (m + 1), log2(m) = 2 / ln 2 * atanh(t).
 MIEN_INLINE F log2_precise(F a) {
@@ -171,10 +211,63 @@ MIEN_INLINE F log2_precise(F a) {
   return to_float(offset) + 2.8853900818f * t * series;
 }
 
-MIEN_INLINE float sum(F value) {
-  float total = 0;
-  for (int lane = 0; lane < W; ++lane) total += value[lane];
-  return total;
+// The lowest byte of each lane, of values 0..255.
+MIEN_INLINE void store_bytes(uint8_t* to, I value) {
+#if defined(__AVX512F__)
+  _mm_storeu_si128((__m128i*)to, _mm512_cvtepi32_epi8((__m512i)value));
+#else
+  for (int lane = 0; lane < W; ++lane) to[lane] = (uint8_t)value[lane];
+#endif
+}
+
+// Bit `bit` of 64 bytes, one after the other.
+MIEN_INLINE uint64_t bit_column(const uint8_t* bytes, int bit) {
+#if defined(__AVX512BW__)
+  return _mm512_test_epi8_mask(_mm512_loadu_si512(bytes), _mm512_set1_epi8((char)(1 << bit)));
+#elif defined(__AVX2__)
+  uint64_t column = 0;
+  for (int half = 0; half < 2; ++half) {
+    const __m256i own = _mm256_loadu_si256((const __m256i*)(bytes + 32 * half));
+    const __m256i top = _mm256_sll_epi16(own, _mm_cvtsi32_si128(7 - bit));
+    column |= (uint64_t)(uint32_t)_mm256_movemask_epi8(top) << (32 * half);
+  }
+  return column;
+#else
+  uint64_t column = 0;
+  for (int part = 0; part < 8; ++part) {
+    uint64_t eight;
+    memcpy(&eight, bytes + 8 * part, sizeof eight);
+    // The bits of eight bytes meet in the highest byte of the product (the first byte is the lowest).
+    column |= ((eight >> bit & 0x0101010101010101u) * 0x0102040810204080u >> 56) << (8 * part);
+  }
+  return column;
+#endif
+}
+
+typedef uint8_t Bytes16 __attribute__((vector_size(16)));
+
+// Eight rows of 16 bytes to 16 numbers: byte `row` of number i is rows[row * stride + i].
+MIEN_INLINE void transpose_bytes(const uint8_t* rows, int64_t stride, uint64_t* numbers) {
+  Bytes16 v[8], w[8];
+  for (int row = 0; row < 8; ++row) memcpy(&v[row], rows + row * stride, sizeof v[row]);
+  for (int i = 0; i < 4; ++i) {
+    w[i] = __builtin_shufflevector(v[2 * i], v[2 * i + 1], 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+    w[4 + i] =
+        __builtin_shufflevector(v[2 * i], v[2 * i + 1], 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+  }
+  typedef uint16_t Pairs __attribute__((vector_size(16)));
+  typedef uint32_t Quads __attribute__((vector_size(16)));
+  for (int half = 0; half < 2; ++half) {
+    const Pairs a = (Pairs)w[4 * half], b = (Pairs)w[4 * half + 1], c = (Pairs)w[4 * half + 2];
+    const Pairs d = (Pairs)w[4 * half + 3];
+    const Quads ab = (Quads)__builtin_shufflevector(a, b, 0, 8, 1, 9, 2, 10, 3, 11);
+    const Quads cd = (Quads)__builtin_shufflevector(c, d, 0, 8, 1, 9, 2, 10, 3, 11);
+    const Quads ef = (Quads)__builtin_shufflevector(a, b, 4, 12, 5, 13, 6, 14, 7, 15);
+    const Quads gh = (Quads)__builtin_shufflevector(c, d, 4, 12, 5, 13, 6, 14, 7, 15);
+    const Quads out[4] = {__builtin_shufflevector(ab, cd, 0, 4, 1, 5), __builtin_shufflevector(ab, cd, 2, 6, 3, 7),
+                          __builtin_shufflevector(ef, gh, 0, 4, 1, 5), __builtin_shufflevector(ef, gh, 2, 6, 3, 7)};
+    memcpy(numbers + 8 * half, out, sizeof out);
+  }
 }
 
 // The sum of all lanes of a vector, four lanes left.
@@ -195,6 +288,27 @@ MIEN_INLINE F4 sums_of_four(F a, F b, F c, F d) {
   const F4 ab = __builtin_shufflevector(fa, fb, 0, 4, 1, 5) + __builtin_shufflevector(fa, fb, 2, 6, 3, 7);
   const F4 cd = __builtin_shufflevector(fc, fd, 0, 4, 1, 5) + __builtin_shufflevector(fc, fd, 2, 6, 3, 7);
   return __builtin_shufflevector(ab, cd, 0, 1, 4, 5) + __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+}
+
+MIEN_INLINE float sum(F value) {
+  const F4 four = fold(value), two = four + __builtin_shufflevector(four, four, 2, 3, 2, 3);
+  return two[0] + two[1];
+}
+
+// The sums over all lanes of eight vectors.
+MIEN_INLINE void sums_of_eight(const F* v, F4* sums) {
+#if defined(__AVX512F__)
+  // Within each quarter of a vector; then over the quarters.
+  for (int half = 0; half < 2; ++half, v += 4) {
+    const F ab = _mm512_unpacklo_ps(v[0], v[1]) + (F)_mm512_unpackhi_ps(v[0], v[1]);
+    const F cd = _mm512_unpacklo_ps(v[2], v[3]) + (F)_mm512_unpackhi_ps(v[2], v[3]);
+    const F abcd = (F)_mm512_shuffle_ps(ab, cd, 0x44) + (F)_mm512_shuffle_ps(ab, cd, 0xee);
+    sums[half] = fold(abcd);
+  }
+#else
+  sums[0] = sums_of_four(v[0], v[1], v[2], v[3]);
+  sums[1] = sums_of_four(v[4], v[5], v[6], v[7]);
+#endif
 }
 
 }  // namespace
