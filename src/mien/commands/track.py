@@ -24,6 +24,8 @@ class Command:
     """Name of a face model (see `mien face-models`), or a .npz or .pkl in FLAME's schema."""
     again: bool = False
     """Track again even if nothing changed. The scoring masks stay as they are."""
+    preview: bool = False
+    """Show the fit while it runs: DIR/tracking_preview.html, for a browser, is renewed every few seconds."""
     overlay: Literal["auto", "all", "none"] = "auto"
     """Frames in overlay.mp4: all of them, or of long clips every n-th so that there are at most 3,000 (auto)."""
     settings: Annotated[TrackingSettings, tyro.conf.arg(name="tracking")] = field(default_factory=TrackingSettings)
@@ -33,5 +35,5 @@ class Command:
         from mien.commands.stages import tracking_stage
 
         tracking_stage(
-            open_workspace(self.workspace), self.face_model, self.settings, again=self.again, overlay=self.overlay
+            open_workspace(self.workspace), self.face_model, self.settings, self.again, self.overlay, self.preview
         )

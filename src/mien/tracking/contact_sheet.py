@@ -68,20 +68,25 @@ def contact_sheet(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Each frame as a strip: the picture, the mesh over it and, where pixels were looked at, the model's, and heat."""
     painter = OverlayPainter(capture, tracking, face_model)
-    strips = [_strip(painter, capture, frame) for frame in frames]
+    strips = [strip(painter, capture, frame, _name(capture, frame)) for frame in frames]
     columns = min(_STRIPS, len(strips))
     strips += [np.full_like(strips[0], _PAPER)] * (-len(strips) % columns)
     rows = [_joined(strips[first : first + columns], 1) for first in range(0, len(strips), columns)]
     return _joined(rows, 0)
 
 
-def _strip(painter: OverlayPainter, capture: Capture, frame: SheetFrame) -> UInt8[np.ndarray, "h w 3"]:
+def _name(capture: Capture, frame: SheetFrame) -> str:
+    camera = "" if len(capture.camera_ids) == 1 else f"{capture.camera_ids[frame.camera]} "
+    return f"{frame.timestep} {camera}{frame.why}".rstrip()
+
+
+def strip(painter: OverlayPainter, capture: Capture, frame: SheetFrame, name: str) -> UInt8[np.ndarray, "h w 3"]:
+    """A frame's picture, the mesh over it, and, where pixels were looked at, the model's picture and heat."""
     image = np.asarray(capture.images[frame.timestep, frame.camera])
     rows, columns = painter.head_box(frame.timestep, frame.camera)
     panels = [image, *painter.panels(frame.timestep, frame.camera)[1:]]
     tiles = [cv2.resize(panel[rows, columns], (_TILE, _TILE), interpolation=cv2.INTER_AREA) for panel in panels]
-    camera = "" if len(capture.camera_ids) == 1 else f"{capture.camera_ids[frame.camera]} "
-    write_text(tiles[0], f"{frame.timestep} {camera}{frame.why}".rstrip(), (6, 16), 0.45)
+    write_text(tiles[0], name, (6, 16), 0.45)
     if len(tiles) > 2:
         draw_legend(tiles[-1])
     return np.concatenate(tiles, axis=1)

@@ -15,6 +15,7 @@ from mien.tracking.resume import Keeper
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
 from mien.tracking.stages import Fit
+from mien.tracking.watch import Watch
 
 
 def fit_by_descent(
@@ -24,6 +25,7 @@ def fit_by_descent(
     fit: Fit,
     settings: TrackingSettings,
     keeper: Keeper,
+    watch: Watch,
 ) -> PhotometricFit:
     """A fit to landmarks refined as in the supplement of GaussianAvatars, section A.
 
@@ -36,26 +38,35 @@ def fit_by_descent(
         fit: What landmarks led to.
         settings: Of the whole tracking.
         keeper: Of what an interrupted fit of the same input goes on from.
+        watch: Is told how far it has come.
     """
     scene = paper_scene(model, shots, lenses, fit, settings)
     descent = Descent(scene, first_state(scene, fit, lenses), fit)
     descent.resume(keeper)
     total = descent.frames * (1 + settings.paper.epochs)
-    with torch.enable_grad(), progress_bar("Fitting to pixels", total, min(descent.done, total)) as advance:
+    done = min(descent.done, total)
+    with torch.enable_grad(), progress_bar("Fitting to pixels", total, done) as advance:
+
+        def step(amount: int = 1, status: str = "") -> None:
+            nonlocal done
+            done += amount
+            advance(amount, status=status)
+            watch(f"pixels, {status}", done / total, lambda: _as_photometric(scene, descent, fit))
+
         for sequence in range(len(shots)):
-            descent.fit_sequence(sequence, advance, keeper)
+            descent.fit_sequence(sequence, step, keeper)
         if descent.done == descent.frames:
             descent.recentre()
         for epoch in range(settings.paper.epochs):
-            descent.fit_epoch(epoch, advance, keeper)
+            descent.fit_epoch(epoch, step, keeper)
     if descent.lost:
         say(f"{len(descent.lost)} of {descent.frames} frames could not be fitted to pixels and stay near landmarks")
-    return _as_photometric(scene, descent, _as_fit(scene, descent.state, fit))
+    return _as_photometric(scene, descent, fit)
 
 
 def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit) -> PhotometricFit:
     """The fit with texture and light; texels are trusted as the triangles that they are on."""
-    state = descent.state
+    state, fit = descent.state, _as_fit(scene, descent.state, fit)
     fragments = texture_space(scene.face_model, scene.settings.texture_size).fragments
     trust = torch.cat([descent.trusted(), torch.zeros(1)])[fragments.face_index.long()]
     improved = [torch.ones(len(rows), dtype=torch.bool) for rows in state.frames]

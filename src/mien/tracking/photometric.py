@@ -32,12 +32,15 @@ from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
 from mien.tracking.solver import NormalEquations, Smoothness, joined, solve_chain
 from mien.tracking.stages import Fit, SequenceFit, all_landmarks, box_of, fit_bias, fit_of, smoothness_of
+from mien.tracking.watch import Watch
 
 _DAMPING = 1e-3
 _WORSE = 1.02
 """A frame whose cost grows by more than this factor in a step goes back to where it was."""
 _FRAMES_AT_ONCE = 256
 """Timesteps whose equations are kept together: some seconds of work, and some 10 MB."""
+_SHARED_COST, _LOOK_COST = 100, 40
+"""About how long a step of identity and a look at the texture take, in timesteps of a step of all frames."""
 _LEAST_SHARE = 0.03
 """Of a frame in the texture, however far it is from the middle pose: it may be the only one that sees an ear."""
 
@@ -148,6 +151,7 @@ def refine_photometrically(
     fit: Fit,
     settings: TrackingSettings,
     keeper: Keeper,
+    watch: Watch,
 ) -> PhotometricFit:
     """A fit to landmarks refined until pictures agree with a texture that all of them share.
 
@@ -162,6 +166,7 @@ def refine_photometrically(
         fit: What landmarks led to.
         settings: Of the whole tracking.
         keeper: Of what an interrupted fit of the same input goes on from.
+        watch: Is told how far it has come.
     """
     own_settings = settings.photometric
     landmarks = [
@@ -178,25 +183,40 @@ def refine_photometrically(
     )  # fmt: skip
     rounds = [_Round(surface, space, shots, landmarks, own_settings, shrink) for shrink in own_settings.shrinks]
 
-    def kept(name: str, make: Callable[[], PhotometricFit]) -> PhotometricFit:
-        return photometric_fit_of(keeper.once(name, lambda: make().tensors()))
+    frames = sum(len(own.state) for own in fit.sequences)
+    total, done = len(rounds) * (_LOOK_COST + frames) + (len(rounds) - 1) * own_settings.shared_steps * _SHARED_COST, 0
 
     def step_identity(now: _Round, at: PhotometricFit) -> PhotometricFit:
         at = now.look(at)
         moved = step_shared(now.terms(at), at.fit, prior, own_settings.keyframes)
         return replace(at, fit=fit_bias(landmarks, moved, settings))
 
-    with progress_bar("Fitting to pixels", total=len(own_settings.shrinks)) as advance:
+    with progress_bar("Fitting to pixels", total=total) as advance:
+
+        def advance_by(amount: int, status: str) -> None:
+            nonlocal done
+            done += amount
+            advance(amount, status=status)
+            watch(f"pixels, {status}", done / total)
+
+        def kept(name: str, status: str, make: Callable[[], PhotometricFit]) -> PhotometricFit:
+            found = photometric_fit_of(keeper.once(name, lambda: make().tensors()))
+            watch(f"pixels, {status}", done / total, lambda: found)
+            return found
+
         for number, now in enumerate(rounds):
+            status = f"round {number + 1} of {len(rounds)}"
             for step in range(own_settings.shared_steps if number > 0 else 0):
-                at = kept(f"round-{number}-shared-{step}", partial(step_identity, now, at))
-            at = kept(f"round-{number}-looks", partial(now.look, at))
+                at = kept(f"round-{number}-shared-{step}", f"{status}, identity", partial(step_identity, now, at))
+                advance_by(_SHARED_COST, f"{status}, identity")
+            at = kept(f"round-{number}-looks", f"{status}, texture and light", partial(now.look, at))
+            advance_by(_LOOK_COST, f"{status}, texture and light")
             if not (at.appearance.trust > 0).any():
                 say(f"{surface.face_model.name}: pictures give its texture nothing, so faces are as landmarks put them")
                 return replace(at, fit=fit)
-            at = kept(f"round-{number}", partial(_step_sequences, now, at, settings, keeper, f"step-{number}"))
+            step_all = partial(_step_sequences, now, at, settings, keeper, f"step-{number}")
+            at = kept(f"round-{number}", status, partial(step_all, partial(advance_by, status=f"{status}, frames")))
             keeper.drop(f"step-{number}")
-            advance(status=f"pictures {shots[0].capture.width // now.shrink} pixels wide")
     return _with_residuals(rounds[0], rounds[0].look(at))
 
 
@@ -216,21 +236,32 @@ def _quiet(term: LandmarkTerm, share: float) -> LandmarkTerm:
 
 
 def _step_sequences(
-    now: _Round, at: PhotometricFit, settings: TrackingSettings, keeper: Keeper, name: str
+    now: _Round,
+    at: PhotometricFit,
+    settings: TrackingSettings,
+    keeper: Keeper,
+    name: str,
+    advance: Callable[[int], None],
 ) -> PhotometricFit:
     """One step of all timesteps of every sequence; its parts are kept by names that begin with `name`."""
     sequences, improved = [], []
     parts = zip(now.terms(at), now.shots, at.fit.sequences, at.improved, strict=True)
     for number, (term, shot, own, before) in enumerate(parts):
         smoothness = smoothness_of(term.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
-        state, better = _step(term, at.fit.subject, own, smoothness, keeper, f"{name}-{number}")
+        state, better = _step(term, at.fit.subject, own, smoothness, keeper, f"{name}-{number}", advance)
         sequences.append(replace(own, state=state))
         improved.append(before | better)
     return replace(at, fit=replace(at.fit, sequences=tuple(sequences)), improved=tuple(improved))
 
 
 def _step(
-    term: PhotometricTerm, subject: Subject, own: SequenceFit, smoothness: Smoothness, keeper: Keeper, name: str
+    term: PhotometricTerm,
+    subject: Subject,
+    own: SequenceFit,
+    smoothness: Smoothness,
+    keeper: Keeper,
+    name: str,
+    advance: Callable[[int], None],
 ) -> tuple[Float[Tensor, "v p"], Bool[Tensor, " v"]]:
     """All timesteps moved by one Gauss-Newton step, except those that it would make worse; and which ones moved."""
     box, state = box_of(term.layout), own.state
@@ -240,10 +271,10 @@ def _step(
         found = term.equations(state, rows, subject, own.cameras)
         return {"cost": found.cost, "gradient": found.gradient, "hessian": found.hessian}
 
-    parts = [
-        NormalEquations(**keeper.once(f"{name}-equations-{index}", partial(equations_at, rows)))
-        for index, rows in enumerate(chunks)
-    ]
+    parts = []
+    for index, rows in enumerate(chunks):
+        parts.append(NormalEquations(**keeper.once(f"{name}-equations-{index}", partial(equations_at, rows))))
+        advance(len(rows))
     equations = joined(parts)
     damping = torch.diag_embed(_DAMPING * equations.hessian.diagonal(dim1=1, dim2=2))
     held = box.held(state, equations.gradient + smoothness.gradient(state))

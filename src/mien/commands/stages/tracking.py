@@ -46,6 +46,7 @@ def tracking_stage(
     settings: TrackingSettings,
     again: bool = False,
     overlay: Overlay = "auto",
+    preview: bool = False,
 ) -> dict[str, Tracking]:
     """Track all sequences of a workspace together, with one identity; current trackings are read back.
 
@@ -60,7 +61,7 @@ def tracking_stage(
     fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
     trackings = None if again else _current_trackings(workspace, names, fingerprint)
     if trackings is None:
-        trackings = _track(workspace, names, face_model, settings, fingerprint)
+        trackings = _track(workspace, names, face_model, settings, fingerprint, preview)
     else:
         say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
     for name, tracking in trackings.items():
@@ -111,7 +112,12 @@ def _current_trackings(workspace: Workspace, names: list[str], fingerprint: str)
 
 
 def _track(
-    workspace: Workspace, names: list[str], face_model: FaceModel, settings: TrackingSettings, fingerprint: str
+    workspace: Workspace,
+    names: list[str],
+    face_model: FaceModel,
+    settings: TrackingSettings,
+    fingerprint: str,
+    preview: bool,
 ) -> dict[str, Tracking]:
     captures = {name: read_capture(workspace.sequence_dir(name) / "capture") for name in names}
     usable = {name: capture for name, capture in captures.items() if has_enough_faces(capture)} or captures
@@ -121,7 +127,10 @@ def _track(
     for other in workspace.root.glob("sequences/.tracking-*"):
         if other != keep and other.is_dir():
             shutil.rmtree(other, ignore_errors=True)  # of other captures or settings
-    tracked = track_subject(list(usable.values()), face_model, settings, keep)
+    page = workspace.root / "tracking_preview.html" if preview else None
+    if page is not None:
+        say(f"Open {page} in a browser: it is renewed while the fit goes on")
+    tracked = track_subject(list(usable.values()), face_model, settings, keep, page)
     trackings = {}
     for name, tracking in zip(usable, tracked, strict=True):
         made_from = {"fingerprint": fingerprint, "tracked_together": list(usable)}
