@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from mien.benchmarking.motion import Following
 from mien.benchmarking.quality import (
     QualityRow,
     TrackingErrors,
     aligned_distance,
     crop_landmarks,
     markdown_table,
+    tracking_cells,
     tracking_errors,
 )
 from mien.capture import Capture
@@ -51,6 +53,11 @@ def test_the_truth_has_no_error(case):
     assert errors.rotation_deg < 0.05
     assert errors.jitter_px is not None
     assert errors.jitter_px < 0.01
+    assert errors.jitter_mm is not None
+    assert errors.jitter_mm < 0.01
+    assert errors.iris_deviation_percent is not None
+    assert errors.iris_deviation_percent < 0.7
+    assert errors.turns is None or abs(errors.turns.loss_percent) < 0.1
 
 
 def test_a_constant_turn_is_not_unsteady(case):
@@ -77,6 +84,8 @@ def test_another_expression_is_a_distance_and_noise_is_jitter(case):
     assert 1 < errors.vertex_mm < 10
     assert errors.jitter_px is not None
     assert errors.jitter_px > 0.3
+    assert errors.jitter_mm is not None
+    assert 2 < errors.jitter_mm < 20
 
 
 def test_distances_do_not_see_rotation_scale_and_shift():
@@ -104,7 +113,9 @@ def test_the_table_names_hash_and_baselines():
     assert "ring-16 (`abcd`) | novel_view | avatar | 30.00 / 0.900 / 0.0100 / - |" in table
     assert "mean frame" in table
     assert "| mesh |" in table
-    assert "1.00 mm | 2.00 px | 3.00 (0.50) deg | - |" in table
+    assert "1.00 mm | 2.00 px | 3.00 (0.50) deg | - | - | - | - |" in table
+    known = TrackingErrors(1.0, 2.0, 3.0, 0.5, 0.02, 0.04, Following(0.3, 7.0, 5), None, 0.61)
+    assert tracking_cells(known).endswith("| 0.020 px, 0.040 mm | 0.30 frames, 7 % (5) | - | 0.61 %")
 
 
 def test_an_unknown_capture_is_one_line(tmp_path, capsys):

@@ -57,6 +57,7 @@ def test_every_stage_is_shown_and_changes_nothing(tmp_path, seen):
     heights = [height for _, _, height in seen]
     assert heights[0] < heights[stages.index("landmarks, identity")] < heights[-1], "residuals of colours are missing"
     picture = cv2.imread(str(page.with_suffix(".png")))
+    assert picture is not None
     assert picture.shape == (heights[-1], 960, 3)
     assert "refresh" not in page.read_text(), "the last one is not renewed"
     assert "data:image/png" in page.read_text()
@@ -109,5 +110,7 @@ def test_before_any_fit_there_is_a_header_alone(tmp_path):
     case = make_photometric_case(timesteps=3)
     watch: Callable = watch_of(tmp_path, case.capture, case.model)
     watch("landmarks, head pose", 0.1)
-    assert cv2.imread(str(tmp_path / "p.png")).shape == (48, 960, 3)
+    header = cv2.imread(str(tmp_path / "p.png"))
+    assert header is not None
+    assert header.shape == (48, 960, 3)
     assert "refresh" in (tmp_path / "p.html").read_text()

@@ -7,16 +7,22 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from mien.benchmarking.motion import (
+    Following,
+    blink_following,
+    jitter,
+    mean_rotation,
+    still_timesteps,
+    turn_following,
+)
 from mien.capture import Capture
 from mien.face import FaceModel
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.synthetic import Truth
-from mien.tracking import Tracking
+from mien.tracking import Tracking, residual_report
 
 _FACING = 0.2
 """Least cosine between a visible vertex's normal and the direction to the camera."""
-_STILL = 0.02
-"""Pixels a frame: below, true landmarks stand still."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,14 @@ class TrackingErrors:
     """The same without its constant part, in which shape and pose stand in for each other."""
     jitter_px: float | None
     """Median second difference of the tracked landmarks where the true ones stand still, capture pixels."""
+    jitter_mm: float | None = None
+    """The same in world space, millimetres."""
+    blinks: Following | None = None
+    """How the eyes' openings follow the true ones around blinks."""
+    turns: Following | None = None
+    """How head rotation follows the true one around fast turns."""
+    iris_deviation_percent: float | None = None
+    """Standard deviation of the irises' distance x depth / focal length over near-frontal frames, of its mean."""
 
 
 @torch.no_grad()
@@ -45,22 +59,30 @@ def tracking_errors(tracking: Tracking, capture: Capture, truth: Truth, face_mod
     index = torch.from_numpy(truth.vertex_index)
     expected = crop_landmarks(truth.landmarks, capture)
     vertex, pixel, projected = [], [], np.full(expected.shape, np.nan, np.float32)
+    placed = np.full((len(expected), expected.shape[2], 3), np.nan, np.float32)
     for timestep in timesteps:
         vertices = face_model(tracking.face[timestep])[0]
         visible = _visible(truth, face_model, timestep)
         vertex.append(aligned_distance(vertices[index].numpy()[visible], truth.vertices[timestep][visible]))
         points = face_model.landmark_positions(vertices, "mediapipe")
+        placed[timestep] = points.numpy()
         for camera, view in enumerate(tracking.cameras):
             projected[timestep, camera] = view.project(points)[0].numpy()
         seen = capture.valid[timestep]
         pixel.append(np.linalg.norm(projected[timestep, seen] - expected[timestep, seen], axis=-1).mean())
     mean, steady = _rotation_errors(tracking, truth)
+    still = still_timesteps(expected)
+    jitter_m = jitter(placed, still)
     return TrackingErrors(
         vertex_mm=1e3 * float(np.mean(vertex)),
         landmark_px=float(np.mean(pixel)),
         rotation_deg=mean,
         rotation_steady_deg=steady,
-        jitter_px=_jitter(projected, expected),
+        jitter_px=jitter(projected, still),
+        jitter_mm=None if jitter_m is None else 1e3 * jitter_m,
+        blinks=blink_following(projected, expected, truth, capture.fps),
+        turns=turn_following(tracking, truth, capture.fps),
+        iris_deviation_percent=residual_report(capture, tracking, face_model)["iris_distance"]["deviation_percent"],
     )
 
 
@@ -111,21 +133,12 @@ def _rotation_errors(tracking: Tracking, truth: Truth) -> tuple[float, float]:
     kept = tracking.valid
     tracked, true = (matrix_from_axis_angle(t.face.head_rotation)[kept].double() for t in (tracking, truth.tracking))
     difference = tracked.transpose(-1, -2) @ true
-    u, _, vh = torch.linalg.svd(difference.mean(0))
-    mean = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vh))]).double()) @ vh
+    mean = mean_rotation(difference)
     angles = [
         torch.rad2deg(axis_angle_from_matrix(part.float()).norm(dim=-1)).mean()
         for part in (difference, mean.T @ difference)
     ]
     return float(angles[0]), float(angles[1])
-
-
-def _jitter(projected: Float[np.ndarray, "t c l 2"], true: Float[np.ndarray, "t c l 2"]) -> float | None:
-    moving = np.linalg.norm(np.diff(true[:, 0], axis=0), axis=-1).max(-1)
-    still = (moving[1:] < _STILL) & (moving[:-1] < _STILL)
-    second = np.linalg.norm(projected[2:] - 2 * projected[1:-1] + projected[:-2], axis=-1)[still]
-    second = second[np.isfinite(second)]
-    return float(np.median(second)) if len(second) else None
 
 
 @dataclass(frozen=True)
@@ -164,19 +177,36 @@ def markdown_table(rows: list[QualityRow]) -> str:
                              f"{_figures(figures)} | {_figures(figures['head'])} |")  # fmt: skip
     lines += [
         "",
-        "| capture | sequence | face vertices | landmarks | head rotation (steady part left out) | jitter, still |",
-        "|---|---|---|---|---|---|",
+        "| capture | sequence | face vertices | landmarks | head rotation (steady part left out) | jitter, still | "
+        "blinks: lag, loss | fast turns: lag, loss | iris distance |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        for name, errors in row.tracking.items():
-            jitter = "-" if errors.jitter_px is None else f"{errors.jitter_px:.3f} px"
-            lines.append(f"| {row.capture} | {name} | {errors.vertex_mm:.2f} mm | {errors.landmark_px:.2f} px | "
-                         f"{errors.rotation_deg:.2f} ({errors.rotation_steady_deg:.2f}) deg | {jitter} |")  # fmt: skip
+        lines += [f"| {row.capture} | {name} | {tracking_cells(errors)} |" for name, errors in row.tracking.items()]
     lines += ["", "| capture | steps | Gaussians | seconds by stage |", "|---|---|---|---|"]
     for row in rows:
         seconds = ", ".join(f"{name} {value:.0f}" for name, value in row.seconds.items())
         lines.append(f"| {row.capture} | {row.steps:,} | {row.gaussians:,} | {seconds} |")
     return "\n".join(lines) + "\n"
+
+
+def tracking_cells(errors: TrackingErrors) -> str:
+    """The measures of one sequence as cells of a table."""
+    pixels, world = _known(errors.jitter_px, "{:.3f} px"), _known(errors.jitter_mm, "{:.3f} mm")
+    return " | ".join([
+        f"{errors.vertex_mm:.2f} mm", f"{errors.landmark_px:.2f} px",
+        f"{errors.rotation_deg:.2f} ({errors.rotation_steady_deg:.2f}) deg",
+        pixels if errors.jitter_mm is None else f"{pixels}, {world}",
+        *(
+            "-" if one is None else f"{one.lag_frames:.2f} frames, {one.loss_percent:.0f} % ({one.events})"
+            for one in (errors.blinks, errors.turns)
+        ),
+        _known(errors.iris_deviation_percent, "{:.2f} %"),
+    ])  # fmt: skip
+
+
+def _known(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)
 
 
 def _figures(entry: dict[str, Any]) -> str:
