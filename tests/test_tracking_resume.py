@@ -84,7 +84,7 @@ def slowly(self, name, tensors):
     time.sleep(0.3)
 
 write, Keeper._write = Keeper._write, slowly
-stage.load_face_model = lambda name: make_textured_model()
+stage.face_model_of = lambda choice: make_textured_model()
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -93,7 +93,7 @@ def test_killed_tracking_goes_on(case, tmp_path, monkeypatch, capsys):
     """The process is killed, not asked to stop; then the same command ends with the same file."""
     monkeypatch.undo()  # the other process fits as many at once as ever
     model = make_textured_model()
-    monkeypatch.setattr("mien.commands.stages.tracking.load_face_model", lambda name: model)
+    monkeypatch.setattr("mien.commands.stages.tracking.face_model_of", lambda choice: model)
     command = ["--overlay", "none", "--tracking.photometric.texture-size", "64"]
     for name in ("killed", "undisturbed"):
         write_capture(tmp_path / name / "sequences/clip/capture", case.capture)

@@ -17,7 +17,7 @@ from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import Subject
 from mien.tracking.model_pictures import looks_in_world, model_pictures
 from mien.tracking.neck_line import fit_neck_lines
-from mien.tracking.photometric import PhotometricFit
+from mien.tracking.photometric_fit import PhotometricFit
 from mien.tracking.photometric_threads import in_threads
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot

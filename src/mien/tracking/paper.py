@@ -9,7 +9,7 @@ from mien.progress import progress_bar, say
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.paper_descent import Descent
 from mien.tracking.paper_scene import PaperScene, PaperState, first_state, paper_scene
-from mien.tracking.photometric import PhotometricFit
+from mien.tracking.photometric_fit import PhotometricFit
 from mien.tracking.photometric_texture import Appearance, texture_space
 from mien.tracking.resume import Keeper
 from mien.tracking.settings import TrackingSettings

@@ -1,6 +1,6 @@
 """The photometric stage: faces tracked from landmarks are moved until one texture fits all pictures."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -12,13 +12,13 @@ from mien.progress import progress_bar, say
 from mien.tracking.landmark_groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_EYELIDS, RIGHT_IRIS
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import LandmarkTerm, Subject
+from mien.tracking.photometric_fit import PhotometricFit, photometric_fit_of
 from mien.tracking.photometric_pictures import Pictures
 from mien.tracking.photometric_settings import PhotometricSettings
 from mien.tracking.photometric_shared import SharedPrior, step_shared
 from mien.tracking.photometric_surface import SurfaceModel, surface_model
 from mien.tracking.photometric_term import PhotometricTerm
 from mien.tracking.photometric_texture import (
-    Appearance,
     Sighting,
     TextureSpace,
     estimate_appearance,
@@ -30,8 +30,8 @@ from mien.tracking.photometric_threads import in_threads
 from mien.tracking.resume import Keeper
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
-from mien.tracking.solver import NormalEquations, Smoothness, joined, solve_chain
-from mien.tracking.stages import Fit, SequenceFit, all_landmarks, box_of, fit_bias, fit_of, smoothness_of
+from mien.tracking.solver import NormalEquations, Smoothness, solve_chain
+from mien.tracking.stages import Fit, SequenceFit, all_landmarks, box_of, fit_bias, smoothness_of
 from mien.tracking.watch import Watch
 
 _DAMPING = 1e-3
@@ -43,39 +43,6 @@ _SHARED_COST, _LOOK_COST = 100, 40
 """About how long a step of identity and a look at the texture take, in timesteps of a step of all frames."""
 _LEAST_SHARE = 0.03
 """Of a frame in the texture, however far it is from the middle pose: it may be the only one that sees an ear."""
-
-
-@dataclass(frozen=True, eq=False)
-class PhotometricFit:
-    """A fit with what it found out about the subject's looks."""
-
-    fit: Fit
-    appearance: Appearance
-    lights: tuple[Float[Tensor, "9 3"], ...]
-    """Of each sequence."""
-    improved: tuple[Bool[Tensor, " _"], ...]
-    """Of each sequence, timesteps that pixels made better; the others stay as landmarks had them."""
-    residuals: tuple[Float[Tensor, "_ _"], ...] = ()
-    """Of each sequence: `PhotometricTerm.residuals`, NaN where not improved."""
-
-    def tensors(self) -> dict[str, Tensor]:
-        """By name, for a file: all but the residuals."""
-        tensors = self.fit.tensors() | {"albedo": self.appearance.albedo, "trust": self.appearance.trust}
-        tensors["sigma"] = torch.tensor([self.appearance.sigma], dtype=torch.float64)
-        for index, (light, improved) in enumerate(zip(self.lights, self.improved, strict=True)):
-            tensors |= {f"light_{index}": light, f"improved_{index}": improved.to(torch.uint8)}
-        return tensors
-
-
-def photometric_fit_of(tensors: Mapping[str, Tensor]) -> PhotometricFit:
-    """The fit with these tensors (`PhotometricFit.tensors`)."""
-    fit = fit_of(tensors)
-    count = range(len(fit.sequences))
-    return PhotometricFit(
-        fit, Appearance(tensors["albedo"], tensors["trust"], float(tensors["sigma"])),
-        tuple(tensors[f"light_{index}"] for index in count),
-        tuple(tensors[f"improved_{index}"].bool() for index in count),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +221,30 @@ def _step_sequences(
     return replace(at, fit=replace(at.fit, sequences=tuple(sequences)), improved=tuple(improved))
 
 
+def _equations(
+    term: PhotometricTerm,
+    subject: Subject,
+    own: SequenceFit,
+    keeper: Keeper,
+    name: str,
+    advance: Callable[[int], None],
+) -> NormalEquations:
+    """Of all timesteps, some of them at a time; those that an interrupted fit had made are read."""
+
+    def made(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
+        found = term.equations(own.state, rows, subject, own.cameras)
+        return {"cost": found.cost, "gradient": found.gradient, "hessian": found.hessian}
+
+    v, p = own.state.shape
+    whole = {"cost": own.state.new_empty(v), "gradient": own.state.new_empty(v, p),
+             "hessian": own.state.new_empty(v, p, p)}  # fmt: skip
+    for index, rows in enumerate(torch.arange(v).split(_FRAMES_AT_ONCE)):
+        for key, part in keeper.once(f"{name}-equations-{index}", partial(made, rows)).items():
+            whole[key][rows] = part
+        advance(len(rows))
+    return NormalEquations(**whole)
+
+
 def _step(
     term: PhotometricTerm,
     subject: Subject,
@@ -265,17 +256,7 @@ def _step(
 ) -> tuple[Float[Tensor, "v p"], Bool[Tensor, " v"]]:
     """All timesteps moved by one Gauss-Newton step, except those that it would make worse; and which ones moved."""
     box, state = box_of(term.layout), own.state
-    chunks = torch.arange(len(state)).split(_FRAMES_AT_ONCE)
-
-    def equations_at(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
-        found = term.equations(state, rows, subject, own.cameras)
-        return {"cost": found.cost, "gradient": found.gradient, "hessian": found.hessian}
-
-    parts = []
-    for index, rows in enumerate(chunks):
-        parts.append(NormalEquations(**keeper.once(f"{name}-equations-{index}", partial(equations_at, rows))))
-        advance(len(rows))
-    equations = joined(parts)
+    equations = _equations(term, subject, own, keeper, name, advance)
     damping = torch.diag_embed(_DAMPING * equations.hessian.diagonal(dim1=1, dim2=2))
     held = box.held(state, equations.gradient + smoothness.gradient(state))
     damped = replace(equations, hessian=equations.hessian + damping)

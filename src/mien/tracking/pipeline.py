@@ -19,7 +19,8 @@ from mien.tracking.landmark_term import Subject
 from mien.tracking.outcome import as_tracking, with_pixels
 from mien.tracking.paper import fit_by_descent
 from mien.tracking.parameters import layout_of
-from mien.tracking.photometric import PhotometricFit, refine_photometrically
+from mien.tracking.photometric import refine_photometrically
+from mien.tracking.photometric_fit import PhotometricFit
 from mien.tracking.preview import DONE, Preview
 from mien.tracking.resume import Keeper
 from mien.tracking.settings import TrackingSettings

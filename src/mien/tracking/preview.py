@@ -19,7 +19,7 @@ from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.model_pictures import model_pictures
 from mien.tracking.outcome import as_tracking, looks_of
 from mien.tracking.overlay import OverlayPainter, frontal_camera
-from mien.tracking.photometric import PhotometricFit
+from mien.tracking.photometric_fit import PhotometricFit
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
 from mien.tracking.stages import Fit, SequenceFit
