@@ -41,11 +41,17 @@ void set_row_buffers(PhotometricBand& band) {
   thread_local std::vector<float> storage;
   const size_t columns = static_cast<size_t>(band.limit - band.origin);
   const size_t row = (columns + kPhotometricLine - 1) / kPhotometricLine * kPhotometricLine + 2 * kPhotometricPad;
-  storage.assign(row * (4 + 3 * kPhotometricRing) + kPhotometricLine, 0.0f);
+  storage.assign(row * (7 * kPhotometricRows + 3 * kPhotometricRing + 1) + kPhotometricLine, 0.0f);
   const size_t beyond = reinterpret_cast<uintptr_t>(storage.data()) / sizeof(float) % kPhotometricLine;
   float* next = storage.data() + (kPhotometricLine - beyond) % kPhotometricLine + kPhotometricPad;
   const auto take = [&](float*& buffer) { buffer = next, next += row; };
-  for (float*& buffer : band.rows) take(buffer);
+  take(band.zeros);
+  for (auto& map : band.blurred) {
+    for (float*& buffer : map) take(buffer);
+  }
+  for (auto& map : band.derivatives) {
+    for (float*& buffer : map) take(buffer);
+  }
   for (auto& map : band.ring) {
     for (float*& buffer : map) take(buffer);
   }

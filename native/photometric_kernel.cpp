@@ -1,5 +1,6 @@
-// The photometric loss on a band of rows, streaming: each row of the SSIM map is made once, its derivatives wait in a
-// ring of rows until the window around a row is complete, then that row's gradient is written. All in the L2 cache.
+// The photometric loss on a band of rows, streaming, four rows at a time: rows of the SSIM map are made once, their
+// derivatives wait in a ring of rows until the window around a row is complete, then that row's gradient is written.
+// Columns go by strips, so that what is filtered along columns is still in the L1 cache when it is filtered along rows.
 #include "photometric_band.h"
 #include "simd.h"
 
@@ -7,8 +8,11 @@ namespace {
 
 using mien::PhotometricBand;
 
-constexpr int RADIUS = mien::kPhotometricRadius, TAPS = 2 * RADIUS + 1;
+constexpr int RADIUS = mien::kPhotometricRadius;
 constexpr int RING = mien::kPhotometricRing;
+constexpr int ROWS = mien::kPhotometricRows;
+constexpr int TAPS = ROWS + 2 * RADIUS;  // rows that ROWS windows see
+constexpr int STRIP = 128, SIDES = 16;   // floats: the second at least the window's reach; whole vectors
 constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
 
 MIEN_INLINE int smaller(int a, int b) { return a < b ? a : b; }
@@ -18,39 +22,62 @@ MIEN_INLINE void clear(float* from, const float* to) {
   for (; from < to; ++from) *from = 0;
 }
 
-// Weighted sums along columns of the pictures (image, target, image^2 + target^2, image * target) for VECTORS
-// vectors at a time, so that enough independent sums are in flight.
-template <int VECTORS>
-MIEN_INLINE void filter_block(const PhotometricBand& band, const float* weights, int64_t from, int taps, int x) {
-  F mean_x[VECTORS]{}, mean_y[VECTORS]{}, squares[VECTORS]{}, products[VECTORS]{};
-  const float *image = band.image + from + x, *target = band.target + from + x;
-  for (int k = 0; k < taps; ++k, image += band.stride, target += band.stride) {
-    for (int v = 0; v < VECTORS; ++v) {
-      const F a = load(image + v * W), b = load(target + v * W);
-      const F weighted_a = a * weights[k], weighted_b = b * weights[k];
-      mean_x[v] += weighted_a;
-      mean_y[v] += weighted_b;
-      squares[v] += weighted_a * a + weighted_b * b;
-      products[v] += weighted_a * b;
-    }
-  }
-  for (int v = 0; v < VECTORS; ++v) {
-    store(band.rows[0] + x + v * W, mean_x[v]);
-    store(band.rows[1] + x + v * W, mean_y[v]);
-    store(band.rows[2] + x + v * W, squares[v]);
-    store(band.rows[3] + x + v * W, products[v]);
+// Filters `count` columns: vertical(from, to) strip by strip, and horizontal(from, to), which needs SIDES more on both
+// sides, right behind it. All begin at whole vectors; the last ends at `count`.
+template <typename Vertical, typename Horizontal>
+MIEN_INLINE void sweep(int count, Vertical&& vertical, Horizontal&& horizontal) {
+  int done = 0;
+  for (int from = 0; from < count; from += STRIP) {
+    const int to = smaller(from + STRIP, count), ready = to == count ? count : to - SIDES;
+    vertical(from, to);
+    horizontal(done, ready);
+    done = ready;
   }
 }
 
-void filter_pictures_vertically(const PhotometricBand& band, int y) {
-  const int first = larger(y - RADIUS, 0), last = smaller(y + RADIUS, band.height - 1);
-  const int count = band.limit - band.origin, taps = last - first + 1;
-  const float* weights = band.weights + (first - y + RADIUS);
-  const int64_t from = first * band.stride + band.origin;
-  int x = 0;
-  for (; x + 2 * W <= count; x += 2 * W) filter_block<2>(band, weights, from, taps, x);
-  // The last vector overlaps the one before it: no reads past the row.
-  for (; x < count; x += W) filter_block<1>(band, weights, from, taps, smaller(x, count - W));
+// Half of the window, from its edge to its middle: a copy that no store can be suspected to change.
+struct Window {
+  float w[RADIUS + 1];
+
+  MIEN_INLINE explicit Window(const PhotometricBand& band) { memcpy(w, band.weights, sizeof w); }
+};
+
+// The window along columns for ROWS rows of one vector each, of the values that lie RADIUS rows above the first to
+// RADIUS rows below the last. The same sums in the same order for every row.
+MIEN_INLINE void filter_vertically(const F* values, const Window& window, float* const* rows, int x) {
+  F sums[ROWS];
+  for (int row = 0; row < ROWS; ++row) {
+    const F* middle = values + row + RADIUS;
+    sums[row] = middle[0] * window.w[RADIUS];
+    for (int k = 1; k <= RADIUS; ++k) sums[row] = sums[row] + (middle[-k] + middle[k]) * window.w[RADIUS - k];
+  }
+  for (int row = 0; row < ROWS; ++row) store(rows[row] + x, sums[row]);
+}
+
+// Rows y - RADIUS .. of a picture, from column `origin`; rows beyond its border are all zero.
+MIEN_INLINE void find_rows(const PhotometricBand& band, const float* picture, int y, const float** rows) {
+  for (int k = 0; k < TAPS; ++k) {
+    const int row = y - RADIUS + k;
+    rows[k] = row < 0 || row >= band.height ? band.zeros : picture + row * band.stride + band.origin;
+  }
+}
+
+// Image, target, image^2 + target^2 and image * target: both pictures stay in registers.
+MIEN_INLINE void filter_pictures(const PhotometricBand& band, const float* const* images, const float* const* targets,
+                                 const Window& window, int x) {
+  F a[TAPS], b[TAPS];
+  for (int k = 0; k < TAPS; ++k) a[k] = load(images[k] + x);
+  filter_vertically(a, window, band.blurred[0], x);
+  for (int k = 0; k < TAPS; ++k) b[k] = load(targets[k] + x);
+  filter_vertically(b, window, band.blurred[1], x);
+  for (int k = 0; k < TAPS; ++k) {
+    // Rounded, or else some rows would get them so and others multiply and add at once.
+    const F product = rounded(a[k] * b[k]);
+    a[k] = rounded(a[k] * a[k] + b[k] * b[k]);
+    b[k] = product;
+  }
+  filter_vertically(a, window, band.blurred[2], x);
+  filter_vertically(b, window, band.blurred[3], x);
 }
 
 // The floats that begin OFFSET before or after those at `row`, which is aligned with the vectors of its buffer. Loads
@@ -72,50 +99,70 @@ MIEN_INLINE F pair_sum(const float* row) {
   return shifted<-K * mien::kPhotometricChannels>(row) + shifted<K * mien::kPhotometricChannels>(row);
 }
 
-MIEN_INLINE F filter_horizontally(const float* row, const float* weights) {
+MIEN_INLINE F filter_horizontally(const float* row, const Window& window) {
   static_assert(RADIUS == 5, "the window is written out");
-  F sum = load(row) * weights[RADIUS];
-  sum += pair_sum<1>(row) * weights[RADIUS - 1];
-  sum += pair_sum<2>(row) * weights[RADIUS - 2];
-  sum += pair_sum<3>(row) * weights[RADIUS - 3];
-  sum += pair_sum<4>(row) * weights[RADIUS - 4];
-  return sum + pair_sum<5>(row) * weights[RADIUS - 5];
+  F sum = load(row) * window.w[RADIUS];
+  sum += pair_sum<1>(row) * window.w[RADIUS - 1];
+  sum += pair_sum<2>(row) * window.w[RADIUS - 2];
+  sum += pair_sum<3>(row) * window.w[RADIUS - 3];
+  sum += pair_sum<4>(row) * window.w[RADIUS - 4];
+  return sum + pair_sum<5>(row) * window.w[RADIUS - 5];
 }
 
-// One row of the SSIM map inside the box: its sum, and its derivatives into the ring.
-void map_row(const PhotometricBand& band, int y) {
-  filter_pictures_vertically(band, y);
-  const int slot = y & (RING - 1);
-  float *by_mean = band.ring[0][slot], *by_squares = band.ring[1][slot], *by_products = band.ring[2][slot];
+// One vector of a row of the SSIM map; its derivatives go into the ring.
+MIEN_INLINE F map_vector(const PhotometricBand& band, const Window& window, int row, int slot, int x) {
+  const F mean_x = filter_horizontally(band.blurred[0][row] + x, window);
+  const F mean_y = filter_horizontally(band.blurred[1][row] + x, window);
+  const F squares = filter_horizontally(band.blurred[2][row] + x, window);
+  const F products = filter_horizontally(band.blurred[3][row] + x, window);
+  const F mean_product = mean_x * mean_y, mean_squares = mean_x * mean_x + mean_y * mean_y;
+  const F a1 = 2.0f * mean_product + C1, a2 = 2.0f * (products - mean_product) + C2;
+  const F b1 = mean_squares + C1, b2 = squares - mean_squares + C2;
+  const F inverse = reciprocal(b1 * b2);
+  const F map = a1 * a2 * inverse;
+  const F square_slope = -map * inverse * b1;
+  store(band.ring[0][slot] + x, 2.0f * (mean_y * (a2 - a1) * inverse - mean_x * (map * inverse * b2 + square_slope)));
+  store(band.ring[1][slot] + x, square_slope);
+  store(band.ring[2][slot] + x, 2.0f * a1 * inverse);
+  return map;
+}
+
+// ROWS rows of the SSIM map from row y on, as far as they lie inside the box: their sums, and their derivatives.
+void map_rows(const PhotometricBand& band, int y) {
+  const Window window(band);
+  const float *images[TAPS], *targets[TAPS];
+  find_rows(band, band.image, y, images);
+  find_rows(band, band.target, y, targets);
   const int begin = band.left - band.origin, aligned = begin / W * W, end = band.right - band.origin;
-  F map_sum{};
-  for (int x = aligned; x < end; x += W) {
-    const F mean_x = filter_horizontally(band.rows[0] + x, band.weights);
-    const F mean_y = filter_horizontally(band.rows[1] + x, band.weights);
-    const F squares = filter_horizontally(band.rows[2] + x, band.weights);
-    const F products = filter_horizontally(band.rows[3] + x, band.weights);
-    const F mean_product = mean_x * mean_y, mean_squares = mean_x * mean_x + mean_y * mean_y;
-    const F a1 = 2.0f * mean_product + C1, a2 = 2.0f * (products - mean_product) + C2;
-    const F b1 = mean_squares + C1, b2 = squares - mean_squares + C2;
-    const F inverse = 1.0f / (b1 * b2);
-    const F map = a1 * a2 * inverse;
-    const F square_slope = -map * inverse * b1;
-    store(by_mean + x, 2.0f * (mean_y * (a2 - a1) * inverse - mean_x * (map * inverse * b2 + square_slope)));
-    store(by_squares + x, square_slope);
-    store(by_products + x, 2.0f * a1 * inverse);
-    map_sum += keep(both(less_equal(set1((float)(begin - x)), iota()), less(iota(), set1((float)(end - x)))), map);
+  const int first = larger(band.top - y, 0), last = smaller(band.bottom - y, ROWS);
+  const F left = set1((float)begin), right = set1((float)end);
+  F sums[ROWS]{};
+  const int count = band.limit - band.origin;
+  sweep(
+      count,
+      [&](int from, int to) {
+        // The last vector overlaps the one before it: no reads past the row.
+        for (int x = from; x < to; x += W) filter_pictures(band, images, targets, window, smaller(x, count - W));
+      },
+      [&](int from, int to) {
+        for (int row = first; row < last; ++row) {
+          for (int x = larger(from, aligned); x < smaller(to, end); x += W) {
+            const F map = map_vector(band, window, row, (y + row) & (RING - 1), x), column = iota() + (float)x;
+            sums[row] = sums[row] + keep(both(less_equal(left, column), less(column, right)), map);
+          }
+        }
+      });
+  for (int row = first; row < last; ++row) {
+    for (auto& map : band.ring) {  // what whole vectors wrote beside the box
+      float* const own = map[(y + row) & (RING - 1)];
+      clear(own + aligned, own + begin);
+      clear(own + end, own + end + W);
+    }
+    if (y + row < band.begin || y + row >= band.end) continue;  // a neighbour's row
+    double total = 0;
+    for (int lane = 0; lane < W; ++lane) total += sums[row][lane];
+    band.ssim_sums[y + row] = total;
   }
-  // What whole vectors wrote beside the box.
-  clear(by_mean + aligned, by_mean + begin);
-  clear(by_squares + aligned, by_squares + begin);
-  clear(by_products + aligned, by_products + begin);
-  clear(by_mean + end, by_mean + end + 2 * W);
-  clear(by_squares + end, by_squares + end + 2 * W);
-  clear(by_products + end, by_products + end + 2 * W);
-  if (y < band.begin || y >= band.end) return;  // a neighbour's row
-  double total = 0;
-  for (int lane = 0; lane < W; ++lane) total += map_sum[lane];
-  band.ssim_sums[y] = total;
 }
 
 void sum_l1(const PhotometricBand& band, int y) {
@@ -133,57 +180,55 @@ void sum_l1(const PhotometricBand& band, int y) {
   band.l1_sums[y] = total;
 }
 
-// Weighted sums along columns of the three rings of derivatives; whole vectors may reach past the box, where the rings
-// hold zeros.
-void filter_derivatives_vertically(const PhotometricBand& band, int y) {
-  const int first = larger(y - RADIUS, band.top), last = smaller(y + RADIUS, band.bottom - 1);
-  const int begin = (band.left - band.origin) / W * W, end = band.right - band.origin;
-  const float* weights = band.weights + (first - y + RADIUS);
-  const float* taps[TAPS][3];
-  for (int k = 0; k <= last - first; ++k)
-    for (int map = 0; map < 3; ++map) taps[k][map] = band.ring[map][(first + k) & (RING - 1)];
-  for (int x = begin; x < end; x += 2 * W) {
-    F sums[3][2]{};
-    for (int k = 0; k <= last - first; ++k) {
-      for (int map = 0; map < 3; ++map) {
-        sums[map][0] += load(taps[k][map] + x) * weights[k];
-        sums[map][1] += load(taps[k][map] + x + W) * weights[k];
-      }
-    }
-    for (int map = 0; map < 3; ++map) {
-      store(band.rows[map] + x, sums[map][0]);
-      store(band.rows[map] + x + W, sums[map][1]);
-    }
-  }
-  for (int map = 0; map < 3; ++map) {
-    // What the pictures' filter left outside the box.
-    float* row = band.rows[map];
-    clear(row, row + begin);
-    clear(row + end, row + larger(end + 2 * W, band.limit - band.origin));
-  }
+// One vector of a row of the gradient. The window is symmetric, so its adjoint is itself.
+MIEN_INLINE F gradient_vector(const PhotometricBand& band, const Window& window, F a, F b, int row, int x) {
+  const F by_mean = filter_horizontally(band.derivatives[0][row] + x, window);
+  const F by_squares = filter_horizontally(band.derivatives[1][row] + x, window);
+  const F by_products = filter_horizontally(band.derivatives[2][row] + x, window);
+  return band.ssim_factor * (by_mean + 2.0f * a * by_squares + b * by_products);
 }
 
-// The gradient of one row of the grown box. The window is symmetric, so its adjoint is itself.
-void gradient_row(const PhotometricBand& band, int y) {
-  filter_derivatives_vertically(band, y);
-  const float* image = band.image + y * band.stride + band.origin;
-  const float* target = band.target + y * band.stride + band.origin;
-  float* gradient = band.gradient + y * band.stride + band.origin;
-  const int columns = band.limit - band.origin;
-  const F l1_factor = set1(y >= band.top && y < band.bottom ? band.l1_factor : 0.0f);
+// The gradient of ROWS rows of the grown box from row y on, as far as they belong to the band.
+void gradient_rows(const PhotometricBand& band, int y) {
+  const Window window(band);
+  const int columns = band.limit - band.origin, last = smaller(band.end - y, ROWS);
   const F left = set1((float)(band.left - band.origin)), right = set1((float)(band.right - band.origin));
-  for (int block = 0; block < columns; block += W) {
-    const int x = smaller(block, columns - W);
-    const F a = load(image + x), b = load(target + x), column = iota() + (float)x;
-    const F by_mean = filter_horizontally(band.rows[0] + x, band.weights);
-    const F by_squares = filter_horizontally(band.rows[1] + x, band.weights);
-    const F by_products = filter_horizontally(band.rows[2] + x, band.weights);
-    const F sign = keep(less(b, a), set1(1.0f)) - keep(less(a, b), set1(1.0f));
-    const F l1 = keep(both(less_equal(left, column), less(column, right)), sign * l1_factor);
-    store(gradient + x, l1 - band.ssim_factor * (by_mean + 2.0f * a * by_squares + b * by_products));
+  const float* derivatives[3][TAPS];
+  for (int k = 0; k < TAPS; ++k) {
+    const int row = y - RADIUS + k;
+    const bool inside = row >= band.top && row < band.bottom;
+    for (int map = 0; map < 3; ++map) derivatives[map][k] = inside ? band.ring[map][row & (RING - 1)] : band.zeros;
   }
-  memset(gradient - band.origin, 0, sizeof(float) * (size_t)band.origin);
-  memset(gradient + columns, 0, sizeof(float) * (size_t)(band.stride - band.limit));
+  sweep(
+      columns,
+      [&](int from, int to) {
+        for (int x = from; x < to; x += W) {
+          for (int map = 0; map < 3; ++map) {
+            F values[TAPS];
+            for (int k = 0; k < TAPS; ++k) values[k] = load(derivatives[map][k] + x);
+            filter_vertically(values, window, band.derivatives[map], x);
+          }
+        }
+      },
+      [&](int from, int to) {
+        for (int row = 0; row < last; ++row) {
+          const int64_t at = (y + row) * band.stride + band.origin;
+          const float *image = band.image + at, *target = band.target + at;
+          const F l1_factor = set1(y + row >= band.top && y + row < band.bottom ? band.l1_factor : 0.0f);
+          for (int block = from; block < to; block += W) {
+            const int x = smaller(block, columns - W);
+            const F a = load(image + x), b = load(target + x), column = iota() + (float)x;
+            const F sign = keep(less(b, a), set1(1.0f)) - keep(less(a, b), set1(1.0f));
+            const F l1 = keep(both(less_equal(left, column), less(column, right)), sign * l1_factor);
+            store(band.gradient + at + x, l1 - gradient_vector(band, window, a, b, row, x));
+          }
+        }
+      });
+  for (int row = 0; row < last; ++row) {
+    float* const own = band.gradient + (y + row) * band.stride;
+    memset(own, 0, sizeof(float) * (size_t)band.origin);
+    memset(own + band.limit, 0, sizeof(float) * (size_t)(band.stride - band.limit));
+  }
 }
 
 }  // namespace
@@ -192,15 +237,18 @@ namespace mien::MIEN_ISA {
 namespace {
 
 void run_band(const PhotometricBand& band) {
-  const int halo = band.gradient ? RADIUS : 0;
-  for (int row = band.begin - halo; row < band.end + halo; ++row) {
-    if (row >= band.top && row < band.bottom) {
-      map_row(band, row);
-      if (row >= band.begin && row < band.end) sum_l1(band, row);
+  if (!band.gradient) {
+    for (int y = band.begin; y < band.end; y += ROWS) map_rows(band, y);
+  } else {
+    // The gradient of a row needs the map RADIUS rows further.
+    constexpr int kBehind = (ROWS - 1 + 2 * RADIUS) / ROWS * ROWS;
+    for (int y = band.begin; y < band.end + kBehind; y += ROWS) {
+      const int mapped = y - RADIUS;
+      if (mapped + ROWS > band.top && mapped < band.bottom) map_rows(band, mapped);
+      if (y - kBehind >= band.begin) gradient_rows(band, y - kBehind);
     }
-    const int finished = row - halo;
-    if (band.gradient && finished >= band.begin && finished < band.end) gradient_row(band, finished);
   }
+  for (int y = larger(band.begin, band.top); y < smaller(band.end, band.bottom); ++y) sum_l1(band, y);
 }
 
 void bytes_to_floats(const uint8_t* from, int64_t count, float* to) {

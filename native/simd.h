@@ -43,6 +43,18 @@ MIEN_INLINE F from_bits(I value) { return (F)value; }
 MIEN_INLINE F to_float(I value) { return __builtin_convertvector(value, F); }
 MIEN_INLINE I truncate(F value) { return __builtin_convertvector(value, I); }
 
+// The value itself, rounded: the compiler may not make one operation of the one that made it and one that follows.
+MIEN_INLINE F rounded(F value) {
+#if defined(__AVX512F__)
+  __asm__("" : "+v"(value));
+#elif defined(__x86_64__)
+  __asm__("" : "+x"(value));
+#elif defined(__aarch64__)
+  __asm__("" : "+w"(value));
+#endif
+  return value;
+}
+
 // 0, 1, 2, ...
 MIEN_INLINE F iota() {
   F value;

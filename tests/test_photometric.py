@@ -20,6 +20,15 @@ WHOLE_AND_PARTS = [
 ]
 
 
+@pytest.fixture(params=["avx512", "avx2", "sse4", "baseline"])
+def isa(request: pytest.FixtureRequest):
+    before = _native.rasterize_isa()
+    if not _native.set_rasterize_isa(request.param):
+        pytest.skip(f"this machine has no {request.param}")
+    yield request.param
+    assert _native.set_rasterize_isa(before)
+
+
 def smooth_picture(height: int, width: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.rand(1, 3, height // 8 + 2, width // 8 + 2, generator=generator)
@@ -48,7 +57,7 @@ def relative_error(value: Tensor, expected: Tensor) -> float:
 @pytest.mark.parametrize(("height", "width", "box"), WHOLE_AND_PARTS)
 @pytest.mark.parametrize("weights", [(0.8, 0.2), (1.0, 0.0), (0.0, 1.0)])
 def test_value_and_gradient_equal_the_float64_reference(
-    height: int, width: int, box: Box | None, weights: tuple[float, float]
+    isa: str, height: int, width: int, box: Box | None, weights: tuple[float, float]
 ):
     image, target = pair(height, width)
     value, gradient = exact(image, target, weights, box)
@@ -112,7 +121,7 @@ def test_ssim_follows_its_formula():
     assert ssim_map(image, black)[0, 0, 0] < 1e-4 / (mean_at_corner**2 + 1e-4)
 
 
-def test_threads_do_not_change_a_bit():
+def test_threads_do_not_change_a_bit(isa: str):
     image, target = pair(150, 90)
     image.requires_grad_()
     results = []
