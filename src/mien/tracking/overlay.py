@@ -24,7 +24,7 @@ from mien.tracking.tracking import Tracking
 _REGION_COLORS = {
     "lips": (0.95, 0.45, 0.5), "eyelids": (0.55, 0.75, 0.95), "eyes": (1.0, 1.0, 1.0), "irises": (0.2, 0.3, 0.7),
     "teeth": (1.0, 1.0, 0.85), "mouth": (0.45, 0.1, 0.1), "brows": (0.6, 0.55, 0.4), "ears": (0.65, 0.9, 0.6),
-    "nose": (0.9, 0.85, 0.6),
+    "nose": (0.9, 0.85, 0.6), "tongue": (0.85, 0.55, 0.5),
 }  # fmt: skip
 _SKIN = (0.8, 0.78, 0.75)
 _MESH_OPACITY = 0.6
