@@ -180,3 +180,35 @@ def test_tracked_faces_have_looks(case, schedule):
     assert tracking.pixel_residuals is not None
     assert tracking.pixel_residuals.median() < 0.08
     assert residual_report(case.capture, tracking, case.model)["landmarks_only_frames"] == []
+
+
+def test_calibrated_cameras_in_another_world_are_compared_too(case, tmp_path):
+    """Lit from one side, so that light has to be turned into the world; pictures of all cameras in a grid."""
+    W_other = torch.eye(4)
+    W_other[:3, :3] = matrix_from_axis_angle(torch.tensor([0.3, 1.2, -0.2]))
+    W_other[:3, 3] = torch.tensor([1.0, 2.0, -0.5])
+    camera = replace(case.camera, viewmat=case.camera.viewmat @ torch.linalg.inv(W_other))
+    slope = np.linspace(0.5, 1.2, SIZE, dtype=np.float32)[:, None]
+    images = np.clip(case.capture.images * slope, 0, 255).astype(np.uint8)
+    both = {name: np.repeat(getattr(case.capture, name), 2, axis=1) for name in ("mattes", "landmarks", "valid")}
+    capture = replace(
+        case.capture, **both, images=np.repeat(images, 2, axis=1), camera_ids=("a", "b"), calibration=(camera, camera),
+        principal_point=np.repeat(case.capture.principal_point, 2, axis=0),
+    )  # fmt: skip
+    tracking = track(capture, case.model, FAST)
+    assert tracking.pixel_residuals is not None
+    pictures = model_pictures(capture, tracking, case.model)
+    assert pictures is not None
+    vertices = case.model(tracking.face[3])[0]
+    found = [pictures.compare(3, index, vertices).rms for index in (0, 1)]
+    assert found[0] == found[1]
+    assert found[0] == pytest.approx(float(tracking.pixel_residuals[3, 0]), rel=0.3)
+    assert tracking.looks is not None
+    unturned = replace(tracking.looks, light=turn_light(tracking.looks.light, W_other[:3, :3].T))
+    wrong = model_pictures(capture, replace(tracking, looks=unturned), case.model)
+    assert wrong is not None
+    assert wrong.compare(3, 0, vertices).rms > 1.02 * found[0]
+    write_overlay(tmp_path / "overlay.mp4", capture, tracking, case.model, every=3)
+    assert probe_video(tmp_path / "overlay.mp4").frames == 2
+    write_residual_report(tmp_path, capture, tracking, case.model)
+    assert (tmp_path / "report.html").is_file()

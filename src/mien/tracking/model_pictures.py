@@ -82,7 +82,7 @@ class ModelPictures:
         view, residual = picture.camera, torch.empty_like(picture.image)
         depth = float(view.project(vertices.mean(0, keepdim=True))[1])
         radius = max(round(self.looks.light_extent * float(view.K[0, 0]) / max(depth, 1e-3)), 2)
-        seen = Sighting(posed, picture, self.looks.light).arguments()
+        seen = Sighting(posed, picture, self.looks.light.contiguous()).arguments()
         cost, weight = _native.align_mesh(self.surface, *seen, radius, None, None, None, residual, None)
         rms = self.looks.sigma * cost**0.5 if weight >= _LEAST_PIXELS else float("nan")
         return Comparison(window, picture.image - residual, residual.norm(dim=-1), rms)
@@ -112,4 +112,4 @@ def turn_light(light: Float[Tensor, "9 3"], rotation: Float[Tensor, "3 3"]) -> F
     normals = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     turned = sh_basis(normals.double() @ rotation.double().T)
     # Rotations map the harmonics of a degree to themselves, so that the fit is exact.
-    return torch.linalg.lstsq(turned, sh_basis(normals.double()) @ light.double()).solution.to(light)
+    return torch.linalg.lstsq(turned, sh_basis(normals.double()) @ light.double()).solution.to(light).contiguous()

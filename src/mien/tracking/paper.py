@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import torch
 
-from mien.progress import progress_bar, say
+from mien.progress import progress_bar
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.paper_descent import Descent
 from mien.tracking.paper_scene import PaperScene, PaperState, first_state, paper_scene
@@ -29,7 +29,7 @@ def fit_by_descent(
 ) -> PhotometricFit:
     """A fit to landmarks refined as in the supplement of GaussianAvatars, section A.
 
-    Frames whose landmarks a fit to pixels lost go back to where landmarks had them; how many is said.
+    Frames whose landmarks a fit to pixels lost go back to where landmarks had them, and are not `improved`.
 
     Args:
         model: The face model reduced to its landmarks.
@@ -59,8 +59,6 @@ def fit_by_descent(
             descent.recentre()
         for epoch in range(settings.paper.epochs):
             descent.fit_epoch(epoch, step, keeper)
-    if descent.lost:
-        say(f"{len(descent.lost)} of {descent.frames} frames could not be fitted to pixels and stay near landmarks")
     return _as_photometric(scene, descent, fit)
 
 
