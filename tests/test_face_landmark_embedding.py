@@ -16,6 +16,7 @@ from mien.tracking.landmark_embedding import (
     _best_point,
     embed_landmarks,
 )
+from mien.tracking.landmark_groups import LEFT_EYELIDS, RIGHT_EYELIDS
 from small_face_model import make_small_face_model
 
 
@@ -68,6 +69,18 @@ def test_few_pictures_agree_with_the_shipped_landmarks(few):
     distance = (shipped - again).norm(dim=1)
     assert distance.median() < 0.0015
     assert distance.quantile(0.95) < 0.005
+
+
+def test_landmarks_of_lids_are_not_inside_the_eyeballs(few):
+    """In every picture a hidden point may be as near as the lid's edge; it is millimetres too deep."""
+    model, landmarks, _ = few
+    points = landmarks["mediapipe"].positions(model.template, model.faces)
+    for name, lids in (("left_eye", LEFT_EYELIDS), ("right_eye", RIGHT_EYELIDS)):
+        centre = model.joint_template[model.joint_names.index(name)]
+        ball = model.faces[model.region_mask("eyes", "irises")].unique()
+        ball = ball[model.template[ball, 0] * centre[0] > 0]
+        radius = (model.template[ball] - centre).norm(dim=1).median()
+        assert ((points[list(lids)] - centre).norm(dim=1) - radius).min() > -0.0015
 
 
 def test_written_landmarks_are_read_by_the_loader(few, tmp_path, monkeypatch):

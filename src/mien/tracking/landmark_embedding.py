@@ -22,7 +22,7 @@ from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, Landmarks
 from mien.face.loading import load_face_model_without_landmarks, write_landmarks
 from mien.progress import say, track_progress
-from mien.render.mesh import Headlight, render_mesh
+from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.rotation import rigid_transform
 from mien.tracking.landmark_groups import LANDMARKS, LEFT_IRIS, RIGHT_IRIS
 
@@ -40,6 +40,8 @@ _FACE_REGIONS = ("skin", "face", "lips", "eyelids", "brows", "nose", "scalp", "e
 _EYE_REGIONS = ("eyes", "irises")
 _SCALP_FRONT = 0.06
 """Metres ahead of the head frame's origin: only there landmarks may be on the scalp."""
+_LEAST_SEEN = 0.25
+"""Share of the pictures in which a triangle is seen, for landmarks to be on it."""
 _WALL = (0.6, 0.6, 0.6)
 _SUBDIVISIONS = 12
 """Steps along a triangle's side at which points are tried."""
@@ -89,11 +91,10 @@ def embed_landmarks(
         UserError: the detector finds no face in most pictures.
     """
     settings = settings or EmbeddingSettings()
-    views = _draw_and_detect(model, settings)
+    views, seen = _draw_and_detect(model, settings)
     faces, barycentric = torch.empty(LANDMARKS, dtype=torch.long), torch.empty(LANDMARKS, 3)
     errors = torch.empty(LANDMARKS)
-    on_eyes = _allowed(model, _EYE_REGIONS)
-    on_face = _allowed(model, _FACE_REGIONS)
+    on_eyes, on_face = (_allowed(model, regions, seen) for regions in (_EYE_REGIONS, _FACE_REGIONS))
     for landmark in track_progress(range(LANDMARKS), "Placing landmarks", LANDMARKS):
         allowed = on_eyes if landmark in LEFT_IRIS + RIGHT_IRIS else on_face
         faces[landmark], barycentric[landmark], errors[landmark] = _best_point(
@@ -169,7 +170,9 @@ def paint(model: FaceModel, generator: torch.Generator) -> Float[Tensor, "f 3 3"
     return by_region[model.face_regions][:, None].expand(-1, 3, 3).contiguous()
 
 
-def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> Views:
+def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[Views, Float[Tensor, " f"]]:
+    """What was found where, and in which share of these pictures every triangle is seen."""
+    seen = torch.zeros(len(model.faces))
     generator = torch.Generator().manual_seed(settings.seed)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     module = load_solution("face_mesh")
@@ -188,12 +191,14 @@ def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> Views:
                 points = torch.tensor([(point.x, point.y) for point in faces[0].landmark]) * settings.size
                 pixels, depth = camera.project(vertices)
                 found.append((pixels, depth, points))
+                drawn = rasterize_mesh(vertices, model.faces, camera.resized(2 * camera.width, 2 * camera.height))
+                seen[drawn.face_index[drawn.face_index >= 0].unique().long()] += 1
     if len(found) < settings.pictures // 2:
         raise UserError(
             f"the landmark detector found a face in {len(found)} of {settings.pictures} pictures of {model.name}: look "
             "at them; its regions or its head frame may be wrong"
         )
-    return Views(*(torch.stack(parts) for parts in zip(*found, strict=True)))
+    return Views(*(torch.stack(parts) for parts in zip(*found, strict=True))), seen / len(found)
 
 
 def _random_camera(settings: EmbeddingSettings, generator: torch.Generator) -> Camera:
@@ -204,10 +209,12 @@ def _random_camera(settings: EmbeddingSettings, generator: torch.Generator) -> C
     return camera_from_fov(2 * float(np.arctan(0.17 / (distance - 0.08))), settings.size, settings.size, viewmat)
 
 
-def _allowed(model: FaceModel, regions: Sequence[str]) -> Bool[Tensor, " f"]:
+def _allowed(model: FaceModel, regions: Sequence[str], seen: Float[Tensor, " f"]) -> Bool[Tensor, " f"]:
     mask = model.region_mask(*regions)
     assert mask.any(), f"{model.name} has none of the regions {', '.join(regions)}"
-    return mask & (~model.region_mask("scalp") | (model.template[model.faces].mean(1)[:, 2] > _SCALP_FRONT))
+    mask &= ~model.region_mask("scalp") | (model.template[model.faces].mean(1)[:, 2] > _SCALP_FRONT)
+    # What is hidden (a lid's inner side) may be nearer in every picture and yet be the wrong point.
+    return mask & (seen >= _LEAST_SEEN)
 
 
 def _best_point(
