@@ -2,7 +2,6 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 
-#include <algorithm>
 #include <optional>
 #include <stdexcept>
 
@@ -21,8 +20,11 @@ using Rows4 = Array<const float, nb::shape<-1, 4>>;
 using Frames = nb::shape<-1, -1, mien::kTriangleFrameFloats>;
 
 void check_range(const int64_t* begin, size_t size, size_t count, const char* message) {
-  const auto outside = [count](int64_t index) { return index < 0 || index >= static_cast<int64_t>(count); };
-  if (std::any_of(begin, begin + size, outside)) throw std::out_of_range(message);
+  // Without a branch, several at a time: the highest bit is set where an index, or what is left beyond it, is negative.
+  const uint64_t last = count - 1;
+  uint64_t bits = 0;
+  for (size_t i = 0; i < size; ++i) bits |= static_cast<uint64_t>(begin[i]) | (last - static_cast<uint64_t>(begin[i]));
+  if (bits >> 63) throw std::out_of_range(message);
 }
 
 mien::RigArrays rig_arrays(const Array<const float, nb::shape<-1, -1, 3>>& vertices, const Faces& faces,

@@ -10,23 +10,89 @@ namespace mien {
 namespace {
 
 constexpr int kDigit = 11;  // bits per pass of the radix sort
+constexpr uint32_t kDigitMask = (1 << kDigit) - 1;
 
-void radix_pass(const uint32_t* keys, const uint32_t* values, int64_t count, int shift, uint32_t* sorted_keys,
-                uint32_t* sorted_values) {
-  uint32_t starts[1 << kDigit] = {};
-  const uint32_t digit_mask = (1 << kDigit) - 1;
-  for (int64_t i = 0; i < count; ++i) ++starts[keys[i] >> shift & digit_mask];
+// Part `index` of `parts` of `count` elements.
+struct Part {
+  int64_t first, last;
+
+  Part(int64_t count, int64_t index, int64_t parts) : first(count * index / parts), last(count * (index + 1) / parts) {}
+};
+
+// Drawn Gaussians and their keys, in the order of their indices. Every thread does a part: first it counts, then it
+// knows where to put them.
+void gather_drawn(Frame& frame, int64_t count, int64_t parts) {
+  SortPart* own = frame.sort_parts.reserve(parts);
+  parallel_for(parts, [&](int64_t index) {
+    const Part part(count, index, parts);
+    int64_t drawn = 0;
+    uint32_t least = UINT32_MAX, greatest = 0;
+    for (int64_t i = part.first; i < part.last; ++i) {
+      const uint32_t key = frame.depth_keys[i];
+      const bool there = key != UINT32_MAX;
+      drawn += there;
+      least = std::min(least, key);
+      greatest = std::max(greatest, there ? key : 0);
+    }
+    own[index].drawn = drawn;
+    own[index].least = least;
+    own[index].greatest = greatest;
+  });
+  frame.drawn = 0;
+  frame.nearest = UINT32_MAX;
+  frame.farthest = 0;
+  for (int64_t index = 0; index < parts; ++index) {
+    const int64_t here = own[index].drawn;
+    own[index].drawn = frame.drawn;
+    frame.drawn += here;
+    frame.nearest = std::min(frame.nearest, own[index].least);
+    frame.farthest = std::max(frame.farthest, own[index].greatest);
+  }
+  uint32_t* keys = frame.sorted_keys.reserve(count);
+  uint32_t* order = frame.order.reserve(count);
+  parallel_for(parts, [&](int64_t index) {
+    const Part part(count, index, parts);
+    int64_t to = own[index].drawn;
+    for (int64_t i = part.first; i < part.last; ++i) {
+      const uint32_t key = frame.depth_keys[i];
+      if (key == UINT32_MAX) continue;
+      // Depths of a head differ in few bits: sorting the differences to the nearest saves a pass.
+      keys[to] = key - frame.nearest;
+      order[to++] = static_cast<uint32_t>(i);
+    }
+  });
+}
+
+// One stable pass of a radix sort: each part counts its digits, then writes where the parts before it end.
+void radix_pass(Frame& frame, int shift, int64_t parts) {
+  SortPart* own = frame.sort_parts.data();
+  const uint32_t *keys = frame.sorted_keys.data(), *order = frame.order.data();
+  parallel_for(parts, [&](int64_t index) {
+    const Part part(frame.drawn, index, parts);
+    uint32_t* counts = own[index].counts;
+    std::memset(counts, 0, sizeof own[index].counts);
+    for (int64_t i = part.first; i < part.last; ++i) ++counts[keys[i] >> shift & kDigitMask];
+  });
   uint32_t total = 0;
-  for (uint32_t& start : starts) {
-    const uint32_t here = start;
-    start = total;
-    total += here;
+  for (uint32_t digit = 0; digit <= kDigitMask; ++digit) {
+    for (int64_t index = 0; index < parts; ++index) {
+      const uint32_t here = own[index].counts[digit];
+      own[index].counts[digit] = total;
+      total += here;
+    }
   }
-  for (int64_t i = 0; i < count; ++i) {
-    const uint32_t to = starts[keys[i] >> shift & digit_mask]++;
-    sorted_keys[to] = keys[i];
-    sorted_values[to] = values[i];
-  }
+  uint32_t *to_keys = frame.scratch_keys.data(), *to_order = frame.scratch_order.data();
+  parallel_for(parts, [&](int64_t index) {
+    const Part part(frame.drawn, index, parts);
+    uint32_t* starts = own[index].counts;
+    for (int64_t i = part.first; i < part.last; ++i) {
+      const uint32_t to = starts[keys[i] >> shift & kDigitMask]++;
+      to_keys[to] = keys[i];
+      to_order[to] = order[i];
+    }
+  });
+  frame.sorted_keys.swap(frame.scratch_keys);
+  frame.order.swap(frame.scratch_order);
 }
 
 // The tiles of a splat in one row of tiles (the scalar twin of columns_touched in rasterize_project.h).
@@ -143,29 +209,13 @@ void fill_lists(BinChunk& chunk, Frame& frame) {
 }  // namespace
 
 void sort_by_depth(Frame& frame, int64_t count) {
-  uint32_t* keys = frame.sorted_keys.reserve(count);
-  uint32_t* values = frame.order.reserve(count);
+  static_assert(sizeof(SortPart::counts) == sizeof(uint32_t) << kDigit);
+  const int64_t parts = std::clamp<int64_t>(count / 4096, 1, thread_count());
   frame.scratch_keys.reserve(count);
   frame.scratch_order.reserve(count);
-  int64_t drawn = 0;
-  uint32_t least = UINT32_MAX, greatest = 0;
-  for (int64_t i = 0; i < count; ++i) {
-    const uint32_t key = frame.depth_keys[i];
-    keys[drawn] = key;
-    values[drawn] = static_cast<uint32_t>(i);
-    const bool there = key != UINT32_MAX;
-    drawn += there;
-    least = std::min(least, key);
-    greatest = std::max(greatest, there ? key : 0);
-  }
-  frame.drawn = drawn;
-  // Depths of a head differ in few bits: sorting the differences to the nearest saves a pass.
-  for (int64_t i = 0; i < drawn; ++i) keys[i] -= least;
-  for (int shift = 0; shift < 32 && drawn > 0 && (greatest - least) >> shift; shift += kDigit) {
-    radix_pass(frame.sorted_keys.data(), frame.order.data(), drawn, shift, frame.scratch_keys.data(),
-               frame.scratch_order.data());
-    frame.sorted_keys.swap(frame.scratch_keys);
-    frame.order.swap(frame.scratch_order);
+  gather_drawn(frame, count, parts);
+  for (int shift = 0; shift < 32 && frame.drawn > 0 && (frame.farthest - frame.nearest) >> shift; shift += kDigit) {
+    radix_pass(frame, shift, parts);
   }
 }
 

@@ -77,6 +77,13 @@ struct BinChunk {
   Buffer<int32_t> counts;  // per tile; then where the chunk's next entry of that tile goes
 };
 
+// A part of the Gaussians that one thread sorts.
+struct SortPart {
+  int64_t drawn;  // how many; then how many before
+  uint32_t least, greatest;
+  uint32_t counts[1 << 11];  // per digit; then where the next with that digit goes
+};
+
 struct Frame {
   Buffer<Splat> splats;
   Buffer<uint32_t> depth_keys, sorted_keys, order, scratch_keys, scratch_order;
@@ -87,8 +94,10 @@ struct Frame {
   Buffer<int32_t> tile_begins, tile_ends;
   Buffer<Moments> slots;
   Buffer<float> view_gradients;  // per group of Gaussians
+  Buffer<SortPart> sort_parts;
   std::deque<BinChunk> chunks;
   int64_t drawn = 0, pairs = 0;
+  uint32_t nearest = 0, farthest = 0;  // depth keys
   int columns = 0, rows = 0;
 
   TileLists lists() { return {entries.data(), masks.data(), tile_begins.data(), tile_ends.data(), columns, rows}; }

@@ -38,15 +38,14 @@ struct CornerGradients {
 // omega . a0 = (a1 . de2 - p / L a1 . de1) / h,  omega . a1 = -(a2 . de1) / L,  omega . a2 = (a1 . de1) / L,
 // and changes the lengths by dL = a0 . de1, dh = p / L a2 . de1 - a2 . de2.
 CornerGradients frame_to_corners(const TriangleFrame& frame, const FrameGradient& gradient) {
-  const Vec third = (1.0f / 3) * Vec{gradient.T[0], gradient.T[1], gradient.T[2]};
+  const float *T = gradient.floats, *about = gradient.floats + 3;
+  const Vec third = (1.0f / 3) * Vec{T[0], T[1], T[2]};
   Vec by_edge1{}, by_edge2{};
   if (frame.edge_length > 0) {
     const float* R = frame.R;
     const Vec a0{R[0], R[3], R[6]}, a1{R[1], R[4], R[7]}, a2{R[2], R[5], R[8]};
-    const auto torque = [&](const Vec& axis) {
-      return gradient.torque[0] * axis.x + gradient.torque[1] * axis.y + gradient.torque[2] * axis.z;
-    };
-    const float slant = frame.along / frame.edge_length, half = 0.5f * gradient.k;
+    const auto torque = [&](const Vec& axis) { return about[0] * axis.x + about[1] * axis.y + about[2] * axis.z; };
+    const float slant = frame.along / frame.edge_length, half = 0.5f * gradient.floats[6];
     const float about_edge = torque(a0) / frame.height;
     by_edge1 = (torque(a2) / frame.edge_length - about_edge * slant) * a1 + half * a0 +
                (half * slant - torque(a1) / frame.edge_length) * a2;
@@ -87,11 +86,7 @@ void rig_backward(const RigArrays& rig, const TriangleFrame* frames, const float
   per_face.assign(rig.face_count, FrameGradient{});
   for (int64_t i = 0; i < rig.count; ++i) {
     FrameGradient& sum = per_face[rig.face_index[i]];
-    for (int axis = 0; axis < 3; ++axis) {
-      sum.T[axis] += shares[i].T[axis];
-      sum.torque[axis] += shares[i].torque[axis];
-    }
-    sum.k += shares[i].k;
+    for (int j = 0; j < FrameGradient::kFloats; ++j) sum.floats[j] += shares[i].floats[j];
   }
   per_corner.resize(rig.face_count);
   CornerGradients* const corners = per_corner.data();

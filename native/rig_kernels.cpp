@@ -1,4 +1,4 @@
-// Compiled once per instruction set: triangles one at a time, Gaussians one a lane.
+// Compiled once per instruction set: one triangle, then one Gaussian a lane.
 #include "rig_kernels.h"
 
 #include "simd_columns.h"
@@ -7,62 +7,6 @@ namespace mien::MIEN_ISA {
 namespace {
 
 constexpr float DEGENERATE_LENGTH = 1e-7f;
-
-struct Vec {
-  float x, y, z;
-};
-
-MIEN_INLINE Vec at(const float* from) { return {from[0], from[1], from[2]}; }
-MIEN_INLINE Vec operator+(Vec a, Vec b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-MIEN_INLINE Vec operator-(Vec a, Vec b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-MIEN_INLINE Vec operator*(float s, Vec a) { return {s * a.x, s * a.y, s * a.z}; }
-MIEN_INLINE float dot(Vec a, Vec b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-MIEN_INLINE Vec cross(Vec a, Vec b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
-MIEN_INLINE float length(Vec a) { return __builtin_sqrtf(dot(a, a)); }
-MIEN_INLINE void put(float* to, Vec a) { to[0] = a.x, to[1] = a.y, to[2] = a.z; }
-
-// The same four formulas as mien.rotation.quaternion_from_matrix: the one with the largest divisor.
-MIEN_INLINE void quaternion_from_matrix(const float* m, float* q) {
-  const float divisors[4] = {1 + m[0] + m[4] + m[8], 1 + m[0] - m[4] - m[8], 1 - m[0] + m[4] - m[8],
-                             1 - m[0] - m[4] + m[8]};
-  int best = 0;
-  for (int i = 1; i < 4; ++i)
-    if (divisors[i] > divisors[best]) best = i;
-  const float a = m[7] - m[5], b = m[2] - m[6], c = m[3] - m[1];
-  const float d = m[1] + m[3], e = m[2] + m[6], f = m[5] + m[7];
-  const float rows[4][4] = {
-      {divisors[0], a, b, c}, {a, divisors[1], d, e}, {b, d, divisors[2], f}, {c, e, f, divisors[3]}};
-  const float* row = rows[best];
-  const float scale = 1 / __builtin_sqrtf(row[0] * row[0] + row[1] * row[1] + row[2] * row[2] + row[3] * row[3]);
-  for (int i = 0; i < 4; ++i) q[i] = row[i] * scale;
-}
-
-void frames(const RigArrays& rig, int64_t first, int64_t last, TriangleFrame* out) {
-  for (int64_t face = first; face < last; ++face) {
-    const int64_t* index = rig.faces + 3 * face;
-    const Vec v0 = at(rig.vertices + 3 * index[0]), v1 = at(rig.vertices + 3 * index[1]);
-    const Vec v2 = at(rig.vertices + 3 * index[2]);
-    Vec edge = v1 - v0, other = v2 - v0;
-    const float edge_length = length(edge);
-    const bool degenerate =
-        edge_length < DEGENERATE_LENGTH || length(cross(edge, other)) < DEGENERATE_LENGTH * edge_length;
-    if (degenerate) edge = {DEGENERATE_LENGTH, 0, 0}, other = {0, DEGENERATE_LENGTH, 0};
-    const Vec a0 = (1 / length(edge)) * edge;
-    const Vec area_normal = cross(a0, other);
-    const float height = length(area_normal);
-    const Vec a1 = (1 / height) * area_normal;
-    const Vec a2 = cross(a0, a1);
-    TriangleFrame& frame = out[face];
-    const float R[9] = {a0.x, a1.x, a2.x, a0.y, a1.y, a2.y, a0.z, a1.z, a2.z};
-    for (int i = 0; i < 9; ++i) frame.R[i] = R[i];
-    put(frame.T, (1.0f / 3) * (v0 + v1 + v2));
-    frame.k = 0.5f * (length(edge) + height);
-    quaternion_from_matrix(frame.R, frame.q);
-    frame.edge_length = degenerate ? 0 : edge_length;
-    frame.height = degenerate ? 0 : height;
-    frame.along = degenerate ? 0 : dot(a0, other);
-  }
-}
 
 // Vectors of three and of four whose components are vectors of W lanes: one Gaussian a lane.
 MIEN_INLINE void turn(const F* R, const F* v, F* out) {
@@ -89,6 +33,82 @@ MIEN_INLINE F normalize(F* q) {
   const F unit = 1.0f / maximum(norm, set1(1e-12f));
   for (int i = 0; i < 4; ++i) q[i] = q[i] * unit;
   return unit;
+}
+
+// The corners of triangles first .. first + valid - 1, by corner and axis.
+MIEN_INLINE void load_corners(const RigArrays& rig, int64_t first, int valid, F corners[3][3]) {
+  alignas(64) float buffer[3][3][W];
+  for (int lane = 0; lane < W; ++lane) {
+    const int64_t* index = rig.faces + 3 * (first + (lane < valid ? lane : valid - 1));
+    for (int corner = 0; corner < 3; ++corner)
+      for (int axis = 0; axis < 3; ++axis) buffer[corner][axis][lane] = rig.vertices[3 * index[corner] + axis];
+  }
+  for (int corner = 0; corner < 3; ++corner)
+    for (int axis = 0; axis < 3; ++axis) corners[corner][axis] = load(buffer[corner][axis]);
+}
+
+MIEN_INLINE F dot(const F* a, const F* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+MIEN_INLINE F length(const F* a) { return square_root(dot(a, a)); }
+MIEN_INLINE void scale(F by, const F* v, F* out) {
+  for (int axis = 0; axis < 3; ++axis) out[axis] = by * v[axis];
+}
+
+// The same four formulas as mien.rotation.quaternion_from_matrix: the one with the largest divisor.
+MIEN_INLINE void quaternion_from_matrix(const F* m, F* q) {
+  const F divisors[4] = {1.0f + m[0] + m[4] + m[8], 1.0f + m[0] - m[4] - m[8], 1.0f - m[0] + m[4] - m[8],
+                         1.0f - m[0] - m[4] + m[8]};
+  const F a = m[7] - m[5], b = m[2] - m[6], c = m[3] - m[1];
+  const F d = m[1] + m[3], e = m[2] + m[6], f = m[5] + m[7];
+  const F rows[4][4] = {{divisors[0], a, b, c}, {a, divisors[1], d, e}, {b, d, divisors[2], f}, {c, e, f, divisors[3]}};
+  F best = divisors[0];
+  for (int i = 0; i < 4; ++i) q[i] = rows[0][i];
+  for (int row = 1; row < 4; ++row) {
+    const M better = less(best, divisors[row]);
+    best = select(better, divisors[row], best);
+    for (int i = 0; i < 4; ++i) q[i] = select(better, rows[row][i], q[i]);
+  }
+  const F unit = 1.0f / square_root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  for (int i = 0; i < 4; ++i) q[i] = q[i] * unit;
+}
+
+void frames(const RigArrays& rig, int64_t first, int64_t last, TriangleFrame* out) {
+  constexpr int kFloats = sizeof(TriangleFrame) / sizeof(float);
+  for (int64_t face = first; face < last; face += W) {
+    const int valid = last - face < W ? (int)(last - face) : W;
+    F v[3][3], edge[3], other[3], normal[3], columns[kFloats];
+    load_corners(rig, face, valid, v);
+    for (int axis = 0; axis < 3; ++axis) {
+      edge[axis] = v[1][axis] - v[0][axis];
+      other[axis] = v[2][axis] - v[0][axis];
+    }
+    cross(edge, other, normal);
+    const F edge_length = length(edge);
+    const M degenerate =
+        either(less(edge_length, set1(DEGENERATE_LENGTH)), less(length(normal), DEGENERATE_LENGTH * edge_length));
+    for (int axis = 0; axis < 3; ++axis) {
+      edge[axis] = select(degenerate, set1(axis == 0 ? DEGENERATE_LENGTH : 0.0f), edge[axis]);
+      other[axis] = select(degenerate, set1(axis == 1 ? DEGENERATE_LENGTH : 0.0f), other[axis]);
+    }
+    F a0[3], a1[3], a2[3];
+    const F usable_length = length(edge);
+    scale(1.0f / usable_length, edge, a0);
+    cross(a0, other, normal);
+    const F height = length(normal);
+    scale(1.0f / height, normal, a1);
+    cross(a0, a1, a2);
+    for (int axis = 0; axis < 3; ++axis) {
+      columns[3 * axis] = a0[axis];
+      columns[3 * axis + 1] = a1[axis];
+      columns[3 * axis + 2] = a2[axis];
+      columns[9 + axis] = (1.0f / 3) * (v[0][axis] + v[1][axis] + v[2][axis]);
+    }
+    columns[12] = 0.5f * (usable_length + height);
+    quaternion_from_matrix(columns, columns + 13);
+    columns[17] = select(degenerate, F{}, edge_length);
+    columns[18] = select(degenerate, F{}, height);
+    columns[19] = select(degenerate, F{}, dot(a0, other));
+    store_columns<kFloats>(out[face].R, kFloats, valid, columns);
+  }
 }
 
 // The frames of the triangles that Gaussians i .. i + valid - 1 ride on; lanes from `valid` on repeat the last one.
@@ -180,7 +200,7 @@ void to_local(const RigArrays& rig, int64_t first, int64_t last, const TriangleF
     for (int axis = 0; axis < 3; ++axis) share[3 + axis] = share[3 + axis] + *frame.k * about[axis];
     share[6] = by_size;
     share[7] = F{};
-    store_columns<8>(out[i].T, 8, valid, share);
+    store_columns<8>(out[i].floats, 8, valid, share);
   }
 }
 

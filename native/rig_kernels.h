@@ -5,13 +5,11 @@
 
 namespace mien {
 
-// What a Gaussian passes to its triangle: d loss / d T, the torque d loss / d (small world rotation of R), d loss / d
-// k.
+// What a Gaussian passes to its triangle: d loss / d T [3], the torque d loss / d (small world rotation of R) [3],
+// d loss / d k, and a zero. In one array, because they are added up together.
 struct FrameGradient {
-  float T[3];
-  float torque[3];
-  float k;
-  float unused;
+  static constexpr int kFloats = 8;
+  float floats[kFloats];
 };
 
 struct RigKernels {

@@ -1,5 +1,7 @@
 """Rotations: axis-angle, matrices and wxyz quaternions, batched over leading axes."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -108,8 +110,23 @@ def rigid_transform(rotations: Float[Tensor, "*b 3 3"], translations: Float[Tens
 
 def compose_rigid(first: Float[Tensor, "4 4"], second: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
     """`first @ second`, added up in the order that `mien.runtime` adds, so that both round alike."""
-    columns = [first[:, axis, None] * second[axis] for axis in range(4)]
-    return ((columns[0] + columns[1]) + columns[2]) + columns[3]
+    return _ComposeRigid.apply(first, second)  # pyright: ignore[reportReturnType]
+
+
+class _ComposeRigid(torch.autograd.Function):
+    """One node of the graph instead of twenty: a training step runs it once, on the caller's thread alone."""
+
+    @staticmethod
+    def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:
+        ctx.save_for_backward(first, second)
+        columns = [first[:, axis, None] * second[axis] for axis in range(4)]
+        return ((columns[0] + columns[1]) + columns[2]) + columns[3]
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        first, second = ctx.saved_tensors
+        of_first, of_second = ctx.needs_input_grad
+        return gradient @ second.T if of_first else None, first.T @ gradient if of_second else None
 
 
 def invert_rigid(transforms: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
