@@ -32,6 +32,8 @@ class Command:
     """Name of the run (default: the method's)."""
     face_model: str = "anny"
     """Name of a face model (see `mien face-models`), or a .npz or .pkl in FLAME's schema."""
+    preview: bool = False
+    """Show the fit of the face while it runs: OUT/tracking_preview.html, for a browser, is renewed as it goes on."""
     overlay: Literal["auto", "all", "none"] = "auto"
     """Frames in overlay.mp4: all of them, or of long clips every n-th so that there are at most 3,000 (auto)."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
@@ -67,7 +69,9 @@ class Command:
         videos = zip(self.videos, names, strict=True)
         captured = [part for video, name in videos for part in capture_stage(workspace, video, name, self.capture)]
         check_held_out(captured, settings)
-        trackings = tracking_stage(workspace, self.face_model, self.tracking, overlay=self.overlay)
+        trackings = tracking_stage(
+            workspace, self.face_model, self.tracking, overlay=self.overlay, preview=self.preview
+        )
         training_stage(workspace, [name for name in captured if name in trackings], run, method, settings)
         if settings.holds_out:
             evaluation_stage(workspace, run, again=False)

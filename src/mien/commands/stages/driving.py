@@ -80,7 +80,8 @@ def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[s
     workspace = Workspace(cache_folder() / "drivers" / f"{video.stem}-{file_digest(video)[:12]}")
     capture_stage(workspace, video, None, CaptureSettings())
     # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
-    names = sorted(tracking_stage(workspace, face_model_name, TrackingSettings()), key=lambda name: (len(name), name))
+    tracked = tracking_stage(workspace, face_model_name, TrackingSettings(), overlay="none")
+    names = sorted(tracked, key=lambda name: (len(name), name))
     say(f"{video}: tracked in {workspace.root}, kept for the next time")
     return workspace, names
 

@@ -73,7 +73,7 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
         for recipe in reference.sequences:
             _capture(workspace, drawn / recipe.name, recipe.name)
     with times.measured("track"):
-        trackings = tracking_stage(workspace, _FACE_MODEL, TrackingSettings())
+        trackings = tracking_stage(workspace, _FACE_MODEL, TrackingSettings(), overlay="none")
     run = f"{method}-{steps}"
     settings = TrainSettings(
         steps=steps,
