@@ -37,7 +37,7 @@ def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             write_scoring(folder / "scoring", Scoring(capture.mattes, crops))
         return list(PARTS)
 
-    def tracking_stage(*_: object) -> dict[str, Tracking]:
+    def tracking_stage(*_: object, **__: object) -> dict[str, Tracking]:
         return {name: part(1, PARTS[name])[1] for name in sorted(PARTS)}
 
     monkeypatch.setattr(driving, "capture_stage", capture_stage)
