@@ -88,7 +88,7 @@ def strip(painter: OverlayPainter, capture: Capture, frame: SheetFrame, name: st
     tiles = [cv2.resize(panel[rows, columns], (_TILE, _TILE), interpolation=cv2.INTER_AREA) for panel in panels]
     write_text(tiles[0], name, (6, 16), 0.45)
     if len(tiles) > 2:
-        draw_legend(tiles[-1])
+        draw_legend(tiles[-1], 8)
     return np.concatenate(tiles, axis=1)
 
 

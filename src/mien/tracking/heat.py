@@ -24,18 +24,18 @@ def dimmed(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return cv2.cvtColor(cv2.convertScaleAbs(grey, alpha=_DIMMED), cv2.COLOR_GRAY2RGB)
 
 
-def draw_legend(picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """A bar of colours at the lower left, from no difference to the largest that is told apart."""
+def draw_legend(picture: UInt8[np.ndarray, "h w 3"], top: int) -> None:
+    """A bar of colours at the left, from no difference to the largest that is told apart; none on small pictures."""
     height, width = picture.shape[:2]
-    length = min(160, width // 2)
-    if length < 32 or height < 64:
+    length = min(120, width // 2 - 2 * _MARGIN)
+    if length < 32 or height < top + 64:
         return
-    top = height - _MARGIN - _BAR
+    left = 3 * _MARGIN
     bar = np.broadcast_to(np.linspace(0, 255, length).astype(np.uint8), (_BAR, length))
-    picture[top : top + _BAR, _MARGIN : _MARGIN + length] = _inferno(bar)
-    cv2.rectangle(picture, (_MARGIN - 1, top - 1), (_MARGIN + length, top + _BAR), _WHITE, 1)
-    write_text(picture, "0", (_MARGIN, top - 5), 0.4)
-    write_text(picture, f"{100 * _HOTTEST:.0f} %", (_MARGIN + length - 26, top - 5), 0.4)
+    picture[top : top + _BAR, left : left + length] = _inferno(bar)
+    cv2.rectangle(picture, (left - 1, top - 1), (left + length, top + _BAR), _WHITE, 1)
+    write_text(picture, "0", (_MARGIN, top + _BAR), 0.4)
+    write_text(picture, f"{100 * _HOTTEST:.0f} %", (left + length + _MARGIN, top + _BAR), 0.4)
 
 
 def write_text(picture: UInt8[np.ndarray, "h w 3"], text: str, at: tuple[int, int], size: float = 0.5) -> None:

@@ -72,7 +72,7 @@ class OverlayPainter:
         for panel, name in zip(panels[2:], ("model", "difference"), strict=False):
             write_text(panel, name, (8, 20))
         if len(panels) > 2:
-            draw_legend(panels[-1])
+            draw_legend(panels[-1], 32)
         rows = [np.concatenate(panels[row : row + 2], axis=1) for row in range(0, len(panels), 2)]
         return np.concatenate(rows, axis=0)
 
