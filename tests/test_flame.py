@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from flame_like import exact_landmarks, flame_like, posed_as_flame, true_regions, write_npz, write_pickle
+from mien.commands.expression import with_expression
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.flame import flame_face_model, read_flame
@@ -77,6 +78,22 @@ def test_an_open_jaw_opens_the_lips_and_leaves_the_forehead(model):
     marks = model.landmarks["mediapipe"].positions(moved, model.faces)
     assert marks[14, 1] < -0.015  # the lower lip goes down
     assert marks[[13, 10, 4], 1].abs().max() < 0.002
+
+
+def test_it_is_posed_by_number_on_the_command_line(model):
+    face = model.neutral(2)
+    posed = with_expression(face, model, ("jaw_x=0.3", "expression_003=-1.5"))
+    assert torch.all(posed.joints[:, model.free_joint_names.index("jaw"), 0] == 0.3)
+    assert posed.joints.count_nonzero() == 2
+    assert torch.all(posed.expression[:, 3] == -1.5)
+    for assignment, message in (
+        ("jaw_x=2", "from -1 to 1 radians"),
+        ("jaw_w=0.1", "did you mean jaw_"),
+        ("expression_003=4", "-3 to 3; 1 is much"),
+        ("smile=1", "there are: expression_000.*joints by radians: neck_x"),
+    ):
+        with pytest.raises(UserError, match=message):
+            with_expression(face, model, (assignment,))
 
 
 def test_the_fit_knows_jaw_and_scale(model):

@@ -147,7 +147,7 @@ def test_from_pixels_to_an_avatar_that_is_not_passed_on(added, capture, tmp_path
     assert main(["train", root, "--steps", "6", "--run", "a"]) == 0
     assert main(["evaluate", root, "--run", "a"]) == 0
     picture = workspace / "a.png"
-    assert main(["render", root, "--run", "a", "--set", "expression_000=1", "--out", str(picture)]) == 0
+    assert main(["render", root, "--run", "a", "--set", "expression_000=1", "jaw_x=0.2", "--out", str(picture)]) == 0
     assert main(["drive", root, "--run", "a", "--by", root, "--out", str(workspace / "a.mp4")]) == 0
     assert main(["export", root, "--run", "a", "--out", str(workspace / "a.ply")]) == 0
     avatar = load_avatar(workspace / "runs" / "a")

@@ -21,7 +21,8 @@ class Command:
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Which run (default: the only one)."""
     set: tuple[str, ...] = ()
-    """Expressions by name, e.g. --set jawOpen=0.6 mouthSmileLeft=0.4 (default: the person's neutral)."""
+    """Expressions by name, and joints by radians, e.g. --set jawOpen=0.6 mouthSmileLeft=0.4 left_eye_y=0.2 (default:
+    the person's neutral)."""
     series: str | None = None
     """A .ply for every frame of a motion: the name of one of the workspace's sequences, or anything `mien drive --by`
     takes. The head stays at the origin."""

@@ -1,4 +1,4 @@
-"""Expressions on the command line: `--set jawOpen=0.6 mouthSmileLeft=0.4`."""
+"""Expressions and joints on the command line: `--set jawOpen=0.6 mouthSmileLeft=0.4 left_eye_y=0.2`."""
 
 import difflib
 import math
@@ -7,18 +7,22 @@ from dataclasses import replace
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 
+_WIDEST_TURN = 1.0
+"""Radians either way that a joint may be turned."""
+
 
 def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, ...]) -> FaceParams:
-    """`face` with some expression coefficients set by name, at every timestep; none set: `face` itself.
+    """`face` with some coefficients or joint angles set by name, at every timestep; none set: `face` itself.
 
     Raises:
-        UserError: an assignment is not NAME=NUMBER, the face model has no expression of that name, or the number is
-            out of that expression's range.
+        UserError: an assignment is not NAME=NUMBER, the face model has no expression or joint of that name, or the
+            number is out of its range.
     """
-    expression = face.expression.clone()
+    expression, joints = face.expression.clone(), face.joints.flatten(1).clone()
+    angles = _angle_names(model)
     for position, assignment in enumerate(assignments):
         name, equals, text = assignment.partition("=")
-        index = _index_of(name, model, assignment)
+        _check_name(name, model, assignment)
         if not equals:
             apart = "".join(assignments[position + 1 : position + 2])
             number = apart if _is_number(apart) else ""
@@ -27,13 +31,25 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
             value = float(text)
         except ValueError:
             raise UserError(f"--set {assignment}: {text!r} is no number; write for example --set {name}=0.6") from None
+        if name in angles:
+            if math.isnan(value) or abs(value) > _WIDEST_TURN:
+                raise UserError(f"--set {assignment}: {name} goes from -{_WIDEST_TURN:g} to {_WIDEST_TURN:g} radians")
+            joints[:, angles.index(name)] = value
+            continue
+        index = model.expression_names.index(name)
         lower, upper = (round(float(bound), 4) for bound in model.expression_bounds[index])
         if lower == upper:
             raise UserError(f"--set {assignment}: {name} does nothing with the face model {model.name!r}; leave it out")
         if math.isnan(value) or not lower <= value <= upper:
-            raise UserError(f"--set {assignment}: {name} goes from {lower:g} to {upper:g}; 1 is the full expression")
+            unit = "the full expression" if model.expression_sigmas is None else "much, 0 the mean face"
+            raise UserError(f"--set {assignment}: {name} goes from {lower:g} to {upper:g}; 1 is {unit}")
         expression[:, index] = value
-    return replace(face, expression=expression)
+    return replace(face, expression=expression, joints=joints.reshape(face.joints.shape))
+
+
+def _angle_names(model: FaceModel) -> tuple[str, ...]:
+    """In the order of the flattened `FaceParams.joints`."""
+    return tuple(f"{name}_{axis}" for name in model.free_joint_names for axis in "xyz")
 
 
 def _is_number(text: str) -> bool:
@@ -43,12 +59,13 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def _index_of(name: str, model: FaceModel, assignment: str) -> int:
-    names = model.expression_names
-    if name in names:
-        return names.index(name)
+def _check_name(name: str, model: FaceModel, assignment: str) -> None:
+    names, angles = model.expression_names, _angle_names(model)
+    if name in names or name in angles:
+        return
     # Letter by letter in small letters: `jawopen` is as near to jawOpen as can be.
-    folded = {known.lower(): known for known in names}
+    folded = {known.lower(): known for known in (*names, *angles)}
     near = [folded[match] for match in difflib.get_close_matches(name.lower(), folded, 3, 0.6)]
-    hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {', '.join(names)}"
+    every = f"there are: {', '.join(names)}; and joints by radians: {', '.join(angles)}"
+    hint = f"did you mean {' or '.join(near)}?" if near else every
     raise UserError(f"--set {assignment}: no expression {name!r}; {hint}")

@@ -26,7 +26,8 @@ class Command:
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Which run (default: the only one)."""
     set: tuple[str, ...] = ()
-    """Expressions by name, e.g. --set jawOpen=0.6 mouthSmileLeft=0.4 (default: the person's neutral)."""
+    """Expressions by name, and joints by radians, e.g. --set jawOpen=0.6 mouthSmileLeft=0.4 left_eye_y=0.2 (default:
+    the person's neutral)."""
     path: Literal["turntable", "orbit", "sway", "still", "captured"] = "turntable"
     """How the camera moves: to the sides, on an oval, on a figure eight, not at all, or from camera to camera of the
     capture. A .png is always a still."""
