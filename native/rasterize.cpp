@@ -112,15 +112,21 @@ FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, co
   FramePtr frame = take_frame();
   const int64_t count = gaussians.count;
   Splat* splats = frame->splats.reserve(count);
-  uint32_t* depth_keys = frame->depth_keys.reserve(count);
+  frame->columns = (view.width + kTile - 1) / kTile;
+  frame->rows = (view.height + kTile - 1) / kTile;
+  const Projected projected{{frame->columns, frame->rows},
+                            splats,
+                            frame->spans.reserve(count),
+                            frame->depth_keys.reserve(count),
+                            picture.radii};
   std::atomic<bool> finite{true};
   parallel_for(groups(count), [&](int64_t group) {
     const int64_t first = group * kGroup, last = std::min(first + kGroup, count);
-    if (!kernels.project(gaussians, view, first, last, splats, depth_keys, picture.radii)) finite = false;
+    if (!kernels.project(gaussians, view, first, last, projected)) finite = false;
   });
   if (!finite) return nullptr;
   sort_by_depth(*frame, count);
-  bin_into_tiles(*frame, kernels, count, view.width, view.height);
+  bin_into_tiles(*frame, count);
   const TileLists lists = frame->lists();
   parallel_for(static_cast<int64_t>(lists.columns) * lists.rows, [&](int64_t tile) {
     kernels.blend(splats, lists, view, static_cast<int>(tile), picture.image, picture.alpha);

@@ -130,16 +130,19 @@ void find_large(const Splat& splat, uint32_t gaussian, const TileSpan& span, int
   }
 }
 
-void find_pairs(BinChunk& chunk, Frame& frame, const Kernels& kernels) {
+void find_pairs(BinChunk& chunk, Frame& frame) {
   const int64_t count = chunk.last - chunk.first;
   const uint32_t* order = frame.order.data() + chunk.first;
-  TileSpan* spans = chunk.spans.reserve(count);
-  kernels.find_tiles(frame.splats.data(), order, count, frame.columns, frame.rows, spans);
+  const TileSpan* spans = frame.spans.data();
   Buffer<Pair>& pairs = chunk.pairs;
   pairs.clear();
+  constexpr int64_t kAhead = 16;  // by depth, Gaussians lie anywhere in memory
   for (int64_t i = 0; i < count; ++i) {
-    const uint32_t gaussian = order[i];
-    const TileSpan& span = spans[i];
+    const uint32_t gaussian = order[i], later = order[std::min(i + kAhead, count - 1)];
+    __builtin_prefetch(&spans[later]);
+    __builtin_prefetch(&frame.slot_begins[later], 1);
+    __builtin_prefetch(&frame.slot_ends[later], 1);
+    const TileSpan& span = spans[gaussian];
     frame.slot_begins[gaussian] = static_cast<uint32_t>(pairs.size());
     const int above = std::max(span.high[0] - span.low[0] + 1, 0), below = std::max(span.high[1] - span.low[1] + 1, 0);
     if (span.row_count <= 2 && above <= 2 && below <= 2) {
@@ -219,9 +222,7 @@ void sort_by_depth(Frame& frame, int64_t count) {
   }
 }
 
-void bin_into_tiles(Frame& frame, const Kernels& kernels, int64_t count, int width, int height) {
-  frame.columns = (width + kTile - 1) / kTile;
-  frame.rows = (height + kTile - 1) / kTile;
+void bin_into_tiles(Frame& frame, int64_t count) {
   std::memset(frame.slot_begins.reserve(count), 0, sizeof(uint32_t) * count);
   std::memset(frame.slot_ends.reserve(count), 0, sizeof(uint32_t) * count);
   const int64_t chunks = std::clamp<int64_t>(frame.drawn / 1024, 1, thread_count());
@@ -231,7 +232,7 @@ void bin_into_tiles(Frame& frame, const Kernels& kernels, int64_t count, int wid
     frame.chunks[c].first = frame.drawn * c / chunks;
     frame.chunks[c].last = frame.drawn * (c + 1) / chunks;
   }
-  parallel_for(chunks, [&](int64_t c) { find_pairs(frame.chunks[c], frame, kernels); });
+  parallel_for(chunks, [&](int64_t c) { find_pairs(frame.chunks[c], frame); });
   place_chunks(frame);
   place_slots(frame, count);
   frame.entries.reserve(frame.pairs);

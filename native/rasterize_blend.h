@@ -7,8 +7,9 @@ namespace {
 
 constexpr int kVectors = kBlock * kBlock / W;  // vectors per block
 constexpr int kBlocks = kTileBlocks * kTileBlocks;
-constexpr int kAhead = 8;    // entries: how far ahead their splats are fetched into the cache
-constexpr int kChunk = 256;  // entries handled at a time: their splats stay in the cache
+constexpr int kGatherAhead = 32;  // entries: the same where nothing but their shapes is read
+constexpr int kAhead = 8;         // entries: how far ahead their splats are fetched into the cache
+constexpr int kChunk = 256;       // entries handled at a time: their splats stay in the cache
 
 // Pixel centres of vector `v` of a block, relative to the block's first pixel centre.
 MIEN_INLINE F lane_x() {
@@ -44,6 +45,8 @@ void find_blocks(const Splat* splats, const Entry* entries, int count, float lef
     const int valid = count - i < W ? count - i : W;
     const Splat* chosen[W];
     for (int lane = 0; lane < W; ++lane) chosen[lane] = &splats[entries[i + (lane < valid ? lane : 0)].gaussian];
+    for (int later = i + kGatherAhead; later < i + kGatherAhead + W && later < count; ++later)
+      __builtin_prefetch(&splats[entries[later].gaussian]);
     const SplatShape s = gather_shapes(chosen);
     const M there = less(iota(), set1((float)valid));
     for (int row = 0; row < kTileBlocks; ++row) {
@@ -210,7 +213,7 @@ void blend(const Splat* splats, const TileLists& lists, const View& view, int ti
     fill_background(view, left, top, image, alpha);
     return;
   }
-  for (int i = begin; i < end && i < begin + kChunk; ++i) __builtin_prefetch(&splats[lists.entries[i].gaussian]);
+  for (int i = begin; i < end && i < begin + kGatherAhead; ++i) __builtin_prefetch(&splats[lists.entries[i].gaussian]);
   [[maybe_unused]] const NoDenormals guard;
   TilePixels pixels;
   BlockBits found;

@@ -72,7 +72,6 @@ struct Pair {
 // A part of the depth order that one thread bins.
 struct BinChunk {
   int64_t first, last;  // ranks in depth order
-  Buffer<TileSpan> spans;
   Buffer<Pair> pairs;
   Buffer<int32_t> counts;  // per tile; then where the chunk's next entry of that tile goes
 };
@@ -86,6 +85,7 @@ struct SortPart {
 
 struct Frame {
   Buffer<Splat> splats;
+  Buffer<TileSpan> spans;
   Buffer<uint32_t> depth_keys, sorted_keys, order, scratch_keys, scratch_order;
   Buffer<uint32_t> slot_begins, slot_ends;  // per Gaussian; at first counted from the first pair of its chunk
   Buffer<uint32_t> slot_shifts;             // per Gaussian: from a pair's place in its chunk to its slot
@@ -107,6 +107,6 @@ struct Frame {
 void sort_by_depth(Frame& frame, int64_t count);
 
 // Fills the tiles' lists and the Gaussians' slots. The result does not depend on the number of threads.
-void bin_into_tiles(Frame& frame, const Kernels& kernels, int64_t count, int width, int height);
+void bin_into_tiles(Frame& frame, int64_t count);
 
 }  // namespace mien

@@ -6,6 +6,6 @@
 namespace mien {
 
 extern const Kernels MIEN_KERNELS;
-const Kernels MIEN_KERNELS = {project, find_tiles, blend, blend_backward, project_backward};
+const Kernels MIEN_KERNELS = {project, blend, blend_backward, project_backward};
 
 }  // namespace mien

@@ -63,12 +63,22 @@ struct TileSpan {
   int16_t low[2], high[2];  // columns, inclusive; empty where high < low
 };
 
+struct TileGrid {
+  int columns, rows;
+};
+
+// What projection writes of each Gaussian.
+struct Projected {
+  TileGrid grid;
+  Splat* splats;
+  TileSpan* spans;       // only where drawn
+  uint32_t* depth_keys;  // all ones: not drawn
+  int32_t* radii;
+};
+
 struct Kernels {
-  // Gaussians first .. last - 1; radii[i] and depth_keys[i] (all ones: not drawn) too. False on NaN or infinity.
-  bool (*project)(const GaussianArrays&, const View&, int64_t first, int64_t last, Splat*, uint32_t* depth_keys,
-                  int32_t* radii);
-  // The tiles of the splats order[0 .. count - 1].
-  void (*find_tiles)(const Splat*, const uint32_t* order, int64_t count, int columns, int rows, TileSpan*);
+  // Gaussians first .. last - 1. False on NaN or infinity.
+  bool (*project)(const GaussianArrays&, const View&, int64_t first, int64_t last, const Projected&);
   void (*blend)(const Splat*, const TileLists&, const View&, int tile, float* image, float* alpha);
   void (*blend_backward)(const Splat*, const TileLists&, const View&, int tile, const PictureGradient&, Moments*);
   // Gaussians first .. last - 1; view_gradient gets their share.

@@ -60,9 +60,62 @@ MIEN_INLINE void store_radii(const Projection& p, M drawn, int valid, int32_t* r
   for (int lane = 0; lane < valid; ++lane) radii[lane] = lanes[lane];
 }
 
+struct SplatShape {
+  F x, y, slope, width2, half_height, y_rightmost, inverse_half_height;
+};
+
+MIEN_INLINE SplatShape gather_shapes(const Splat* const* splats) {
+  const float* rows[W];
+  for (int lane = 0; lane < W; ++lane) rows[lane] = &splats[lane]->x;
+  F v[8];
+  gather_columns<8>(rows, v);
+  return {v[0], v[1], v[2], v[3], v[4], v[5], v[7]};
+}
+
+// The columns of pixel groups of `size` pixels that the ellipse touches in the rows of pixel centres top..bottom (both
+// relative to the centre): exact, because within a strip the ellipse is widest at its rightmost point or, if that lies
+// outside, at the edge nearer to it. `first` is the first group's first pixel centre relative to the splat's.
+struct Columns {
+  F low, high;  // not clamped; high < low where the ellipse misses the strip
+};
+
+MIEN_INLINE Columns columns_touched(const SplatShape& s, F top, F bottom, F first, float size) {
+  const F right_y = clamp(s.y_rightmost, top, bottom), left_y = clamp(-s.y_rightmost, top, bottom);
+  const F right_t = right_y * s.inverse_half_height, left_t = left_y * s.inverse_half_height;
+  const F right = s.slope * right_y + root_bound(s.width2 * (1.0f - right_t * right_t));
+  const F left = s.slope * left_y - root_bound(s.width2 * (1.0f - left_t * left_t));
+  const M hit = both(less_equal(top, s.half_height), less_equal(-s.half_height, bottom));
+  const float per_group = 1.0f / size;
+  const F low = -round_down((first + (size - 1.0f) - left) * per_group);
+  const F high = round_down((right - first) * per_group);
+  return {low, select(hit, high, set1(-1e6f))};
+}
+
+// The tiles of W splats, for those that have any.
+MIEN_INLINE void store_spans(const SplatShape& s, TileGrid grid, int valid, TileSpan* spans) {
+  const F last_row = set1((float)(grid.rows - 1)), last_column = set1((float)(grid.columns - 1));
+  const F first_row = clamp(round_down((s.y - s.half_height - 0.5f) * (1.0f / kTile)), F{}, last_row);
+  const F end_row = clamp(round_down((s.y + s.half_height - 0.5f) * (1.0f / kTile)), F{}, last_row);
+  I low[2], high[2];
+  for (int row = 0; row < 2; ++row) {
+    const F top = (first_row + (float)row) * (float)kTile + 0.5f - s.y;
+    const Columns c = columns_touched(s, top, top + (kTile - 1.0f), 0.5f - s.x, kTile);
+    low[row] = truncate(clamp(c.low, F{}, last_column + 1.0f));
+    const F hit = select(less_equal(first_row + (float)row, end_row), c.high, set1(-1.0f));
+    high[row] = truncate(clamp(hit, set1(-1.0f), last_column));
+  }
+  const I first = truncate(first_row), count = truncate(end_row) - first + 1;
+  // Two halves a word, as TileSpan has them.
+  const F words[3] = {from_bits(first | count << 16), from_bits(low[0] | low[1] << 16),
+                      from_bits((high[0] & 0xffff) | high[1] << 16)};
+  static_assert(sizeof(TileSpan) == sizeof(float[3]) && __builtin_offsetof(TileSpan, high) == 8);
+  float rows[3 * W];
+  store_columns<3>(rows, 3, W, words);
+  memcpy(spans, rows, sizeof(TileSpan) * valid);
+}
+
 // Returns the lanes with a NaN or an infinity.
-MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i, int valid, Splat* splats,
-                            uint32_t* depth_keys, int32_t* radii) {
+MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i, int valid, const Projected& out) {
   F in[11];
   load_columns<3>(g.means + 3 * i, 3, valid, in);
   load_columns<4>(g.quats + 4 * i, 4, valid, in + 3);
@@ -97,87 +150,28 @@ MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i
                          color.z,
                          F{},
                          F{}};
-  store_columns<16>(&splats[i].x, 16, valid, columns);
-  store_radii(p, o.drawn, valid, radii + i);
+  store_columns<16>(&out.splats[i].x, 16, valid, columns);
+  store_radii(p, o.drawn, valid, out.radii + i);
+  if (any(o.drawn)) {
+    const SplatShape shape{columns[0], columns[1], columns[2], columns[3], columns[4], columns[5], columns[7]};
+    store_spans(shape, out.grid, valid, out.spans + i);
+  }
   const uint32_t drawn = lane_bits(o.drawn);
   for (int lane = 0; lane < valid; ++lane) {
     uint32_t key;
-    memcpy(&key, &splats[i + lane].depth, 4);  // positive floats sort as their bits
-    depth_keys[i + lane] = drawn >> lane & 1 ? key : UINT32_MAX;
+    memcpy(&key, &out.splats[i + lane].depth, 4);  // positive floats sort as their bits
+    out.depth_keys[i + lane] = drawn >> lane & 1 ? key : UINT32_MAX;
   }
   return bad;
 }
 
-bool project(const GaussianArrays& g, const View& view, int64_t first, int64_t last, Splat* splats,
-             uint32_t* depth_keys, int32_t* radii) {
+bool project(const GaussianArrays& g, const View& view, int64_t first, int64_t last, const Projected& out) {
   M bad = no_lanes();
   for (int64_t i = first; i < last; i += W) {
     const int valid = last - i < W ? (int)(last - i) : W;
-    bad = either(bad, project_group(g, view, i, valid, splats, depth_keys, radii));
+    bad = either(bad, project_group(g, view, i, valid, out));
   }
   return !any(bad);
-}
-
-struct SplatShape {
-  F x, y, slope, width2, half_height, y_rightmost, inverse_half_height;
-};
-
-MIEN_INLINE SplatShape gather_shapes(const Splat* const* splats) {
-  const float* rows[W];
-  for (int lane = 0; lane < W; ++lane) rows[lane] = &splats[lane]->x;
-  F v[8];
-  gather_columns<8>(rows, v);
-  return {v[0], v[1], v[2], v[3], v[4], v[5], v[7]};
-}
-
-// The columns of pixel groups of `size` pixels that the ellipse touches in the rows of pixel centres top..bottom (both
-// relative to the centre): exact, because within a strip the ellipse is widest at its rightmost point or, if that lies
-// outside, at the edge nearer to it. `first` is the first group's first pixel centre relative to the splat's.
-struct Columns {
-  F low, high;  // not clamped; high < low where the ellipse misses the strip
-};
-
-MIEN_INLINE Columns columns_touched(const SplatShape& s, F top, F bottom, F first, float size) {
-  const F right_y = clamp(s.y_rightmost, top, bottom), left_y = clamp(-s.y_rightmost, top, bottom);
-  const F right_t = right_y * s.inverse_half_height, left_t = left_y * s.inverse_half_height;
-  const F right = s.slope * right_y + root_bound(s.width2 * (1.0f - right_t * right_t));
-  const F left = s.slope * left_y - root_bound(s.width2 * (1.0f - left_t * left_t));
-  const M hit = both(less_equal(top, s.half_height), less_equal(-s.half_height, bottom));
-  const float per_group = 1.0f / size;
-  const F low = -round_down((first + (size - 1.0f) - left) * per_group);
-  const F high = round_down((right - first) * per_group);
-  return {low, select(hit, high, set1(-1e6f))};
-}
-
-void find_tiles(const Splat* splats, const uint32_t* order, int64_t count, int columns, int rows, TileSpan* spans) {
-  for (int64_t i = 0; i < count; i += W) {
-    const int valid = count - i < W ? (int)(count - i) : W;
-    const Splat* chosen[W];
-    for (int lane = 0; lane < W; ++lane) chosen[lane] = &splats[order[i + (lane < valid ? lane : 0)]];
-    const SplatShape s = gather_shapes(chosen);
-    const F last_row = set1((float)(rows - 1)), last_column = set1((float)(columns - 1));
-    const F first_row = clamp(round_down((s.y - s.half_height - 0.5f) * (1.0f / kTile)), F{}, last_row);
-    const F end_row = clamp(round_down((s.y + s.half_height - 0.5f) * (1.0f / kTile)), F{}, last_row);
-    alignas(64) int32_t ints[6][W];
-    store(ints[0], truncate(first_row));
-    store(ints[1], truncate(end_row));
-    for (int row = 0; row < 2; ++row) {
-      const F top = (first_row + (float)row) * (float)kTile + 0.5f - s.y;
-      const Columns c = columns_touched(s, top, top + (kTile - 1.0f), 0.5f - s.x, kTile);
-      store(ints[2 + 2 * row], truncate(clamp(c.low, F{}, last_column + 1.0f)));
-      const F high = select(less_equal(first_row + (float)row, end_row), c.high, set1(-1.0f));
-      store(ints[3 + 2 * row], truncate(clamp(high, set1(-1.0f), last_column)));
-    }
-    for (int lane = 0; lane < valid; ++lane) {
-      TileSpan& span = spans[i + lane];
-      span.first_row = (int16_t)ints[0][lane];
-      span.row_count = (int16_t)(ints[1][lane] - ints[0][lane] + 1);
-      for (int row = 0; row < 2; ++row) {
-        span.low[row] = (int16_t)ints[2 + 2 * row][lane];
-        span.high[row] = (int16_t)ints[3 + 2 * row][lane];
-      }
-    }
-  }
 }
 
 }  // namespace

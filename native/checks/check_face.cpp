@@ -55,9 +55,27 @@ Result pose(const Sizes& sizes, bool in_world) {
   return r;
 }
 
+void check_head_poses() {
+  Random random(13);
+  for (float size : {0.0f, 1e-20f, 1e-4f, 1.0f, 40.0f}) {
+    const Floats rotation = random.normal(3, size), translation = random.normal(3), gradient = random.normal(16);
+    Floats transform(16), grad_rotation(3);
+    mien::head_pose(rotation.data(), translation.data(), transform.data());
+    mien::head_pose_backward(rotation.data(), gradient.data(), grad_rotation.data());
+    CHECK(all_finite(transform) && all_finite(grad_rotation));
+    for (int row = 0; row < 3; ++row) {
+      CHECK(transform[4 * row + 3] == translation[row]);
+      float squares = 0;
+      for (int column = 0; column < 3; ++column) squares += transform[4 * row + column] * transform[4 * row + column];
+      CHECK(std::fabs(squares - 1) < 1e-5f);
+    }
+  }
+}
+
 }  // namespace
 
 void check_face() {
+  check_head_poses();
   for (const Sizes& sizes : {Sizes{1, 1, 0, false},
                              {15, 2, 1, true},
                              {16, 3, 2, true},

@@ -1,5 +1,7 @@
 // The rig, the photometric loss, Adam, penalties and statistics: odd lengths, the same bits for any number of threads.
+#include "activation.h"
 #include "checks.h"
+#include "memory.h"
 #include "photometric.h"
 #include "pool.h"
 #include "rig.h"
@@ -140,6 +142,47 @@ void check_box() {
   }
 }
 
+void check_sigmoid() {
+  for (int64_t count : {0, 1, 15, 16, 17, 40000}) {
+    Floats results[2], gradients[2];
+    for (int threads : {1, 3}) {
+      mien::set_thread_count(threads);
+      Random random(9);
+      Floats values = random.normal(count, 60), out(count), back(count);
+      const Floats gradient = random.normal(count);
+      mien::sigmoid(values.data(), count, out.data());
+      mien::sigmoid_backward(out.data(), gradient.data(), count, back.data());
+      for (float value : out) CHECK(value >= 0 && value <= 1);
+      CHECK(all_finite(back));
+      results[threads > 1] = out;
+      gradients[threads > 1] = back;
+    }
+    CHECK(results[0] == results[1] && gradients[0] == gradients[1]);
+  }
+}
+
+// Memory comes back, to one owner at a time, and no more of it is kept than is allowed.
+void check_memory() {
+  const size_t bytes = size_t{100} << 20;
+  void* const first = mien::take_memory(bytes);
+  void* const second = mien::take_memory(bytes);
+  CHECK(first && second && first != second && reinterpret_cast<uintptr_t>(first) % 64 == 0);
+  mien::give_memory(first, bytes);
+  CHECK(mien::take_memory(bytes) == first);
+  mien::give_memory(first, bytes);
+  mien::give_memory(second, bytes);
+  mien::give_memory(mien::take_memory(bytes + 1), bytes + 1);  // 300 MB: the oldest goes
+  CHECK(mien::take_memory(bytes) == second);
+  mien::give_memory(second, bytes);
+  mien::parallel_for(100, [](int64_t index) {
+    const size_t own = 64 + static_cast<size_t>(index % 3);
+    auto* const memory = static_cast<unsigned char*>(mien::take_memory(own));
+    for (size_t i = 0; i < own; ++i) memory[i] = static_cast<unsigned char>(index);
+    for (size_t i = 0; i < own; ++i) CHECK(memory[i] == static_cast<unsigned char>(index));
+    mien::give_memory(memory, own);
+  });
+}
+
 }  // namespace
 
 void check_training_step() {
@@ -148,6 +191,8 @@ void check_training_step() {
   check_adam();
   check_penalties_and_statistics();
   check_box();
+  check_sigmoid();
+  check_memory();
 }
 
 }  // namespace checks
