@@ -9,8 +9,12 @@ from torch import Tensor
 
 from mien.face import FaceModel, FaceParams
 from mien.rotation import matrix_from_axis_angle, skew
+from mien.tracking.detector_response import DetectorResponse, unknown_response
 from mien.tracking.parameters import ParameterLayout
 from mien.tracking.views import CameraBatch
+
+_UNKNOWN_SIGMA = 0.003
+"""Metres: how far a landmark's point on a subject may lie from the model's where nothing was measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +27,8 @@ class Linearization:
     by_identity: Float[Tensor, "b l 2 i"] | None
     by_log_focal: Float[Tensor, "b l 2"]
     by_bias: Float[Tensor, "b l 2 3"]
+    by_person: Float[Tensor, "b l 2 k"] | None
+    """With the components of what a detector makes of a person."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +49,8 @@ class LandmarkModel:
     joint_weights: Float[Tensor, "k l"]
     joints: Int[Tensor, " k"]
     """Which of the face model's joints these are: those that move a landmark."""
+    response: DetectorResponse
+    """Of the detector; its part that follows expressions is in their basis already."""
 
     def at(self, landmarks: Int[Tensor, " n"], layout: ParameterLayout) -> "LandmarkModel":
         """Some of the landmarks, under other free parameters."""
@@ -54,6 +62,7 @@ class LandmarkModel:
             expression_basis=self.expression_basis[:, :, landmarks],
             pose_basis=None if self.pose_basis is None else self.pose_basis[:, :, landmarks],
             joint_weights=self.joint_weights[:, landmarks],
+            response=self.response.at(landmarks),
         )
 
     def head_points(
@@ -64,6 +73,7 @@ class LandmarkModel:
         static = self.rest + torch.einsum("i,iklc->klc", face.identity, self.identity_basis)
         static = static + self.joint_weights[:, :, None] * bias
         shaped = static + (face.expression @ self.expression_basis.flatten(1)).reshape(-1, k, points, 3)
+        shaped = shaped + self.joint_weights[:, :, None] * self.response.of_turns(face.head_rotation)[:, None]
         if self.pose_basis is not None:
             turned = matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)
             shaped = shaped + torch.einsum("bq,qklc->bklc", turned.flatten(1), self.pose_basis)
@@ -116,7 +126,8 @@ class LandmarkModel:
         by_frame = torch.cat([by_rotation, by_world, _chained(by_head, of_head, row)], dim=-1)
         by_identity = _chained(by_head, self._by_identity(transforms, face), row) if with_identity else None
         by_bias = by_head @ torch.einsum("vkrc,kl->vlrc", transforms[:, :, :3, :3], self.joint_weights)[row]
-        return Linearization(pixels, by_frame, by_identity, by_log_focal, by_bias)
+        by_person = torch.einsum("blxc,klc->blxk", by_bias, self.response.by_person) if with_identity else None
+        return Linearization(pixels, by_frame, by_identity, by_log_focal, by_bias, by_person)
 
     def _by_joint_motion(
         self, transforms: Float[Tensor, "v k 4 4"], shaped: Float[Tensor, "v k l 3"], face: FaceParams
@@ -160,8 +171,10 @@ class LandmarkModel:
         return by_identity
 
 
-def reduce_face_model(face_model: FaceModel, layout: ParameterLayout) -> LandmarkModel:
-    """The face model reduced to its MediaPipe landmarks, in float64."""
+def reduce_face_model(
+    face_model: FaceModel, layout: ParameterLayout, response: DetectorResponse | None = None
+) -> LandmarkModel:
+    """The face model reduced to its MediaPipe landmarks as a detector sees them, in float64."""
     model = face_model.to(torch.zeros((), dtype=torch.float64))
     marks = model.landmarks["mediapipe"]
     corners = model.faces[marks.faces]
@@ -172,15 +185,19 @@ def reduce_face_model(face_model: FaceModel, layout: ParameterLayout) -> Landmar
     def gather(positions: Tensor) -> Tensor:
         return torch.einsum("...lnc,lnk->...klc", positions[..., corners, :], share)
 
+    joint_weights = share.sum(1).T.contiguous()
+    response = response or unknown_response(len(marks.faces), len(model.expression_basis), _UNKNOWN_SIGMA)
+    seen = torch.einsum("elc,kl->eklc", response.by_expression, joint_weights)
     return LandmarkModel(
         face_model=model,
         layout=layout,
         rest=gather(model.template),
         identity_basis=gather(model.identity_basis),
-        expression_basis=gather(model.expression_basis),
+        expression_basis=gather(model.expression_basis) + seen,
         pose_basis=None if model.pose_basis is None else gather(model.pose_basis),
-        joint_weights=share.sum(1).T.contiguous(),
+        joint_weights=joint_weights,
         joints=joints,
+        response=response,
     )
 
 

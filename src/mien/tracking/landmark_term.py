@@ -1,12 +1,13 @@
 """The landmark cost: robust distances between detected and projected landmarks, with priors on the parameters."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mien.tracking.detector_response import DetectorResponse
 from mien.tracking.landmark_model import LandmarkModel, Linearization
 from mien.tracking.solver import NormalEquations, SharedEquations
 from mien.tracking.views import CameraBatch, Views
@@ -27,6 +28,26 @@ class Subject:
     other points than the embedding, and no identity basis spans every face."""
     vertex_offsets: Float[Tensor, "v 3"] | None = None
     """Static offsets of the mesh, where pixels told them; the bias then holds what they move of landmarks."""
+    person: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    """What the detector makes of this person, in `DetectorResponse.by_person`: part of the bias."""
+
+    @property
+    def shared(self) -> Float[Tensor, " s"]:
+        """Identity, then person: what all pictures tell together."""
+        return torch.cat([self.identity, self.person])
+
+    def moved(self, step: Float[Tensor, " s"], response: DetectorResponse) -> "Subject":
+        """With `shared` changed by a step."""
+        identity, person = step.split([len(self.identity), len(self.person)])
+        bias = self.bias + (person @ response.by_person.flatten(1)).reshape(self.bias.shape)
+        return replace(self, identity=self.identity + identity, person=self.person + person, bias=bias)
+
+
+def unknown_subject(model: LandmarkModel) -> Subject:
+    """An average person."""
+    response = model.response
+    zeros = response.mean.new_zeros
+    return Subject(zeros(len(model.identity_basis)), response.mean, person=zeros(len(response.by_person)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +132,9 @@ class LandmarkTerm:
     def joint_equations(
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
     ) -> tuple[NormalEquations, SharedEquations]:
-        """Of each timestep, and of what they share: identity, then the logarithm of the focal length."""
+        """Of each timestep, and of what they share: `Subject.shared`, then the logarithm of the focal length."""
         equations = self._prior_equations(state)
-        size = len(subject.identity) + 1
+        size = len(subject.shared) + 1
         shared = SharedEquations(
             state.new_zeros(*state.shape, size), state.new_zeros(size, size), state.new_zeros(size)
         )
@@ -152,7 +173,9 @@ class WeightedLinearization:
     def add_to_shared(self, equations: SharedEquations) -> None:
         """Add the blocks of the shared parameters, in place."""
         assert self.at.by_identity is not None
-        shared = self._weighted(torch.cat([self.at.by_identity, self.at.by_log_focal[..., None]], dim=-1))
+        assert self.at.by_person is not None
+        derivatives = [self.at.by_identity, self.at.by_person, self.at.by_log_focal[..., None]]
+        shared = self._weighted(torch.cat(derivatives, dim=-1))
         own = self._weighted(self.at.by_frame)
         gradient = shared.mT @ self._weighted(self.residual[..., None])
         equations.across.index_add_(0, self.row, own.mT @ shared)

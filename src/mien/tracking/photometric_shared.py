@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -39,7 +39,7 @@ def step_shared(terms: Sequence[PhotometricTerm], fit: Fit, prior: SharedPrior, 
     A texture that was made with these very poses hardly resists a change that shifts every view alike, but it resists
     one that the views contradict: what is gained is depth, from parallax.
     """
-    identity, box = fit.subject.identity, box_of(terms[0].layout)
+    subject, box = fit.subject, box_of(terms[0].layout)
     rows = [choose_keyframes(own.state[:, :6], keyframes) for own in fit.sequences]
     frames, shared = [], []
     for term, own, chosen, lens in zip(terms, fit.sequences, rows, prior.lenses, strict=True):
@@ -55,12 +55,12 @@ def step_shared(terms: Sequence[PhotometricTerm], fit: Fit, prior: SharedPrior, 
     sequences = []
     steps = step.split([len(chosen) for chosen in rows])
     for own, own_step, lens in zip(fit.sequences, steps, prior.lenses, strict=True):
-        factor = 1.0 if lens is None else math.exp(float(shared_step[len(identity) + lens]))
+        factor = 1.0 if lens is None else math.exp(float(shared_step[len(subject.shared) + lens]))
         # Every frame takes the keyframes' mean step: what the changed identity asks of all of them.
         state = box.clip(own.state + own_step.mean(0))
         sequences.append(SequenceFit(own.cameras.with_focal(factor), state))
-    subject = replace(fit.subject, identity=identity + shared_step[: len(identity)])
-    return Fit(subject, tuple(sequences))
+    response = terms[0].landmarks.model.response
+    return Fit(subject.moved(shared_step[: len(subject.shared)], response), tuple(sequences))
 
 
 def _prior(fit: Fit, prior: SharedPrior, keyframes: Sequence[int]) -> tuple[Float[Tensor, " s"], Float[Tensor, " s"]]:
@@ -71,5 +71,6 @@ def _prior(fit: Fit, prior: SharedPrior, keyframes: Sequence[int]) -> tuple[Floa
         if lens is not None:
             weights[lens] += count * prior.focal_sigma**-2
             values[lens] = (own.cameras.K[0, 0, 0] / first).log()
-    identity_weights = torch.full_like(identity, prior.identity_weight)
-    return torch.cat([identity_weights, weights]), torch.cat([identity, values])
+    precision = torch.ones_like(fit.subject.shared)
+    precision[: len(identity)] = prior.identity_weight
+    return torch.cat([precision, weights]), torch.cat([fit.subject.shared, values])

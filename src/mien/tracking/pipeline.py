@@ -12,10 +12,10 @@ from mien.capture.capture import Capture
 from mien.errors import UserError
 from mien.face import FaceModel
 from mien.progress import progress_bar
+from mien.tracking.detector_response import DetectorResponse, read_response
 from mien.tracking.head_pose import fit_head_pose
-from mien.tracking.landmark_groups import LANDMARKS
 from mien.tracking.landmark_model import LandmarkModel, reduce_face_model
-from mien.tracking.landmark_term import Subject
+from mien.tracking.landmark_term import unknown_subject
 from mien.tracking.outcome import as_tracking, with_pixels
 from mien.tracking.paper import fit_by_descent
 from mien.tracking.parameters import layout_of
@@ -82,7 +82,7 @@ def track_subject(
         raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; calibrate them for it first")
     shots, keeper = [shot_of(capture, settings) for capture in captures], Keeper(keep)
     with torch.no_grad():
-        model = reduce_face_model(face_model, layout_of(face_model))
+        model = reduce_face_model(face_model, layout_of(face_model), _response(face_model, shots, settings))
         lenses = lenses_of(captures, settings)
         watch = nobody if preview is None else Preview(preview, face_model, model, shots, settings)
         try:
@@ -109,6 +109,12 @@ def track_subject(
     return trackings
 
 
+def _response(face_model: FaceModel, shots: Sequence[Shot], settings: TrackingSettings) -> DetectorResponse:
+    response = read_response(face_model, settings.bias_sigma)
+    # Turns were measured as one camera sees them, and are the head's own only where that camera is all there is.
+    return response if all(len(shot.cameras) == 1 for shot in shots) else response.without_turns()
+
+
 def _fit_landmarks(
     model: LandmarkModel,
     shots: Sequence[Shot],
@@ -117,7 +123,7 @@ def _fit_landmarks(
     keeper: Keeper,
     watch: Watch,
 ) -> Fit:
-    subject = Subject(torch.zeros(len(model.identity_basis)).double(), torch.zeros(LANDMARKS, 3).double())
+    subject = unknown_subject(model)
     frames = sum(int(shot.valid.sum()) for shot in shots)
     total, done = frames * sum(_COSTS.values()), 0
     with progress_bar("Tracking", total=total) as advance:

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.tracking.detector_response import DetectorResponse
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.solver import Box, NormalEquations, SharedEquations, joined, joined_shared, solve_arrow
@@ -49,7 +50,7 @@ def _fit_jointly(
 ) -> Fit:
     box, damping = box_of(terms[0].model.layout), 1e-3
     precision = _precision(start, lenses, settings)
-    free = len(precision) - len(start.subject.identity)
+    free = len(precision) - len(start.subject.shared)
 
     def cost(candidate: _Joint) -> float:
         fit = candidate.fit
@@ -65,7 +66,7 @@ def _fit_jointly(
         shared = shared.with_prior(precision, _shared_values(at))
         state = torch.cat([own.state for own in at.fit.sequences])
         step, shared_step = solve_arrow(frames, shared, box.held(state, frames.gradient), damping)
-        candidate = _moved(at, step, shared_step, start, lenses, box)
+        candidate = _moved(at, step, shared_step, start, lenses, box, terms[0].model.response)
         candidate_cost = cost(candidate)
         if candidate_cost < best:
             at, best, damping = candidate, candidate_cost, damping / 5
@@ -76,16 +77,17 @@ def _fit_jointly(
 
 def _precision(fit: Fit, lenses: Sequence[int | None], settings: TrackingSettings) -> Float[Tensor, " s"]:
     """Of the priors of identity and free focal lengths."""
-    identity = torch.full_like(fit.subject.identity, settings.identity_weight)
+    subject = torch.ones_like(fit.subject.shared)
+    subject[: len(fit.subject.identity)] = settings.identity_weight
     groups = sorted({lens for lens in lenses if lens is not None})
     assert groups == list(range(len(groups))), "lenses are numbered from 0"
     keyframes = [sum(len(own.state) for own, lens in zip(fit.sequences, lenses, strict=True) if lens == group)
                  for group in groups]  # fmt: skip
-    return torch.cat([identity, identity.new_tensor(keyframes) * _FOCAL_SIGMA**-2])
+    return torch.cat([subject, subject.new_tensor(keyframes) * _FOCAL_SIGMA**-2])
 
 
 def _shared_values(at: _Joint) -> Float[Tensor, " s"]:
-    return torch.cat([at.fit.subject.identity, at.log_focals])
+    return torch.cat([at.fit.subject.shared, at.log_focals])
 
 
 def _equations(
@@ -101,12 +103,12 @@ def _equations(
 
 
 def placed(own: SharedEquations, lens: int | None, free: int) -> SharedEquations:
-    """A sequence's blocks (identity, its focal length) among those of all focal lengths; a known one falls away."""
-    identity = len(own.gradient) - 1
-    placing = own.gradient.new_zeros(identity + 1, identity + free)
-    placing[:identity, :identity] = torch.eye(identity)
+    """A sequence's blocks (subject, focal length) among those of all focal lengths; a known one falls away."""
+    subject = len(own.gradient) - 1
+    placing = own.gradient.new_zeros(subject + 1, subject + free)
+    placing[:subject, :subject] = torch.eye(subject)
     if lens is not None:
-        placing[identity, identity + lens] = 1
+        placing[subject, subject + lens] = 1
     return SharedEquations(own.across @ placing, placing.T @ own.hessian @ placing, own.gradient @ placing)
 
 
@@ -117,14 +119,15 @@ def _moved(
     start: Fit,
     lenses: Sequence[int | None],
     box: Box,
+    response: DetectorResponse,
 ) -> _Joint:
     subject: Subject = at.fit.subject
-    identity = len(subject.identity)
-    log_focals = at.log_focals + shared_step[identity:]
+    own_steps = len(subject.shared)
+    log_focals = at.log_focals + shared_step[own_steps:]
     steps = step.split([len(own.state) for own in at.fit.sequences])
     sequences = []
     for own, first, own_step, lens in zip(at.fit.sequences, start.sequences, steps, lenses, strict=True):
         factor = 1.0 if lens is None else math.exp(float(log_focals[lens]))
         sequences.append(SequenceFit(first.cameras.with_focal(factor), box.clip(own.state + own_step)))
-    subject = replace(subject, identity=subject.identity + shared_step[:identity])
+    subject = subject.moved(shared_step[:own_steps], response)
     return _Joint(Fit(subject, tuple(sequences)), log_focals)

@@ -55,7 +55,7 @@ class Fit:
 
     def tensors(self) -> dict[str, Tensor]:
         """By name, for a file."""
-        tensors = {"identity": self.subject.identity, "bias": self.subject.bias}
+        tensors = {"identity": self.subject.identity, "bias": self.subject.bias, "person": self.subject.person}
         if self.subject.vertex_offsets is not None:
             tensors["vertex_offsets"] = self.subject.vertex_offsets
         for index, own in enumerate(self.sequences):
@@ -66,7 +66,7 @@ class Fit:
 
 def fit_of(tensors: Mapping[str, Tensor]) -> Fit:
     """The fit with these tensors (`Fit.tensors`)."""
-    subject = Subject(tensors["identity"], tensors["bias"], tensors.get("vertex_offsets"))
+    subject = Subject(tensors["identity"], tensors["bias"], tensors.get("vertex_offsets"), tensors["person"])
     sequences: list[SequenceFit] = []
     while f"state_{len(sequences)}" in tensors:
         K, viewmat, state = (tensors[f"{name}_{len(sequences)}"] for name in ("K", "viewmat", "state"))
@@ -89,23 +89,26 @@ def choose_keyframes(pose: Float[Tensor, "v 6"], count: int) -> Int[Tensor, " k"
 def fit_bias(terms: Sequence[LandmarkTerm], fit: Fit, settings: TrackingSettings) -> Fit:
     """The static offset of every landmark, all else fixed.
 
-    Irises get none (their place tells scale and gaze), lids and lips little (closed is closed for everyone), and the
-    offsets together hold no translation, rotation or scaling, which belong to pose and identity.
+    Beside what is expected of the detector, irises get none (their place tells scale and gaze), lids and lips little
+    (closed is closed for everyone), and the offsets together hold no translation, rotation or scaling, which belong to
+    pose and identity.
     """
-    bias = fit.subject.bias
-    precision = torch.full((len(bias), 1), settings.bias_sigma**-2).to(bias)
+    bias, response = fit.subject.bias, terms[0].model.response
+    expected = response.mean + (fit.subject.person @ response.by_person.flatten(1)).reshape(bias.shape)
+    precision = torch.full((len(bias), 1), response.rest_sigma**-2).to(bias)
     precision[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS)] *= _RIM_BIAS_SHARE**-2
-    hessian, gradient = precision[..., None] * torch.eye(3).to(bias), precision * bias
-    for term, own in zip(terms, fit.sequences, strict=True):
-        for part in term.linearizations(own.state, fit.subject, own.cameras):
+    hessian, gradient = precision[..., None] * torch.eye(3).to(bias), precision * (bias - expected)
+    for term, sequence in zip(terms, fit.sequences, strict=True):
+        for part in term.linearizations(sequence.state, fit.subject, sequence.cameras):
             part_hessian, part_gradient = part.bias_equations()
             hessian, gradient = hessian + part_hessian, gradient + part_gradient
-    bias = bias - torch.linalg.solve(hessian, gradient)
-    bias[list(LEFT_IRIS + RIGHT_IRIS)] = 0
+    own = bias - torch.linalg.solve(hessian, gradient) - expected
+    own[list(LEFT_IRIS + RIGHT_IRIS)] = 0
     model, weights = terms[0].model, terms[0].weights
     rest = model.layout.face_params(bias.new_zeros(1, model.layout.size), fit.subject.identity)
     positions = model.head_points(rest, torch.zeros_like(bias))[0][0]
-    return replace(fit, subject=replace(fit.subject, bias=_without_similarity(bias, positions, weights)))
+    bias = expected + _without_similarity(own, positions, weights)
+    return replace(fit, subject=replace(fit.subject, bias=bias))
 
 
 def _without_similarity(
