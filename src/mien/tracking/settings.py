@@ -42,8 +42,8 @@ class TrackingSettings:
     identity_weight: float = 4.0
     """Weight of the identity's unit-variance prior."""
     bias_sigma: float = 0.003
-    """How far a landmark's point on the subject may lie from the model's, metres; one offset for all sequences. Only for
-    face models that the detector's habits were not measured on (`mien.tracking.detector_response`)."""
+    """How far a landmark's point on the subject may lie from the model's, metres; one offset for all sequences. For
+    face models only that the detector's habits were not measured on (`mien.tracking.detector_response`)."""
     smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
     """Over time."""
     schedule: Literal["landmarks", "fast", "paper"] = "fast"
