@@ -108,7 +108,8 @@ struct BackwardTask {
   Out<-1> grad_opacities;
   Out<-1, -1, 3> grad_sh;
   Out<-1, 2> grad_means2d;
-  Out<mien::kViewGradients> grad_view;
+  Out<4, 4> grad_viewmat;
+  Out<3, 3> grad_K;
 
   explicit BackwardTask(const nb::tuple& t)
       : frame(nb::cast<RasterizeFrame&>(t[0])),
@@ -126,7 +127,8 @@ struct BackwardTask {
         grad_opacities(item<Out<-1>>(t, 13)),
         grad_sh(item<Out<-1, -1, 3>>(t, 14)),
         grad_means2d(item<Out<-1, 2>>(t, 15)),
-        grad_view(item<Out<mien::kViewGradients>>(t, 16)) {
+        grad_viewmat(item<Out<4, 4>>(t, 16)),
+        grad_K(item<Out<3, 3>>(t, 17)) {
     if (!t[9].is_none()) grad_alpha = item<In<-1, -1>>(t, 9);
     const size_t n = means.shape(0), pixels = static_cast<size_t>(frame.view.width) * frame.view.height;
     require(static_cast<int64_t>(n) == frame.count, "these are not the Gaussians of the forward pass");
@@ -142,8 +144,17 @@ struct BackwardTask {
                                         grad_alpha ? grad_alpha->data() : nullptr};
     const mien::GaussianGradients gradients{grad_means.data(),     grad_quats.data(), grad_scales.data(),
                                             grad_opacities.data(), grad_sh.data(),    grad_means2d.data()};
+    float view[mien::kViewGradients];
     mien::rasterize_backward(*frame.frame, gaussian_arrays(means, quats, scales, opacities, sh), frame.view, picture,
-                             gradients, grad_view.data());
+                             gradients, view);
+    float *m = grad_viewmat.data(), *k = grad_K.data();
+    for (int row = 0; row < 3; ++row) {
+      for (int column = 0; column < 3; ++column) m[4 * row + column] = view[3 * row + column];
+      m[4 * row + 3] = view[9 + row];
+    }
+    for (int column = 0; column < 4; ++column) m[12 + column] = 0;
+    const float intrinsics[9] = {view[12], 0, view[14], 0, view[13], view[15], 0, 0, 0};
+    for (int i = 0; i < 9; ++i) k[i] = intrinsics[i];
   }
 };
 
@@ -182,8 +193,7 @@ void bind_rasterize(nb::module_& module) {
   module.def("rasterize_views_backward", &backward, "views"_a,
              "Fills the gradients of each view, given as (frame, means, quats, scales, opacities, sh, image, alpha, "
              "grad_image, grad_alpha or None, grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, "
-             "grad_means2d, grad_view); grad_view is that of the viewmat's rotation and translation, then fx, fy, cx, "
-             "cy.");
+             "grad_means2d, grad_viewmat, grad_K).");
   module.def("thread_count", &mien::thread_count, "The number of threads that native operations use.");
   module.def("set_thread_count", &mien::set_thread_count, "count"_a, "Replaces the threads; 0 for the default.");
   module.def("rasterize_isa", &mien::rasterize_isa, "The instruction set of the rasterizer's kernels.");

@@ -119,8 +119,8 @@ class _ComposeRigid(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:
         ctx.save_for_backward(first, second)
-        columns = [first[:, axis, None] * second[axis] for axis in range(4)]
-        return ((columns[0] + columns[1]) + columns[2]) + columns[3]
+        one, two, three, four = (first[:, :, None] * second).unbind(1)
+        return ((one + two) + three) + four
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:

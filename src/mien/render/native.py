@@ -87,29 +87,18 @@ class _Rasterize(torch.autograd.Function):
             grad_image, grad_alpha, _ = gradients[3 * index : 3 * index + 3]
             grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
             grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-            found = [torch.empty_like(t) for t in own] + [torch.empty(len(own[0]), 2), torch.empty(16)]
+            found = [torch.empty_like(t) for t in own] + [
+                torch.empty(size) for size in ((len(own[0]), 2), (4, 4), (3, 3))
+            ]
             known = (*own, image.detach(), alpha.detach(), grad_image)
             tasks.append((frame, *unpacked(*known, grad_alpha, *found)))
             views.append((grad_image, alpha, *found))
         _native.rasterize_views_backward(tasks)
         result: list[Tensor | None] = [None]
         for index, (grad_image, alpha, *found) in enumerate(views):
-            *grad_parameters, grad_means2d, grad_view = found
+            *grad_parameters, grad_means2d, grad_viewmat, grad_K = found
             needs_background, needs_viewmat, needs_K = ctx.needs_input_grad[1 + _INPUTS * index + 6 :][:3]
             result += (grad_means2d, *grad_parameters)
             result.append(torch.einsum("hwc,hw->c", grad_image, 1 - alpha) if needs_background else None)
-            result.append(_viewmat_gradient(grad_view) if needs_viewmat else None)
-            result.append(_intrinsics_gradient(grad_view) if needs_K else None)
+            result += (grad_viewmat if needs_viewmat else None, grad_K if needs_K else None)
         return tuple(result)
-
-
-# The kernel's gradient of the view: rotation [9], translation [3], fx, fy, cx, cy.
-def _viewmat_gradient(grad_view: Float[Tensor, " 16"]) -> Float[Tensor, "4 4"]:
-    top = torch.cat([grad_view[:9].reshape(3, 3), grad_view[9:12, None]], 1)
-    return torch.cat([top, torch.zeros_like(top[:1])])
-
-
-def _intrinsics_gradient(grad_view: Float[Tensor, " 16"]) -> Float[Tensor, "3 3"]:
-    grad_K = grad_view.new_zeros(3, 3)
-    grad_K[[0, 1, 0, 1], [0, 1, 2, 2]] = grad_view[12:]
-    return grad_K

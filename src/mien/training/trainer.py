@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Items
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import torch
@@ -120,7 +121,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     colour = torch.from_numpy(background) / 255
     rendering = rasterize(posed.gaussians.timestep(0), targets.camera(frame.camera), background=colour)
     losses = picture_losses(rendering, target, weights) | avatar.regularizers(posed, rendering, progress)
-    loss = torch.stack(list(losses.values())).sum()
+    loss = reduce(torch.add, losses.values())
     loss.backward()
 
     groups = [*avatar.parameter_groups(), *state.track.parameter_groups(face, frame.track_index)]
