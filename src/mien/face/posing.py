@@ -64,7 +64,7 @@ class _HeadPoses(torch.autograd.Function):
     def backward(ctx: Any, grad_transforms: Tensor) -> tuple[Tensor, Tensor]:
         (rotation,) = ctx.saved_tensors
         grad_transforms, grad_rotation = grad_transforms.contiguous(), torch.empty_like(rotation)
-        _native.head_poses_backward(rotation, grad_transforms, grad_rotation)
+        _native.head_poses_backward(*unpacked(rotation, grad_transforms, grad_rotation))
         return grad_rotation, grad_transforms[:, :3, 3].contiguous()
 
 

@@ -87,9 +87,8 @@ class _Rasterize(torch.autograd.Function):
             grad_image, grad_alpha, _ = gradients[3 * index : 3 * index + 3]
             grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
             grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-            found = [torch.empty_like(t) for t in own] + [
-                torch.empty(size) for size in ((len(own[0]), 2), (4, 4), (3, 3))
-            ]
+            found = [torch.empty_like(t) for t in own]
+            found += [torch.empty(len(own[0]), 2), torch.empty(4, 4), torch.empty(3, 3)]
             known = (*own, image.detach(), alpha.detach(), grad_image)
             tasks.append((frame, *unpacked(*known, grad_alpha, *found)))
             views.append((grad_image, alpha, *found))
