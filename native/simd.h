@@ -169,7 +169,7 @@ MIEN_INLINE F exp2_fast(F a) {
   return from_bits(bits(power) + (bits(shifted) << 23));
 }
 
-// 2^a for what is seen of a splat: -8 < a <= 0, anything beyond; to 4e-7 (relative) with AVX-512, 4e-6 otherwise. A
+// 2^a for what is seen of a splat: -8 < a <= 0, anything beyond; to 4e-7 (relative) with AVX-512, 4e-6 with AVX2. A
 // vector register holds the powers of 2 in steps of 1/16 (1/8), less the index where their exponent will be added, so
 // that a parabola does for the rest.
 #if defined(__AVX512F__) || defined(__AVX2__)
@@ -199,14 +199,7 @@ MIEN_INLINE F exp2_alpha(F a) {
   return scale + scale * (f * (f * kPower2 + kPower1));
 }
 #else
-MIEN_INLINE F exp2_alpha(F a) {
-  const F shifted = a + 12582912.0f, f = a - (shifted - 12582912.0f);
-  F power = f * 9.5701020e-3f + 5.5917861e-2f;
-  power = power * f + 2.4024745e-1f;
-  power = power * f + 6.9312181e-1f;
-  power = power * f + 0.99999926f;
-  return from_bits(bits(power) + (bits(shifted) << 23));
-}
+MIEN_INLINE F exp2_alpha(F a) { return exp2_fast(a); }
 #endif
 
 // log2(a) to 1e-7 (absolute, near 1; relative elsewhere) for positive normal a: with a = m 2^e, m in 0.7..1.4 and
