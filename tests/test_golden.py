@@ -9,11 +9,12 @@ from safetensors.torch import load_file
 
 from mien.camera import camera_from_fov
 from mien.gaussians import Gaussians
-from mien.render import rasterize
 from mien.render.rasterize import Backend
+from rasterize_scenes import GSPLAT
+from rasterize_scenes import rasterize_anywhere as rasterize
 
 
-@pytest.mark.parametrize("backend", ["reference", "native"])
+@pytest.mark.parametrize("backend", ["reference", "native", GSPLAT])
 def test_tiny_case_matches_the_picture_that_gsplat_made(test_data: Path, backend: Backend) -> None:
     stored = load_file(test_data / "golden" / "tiny_case.safetensors")
     viewmat = torch.eye(4)

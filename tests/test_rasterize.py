@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from mien import _native
+from mien.render.rasterize import Backend
 from rasterize_scenes import (
+    GSPLAT,
     WeightedSum,
     assert_matches_reference,
     gradients,
@@ -18,6 +20,7 @@ from rasterize_scenes import (
     render,
 )
 
+BACKENDS = ["native", GSPLAT]
 ISAS = ["avx512", "avx2", "sse4"] if platform.machine() in ("x86_64", "AMD64") else ["baseline"]
 
 
@@ -37,36 +40,47 @@ def test_native_matches_reference(coefficients: int, isa: str, monkeypatch: pyte
     assert_matches_reference(random_scene(coefficients, coefficients=coefficients), monkeypatch)
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_gsplat_matches_reference(coefficients: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_matches_reference(random_scene(coefficients, coefficients=coefficients), monkeypatch, "gsplat")
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (3, 70), (32, 32), (33, 31), (129, 65)])
-def test_sizes(width: int, height: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_matches_reference(random_scene(width + height, count=150, width=width, height=height), monkeypatch)
+def test_sizes(width: int, height: int, backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_matches_reference(random_scene(width + height, count=150, width=width, height=height), monkeypatch, backend)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 1000])
-def test_counts(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_matches_reference(random_scene(count, count=count), monkeypatch)
+def test_counts(count: int, backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_matches_reference(random_scene(count, count=count), monkeypatch, backend)
 
 
-def test_pixels_that_end_early(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_pixels_that_end_early(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
     """Many opaque layers: transmittance runs out, and alpha is clamped at 0.999."""
     scene = random_scene(5, count=600, width=40, height=40)
     scene.gaussians.scales.mul_(4)
     scene.gaussians.opacities.clamp_(min=0.9).mul_(1.2).clamp_(max=1.0)
-    assert_matches_reference(scene, monkeypatch)
+    assert_matches_reference(scene, monkeypatch, backend)
 
 
-def test_splats_larger_than_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_splats_larger_than_the_picture(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = random_scene(6, count=30, width=150, height=140)
     scene.gaussians.scales.mul_(20)
     scene.gaussians.opacities.mul_(0.2)
-    assert_matches_reference(scene, monkeypatch)
+    assert_matches_reference(scene, monkeypatch, backend)
 
 
-def test_needles(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_needles(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
     """Long and thin: the covariance's determinant cancels if it is computed carelessly."""
     scene = random_scene(7, count=60, width=100, height=100)
     scene.gaussians.scales.copy_(torch.tensor([0.5, 1e-4, 1e-4]))
-    assert_matches_reference(scene, monkeypatch)
+    assert_matches_reference(scene, monkeypatch, backend)
 
 
 @pytest.mark.parametrize("loss", ["image", "alpha"])

@@ -22,7 +22,8 @@ class Moments:
     @staticmethod
     def zeros(like: Tensor) -> "Moments":
         """The state before the first update of a tensor."""
-        return Moments(torch.zeros_like(like), torch.zeros_like(like), like.new_zeros(()))
+        # Counted on the CPU: what is worked out of it are numbers of the host, which must not wait for a GPU.
+        return Moments(torch.zeros_like(like), torch.zeros_like(like), torch.zeros((), dtype=like.dtype))
 
 
 class GaussianStore(nn.Module):

@@ -163,9 +163,10 @@ class FaceModel:
         rest = self.rest_joints(face)
         rotation = torch.einsum("be,ekc->bkc", face.expression, self.joint_rotation_basis)
         shift = torch.einsum("be,ekc->bkc", face.expression, self.joint_translation_basis)
-        free = [index for index, is_free in enumerate(self.joint_free) if is_free]
-        rotation = rotation.index_copy(1, torch.tensor(free, dtype=torch.long, device=rest.device), face.joints)
-        matrices = matrix_from_axis_angle(rotation)
+        # Joint by joint: an index made here would have to be sent to a GPU, in every training step.
+        given = iter(face.joints.unbind(1))
+        turns = [next(given) if free else rotation[:, index] for index, free in enumerate(self.joint_free)]
+        matrices = matrix_from_axis_angle(torch.stack(turns, dim=1))
         # About the joint: x -> R (x - rest) + rest + shift.
         about = rest + shift - (matrices @ rest[:, :, None])[..., 0]
         local = rigid_transform(matrices, about)

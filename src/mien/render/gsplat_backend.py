@@ -32,7 +32,6 @@ def render_gsplat(
             f"rasterize: backend 'gsplat' takes float32 CUDA tensors, got {gaussians.means.dtype} on "
             f"{gaussians.means.device}; use backend='auto'"
         )
-    check_finite(gaussians, camera, background)
     viewmats, Ks = camera.viewmat[None].contiguous(), camera.K[None].contiguous()
     means, quats, scales = (t.contiguous() for t in (gaussians.means, gaussians.quats, gaussians.scales))
     radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
@@ -44,6 +43,8 @@ def render_gsplat(
     degree = math.isqrt(gaussians.sh.shape[-2]) - 1
     directions = (means - camera_position)[None]
     colors = gsplat.spherical_harmonics(degree, directions, gaussians.sh[None].contiguous(), masks=visible)
+    # The next step makes the host wait for the number of pairs, so that asking here, once, costs next to nothing.
+    check_finite(gaussians, camera, background)
     columns, rows = math.ceil(camera.width / _TILE), math.ceil(camera.height / _TILE)
     _, intersections, flat_ids = gsplat.isect_tiles(
         means2d, radii, depths, _TILE, columns, rows, packed=False, n_images=1

@@ -38,9 +38,9 @@ class DensityStrategy(ABC):
 def density_strategy(control: DensityControl, store: GaussianStore) -> DensityStrategy:
     """The strategy that a method's description asks for."""
     if isinstance(control, GradientDensity):
-        return GradientStrategy(control, len(store))
+        return GradientStrategy(control, len(store), store[store.names()[0]].device)
     if isinstance(control, RefillDensity):
-        return RefillStrategy(control, len(store))
+        return RefillStrategy(control, len(store), store[store.names()[0]].device)
     assert isinstance(control, FixedDensity)
     return FixedStrategy()
 
@@ -48,8 +48,9 @@ def density_strategy(control: DensityControl, store: GaussianStore) -> DensitySt
 class GradientStrategy(DensityStrategy):
     """Duplicate small and split large Gaussians whose centres pull; prune faint ones; lower opacities at times."""
 
-    def __init__(self, control: GradientDensity, gaussians: int):
+    def __init__(self, control: GradientDensity, gaussians: int, device: torch.device):
         self._control = control
+        self._device = device
         self._restart(gaussians)
 
     def observe(self, posed: Posed, rendering: Rendering) -> None:
@@ -90,10 +91,10 @@ class GradientStrategy(DensityStrategy):
         )
 
     def _restart(self, gaussians: int) -> None:
-        self._pull = torch.zeros(gaussians)
-        self._seen = torch.zeros(gaussians)
-        self._radius = torch.zeros(gaussians, dtype=torch.int32)
-        self._opacity = torch.zeros(gaussians)
+        self._pull = torch.zeros(gaussians, device=self._device)
+        self._seen = torch.zeros(gaussians, device=self._device)
+        self._radius = torch.zeros(gaussians, dtype=torch.int32, device=self._device)
+        self._opacity = torch.zeros(gaussians, device=self._device)
 
     def _grow_and_prune(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> None:
         settings = self._control.settings
@@ -141,7 +142,7 @@ def observe_reference(
     """`_native.observe_view` in plain PyTorch: adds a step to pull, seen, radius and opacity."""
     pull, seen, radius, opacity = statistics
     # Culled Gaussians have no gradient, so the sum needs no mask.
-    pull += torch.linalg.vector_norm(gradient * gradient.new_tensor(scale), dim=-1)
+    pull += torch.hypot(gradient[:, 0] * scale[0], gradient[:, 1] * scale[1])
     seen += radii > 0
     torch.maximum(radius, radii, out=radius)
     torch.maximum(opacity, opacities, out=opacity)
@@ -150,9 +151,9 @@ def observe_reference(
 class RefillStrategy(DensityStrategy):
     """Delete what no view has shown, then refill up to the target with children of random survivors."""
 
-    def __init__(self, control: RefillDensity, gaussians: int):
+    def __init__(self, control: RefillDensity, gaussians: int, device: torch.device):
         self._control = control
-        self._opacity = torch.zeros(gaussians)
+        self._opacity = torch.zeros(gaussians, device=device)
 
     def observe(self, posed: Posed, rendering: Rendering) -> None:
         """Remember each Gaussian's highest opacity."""
@@ -179,7 +180,7 @@ class RefillStrategy(DensityStrategy):
             parents = torch.randint(len(store), (missing,), generator=random)
             noise = torch.rand(missing, 3, generator=random) - 0.5
             store.append(parents, self._control.refill(store, parents, noise, progress.fraction))
-        self._opacity = torch.zeros(len(store))
+        self._opacity = torch.zeros(len(store), device=self._opacity.device)
         return True
 
     def state(self) -> dict[str, Tensor]:

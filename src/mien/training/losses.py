@@ -15,7 +15,8 @@ from mien.training.sequence import Target
 
 def picture_losses(rendering: Rendering, target: Target, weights: Photometric) -> dict[str, Float[Tensor, ""]]:
     """The weighted losses of one picture, by name; differentiable in the rendering."""
-    box = _box_of_difference(rendering, target)
+    # On a GPU the host would wait for the box, longer than the rest of the picture takes.
+    box = _box_of_difference(rendering, target) if rendering.image.device.type == "cpu" else None
     losses = {
         "photometric": photometric_loss(rendering.image, target.picture, weights.l1_weight, weights.ssim_weight, box)
     }
