@@ -80,10 +80,12 @@ def bind_to_world(
     floats = (vertices, local_means, local_quats, log_scales)
     if any(tensor.device.type != "cpu" or tensor.dtype != torch.float32 for tensor in floats):
         return frames_to_world(triangle_frames(vertices, faces), face_index, local_means, local_quats, log_scales)
-    flat = vertices.reshape(-1, *vertices.shape[-2:])
-    bound = _BindToWorld.apply(flat, faces, face_index, local_means, local_quats, log_scales)
-    means, quats, scales = (output.view(*vertices.shape[:-2], *output.shape[1:]) for output in bound)
-    return means, quats, scales
+    one_axis = vertices.ndim == 3  # no views then: they are nodes of the graph
+    flat = vertices if one_axis else vertices.reshape(-1, *vertices.shape[-2:])
+    means, quats, scales = _BindToWorld.apply(flat, faces, face_index, local_means, local_quats, log_scales)
+    if one_axis:
+        return means, quats, scales
+    return tuple(output.view(*vertices.shape[:-2], *output.shape[1:]) for output in (means, quats, scales))
 
 
 class _BindToWorld(torch.autograd.Function):

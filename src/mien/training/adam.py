@@ -67,13 +67,14 @@ def update_all(updates: Sequence[Update]) -> None:
     for update in updates:
         moments = update.moments
         moments.step += 1
-        tensors = (update.values, update.gradient, moments.first, moments.second)
-        if not all(t.dtype == torch.float32 and t.device.type == "cpu" and t.is_contiguous() for t in tensors):
+        values, gradient, first, second = tensors = (update.values, update.gradient, moments.first, moments.second)
+        if not all(t.dtype is torch.float32 and t.is_cpu and t.is_contiguous() for t in tensors):
             update_reference(update)
             continue
-        assert len({tensor.shape for tensor in tensors}) == 1, "a gradient and moments have their tensor's shape"
+        same_shape = values.shape == gradient.shape == first.shape == second.shape
+        assert same_shape, "a gradient and moments have their tensor's shape"
         pointers = [tensor.data_ptr() for tensor in tensors]
-        tasks.append((*pointers, update.values.numel(), *_step_sizes(update)))
+        tasks.append((*pointers, values.numel(), *_step_sizes(update)))
     if tasks:
         _native.adam_update(tasks)
 
