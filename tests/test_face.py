@@ -100,8 +100,9 @@ def test_texture_is_not_mirrored_and_does_not_overlap(model):
 
 
 def test_mean_head_is_symmetric(model):
-    mirrored = model.template * torch.tensor([-1.0, 1.0, 1.0])
-    assert torch.cdist(mirrored, model.template).min(1).values.max() < 1e-4
+    template = model.template.double()  # in float32, differences of nearly equal points are noise
+    mirrored = template * torch.tensor([-1.0, 1.0, 1.0])
+    assert torch.cdist(mirrored, template).min(1).values.max() < 1e-5
 
 
 def test_lower_teeth_follow_the_jaw_rigidly(model):
