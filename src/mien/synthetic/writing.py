@@ -23,7 +23,7 @@ from mien.synthetic.truth import hash_truth, truth_of, write_truth
 FORMAT, VERSION = "mien.synthetic_capture", 1
 _JSON, _WORK, _STATE = "synthetic.json", ".drawing", "state.json"
 VIDEO_NAME, CAPTURE_NAME, TRUTH_NAME = "video.mp4", "capture", "truth"
-_DRAWING = 1
+_DRAWING = 2
 """Raised whenever the same recipe would be drawn otherwise, so that old captures are not taken for current."""
 _CHUNK = 16
 """Timesteps after which progress is kept."""
