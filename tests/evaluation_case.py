@@ -14,8 +14,8 @@ from mien.face import FaceParams
 from mien.gaussians import sh_from_rgb
 from mien.render import rasterize
 from mien.tracking import Scoring, Tracking
+from mien.training import Split, held_out
 from mien.training.sequence import Sequence
-from mien.training.split import Split, held_out
 from small_face_model import make_small_face_model
 
 SIZE = 72

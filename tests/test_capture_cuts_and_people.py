@@ -15,7 +15,7 @@ from mien.capture.follow import LandmarkFollower
 from mien.capture.people import choose_person
 from mien.capture.survey import MOST_FACES, Survey
 from mien.capture.video import write_video
-from mien.commands.stages import capture_stage
+from mien.commands.stages.capturing import capture_stage
 from mien.errors import UserError
 from mien.workspace import Workspace
 

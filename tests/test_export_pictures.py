@@ -12,9 +12,11 @@ import torch
 from mien.camera import camera_from_fov
 from mien.capture.video import probe_video
 from mien.commands.picture import PictureOptions
+from mien.commands.stages.pictures import draw
 from mien.errors import UserError
 from mien.evaluation.cameras import fitted, read_cameras, sway, write_cameras
-from mien.export.pictures import plan_output, to_rgb, to_rgba, write_pictures
+from mien.export.output import plan_output
+from mien.export.pictures import to_rgb, to_rgba, write_pictures
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.storage import write_json
 
@@ -116,8 +118,8 @@ def test_one_view_over_every_background() -> None:
         opacities=torch.tensor([0.8]), sh=sh_from_rgb(torch.tensor([[[0.9, 0.4, 0.1]]])),
     )  # fmt: skip
     camera = camera_from_fov(0.6, 48, 48, FACING)
-    blue = PictureOptions(background="#0000ff").picture(gaussians, camera)
-    clear = PictureOptions(background="transparent").picture(gaussians, camera).astype(float)
+    blue = draw(PictureOptions(background="#0000ff"), gaussians, camera)
+    clear = draw(PictureOptions(background="transparent"), gaussians, camera).astype(float)
     alpha = clear[..., 3:] / 255
     assert np.abs(clear[..., :3] * alpha + (1 - alpha) * [0, 0, 255] - blue).max() <= 2
     assert to_rgb(np.full((600, 2, 3), 1.5, np.float32)).min() == 255

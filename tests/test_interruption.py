@@ -15,7 +15,7 @@ import pytest
 
 from mien.capture.video import read_video_frames
 from mien.cli import main
-from mien.commands.picture import PictureOptions
+from mien.commands.stages import pictures
 from toy_workspace import write_toy_workspace
 
 FRAMES = 6
@@ -25,7 +25,7 @@ SLOWLY = """
 import signal, sys, time
 from mien.capture.video import read_video_frames
 from mien.cli import main
-from mien.commands.picture import PictureOptions
+from mien.commands.stages import pictures
 from mien.evaluation.partial import PartialScores
 
 def slowed(original):
@@ -37,7 +37,7 @@ def slowed(original):
     return step
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell starts in the background
-PictureOptions.picture, PartialScores.add = slowed(PictureOptions.picture), slowed(PartialScores.add)
+pictures.draw, PartialScores.add = slowed(pictures.draw), slowed(PartialScores.add)
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -80,16 +80,16 @@ def test_interrupted_rendering(
     if not numbered:
         out.mkdir()
         (out / name).write_text("mine")
-    original, last = PictureOptions.picture, 1 if name == "a.png" else 3
+    original, last = pictures.draw, 1 if name == "a.png" else 3
     calls = iter(range(1, 100))
 
-    def interrupted(self: PictureOptions, *arguments: Any) -> np.ndarray:
+    def interrupted(*arguments: Any) -> np.ndarray:
         if next(calls) == last:
             raise KeyboardInterrupt
-        return original(self, *arguments)
+        return original(*arguments)
 
     with monkeypatch.context() as patched:
-        patched.setattr(PictureOptions, "picture", interrupted)
+        patched.setattr(pictures, "draw", interrupted)
         assert main([*command, str(out / name)]) == 130
     assert "the same command" in capsys.readouterr().err
     assert sorted(path.name for path in out.iterdir()) == (["a_000000.png", "a_000001.png"] if numbered else [name]), (

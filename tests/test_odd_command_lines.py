@@ -9,7 +9,7 @@ import pytest
 
 from damage import edit_json
 from mien.cli import main
-from mien.commands.stages import doubled_videos
+from mien.commands.stages.names import doubled_videos
 from mien.tracking import read_tracking
 from toy_workspace import write_toy_workspace
 

@@ -30,7 +30,10 @@ COMMANDS = {
     "bench": "timings of this machine; quality over reference captures with known truth",
     "demo": "the whole path on a synthetic head, in minutes: start here",
 }
-"""Name -> summary; `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command` with `run()`."""
+"""Name -> summary; `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command`.
+
+Its `check()` tells what can be told of options and paths without heavy libraries; `run()` does the work after it.
+"""
 
 EXIT_USER_ERROR = 2
 EXIT_INTERRUPTED = 130
@@ -94,7 +97,6 @@ def _run(name: str, rest: list[str]) -> int:
     import tyro
 
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
-    _use_one_torch_thread()
     complaints = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaints):
@@ -110,6 +112,8 @@ def _run(name: str, rest: list[str]) -> int:
             raise
         raise UserError(f"{_in_one_line(complaints.getvalue())}; see mien {name} --help") from None
     sys.stderr.write(complaints.getvalue())
+    command.check()
+    _use_one_torch_thread()
     command.run()
     return 0
 

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mien.commands.options import MethodName
+from mien.errors import UserError
+
 if TYPE_CHECKING:
     from mien.benchmarking.timing import BenchmarkRow, Machine
 
@@ -20,6 +23,9 @@ class Render:
     """Print the machine and a list of rows for programs."""
     seconds: float = 0.8
     """To spend on each row; more finds a smaller minimum on a busy machine."""
+
+    def check(self) -> None:
+        """Nothing can be wrong before it runs."""
 
     def run(self) -> None:
         """Measure and print."""
@@ -39,13 +45,18 @@ class Scaling:
     plot: Path | None = None
     """Write a chart here: .png, .svg or .pdf."""
 
-    def run(self) -> None:
-        """Measure, print and draw."""
-        from mien.benchmarking.charts import check_chart_path, write_scaling_chart
-        from mien.benchmarking.render import scaling_suite
+    def check(self) -> None:
+        """Find out before any measuring whether the chart can be written."""
+        from mien.benchmarking.chart_path import check_chart_path
 
         if self.plot is not None:
             check_chart_path(self.plot)
+
+    def run(self) -> None:
+        """Measure, print and draw."""
+        from mien.benchmarking.charts import write_scaling_chart
+        from mien.benchmarking.render import scaling_suite
+
         machine, rows = show_rows(scaling_suite(self.seconds), self.as_json)
         if self.plot is not None:
             write_scaling_chart(self.plot, rows, machine)
@@ -59,6 +70,9 @@ class TrainStep:
     """Print the machine and a list of rows for programs."""
     seconds: float = 3.0
     """To spend on each row; more finds a smaller minimum on a busy machine."""
+
+    def check(self) -> None:
+        """Nothing can be wrong before it runs."""
 
     def run(self) -> None:
         """Measure and print."""
@@ -76,14 +90,19 @@ class Quality:
 
     captures: tuple[str, ...] = ()
     """Names of reference captures (default: all; an unknown name lists them)."""
-    method: str = "gaussian_avatars"
-    """gaussian_avatars, headgas or mono_gaussian_avatar."""
+    method: MethodName = "gaussian_avatars"
+    """How the avatars are made."""
     steps: int = 0
     """Optimiser steps; 0 for each capture's own number."""
     out: Path = Path("out/bench-quality")
     """Folder for the drawn captures, the workspaces and the tables."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print a list of rows for programs."""
+
+    def check(self) -> None:
+        """Tell a negative number of steps."""
+        if self.steps < 0:
+            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for each capture's own")
 
     def run(self) -> None:
         """Walk every capture, then print the table."""
@@ -103,6 +122,10 @@ class Command:
         | Annotated[Quality, tyro.conf.subcommand("quality", prefix_name=False)],
         tyro.conf.arg(name=""),
     ]
+
+    def check(self) -> None:
+        """Tell what can be told before the chosen benchmark."""
+        self.what.check()
 
     def run(self) -> None:
         """Run the chosen benchmark."""

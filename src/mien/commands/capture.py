@@ -32,8 +32,17 @@ class Command:
     """Replace a sequence of that name that was made from another video."""
     settings: Annotated[CaptureSettings, tyro.conf.arg(name="capture")] = field(default_factory=CaptureSettings)
 
+    def check(self) -> None:
+        """Tell what can be told without the libraries that capture."""
+        from mien.commands.stages.names import sequence_names
+        from mien.files import check_writable
+
+        sequence_names([self.video], () if self.name is None else (self.name,))
+        self.settings.check()
+        check_writable(self.out, folder=True)
+
     def run(self) -> None:
         """Capture and say what was found."""
-        from mien.commands.stages import capture_stage
+        from mien.commands.stages.capturing import capture_stage
 
         capture_stage(Workspace(self.out), self.video, self.name, self.settings, self.replace)

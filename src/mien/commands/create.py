@@ -40,27 +40,32 @@ class Command:
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
 
+    def check(self) -> None:
+        """Tell what can be told without heavy libraries: options, names, paths."""
+        from mien.commands.stages.names import run_name, sequence_names
+        from mien.files import check_writable
+
+        self.options.settings()
+        sequence_names(self.videos, self.name)
+        run_name(self.run_name or self.options.method)
+        self.capture.check()
+        check_writable(self.out, folder=True)
+
     def run(self) -> None:
         """All stages, each skipped if its result is current; what can be told before any work is told then."""
-        from mien.commands.stages import (
-            capture_stage,
-            doubled_videos,
-            evaluation_stage,
-            face_model_of,
-            run_name,
-            sequence_names,
-            tracking_stage,
-            training_stage,
-        )
+        from mien.commands.stages.capturing import capture_stage
+        from mien.commands.stages.evaluating import evaluation_stage
+        from mien.commands.stages.face_models import face_model_of
+        from mien.commands.stages.names import doubled_videos, run_name, sequence_names
+        from mien.commands.stages.tracking import tracking_stage
+        from mien.commands.stages.training import training_stage
         from mien.progress import say
-        from mien.storage import check_writable
         from mien.training import check_held_out, check_run
 
         began = time.monotonic()
         method, settings = self.options.method_config(), self.options.settings()
         names = sequence_names(self.videos, self.name)
         workspace, run = Workspace(self.out), run_name(self.run_name or self.options.method)
-        check_writable(self.out, folder=True)
         check_run(workspace.run_dir(run), method, settings)
         face_model_of(self.face_model)
         for warning in doubled_videos(self.videos, names, settings.held_out_sequences):

@@ -26,16 +26,21 @@ class Command:
     seed: int = 0
     """Another head, another motion."""
 
+    def check(self) -> None:
+        """Tell what can be told without heavy libraries."""
+        from mien.files import check_writable
+
+        TrainOptions(preset=self.preset, steps=self.steps).settings()
+        if self.seconds and not 0 < self.seconds <= _LONGEST:
+            raise UserError(f"--seconds {self.seconds:g}: give up to {_LONGEST:g}, or leave it out")
+        check_writable(self.out, folder=True)
+
     def run(self) -> None:
         """Write the video unless it is there, then create."""
         from dataclasses import replace
 
-        from mien.storage import check_writable
         from mien.synthetic import RECIPES, write_synthetic_video
 
-        if self.seconds and not 0 < self.seconds <= _LONGEST:
-            raise UserError(f"--seconds {self.seconds:g}: give up to {_LONGEST:g}, or leave it out")
-        check_writable(self.out, folder=True)
         recipe = RECIPES["demo"]
         if self.seconds:
             recipe = replace(recipe, seconds=self.seconds)
@@ -43,4 +48,6 @@ class Command:
         if not video.is_file():
             write_synthetic_video(recipe, video, self.seed)
         options = TrainOptions(preset=self.preset, steps=self.steps)
-        Create(videos=(video,), out=self.out, name=("synthetic",), options=options).run()
+        create = Create(videos=(video,), out=self.out, name=("synthetic",), options=options)
+        create.check()
+        create.run()

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from mien.commands.options import check_driver
 from mien.commands.picture import PictureOptions
 from mien.workspace import open_workspace
 
@@ -33,12 +34,20 @@ class Command:
     """Frames a second that a .csv's timecode counts in (default: the smallest usual rate above its frame numbers)."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
+    def check(self) -> None:
+        """Tell what can be told without heavy libraries."""
+        open_workspace(self.workspace).pick_run(self.run_name)
+        # Of how many frames is not known before the driver is tracked, but a film or a sequence takes any number.
+        self.picture.plan(self.out, 2)
+        check_driver(self.by, self.sequence, self.fps)
+
     def run(self) -> None:
         """Track the driver if need be, then pose and render every timestep."""
-        from mien.commands.stages import DriveOptions, drive_stage
+        from mien.commands.stages.driving import DriveOptions, drive_stage
+        from mien.commands.stages.pictures import warn_of_white
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
-        self.picture.warn_of_white(run_dir)
+        warn_of_white(self.picture, run_dir)
         options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps)
         drive_stage(run_dir, self.by, self.out, options, self.picture)

@@ -52,30 +52,38 @@ class Command:
     as_json: JsonFlag = False
     """Print the result on standard output for machines."""
 
-    def run(self) -> None:
-        """Do which of the three is asked for."""
+    def check(self) -> None:
+        """Tell what can be told without heavy libraries: which of the three is asked for, and whether it is there."""
         if self.perceptual_frames < 0:
             raise UserError(f"--perceptual-frames {self.perceptual_frames}: give a positive number, or 0 for all")
         if self.images is not None or self.truth is not None:
-            self._score_images()
+            self._check_images()
         elif not self.workspaces:
             raise UserError("nothing to evaluate; give a workspace folder, or --images PRED --truth TRUTH")
+        elif len(self.workspaces) > 1 and not self.compare:
+            raise UserError(f"{len(self.workspaces)} workspaces: give one, or --compare their runs")
+        for folder in self.workspaces:
+            workspace = open_workspace(folder)
+            if not self.compare or self.run_name is not None:
+                workspace.pick_run(self.run_name)
+
+    def run(self) -> None:
+        """Do which of the three is asked for."""
+        if self.images is not None and self.truth is not None:
+            self._score_images(self.images, self.truth)
         elif self.compare:
             self._compare()
         else:
             self._evaluate()
 
     def _evaluate(self) -> None:
-        from mien.commands.stages import evaluation_stage
+        from mien.commands.stages.evaluating import evaluation_stage
         from mien.evaluation import EvaluationSettings
 
-        first, *more = self.workspaces
-        if more:
-            raise UserError(f"{len(self.workspaces)} workspaces: give one, or --compare their runs")
         settings = EvaluationSettings(
             perceptual=self.perceptual, perceptual_frames=self.perceptual_frames, pictures=self.pictures
         )
-        workspace = open_workspace(first)
+        workspace = open_workspace(self.workspaces[0])
         metrics = evaluation_stage(workspace, workspace.pick_run(self.run_name), settings, self.drivers)
         if self.as_json:
             _print_json(metrics)
@@ -90,16 +98,21 @@ class Command:
         else:
             print(comparison_text(comparison, bold=sys.stdout.isatty()))
 
-    def _score_images(self) -> None:
-        from mien.evaluation.image_folders import ImageFolders, score_folders, write_scores
-        from mien.evaluation.scoring import ScoreSettings
-        from mien.evaluation.words import scores_lines
-
+    def _check_images(self) -> None:
         if self.images is None or self.truth is None:
             raise UserError("--images PRED and --truth TRUTH belong together; give both")
         if self.workspaces or self.compare:
             raise UserError("--images and --truth score folders of pictures; leave the workspace and --compare out")
-        folders = ImageFolders(self.images, self.truth, self.mattes, self.crops, self.background)
+        for path in (self.images, self.truth):
+            if not path.exists():
+                raise UserError(f"{path}: no such folder; name a folder of pictures, or a video")
+
+    def _score_images(self, images: Path, truth: Path) -> None:
+        from mien.evaluation.image_folders import ImageFolders, score_folders, write_scores
+        from mien.evaluation.scoring import ScoreSettings
+        from mien.evaluation.words import scores_lines
+
+        folders = ImageFolders(images, truth, self.mattes, self.crops, self.background)
         scores = score_folders(folders, ScoreSettings(self.perceptual, self.perceptual_frames))
         if self.out is not None:
             write_scores(self.out, scores)

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from mien.commands.options import check_driver
 from mien.errors import UserError
 from mien.workspace import Workspace, open_workspace
 
@@ -29,13 +30,12 @@ class Command:
     every: int = 1
     """With --series: only every so many-th frame."""
 
-    def run(self) -> None:
-        """Check, pose, write."""
-        from mien.avatar import load_avatar
-        from mien.storage import check_writable
+    def check(self) -> None:
+        """Tell what can be told without heavy libraries."""
+        from mien.files import check_writable
 
         workspace = open_workspace(self.workspace)
-        run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
+        workspace.pick_run(self.run_name)
         kind = self.out.suffix.lower()
         if kind not in (".ply", ".mien"):
             raise UserError(f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply or .mien")
@@ -43,9 +43,18 @@ class Command:
             raise UserError(f"{self.out}: a .mien file holds every expression; leave --set and --series out")
         if self.every < 1 or (self.every > 1 and self.series is None):
             raise UserError(f"--every {self.every}: give 1 or more, together with --series")
+        if self.series is not None and self.series not in workspace.sequence_names():
+            check_driver(Path(self.series), None)
         check_writable(self.out if self.series is None else self._numbered(0))
+
+    def run(self) -> None:
+        """Pose and write."""
+        from mien.avatar import load_avatar
+
+        workspace = open_workspace(self.workspace)
+        run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         avatar = load_avatar(run_dir)
-        if kind == ".mien":
+        if self.out.suffix.lower() == ".mien":
             self._write_mien(avatar, run_dir)
         elif self.series is None:
             self._write_one(avatar)

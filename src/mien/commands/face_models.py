@@ -26,14 +26,21 @@ class Command:
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print a list of objects for programs."""
 
+    def check(self) -> None:
+        """Tell what can be told without heavy libraries."""
+        if self.add is None and (self.name is not None or self.shareable):
+            raise UserError("--name and --shareable belong to a model that is added: give its file with --add FILE")
+        if self.add is not None and not self.add.is_file():
+            raise UserError(
+                f"{self.add}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz"
+            )
+
     def run(self) -> None:
         """Print the table."""
         from mien.face import available_face_models, load_face_model
 
-        if self.add is None and (self.name is not None or self.shareable):
-            raise UserError("--name and --shareable belong to a model that is added: give its file with --add FILE")
         if self.add is not None:
-            from mien.commands.stages import add_face_model_stage
+            from mien.commands.stages.face_models import add_face_model_stage
 
             add_face_model_stage(self.add, self.name, self.shareable)
         if self.bake is not None:

@@ -1,13 +1,18 @@
 """What several sub-commands ask: which method, how thorough, which settings in detail."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from mien.avatar import MethodConfig, method_named
 from mien.errors import UserError
-from mien.training import PRESETS, TrainSettings
-from mien.training.split import Split
+from mien.training import PRESETS, Split, TrainSettings
+from mien.workspace import open_workspace
 
+if TYPE_CHECKING:
+    import mien.avatar
+
+MethodName = Literal["gaussian_avatars", "headgas", "mono_gaussian_avatar"]
+"""The keys of `mien.avatar.METHODS` (a test compares them): options are read before torch is imported."""
 Preset = Literal["draft", "standard"]
 
 
@@ -15,8 +20,8 @@ Preset = Literal["draft", "standard"]
 class TrainOptions:
     """The dials of training; everything else is the preset's and the method's own."""
 
-    method: str = "gaussian_avatars"
-    """gaussian_avatars, headgas or mono_gaussian_avatar."""
+    method: MethodName = "gaussian_avatars"
+    """How the avatar is made (docs/results.md compares them)."""
     preset: Preset = "standard"
     """draft: minutes; standard: the figures of docs/results.md."""
     split: Split = "blocks"
@@ -54,11 +59,26 @@ class TrainOptions:
             held_out_cameras=tuple(sorted(set(self.hold_out_cameras))),
         )
 
-    def method_config(self) -> MethodConfig:
-        """The method's settings.
+    def method_config(self) -> "mien.avatar.MethodConfig":
+        """The method's settings."""
+        from mien.avatar import method_named
 
-        Raises:
-            UserError: there is no such method.
-        """
         config = method_named(self.method).config()
         return replace(config, face_tuning=replace(config.face_tuning, enabled=self.face_tuning))
+
+
+def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> None:
+    """Find before any work that somebody can be followed there: a workspace with that sequence, or a file.
+
+    Raises:
+        UserError: it is not there, has no such sequence, or none to choose from, or a frame rate that is not asked for.
+    """
+    suffix = by.suffix.lower() if by.is_file() else ""
+    if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
+        raise UserError(f"--fps {fps:g}: only the timecode of a .csv has one to give, above 0 and up to 1000")
+    if not by.exists():
+        raise UserError(f"{by}: no such file or folder; give a workspace, a video, a csv of Live Link Face, or a json")
+    if suffix in (".csv", ".json") and sequence is not None:
+        raise UserError(f"--sequence {sequence}: {by} has none to choose from; leave it out")
+    if not by.is_file():
+        open_workspace(by).pick_sequence(sequence)

@@ -3,16 +3,19 @@
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 import tyro
-from torch import Tensor
 
-from mien.camera import Camera
 from mien.commands.picture import PictureOptions
 from mien.errors import UserError
 from mien.workspace import Workspace, open_workspace
+
+if TYPE_CHECKING:
+    import numpy
+    import torch
+
+    import mien.camera
 
 
 @dataclass(frozen=True)
@@ -47,10 +50,21 @@ class Command:
     """Play this sequence's motion, a frame a timestep (`mien drive` has more)."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
+    def check(self) -> None:
+        """Tell what can be told without heavy libraries."""
+        workspace = open_workspace(self.workspace)
+        workspace.pick_run(self.run_name)
+        if self.sequence is not None or (self.path == "captured" and self.cameras is None):
+            workspace.pick_sequence(self.sequence)
+        self._check_numbers()
+        if self.sequence is None and self.cameras is None and self.path != "captured":
+            self.picture.plan(self.out, self._frames(None))
+
     def run(self) -> None:
-        """Check everything, then pose and render frame by frame."""
+        """Pose and render frame by frame; what depends on files is checked first."""
         from mien.avatar import load_avatar
         from mien.commands.expression import with_expression
+        from mien.commands.stages.pictures import draw, view, warn_of_white
         from mien.export.pictures import write_pictures
         from mien.progress import say, track_progress
         from mien.training import read_sequence, run_camera
@@ -60,23 +74,22 @@ class Command:
         motion = None
         if self.sequence is not None:
             motion = read_sequence(workspace.sequence_dir(workspace.pick_sequence(self.sequence))).tracking.face
-        self._check()
         timesteps = None if motion is None else len(motion)
         cameras = self._given_cameras(workspace, timesteps)
         output = self.picture.plan(self.out, self._frames(timesteps) if cameras is None else len(cameras))
-        self.picture.warn_of_white(run_dir)
+        warn_of_white(self.picture, run_dir)
         avatar = load_avatar(run_dir)
         subject = avatar.subject
         face = with_expression(subject if motion is None else motion, avatar.face_model, self.set)
         face = replace(face, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
         if cameras is None:
-            camera = self.picture.camera(run_camera(run_dir), self.zoom)
+            camera = view(self.picture, run_camera(run_dir), self.zoom)
             cameras = self._path(camera, subject.head_translation[0], self._frames(timesteps))
         still = None if motion is not None else avatar.pose(face).gaussians.detach().timestep(0)
 
-        def picture(index: int) -> np.ndarray:
+        def picture(index: int) -> "numpy.ndarray":
             posed = still or avatar.pose(face[index]).gaussians.detach().timestep(0)
-            return self.picture.picture(posed, cameras[index])
+            return draw(self.picture, posed, cameras[index])
 
         pictures = (picture(index) for index in range(len(cameras)))
         shown = pictures if output.kind == "still" else track_progress(pictures, "Rendering", len(cameras))
@@ -84,7 +97,7 @@ class Command:
         count, first = len(avatar.gaussian_store()), cameras[0]
         say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
 
-    def _check(self) -> None:
+    def _check_numbers(self) -> None:
         if self.frames < 1:
             raise UserError(f"--frames {self.frames}: give 1 or more")
         if not 0 < self.fps <= 1000:
@@ -102,8 +115,9 @@ class Command:
     def _frames(self, timesteps: int | None) -> int:
         return timesteps or (1 if self._is_still() else self.frames)
 
-    def _given_cameras(self, workspace: Workspace, timesteps: int | None) -> list[Camera] | None:
+    def _given_cameras(self, workspace: Workspace, timesteps: int | None) -> "list[mien.camera.Camera] | None":
         """Cameras that do not depend on the avatar, one a frame; None for a path around its head."""
+        from mien.commands.stages.pictures import view
         from mien.evaluation.cameras import read_cameras
         from mien.tracking import read_tracking
 
@@ -118,12 +132,12 @@ class Command:
             return None
         name = workspace.pick_sequence(self.sequence)
         stored = read_tracking(workspace.sequence_dir(name) / "tracking").cameras
-        cameras = [self.picture.camera(camera, self.zoom) for camera in stored]
+        cameras = [view(self.picture, camera, self.zoom) for camera in stored]
         if self._is_still():
             return cameras[:1]
         return cameras if timesteps is None else [cameras[i * len(cameras) // timesteps] for i in range(timesteps)]
 
-    def _path(self, camera: Camera, centre: Tensor, frames: int) -> list[Camera]:
+    def _path(self, camera: "mien.camera.Camera", centre: "torch.Tensor", frames: int) -> "list[mien.camera.Camera]":
         from mien.evaluation.cameras import sway, turntable
 
         span, tilt = math.radians(self.span), math.radians(self.tilt)

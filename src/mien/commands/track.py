@@ -30,9 +30,13 @@ class Command:
     """Frames in overlay.mp4: all of them, or of long clips every n-th so that there are at most 3,000 (auto)."""
     settings: Annotated[TrackingSettings, tyro.conf.arg(name="tracking")] = field(default_factory=TrackingSettings)
 
+    def check(self) -> None:
+        """Tell what can be told without heavy libraries."""
+        open_workspace(self.workspace)
+
     def run(self) -> None:
         """Track and write overlays and reports."""
-        from mien.commands.stages import tracking_stage
+        from mien.commands.stages.tracking import tracking_stage
 
         tracking_stage(
             open_workspace(self.workspace), self.face_model, self.settings, self.again, self.overlay, self.preview

@@ -8,6 +8,7 @@ import tyro
 
 from mien.commands.options import TrainOptions
 from mien.errors import UserError
+from mien.training import check_held_out
 from mien.workspace import Workspace, open_workspace
 
 
@@ -23,16 +24,24 @@ class Command:
     """Name of the run (default: the method's)."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
 
+    def check(self) -> None:
+        """Tell what can be told without heavy libraries."""
+        from mien.commands.stages.names import run_name
+
+        workspace, settings = open_workspace(self.workspace), self.options.settings()
+        run_name(self.run_name or self.options.method)
+        check_held_out(self._names(workspace), settings)
+
     def run(self) -> None:
         """Train to the end."""
-        from mien.commands.stages import run_name, training_stage
-        from mien.training import check_held_out, check_run
+        from mien.commands.stages.names import run_name
+        from mien.commands.stages.training import training_stage
+        from mien.training import check_run
 
         workspace = open_workspace(self.workspace)
         method, settings = self.options.method_config(), self.options.settings()
         run = run_name(self.run_name or self.options.method)
         names = self._names(workspace)
-        check_held_out(names, settings)
         check_run(workspace.run_dir(run), method, settings, names)
         training_stage(workspace, names, run, method, settings)
 

@@ -1,6 +1,19 @@
 """Avatars and posed Gaussians as files for other programs: `write_*` and `read_*` side by side."""
 
-from mien.export.frames import in_world
-from mien.export.ply import read_ply, write_ply
+from typing import TYPE_CHECKING
+
+from mien.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from mien.export.frames import in_world
+    from mien.export.ply import read_ply, write_ply
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "frames": ["in_world"],
+            "ply": ["read_ply", "write_ply"],
+        },
+    )
 
 __all__ = ["in_world", "read_ply", "write_ply"]

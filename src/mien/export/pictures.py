@@ -5,12 +5,9 @@ the alpha of a VP9 .webm. An .mp4 has no transparency.
 """
 
 import itertools
-import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal
 
 import av
 import cv2
@@ -20,64 +17,15 @@ from jaxtyping import Float32, UInt8
 
 from mien.capture.video import write_video
 from mien.errors import UserError
-from mien.storage import check_writable, write_atomically
+from mien.export.output import Output
+from mien.storage import write_atomically
 
-ENDINGS = ".png (one picture), a folder or NAME_%06d.png (numbered pictures), .mp4 or .webm"
-_NUMBER = re.compile(r"%0?\d*d")
 _ROWS = 512
 """Of a picture are converted at once: an 8192x8192 picture would otherwise be held four times."""
 _FRINGE = 8
 """Pixels that colours are spread beyond the opaque part, since video keeps colour at half the resolution."""
 _WEBM_QUALITY = 24
 """VP9's constant quality: 0 is lossless, 63 is worst."""
-
-
-@dataclass(frozen=True)
-class Output:
-    """Where pictures go, found to be possible before any of them is made."""
-
-    path: Path
-    """A file; a folder or a pattern for `sequence`."""
-    kind: Literal["still", "sequence", "mp4", "webm"]
-    transparent: bool
-
-    def numbered(self, index: int) -> Path:
-        """The file of one picture of a sequence."""
-        if _NUMBER.search(self.path.name):
-            return self.path.with_name(_NUMBER.sub(lambda match: match.group() % index, self.path.name))
-        return self.path / f"{index:06d}.png"
-
-
-def plan_output(path: Path, frames: int, transparent: bool = False) -> Output:
-    """What the ending of `path` asks for, checked before any work.
-
-    Raises:
-        UserError: the ending is none of `ENDINGS` or does not suit the number of frames or transparency, the place
-            cannot be written, or pictures of a longer sequence lie there.
-    """
-    ending = path.suffix.lower()
-    if ending == ".png" and _NUMBER.search(path.name):
-        output = Output(path, "sequence", transparent)
-        check_writable(output.numbered(0))
-    elif ending == "":
-        output = Output(path, "sequence", transparent)
-        check_writable(path, folder=True)
-    elif ending == ".png":
-        output = Output(path, "still", transparent)
-        check_writable(path)
-        if frames != 1:
-            numbered = path.with_name(f"{path.stem}_%06d.png")
-            raise UserError(f"{path}: one picture, but there are {frames}; write --out {numbered}, or a folder")
-    elif ending in (".mp4", ".webm"):
-        output = Output(path, "mp4" if ending == ".mp4" else "webm", transparent)
-        check_writable(path)
-    else:
-        raise UserError(f"{path}: cannot write {path.suffix}; use {ENDINGS}")
-    if output.kind == "mp4" and transparent:
-        raise UserError(f"{path}: an .mp4 cannot be transparent; use .webm or .png, or name a --background")
-    if output.kind == "sequence" and output.numbered(frames).exists():
-        raise UserError(f"{output.numbered(frames)}: belongs to a longer sequence; delete it, or choose another name")
-    return output
 
 
 def write_pictures(output: Output, pictures: Iterable[UInt8[np.ndarray, "h w _"]], fps: int | float) -> None:

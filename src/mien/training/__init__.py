@@ -1,19 +1,42 @@
 """Training: sequences and a method's config in, an avatar out."""
 
-from mien.training.frames import check_held_out
-from mien.training.run import (
-    check_data,
-    check_run,
-    outdated_sequences,
-    read_curves,
-    read_run_config,
-    read_training_summary,
-    run_camera,
-)
-from mien.training.sequence import Sequence, read_sequence
-from mien.training.settings import PRESETS, TrainSettings
-from mien.training.split import Split, held_out
-from mien.training.trainer import train
+from typing import TYPE_CHECKING
+
+from mien.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from mien.training.run import (
+        check_data,
+        check_run,
+        outdated_sequences,
+        read_curves,
+        read_run_config,
+        read_training_summary,
+        run_camera,
+    )
+    from mien.training.sequence import Sequence, read_sequence
+    from mien.training.settings import PRESETS, Split, TrainSettings, check_held_out
+    from mien.training.split import held_out
+    from mien.training.trainer import train
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "run": [
+                "check_data",
+                "check_run",
+                "outdated_sequences",
+                "read_curves",
+                "read_run_config",
+                "read_training_summary",
+                "run_camera",
+            ],
+            "sequence": ["Sequence", "read_sequence"],
+            "settings": ["PRESETS", "Split", "TrainSettings", "check_held_out"],
+            "split": ["held_out"],
+            "trainer": ["train"],
+        },
+    )
 
 __all__ = [
     "PRESETS",

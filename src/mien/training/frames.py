@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from mien.errors import UserError
 from mien.training.sequence import Sequence
-from mien.training.settings import TrainSettings
+from mien.training.settings import TrainSettings, check_held_out
 from mien.training.split import held_out
 
 _ORDER, _BACKGROUND, _DENSITY = range(3)
@@ -56,19 +56,6 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
             "a longer clip, --split none, or hold out less"
         )
     return frames
-
-
-def check_held_out(names: Items[str], settings: TrainSettings) -> None:
-    """Find that the sequences to be held out are among a run's, and that others remain.
-
-    Raises:
-        UserError: they are not, or nothing remains.
-    """
-    unknown = [name for name in settings.held_out_sequences if name not in names]
-    if unknown:
-        raise UserError(f"--hold-out {unknown[0]}: no such sequence in this run; there are: {', '.join(names)}")
-    if set(names) <= set(settings.held_out_sequences):
-        raise UserError(f"--hold-out {' '.join(settings.held_out_sequences)}: leaves no sequence to train on")
 
 
 class FrameOrder:

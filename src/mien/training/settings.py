@@ -1,9 +1,13 @@
 """TrainSettings: what a run is, apart from the method; presets are plain instances."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from mien.training.split import Split
+from mien.errors import UserError
+
+Split = Literal["blocks", "tail", "none"]
+"""Which timesteps are held out (`mien.training.split`)."""
 
 
 @dataclass(frozen=True)
@@ -43,3 +47,16 @@ PRESETS = {
     "standard": TrainSettings(),
 }
 """From quick to good."""
+
+
+def check_held_out(names: Sequence[str], settings: TrainSettings) -> None:
+    """Find that the sequences to be held out are among a run's, and that others remain.
+
+    Raises:
+        UserError: they are not, or nothing remains.
+    """
+    unknown = [name for name in settings.held_out_sequences if name not in names]
+    if unknown:
+        raise UserError(f"--hold-out {unknown[0]}: no such sequence in this run; there are: {', '.join(names)}")
+    if set(names) <= set(settings.held_out_sequences):
+        raise UserError(f"--hold-out {' '.join(settings.held_out_sequences)}: leaves no sequence to train on")

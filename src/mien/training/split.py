@@ -1,12 +1,11 @@
 """Which timesteps are held out."""
 
-from typing import Literal
-
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-Split = Literal["blocks", "tail", "none"]
+from mien.training.settings import Split
+
 _BLOCK, _EVERY = 10, 5
 _TAIL_SHARE = 0.2
 

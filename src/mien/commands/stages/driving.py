@@ -10,13 +10,15 @@ import numpy as np
 
 from mien.avatar import load_avatar, neutral_of
 from mien.capture import CaptureSettings
+from mien.commands.options import check_driver
 from mien.commands.picture import PictureOptions
 from mien.commands.stages.capturing import capture_stage
+from mien.commands.stages.pictures import draw, view
 from mien.commands.stages.tracking import tracking_stage
-from mien.errors import UserError
 from mien.evaluation.driving import drive, face_of_motion
 from mien.evaluation.pictures import side_by_side
-from mien.export.pictures import plan_output, write_pictures
+from mien.export.output import plan_output
+from mien.export.pictures import write_pictures
 from mien.face import FaceModel, FaceParams
 from mien.face.loading import cache_folder
 from mien.face.params import concatenate
@@ -53,14 +55,9 @@ def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: floa
     Raises:
         UserError: it is none of these, or its stages fail.
     """
+    check_driver(by, sequence, fps)
     suffix = by.suffix.lower() if by.is_file() else ""
-    if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
-        raise UserError(f"--fps {fps:g}: only the timecode of a .csv has one to give, above 0 and up to 1000")
-    if not by.exists():
-        raise UserError(f"{by}: no such file or folder; give a workspace, a video, a csv of Live Link Face, or a json")
     if suffix in (".csv", ".json"):
-        if sequence is not None:
-            raise UserError(f"--sequence {sequence}: {by} has none to choose from; leave it out")
         motion = read_live_link_face(by, fps) if suffix == ".csv" else read_blendshape_json(by)
         if motion.lost:
             say(f"{by}: no face in {motion.lost} of {len(motion)} frames; they repeat the one before")
@@ -124,11 +121,11 @@ def drive_stage(
     driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, with_head_pose=options.head_pose)
     if output.kind == "sequence":
         plan_output(out, len(driven), output.transparent)
-    camera = look.camera(run_camera(run_dir))
+    camera = view(look, run_camera(run_dir))
     beside = None if options.alone or output.transparent else driver.pictures
 
     def frame(timestep: int) -> np.ndarray:
-        shown = look.picture(avatar.pose(driven[timestep]).gaussians.detach().timestep(0), camera)
+        shown = draw(look, avatar.pose(driven[timestep]).gaussians.detach().timestep(0), camera)
         if beside is None:
             return shown
         theirs = beside(timestep)

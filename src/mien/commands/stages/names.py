@@ -6,7 +6,7 @@ from itertools import combinations
 from pathlib import Path
 
 from mien.errors import UserError
-from mien.storage import file_digest
+from mien.files import file_digest
 
 
 def sequence_name(video: Path, name: str | None) -> str:

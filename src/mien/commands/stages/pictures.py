@@ -1,0 +1,39 @@
+"""Posed Gaussians -> pictures, as options of the command line ask."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from mien.camera import Camera
+from mien.commands.picture import PictureOptions
+from mien.evaluation.cameras import fitted
+from mien.export.pictures import to_rgb, to_rgba
+from mien.gaussians import Gaussians
+from mien.progress import say
+from mien.render import rasterize
+from mien.training import read_run_config
+
+
+def view(look: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
+    """The camera in pictures of this size."""
+    return fitted(camera, *look.shape(), zoom)
+
+
+@torch.no_grad()
+def draw(look: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8[np.ndarray, "h w _"]:
+    """RGB over the background, or RGBA with straight colours."""
+    rendering = rasterize(gaussians, camera, torch.tensor(look.colour()))
+    if look.background == "transparent":
+        return to_rgba(rendering.image.numpy(), rendering.alpha.numpy())
+    return to_rgb(rendering.image.numpy())
+
+
+def warn_of_white(look: PictureOptions, run_dir: Path) -> None:
+    """Say so where transparency is asked of a run that has learned to lean on white."""
+    if look.background == "transparent" and read_run_config(run_dir)["settings"].get("background") == "white":
+        say(
+            "this avatar was trained over white, and bright skin and outlines may let light through; "
+            "`mien train --background random` makes one that does not"
+        )

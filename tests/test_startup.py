@@ -1,0 +1,120 @@
+"""Help, mistyped options and wrong paths are told without the libraries that take seconds to import."""
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from mien.avatar import METHODS
+from mien.cli import COMMANDS
+from mien.commands.options import MethodName
+from mien.commands.picture import LARGEST_SIDE
+from mien.evaluation import cameras
+
+HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
+LAZY_ROOMS = ["capture", "export", "tracking", "training"]
+SCRIPT = """
+import json, os, sys
+from mien.cli import main
+found = []
+for line in json.loads(sys.argv[1]):
+    try:
+        code = main(line)
+    except SystemExit as stop:
+        code = stop.code
+    found.append([code, sorted(sys.modules)])
+print(json.dumps(found), file=sys.__stdout__)
+"""
+
+
+def modules_after(lines: list[list[str]], folder: Path) -> list[tuple[int, set[str]]]:
+    """Exit code and imported modules after each of some command lines, run one after the other in a new process."""
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, json.dumps(lines)], capture_output=True, text=True, check=True, cwd=folder
+    )
+    return [(code, set(modules)) for code, modules in json.loads(done.stdout.splitlines()[-1])]
+
+
+def expect_light(lines: list[list[str]], folder: Path, code: int) -> None:
+    for line, (found, modules) in zip(lines, modules_after(lines, folder), strict=True):
+        assert found == code, f"mien {' '.join(line)}: exit code {found}"
+        assert not modules & HEAVY, f"mien {' '.join(line)} imports {sorted(modules & HEAVY)}"
+
+
+def test_help_and_wrong_options_import_nothing_heavy(tmp_path: Path) -> None:
+    expect_light([[name, "--help"] for name in COMMANDS], tmp_path, 0)
+    expect_light([[name, "--no-such-option"] for name in COMMANDS], tmp_path, 2)
+
+
+def test_wrong_values_and_paths_import_nothing_heavy(tmp_path: Path) -> None:
+    """Where everything before the mistake is right: a workspace with a sequence and a run, a video, a csv."""
+    for name in ("w/sequences/s/capture/capture.json", "w/sequences/s/tracking/tracking.json", "w/runs/r/config.json"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_text("{}")
+    for name in ("a.mp4", "a.csv", "a.npz"):
+        (tmp_path / name).touch()
+    text = """
+        capture gone.mp4 --out w
+        capture a.mp4 --out w --capture.size 3
+        capture a.mp4 --out a.csv
+        capture a.mp4 --out w --capture.mattes gone
+        create gone.mp4 --out w
+        create a.mp4 a.mp4 --out w
+        create a.mp4 --out w --steps -3
+        create a.mp4 --out w --method nerf
+        create a.mp4 --out w --run a/b
+        create a.mp4 --out a.csv
+        track gone
+        track .
+        train gone
+        train w --hold-out nobody
+        train w --sequences nobody
+        evaluate
+        evaluate gone
+        evaluate w --run nobody
+        evaluate w w
+        evaluate --images gone --truth gone
+        evaluate w --perceptual-frames -1
+        render gone --out a.png
+        render w --out a.gif
+        render w --out b.png --size 9999
+        render w --out b.png --background pinkish
+        render w --out b.mp4 --frames 0
+        render w --out b.mp4 --sequence nobody
+        drive gone --by a.csv --out b.mp4
+        drive w --by gone --out b.mp4
+        drive w --by a.csv --out b.gif
+        drive w --by a.csv --out b.mp4 --fps 0
+        export w --out a.obj
+        export w --out gone.ply --series nobody
+        face-models --name x
+        face-models --add gone.npz
+        bench scaling --plot a.txt
+        bench quality --steps -1
+        demo --seconds 9999
+        demo --out a.csv
+    """
+    lines: list[list[str]] = [[*line.split()] for line in text.strip().splitlines()]
+    expect_light(lines, tmp_path, 2)
+
+
+def test_what_is_written_twice_to_keep_options_light_agrees() -> None:
+    assert get_args(MethodName) == tuple(METHODS)
+    assert LARGEST_SIDE == cameras.LARGEST_SIDE
+
+
+@pytest.mark.parametrize("room", LAZY_ROOMS)
+def test_lazy_rooms_give_all_their_names(room: str) -> None:
+    """Each in a module of the room, none hidden by a module of the same name, whatever was imported before."""
+    module = importlib.import_module(f"mien.{room}")
+    for path in Path(str(module.__file__)).parent.glob("*.py"):
+        importlib.import_module(f"mien.{room}.{path.stem}")
+    assert set(module.__all__) <= set(dir(module))
+    for name in module.__all__:
+        assert type(getattr(module, name)) is not type(module), f"mien.{room}.{name} is a module"
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        module.nothing  # noqa: B018
