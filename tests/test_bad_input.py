@@ -26,6 +26,7 @@ from mien.tracking import Scoring, write_scoring, write_tracking
 from mien.training import read_run_config, read_training_summary
 from mien.training.checkpoint import checkpoint_files
 from mien.training.run import run_camera
+from mien.workspace import Workspace, open_workspace
 from toy_scene import toy_sequence
 
 DOCS = Path(__file__).parent.parent / "docs" / "bad_input.md"
@@ -288,3 +289,12 @@ def test_every_row_of_the_table_names_a_test_that_exists() -> None:
         for file, test in named:
             source = (Path(__file__).parent / f"{file}.py").read_text(encoding="utf-8")
             assert f"def {test}(" in source, f"{file}.py has no {test}"
+
+
+def test_a_file_in_place_of_a_workspace_and_a_workspace_without_runs_are_told_apart(tmp_path):
+    (tmp_path / "video.mp4").write_bytes(b"x")
+    with pytest.raises(UserError, match="a file; name the workspace's folder"):
+        open_workspace(tmp_path / "video.mp4")
+    (tmp_path / "me/runs").mkdir(parents=True)
+    with pytest.raises(UserError, match="there is no run yet; make one with `mien train"):
+        Workspace(tmp_path / "me").pick_run(None)

@@ -67,7 +67,7 @@ ODD = [
     ("render W --out a.png --cameras cameras.json", "viewmat is no rotation"),
     ("render W/runs/toy --out a.png", "did you mean W --run toy?"),
     ("render 'not there' --out a.png", "--out 'not there'`"),
-    ("render text.txt --out a.png", "text.txt: no such folder"),
+    ("render text.txt --out a.png", "text.txt: a file; name"),
     ("drive W --by none.csv --out a.mp4", "none.csv: no such file or folder"),
     ("drive W --by empty.csv --out a.mp4", "empty.csv: has no frames"),
     ("drive W --by bytes.csv --out a.mp4", "bytes.csv: cannot be read as csv"),

@@ -105,7 +105,7 @@ def _run(name: str, rest: list[str]) -> int:
                 prog=f"mien {name}",
                 description=inspect.getdoc(module.Command),
                 args=rest,
-                config=(tyro.conf.FlagCreatePairsOff,),
+                config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone),
             )
     except SystemExit as stop:
         if stop.code != EXIT_USER_ERROR:

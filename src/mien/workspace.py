@@ -59,6 +59,8 @@ def open_workspace(root: Path) -> Workspace:
         UserError: the folder is not there or holds no sequences and no runs.
     """
     workspace = Workspace(root)
+    if root.is_file():
+        raise UserError(f"{root}: a file; name the workspace's folder (a video becomes one by `mien create`)")
     if not root.is_dir():
         raise UserError(
             f"{root}: no such folder; make a workspace with `mien create VIDEO --out {shlex.quote(str(root))}`"
@@ -76,7 +78,10 @@ def open_workspace(root: Path) -> Workspace:
 def _pick(kind: str, name: str | None, names: list[str], root: Path, option: str) -> str:
     if name is None and len(names) == 1:
         return names[0]
-    listed = ", ".join(names) or "none"
+    if not names:
+        remedy = {"sequence": "mien create VIDEO --out", "run": "mien train"}[kind]
+        raise UserError(f"{root}: there is no {kind} yet; make one with `{remedy} {shlex.quote(str(root))}`")
+    listed = ", ".join(names)
     if name is None:
         raise UserError(f"{root}: which {kind}? There are: {listed}; name one with {option} NAME")
     if name not in names:

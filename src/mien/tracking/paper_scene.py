@@ -36,8 +36,8 @@ class PaperState:
     texture: Float[Tensor, "th tw 3"]
     lights: Float[Tensor, "s 9 3"]
     log_focals: Float[Tensor, " g"]
-    frames: list[Float[Tensor, "t p"]]
-    """Of each sequence, a row a timestep with a face."""
+    frames: list[Float[Tensor, "_ p"]]
+    """Of each sequence, a row a timestep with a face (their numbers differ)."""
     sight: Float[Tensor, " f"]
     """The best cosine between a triangle's normal and the direction to a camera of a frame that its texels are from."""
 

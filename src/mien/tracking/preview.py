@@ -15,6 +15,7 @@ from mien.capture.capture import Capture
 from mien.face import FaceModel
 from mien.storage import write_atomically
 from mien.tracking.contact_sheet import SheetFrame, strip
+from mien.tracking.heat import write_text
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.model_pictures import model_pictures
 from mien.tracking.outcome import as_tracking, looks_of
@@ -34,6 +35,8 @@ _CURVE_FRAMES, _STRIPS = 48, 3
 _MOST_BYTES = 64 << 20
 """Of pictures that are kept for it."""
 _WIDTH, _HEADER, _CURVE = 960, 48, 150
+_PANELS = (("picture", False), ("mesh", False), ("model", False), ("difference", True))
+"""Of a strip, and whether a legend stands in the upper corner."""
 _INK, _PAPER, _FAINT = (40, 40, 40), 250, (190, 190, 190)
 _COLORS = ((30, 90, 200), (200, 60, 30))
 """Of the curves: landmarks, colours."""
@@ -92,6 +95,7 @@ class Preview:
             if len(strips) < _STRIPS:
                 strips += _strips(capture, tracking, self._face_model, sample, per_sequence)
         curves = [np.concatenate(landmarks), 100 * np.concatenate(colors)]
+        _head(strips[0])
         parts = [*strips, _plot(curves, self._before, labels)]
         self._before = curves
         return np.concatenate([_widened(part) for part in parts])
@@ -144,6 +148,14 @@ def _strips(
     return [strip(painter, capture, SheetFrame(one, camera), str(sample.timesteps[one])) for one in chosen]
 
 
+def _head(first: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Name the panels, on the first strip."""
+    tile = len(first)
+    for index in range(1, first.shape[1] // tile):
+        name, legend = _PANELS[index]
+        write_text(first, name, (index * tile + 6, tile - 8 if legend else 16), 0.45)
+
+
 def _color_residuals(capture: Capture, tracking: Tracking, face_model: FaceModel) -> Float[np.ndarray, " k"]:
     """Of the frontal camera; NaN where pixels were not looked at."""
     found, pictures = np.full(capture.timesteps, np.nan), model_pictures(capture, tracking, face_model)
@@ -169,7 +181,8 @@ def _plot(
             x, y = np.linspace(50, _WIDTH - 15, len(values)), _CURVE - 25 - (_CURVE - 50) * values / top
             points = np.stack([x, y], axis=1)[np.isfinite(values)]
             cv2.polylines(plot, [np.round(points).astype(np.int32)], False, color, 1, cv2.LINE_AA)
-        _text(plot, f"{names[index]}: now {np.nanmedian(curves[index]):.2f} in the middle", (50, 16), _COLORS[index])
+        told = f"{names[index]}: {np.nanmedian(curves[index]):.2f} over all frames (grey: at the last look)"
+        _text(plot, told, (50, 16), _COLORS[index])
         _text(plot, f"{top:.2f}", (5, 30), _INK)
         _text(plot, "0", (5, _CURVE - 22), _INK)
         for at in np.linspace(0, len(labels) - 1, 6).round().astype(int):

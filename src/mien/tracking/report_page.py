@@ -1,6 +1,7 @@
 """report.html of a tracking: what was fitted and how well, what stands out, and pictures to look at."""
 
 import base64
+import re
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -20,6 +21,7 @@ _STYLE = (
     "background:#fff}"
     "img,video{max-width:100%;height:auto}table{border-collapse:collapse}td,th{padding:.2rem .8rem .2rem 0;text-align:"
     "left;font-weight:400}td{font-variant-numeric:tabular-nums}.odd{color:#a40000}"
+    ".sheet{width:min(94vw,1924px);max-width:none;position:relative;left:50%;transform:translateX(-50%)}"
     "@media(prefers-color-scheme:dark){body{background:#181818;color:#ddd}.odd{color:#ff8a80}}"
 )
 _JPEG_QUALITY = 85
@@ -57,16 +59,21 @@ def page_html(name: str, tracking: Tracking, report: dict[str, Any], plot: str, 
     if tracking.looks is not None:
         panels += (", the model's own picture (its texture in the fitted light), and the difference of colours"
                    " (black is none; grey parts, such as hair, eyes and mouth, are not compared)")  # fmt: skip
-    paragraphs = "".join(f'<p class="{kind}">{escape(text)}</p>' for kind, text in findings(tracking, report))
+    paragraphs = "".join(f'<p class="{kind}">{_with_code(text)}</p>' for kind, text in findings(tracking, report))
     rows = "".join(f"<tr><th>{escape(what)}</th><td>{escape(value)}</td></tr>" for what, value in _figures(report))
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(name)}: tracking</title>'
         f"<style>{_STYLE}</style></head><body><h1>{escape(name)}: how the face was tracked</h1>{paragraphs}"
         f"<table>{rows}</table><h2>Frames</h2><p>Evenly spread frames, and those that stand out; of each "
-        f'{escape(panels)}.</p><img alt="contact sheet" src="{sheet}">'
+        f'{escape(panels)}.</p><img class="sheet" alt="contact sheet" src="{sheet}">'
         f'<h2>Over time</h2><img alt="residuals over time" src="{plot}">'
         '<h2>Overlay</h2><video controls preload="none" src="overlay.mp4"></video></body></html>\n'
     )
+
+
+def _with_code(text: str) -> str:
+    """As html, with what stands between backticks as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
 def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]]:
