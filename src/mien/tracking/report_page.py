@@ -21,7 +21,7 @@ _STYLE = (
     "background:#fff}"
     "img,video{max-width:100%;height:auto}table{border-collapse:collapse}td,th{padding:.2rem .8rem .2rem 0;text-align:"
     "left;font-weight:400}td{font-variant-numeric:tabular-nums}.odd{color:#a40000}"
-    ".sheet{width:min(94vw,1924px);max-width:none;position:relative;left:50%;transform:translateX(-50%)}"
+    ".sheet{width:min(94vw,1924px);max-width:none;margin-left:calc(50% - min(47vw,962px))}"
     "@media(prefers-color-scheme:dark){body{background:#181818;color:#ddd}.odd{color:#ff8a80}}"
 )
 _JPEG_QUALITY = 85
