@@ -269,6 +269,20 @@ def test_create_into_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert (tmp_path / "out").read_text() == "mine"
 
 
+@pytest.mark.parametrize("place", ["runs", "sequences/other", "runs/new/deep"])
+@pytest.mark.parametrize("command", ["create", "capture"])
+def test_a_workspace_inside_a_workspace(
+    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, place: str
+) -> None:
+    write_toy_video(tmp_path)
+    outer = tmp_path / "outer"
+    shutil.copytree(run_dir, outer / "runs/old")
+    before = sorted(outer.rglob("*"))
+    assert main([command, str(tmp_path / "a.mp4"), "--out", str(outer / place)]) == 2
+    assert f"inside the workspace {outer}" in capsys.readouterr().err
+    assert sorted(outer.rglob("*")) == before
+
+
 @torch.no_grad()
 def test_a_ply_with_nan_is_refused(run_dir: Path, tmp_path: Path) -> None:
     avatar, path = load_avatar(run_dir), tmp_path / "a.ply"

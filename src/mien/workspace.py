@@ -75,6 +75,22 @@ def open_workspace(root: Path) -> Workspace:
     return workspace
 
 
+def check_new_workspace(root: Path) -> None:
+    """A workspace may begin or go on here.
+
+    Raises:
+        UserError: the folder cannot be written, or belongs to another workspace.
+    """
+    from mien.files import check_writable  # brings numpy
+
+    check_writable(root, folder=True)
+    whole = root.resolve()
+    for folder in (whole, *whole.parents):
+        outer = Workspace(folder.parent)
+        if folder.name in ("sequences", "runs") and (outer.sequence_names() or outer.run_names()):
+            raise UserError(f"{root}: lies inside the workspace {folder.parent}; name that, or a folder beside it")
+
+
 def _pick(kind: str, name: str | None, names: list[str], root: Path, option: str) -> str:
     if name is None and len(names) == 1:
         return names[0]

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from mien.capture import CaptureSettings
-from mien.workspace import Workspace
+from mien.workspace import Workspace, check_new_workspace
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,10 @@ class Command:
     def check(self) -> None:
         """Tell what can be told without the libraries that capture."""
         from mien.commands.stages.names import sequence_names
-        from mien.files import check_writable
 
         sequence_names([self.video], () if self.name is None else (self.name,))
         self.settings.check()
-        check_writable(self.out, folder=True)
+        check_new_workspace(self.out)
 
     def run(self) -> None:
         """Capture and say what was found."""

@@ -11,7 +11,7 @@ import tyro
 from mien.capture import CaptureSettings
 from mien.commands.options import TrainOptions
 from mien.tracking import TrackingSettings
-from mien.workspace import Workspace
+from mien.workspace import Workspace, check_new_workspace
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,12 @@ class Command:
     def check(self) -> None:
         """Tell what can be told without heavy libraries: options, names, paths."""
         from mien.commands.stages.names import run_name, sequence_names
-        from mien.files import check_writable
 
         self.options.settings()
         sequence_names(self.videos, self.name)
         run_name(self.run_name or self.options.method)
         self.capture.check()
-        check_writable(self.out, folder=True)
+        check_new_workspace(self.out)
 
     def run(self) -> None:
         """All stages, each skipped if its result is current; what can be told before any work is told then."""
