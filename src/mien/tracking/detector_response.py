@@ -5,7 +5,7 @@ its annotators did, closes lids later than they close, turns heads less than the
 for somebody else. `mien.synthetic.detector_calibration` measures these habits over synthetic people.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 
@@ -40,6 +40,10 @@ class DetectorResponse:
         turns = head_rotation[:, :2].clamp(-_LARGEST_TURN, _LARGEST_TURN)
         return (turns @ self.by_turn.flatten(1)).reshape(len(turns), *self.mean.shape)
 
+    def of_person(self, person: Float[Tensor, " k"]) -> Float[Tensor, "l 3"]:
+        """The part that is a person's own, beside the mean."""
+        return (person @ self.by_person.flatten(1)).reshape(self.mean.shape)
+
     def at(self, landmarks: Int[Tensor, " n"]) -> "DetectorResponse":
         """Of some of the landmarks."""
         return DetectorResponse(
@@ -49,9 +53,7 @@ class DetectorResponse:
 
     def without_turns(self) -> "DetectorResponse":
         """For several cameras, which see a head from as many sides."""
-        return DetectorResponse(
-            self.mean, torch.zeros_like(self.by_turn), self.by_expression, self.by_person, self.rest_sigma
-        )
+        return replace(self, by_turn=torch.zeros_like(self.by_turn))
 
 
 def unknown_response(landmarks: int, expressions: int, sigma: float) -> DetectorResponse:

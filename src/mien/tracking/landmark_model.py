@@ -11,10 +11,8 @@ from mien.face import FaceModel, FaceParams
 from mien.rotation import matrix_from_axis_angle, skew
 from mien.tracking.detector_response import DetectorResponse, unknown_response
 from mien.tracking.parameters import ParameterLayout
+from mien.tracking.settings import TrackingSettings
 from mien.tracking.views import CameraBatch
-
-_UNKNOWN_SIGMA = 0.003
-"""Metres: how far a landmark's point on a subject may lie from the model's where nothing was measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +184,7 @@ def reduce_face_model(
         return torch.einsum("...lnc,lnk->...klc", positions[..., corners, :], share)
 
     joint_weights = share.sum(1).T.contiguous()
-    response = response or unknown_response(len(marks.faces), len(model.expression_basis), _UNKNOWN_SIGMA)
+    response = response or unknown_response(len(marks.faces), len(model.expression_basis), TrackingSettings.bias_sigma)
     seen = torch.einsum("elc,kl->eklc", response.by_expression, joint_weights)
     return LandmarkModel(
         face_model=model,

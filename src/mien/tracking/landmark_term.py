@@ -39,7 +39,7 @@ class Subject:
     def moved(self, step: Float[Tensor, " s"], response: DetectorResponse) -> "Subject":
         """With `shared` changed by a step."""
         identity, person = step.split([len(self.identity), len(self.person)])
-        bias = self.bias + (person @ response.by_person.flatten(1)).reshape(self.bias.shape)
+        bias = self.bias + response.of_person(person)
         return replace(self, identity=self.identity + identity, person=self.person + person, bias=bias)
 
 

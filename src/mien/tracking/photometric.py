@@ -156,7 +156,7 @@ def refine_photometrically(
     def step_identity(now: _Round, at: PhotometricFit) -> PhotometricFit:
         at = now.look(at)
         moved = step_shared(now.terms(at), at.fit, prior, own_settings.keyframes)
-        return replace(at, fit=fit_bias(landmarks, moved, settings))
+        return replace(at, fit=fit_bias(landmarks, moved))
 
     with progress_bar("Fitting to pixels", total=total) as advance:
 

@@ -165,4 +165,4 @@ def _fit_landmarks(
         smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
                       for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
         advance_one = partial(advance_by, "sequence", share=SEQUENCE_ITERATIONS)
-        return fit_sequences(terms, alone, smoothness, settings, advance_one, keeper)
+        return fit_sequences(terms, alone, smoothness, advance_one, keeper)

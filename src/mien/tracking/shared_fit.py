@@ -41,7 +41,7 @@ def fit_shared(
     """
     for _ in range(_ROUNDS):
         fit = _fit_jointly(terms, fit, lenses, settings)
-        fit = fit_bias(terms, fit, settings)
+        fit = fit_bias(terms, fit)
     return fit
 
 

@@ -86,7 +86,7 @@ def choose_keyframes(pose: Float[Tensor, "v 6"], count: int) -> Int[Tensor, " k"
     return torch.tensor(sorted(chosen))
 
 
-def fit_bias(terms: Sequence[LandmarkTerm], fit: Fit, settings: TrackingSettings) -> Fit:
+def fit_bias(terms: Sequence[LandmarkTerm], fit: Fit) -> Fit:
     """The static offset of every landmark, all else fixed.
 
     Beside what is expected of the detector, irises get none (their place tells scale and gaze), lids and lips little
@@ -94,7 +94,7 @@ def fit_bias(terms: Sequence[LandmarkTerm], fit: Fit, settings: TrackingSettings
     pose and identity.
     """
     bias, response = fit.subject.bias, terms[0].model.response
-    expected = response.mean + (fit.subject.person @ response.by_person.flatten(1)).reshape(bias.shape)
+    expected = response.mean + response.of_person(fit.subject.person)
     precision = torch.full((len(bias), 1), response.rest_sigma**-2).to(bias)
     precision[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS)] *= _RIM_BIAS_SHARE**-2
     hessian, gradient = precision[..., None] * torch.eye(3).to(bias), precision * (bias - expected)
@@ -156,7 +156,6 @@ def fit_sequences(
     terms: Sequence[LandmarkTerm],
     fit: Fit,
     smoothness: Sequence[Smoothness],
-    settings: TrackingSettings,
     advance: Callable[[int], None] = lambda timesteps: None,
     keeper: Keeper | None = None,
 ) -> Fit:
@@ -167,7 +166,7 @@ def fit_sequences(
     keeper = keeper or Keeper()
 
     def round_from(fit: Fit) -> dict[str, Tensor]:
-        fit = fit_bias(terms, fit, settings)
+        fit = fit_bias(terms, fit)
         parts = zip(terms, fit.sequences, smoothness, strict=True)
         chains = tuple(_fit_chain(term, fit.subject, own, smooth, advance) for term, own, smooth in parts)
         return replace(fit, sequences=chains).tensors()
