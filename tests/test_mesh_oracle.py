@@ -1,4 +1,4 @@
-"""Gradients of antialiased meshes against deodr, an independent renderer with another scheme; where it is installed."""
+"""Gradients of antialiased meshes against deodr, an independent renderer with another scheme (locked where it has a wheel: Linux on x86-64)."""
 
 import numpy as np
 import pytest
