@@ -1,4 +1,7 @@
-"""Gradients of antialiased meshes against deodr, an independent renderer with another scheme (locked where it has a wheel: Linux on x86-64)."""
+"""Gradients of antialiased meshes against deodr, an independent renderer with another scheme.
+
+It is in the lock where it has a wheel: Linux on x86-64.
+"""
 
 import numpy as np
 import pytest
