@@ -17,7 +17,7 @@ from tracking_case import make_tracking_case
 LANDMARKS = TrackingSettings(focal=FOCAL, schedule="landmarks")
 FAST = replace(
     LANDMARKS, schedule="fast",
-    photometric=PhotometricSettings(shrinks=(1, 1), texture_size=128, keyframes=8, shared_steps=1),
+    photometric=PhotometricSettings(texture_size=128, keyframes=8, shared_steps=1),
 )  # fmt: skip
 
 

@@ -30,9 +30,7 @@ from mien.tracking.photometric_threads import stream_in_threads
 from mien.tracking.report_page import findings, named
 from photometric_case import FOCAL, SIZE, PhotometricCase, make_photometric_case, smooth_noise
 
-FAST = TrackingSettings(
-    focal=FOCAL, photometric=PhotometricSettings(shrinks=(1, 1), texture_size=128, keyframes=8, shared_steps=1)
-)
+FAST = TrackingSettings(focal=FOCAL, photometric=PhotometricSettings(texture_size=128, keyframes=8, shared_steps=1))
 
 
 @pytest.fixture(scope="module")

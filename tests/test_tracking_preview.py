@@ -20,9 +20,7 @@ from mien.tracking.preview import Preview
 from mien.tracking.shot import shot_of
 from photometric_case import FOCAL, assert_alike, make_photometric_case
 
-FAST = TrackingSettings(
-    focal=FOCAL, photometric=PhotometricSettings(shrinks=(1, 1), texture_size=64, keyframes=4, shared_steps=1)
-)
+FAST = TrackingSettings(focal=FOCAL, photometric=PhotometricSettings(texture_size=64, keyframes=4, shared_steps=1))
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from mien.tracking.photometric_settings import PhotometricSettings
 from mien.tracking.resume import Keeper
 from photometric_case import PhotometricCase, assert_alike, make_photometric_case, make_textured_model
 
-FAST = TrackingSettings(photometric=PhotometricSettings(shrinks=(1, 1), texture_size=128, keyframes=4, shared_steps=1))
+FAST = TrackingSettings(photometric=PhotometricSettings(texture_size=128, keyframes=4, shared_steps=1))
 """The focal length is unknown, so that it has to be kept as well."""
 
 

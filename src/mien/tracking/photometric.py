@@ -41,6 +41,8 @@ _FRAMES_AT_ONCE = 256
 """Timesteps whose equations are kept together: some seconds of work, and some 10 MB."""
 _SHARED_COST, _LOOK_COST = 100, 40
 """About how long a step of identity and a look at the texture take, in timesteps of a step of all frames."""
+_LEAST_KEYFRAMES = 3
+"""However many cameras there are: the mouth must be seen open and closed."""
 _LEAST_SHARE = 0.03
 """Of a frame in the texture, however far it is from the middle pose: it may be the only one that sees an ear."""
 
@@ -54,21 +56,32 @@ class _Round:
     shots: Sequence[Shot]
     landmarks: Sequence[LandmarkTerm]
     settings: PhotometricSettings
-    shrink: int
+    size: int
 
-    def light_radius(self, own: SequenceFit) -> int:
+    @property
+    def keyframes(self) -> int:
+        """Timesteps of each sequence for the steps of what they share."""
+        pictures = 2 * self.settings.keyframes // max(shot.capture.valid.shape[1] for shot in self.shots)
+        return min(self.settings.keyframes, max(pictures, _LEAST_KEYFRAMES))
+
+    def pictures(self, shot: Shot) -> Pictures:
+        """Of a sequence, at this round's size."""
+        return Pictures(shot.capture, max(round(min(shot.capture.width, shot.capture.height) / self.size), 1))
+
+    def light_radius(self, shot: Shot, own: SequenceFit) -> int:
         """Pixels over which a smooth difference counts as light."""
         cameras = own.cameras
         depth = (own.state[:, 3:6] @ cameras.viewmat[0, 2, :3] + cameras.viewmat[0, 2, 3]).median()
-        return max(round(self.settings.light_extent * float(cameras.K[0, 0, 0] / depth) / self.shrink), 2)
+        extent = self.settings.light_extent * float(cameras.K[0, 0, 0] / depth)
+        return max(round(extent / self.pictures(shot).shrink), 2)
 
     def terms(self, at: PhotometricFit) -> list[PhotometricTerm]:
         """The cost of every sequence."""
         surface = self.space.native(at.appearance, self.settings.outlier)
         return [
             PhotometricTerm(
-                self.model, marks, Pictures(shot.capture, self.shrink), shot.valid.nonzero()[:, 0], surface, light,
-                self.light_radius(own), self.settings.independent_pixels, at.appearance.sigma,
+                self.model, marks, self.pictures(shot), shot.valid.nonzero()[:, 0], surface, light,
+                self.light_radius(shot, own), self.settings.independent_pixels, at.appearance.sigma,
             )
             for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
         ]  # fmt: skip
@@ -79,7 +92,7 @@ class _Round:
             self._sightings(shot, marks, own, at.fit.subject.identity, light)
             for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
         ]
-        radius = self.light_radius(at.fit.sequences[0])
+        radius = self.light_radius(self.shots[0], at.fit.sequences[0])
         found, lights = estimate_appearance(self.space, sightings, at.appearance, self.settings.outlier, radius)
         return replace(at, appearance=found, lights=tuple(lights))
 
@@ -91,10 +104,10 @@ class _Round:
         identity: Float[Tensor, " i"],
         light: Float[Tensor, "9 3"],
     ) -> list[Sighting]:
-        pictures, timesteps = Pictures(shot.capture, self.shrink), shot.valid.nonzero()[:, 0]
+        pictures, timesteps = self.pictures(shot), shot.valid.nonzero()[:, 0]
         middle = own.state[:, :3].median(0).values
         away = (own.state[:, :3] - middle).norm(dim=1) / self.settings.reference_angle
-        shares = 1 / (1 + away**4) + _LEAST_SHARE
+        shares = 1 / (1 + away**4) + _LEAST_SHARE if len(own.cameras) == 1 else torch.ones_like(away)
 
         def sight(row: int) -> list[Sighting]:
             posed = self.model.pose(own.state[row], identity, derive=False)
@@ -148,14 +161,16 @@ def refine_photometrically(
         fit, unknown_appearance(space), tuple(even_light() for _ in shots),
         tuple(torch.zeros(len(own.state), dtype=torch.bool) for own in fit.sequences),
     )  # fmt: skip
-    rounds = [_Round(surface, space, shots, landmarks, own_settings, shrink) for shrink in own_settings.shrinks]
+    rounds = [_Round(surface, space, shots, landmarks, own_settings, size) for size in own_settings.sizes]
 
     frames = sum(len(own.state) for own in fit.sequences)
-    total, done = len(rounds) * (_LOOK_COST + frames) + (len(rounds) - 1) * own_settings.shared_steps * _SHARED_COST, 0
+    several = any(len(own.cameras) > 1 for own in fit.sequences)
+    shared_steps = own_settings.shared_steps_of_cameras if several else own_settings.shared_steps
+    total, done = len(rounds) * (_LOOK_COST + frames) + (len(rounds) - 1) * shared_steps * _SHARED_COST, 0
 
     def step_identity(now: _Round, at: PhotometricFit) -> PhotometricFit:
         at = now.look(at)
-        moved = step_shared(now.terms(at), at.fit, prior, own_settings.keyframes)
+        moved = step_shared(now.terms(at), at.fit, prior, now.keyframes)
         return replace(at, fit=fit_bias(landmarks, moved))
 
     with progress_bar("Fitting to pixels", total=total) as advance:
@@ -173,7 +188,7 @@ def refine_photometrically(
 
         for number, now in enumerate(rounds):
             status = f"round {number + 1} of {len(rounds)}"
-            for step in range(own_settings.shared_steps if number > 0 else 0):
+            for step in range(shared_steps if number > 0 else 0):
                 at = kept(f"round-{number}-shared-{step}", f"{status}, identity", partial(step_identity, now, at))
                 advance_by(_SHARED_COST, f"{status}, identity")
             at = kept(f"round-{number}-looks", f"{status}, texture and light", partial(now.look, at))

@@ -7,19 +7,23 @@ from dataclasses import dataclass
 class PhotometricSettings:
     """How faces are fitted to pixels, after the fit to landmarks."""
 
-    shrinks: tuple[int, ...] = (2, 2)
-    """Rounds from coarse to fine, each at pictures shrunk by this; the texture is made anew before each."""
+    sizes: tuple[int, ...] = (256, 256)
+    """Rounds, each at pictures shrunk by the whole number that brings their shorter side nearest to this, pixels; the
+    texture is made anew before each."""
     texture_size: int = 512
     """Texels along each side."""
     texture_frames: int = 48
     """Frames of each sequence that make the texture."""
     reference_angle: float = 0.12
     """Radians of head rotation away from the middle pose within which frames decide the texture; others follow it.
-    Were all alike, every pose would keep its own error: the texture shows it where only such frames see the skin."""
+    Were all alike, every pose would keep its own error: the texture shows it where only such frames see the skin.
+    With several cameras all are alike: one pose is seen from many sides."""
     shared_steps: int = 3
     """Gauss-Newton steps of identity and focal length before each round but the first."""
+    shared_steps_of_cameras: int = 8
+    """The same with several cameras: these see depth, so that shape goes on improving."""
     keyframes: int = 24
-    """Frames of each sequence for these steps."""
+    """Timesteps of each sequence for these steps; of several cameras fewer, for twice as many pictures at most."""
     focal_sigma: float = 0.03
     """How far the logarithm of an unknown focal length may go from the landmarks' in each keyframe's opinion."""
     independent_pixels: float = 100.0
