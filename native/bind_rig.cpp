@@ -68,10 +68,15 @@ void rig_forward(const Array<const float, nb::shape<-1, -1, 3>>& vertices, const
   }
 }
 
-void rig_backward(const Array<const float, nb::shape<-1, -1, 3>>& vertices, const Faces& faces,
-                  const FaceIndex& face_index, const Rows3& local_means, const Rows4& local_quats,
-                  const Rows3& log_scales, const Array<const float, Frames>& frames,
-                  const Array<const float, nb::shape<-1, -1, 3>>& scales,
+mien::RigTopology make_topology(size_t vertex_count, const Faces& faces, const FaceIndex& face_index) {
+  const nb::gil_scoped_release release;
+  return {static_cast<int64_t>(vertex_count), faces.data(), static_cast<int64_t>(faces.shape(0)), face_index.data(),
+          static_cast<int64_t>(face_index.shape(0))};
+}
+
+void rig_backward(const mien::RigTopology& topology, const Array<const float, nb::shape<-1, -1, 3>>& vertices,
+                  const Rows3& local_means, const Rows4& local_quats, const Rows3& log_scales,
+                  const Array<const float, Frames>& frames, const Array<const float, nb::shape<-1, -1, 3>>& scales,
                   const Array<const float, nb::shape<-1, -1, 3>>& grad_means,
                   const Array<const float, nb::shape<-1, -1, 4>>& grad_quats,
                   const Array<const float, nb::shape<-1, -1, 3>>& grad_scales,
@@ -80,17 +85,21 @@ void rig_backward(const Array<const float, nb::shape<-1, -1, 3>>& vertices, cons
                   const Array<float, nb::shape<-1, 3>>& grad_log_scales,
                   const std::optional<Array<float, nb::shape<-1, -1, 3>>>& grad_vertices) {
   const nb::gil_scoped_release release;
-  mien::RigArrays rig = rig_arrays(vertices, faces, face_index, local_means, local_quats, log_scales);
-  const size_t batch = vertices.shape(0), count = face_index.shape(0);
-  check_batch(frames, batch, rig.face_count);
+  const size_t batch = vertices.shape(0), count = topology.face_index.size(), faces = topology.faces.size() / 3;
+  const auto vertex_count = static_cast<size_t>(topology.vertex_count);
+  require(batch > 0, "a batch of no timesteps");
+  check_batch(vertices, batch, vertex_count);
+  check_batch(frames, batch, faces);
   for (const auto& array : {scales, grad_means, grad_scales}) check_batch(array, batch, count);
   check_batch(grad_quats, batch, count);
-  if (grad_vertices) check_batch(*grad_vertices, batch, rig.vertex_count);
-  if (grad_local_means.shape(0) != count || grad_local_quats.shape(0) != count || grad_log_scales.shape(0) != count) {
-    throw std::invalid_argument("one row of every gradient a Gaussian");
+  if (grad_vertices) check_batch(*grad_vertices, batch, vertex_count);
+  if (local_means.shape(0) != count || local_quats.shape(0) != count || log_scales.shape(0) != count ||
+      grad_local_means.shape(0) != count || grad_local_quats.shape(0) != count || grad_log_scales.shape(0) != count) {
+    throw std::invalid_argument("one row of every parameter and gradient a Gaussian");
   }
-  require(batch > 0, "a batch of no timesteps");
   for (size_t b = 0; b < batch; ++b) {
+    const mien::RigArrays rig = mien::rig_arrays(topology, vertices.data() + b * vertex_count * 3, local_means.data(),
+                                                 local_quats.data(), log_scales.data());
     const mien::RigGradients gradients{grad_means.data() + b * count * 3,
                                        grad_quats.data() + b * count * 4,
                                        grad_scales.data() + b * count * 3,
@@ -98,10 +107,9 @@ void rig_backward(const Array<const float, nb::shape<-1, -1, 3>>& vertices, cons
                                        grad_local_means.data(),
                                        grad_local_quats.data(),
                                        grad_log_scales.data(),
-                                       grad_vertices ? grad_vertices->data() + b * rig.vertex_count * 3 : nullptr};
-    mien::rig_backward(rig, reinterpret_cast<const mien::TriangleFrame*>(frames.data()) + b * rig.face_count,
+                                       grad_vertices ? grad_vertices->data() + b * vertex_count * 3 : nullptr};
+    mien::rig_backward(topology, rig, reinterpret_cast<const mien::TriangleFrame*>(frames.data()) + b * faces,
                        scales.data() + b * count * 3, gradients);
-    rig.vertices += rig.vertex_count * 3;
   }
 }
 
@@ -112,9 +120,11 @@ void bind_rig(nb::module_& module) {
   module.def("rig_forward", &rig_forward, "vertices"_a.noconvert(), "faces"_a.noconvert(), "face_index"_a.noconvert(),
              "local_means"_a.noconvert(), "local_quats"_a.noconvert(), "log_scales"_a.noconvert(),
              "frames"_a.noconvert(), "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert());
-  module.def("rig_backward", &rig_backward, "vertices"_a.noconvert(), "faces"_a.noconvert(), "face_index"_a.noconvert(),
-             "local_means"_a.noconvert(), "local_quats"_a.noconvert(), "log_scales"_a.noconvert(),
-             "frames"_a.noconvert(), "scales"_a.noconvert(), "grad_means"_a.noconvert(), "grad_quats"_a.noconvert(),
-             "grad_scales"_a.noconvert(), "grad_local_means"_a.noconvert(), "grad_local_quats"_a.noconvert(),
-             "grad_log_scales"_a.noconvert(), "grad_vertices"_a.noconvert().none());
+  nb::class_<mien::RigTopology>(module, "RigTopology", "Who rides on which triangle, ready for sums in parallel.");
+  module.def("make_rig_topology", &make_topology, "vertex_count"_a, "faces"_a.noconvert(), "face_index"_a.noconvert());
+  module.def("rig_backward", &rig_backward, "topology"_a, "vertices"_a.noconvert(), "local_means"_a.noconvert(),
+             "local_quats"_a.noconvert(), "log_scales"_a.noconvert(), "frames"_a.noconvert(), "scales"_a.noconvert(),
+             "grad_means"_a.noconvert(), "grad_quats"_a.noconvert(), "grad_scales"_a.noconvert(),
+             "grad_local_means"_a.noconvert(), "grad_local_quats"_a.noconvert(), "grad_log_scales"_a.noconvert(),
+             "grad_vertices"_a.noconvert().none());
 }

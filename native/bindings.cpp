@@ -9,6 +9,7 @@ void bind_mesh_gradients(nanobind::module_& module);
 void bind_mesh_align(nanobind::module_& module);
 void bind_photometric(nanobind::module_& module);
 void bind_rig(nanobind::module_& module);
+void bind_ride(nanobind::module_& module);
 void bind_rasterize(nanobind::module_& module);
 void bind_training(nanobind::module_& module);
 
@@ -23,6 +24,7 @@ NB_MODULE(_native, module) {
   bind_mesh_align(module);
   bind_photometric(module);
   bind_rig(module);
+  bind_ride(module);  // after the face and the rig, whose classes it takes
   bind_rasterize(module);
   bind_training(module);
 }

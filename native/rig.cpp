@@ -1,7 +1,7 @@
 #include "rig.h"
 
 #include <algorithm>
-#include <cstring>
+#include <stdexcept>
 #include <vector>
 
 #include "isa.h"
@@ -27,7 +27,6 @@ struct Vec {
 };
 Vec operator+(Vec a, Vec b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 Vec operator*(float s, Vec a) { return {s * a.x, s * a.y, s * a.z}; }
-void add(float* to, Vec a) { to[0] += a.x, to[1] += a.y, to[2] += a.z; }
 
 // What a triangle passes to its three corners.
 struct CornerGradients {
@@ -54,14 +53,48 @@ CornerGradients frame_to_corners(const TriangleFrame& frame, const FrameGradient
   return {{third + -1.0f * (by_edge1 + by_edge2), third + by_edge1, third + by_edge2}};
 }
 
-void clear_gaussians(const RigGradients& gradients, int64_t first, int64_t last) {
-  const size_t bytes = sizeof(float) * static_cast<size_t>(last - first);
-  std::memset(gradients.local_means + 3 * first, 0, 3 * bytes);
-  std::memset(gradients.local_quats + 4 * first, 0, 4 * bytes);
-  std::memset(gradients.log_scales + 3 * first, 0, 3 * bytes);
+// Where the entries of each of `groups` groups begin in `members`, which lists them in ascending order.
+void list_members(const int64_t* group_of, int64_t count, int64_t groups, std::vector<int32_t>& begins,
+                  std::vector<int32_t>& members) {
+  begins.assign(groups + 1, 0);
+  for (int64_t i = 0; i < count; ++i) ++begins[group_of[i] + 1];
+  for (int64_t group = 0; group < groups; ++group) begins[group + 1] += begins[group];
+  std::vector<int32_t> next(begins.begin(), begins.end() - 1);
+  members.resize(count);
+  for (int64_t i = 0; i < count; ++i) members[next[group_of[i]]++] = static_cast<int32_t>(i);
+}
+
+void check_range(const std::vector<int64_t>& indices, int64_t count, const char* message) {
+  for (const int64_t index : indices) {
+    if (index < 0 || index >= count) throw std::out_of_range(message);
+  }
 }
 
 }  // namespace
+
+RigTopology::RigTopology(int64_t vertices, const int64_t* corner_vertices, int64_t face_count, const int64_t* face_of,
+                         int64_t count)
+    : vertex_count(vertices),
+      faces(corner_vertices, corner_vertices + 3 * face_count),
+      face_index(face_of, face_of + count) {
+  check_range(faces, vertices, "a face names a vertex that does not exist");
+  check_range(face_index, face_count, "a Gaussian names a face that does not exist");
+  list_members(face_index.data(), count, face_count, rider_begins, riders);
+  list_members(faces.data(), 3 * face_count, vertices, corner_begins, corners);
+}
+
+RigArrays rig_arrays(const RigTopology& topology, const float* vertices, const float* local_means,
+                     const float* local_quats, const float* log_scales) {
+  return {vertices,
+          topology.vertex_count,
+          topology.faces.data(),
+          static_cast<int64_t>(topology.faces.size() / 3),
+          topology.face_index.data(),
+          static_cast<int64_t>(topology.face_index.size()),
+          local_means,
+          local_quats,
+          log_scales};
+}
 
 void rig_forward(const RigArrays& rig, TriangleFrame* frames, const RigWorld& world) {
   const RigKernels& kernel = rig_kernels();
@@ -69,37 +102,41 @@ void rig_forward(const RigArrays& rig, TriangleFrame* frames, const RigWorld& wo
   in_pieces(rig.count, [&](int64_t first, int64_t last) { kernel.to_world(rig, first, last, frames, world); });
 }
 
-void rig_backward(const RigArrays& rig, const TriangleFrame* frames, const float* scales,
+void rig_backward(const RigTopology& topology, const RigArrays& rig, const TriangleFrame* frames, const float* scales,
                   const RigGradients& gradients) {
   // Kept between calls: fresh pages cost as much as the work.
-  thread_local std::vector<FrameGradient> per_gaussian, per_face;
+  thread_local std::vector<FrameGradient> per_gaussian;
   thread_local std::vector<CornerGradients> per_corner;
   per_gaussian.resize(rig.count);
   FrameGradient* const shares = per_gaussian.data();
   const RigKernels& kernel = rig_kernels();
-  in_pieces(rig.count, [&](int64_t first, int64_t last) {
-    if (!gradients.add) clear_gaussians(gradients, first, last);
-    kernel.to_local(rig, first, last, frames, scales, gradients, shares);
-  });
+  in_pieces(rig.count,
+            [&](int64_t first, int64_t last) { kernel.to_local(rig, first, last, frames, scales, gradients, shares); });
   if (!gradients.vertices) return;
   // In the order of Gaussians, then of triangles: the same sums for any number of threads.
-  per_face.assign(rig.face_count, FrameGradient{});
-  for (int64_t i = 0; i < rig.count; ++i) {
-    FrameGradient& sum = per_face[rig.face_index[i]];
-    for (int j = 0; j < FrameGradient::kFloats; ++j) sum.floats[j] += shares[i].floats[j];
-  }
   per_corner.resize(rig.face_count);
   CornerGradients* const corners = per_corner.data();
-  const FrameGradient* const sums = per_face.data();
   in_pieces(rig.face_count, [&](int64_t first, int64_t last) {
-    for (int64_t face = first; face < last; ++face) corners[face] = frame_to_corners(frames[face], sums[face]);
-  });
-  std::memset(gradients.vertices, 0, sizeof(float) * 3 * static_cast<size_t>(rig.vertex_count));
-  for (int64_t face = 0; face < rig.face_count; ++face) {
-    for (int corner = 0; corner < 3; ++corner) {
-      add(gradients.vertices + 3 * rig.faces[3 * face + corner], corners[face].corners[corner]);
+    for (int64_t face = first; face < last; ++face) {
+      FrameGradient sum{};
+      for (int32_t at = topology.rider_begins[face]; at < topology.rider_begins[face + 1]; ++at) {
+        const FrameGradient& share = shares[topology.riders[at]];
+        for (int j = 0; j < FrameGradient::kFloats; ++j) sum.floats[j] += share.floats[j];
+      }
+      corners[face] = frame_to_corners(frames[face], sum);
     }
-  }
+  });
+  in_pieces(rig.vertex_count, [&](int64_t first, int64_t last) {
+    for (int64_t vertex = first; vertex < last; ++vertex) {
+      Vec sum{};
+      for (int32_t at = topology.corner_begins[vertex]; at < topology.corner_begins[vertex + 1]; ++at) {
+        const int32_t corner = topology.corners[at];
+        sum = sum + corners[corner / 3].corners[corner % 3];
+      }
+      gradients.vertices[3 * vertex] = sum.x, gradients.vertices[3 * vertex + 1] = sum.y;
+      gradients.vertices[3 * vertex + 2] = sum.z;
+    }
+  });
 }
 
 }  // namespace mien

@@ -2,8 +2,24 @@
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
 namespace mien {
+
+// Which Gaussians ride on a triangle, and which corners of triangles meet at a vertex, both in ascending order: so that
+// sums over them can run side by side and still add up in one order. Throws std::out_of_range where an index does not
+// exist.
+struct RigTopology {
+  RigTopology(int64_t vertex_count, const int64_t* faces, int64_t face_count, const int64_t* face_index, int64_t count);
+
+  int64_t vertex_count;
+  std::vector<int64_t> faces;          // [f,3]
+  std::vector<int64_t> face_index;     // [n]
+  std::vector<int32_t> rider_begins;   // [f + 1] into riders
+  std::vector<int32_t> riders;         // [n]
+  std::vector<int32_t> corner_begins;  // [v + 1] into corners
+  std::vector<int32_t> corners;        // [3 f], 3 * face + corner
+};
 
 struct RigArrays {
   const float* vertices;  // [v,3], metres
@@ -16,6 +32,10 @@ struct RigArrays {
   const float* local_quats;   // [n,4], wxyz, of any length
   const float* log_scales;    // [n,3], in units of k
 };
+
+// One timestep's arrays of a rig.
+RigArrays rig_arrays(const RigTopology& topology, const float* vertices, const float* local_means,
+                     const float* local_quats, const float* log_scales);
 
 // world = k R local + T. R's columns: a0 along the first edge, a1 the normal, a2 = a0 x a1.
 struct TriangleFrame {
@@ -44,14 +64,14 @@ struct RigGradients {
   float* local_means;
   float* local_quats;
   float* log_scales;
-  float* vertices;  // or null
+  float* vertices;  // or null; written
 };
 
 // Fills frames [f] and the Gaussians in world space. Runs on the pool.
 void rig_forward(const RigArrays& rig, TriangleFrame* frames, const RigWorld& world);
 
 // From the frames and scales of the forward pass. The result does not depend on the number of threads.
-void rig_backward(const RigArrays& rig, const TriangleFrame* frames, const float* scales,
+void rig_backward(const RigTopology& topology, const RigArrays& rig, const TriangleFrame* frames, const float* scales,
                   const RigGradients& gradients);
 
 }  // namespace mien

@@ -145,13 +145,16 @@ void to_world(const RigArrays& rig, int64_t first, int64_t last, const TriangleF
   }
 }
 
-// Adds to some columns in memory.
+// Writes some columns to memory, or adds to those there.
 template <int COUNT>
-MIEN_INLINE void add_columns(float* rows, int valid, const F* columns) {
+MIEN_INLINE void put_columns(float* rows, int valid, bool add, const F* columns) {
   F sums[COUNT];
-  load_columns<COUNT>(rows, COUNT, valid, sums);
-  for (int j = 0; j < COUNT; ++j) sums[j] = sums[j] + columns[j];
-  store_columns<COUNT>(rows, COUNT, valid, sums);
+  if (add) {
+    load_columns<COUNT>(rows, COUNT, valid, sums);
+    for (int j = 0; j < COUNT; ++j) sums[j] = sums[j] + columns[j];
+    columns = sums;
+  }
+  store_columns<COUNT>(rows, COUNT, valid, columns);
 }
 
 // d loss / d local quaternion; and the torque that the world quaternion's gradient `g` exerts.
@@ -182,7 +185,7 @@ void to_local(const RigArrays& rig, int64_t first, int64_t last, const TriangleF
     turn(frame.R, local, turned);
     turn_back(frame.R, g, by_local);
     for (int axis = 0; axis < 3; ++axis) by_local[axis] = *frame.k * by_local[axis];
-    add_columns<3>(gradients.local_means + 3 * i, valid, by_local);
+    put_columns<3>(gradients.local_means + 3 * i, valid, gradients.add, by_local);
     cross(turned, g, about);
     for (int axis = 0; axis < 3; ++axis) share[axis] = g[axis];
     F by_size = turned[0] * g[0] + turned[1] * g[1] + turned[2] * g[2];
@@ -190,13 +193,13 @@ void to_local(const RigArrays& rig, int64_t first, int64_t last, const TriangleF
     load_columns<3>(scales + 3 * i, 3, valid, local);
     load_columns<3>(gradients.scales + 3 * i, 3, valid, g);
     for (int axis = 0; axis < 3; ++axis) by_local[axis] = local[axis] * g[axis];
-    add_columns<3>(gradients.log_scales + 3 * i, valid, by_local);
+    put_columns<3>(gradients.log_scales + 3 * i, valid, gradients.add, by_local);
     by_size = by_size + (by_local[0] + by_local[1] + by_local[2]) / *frame.k;
 
     load_columns<4>(rig.local_quats + 4 * i, 4, valid, local);
     load_columns<4>(gradients.quats + 4 * i, 4, valid, g);
     quaternion_to_local(frame.q, local, g, by_local, share + 3);
-    add_columns<4>(gradients.local_quats + 4 * i, valid, by_local);
+    put_columns<4>(gradients.local_quats + 4 * i, valid, gradients.add, by_local);
     for (int axis = 0; axis < 3; ++axis) share[3 + axis] = share[3 + axis] + *frame.k * about[axis];
     share[6] = by_size;
     share[7] = F{};

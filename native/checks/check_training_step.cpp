@@ -31,7 +31,8 @@ RigResult ride(int64_t count, int64_t faces, uint32_t seed) {
   mien::rig_forward(rig, frames.data(), {r.means.data(), r.quats.data(), r.scales.data()});
   const Floats by_means = random.normal(3 * count), by_quats = random.normal(4 * count);
   const Floats by_scales = random.normal(3 * count);
-  mien::rig_backward(rig, frames.data(), r.scales.data(),
+  const mien::RigTopology topology(vertex_count, corners.data(), faces, face_index.data(), count);
+  mien::rig_backward(topology, rig, frames.data(), r.scales.data(),
                      {by_means.data(), by_quats.data(), by_scales.data(), false, r.local_means.data(),
                       r.local_quats.data(), r.log_scales.data(), r.vertices.data()});
   return r;

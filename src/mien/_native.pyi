@@ -148,10 +148,12 @@ def rig_forward(
     quats: Tensor,
     scales: Tensor,
 ) -> None: ...
+class RigTopology: ...
+
+def make_rig_topology(vertex_count: int, faces: Tensor, face_index: Tensor) -> RigTopology: ...
 def rig_backward(
+    topology: RigTopology,
     vertices: Tensor,
-    faces: Tensor,
-    face_index: Tensor,
     local_means: Tensor,
     local_quats: Tensor,
     log_scales: Tensor,
@@ -165,6 +167,12 @@ def rig_backward(
     grad_log_scales: Tensor,
     grad_vertices: Tensor | None,
 ) -> None: ...
+
+# native/bind_ride.cpp; one timestep. What `ride_backward` takes is what `ride` took, and the gradients
+class Ride: ...
+
+def ride(model: "FaceModelData", topology: RigTopology, *arrays: Any) -> Ride: ...
+def ride_backward(ride: Ride, model: "FaceModelData", topology: RigTopology, *arrays: Any) -> None: ...
 
 # native/bind_training.cpp; radii, radius: int32
 def adam_update(tasks: Sequence[tuple[int, int, int, int, int, float, float]]) -> None: ...

@@ -11,15 +11,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar.activation import sigmoid
 from mien.avatar.avatar import TRAINED, Avatar, MethodConfig, ParameterGroup, Posed, Progress, Rate, store_group
 from mien.avatar.baked import Attributes, MeshBound, bake_rig
 from mien.avatar.density import GradientDensity, GradientSettings
 from mien.avatar.penalties import triangle_penalties
-from mien.avatar.rig import bind_to_world
+from mien.avatar.ride import ride
 from mien.avatar.store import GaussianStore
-from mien.face import FaceModel, FaceParams, head_poses
-from mien.gaussians import Gaussians
+from mien.face import FaceModel, FaceParams
 from mien.render.rendering import Rendering
 
 
@@ -77,19 +75,8 @@ class GaussianAvatars(Avatar):
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in world space, or in the head frame (`_sh_frame`), one batch entry a timestep."""
-        store, in_head = self.store, self._sh_frame == "head"
-        vertices = self.face_model.head_vertices(face) if in_head else self.face_model(face)
-        means, quats, scales = bind_to_world(
-            vertices,
-            self.face_model.faces,
-            store["face_index"],
-            store["means"],
-            store["quats"],
-            store["log_scales"],
-        )
-        opacities = sigmoid(store["opacity_logits"])
-        T_world_local = head_poses(face) if in_head else None
-        return Posed(Gaussians(means, quats, scales, opacities, self._active_sh(progress), T_world_local), {})
+        sh = self._active_sh(progress)
+        return Posed(ride(self.face_model, face, self.store, sh, in_head=self._sh_frame == "head"), {})
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Section 3.4: of the Gaussians in view, distances and scales beyond their thresholds, in triangle units."""

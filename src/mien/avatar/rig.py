@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
+from torch.utils.weak import WeakIdKeyDictionary
 
 from mien import _native
 from mien.arrays import unpacked
@@ -88,6 +89,33 @@ def bind_to_world(
     return tuple(output.view(*vertices.shape[:-2], *output.shape[1:]) for output in (means, quats, scales))
 
 
+def rig_topology(vertex_count: int, faces: Int[Tensor, "f 3"], face_index: Int[Tensor, " n"]) -> _native.RigTopology:
+    """Who rides on which triangle, as the core takes it; made once for a `face_index` that nobody changes.
+
+    Raises:
+        IndexError: a vertex or a face is named that does not exist.
+    """
+    known, versions = _topologies.get(face_index), (faces._version, face_index._version)
+    if known is None or known.faces is not faces or known.versions != versions or known.vertex_count != vertex_count:
+        topology = _native.make_rig_topology(vertex_count, faces.contiguous(), face_index.contiguous())
+        known = _topologies[face_index] = _Topology(topology, vertex_count, faces, versions)
+    return known.topology
+
+
+@dataclass(frozen=True, eq=False)
+class _Topology:
+    """Of which tensors, in which version, a topology was made."""
+
+    topology: _native.RigTopology
+    vertex_count: int
+    faces: Tensor
+    versions: tuple[int, int]
+
+
+_topologies = WeakIdKeyDictionary()
+"""By `face_index`."""
+
+
 class _BindToWorld(torch.autograd.Function):
     @staticmethod
     def forward(ctx, vertices: Tensor, faces: Tensor, *gaussians: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -96,20 +124,22 @@ class _BindToWorld(torch.autograd.Function):
         frames = torch.empty(batch, len(faces), _native.TRIANGLE_FRAME_FLOATS)
         means, quats, scales = (torch.empty(batch, count, width) for width in (3, 4, 3))
         _native.rig_forward(*unpacked(*inputs, frames, means, quats, scales))
-        ctx.save_for_backward(*inputs, frames, scales)
+        vertices, _, _, *local = inputs
+        ctx.faces, ctx.face_index = faces, gaussians[0]
+        ctx.save_for_backward(vertices, *local, frames, scales)
         return means, quats, scales
 
     @staticmethod
     def backward(ctx, *world_gradients: Tensor):
-        *inputs, frames, scales = ctx.saved_tensors
-        vertices, _, _, *local = inputs
+        vertices, *local, frames, scales = ctx.saved_tensors
         if len(vertices) == 0:
             return torch.zeros_like(vertices), None, None, *(torch.zeros_like(tensor) for tensor in local)
         local_gradients = [torch.empty_like(tensor) for tensor in local]
         vertex_gradient = torch.empty_like(vertices) if ctx.needs_input_grad[0] else None
         world = [gradient.contiguous() for gradient in world_gradients]
-        known = (tensor.detach() for tensor in (*inputs, frames, scales, *world))
-        _native.rig_backward(*unpacked(*known, *local_gradients, vertex_gradient))
+        topology = rig_topology(vertices.shape[1], ctx.faces, ctx.face_index)
+        known = (tensor.detach() for tensor in (vertices, *local, frames, scales, *world))
+        _native.rig_backward(topology, *unpacked(*known, *local_gradients, vertex_gradient))
         return vertex_gradient, None, None, *local_gradients
 
 

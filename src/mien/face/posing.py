@@ -31,9 +31,7 @@ def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:
 
 def pose_vertices(model: "FaceModel", face: FaceParams, in_world: bool) -> Float[Tensor, "b v 3"]:
     """What `FaceModel.__call__` (in world space) or `FaceModel.head_vertices` returns; differentiable in all fields."""
-    compiled = _compiled.get(model)
-    if compiled is None:
-        compiled = _compiled[model] = _CompiledModel(model)
+    compiled = compiled_model(model)
     rest, joint_rest = compiled.rest_shape(model, face)
     head = (face.head_rotation, face.head_translation) if in_world else (None, None)
     return _PoseVertices.apply(compiled.data, rest, joint_rest, face.expression, face.joints, *head)
@@ -68,7 +66,7 @@ class _HeadPoses(torch.autograd.Function):
         return grad_rotation, grad_transforms[:, :3, 3].contiguous()
 
 
-class _CompiledModel:
+class CompiledModel:
     """A model's constants as the core keeps them, and the last person's shape: training asks for it in every step."""
 
     def __init__(self, model: "FaceModel"):
@@ -106,7 +104,15 @@ class _Person:
     shape: tuple[Tensor, Tensor]
 
 
-_compiled: "WeakKeyDictionary[FaceModel, _CompiledModel]" = WeakKeyDictionary()
+def compiled_model(model: "FaceModel") -> CompiledModel:
+    """A model as the core takes it, made once."""
+    compiled = _compiled.get(model)
+    if compiled is None:
+        compiled = _compiled[model] = CompiledModel(model)
+    return compiled
+
+
+_compiled: "WeakKeyDictionary[FaceModel, CompiledModel]" = WeakKeyDictionary()
 
 
 class _PoseVertices(torch.autograd.Function):

@@ -1,0 +1,78 @@
+"""From a face to the Gaussians that ride on its triangles: posing, rig and opacities as one operation."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mien import _native
+from mien.arrays import unpacked
+from mien.avatar.activation import sigmoid
+from mien.avatar.rig import bind_to_world, rig_topology
+from mien.avatar.store import GaussianStore
+from mien.face import FaceModel, FaceParams, head_poses
+from mien.face.posing import compiled_model, has_native_posing
+from mien.gaussians import Gaussians
+
+_LOCAL = ("means", "quats", "log_scales", "opacity_logits")
+
+
+def ride(
+    face_model: FaceModel, face: FaceParams, store: GaussianStore, sh: Float[Tensor, "n k 3"], in_head: bool
+) -> Gaussians:
+    """The Gaussians of a store (`face_index`, `means, quats, log_scales` in triangle units, `opacity_logits`).
+
+    In world space, or `in_head`: in the head frame, with its pose. One batch entry a timestep; differentiable in the
+    store and in `face`. A single timestep on a CPU is one native call each way, which a training step is made of.
+    """
+    if len(face) == 1 and has_native_posing(face_model, face) and store["means"].dtype == torch.float32:
+        compiled = compiled_model(face_model)
+        rest = compiled.rest_shape(face_model, face)
+        if not rest[0].requires_grad:
+            topology = rig_topology(len(face_model.template), face_model.faces, store["face_index"])
+            pose = (face.expression, face.joints, face.head_rotation, face.head_translation)
+            local = (store[name] for name in _LOCAL)
+            means, quats, scales, opacities, *head = _Ride.apply(compiled.data, topology, in_head, *rest, *pose, *local)
+            return Gaussians(means, quats, scales, opacities, sh, *head)
+    return ride_reference(face_model, face, store, sh, in_head)
+
+
+def ride_reference(
+    face_model: FaceModel, face: FaceParams, store: GaussianStore, sh: Float[Tensor, "n k 3"], in_head: bool
+) -> Gaussians:
+    """`ride` put together from its parts; any dtype, device and number of timesteps."""
+    vertices = face_model.head_vertices(face) if in_head else face_model(face)
+    means, quats, log_scales, opacity_logits = (store[name] for name in _LOCAL)
+    bound = bind_to_world(vertices, face_model.faces, store["face_index"], means, quats, log_scales)
+    return Gaussians(*bound, sigmoid(opacity_logits), sh, head_poses(face) if in_head else None)
+
+
+class _Ride(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, data: Any, topology: Any, in_head: bool, *inputs: Tensor) -> tuple[Tensor, ...]:
+        arrays = [tensor.detach().contiguous() for tensor in inputs]
+        count = len(arrays[-1])
+        means, quats, scales = (torch.empty(1, count, width) for width in (3, 4, 3))
+        opacities, head_pose = torch.empty(count), torch.empty(1, 4, 4)
+        known = unpacked(*arrays)
+        outputs = unpacked(means, quats, scales, opacities, head_pose)
+        ctx.ride = _native.ride(data, topology, *known[:6], in_head, *known[6:], *outputs)
+        ctx.data, ctx.topology, ctx.in_head = data, topology, in_head
+        ctx.save_for_backward(*arrays, scales, opacities)
+        return (means, quats, scales, opacities, head_pose) if in_head else (means, quats, scales, opacities)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        saved = [tensor.detach() for tensor in ctx.saved_tensors]
+        moves_face = any(ctx.needs_input_grad[5:9])
+        of_face = [torch.empty_like(tensor) if moves_face else None for tensor in saved[2:6]]
+        of_gaussians = [torch.empty_like(tensor) for tensor in saved[6:10]]
+        known = unpacked(*saved, *(gradient.contiguous() for gradient in gradients))
+        if not ctx.in_head:
+            known.append(None)
+        results = unpacked(*of_gaussians, *of_face)
+        _native.ride_backward(ctx.ride, ctx.data, ctx.topology, *known[:6], ctx.in_head, *known[6:], *results)
+        return None, None, None, None, None, *of_face, *of_gaussians
