@@ -5,6 +5,7 @@
 #include <nanobind/stl/vector.h>
 
 #include <array>
+#include <cmath>
 #include <tuple>
 #include <vector>
 
@@ -18,17 +19,21 @@ namespace {
 
 using Floats = Array<float, nb::ndim<1>>;
 using Rows3 = Array<const float, nb::shape<-1, 3>>;
+constexpr double kBeta1 = 0.9, kBeta2 = 0.999;  // of the bias corrections, which Python works out in the same numbers
 using Radii = Array<const int32_t, nb::ndim<1>>;
 
 // Addresses instead of arrays: unpacking forty arrays would cost as much as the update itself.
-using AdamArguments = std::tuple<uintptr_t, uintptr_t, uintptr_t, uintptr_t, int64_t, double, double>;
+using AdamArguments = std::tuple<uintptr_t, uintptr_t, uintptr_t, uintptr_t, uintptr_t, int64_t, double>;
 
 void adam_update(const std::vector<AdamArguments>& arguments) {
   std::vector<mien::AdamTask> tasks;
-  for (const auto& [values, gradient, first, second, count, step_size, second_unbiased] : arguments) {
+  tasks.reserve(arguments.size());
+  for (const auto& [values, gradient, first, second, steps, count, rate] : arguments) {
+    const double step = *reinterpret_cast<float*>(steps) += 1;
     tasks.push_back({reinterpret_cast<float*>(values), reinterpret_cast<const float*>(gradient),
                      reinterpret_cast<float*>(first), reinterpret_cast<float*>(second), count,
-                     static_cast<float>(step_size), static_cast<float>(second_unbiased)});
+                     static_cast<float>(rate / (1 - std::pow(kBeta1, step))),
+                     static_cast<float>(1 / std::sqrt(1 - std::pow(kBeta2, step)))});
   }
   const nb::gil_scoped_release release;
   mien::adam_update(tasks.data(), static_cast<int>(tasks.size()));
@@ -80,8 +85,8 @@ double mean_squared_difference(const Array<const float>& image, const Array<cons
 
 void bind_training(nb::module_& module) {
   module.def("adam_update", &adam_update, "tasks"_a,
-             "Each task: the addresses of values, gradient, first and second moments; count, step size, 1 / sqrt(1 - "
-             "beta2^t).");
+             "Each task: the addresses of values, gradient, first and second moments and of the number of steps, which "
+             "grows by one; count, rate.");
   module.def("triangle_penalties", &triangle_penalties, "means"_a.noconvert(), "log_scales"_a.noconvert(),
              "radii"_a.noconvert(), "thresholds"_a, "weights"_a, "grad_means"_a.noconvert(),
              "grad_log_scales"_a.noconvert(), "The position and scale penalties; fills their gradients.");

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,8 +13,7 @@ from mien.avatar import Moments, ParameterGroup, Progress
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
 
 
-@dataclass(frozen=True, eq=False)
-class Update:
+class Update(NamedTuple):
     """What one step does to one tensor."""
 
     values: Tensor
@@ -38,9 +37,12 @@ class Adam:
         for group in groups:
             rate = group.rate.at(progress)
             for name, tensor in group.tensors.items():
-                if tensor.grad is not None and rate > 0:
-                    updates.append(Update(tensor.detach(), tensor.grad, self._state(group, name, tensor), rate))
+                gradient = tensor.grad
+                if gradient is None:
+                    continue
                 tensor.grad = None
+                if rate > 0:
+                    updates.append(Update(tensor, gradient, self._state(group, name, tensor), rate))
         update_all(updates)
 
     def state(self) -> dict[str, Moments]:
@@ -65,30 +67,37 @@ def update_all(updates: Sequence[Update]) -> None:
     """Apply all updates in place, natively where tensors are float32, dense and on a CPU."""
     tasks = []
     for update in updates:
-        moments = update.moments
-        moments.step += 1
-        values, gradient, first, second = tensors = (update.values, update.gradient, moments.first, moments.second)
-        if not all(t.dtype is torch.float32 and t.is_cpu and t.is_contiguous() for t in tensors):
+        task = _native_task(update)
+        if task is None:
             update_reference(update)
-            continue
-        same_shape = values.shape == gradient.shape == first.shape == second.shape
-        assert same_shape, "a gradient and moments have their tensor's shape"
-        pointers = [tensor.data_ptr() for tensor in tensors]
-        tasks.append((*pointers, values.numel(), *_step_sizes(update)))
+        else:
+            tasks.append(task)
     if tasks:
         _native.adam_update(tasks)
 
 
+@torch.no_grad()
 def update_reference(update: Update) -> None:
-    """One update in plain PyTorch; `moments.step` already counts it."""
-    moments, gradient = update.moments, update.gradient
-    step_size, second_unbiased = _step_sizes(update)
+    """One update in plain PyTorch."""
+    values, gradient, moments, rate = update
+    moments.step += 1
+    step = float(moments.step)
     moments.first.lerp_(gradient, 1 - _BETA1)
     moments.second.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
-    update.values.addcdiv_(moments.first, moments.second.sqrt().mul_(second_unbiased).add_(_EPSILON), value=-step_size)
+    denominator = moments.second.sqrt().mul_(1 / math.sqrt(1 - _BETA2**step)).add_(_EPSILON)
+    values.addcdiv_(moments.first, denominator, value=-rate / (1 - _BETA1**step))
 
 
-def _step_sizes(update: Update) -> tuple[float, float]:
-    """Rate / (1 - beta1^t) and 1 / sqrt(1 - beta2^t)."""
-    step = float(update.moments.step)
-    return update.rate / (1 - _BETA1**step), 1 / math.sqrt(1 - _BETA2**step)
+def _native_task(update: Update) -> tuple[int, int, int, int, int, int, float] | None:
+    """The update as the core takes it, by addresses; None where the tensors are not what it takes."""
+    values, gradient, moments, rate = update
+    first, second = moments.first, moments.second
+    for tensor in (values, gradient, first, second, moments.step):
+        if not (tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous()):
+            return None
+    shape = values.shape
+    assert gradient.shape == shape, "a gradient has its tensor's shape"
+    assert first.shape == shape, "moments have their tensor's shape"
+    assert second.shape == shape, "moments have their tensor's shape"
+    addresses = (values.data_ptr(), gradient.data_ptr(), first.data_ptr(), second.data_ptr())
+    return *addresses, moments.step.data_ptr(), values.numel(), rate
