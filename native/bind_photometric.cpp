@@ -3,10 +3,14 @@
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 
+#include <algorithm>
 #include <array>
+#include <cstring>
 #include <optional>
 
+#include "arrays.h"
 #include "photometric.h"
+#include "training.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -14,44 +18,55 @@ using namespace nb::literals;
 namespace {
 
 template <typename T>
-using Picture = nb::ndarray<T, nb::c_contig, nb::device::cpu, nb::shape<-1, -1, 3>>;
+using Picture = Array<T, nb::shape<-1, -1, 3>>;
+constexpr int kMargin = 6;  // pixels: one more than the window's reach
 
-template <typename Target>
-double photometric_loss(const Picture<const float>& image, const Picture<const Target>& target,
-                        const std::array<int, 4>& box, double l1_weight, double ssim_weight,
-                        const std::optional<Picture<float>>& gradient) {
-  const int height = static_cast<int>(image.shape(0)), width = static_cast<int>(image.shape(1));
-  const auto same_size = [&](const auto& other) {
-    return other.shape(0) == image.shape(0) && other.shape(1) == image.shape(1);
-  };
-  if (!same_size(target) || (gradient && !same_size(*gradient))) throw nb::value_error("pictures differ in size");
+// What is compared: the box and all of `drawn` (one number a pixel, 0 for nothing), with a margin beyond what windows
+// reach; the whole box if `drawn` is not there.
+mien::Box compared(const std::array<int, 4>& box, const std::optional<In<-1, -1>>& drawn, int width, int height) {
   const int left = box[0], top = box[1], right = left + box[2], bottom = top + box[3];
-  if (width < 6 || left < 0 || top < 0 || right > width || bottom > height || left >= right || top >= bottom) {
-    throw nb::value_error("the box must lie inside a picture at least 6 pixels wide");
+  require(left >= 0 && top >= 0 && box[2] >= 0 && box[3] >= 0 && right <= width && bottom <= height,
+          "the box must lie inside the picture");
+  if (!drawn) return {left, top, right, bottom};
+  mien::PixelBox all = mien::box_of_nonzero(drawn->data(), width, height);
+  if (box[2] > 0 && box[3] > 0) {
+    all = all.right == 0 ? mien::PixelBox{left, top, right, bottom}
+                         : mien::PixelBox{std::min(all.left, left), std::min(all.top, top), std::max(all.right, right),
+                                          std::max(all.bottom, bottom)};
   }
-  mien::PhotometricTask task{image.data(),
-                             nullptr,
-                             nullptr,
-                             width,
-                             height,
-                             {left, top, right, bottom},
-                             static_cast<float>(l1_weight),
-                             static_cast<float>(ssim_weight),
-                             gradient ? gradient->data() : nullptr};
-  if constexpr (std::is_same_v<Target, float>) {
-    task.target = target.data();
-  } else {
-    task.target_bytes = target.data();
-  }
+  if (all.right == 0) return {0, 0, 0, 0};
+  return {std::max(all.left - kMargin, 0), std::max(all.top - kMargin, 0), std::min(all.right + kMargin, width),
+          std::min(all.bottom + kMargin, height)};
+}
+
+void photometric_loss(const Picture<const float>& image, const nb::ndarray<nb::c_contig, nb::device::cpu>& target,
+                      const std::array<int, 4>& box, const std::optional<In<-1, -1>>& drawn,
+                      const std::array<double, 2>& weights, const std::optional<Picture<float>>& gradient,
+                      const Array<float, nb::shape<>>& loss) {
+  const int height = static_cast<int>(image.shape(0)), width = static_cast<int>(image.shape(1));
+  const bool bytes = target.dtype() == nb::dtype<uint8_t>();
+  require(bytes || target.dtype() == nb::dtype<float>(), "a target is of float32 or uint8");
+  require(target.size() == image.size() && (!gradient || gradient->size() == image.size()) &&
+              (!drawn || 3 * drawn->size() == image.size()),
+          "pictures differ in size");
+  require(width >= 6, "a picture must be at least 6 pixels wide");
   const nb::gil_scoped_release release;
-  return mien::photometric_loss(task);
+  const mien::Box inside = compared(box, drawn, width, height);
+  if (inside.left >= inside.right || inside.top >= inside.bottom) {
+    if (gradient) std::memset(gradient->data(), 0, sizeof(float) * gradient->size());
+    *loss.data() = 0;
+    return;
+  }
+  *loss.data() = static_cast<float>(mien::photometric_loss(
+      {image.data(), bytes ? nullptr : static_cast<const float*>(target.data()),
+       bytes ? static_cast<const uint8_t*>(target.data()) : nullptr, width, height, inside,
+       static_cast<float>(weights[0]), static_cast<float>(weights[1]), gradient ? gradient->data() : nullptr}));
 }
 
 }  // namespace
 
 void bind_photometric(nb::module_& module) {
-  module.def("photometric_loss", &photometric_loss<float>, "image"_a.noconvert(), "target"_a.noconvert(), "box"_a,
-             "l1_weight"_a, "ssim_weight"_a, "gradient"_a.noconvert().none());
-  module.def("photometric_loss", &photometric_loss<uint8_t>, "image"_a.noconvert(), "target"_a.noconvert(), "box"_a,
-             "l1_weight"_a, "ssim_weight"_a, "gradient"_a.noconvert().none());
+  module.def("photometric_loss", &photometric_loss, "image"_a, "target"_a, "box"_a, "drawn"_a.none(), "weights"_a,
+             "gradient"_a.none(), "loss"_a,
+             "Fills the loss of a picture, and its gradient, within a box; or within it, what is drawn, and a margin.");
 }

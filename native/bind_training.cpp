@@ -39,11 +39,11 @@ void adam_update(const std::vector<AdamArguments>& arguments) {
   mien::adam_update(tasks.data(), static_cast<int>(tasks.size()));
 }
 
-std::tuple<double, double> triangle_penalties(const Rows3& means, const Rows3& log_scales, const Radii& radii,
-                                              const std::array<float, 2>& thresholds,
-                                              const std::array<float, 2>& weights,
-                                              const Array<float, nb::shape<-1, 3>>& grad_means,
-                                              const Array<float, nb::shape<-1, 3>>& grad_log_scales) {
+void triangle_penalties(const Rows3& means, const Rows3& log_scales, const Radii& radii,
+                        const std::array<float, 2>& thresholds, const std::array<float, 2>& weights,
+                        const Array<float, nb::shape<-1, 3>>& grad_means,
+                        const Array<float, nb::shape<-1, 3>>& grad_log_scales,
+                        const Array<float, nb::shape<>>& position, const Array<float, nb::shape<>>& scale) {
   const size_t n = means.shape(0);
   require(log_scales.shape(0) == n && radii.shape(0) == n && grad_means.shape(0) == n && grad_log_scales.shape(0) == n,
           "one row of every array a Gaussian");
@@ -52,7 +52,8 @@ std::tuple<double, double> triangle_penalties(const Rows3& means, const Rows3& l
       thresholds[1],           weights[1],   grad_means.data(), grad_log_scales.data()};
   const nb::gil_scoped_release release;
   const mien::Penalties sums = mien::triangle_penalties(task);
-  return {sums.position, sums.scale};
+  *position.data() = static_cast<float>(sums.position);
+  *scale.data() = static_cast<float>(sums.scale);
 }
 
 void observe_view(const Array<const float, nb::shape<-1, 2>>& grad_means2d, const Radii& radii,
@@ -87,12 +88,11 @@ void bind_training(nb::module_& module) {
   module.def("adam_update", &adam_update, "tasks"_a,
              "Each task: the addresses of values, gradient, first and second moments and of the number of steps, which "
              "grows by one; count, rate.");
-  module.def("triangle_penalties", &triangle_penalties, "means"_a.noconvert(), "log_scales"_a.noconvert(),
-             "radii"_a.noconvert(), "thresholds"_a, "weights"_a, "grad_means"_a.noconvert(),
-             "grad_log_scales"_a.noconvert(), "The position and scale penalties; fills their gradients.");
-  module.def("observe_view", &observe_view, "grad_means2d"_a.noconvert(), "radii"_a.noconvert(),
-             "opacities"_a.noconvert(), "scale"_a, "pull"_a.noconvert(), "seen"_a.noconvert(), "radius"_a.noconvert(),
-             "opacity"_a.noconvert(), "Adds a step to the statistics of density control.");
+  module.def("triangle_penalties", &triangle_penalties, "means"_a, "log_scales"_a, "radii"_a, "thresholds"_a,
+             "weights"_a, "grad_means"_a, "grad_log_scales"_a, "position"_a, "scale"_a,
+             "Fills the position and the scale penalty, and their gradients.");
+  module.def("observe_view", &observe_view, "grad_means2d"_a, "radii"_a, "opacities"_a, "scale"_a, "pull"_a, "seen"_a,
+             "radius"_a, "opacity"_a, "Adds a step to the statistics of density control.");
   module.def("mean_squared_difference", &mean_squared_difference, "image"_a.noconvert(), "target"_a.noconvert(),
              "Of a picture and one of bytes, where 255 is 1.");
   module.def("box_of_nonzero", &box_of_nonzero, "values"_a.noconvert(), "Left, top, width and height; 0 where all is.");

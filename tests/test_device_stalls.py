@@ -59,4 +59,4 @@ def _rendered(gaussians) -> Rendering:
 
 def _target() -> Target:
     picture = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8, device="meta")
-    return Target(picture, picture[..., 0], (0, 0, WIDTH, HEIGHT))
+    return Target(picture, picture[..., 0], (0, 0, WIDTH, HEIGHT), torch.ones(3, device="meta"))

@@ -9,7 +9,6 @@ from mien.avatar import Moments
 from mien.avatar.penalties import triangle_penalties, triangle_penalties_reference
 from mien.training.adam import Update, update_all, update_reference
 from mien.training.density import observe_reference
-from mien.training.losses import box_of_nonzero
 
 COUNTS = (0, 1, 15, 16, 4097)
 ISAS = ("avx512", "avx2", "sse4")
@@ -85,10 +84,12 @@ def test_observing_a_view_equals_its_reference(isa: str, count: int) -> None:
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130)])
 def test_box_of_nonzero(isa: str, size: tuple[int, int]) -> None:
     values = torch.zeros(size)
-    assert box_of_nonzero(values) == box_of_nonzero(values.double()) == (0, 0, 0, 0)
+    assert _native.box_of_nonzero(values) == (0, 0, 0, 0)
     for pixel in ((size[0] - 1, size[1] // 2), (size[0] // 3, size[1] - 1), (size[0] // 2, size[1] // 3)):
         values[pixel] = 1e-6
-        assert box_of_nonzero(values) == box_of_nonzero(values.double())
+        rows, columns = values.nonzero().T
+        left, top = int(columns.min()), int(rows.min())
+        assert _native.box_of_nonzero(values) == (left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top)
 
 
 @pytest.mark.parametrize("size", [(0, 5), (1, 1), (40, 130)])

@@ -165,7 +165,7 @@ def test_loss_inside_the_box_of_difference_is_that_of_the_whole_picture(
         picture[matte[0], matte[1]], mask[matte[0], matte[1]] = 10, 255
     rendering = Rendering(image, alpha, torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
     left, top, width, height = cv2.boundingRect(mask)
-    target = Target(picture, torch.from_numpy(mask), (left, top, width, height))
+    target = Target(picture, torch.from_numpy(mask), (left, top, width, height), torch.ones(3))
     loss = picture_losses(rendering, target, Photometric(alpha_weight=0.5))
     torch.testing.assert_close(loss["photometric"], photometric_loss(image, picture, 0.8, 0.2))
     expected = 0.5 * ((drawn is not None) * 0.9 + (matte is not None)) / 1600

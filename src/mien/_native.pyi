@@ -97,15 +97,16 @@ def mesh_loss(
     grad_light: Tensor,
 ) -> tuple[float, float]: ...
 
-# native/bind_photometric.cpp; target: float32 or uint8; box: left, top, width, height
+# native/bind_photometric.cpp; target: float32 or uint8; box: left, top, width, height; loss: of no axes
 def photometric_loss(
     image: Tensor,
     target: Tensor,
     box: tuple[int, int, int, int],
-    l1_weight: float,
-    ssim_weight: float,
+    drawn: Tensor | None,
+    weights: tuple[float, float],
     gradient: Tensor | None,
-) -> float: ...
+    loss: Tensor,
+) -> None: ...
 
 # native/bind_rasterize.cpp; radii: int32
 class RasterizeFrame: ...
@@ -148,6 +149,7 @@ def rig_forward(
     quats: Tensor,
     scales: Tensor,
 ) -> None: ...
+
 class RigTopology: ...
 
 def make_rig_topology(vertex_count: int, faces: Tensor, face_index: Tensor) -> RigTopology: ...
@@ -171,8 +173,8 @@ def rig_backward(
 # native/bind_ride.cpp; one timestep. What `ride_backward` takes is what `ride` took, and the gradients
 class Ride: ...
 
-def ride(model: "FaceModelData", topology: RigTopology, *arrays: Any) -> Ride: ...
-def ride_backward(ride: Ride, model: "FaceModelData", topology: RigTopology, *arrays: Any) -> None: ...
+def ride(model: FaceModelData, topology: RigTopology, *arrays: Any) -> Ride: ...
+def ride_backward(ride: Ride, model: FaceModelData, topology: RigTopology, *arrays: Any) -> None: ...
 
 # native/bind_training.cpp; radii, radius: int32
 def adam_update(tasks: Sequence[tuple[int, int, int, int, int, int, float]]) -> None: ...
@@ -184,7 +186,9 @@ def triangle_penalties(
     weights: tuple[float, float],
     grad_means: Tensor,
     grad_log_scales: Tensor,
-) -> tuple[float, float]: ...
+    position: Tensor,
+    scale: Tensor,
+) -> None: ...
 def observe_view(
     grad_means2d: Tensor,
     radii: Tensor,

@@ -1,10 +1,14 @@
 """Penalties on Gaussians that stray from the triangle they ride on (GaussianAvatars, CVPR 2024, section 3.4)."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from mien import _native
+from mien.arrays import unpacked
 
 Pair = tuple[float, float]
 
@@ -52,17 +56,16 @@ class _TrianglePenalties(torch.autograd.Function):
     """Values and gradients come from one native pass; `backward` only scales the gradients."""
 
     @staticmethod
-    def forward(ctx, means: Tensor, log_scales: Tensor, radii: Tensor, thresholds: Pair, weights: Pair):
-        means, log_scales, radii = (tensor.detach().contiguous() for tensor in (means, log_scales, radii))
-        grad_means, grad_log_scales = torch.empty_like(means), torch.empty_like(log_scales)
-        position, scale = _native.triangle_penalties(
-            means, log_scales, radii, thresholds, weights, grad_means, grad_log_scales
-        )
-        ctx.save_for_backward(grad_means, grad_log_scales)
-        return means.new_tensor(position), means.new_tensor(scale)
+    def forward(ctx: Any, means: Tensor, log_scales: Tensor, radii: Tensor, thresholds: Pair, weights: Pair):
+        inputs = unpacked(*(tensor.detach().contiguous() for tensor in (means, log_scales, radii)))
+        gradients, values = (torch.empty_like(means), torch.empty_like(log_scales)), (torch.empty(()), torch.empty(()))
+        _native.triangle_penalties(*inputs, thresholds, weights, *unpacked(*gradients, *values))
+        ctx.save_for_backward(*gradients)
+        return values
 
     @staticmethod
-    def backward(ctx, *output_gradients: Tensor):
+    @once_differentiable
+    def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:
         scaled = [
             gradient if float(factor) == 1 else gradient * factor
             for gradient, factor in zip(ctx.saved_tensors, output_gradients, strict=True)

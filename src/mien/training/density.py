@@ -5,14 +5,20 @@ statistics of one entry per Gaussian, which checkpoints save.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien import _native
+from mien.arrays import unpacked
 from mien.avatar import DensityControl, FixedDensity, GaussianStore, GradientDensity, Posed, Progress, RefillDensity
 from mien.render.rendering import Rendering
+
+Random = Callable[[], torch.Generator]
+"""Makes the generator of a step's random numbers, which few steps need."""
 
 
 class DensityStrategy(ABC):
@@ -23,7 +29,7 @@ class DensityStrategy(ABC):
         """Take statistics after a step's backward pass; `posed` is of one timestep."""
 
     @abstractmethod
-    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
+    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
         """Change the store if it is time to, after the optimiser's step; True if it did."""
 
     @abstractmethod
@@ -62,17 +68,17 @@ class GradientStrategy(DensityStrategy):
         scale, opacities = (width / 2, height / 2), posed.gaussians.opacities.detach().reshape(-1)
         statistics = (self._pull, self._seen, self._radius, self._opacity)
         if gradient.device.type == "cpu":
-            _native.observe_view(gradient, rendering.radii, opacities, scale, *statistics)
+            _native.observe_view(*unpacked(gradient, rendering.radii, opacities), scale, *unpacked(*statistics))
         else:
             observe_reference(gradient, rendering.radii, opacities, scale, *statistics)
 
-    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
+    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
         """Grow and prune in rounds; reset opacities at their times."""
         settings = self._control.settings
         done = progress.step + 1
         changed = done in _round_steps(settings.start, settings.stop, settings.rounds, progress.steps)
         if changed:
-            self._grow_and_prune(store, posed, progress, random)
+            self._grow_and_prune(store, posed, progress, random())
             self._restart(len(store))
         name = self._control.opacity_logits
         if name is not None and done in {max(1, round(time * progress.steps)) for time in settings.opacity_resets}:
@@ -159,7 +165,7 @@ class RefillStrategy(DensityStrategy):
         """Remember each Gaussian's highest opacity."""
         torch.maximum(self._opacity, posed.gaussians.opacities.detach().reshape(-1), out=self._opacity)
 
-    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
+    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
         """Prune and refill at the rounds' times."""
         settings = self._control.settings
         due = [
@@ -177,8 +183,9 @@ class RefillStrategy(DensityStrategy):
         store.select(kept)
         missing = due[-1] - len(store)
         if missing > 0:
-            parents = torch.randint(len(store), (missing,), generator=random)
-            noise = torch.rand(missing, 3, generator=random) - 0.5
+            generator = random()
+            parents = torch.randint(len(store), (missing,), generator=generator)
+            noise = torch.rand(missing, 3, generator=generator) - 0.5
             store.append(parents, self._control.refill(store, parents, noise, progress.fraction))
         self._opacity = torch.zeros(len(store), device=self._opacity.device)
         return True
@@ -198,7 +205,7 @@ class FixedStrategy(DensityStrategy):
     def observe(self, posed: Posed, rendering: Rendering) -> None:
         """Nothing to watch."""
 
-    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> bool:
+    def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
         """Never changes the store."""
         return False
 
@@ -210,7 +217,8 @@ class FixedStrategy(DensityStrategy):
         """Nothing to load."""
 
 
-def _round_steps(start: float, stop: float, rounds: int, steps: int) -> set[int]:
+@lru_cache
+def _round_steps(start: float, stop: float, rounds: int, steps: int) -> frozenset[int]:
     """After how many steps each round happens, evenly from `start` to `stop` (fractions of the run)."""
     gaps = max(rounds - 1, 1)
-    return {max(1, round((start + (stop - start) * index / gaps) * steps)) for index in range(rounds)}
+    return frozenset(max(1, round((start + (stop - start) * index / gaps) * steps)) for index in range(rounds))

@@ -1,12 +1,15 @@
 """The photometric loss of Gaussian splatting: L1 and SSIM (Wang et al. 2004; Kerbl et al. 2023, section 5)."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from mien import _native
-from mien.arrays import recycled
+from mien.arrays import recycled, unpacked
 
 WINDOW_RADIUS = 5
 """Pixels: the SSIM window is 11x11."""
@@ -24,23 +27,21 @@ def photometric_loss(
     l1_weight: float = 0.8,
     ssim_weight: float = 0.2,
     box: Box | None = None,
+    drawn: Float[Tensor, "h w"] | None = None,
 ) -> Float[Tensor, ""]:
     """`l1_weight` * mean |image - target| + `ssim_weight` * (1 - mean SSIM), fused and native on a CPU.
 
     Differentiable in `image`. A uint8 `target` counts as 0..255. With a `box`, pixels outside count as equal in both
     pictures (the windows of pixels inside still see them), and the means stay over the whole picture: the same value
     and gradient in a fraction of the time where the pictures are equal beyond 5 pixels inside the box's edges.
+    With `drawn`, pictures are equal where it is 0 and the box does not reach: the native loss looks no further.
     """
     assert image.shape == target.shape, (image.shape, target.shape)
     assert not target.requires_grad
-    box = _clipped(box, image)
-    large_enough = image.shape[1] >= _NATIVE_MIN_WIDTH and 0 not in box[2:]
     native_types = image.dtype == torch.float32 and target.dtype in (torch.float32, torch.uint8)
-    if not large_enough or not native_types or image.device.type != "cpu":
-        return photometric_loss_reference(image, target, l1_weight, ssim_weight, box)
-    if not (image.requires_grad and torch.is_grad_enabled()):
-        return image.new_tensor(_native_loss(image, target, box, (l1_weight, ssim_weight), None))
-    return _PhotometricLoss.apply(image, target, box, (l1_weight, ssim_weight))
+    if not native_types or image.device.type != "cpu" or image.shape[1] < _NATIVE_MIN_WIDTH:
+        return photometric_loss_reference(image, target, l1_weight, ssim_weight, box if drawn is None else None)
+    return _PhotometricLoss.apply(image, target, _clipped(box, image), drawn, (l1_weight, ssim_weight))
 
 
 def photometric_loss_reference(
@@ -78,22 +79,22 @@ class _PhotometricLoss(torch.autograd.Function):
     """Value and gradient come from one native pass; `backward` only scales the gradient."""
 
     @staticmethod
-    def forward(ctx, image: Tensor, target: Tensor, box: Box, weights: tuple[float, float]) -> Tensor:
-        gradient = recycled(*image.shape)
-        loss = _native_loss(image, target, box, weights, gradient)
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, box: Box, drawn: Tensor | None, weights: tuple[float, float]
+    ) -> Tensor:
+        gradient = recycled(*image.shape) if ctx.needs_input_grad[0] else None
+        drawn = None if drawn is None else drawn.detach().contiguous()
+        loss = torch.empty(())
+        pictures = unpacked(image.detach().contiguous(), target.contiguous(), drawn, gradient, loss)
+        _native.photometric_loss(*pictures[:2], box, pictures[2], weights, *pictures[3:])
         ctx.save_for_backward(gradient)
-        return image.new_tensor(loss)
+        return loss
 
     @staticmethod
-    def backward(ctx, grad_loss: Tensor):
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        return gradient if float(grad_loss) == 1 else gradient * grad_loss, None, None, None
-
-
-def _native_loss(
-    image: Tensor, target: Tensor, box: Box, weights: tuple[float, float], gradient: Tensor | None
-) -> float:
-    return _native.photometric_loss(image.detach().contiguous(), target.contiguous(), box, *weights, gradient)
+        return gradient if float(grad_loss) == 1 else gradient * grad_loss, None, None, None, None
 
 
 def _blur(images: Float[Tensor, "s h w c"]) -> Float[Tensor, "s h w c"]:
@@ -111,6 +112,6 @@ def _clipped(box: Box | None, image: Tensor) -> Box:
     height, width = image.shape[:2]
     if box is None:
         return 0, 0, width, height
-    left, top = max(box[0], 0), max(box[1], 0)
+    left, top = min(max(box[0], 0), width), min(max(box[1], 0), height)
     right, bottom = min(box[0] + box[2], width), min(box[1] + box[3], height)
     return left, top, max(right - left, 0), max(bottom - top, 0)

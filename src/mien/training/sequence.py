@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from mien.camera import Camera
@@ -62,6 +62,8 @@ class Target:
     """Opacity of what counts."""
     box: Box
     """Left, top, width and height, pixels, outside of which there is only background."""
+    background: Float[Tensor, " 3"]
+    """Its colour, 0..1."""
 
 
 class Targets:
@@ -99,7 +101,8 @@ class Targets:
         picture = np.empty_like(image)
         picture[:] = background
         picture[inside] = composite(image[inside], matte[inside], background)
-        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), (left, top, width, height))
+        colour = torch.from_numpy(background) / 255
+        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), (left, top, width, height), colour)
         if keep and len(self._kept) < self._room:
             self._kept[key] = target
         return target

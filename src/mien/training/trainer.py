@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Items
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -118,16 +118,15 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
 
     face = state.track.face(frame.track_index)
     posed = avatar.pose(face, progress)
-    colour = torch.from_numpy(background) / 255
-    rendering = rasterize(posed.gaussians.timestep(0), targets.camera(frame.camera), background=colour)
+    rendering = rasterize(posed.gaussians.timestep(0), targets.camera(frame.camera), target.background)
     losses = picture_losses(rendering, target, weights) | avatar.regularizers(posed, rendering, progress)
-    loss = reduce(torch.add, losses.values())
-    loss.backward()
+    torch.autograd.backward(list(losses.values()))
 
     groups = [*avatar.parameter_groups(), *state.track.parameter_groups(face, frame.track_index)]
     state.density.observe(posed, rendering)
     state.adam.step(groups, progress)
-    state.density.control(avatar.gaussian_store(), posed, progress, density_random(settings, state.step))
+    random = partial(density_random, settings, state.step)
+    state.density.control(avatar.gaussian_store(), posed, progress, random)
 
     state.step += 1
     elapsed = time.perf_counter() - began
@@ -135,7 +134,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     if state.step % settings.record_every != 0 and state.step != settings.steps:
         return ""
     entry = {name: float(value.detach()) for name, value in losses.items()}
-    entry |= {"step": state.step, "loss": float(loss.detach()), "psnr": train_psnr(rendering, target)}
+    entry |= {"step": state.step, "loss": sum(entry.values()), "psnr": train_psnr(rendering, target)}
     entry |= {"gaussians": len(avatar.gaussian_store()), "step_ms": elapsed * 1000}
     for name, value in entry.items():
         state.curves.setdefault(name, []).append(value)
