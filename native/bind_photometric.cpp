@@ -39,9 +39,9 @@ mien::Box compared(const std::array<int, 4>& box, const std::optional<In<-1, -1>
           std::min(all.bottom + kMargin, height)};
 }
 
-void photometric_loss(const Picture<const float>& image, const nb::ndarray<nb::c_contig, nb::device::cpu>& target,
-                      const std::array<int, 4>& box, const std::optional<In<-1, -1>>& drawn,
-                      const std::array<double, 2>& weights, const std::optional<Picture<float>>& gradient,
+void photometric_loss(const std::array<int, 4>& box, const std::array<double, 2>& weights,
+                      const Picture<const float>& image, const nb::ndarray<nb::c_contig, nb::device::cpu>& target,
+                      const std::optional<In<-1, -1>>& drawn, const std::optional<Picture<float>>& gradient,
                       const Array<float, nb::shape<>>& loss) {
   const int height = static_cast<int>(image.shape(0)), width = static_cast<int>(image.shape(1));
   const bool bytes = target.dtype() == nb::dtype<uint8_t>();
@@ -66,7 +66,7 @@ void photometric_loss(const Picture<const float>& image, const nb::ndarray<nb::c
 }  // namespace
 
 void bind_photometric(nb::module_& module) {
-  module.def("photometric_loss", &photometric_loss, "image"_a, "target"_a, "box"_a, "drawn"_a.none(), "weights"_a,
+  module.def("photometric_loss", &photometric_loss, "box"_a, "weights"_a, "image"_a, "target"_a, "drawn"_a.none(),
              "gradient"_a.none(), "loss"_a,
              "Fills the loss of a picture, and its gradient, within a box; or within it, what is drawn, and a margin.");
 }

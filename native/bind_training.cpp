@@ -39,9 +39,8 @@ void adam_update(const std::vector<AdamArguments>& arguments) {
   mien::adam_update(tasks.data(), static_cast<int>(tasks.size()));
 }
 
-void triangle_penalties(const Rows3& means, const Rows3& log_scales, const Radii& radii,
-                        const std::array<float, 2>& thresholds, const std::array<float, 2>& weights,
-                        const Array<float, nb::shape<-1, 3>>& grad_means,
+void triangle_penalties(const std::array<float, 2>& thresholds, const std::array<float, 2>& weights, const Rows3& means,
+                        const Rows3& log_scales, const Radii& radii, const Array<float, nb::shape<-1, 3>>& grad_means,
                         const Array<float, nb::shape<-1, 3>>& grad_log_scales,
                         const Array<float, nb::shape<>>& position, const Array<float, nb::shape<>>& scale) {
   const size_t n = means.shape(0);
@@ -56,10 +55,9 @@ void triangle_penalties(const Rows3& means, const Rows3& log_scales, const Radii
   *scale.data() = static_cast<float>(sums.scale);
 }
 
-void observe_view(const Array<const float, nb::shape<-1, 2>>& grad_means2d, const Radii& radii,
-                  const Array<const float, nb::ndim<1>>& opacities, const std::array<float, 2>& scale,
-                  const Floats& pull, const Floats& seen, const Array<int32_t, nb::ndim<1>>& radius,
-                  const Floats& opacity) {
+void observe_view(const std::array<float, 2>& scale, const Array<const float, nb::shape<-1, 2>>& grad_means2d,
+                  const Radii& radii, const Array<const float, nb::ndim<1>>& opacities, const Floats& pull,
+                  const Floats& seen, const Array<int32_t, nb::ndim<1>>& radius, const Floats& opacity) {
   const size_t n = radii.shape(0);
   require(grad_means2d.shape(0) == n && opacities.shape(0) == n && pull.shape(0) == n && seen.shape(0) == n &&
               radius.shape(0) == n && opacity.shape(0) == n,
@@ -88,10 +86,10 @@ void bind_training(nb::module_& module) {
   module.def("adam_update", &adam_update, "tasks"_a,
              "Each task: the addresses of values, gradient, first and second moments and of the number of steps, which "
              "grows by one; count, rate.");
-  module.def("triangle_penalties", &triangle_penalties, "means"_a, "log_scales"_a, "radii"_a, "thresholds"_a,
-             "weights"_a, "grad_means"_a, "grad_log_scales"_a, "position"_a, "scale"_a,
+  module.def("triangle_penalties", &triangle_penalties, "thresholds"_a, "weights"_a, "means"_a, "log_scales"_a,
+             "radii"_a, "grad_means"_a, "grad_log_scales"_a, "position"_a, "scale"_a,
              "Fills the position and the scale penalty, and their gradients.");
-  module.def("observe_view", &observe_view, "grad_means2d"_a, "radii"_a, "opacities"_a, "scale"_a, "pull"_a, "seen"_a,
+  module.def("observe_view", &observe_view, "scale"_a, "grad_means2d"_a, "radii"_a, "opacities"_a, "pull"_a, "seen"_a,
              "radius"_a, "opacity"_a, "Adds a step to the statistics of density control.");
   module.def("mean_squared_difference", &mean_squared_difference, "image"_a.noconvert(), "target"_a.noconvert(),
              "Of a picture and one of bytes, where 255 is 1.");

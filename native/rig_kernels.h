@@ -16,7 +16,8 @@ struct RigKernels {
   // Triangles, then Gaussians, first .. last - 1.
   void (*frames)(const RigArrays&, int64_t first, int64_t last, TriangleFrame*);
   void (*to_world)(const RigArrays&, int64_t first, int64_t last, const TriangleFrame*, const RigWorld&);
-  // Writes or adds to (RigGradients::add) the gradients of the Gaussians' own parameters; writes one FrameGradient a Gaussian.
+  // Writes or adds to (RigGradients::add) the gradients of the Gaussians' own parameters; writes one FrameGradient a
+  // Gaussian.
   void (*to_local)(const RigArrays&, int64_t first, int64_t last, const TriangleFrame*, const float* scales,
                    const RigGradients&, FrameGradient*);
 };

@@ -75,7 +75,7 @@ def test_observing_a_view_equals_its_reference(isa: str, count: int) -> None:
         return floats[0], floats[1], torch.ones(count, dtype=torch.int32), floats[2]
 
     ours, theirs = statistics(), statistics()
-    _native.observe_view(*arguments, *ours)
+    _native.observe_view(arguments[3], *arguments[:3], *ours)
     observe_reference(*arguments, *theirs)
     for one, other in zip(ours, theirs, strict=True):
         torch.testing.assert_close(one, other)

@@ -97,16 +97,9 @@ def mesh_loss(
     grad_light: Tensor,
 ) -> tuple[float, float]: ...
 
-# native/bind_photometric.cpp; target: float32 or uint8; box: left, top, width, height; loss: of no axes
-def photometric_loss(
-    image: Tensor,
-    target: Tensor,
-    box: tuple[int, int, int, int],
-    drawn: Tensor | None,
-    weights: tuple[float, float],
-    gradient: Tensor | None,
-    loss: Tensor,
-) -> None: ...
+# native/bind_photometric.cpp; box: left, top, width, height; pictures: image, target (float32 or uint8), what is drawn
+# or None, gradient or None, loss (of no axes)
+def photometric_loss(box: tuple[int, int, int, int], weights: tuple[float, float], *pictures: Any) -> None: ...
 
 # native/bind_rasterize.cpp; radii: int32
 class RasterizeFrame: ...
@@ -176,29 +169,12 @@ class Ride: ...
 def ride(model: FaceModelData, topology: RigTopology, *arrays: Any) -> Ride: ...
 def ride_backward(ride: Ride, model: FaceModelData, topology: RigTopology, *arrays: Any) -> None: ...
 
-# native/bind_training.cpp; radii, radius: int32
+# native/bind_training.cpp; radii, radius: int32; the penalties' arrays: means, log_scales, radii, grad_means,
+# grad_log_scales, position, scale (the last two of no axes); a view's arrays: grad_means2d, radii,
+# opacities, then the statistics pull, seen, radius, opacity
 def adam_update(tasks: Sequence[tuple[int, int, int, int, int, int, float]]) -> None: ...
-def triangle_penalties(
-    means: Tensor,
-    log_scales: Tensor,
-    radii: Tensor,
-    thresholds: tuple[float, float],
-    weights: tuple[float, float],
-    grad_means: Tensor,
-    grad_log_scales: Tensor,
-    position: Tensor,
-    scale: Tensor,
-) -> None: ...
-def observe_view(
-    grad_means2d: Tensor,
-    radii: Tensor,
-    opacities: Tensor,
-    scale: tuple[float, float],
-    pull: Tensor,
-    seen: Tensor,
-    radius: Tensor,
-    opacity: Tensor,
-) -> None: ...
+def triangle_penalties(thresholds: tuple[float, float], weights: tuple[float, float], *arrays: Any) -> None: ...
+def observe_view(scale: tuple[float, float], *arrays: Any) -> None: ...
 def mean_squared_difference(image: Tensor, target: Tensor) -> float: ...
 def box_of_nonzero(values: Tensor) -> tuple[int, int, int, int]: ...
 

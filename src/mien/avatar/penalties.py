@@ -59,7 +59,7 @@ class _TrianglePenalties(torch.autograd.Function):
     def forward(ctx: Any, means: Tensor, log_scales: Tensor, radii: Tensor, thresholds: Pair, weights: Pair):
         inputs = unpacked(*(tensor.detach().contiguous() for tensor in (means, log_scales, radii)))
         gradients, values = (torch.empty_like(means), torch.empty_like(log_scales)), (torch.empty(()), torch.empty(()))
-        _native.triangle_penalties(*inputs, thresholds, weights, *unpacked(*gradients, *values))
+        _native.triangle_penalties(thresholds, weights, *inputs, *unpacked(*gradients, *values))
         ctx.save_for_backward(*gradients)
         return values
 

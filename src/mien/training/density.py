@@ -68,7 +68,8 @@ class GradientStrategy(DensityStrategy):
         scale, opacities = (width / 2, height / 2), posed.gaussians.opacities.detach().reshape(-1)
         statistics = (self._pull, self._seen, self._radius, self._opacity)
         if gradient.device.type == "cpu":
-            _native.observe_view(*unpacked(gradient, rendering.radii, opacities), scale, *unpacked(*statistics))
+            arrays = unpacked(gradient, rendering.radii, opacities, *statistics)
+            _native.observe_view(scale, *arrays)
         else:
             observe_reference(gradient, rendering.radii, opacities, scale, *statistics)
 

@@ -86,7 +86,7 @@ class _PhotometricLoss(torch.autograd.Function):
         drawn = None if drawn is None else drawn.detach().contiguous()
         loss = torch.empty(())
         pictures = unpacked(image.detach().contiguous(), target.contiguous(), drawn, gradient, loss)
-        _native.photometric_loss(*pictures[:2], box, pictures[2], weights, *pictures[3:])
+        _native.photometric_loss(box, weights, *pictures)
         ctx.save_for_backward(gradient)
         return loss
 
