@@ -155,6 +155,15 @@ MIEN_INLINE F reciprocal(F a) {
   return estimate * (2.0f - a * estimate);
 }
 
+// sum + a * b where `mask` is set, else sum.
+MIEN_INLINE F add_where(M mask, F a, F b, F sum) {
+#if defined(__AVX512F__)
+  return _mm512_mask3_fmadd_ps(a, b, sum, mask);
+#else
+  return sum + keep(mask, a) * b;
+#endif
+}
+
 // 2^a to 2e-7 (relative) for -100 < a < 100, anything beyond. Adding 1.5 * 2^23 leaves round(a) in the low bits of the
 // sum; the polynomial is the minimax one for 2^f on -0.5..0.5, and the integer part goes straight into the exponent.
 MIEN_INLINE F exp2_fast(F a) {
@@ -169,25 +178,25 @@ MIEN_INLINE F exp2_fast(F a) {
   return from_bits(bits(power) + (bits(shifted) << 23));
 }
 
-// 2^a for what is seen of a splat: -8 < a <= 0, anything beyond; to 4e-7 (relative) with AVX-512, 4e-6 with AVX2. A
-// vector register holds the powers of 2 in steps of 1/16 (1/8), less the index where their exponent will be added, so
-// that a parabola does for the rest.
+// 2^a for what is seen of a splat: -8 < a <= 0, anything beyond; to 6e-7 (relative) with AVX-512, 4e-6 with AVX2. A
+// vector register holds the powers of 2 in steps of 1/16 (1/8), so that a parabola does for the rest: K ((f + c)^2 +
+// e), with K already in the powers. Theirs is less the index where the exponent will be added.
 #if defined(__AVX512F__) || defined(__AVX2__)
 alignas(64) constexpr int32_t kPowers[W] = {
 #if defined(__AVX512F__)
-    0x3f800000, 0x3f7daac3, 0x3f7b95c2, 0x3f79c3d3, 0x3f7837f0, 0x3f76f532, 0x3f75fed7, 0x3f75583f,
-    0x3f7504f3, 0x3f7508a4, 0x3f75672a, 0x3f76248c, 0x3f7744fd, 0x3f78ccdf, 0x3f7ac0c7, 0x3f7d257d};
+    0x3e75fc17, 0x3e78700d, 0x3e761fc7, 0x3e740ff3, 0x3e72436e, 0x3e70bd31, 0x3e6f8059, 0x3e6e9027,
+    0x3e6deffe, 0x3e6da36a, 0x3e6dae1f, 0x3e6e13f9, 0x3e6ed901, 0x3e70016f, 0x3e7191a9, 0x3e738e48};
 constexpr int kPowerBits = 4;
-constexpr float kPower1 = 6.9318783e-1f, kPower2 = 2.4021946e-1f;
+constexpr float kParabolaShift = 1.442822f, kParabolaRise = 2.0811248f;  // c, e; K = 0.24021946
 #else
-    0x3f800000, 0x3f7b95c2, 0x3f7837f0, 0x3f75fed7, 0x3f7504f3, 0x3f75672a, 0x3f7744fd, 0x3f7ac0c7};
+    0x3e75f68d, 0x3e761cc1, 0x3e724023, 0x3e6f7cc2, 0x3e6dec13, 0x3e6da9d9, 0x3e6ed459, 0x3e718c95};
 constexpr int kPowerBits = 3;
-constexpr float kPower1 = 6.9330976e-1f, kPower2 = 2.4019833e-1f;
+constexpr float kParabolaShift = 1.4432027f, kParabolaRise = 2.0803926f;  // K = 0.24019833
 #endif
 
 MIEN_INLINE F exp2_alpha(F a) {
   const float magic = 12582912.0f / (1 << kPowerBits);  // the sum's low bits are round(a * 2^kPowerBits)
-  const F shifted = a + magic, f = a - (shifted - magic);
+  const F shifted = a + magic, f = (a - (shifted - magic)) + kParabolaShift;
   I powers;
   memcpy(&powers, kPowers, sizeof powers);
 #if defined(__AVX512F__)
@@ -195,8 +204,7 @@ MIEN_INLINE F exp2_alpha(F a) {
 #else
   const I power = (I)_mm256_permutevar8x32_epi32((__m256i)powers, (__m256i)bits(shifted));
 #endif
-  const F scale = from_bits(power + (bits(shifted) << (23 - kPowerBits)));
-  return scale + scale * (f * (f * kPower2 + kPower1));
+  return from_bits(power + (bits(shifted) << (23 - kPowerBits))) * (f * f + kParabolaRise);
 }
 #else
 MIEN_INLINE F exp2_alpha(F a) { return exp2_fast(a); }
