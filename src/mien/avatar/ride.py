@@ -66,11 +66,13 @@ class _Ride(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        saved = [tensor.detach() for tensor in ctx.saved_tensors]
+        *saved, scales, opacities = ctx.saved_tensors
         moves_face = any(ctx.needs_input_grad[5:9])
         of_face = [torch.empty_like(tensor) if moves_face else None for tensor in saved[2:6]]
-        of_gaussians = [torch.empty_like(tensor) for tensor in saved[6:10]]
-        known = unpacked(*saved, *(gradient.contiguous() for gradient in gradients))
+        of_gaussians = [torch.empty_like(tensor) for tensor in saved[6:]]
+        known = unpacked(
+            *saved, scales.detach(), opacities.detach(), *(gradient.contiguous() for gradient in gradients)
+        )
         if not ctx.in_head:
             known.append(None)
         results = unpacked(*of_gaussians, *of_face)

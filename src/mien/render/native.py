@@ -60,9 +60,10 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, sizes: list[tuple[int, int]], *inputs: Tensor) -> tuple[Tensor, ...]:
-        outputs, tasks = [], []
+        outputs, tasks, kept = [], [], []
         for index, size in enumerate(sizes):
             own = [tensor.detach() for tensor in inputs[_INPUTS * index + 1 : _INPUTS * (index + 1)]]
+            kept += own[:5]
             count = len(own[0])
             view = (recycled(*size, 3), recycled(*size), torch.empty(count, dtype=torch.int32))
             tasks.append(tuple(unpacked(*own, *view)))
@@ -72,24 +73,24 @@ class _Rasterize(torch.autograd.Function):
             raise _NotFiniteError(ctx.frames.index(None))
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*outputs[2::3])
-        ctx.save_for_backward(*inputs, *(output for output in outputs if output.is_floating_point()))
+        ctx.save_for_backward(*kept, *(output for output in outputs if output.is_floating_point()))
         return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        inputs, pictures = saved[: _INPUTS * len(ctx.frames)], saved[_INPUTS * len(ctx.frames) :]
+        pictures = [tensor.detach() for tensor in saved[5 * len(ctx.frames) :]]
         views, tasks = [], []
         for index, frame in enumerate(ctx.frames):
-            own = [tensor.detach() for tensor in inputs[_INPUTS * index + 1 : _INPUTS * index + 6]]
+            own = saved[5 * index : 5 * index + 5]
             image, alpha = pictures[2 * index : 2 * index + 2]
             grad_image, grad_alpha, _ = gradients[3 * index : 3 * index + 3]
             grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
             grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
             found = [torch.empty_like(t) for t in own]
             found += [torch.empty(len(own[0]), 2), torch.empty(4, 4), torch.empty(3, 3)]
-            known = (*own, image.detach(), alpha.detach(), grad_image)
+            known = (*own, image, alpha, grad_image)
             tasks.append((frame, *unpacked(*known, grad_alpha, *found)))
             views.append((grad_image, alpha, *found))
         _native.rasterize_views_backward(tasks)
