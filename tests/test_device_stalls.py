@@ -7,17 +7,23 @@ import pytest
 import torch
 from torch import Tensor
 
-from mien.avatar import GaussianAvatarsConfig, Photometric, Progress, method_named
+from mien.avatar import (
+    GaussianAvatarsConfig,
+    HeadGasConfig,
+    MethodConfig,
+    MonoGaussianAvatarConfig,
+    Photometric,
+)
 from mien.avatar.store import Moments
-from mien.face import load_face_model
+from mien.camera import Camera
+from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
-from mien.training.adam import Adam
-from mien.training.density import density_strategy
-from mien.training.losses import picture_losses
-from mien.training.sequence import Target
+from mien.training import TrainSettings, trainer
+from mien.training.frames import FrameOrder, training_frames
+from mien.training.sequence import Targets
+from toy_scene import toy_sequence
 
 META = torch.zeros((), device="meta")
-HEIGHT, WIDTH = 24, 32
 
 
 def test_meta_tensors_show_who_asks_for_a_number() -> None:
@@ -26,37 +32,43 @@ def test_meta_tensors_show_who_asks_for_a_number() -> None:
             ask(META + 1)
 
 
-@pytest.mark.parametrize("sh_degree", [0, 3])
-def test_a_step_of_gaussian_avatars_asks_for_no_number(sh_degree: int) -> None:
-    face_model = load_face_model().to(META)
-    face = load_face_model().neutral(1).to(META)
-    config = GaussianAvatarsConfig(sh_degree=sh_degree)
-    avatar = method_named("gaussian_avatars").avatar(config, face_model, face)
-    density, adam, progress = density_strategy(avatar.density(), avatar.gaussian_store()), Adam(), Progress(3, 10, 0)
-    for _ in range(2):
-        posed = avatar.pose(face, progress)
-        rendering = _rendered(posed.gaussians.timestep(0))
-        losses = picture_losses(rendering, _target(), Photometric(alpha_weight=0.1))
-        losses |= avatar.regularizers(posed, rendering, progress)
-        torch.stack(list(losses.values())).sum().backward()
-        density.observe(posed, rendering)
-        adam.step(avatar.parameter_groups(), progress)
+CONFIGS = {
+    "gaussian_avatars": GaussianAvatarsConfig(photometric=Photometric(alpha_weight=0.1)),
+    "gaussian_avatars_sh3": GaussianAvatarsConfig(sh_degree=3, sh_frame="world"),
+    "headgas": HeadGasConfig(),
+    "mono_gaussian_avatar": MonoGaussianAvatarConfig(points=200),
+}
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
+def test_a_step_of_training_asks_for_no_number(config: MethodConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The trainer's own step: what it does in every step, in a run whose pictures are composited each time."""
+    monkeypatch.setattr(trainer, "rasterize", _rendered)
+    face_model, sequence = toy_sequence(timesteps=3, size=32)
+    settings = TrainSettings(steps=1_000_000, split="none", background="random", record_every=1_000_000)
+    state = trainer.start([sequence], face_model, config, settings, META)
+    order = FrameOrder(training_frames([sequence], settings), settings.seed)
+    data = trainer.TrainingData(order, (Targets(sequence, 0, like=META),))
+    for _ in range(3):
+        trainer.step(state, data, settings)
+    store = state.avatar.gaussian_store()
+    assert all(store[name].device.type == "meta" for name in store.names())
+    updated = {**store.moments, **state.adam.state()}
+    assert updated
+    assert all(float(moments.step) == 3 and moments.first.device.type == "meta" for moments in updated.values())
 
 
 def test_steps_are_counted_on_the_host() -> None:
     assert Moments.zeros(META).step.device.type == "cpu"
 
 
-def _rendered(gaussians) -> Rendering:
+def _rendered(gaussians: Gaussians, camera: Camera, background: Tensor) -> Rendering:
     """What a rasterizer would return, with the same dependences."""
     count = len(gaussians)
     offset = torch.zeros(count, 2, device="meta", requires_grad=True)
-    parts = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, offset)
+    parts = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, offset]
+    parts += [camera.K, camera.viewmat, background]
+    parts += [] if gaussians.T_world_local is None else [gaussians.T_world_local]
     value = torch.stack([part.sum() for part in parts]).sum()
-    image = value + torch.zeros(HEIGHT, WIDTH, 3, device="meta")
+    image = value + torch.zeros(camera.height, camera.width, 3, device="meta")
     return Rendering(image, image[..., 0], torch.ones(count, dtype=torch.int32, device="meta"), offset)
-
-
-def _target() -> Target:
-    picture = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8, device="meta")
-    return Target(picture, picture[..., 0], (0, 0, WIDTH, HEIGHT), torch.ones(3, device="meta"))

@@ -177,6 +177,17 @@ class Avatar(nn.Module, ABC):
         """What runs without this class: for files, the web, engines."""
 
 
+def move_avatar(avatar: Avatar, like: Tensor) -> None:
+    """Give an avatar, in place, the float dtype and the device of `like`, with its face model and its subject.
+
+    To be done before training: the optimiser's state in the store stays where it is.
+    """
+    if avatar.face_model.template.dtype == like.dtype and avatar.face_model.template.device == like.device:
+        return
+    avatar.to(like)
+    avatar.face_model, avatar.subject = avatar.face_model.to(like), avatar.subject.to(like)
+
+
 def neutral_of(face: FaceParams) -> FaceParams:
     """The person of `face` at rest, as one timestep: an estimate that a few bad frames do not move.
 

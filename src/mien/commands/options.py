@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from mien.devices import DeviceName, check_device
 from mien.errors import UserError
 from mien.training import PRESETS, Split, TrainSettings
 from mien.workspace import open_workspace
@@ -37,6 +38,9 @@ class TrainOptions:
     """Whole sequences that are not trained on, only scored."""
     hold_out_cameras: tuple[str, ...] = ()
     """Ids of cameras that are not trained on, only scored (captures with several cameras)."""
+    device: DeviceName = "cpu"
+    """Where training runs. cpu: the same bytes every time; cuda: an NVIDIA GPU, through gsplat (`pip install
+    'mien[cuda]'`); auto: a GPU where there is one. A run may be resumed on the other."""
     face_tuning: bool = True
     """Whether training also corrects the tracking of the frames it sees (held-out frames get what lies beside them)."""
 
@@ -44,8 +48,9 @@ class TrainOptions:
         """The preset with these changes.
 
         Raises:
-            UserError: the number of steps is negative.
+            UserError: the number of steps is negative; CUDA is asked for without gsplat.
         """
+        check_device(self.device)
         if self.steps < 0:
             raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's")
         preset = PRESETS[self.preset]
@@ -55,6 +60,7 @@ class TrainOptions:
             background=self.background,
             seed=self.seed,
             steps=self.steps or preset.steps,
+            device=self.device,
             held_out_sequences=tuple(sorted(set(self.hold_out))),
             held_out_cameras=tuple(sorted(set(self.hold_out_cameras))),
         )

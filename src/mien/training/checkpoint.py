@@ -88,14 +88,20 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
         return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
     overwrite(state.avatar, part("avatar."), int(tensors["gaussians"]), path)
-    state.avatar.gaussian_store().moments.update(_moments(part("store.")))
-    state.adam.load_state(_moments(part("adam.")))
+    store = state.avatar.gaussian_store()
+    like = store[store.names()[0]]
+    store.moments.update(_moments(part("store."), like))
+    state.adam.load_state(_moments(part("adam."), like))
     state.density.load_state(part("density."))
     state.track.load_state(part("track."))
     state.curves = {name: curve.tolist() for name, curve in part("curves.").items()}
     state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
 
 
-def _moments(tensors: dict[str, Tensor]) -> dict[str, Moments]:
-    names = dict.fromkeys(key.rpartition(":")[0] for key in tensors)
-    return {name: Moments(*(tensors[f"{name}:{field}"] for field in ("first", "second", "step"))) for name in names}
+def _moments(tensors: dict[str, Tensor], like: Tensor) -> dict[str, Moments]:
+    """On the device of `like`, but for the numbers of steps."""
+    moments = {}
+    for name in dict.fromkeys(key.rpartition(":")[0] for key in tensors):
+        first, second = (tensors[f"{name}:{field}"].to(like.device) for field in ("first", "second"))
+        moments[name] = Moments(first, second, tensors[f"{name}:step"])
+    return moments

@@ -67,7 +67,7 @@ class GradientStrategy(DensityStrategy):
         # Pixels to normalised device coordinates, which span -1..1: the unit that thresholds are given in.
         scale, opacities = (width / 2, height / 2), posed.gaussians.opacities.detach().reshape(-1)
         statistics = (self._pull, self._seen, self._radius, self._opacity)
-        if gradient.device.type == "cpu":
+        if gradient.device.type == "cpu" and gradient.dtype == torch.float32:
             arrays = unpacked(gradient, rendering.radii, opacities, *statistics)
             _native.observe_view(scale, *arrays)
         else:
@@ -94,7 +94,7 @@ class GradientStrategy(DensityStrategy):
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Go on from what `state` returned."""
         self._pull, self._seen, self._radius, self._opacity = (
-            state[name].clone() for name in ("pull", "seen", "radius", "opacity")
+            state[name].to(self._device, copy=True) for name in ("pull", "seen", "radius", "opacity")
         )
 
     def _restart(self, gaussians: int) -> None:
@@ -113,9 +113,9 @@ class GradientStrategy(DensityStrategy):
         store.append(parents)
         # Both children of a split replace their parent.
         parents = split.nonzero()[:, 0].repeat(2)
-        noise = torch.randn(len(parents), 3, generator=random)
+        noise = torch.randn(len(parents), 3, generator=random).to(sizes)
         store.append(parents, self._control.split(store, parents, noise))
-        kept = torch.ones(len(store), dtype=torch.bool)
+        kept = torch.ones(len(store), dtype=torch.bool, device=prune.device)
         kept[: len(prune)] = ~(prune | split)
         store.select(kept)
 
@@ -186,7 +186,8 @@ class RefillStrategy(DensityStrategy):
         if missing > 0:
             generator = random()
             parents = torch.randint(len(store), (missing,), generator=generator)
-            noise = torch.rand(missing, 3, generator=generator) - 0.5
+            noise = torch.rand(missing, 3, generator=generator).to(self._opacity) - 0.5
+            parents = parents.to(noise.device)
             store.append(parents, self._control.refill(store, parents, noise, progress.fraction))
         self._opacity = torch.zeros(len(store), device=self._opacity.device)
         return True
@@ -197,7 +198,7 @@ class RefillStrategy(DensityStrategy):
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Go on from what `state` returned."""
-        self._opacity = state["opacity"].clone()
+        self._opacity = state["opacity"].to(self._opacity, copy=True)
 
 
 class FixedStrategy(DensityStrategy):

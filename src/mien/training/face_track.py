@@ -32,8 +32,9 @@ class FaceTrack:
         self._fields = {name: getattr(self._start, name).clone() for name in _FIELDS}
         names = _FIELDS if tuning.enabled else ()
         self._moments = {name: Moments.zeros(self._fields[name]) for name in names}
-        for name, moments in self._moments.items():
-            moments.step = self._fields[name].new_zeros(len(face))
+        for moments in self._moments.values():
+            # On the CPU, wherever the rest is: what is worked out of it are numbers of the host.
+            moments.step = torch.zeros(len(face))
 
     def face(self, index: int) -> FaceParams:
         """One timestep; where tuning is on, its tensors are leaves that share memory with the track."""
@@ -92,7 +93,7 @@ def spread_corrections(tuned: Tensor, tracked: Tensor, seen: Tensor) -> None:
     if not bool(seen.any()) or bool(seen.all()) or tuned.numel() == 0:
         return
     known, unseen = seen.nonzero()[:, 0].numpy(), (~seen).nonzero()[:, 0].numpy()
-    corrections = (tuned - tracked).flatten(1).double().numpy()
+    corrections = (tuned - tracked).flatten(1).double().cpu().numpy()
     columns = [np.interp(unseen, known, column[known]) for column in corrections.T]
     spread = torch.from_numpy(np.stack(columns, axis=1)).to(tuned).reshape(-1, *tuned.shape[1:])
     tuned[torch.from_numpy(unseen)] = tracked[torch.from_numpy(unseen)] + spread

@@ -27,8 +27,8 @@ _FORMAT, _VERSION = "mien.run", 1
 _SUMMARY = "mien.training"
 _REMEDY = "put a copy back, or train again under another name (--run NAME); the run's folder holds the trained avatar"
 _AGAIN = "delete the run's training.json and run the same `mien train` again, which goes on from the last checkpoint"
-_FREE_TO_CHANGE = ("threads", "checkpoint_every")
-"""Settings that do not change the result: a run may go on with others."""
+_FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
+"""Settings that say how a run is made, not what it is: it may go on with others."""
 
 
 def claim_run(run_dir: Path, sequences: Items[Sequence], method_config: MethodConfig, settings: TrainSettings) -> None:

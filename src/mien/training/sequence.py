@@ -1,6 +1,6 @@
 """Sequence: what training needs to know about one filmed sequence, and the pictures it is compared with."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +15,7 @@ from mien.tracking import Tracking, read_scoring, read_tracking
 from mien.training.photometric import Box
 
 _CACHE_BYTES = 1 << 30
+_ON_CPU = torch.zeros(())
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,24 @@ class Target:
     background: Float[Tensor, " 3"]
     """Its colour, 0..1."""
 
+    def pinned(self) -> "Target":
+        """The same in memory that a GPU reads while the host goes on."""
+        return replace(
+            self,
+            picture=self.picture.pin_memory(),
+            matte=self.matte.pin_memory(),
+            background=self.background.pin_memory(),
+        )
+
+    def to(self, like: Tensor) -> "Target":
+        """The same on the device of `like`, with a background of its dtype; the host does not wait for the copies."""
+        return replace(
+            self,
+            picture=self.picture.to(like.device, non_blocking=True),
+            matte=self.matte.to(like.device, non_blocking=True),
+            background=self.background.to(like, non_blocking=True),
+        )
+
 
 class Targets:
     """The pictures of one sequence at training resolution, composited; those over a fixed background are kept.
@@ -73,15 +92,19 @@ class Targets:
         sequence: Whose pictures.
         resolution: Longer side in pixels; 0 for the capture's own.
         share: The number of sequences that share the memory for kept pictures.
+        like: Cameras and targets come with its float dtype and on its device.
     """
 
-    def __init__(self, sequence: Sequence, resolution: int, share: int = 1):
+    def __init__(self, sequence: Sequence, resolution: int, share: int = 1, like: Tensor = _ON_CPU):
         self._sequence = sequence
         longest = max(sequence.capture.width, sequence.capture.height)
         scale = min(1.0, resolution / longest) if resolution > 0 else 1.0
         self.width = max(1, round(sequence.capture.width * scale))
         self.height = max(1, round(sequence.capture.height * scale))
-        self.cameras = tuple(camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
+        cameras = (camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
+        self.cameras = tuple(camera.to(like) for camera in cameras)
+        self._like = like
+        self._stays = like.device.type == "cpu" and like.dtype == torch.float32
         self._kept: dict[tuple[int, int, bytes], Target] = {}
         self._room = _CACHE_BYTES // (share * self.width * self.height * 4)
 
@@ -92,8 +115,14 @@ class Targets:
     def target(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool) -> Target:
         """The picture over a background; `keep` it if the same background will be asked for again."""
         key = (timestep, camera, background.tobytes())
-        if key in self._kept:
-            return self._kept[key]
+        target = self._kept.get(key)
+        if target is None:
+            target = self._compose(timestep, camera, background)
+            if keep and len(self._kept) < self._room:
+                self._kept[key] = target
+        return target if self._stays else target.to(self._like)
+
+    def _compose(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"]) -> Target:
         image = self._resize(self._sequence.capture.images[timestep, camera])
         matte = self._resize(self._sequence.scoring[timestep, camera])
         left, top, width, height = cv2.boundingRect(matte)
@@ -103,9 +132,7 @@ class Targets:
         picture[inside] = composite(image[inside], matte[inside], background)
         colour = torch.from_numpy(background) / 255
         target = Target(torch.from_numpy(picture), torch.from_numpy(matte), (left, top, width, height), colour)
-        if keep and len(self._kept) < self._room:
-            self._kept[key] = target
-        return target
+        return target.pinned() if self._like.is_cuda else target
 
     def _resize(self, picture: np.ndarray) -> np.ndarray:
         if picture.shape[:2] == (self.height, self.width):

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from mien.devices import DeviceName
 from mien.errors import UserError
 
 Split = Literal["blocks", "tail", "none"]
@@ -27,6 +28,8 @@ class TrainSettings:
     """Same seed, same settings, same data: same bytes (on a CPU)."""
     threads: int = 0
     """Threads of native operations; 0 for MIEN_THREADS or all cores. Results do not depend on it."""
+    device: DeviceName = "cpu"
+    """Where training runs. On `cuda` (through gsplat) the same seed does not give the same bytes."""
     checkpoint_every: int = 1_000
     """Steps between checkpoints."""
     record_every: int = 10

@@ -11,8 +11,10 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
-from mien.avatar import Avatar, MethodConfig, Progress, load_avatar, method_named, method_of
+from mien.avatar import Avatar, MethodConfig, Progress, load_avatar, method_named, method_of, move_avatar
+from mien.devices import choose_device, like_on
 from mien.errors import UserError
 from mien.face import FaceModel, concatenate
 from mien.progress import Advance, progress_bar
@@ -63,8 +65,10 @@ def train(
     claim_run(run_dir, sequences, method_config, settings)
     if is_finished(run_dir):
         return load_avatar(run_dir)
-    data = TrainingData(order, tuple(Targets(sequence, settings.resolution, len(sequences)) for sequence in sequences))
-    state = start(sequences, face_model, method_config, settings)
+    like = like_on(choose_device(settings.device))
+    targets = [Targets(sequence, settings.resolution, len(sequences), like) for sequence in sequences]
+    data = TrainingData(order, tuple(targets))
+    state = start(sequences, face_model, method_config, settings, like)
     resume(run_dir / "checkpoints", state)
     with _one_torch_thread(), _deferred_interrupt() as interrupted:
         with progress("training", settings.steps, state.step) as advance:
@@ -94,13 +98,20 @@ def _check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
 
 
 def start(
-    sequences: Items[Sequence], face_model: FaceModel, method_config: MethodConfig, settings: TrainSettings
+    sequences: Items[Sequence],
+    face_model: FaceModel,
+    method_config: MethodConfig,
+    settings: TrainSettings,
+    like: Tensor | None = None,
 ) -> TrainingState:
-    """The state before the first step."""
+    """The state before the first step, with the float dtype and on the device of `like` (float32 on the CPU)."""
     face = concatenate([sequence.tracking.face for sequence in sequences])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
+    if like is not None:
+        move_avatar(avatar, like)
+        face = face.to(like)
     density = density_strategy(avatar.density(), avatar.gaussian_store())
     track = FaceTrack(face, method_config.face_tuning, [len(sequence.tracking.face) for sequence in sequences])
     return TrainingState(avatar, Adam(), density, track, {})

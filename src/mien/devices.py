@@ -1,0 +1,59 @@
+"""Where tensors of training and rendering live: the processor, or a CUDA GPU through gsplat."""
+
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Literal
+
+from mien.errors import UserError
+from mien.progress import say
+
+if TYPE_CHECKING:
+    import torch
+
+DeviceName = Literal["cpu", "cuda", "auto"]
+"""`auto`: a CUDA GPU where torch finds one and gsplat is installed, else the processor."""
+
+_OR_CPU = "or leave --device cuda out to use the processor"
+
+
+def check_device(name: DeviceName) -> None:
+    """Tell what can be told without torch.
+
+    Raises:
+        UserError: CUDA is asked for and gsplat is not installed.
+    """
+    if name == "cuda" and find_spec("gsplat") is None:
+        raise UserError(
+            "--device cuda: needs gsplat, which is not installed; install it with `pip install 'mien[cuda]'` (it "
+            f"compiles its kernels at first use and needs the CUDA toolkit's nvcc for that), {_OR_CPU}"
+        )
+
+
+def choose_device(name: DeviceName) -> "torch.device":
+    """The device for a name; says so where it is a GPU, or where `auto` found none.
+
+    Raises:
+        UserError: CUDA is asked for, and torch finds no GPU or gsplat is not installed.
+    """
+    import torch
+
+    if name == "cpu":
+        return torch.device("cpu")
+    if name == "auto" and not (torch.cuda.is_available() and find_spec("gsplat") is not None):
+        say("--device auto: no CUDA GPU that torch finds, or no gsplat; using the processor")
+        return torch.device("cpu")
+    check_device(name)
+    if not torch.cuda.is_available():
+        built = "is built without CUDA" if torch.version.cuda is None else f"(CUDA {torch.version.cuda}) finds no GPU"
+        raise UserError(
+            f"--device cuda: torch {torch.__version__} {built}; see that `nvidia-smi` lists a GPU and that its driver "
+            f"is new enough, {_OR_CPU}"
+        )
+    say(f"{torch.cuda.get_device_name()}: gsplat compiles its kernels at first use, which takes some minutes, once")
+    return torch.device("cuda")
+
+
+def like_on(device: "torch.device | str") -> "torch.Tensor":
+    """A float32 scalar there: what `.to(like)` of the value objects takes."""
+    import torch
+
+    return torch.zeros((), device=device)

@@ -1,0 +1,160 @@
+"""Training away from the native core: on a GPU where there is one, and the same code in plain PyTorch on the CPU.
+
+What is not float32 on a CPU takes the plain PyTorch twins of all native operations, and the reference rasterizer where
+a GPU would take gsplat; so training in float64 runs all that a GPU runs but gsplat's kernels.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import mien.devices
+import train_toy
+from mien import _native
+from mien.avatar import load_avatar
+from mien.devices import choose_device, like_on
+from mien.errors import UserError
+from mien.face import FaceModel
+from mien.progress import Advance
+from mien.training import TrainSettings, train
+from mien.training.checkpoint import TrainingState
+from mien.training.frames import FrameOrder, training_frames
+from mien.training.sequence import Sequence, Targets
+from mien.training.trainer import TrainingData, start, step
+from toy_scene import toy_sequence
+
+SETTINGS = replace(train_toy.SETTINGS, steps=12, record_every=1)
+
+
+Scene = tuple[FaceModel, Sequence]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return toy_sequence(timesteps=5, size=32)
+
+
+def train_some(
+    scene: Scene, like: Tensor, config=train_toy.CONFIG, settings: TrainSettings = SETTINGS
+) -> TrainingState:
+    """The state after training with this dtype and device."""
+    face_model, sequence = scene
+    order = FrameOrder(training_frames([sequence], settings), settings.seed)
+    data = TrainingData(order, (Targets(sequence, settings.resolution, like=like),))
+    state = start([sequence], face_model, train_toy.CONFIG, settings, like)
+    for _ in range(settings.steps):
+        step(state, data, settings)
+    return state
+
+
+@pytest.fixture
+def no_native_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fails whoever asks the native core for a part of a step."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a native operation away from float32 on a CPU")
+
+    parts = ("ride", "rig_forward", "pose_face", "sigmoid", "head_poses", "rasterize_views", "photometric_loss")
+    for name in (*parts, "triangle_penalties", "observe_view", "adam_update", "mean_squared_difference"):
+        monkeypatch.setattr(_native, name, refuse)
+
+
+def test_plain_pytorch_trains_as_the_native_core_does(scene: Scene, request: pytest.FixtureRequest) -> None:
+    native = train_some(scene, torch.zeros(()))
+    request.getfixturevalue("no_native_step")
+    plain = train_some(scene, torch.zeros((), dtype=torch.float64))
+    assert plain.avatar.gaussian_store()["means"].dtype == torch.float64
+    assert plain.curves["gaussians"] == native.curves["gaussians"]
+    assert len(set(native.curves["gaussians"])) > 1  # density control was at work
+    for name in ("loss", "photometric", "psnr"):
+        assert plain.curves[name] == pytest.approx(native.curves[name], rel=2e-3), name
+    assert native.curves["loss"][-1] < native.curves["loss"][0]
+
+
+@pytest.fixture
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+
+def pretend_gsplat(monkeypatch: pytest.MonkeyPatch, installed: bool) -> None:
+    monkeypatch.setattr(mien.devices, "find_spec", lambda name: object() if installed else None)
+
+
+def test_cuda_without_a_gpu_or_without_gsplat_says_what_to_do(monkeypatch: pytest.MonkeyPatch, no_gpu: None) -> None:
+    pretend_gsplat(monkeypatch, installed=False)
+    with pytest.raises(UserError, match=r"--device cuda: needs gsplat.*mien\[cuda\]"):
+        choose_device("cuda")
+    pretend_gsplat(monkeypatch, installed=True)
+    with pytest.raises(UserError, match=r"--device cuda: torch .*nvidia-smi"):
+        choose_device("cuda")
+
+
+def test_auto_takes_the_processor_where_nothing_else_is(
+    monkeypatch: pytest.MonkeyPatch, no_gpu: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pretend_gsplat(monkeypatch, installed=True)
+    assert choose_device("auto").type == choose_device("cpu").type == "cpu"
+    assert "using the processor" in capsys.readouterr().err
+
+
+def test_a_gpu_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    pretend_gsplat(monkeypatch, installed=True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "some GPU")
+    assert choose_device("auto").type == choose_device("cuda").type == "cuda"
+    assert "some GPU: gsplat compiles its kernels at first use" in capsys.readouterr().err
+
+
+def test_a_run_goes_on_elsewhere(scene: Scene, tmp_path: Path, no_gpu: None) -> None:
+    face_model, sequence = scene
+    train([sequence], face_model, train_toy.CONFIG, replace(SETTINGS, device="auto"), tmp_path / "run", no_bar)
+    # The run is finished: with another device it is the same run, and is only loaded.
+    again = train([sequence], face_model, train_toy.CONFIG, SETTINGS, tmp_path / "run", no_bar)
+    assert len(again.gaussian_store()) > 0
+
+
+@contextmanager
+def no_bar(title: str, total: int, completed: int) -> Iterator[Advance]:
+    yield lambda amount=1, status="": None
+
+
+@pytest.mark.gpu
+def test_a_gpu_trains_as_the_native_core_does(scene: Scene) -> None:
+    native, on_gpu = train_some(scene, torch.zeros(())), train_some(scene, like_on("cuda"))
+    store = on_gpu.avatar.gaussian_store()
+    assert all(store[name].is_cuda for name in store.names())
+    for name in ("loss", "photometric", "psnr"):
+        assert on_gpu.curves[name] == pytest.approx(native.curves[name], rel=5e-3), name
+
+
+@pytest.mark.gpu
+def test_what_a_gpu_trained_is_loaded_and_resumed_without_one(scene: Scene, tmp_path: Path) -> None:
+    face_model, sequence = scene
+    run, half = tmp_path / "run", SETTINGS.steps // 2
+
+    @contextmanager
+    def stop_halfway(title: str, total: int, completed: int) -> Iterator[Advance]:
+        done = completed
+
+        def advance(amount: int = 1, status: str = "") -> None:
+            nonlocal done
+            done += amount
+            if done == half:
+                raise KeyboardInterrupt
+
+        yield advance
+
+    often = replace(SETTINGS, device="cuda", checkpoint_every=1)
+    with pytest.raises(KeyboardInterrupt):
+        train([sequence], face_model, train_toy.CONFIG, often, run, stop_halfway)
+    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cpu"), run, no_bar)
+    avatar = load_avatar(run)
+    assert avatar.gaussian_store()["means"].device.type == "cpu"
+    whole = tmp_path / "whole"
+    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cuda"), whole, no_bar)
+    assert len(load_avatar(whole).gaussian_store()) > 0
