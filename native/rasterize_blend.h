@@ -7,7 +7,7 @@ namespace {
 
 constexpr int kVectors = kBlock * kBlock / W;  // vectors per block
 constexpr int kBlocks = kTileBlocks * kTileBlocks;
-constexpr int kGatherAhead = 32;  // entries: the same where nothing but their shapes is read
+constexpr int kGatherAhead = 32;  // entries: the same where little but their shapes is read
 constexpr int kAhead = 8;         // entries: how far ahead their splats are fetched into the cache
 constexpr int kChunk = 256;       // entries handled at a time: their splats stay in the cache
 
@@ -36,16 +36,26 @@ MIEN_INLINE I bits_between(F low, F high) {
 // The blocks of a tile that some entries of its list touch, one bit each.
 struct BlockBits {
   alignas(64) uint8_t rows[kTileBlocks][kChunk];  // by row of blocks and entry; 0 from the last entry on
-  uint64_t masks[kChunk];                         // the same by entry, live blocks only
+
+  // The same by entry, of the blocks in `live`.
+  MIEN_INLINE void store_masks(int count, uint64_t live, uint64_t* masks) const {
+    for (int i = 0; i < count; i += 16) {
+      uint64_t found[16];
+      transpose_bytes(rows[0] + i, kChunk, found);
+      for (int j = 0; j < 16; ++j) found[j] &= live;
+      memcpy(masks + i, found, sizeof(uint64_t) * (count - i < 16 ? count - i : 16));
+    }
+  }
 };
 
-void find_blocks(const Splat* splats, const Entry* entries, int count, float left, float top, uint64_t live,
+// Of `available` entries from here on, the first `count`.
+void find_blocks(const Splat* splats, const Entry* entries, int count, int available, float left, float top,
                  BlockBits& found) {
   for (int i = 0; i < count; i += W) {
     const int valid = count - i < W ? count - i : W;
     const Splat* chosen[W];
     for (int lane = 0; lane < W; ++lane) chosen[lane] = &splats[entries[i + (lane < valid ? lane : 0)].gaussian];
-    for (int later = i + kGatherAhead; later < i + kGatherAhead + W && later < count; ++later)
+    for (int later = i + kGatherAhead; later < i + kGatherAhead + W && later < available; ++later)
       __builtin_prefetch(&splats[entries[later].gaussian]);
     const SplatShape s = gather_shapes(chosen);
     const M there = less(iota(), set1((float)valid));
@@ -58,10 +68,6 @@ void find_blocks(const Splat* splats, const Entry* entries, int count, float lef
   }
   const int written = (count + W - 1) / W * W, used = (count + 63) / 64 * 64;
   for (int row = 0; row < kTileBlocks; ++row) memset(found.rows[row] + written, 0, used - written);
-  for (int i = 0; i < count; i += 16) {
-    transpose_bytes(found.rows[0] + i, kChunk, found.masks + i);
-    for (int j = i; j < i + 16; ++j) found.masks[j] &= live;
-  }
 }
 
 struct TilePixels {
@@ -87,43 +93,64 @@ struct Chosen {
       count += __builtin_popcountll(own);
     }
     begins[words] = 0;
-    bits[words] = 1;  // read, not used
+    bits[words] = 3;  // read once beyond the last, not used
   }
 };
 
-// Blends entries of one chunk into vector `v` of a block. Returns the last one looked at if all pixels of the vector
-// ended there, otherwise kChunk.
+// Goes through the entries that were chosen.
+struct Walk {
+  const Chosen& chosen;
+  uint64_t bits;
+  int word = 0;
+
+  MIEN_INLINE explicit Walk(const Chosen& chosen) : chosen(chosen), bits(chosen.bits[0]) {}
+  MIEN_INLINE int next() {
+    const int entry = chosen.begins[word] + __builtin_ctzll(bits);
+    bits &= bits - 1;
+    word += bits == 0;
+    bits = bits ? bits : chosen.bits[word];
+    return entry;
+  }
+};
+
+MIEN_INLINE F alpha_at(const Splat& s, F px, F py) {
+  const F dy = py - s.y, across = (px - s.x) - s.slope * dy;
+  const F a = s.root_sharpness * across, b = s.root_falloff * dy;
+  const F power = (s.log2_opacity - b * b) - a * a;
+  return keep(less_equal(set1(kLog2AlphaMin), power), minimum(exp2_alpha(power), set1(kAlphaMax)));
+}
+
+// Blends entries of one chunk (at least one) into vector `v` of a block. Returns the last one looked at if all pixels
+// of the vector ended there, otherwise kChunk. A splat's alpha is found while the one before it is blended: together
+// they are a longer chain of dependent operations than a processor looks ahead.
 MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const Chosen& chosen, float x, float y,
                              int block, int v, TilePixels& pixels) {
   F transmittance = load(pixels.transmittance[block] + v * W), product = load(pixels.product[block] + v * W);
   F red = load(pixels.color[0][block] + v * W), green = load(pixels.color[1][block] + v * W);
   F blue = load(pixels.color[2][block] + v * W);
   const F px = lane_x() + x, py = lane_y(v) + y;
-  int word = 0, ended = kChunk;
-  uint64_t bits = chosen.bits[0];
+  Walk walk(chosen);
+  int entry = walk.next(), ended = kChunk;
+  const Splat* s = &splats[entries[entry].gaussian];
+  F alpha = alpha_at(*s, px, py);
   for (int left = chosen.count; left > 0; --left) {
-    const int entry = chosen.begins[word] + __builtin_ctzll(bits);
-    bits &= bits - 1;
-    word += bits == 0;
-    bits = bits ? bits : chosen.bits[word];
-    const Splat& s = splats[entries[entry].gaussian];
-    const F dy = py - s.y, across = (px - s.x) - s.slope * dy;
-    const F a = s.root_sharpness * across, b = s.root_falloff * dy;
-    const F power = (s.log2_opacity - a * a) - b * b;
-    const M seen = less_equal(set1(kLog2AlphaMin), power);
-    const F alpha = keep(seen, minimum(exp2_alpha(power), set1(kAlphaMax)));
+    const int later = walk.next();
+    const Splat* const following = &splats[entries[later].gaussian];
+    const F later_alpha = alpha_at(*following, px, py);
     const F share = product * alpha, next = product - share;
     const M open = less(set1(kTransmittanceMin), next);
-    const F weight = keep(open, share);
-    red = red + weight * s.red;
-    green = green + weight * s.green;
-    blue = blue + weight * s.blue;
+    red = add_where(open, share, set1(s->red), red);
+    green = add_where(open, share, set1(s->green), green);
+    blue = add_where(open, share, set1(s->blue), blue);
     transmittance = select(open, next, transmittance);
     product = next;
     if (!any(open)) {
       ended = entry;
       break;
     }
+    entry = later;
+    s = following;
+    alpha = later_alpha;
   }
   store(pixels.transmittance[block] + v * W, transmittance);
   store(pixels.product[block] + v * W, product);
@@ -133,10 +160,13 @@ MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const Ch
   return ended;
 }
 
-// Blends one chunk into all blocks in `live`; takes ended blocks out of the later entries' masks; returns what is live.
-MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, int count, float left, float top,
-                                 uint64_t live, BlockBits& found, TilePixels& pixels) {
-  find_blocks(splats, entries, count, left, top, live, found);
+// Blends the first `count` of `available` entries into all blocks in `live`; stores which entry was blended into which
+// blocks; returns what is live.
+MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, int count, int available, float left,
+                                 float top, uint64_t live, uint64_t* masks, TilePixels& pixels) {
+  BlockBits found;
+  find_blocks(splats, entries, count, available, left, top, found);
+  const uint64_t live_before = live;
   for (uint64_t blocks = live; blocks; blocks &= blocks - 1) {
     const int block = __builtin_ctzll(blocks);
     const Chosen chosen(found, count, block);
@@ -149,8 +179,10 @@ MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, int 
     }
     if (ended == kChunk) continue;
     live &= ~(1ull << block);
-    for (int i = ended + 1; i < count; ++i) found.masks[i] &= ~(1ull << block);
+    uint8_t* row = found.rows[block / kTileBlocks];
+    for (int i = ended + 1; i < count; ++i) row[i] &= (uint8_t)~(1u << block % kTileBlocks);
   }
+  found.store_masks(count, live_before, masks);
   return live;
 }
 
@@ -216,7 +248,6 @@ void blend(const Splat* splats, const TileLists& lists, const View& view, int ti
   for (int i = begin; i < end && i < begin + kGatherAhead; ++i) __builtin_prefetch(&splats[lists.entries[i].gaussian]);
   [[maybe_unused]] const NoDenormals guard;
   TilePixels pixels;
-  BlockBits found;
   memset(pixels.color, 0, sizeof pixels.color);
   for (int block = 0; block < kBlocks; ++block) {
     for (int v = 0; v < kVectors; ++v) {
@@ -229,8 +260,8 @@ void blend(const Splat* splats, const TileLists& lists, const View& view, int ti
   int i = begin;
   while (i < end && live) {
     const int count = end - i < kChunk ? end - i : kChunk;
-    live = blend_chunk(splats, lists.entries + i, count, (float)left, (float)top, live, found, pixels);
-    memcpy(lists.masks + i, found.masks, sizeof(uint64_t) * count);
+    live =
+        blend_chunk(splats, lists.entries + i, count, end - i, (float)left, (float)top, live, lists.masks + i, pixels);
     i += count;
   }
   lists.ends[tile] = i;
