@@ -22,6 +22,7 @@ struct RasterizeFrame {
   mien::FramePtr frame;
   mien::View view;
   int64_t count;
+  bool differentiable;
 };
 
 mien::GaussianArrays gaussian_arrays(const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1, 3>& scales,
@@ -131,6 +132,7 @@ struct BackwardTask {
         grad_K(item<Out<3, 3>>(t, 17)) {
     if (!t[9].is_none()) grad_alpha = item<In<-1, -1>>(t, 9);
     const size_t n = means.shape(0), pixels = static_cast<size_t>(frame.view.width) * frame.view.height;
+    require(frame.differentiable, "the forward pass was not differentiable");
     require(static_cast<int64_t>(n) == frame.count, "these are not the Gaussians of the forward pass");
     require(image.size() == 3 * pixels && grad_image.size() == 3 * pixels && alpha.size() == pixels &&
                 (!grad_alpha || grad_alpha->size() == pixels),
@@ -159,7 +161,7 @@ struct BackwardTask {
 };
 
 // A single view gets all threads; of several, each gets one.
-std::vector<std::optional<RasterizeFrame>> forward(const std::vector<nb::tuple>& views) {
+std::vector<std::optional<RasterizeFrame>> forward(const std::vector<nb::tuple>& views, bool differentiable) {
   const std::vector<ForwardTask> tasks(views.begin(), views.end());
   std::vector<mien::GaussianArrays> gaussians;
   for (const ForwardTask& task : tasks) gaussians.push_back(task.gaussians());
@@ -168,8 +170,9 @@ std::vector<std::optional<RasterizeFrame>> forward(const std::vector<nb::tuple>&
   mien::parallel_for(static_cast<int64_t>(tasks.size()), [&](int64_t i) {
     const ForwardTask& task = tasks[i];
     const mien::View view = task.view();
-    auto frame = mien::rasterize_forward(gaussians[i], view, {task.image.data(), task.alpha.data(), task.radii.data()});
-    if (frame) frames[i] = RasterizeFrame{std::move(frame), view, gaussians[i].count};
+    auto frame = mien::rasterize_forward(gaussians[i], view, {task.image.data(), task.alpha.data(), task.radii.data()},
+                                         differentiable);
+    if (frame) frames[i] = RasterizeFrame{std::move(frame), view, gaussians[i].count, differentiable};
   });
   return frames;
 }
@@ -185,11 +188,12 @@ void backward(const std::vector<nb::tuple>& views) {
 void bind_rasterize(nb::module_& module) {
   nb::class_<RasterizeFrame>(module, "RasterizeFrame", "What a backward pass needs of its forward pass.");
   module.def(
-      "rasterize_forward", [](nb::args view) { return std::move(forward({nb::tuple(view)})[0]); },
-      "One view of `rasterize_views`.");
-  module.def("rasterize_views", &forward, "views"_a,
+      "rasterize_forward", [](nb::args view) { return std::move(forward({nb::tuple(view)}, false)[0]); },
+      "One view of `rasterize_views`, not differentiable.");
+  module.def("rasterize_views", &forward, "views"_a, "differentiable"_a,
              "Fills image, alpha and radii of each view, given as (means, quats, scales, opacities, sh, background, "
-             "viewmat, K, image, alpha, radii); None for a view where an input is NaN or infinite.");
+             "viewmat, K, image, alpha, radii); None for a view where an input is NaN or infinite. "
+             "Unless `differentiable`, what a backward pass needs is left out.");
   module.def("rasterize_views_backward", &backward, "views"_a,
              "Fills the gradients of each view, given as (frame, means, quats, scales, opacities, sh, image, alpha, "
              "grad_image, grad_alpha or None, grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, "

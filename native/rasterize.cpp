@@ -106,7 +106,8 @@ bool set_rasterize_isa(const char* name) {
   return false;
 }
 
-FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, const Picture& picture) {
+FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, const Picture& picture,
+                           bool differentiable) {
   if (!is_finite(view)) return nullptr;
   const Kernels& kernels = *isa().kernels;
   FramePtr frame = take_frame();
@@ -118,11 +119,15 @@ FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, co
                             splats,
                             frame->spans.reserve(count),
                             frame->depth_keys.reserve(count),
+                            frame->depth_ranges.reserve(groups(count)),
                             picture.radii};
+  frame->differentiable = differentiable;
+  uint32_t* slot_counts = differentiable ? frame->slot_counts.reserve(count) : nullptr;
   std::atomic<bool> finite{true};
   parallel_for(groups(count), [&](int64_t group) {
     const int64_t first = group * kGroup, last = std::min(first + kGroup, count);
     if (!kernels.project(gaussians, view, first, last, projected)) finite = false;
+    if (slot_counts) std::memset(slot_counts + first, 0, sizeof(uint32_t) * (last - first));
   });
   if (!finite) return nullptr;
   sort_by_depth(*frame, count);
@@ -146,8 +151,8 @@ void rasterize_backward(Frame& frame, const GaussianArrays& gaussians, const Vie
   float* view_gradients = frame.view_gradients.reserve(parts * kViewGradients);
   parallel_for(parts, [&](int64_t group) {
     const int64_t first = group * kGroup, last = std::min(first + kGroup, count);
-    kernels.project_backward(gaussians, view, first, last, frame.slot_begins.data(), frame.slot_ends.data(), slots,
-                             gradients, view_gradients + group * kViewGradients);
+    kernels.project_backward(gaussians, view, first, last, frame.slot_begins.data(), slots, gradients,
+                             view_gradients + group * kViewGradients);
   });
   // In the order of the Gaussians, whoever computed which part.
   std::memset(view_gradient, 0, sizeof(float) * kViewGradients);

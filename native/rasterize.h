@@ -57,8 +57,10 @@ struct ReturnFrame {
 };
 using FramePtr = std::unique_ptr<Frame, ReturnFrame>;
 
-// Null if an input that was read is NaN or infinite; the picture is then undefined.
-FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, const Picture& picture);
+// Null if an input that was read is NaN or infinite; the picture is then undefined. Without `differentiable` there can
+// be no backward pass.
+FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, const Picture& picture,
+                           bool differentiable);
 
 // Writes all of `gradients` and `view_gradient` [kViewGradients].
 void rasterize_backward(Frame& frame, const GaussianArrays& gaussians, const View& view, const PictureGradient& picture,

@@ -1,5 +1,6 @@
 // Depth order and tile lists: one sort of the Gaussians, then a counting sort of (Gaussian, tile) pairs by tile.
 #include <algorithm>
+#include <bit>
 #include <cmath>
 #include <cstring>
 
@@ -9,9 +10,6 @@
 namespace mien {
 namespace {
 
-constexpr int kDigit = 11;  // bits per pass of the radix sort
-constexpr uint32_t kDigitMask = (1 << kDigit) - 1;
-
 // Part `index` of `parts` of `count` elements.
 struct Part {
   int64_t first, last;
@@ -19,76 +17,63 @@ struct Part {
   Part(int64_t count, int64_t index, int64_t parts) : first(count * index / parts), last(count * (index + 1) / parts) {}
 };
 
-// Drawn Gaussians and their keys, in the order of their indices. Every thread does a part: first it counts, then it
-// knows where to put them.
-void gather_drawn(Frame& frame, int64_t count, int64_t parts) {
+// What the first pass of the sort reads: all Gaussians, of which some are not drawn.
+struct Unsorted {
+  const uint32_t* keys;
+  uint32_t nearest;
+
+  bool is_drawn(int64_t i) const { return keys[i] != UINT32_MAX; }
+  // Depths of a head differ in few bits: sorting the differences to the nearest saves a pass.
+  uint32_t key(int64_t i) const { return keys[i] - nearest; }
+  uint32_t gaussian(int64_t i) const { return static_cast<uint32_t>(i); }
+};
+
+// What later passes read: what the one before wrote.
+struct Sorted {
+  const uint32_t *keys, *order;
+
+  bool is_drawn(int64_t) const { return true; }
+  uint32_t key(int64_t i) const { return keys[i]; }
+  uint32_t gaussian(int64_t i) const { return order[i]; }
+};
+
+struct Digit {
+  int shift, bits;
+  bool last;  // of the passes: its keys are not needed any more
+
+  uint32_t of(uint32_t key) const { return key >> shift & ((1u << bits) - 1); }
+};
+
+// One stable pass of a radix sort: each part counts its digits, then writes where the parts before it end.
+template <typename Source>
+void radix_pass(Frame& frame, const Source from, int64_t count, const Digit digit) {
+  const int64_t parts = std::clamp<int64_t>(count / 4096, 1, thread_count());
   SortPart* own = frame.sort_parts.reserve(parts);
   parallel_for(parts, [&](int64_t index) {
     const Part part(count, index, parts);
-    int64_t drawn = 0;
-    uint32_t least = UINT32_MAX, greatest = 0;
-    for (int64_t i = part.first; i < part.last; ++i) {
-      const uint32_t key = frame.depth_keys[i];
-      const bool there = key != UINT32_MAX;
-      drawn += there;
-      least = std::min(least, key);
-      greatest = std::max(greatest, there ? key : 0);
-    }
-    own[index].drawn = drawn;
-    own[index].least = least;
-    own[index].greatest = greatest;
-  });
-  frame.drawn = 0;
-  frame.nearest = UINT32_MAX;
-  frame.farthest = 0;
-  for (int64_t index = 0; index < parts; ++index) {
-    const int64_t here = own[index].drawn;
-    own[index].drawn = frame.drawn;
-    frame.drawn += here;
-    frame.nearest = std::min(frame.nearest, own[index].least);
-    frame.farthest = std::max(frame.farthest, own[index].greatest);
-  }
-  uint32_t* keys = frame.sorted_keys.reserve(count);
-  uint32_t* order = frame.order.reserve(count);
-  parallel_for(parts, [&](int64_t index) {
-    const Part part(count, index, parts);
-    int64_t to = own[index].drawn;
-    for (int64_t i = part.first; i < part.last; ++i) {
-      const uint32_t key = frame.depth_keys[i];
-      if (key == UINT32_MAX) continue;
-      // Depths of a head differ in few bits: sorting the differences to the nearest saves a pass.
-      keys[to] = key - frame.nearest;
-      order[to++] = static_cast<uint32_t>(i);
-    }
-  });
-}
-
-// One stable pass of a radix sort: each part counts its digits, then writes where the parts before it end.
-void radix_pass(Frame& frame, int shift, int64_t parts) {
-  SortPart* own = frame.sort_parts.data();
-  const uint32_t *keys = frame.sorted_keys.data(), *order = frame.order.data();
-  parallel_for(parts, [&](int64_t index) {
-    const Part part(frame.drawn, index, parts);
     uint32_t* counts = own[index].counts;
-    std::memset(counts, 0, sizeof own[index].counts);
-    for (int64_t i = part.first; i < part.last; ++i) ++counts[keys[i] >> shift & kDigitMask];
+    std::memset(counts, 0, sizeof(uint32_t) << digit.bits);
+    for (int64_t i = part.first; i < part.last; ++i) {
+      if (from.is_drawn(i)) ++counts[digit.of(from.key(i))];
+    }
   });
   uint32_t total = 0;
-  for (uint32_t digit = 0; digit <= kDigitMask; ++digit) {
+  for (uint32_t value = 0; value < 1u << digit.bits; ++value) {
     for (int64_t index = 0; index < parts; ++index) {
-      const uint32_t here = own[index].counts[digit];
-      own[index].counts[digit] = total;
+      const uint32_t here = own[index].counts[value];
+      own[index].counts[value] = total;
       total += here;
     }
   }
   uint32_t *to_keys = frame.scratch_keys.data(), *to_order = frame.scratch_order.data();
   parallel_for(parts, [&](int64_t index) {
-    const Part part(frame.drawn, index, parts);
+    const Part part(count, index, parts);
     uint32_t* starts = own[index].counts;
     for (int64_t i = part.first; i < part.last; ++i) {
-      const uint32_t to = starts[keys[i] >> shift & kDigitMask]++;
-      to_keys[to] = keys[i];
-      to_order[to] = order[i];
+      if (!from.is_drawn(i)) continue;
+      const uint32_t key = from.key(i), to = starts[digit.of(key)]++;
+      if (!digit.last) to_keys[to] = key;
+      to_order[to] = from.gaussian(i);
     }
   });
   frame.sorted_keys.swap(frame.scratch_keys);
@@ -134,16 +119,16 @@ void find_pairs(BinChunk& chunk, Frame& frame) {
   const int64_t count = chunk.last - chunk.first;
   const uint32_t* order = frame.order.data() + chunk.first;
   const TileSpan* spans = frame.spans.data();
+  uint32_t* const slot_counts = frame.differentiable ? frame.slot_counts.data() : nullptr;
   Buffer<Pair>& pairs = chunk.pairs;
   pairs.clear();
   constexpr int64_t kAhead = 16;  // by depth, Gaussians lie anywhere in memory
   for (int64_t i = 0; i < count; ++i) {
     const uint32_t gaussian = order[i], later = order[std::min(i + kAhead, count - 1)];
     __builtin_prefetch(&spans[later]);
-    __builtin_prefetch(&frame.slot_begins[later], 1);
-    __builtin_prefetch(&frame.slot_ends[later], 1);
+    if (slot_counts) __builtin_prefetch(&slot_counts[later], 1);
     const TileSpan& span = spans[gaussian];
-    frame.slot_begins[gaussian] = static_cast<uint32_t>(pairs.size());
+    const int64_t before = pairs.size();
     const int above = std::max(span.high[0] - span.low[0] + 1, 0), below = std::max(span.high[1] - span.low[1] + 1, 0);
     if (span.row_count <= 2 && above <= 2 && below <= 2) {
       // Without a branch on the number of tiles, which is as good as random: both are written, those that count stay.
@@ -159,7 +144,7 @@ void find_pairs(BinChunk& chunk, Frame& frame) {
     } else {
       find_large(frame.splats[gaussian], gaussian, span, frame.columns, pairs);
     }
-    frame.slot_ends[gaussian] = static_cast<uint32_t>(pairs.size());
+    if (slot_counts) slot_counts[gaussian] = static_cast<uint32_t>(pairs.size() - before);
   }
   const int tiles = frame.columns * frame.rows;
   int32_t* counts = chunk.counts.reserve(tiles);
@@ -187,44 +172,58 @@ void place_chunks(Frame& frame) {
 
 // Slots in the order of the Gaussians, so that the projection's backward pass reads them one after the other.
 void place_slots(Frame& frame, int64_t count) {
-  uint32_t* begins = frame.slot_begins.data();
-  uint32_t* ends = frame.slot_ends.data();
-  uint32_t* shifts = frame.slot_shifts.reserve(count);
+  const uint32_t* counts = frame.slot_counts.data();
+  uint32_t* begins = frame.slot_begins.reserve(count + 1);
   uint32_t total = 0;
   for (int64_t i = 0; i < count; ++i) {
-    const uint32_t own = ends[i] - begins[i];
-    shifts[i] = total - begins[i];
     begins[i] = total;
-    total += own;
-    ends[i] = total;
+    total += counts[i];
   }
+  begins[count] = total;
 }
 
 void fill_lists(BinChunk& chunk, Frame& frame) {
   Entry* entries = frame.entries.data();
-  const uint32_t* shifts = frame.slot_shifts.data();
+  const uint32_t* slot_begins = frame.differentiable ? frame.slot_begins.data() : nullptr;
+  Pair before{UINT32_MAX, 0};
+  uint32_t earlier = 0;  // pairs of the same Gaussian, which lie side by side
   for (int64_t i = 0; i < chunk.pairs.size(); ++i) {
     const Pair pair = chunk.pairs[i];
-    entries[chunk.counts[pair.tile]++] = {pair.gaussian, shifts[pair.gaussian] + static_cast<uint32_t>(i)};
+    earlier = pair.gaussian == before.gaussian ? earlier + 1 : 0;
+    before = pair;
+    entries[chunk.counts[pair.tile]++] = {pair.gaussian, slot_begins ? slot_begins[pair.gaussian] + earlier : 0};
   }
 }
 
 }  // namespace
 
 void sort_by_depth(Frame& frame, int64_t count) {
-  static_assert(sizeof(SortPart::counts) == sizeof(uint32_t) << kDigit);
-  const int64_t parts = std::clamp<int64_t>(count / 4096, 1, thread_count());
-  frame.scratch_keys.reserve(count);
-  frame.scratch_order.reserve(count);
-  gather_drawn(frame, count, parts);
-  for (int shift = 0; shift < 32 && frame.drawn > 0 && (frame.farthest - frame.nearest) >> shift; shift += kDigit) {
-    radix_pass(frame, shift, parts);
+  frame.drawn = 0;
+  uint32_t nearest = UINT32_MAX, farthest = 0;
+  for (int64_t group = 0; group < (count + kGroup - 1) / kGroup; ++group) {
+    const DepthRange& range = frame.depth_ranges[group];
+    frame.drawn += range.drawn;
+    nearest = std::min(nearest, range.nearest);
+    farthest = std::max(farthest, range.farthest);
+  }
+  if (frame.drawn == 0) return;
+  for (auto* buffer : {&frame.sorted_keys, &frame.order, &frame.scratch_keys, &frame.scratch_order}) {
+    buffer->reserve(frame.drawn);
+  }
+  // As few passes as there can be, of equally many bits.
+  const int bits = std::max<int>(std::bit_width(farthest - nearest), 1);
+  const int passes = (bits + kMostDigitBits - 1) / kMostDigitBits, digit = (bits + passes - 1) / passes;
+  for (int pass = 0; pass < passes; ++pass) {
+    const Digit own{pass * digit, digit, pass == passes - 1};
+    if (pass == 0) {
+      radix_pass(frame, Unsorted{frame.depth_keys.data(), nearest}, count, own);
+    } else {
+      radix_pass(frame, Sorted{frame.sorted_keys.data(), frame.order.data()}, frame.drawn, own);
+    }
   }
 }
 
 void bin_into_tiles(Frame& frame, int64_t count) {
-  std::memset(frame.slot_begins.reserve(count), 0, sizeof(uint32_t) * count);
-  std::memset(frame.slot_ends.reserve(count), 0, sizeof(uint32_t) * count);
   const int64_t chunks = std::clamp<int64_t>(frame.drawn / 1024, 1, thread_count());
   while (static_cast<int64_t>(frame.chunks.size()) < chunks) frame.chunks.emplace_back();
   while (static_cast<int64_t>(frame.chunks.size()) > chunks) frame.chunks.pop_back();
@@ -234,9 +233,9 @@ void bin_into_tiles(Frame& frame, int64_t count) {
   }
   parallel_for(chunks, [&](int64_t c) { find_pairs(frame.chunks[c], frame); });
   place_chunks(frame);
-  place_slots(frame, count);
+  if (frame.differentiable) place_slots(frame, count);
   frame.entries.reserve(frame.pairs);
-  frame.masks.reserve(frame.pairs);
+  if (frame.differentiable) frame.masks.reserve(frame.pairs);
   parallel_for(chunks, [&](int64_t c) { fill_lists(frame.chunks[c], frame); });
 }
 

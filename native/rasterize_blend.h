@@ -182,7 +182,7 @@ MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, int 
     uint8_t* row = found.rows[block / kTileBlocks];
     for (int i = ended + 1; i < count; ++i) row[i] &= (uint8_t)~(1u << block % kTileBlocks);
   }
-  found.store_masks(count, live_before, masks);
+  if (masks) found.store_masks(count, live_before, masks);
   return live;
 }
 
@@ -260,8 +260,8 @@ void blend(const Splat* splats, const TileLists& lists, const View& view, int ti
   int i = begin;
   while (i < end && live) {
     const int count = end - i < kChunk ? end - i : kChunk;
-    live =
-        blend_chunk(splats, lists.entries + i, count, end - i, (float)left, (float)top, live, lists.masks + i, pixels);
+    live = blend_chunk(splats, lists.entries + i, count, end - i, (float)left, (float)top, live,
+                       lists.masks ? lists.masks + i : nullptr, pixels);
     i += count;
   }
   lists.ends[tile] = i;

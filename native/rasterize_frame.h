@@ -76,19 +76,21 @@ struct BinChunk {
   Buffer<int32_t> counts;  // per tile; then where the chunk's next entry of that tile goes
 };
 
+constexpr int kMostDigitBits = 12;  // of a pass of the radix sort
+
 // A part of the Gaussians that one thread sorts.
 struct SortPart {
-  int64_t drawn;  // how many; then how many before
-  uint32_t least, greatest;
-  uint32_t counts[1 << 11];  // per digit; then where the next with that digit goes
+  uint32_t counts[1 << kMostDigitBits];  // per digit; then where the next with that digit goes
 };
 
 struct Frame {
+  bool differentiable = true;  // otherwise what only a backward pass needs is left out
   Buffer<Splat> splats;
   Buffer<TileSpan> spans;
   Buffer<uint32_t> depth_keys, sorted_keys, order, scratch_keys, scratch_order;
-  Buffer<uint32_t> slot_begins, slot_ends;  // per Gaussian; at first counted from the first pair of its chunk
-  Buffer<uint32_t> slot_shifts;             // per Gaussian: from a pair's place in its chunk to its slot
+  Buffer<DepthRange> depth_ranges;  // per group of Gaussians
+  Buffer<uint32_t> slot_counts;     // per Gaussian
+  Buffer<uint32_t> slot_begins;     // [n + 1]
   Buffer<Entry> entries;
   Buffer<uint64_t> masks;
   Buffer<int32_t> tile_begins, tile_ends;
@@ -97,16 +99,20 @@ struct Frame {
   Buffer<SortPart> sort_parts;
   std::deque<BinChunk> chunks;
   int64_t drawn = 0, pairs = 0;
-  uint32_t nearest = 0, farthest = 0;  // depth keys
   int columns = 0, rows = 0;
 
-  TileLists lists() { return {entries.data(), masks.data(), tile_begins.data(), tile_ends.data(), columns, rows}; }
+  TileLists lists() {
+    uint64_t* const kept = differentiable ? masks.data() : nullptr;
+    return {entries.data(), kept, tile_begins.data(), tile_ends.data(), columns, rows};
+  }
 };
 
-// Fills frame.order with the drawn Gaussians, nearest first; equal depths stay in the order of their indices.
+// Fills frame.order with the drawn Gaussians, nearest first; equal depths stay in the order of their indices. Reads
+// frame.depth_keys and frame.depth_ranges.
 void sort_by_depth(Frame& frame, int64_t count);
 
-// Fills the tiles' lists and the Gaussians' slots. The result does not depend on the number of threads.
+// Fills the tiles' lists and the Gaussians' slots; reads frame.slot_counts, where it is 0. The result does not depend
+// on the number of threads.
 void bin_into_tiles(Frame& frame, int64_t count);
 
 }  // namespace mien

@@ -51,7 +51,7 @@ struct Moments {
 
 struct TileLists {
   const Entry* entries;
-  uint64_t* masks;        // per entry: the blocks it is blended in (written by the forward pass)
+  uint64_t* masks;        // per entry: the blocks it is blended in (written by the forward pass); null: not needed
   const int32_t* begins;  // [tiles + 1]
   int32_t* ends;          // [tiles]: entries after this one changed no pixel (written by the forward pass)
   int columns, rows;
@@ -67,23 +67,31 @@ struct TileGrid {
   int columns, rows;
 };
 
+// The depth keys of a group's Gaussians that are drawn.
+struct DepthRange {
+  int64_t drawn;
+  uint32_t nearest, farthest;
+};
+
 // What projection writes of each Gaussian.
 struct Projected {
   TileGrid grid;
   Splat* splats;
-  TileSpan* spans;       // only where drawn
-  uint32_t* depth_keys;  // all ones: not drawn
+  TileSpan* spans;           // only where drawn
+  uint32_t* depth_keys;      // all ones: not drawn
+  DepthRange* depth_ranges;  // per group
   int32_t* radii;
 };
 
 struct Kernels {
-  // Gaussians first .. last - 1. False on NaN or infinity.
+  // Gaussians first .. last - 1 of one group. False on NaN or infinity.
   bool (*project)(const GaussianArrays&, const View&, int64_t first, int64_t last, const Projected&);
   void (*blend)(const Splat*, const TileLists&, const View&, int tile, float* image, float* alpha);
   void (*blend_backward)(const Splat*, const TileLists&, const View&, int tile, const PictureGradient&, Moments*);
-  // Gaussians first .. last - 1; view_gradient gets their share.
+  // Gaussians first .. last - 1, whose slots lie from slot_begins[i] to slot_begins[i + 1]; view_gradient gets their
+  // share.
   void (*project_backward)(const GaussianArrays&, const View&, int64_t first, int64_t last, const uint32_t* slot_begins,
-                           const uint32_t* slot_ends, const Moments*, const GaussianGradients&, float* view_gradient);
+                           const Moments*, const GaussianGradients&, float* view_gradient);
 };
 
 }  // namespace mien

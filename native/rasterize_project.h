@@ -114,8 +114,32 @@ MIEN_INLINE void store_spans(const SplatShape& s, TileGrid grid, int valid, Tile
   memcpy(spans, rows, sizeof(TileSpan) * valid);
 }
 
+// Of the drawn Gaussians in each lane so far.
+struct Depths {
+  F nearest = set1(3e38f), farthest{};
+  int64_t drawn = 0;
+
+  MIEN_INLINE void add(F depth, M is_drawn) {
+    nearest = minimum(nearest, select(is_drawn, depth, nearest));
+    farthest = maximum(farthest, keep(is_drawn, depth));
+    drawn += __builtin_popcount(lane_bits(is_drawn));
+  }
+  MIEN_INLINE DepthRange range() const {
+    float least = nearest[0], greatest = farthest[0];
+    for (int lane = 1; lane < W; ++lane) {
+      least = nearest[lane] < least ? nearest[lane] : least;
+      greatest = farthest[lane] > greatest ? farthest[lane] : greatest;
+    }
+    DepthRange result{drawn, 0, 0};
+    memcpy(&result.nearest, &least, sizeof least);  // positive floats sort as their bits
+    memcpy(&result.farthest, &greatest, sizeof greatest);
+    return result;
+  }
+};
+
 // Returns the lanes with a NaN or an infinity.
-MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i, int valid, const Projected& out) {
+MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i, int valid, const Projected& out,
+                            Depths& depths) {
   F in[11];
   load_columns<3>(g.means + 3 * i, 3, valid, in);
   load_columns<4>(g.quats + 4 * i, 4, valid, in + 3);
@@ -156,6 +180,7 @@ MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i
     const SplatShape shape{columns[0], columns[1], columns[2], columns[3], columns[4], columns[5], columns[7]};
     store_spans(shape, out.grid, valid, out.spans + i);
   }
+  depths.add(p.camera.z, both(o.drawn, less(iota(), set1((float)valid))));
   const uint32_t drawn = lane_bits(o.drawn);
   for (int lane = 0; lane < valid; ++lane) {
     uint32_t key;
@@ -167,10 +192,12 @@ MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i
 
 bool project(const GaussianArrays& g, const View& view, int64_t first, int64_t last, const Projected& out) {
   M bad = no_lanes();
+  Depths depths;
   for (int64_t i = first; i < last; i += W) {
     const int valid = last - i < W ? (int)(last - i) : W;
-    bad = either(bad, project_group(g, view, i, valid, out));
+    bad = either(bad, project_group(g, view, i, valid, out, depths));
   }
+  out.depth_ranges[first / kGroup] = depths.range();
   return !any(bad);
 }
 

@@ -133,13 +133,13 @@ MIEN_INLINE void color_gradient(const GaussianArrays& g, const View& view, int64
 }
 
 // Sums the moments of each lane's slots, in their order; false if there are none.
-MIEN_INLINE bool gather_moments(int64_t i, int valid, const uint32_t* begins, const uint32_t* ends,
-                                const Moments* slots, F* moments) {
+MIEN_INLINE bool gather_moments(int64_t i, int valid, const uint32_t* begins, const Moments* slots, F* moments) {
   alignas(64) float buffer[W][12];
   F4 size{};
   for (int lane = 0; lane < W; ++lane) {
     F4 total[3] = {};
-    for (uint32_t slot = lane < valid ? begins[i + lane] : 0; slot < (lane < valid ? ends[i + lane] : 0); ++slot) {
+    const uint32_t end = lane < valid ? begins[i + lane + 1] : 0;
+    for (uint32_t slot = lane < valid ? begins[i + lane] : 0; slot < end; ++slot) {
       F4 from[3];
       memcpy(from, &slots[slot], sizeof from);
       for (int j = 0; j < 3; ++j) total[j] = total[j] + from[j];
@@ -189,13 +189,13 @@ MIEN_INLINE void project_backward_group(const GaussianArrays& g, const View& vie
 }
 
 void project_backward(const GaussianArrays& g, const View& view, int64_t first, int64_t last,
-                      const uint32_t* slot_begins, const uint32_t* slot_ends, const Moments* slots,
-                      const GaussianGradients& out, float* view_gradient) {
+                      const uint32_t* slot_begins, const Moments* slots, const GaussianGradients& out,
+                      float* view_gradient) {
   F view_sums[kViewGradients] = {};
   for (int64_t i = first; i < last; i += W) {
     const int valid = last - i < W ? (int)(last - i) : W;
     F moments[9];
-    if (gather_moments(i, valid, slot_begins, slot_ends, slots, moments)) {
+    if (gather_moments(i, valid, slot_begins, slots, moments)) {
       project_backward_group(g, view, i, valid, moments, out, view_sums);
     } else {
       clear_group(out, g.sh_count, i, valid);

@@ -104,8 +104,12 @@ Result draw(const Scene& s, uint32_t seed) {
            Floats(2 * n),
            Floats(mien::kViewGradients),
            std::vector<int32_t>(n)};
-  const auto frame = mien::rasterize_forward(s.arrays(), s.view, {r.image.data(), r.alpha.data(), r.radii.data()});
+  const auto frame =
+      mien::rasterize_forward(s.arrays(), s.view, {r.image.data(), r.alpha.data(), r.radii.data()}, true);
   CHECK(frame != nullptr);
+  Floats image(3 * pixels), alpha(pixels);
+  CHECK(mien::rasterize_forward(s.arrays(), s.view, {image.data(), alpha.data(), r.radii.data()}, false));
+  CHECK(image == r.image && alpha == r.alpha);
   Random random(seed);
   const Floats grad_image = random.normal(3 * pixels), grad_alpha = random.normal(pixels);
   mien::rasterize_backward(
@@ -137,7 +141,7 @@ void check_what_is_not_finite() {
       (*input)[0] = value;
       Floats image(3 * 600), alpha(600);
       std::vector<int32_t> radii(40);
-      CHECK(!mien::rasterize_forward(s.arrays(), s.view, {image.data(), alpha.data(), radii.data()}));
+      CHECK(!mien::rasterize_forward(s.arrays(), s.view, {image.data(), alpha.data(), radii.data()}, true));
       (*input)[0] = before;
     }
   }

@@ -35,6 +35,8 @@ def render_native(
             )
         own = (means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
         inputs += (t.contiguous() for t in (offset, *own, background, camera.viewmat, camera.K))
+    if not torch.is_grad_enabled():
+        inputs = [tensor.detach() for tensor in inputs]
     sizes = [(camera.height, camera.width) for _, camera in views]
     try:
         outputs: tuple[Tensor, ...] = _Rasterize.apply(sizes, *inputs)  # pyright: ignore[reportAssignmentType]
@@ -68,7 +70,7 @@ class _Rasterize(torch.autograd.Function):
             view = (recycled(*size, 3), recycled(*size), torch.empty(count, dtype=torch.int32))
             tasks.append(tuple(unpacked(*own, *view)))
             outputs += view
-        ctx.frames = _native.rasterize_views(tasks)
+        ctx.frames = _native.rasterize_views(tasks, any(ctx.needs_input_grad))
         if None in ctx.frames:
             raise _NotFiniteError(ctx.frames.index(None))
         ctx.set_materialize_grads(False)
