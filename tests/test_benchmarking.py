@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from mien import _native
+from mien.benchmarking import device as device_benchmark
 from mien.benchmarking import render as render_benchmark
 from mien.benchmarking import train_step
 from mien.benchmarking.charts import write_scaling_chart
@@ -115,3 +116,31 @@ def test_peers_are_compared_in_one_run() -> None:
     command = [sys.executable, str(PEERS / "compare.py"), "--counts", "200", "--size", "48", "--rounds", "1", "--json"]
     shown = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     assert {row["name"] for row in shown["rows"]} >= {"mien_native", "torch_tiles"}
+
+
+def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In float64 on the CPU, which takes the same way through everything but gsplat."""
+    monkeypatch.setattr(device_benchmark, "COUNTS", (60,))
+    monkeypatch.setattr(device_benchmark, "SIZES", ((24, 16),))
+    like = torch.zeros((), dtype=torch.float64)
+    rows = [*device_benchmark.render_rows(like, 0.0), *device_benchmark.train_step_rows(like, 0.0)]
+    names = ["rasterize_forward", "rasterize_forward_backward", "train_step", "pose_and_render"]
+    assert [row.name for row in rows] == names
+    assert all((row.gaussians, row.width, row.height) == (60, 24, 16) and row.min_ms > 0 for row in rows)
+
+
+def test_benchmarks_of_a_gpu_say_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    assert main(["bench", "render", "--device", "cuda"]) == 2
+    assert "--device cuda" in capsys.readouterr().err
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("what", ["render", "train-step"])
+def test_a_gpu_is_measured(what: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_benchmark, "COUNTS", (1000,))
+    assert main(["bench", what, "--device", "cuda", "--json", "--seconds", "0"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["machine"]["gpu"]
+    assert {(row["isa"], row["threads"]) for row in shown["rows"]} == {("cuda", 0)}

@@ -4,10 +4,12 @@ import os
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from mien import _native
 
@@ -34,7 +36,7 @@ class BenchmarkRow(Timing):
     height: int
     threads: int
     isa: str
-    """Instruction set of the native kernels."""
+    """Instruction set of the native kernels; `cuda` on a GPU, where threads are 0."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ class Machine:
     """Float32 operations of one thread in 1e9 a second, measured: a matrix product of 512x512 by torch."""
     load: float
     """Of the last minute, before the benchmark: above 0 others were working."""
+    gpu: str = ""
+    """Its name, torch's CUDA version and gsplat's version, where it is measured."""
 
 
 def time_function(function: Callable[[], object], seconds: float = 0.8, least: int = 7) -> Timing:
@@ -75,7 +79,13 @@ def benchmark_row(name: str, gaussians: int, size: tuple[int, int], timing: Timi
     )  # fmt: skip
 
 
-def measure_machine() -> Machine:
+def device_row(name: str, gaussians: int, size: tuple[int, int], timing: Timing, like: Tensor) -> BenchmarkRow:
+    """A row of what ran on the device of `like`; `size` is (width, height)."""
+    row = benchmark_row(name, gaussians, size, timing)
+    return replace(row, threads=0, isa=like.device.type) if like.is_cuda else row
+
+
+def measure_machine(gpu: bool = False) -> Machine:
     """Takes a fifth of a second."""
     load = os.getloadavg()[0]
     matrix = torch.randn(512, 512)
@@ -86,15 +96,17 @@ def measure_machine() -> Machine:
     finally:
         torch.set_num_threads(threads)
     gflops = 2 * 512**3 / timing.cpu_ms / 1e6
-    return Machine(_processor(), os.cpu_count() or 1, _native.rasterize_isa(), round(gflops, 1), round(load, 2))
+    isa = _native.rasterize_isa()
+    return Machine(_processor(), os.cpu_count() or 1, isa, round(gflops, 1), round(load, 2), _gpu() if gpu else "")
 
 
 def format_machine(machine: Machine) -> str:
     """One line."""
-    return (
+    processor = (
         f"{machine.processor}, {machine.cores} cores, {machine.isa}, {machine.gflops:.0f} GFLOP/s a thread "
         f"(matrix product), load {machine.load:.1f}"
     )
+    return f"{machine.gpu}; {processor}" if machine.gpu else processor
 
 
 def format_row(row: BenchmarkRow) -> str:
@@ -103,6 +115,10 @@ def format_row(row: BenchmarkRow) -> str:
         f"{row.name:28} {row.gaussians:7} {row.width:5}x{row.height:<5} {row.threads:2} threads {row.isa:8} "
         f"{row.min_ms:8.2f} min {row.median_ms:8.2f} median {row.cpu_ms:8.2f} processor ms"
     )
+
+
+def _gpu() -> str:
+    return f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}, gsplat {version('gsplat')}"
 
 
 def _processor() -> str:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mien import _native
 from mien.avatar import Avatar, GaussianAvatarsConfig
@@ -26,6 +27,7 @@ from mien.training.trainer import TrainingData, start, step
 TIMESTEPS = 20
 SETTINGS = TrainSettings(steps=1_000_000_000, split="none")
 """So many that no round of density control comes while we measure."""
+_ON_CPU = torch.zeros(())
 
 
 def train_step_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
@@ -49,13 +51,19 @@ def train_step_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
 def pose_and_render(avatar: Avatar, face: FaceParams, camera: Camera) -> None:
     """From face parameters to a picture."""
     with torch.no_grad():
-        rasterize(avatar.pose(face[0]).gaussians.timestep(0), camera, torch.ones(3))
+        gaussians = avatar.pose(face[0]).gaussians.timestep(0)
+        rasterize(gaussians, camera, gaussians.means.new_ones(3))
 
 
-def training_case(face_model: FaceModel, count: int, width: int, height: int) -> tuple[TrainingState, TrainingData]:
-    """The state in the middle of a run of so many Gaussians, and pictures to train on; head over half the picture."""
+def training_case(
+    face_model: FaceModel, count: int, width: int, height: int, like: Tensor = _ON_CPU
+) -> tuple[TrainingState, TrainingData]:
+    """The state in the middle of a run of so many Gaussians, and pictures to train on; head over half the picture.
+
+    Both with the float dtype and on the device of `like`.
+    """
     sequence = _sequence(face_model, width, height)
-    state = start([sequence], face_model, GaussianAvatarsConfig(), SETTINGS)
+    state = start([sequence], face_model, GaussianAvatarsConfig(), SETTINGS, like)
     _grow(state.avatar, count)
     order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
     state = TrainingState(state.avatar, state.adam, state.density, state.track, {})
@@ -67,8 +75,8 @@ def training_case(face_model: FaceModel, count: int, width: int, height: int) ->
             "opacity": torch.zeros(count),
         }
     )
-    _paint_targets(sequence, state.avatar)
-    return state, TrainingData(order, (Targets(sequence, 0),))
+    _paint_targets(sequence, state.avatar, like)
+    return state, TrainingData(order, (Targets(sequence, 0, like=like),))
 
 
 def _grow(avatar: Avatar, count: int) -> None:
@@ -112,13 +120,13 @@ def _sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
     return Sequence("benchmark", capture, tracking, np.zeros(pictures.shape[:-1], np.uint8))
 
 
-def _paint_targets(sequence: Sequence, avatar: Avatar) -> None:
+def _paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor) -> None:
     """Pictures of the same head in noisy colours, so that every loss has something to do."""
     noise = np.random.default_rng(0)
     for timestep in range(TIMESTEPS):
         with torch.no_grad():
-            gaussians = avatar.pose(sequence.tracking.face[timestep]).gaussians.timestep(0)
-            rendering = rasterize(gaussians, sequence.tracking.cameras[0], torch.ones(3))
-        picture = 255 * rendering.image.numpy() + noise.normal(0, 20, rendering.image.shape)
+            gaussians = avatar.pose(sequence.tracking.face[timestep].to(like)).gaussians.timestep(0)
+            rendering = rasterize(gaussians, sequence.tracking.cameras[0], like.new_ones(3))
+        picture = 255 * rendering.image.cpu().numpy() + noise.normal(0, 20, rendering.image.shape)
         sequence.capture.images[timestep, 0] = picture.clip(0, 255).astype(np.uint8)
-        sequence.scoring[timestep, 0] = (255 * rendering.alpha.numpy()).astype(np.uint8)
+        sequence.scoring[timestep, 0] = (255 * rendering.alpha.cpu().numpy()).astype(np.uint8)

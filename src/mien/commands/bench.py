@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mien.commands.options import MethodName
+from mien.devices import DeviceName, check_device, choose_device, like_on
 from mien.errors import UserError
 
 if TYPE_CHECKING:
+    import torch
+
     from mien.benchmarking.timing import BenchmarkRow, Machine
 
 
@@ -23,15 +26,24 @@ class Render:
     """Print the machine and a list of rows for programs."""
     seconds: float = 0.8
     """To spend on each row; more finds a smaller minimum on a busy machine."""
+    device: DeviceName = "cpu"
+    """cuda: gsplat on a GPU instead, at the papers' sizes."""
 
     def check(self) -> None:
-        """Nothing can be wrong before it runs."""
+        """Tell that CUDA lacks gsplat."""
+        check_device(self.device)
 
     def run(self) -> None:
         """Measure and print."""
         from mien.benchmarking.render import render_suite
 
-        show_rows(render_suite(self.seconds), self.as_json)
+        like = _gpu(self.device)
+        if like is None:
+            show_rows(render_suite(self.seconds), self.as_json)
+            return
+        from mien.benchmarking.device import render_rows
+
+        show_rows(render_rows(like, self.seconds), self.as_json, gpu=True)
 
 
 @dataclass(frozen=True)
@@ -70,15 +82,24 @@ class TrainStep:
     """Print the machine and a list of rows for programs."""
     seconds: float = 3.0
     """To spend on each row; more finds a smaller minimum on a busy machine."""
+    device: DeviceName = "cpu"
+    """cuda: on a GPU instead (gsplat draws), at the papers' sizes."""
 
     def check(self) -> None:
-        """Nothing can be wrong before it runs."""
+        """Tell that CUDA lacks gsplat."""
+        check_device(self.device)
 
     def run(self) -> None:
         """Measure and print."""
         from mien.benchmarking.train_step import train_step_suite
 
-        show_rows(train_step_suite(self.seconds), self.as_json)
+        like = _gpu(self.device)
+        if like is None:
+            show_rows(train_step_suite(self.seconds), self.as_json)
+            return
+        from mien.benchmarking.device import train_step_rows
+
+        show_rows(train_step_rows(like, self.seconds), self.as_json, gpu=True)
 
 
 @dataclass(frozen=True)
@@ -132,14 +153,20 @@ class Command:
         self.what.run()
 
 
-def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool) -> "tuple[Machine, list[BenchmarkRow]]":
+def _gpu(name: DeviceName) -> "torch.Tensor | None":
+    """A scalar on the GPU that was asked for, None where it is the processor."""
+    device = choose_device(name)
+    return like_on(device) if device.type == "cuda" else None
+
+
+def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) -> "tuple[Machine, list[BenchmarkRow]]":
     """Print the machine and every row as soon as it is measured, or all of it as json; torch keeps to one thread."""
     import torch
 
     from mien.benchmarking.timing import format_machine, format_row, measure_machine
 
     torch.set_num_threads(1)
-    machine, shown = measure_machine(), []
+    machine, shown = measure_machine(gpu), []
     if not as_json:
         print(format_machine(machine), flush=True)
     for row in rows:
