@@ -127,7 +127,12 @@ def test_focal_follows_the_crop():
     capture = replace(case.capture, source={"picture_size": [1920, 1080], "crop": crop})
     K = initial_camera(capture, TrackingSettings()).K
     assert float(K[0, 0]) == 1.5 * 1920 * 512 / 1024
-    assert float(initial_camera(case.capture, TrackingSettings()).K[0, 0]) == 1.5 * 512
+
+
+def test_a_square_picture_counts_as_cut_out_of_a_larger_one():
+    case = make_tracking_case(timesteps=3)
+    K = initial_camera(case.capture, TrackingSettings()).K
+    assert float(K[0, 0]) == pytest.approx(2.2 * 512)
 
 
 def test_several_cameras_are_refused():

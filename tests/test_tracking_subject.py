@@ -19,6 +19,8 @@ from tracking_case import FOCAL, FPS, SIZE, capture_of, make_tracking_case, stil
 FEW = TrackingSettings(keyframes=8)
 """Quicker than the default, and good enough for what is tested."""
 DOUBLE = torch.zeros((), dtype=torch.float64)
+_LENS = 1.4
+"""Times the focal length of `tracking_case`."""
 
 
 def _noisy(pixels: torch.Tensor, noise: float, seed: int) -> torch.Tensor:
@@ -40,8 +42,11 @@ def _film(yaw: tuple[float, float], start: int, name: str) -> tuple[Capture, Fac
     face = case.face[slice(start, start + 12)]
     rotation = face.head_rotation.clone()
     rotation[:, 1] = torch.linspace(*yaw, 12)
-    face = replace(face, head_rotation=rotation)
-    pixels = case.camera.project(_landmarks(case.model, face))[0]
+    # As far away as pictures of this lens are filled by, which is about what tracking assumes of square ones.
+    away = face.head_translation * torch.tensor([1, 1, _LENS])
+    face = replace(face, head_rotation=rotation, head_translation=away)
+    K = case.camera.K * torch.tensor([[_LENS, 1, 1], [1, _LENS, 1], [1, 1, 1]])
+    pixels = replace(case.camera, K=K).project(_landmarks(case.model, face))[0]
     return replace(capture_of(_noisy(pixels, 2.0, start)), name=name), face
 
 

@@ -27,8 +27,8 @@ class TrackingSettings:
 
     focal: float | None = None
     """Focal length in pixels of the capture's pictures, if known. Otherwise 1.5 times the larger side of the source
-    picture, from where the fit may move it a little: landmarks of a face hardly tell it. Calibrated cameras keep
-    their own."""
+    picture, or 2.2 times the side of a square one, which somebody cut out of a larger one. From there the fit may
+    move it a little: landmarks of a face hardly tell it. Calibrated cameras keep their own."""
     same_camera: bool = False
     """Whether all sequences were filmed with the same camera and zoom, so that they share one focal length."""
     keyframes: int = 20

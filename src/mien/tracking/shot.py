@@ -18,6 +18,10 @@ from mien.tracking.views import CameraBatch, Views, batch_of
 _LEAST_FRAMES = 3
 _DEFAULT_FOCAL = 1.5
 """Times the larger side of the source picture: between a telephone's wide lens and a portrait lens."""
+_CROPPED_FOCAL = 2.2
+"""The same of a picture that is about square: no camera films squares, so that it was cut around a head."""
+_SQUARE = 1.1
+"""Ratio of sides below which a picture counts as square."""
 _FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 """T_camera_head of a head at the camera's centre that looks the way the camera is seen."""
 
@@ -112,6 +116,6 @@ def initial_camera(capture: Capture, settings: TrackingSettings) -> Camera:
 def _source_focal(capture: Capture) -> tuple[float, float]:
     """The assumed focal lengths along x and y in pixels of the capture: it may be a shrunk crop of what was filmed."""
     crop = capture.source.get("crop", {"width": capture.width, "height": capture.height})
-    side = max(capture.source.get("picture_size", (crop["width"], crop["height"])))
-    assumed = _DEFAULT_FOCAL * float(side)
+    sides = capture.source.get("picture_size", (crop["width"], crop["height"]))
+    assumed = (_CROPPED_FOCAL if max(sides) < _SQUARE * min(sides) else _DEFAULT_FOCAL) * float(max(sides))
     return assumed * capture.width / crop["width"], assumed * capture.height / crop["height"]
