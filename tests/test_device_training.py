@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -17,6 +19,8 @@ import mien.devices
 import train_toy
 from mien import _native
 from mien.avatar import load_avatar
+from mien.cli import main
+from mien.commands import render
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
 from mien.face import FaceModel
@@ -27,6 +31,7 @@ from mien.training.frames import FrameOrder, training_frames
 from mien.training.sequence import Sequence, Targets
 from mien.training.trainer import TrainingData, start, step
 from toy_scene import toy_sequence
+from toy_workspace import write_toy_workspace
 
 SETTINGS = replace(train_toy.SETTINGS, steps=12, record_every=1)
 
@@ -52,6 +57,13 @@ def train_some(
     return state
 
 
+def assert_alike(one: TrainingState, other: TrainingState) -> None:
+    """Equal at first; then last digits decide which Gaussians grow, and Adam makes steps of tiny gradients."""
+    for name in ("loss", "photometric", "position", "scale", "psnr"):
+        assert one.curves[name][:3] == pytest.approx(other.curves[name][:3], rel=2e-4, abs=1e-6), name
+    assert one.curves["loss"] == pytest.approx(other.curves["loss"], rel=2e-2)
+
+
 @pytest.fixture
 def no_native_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fails whoever asks the native core for a part of a step."""
@@ -71,8 +83,7 @@ def test_plain_pytorch_trains_as_the_native_core_does(scene: Scene, request: pyt
     assert plain.avatar.gaussian_store()["means"].dtype == torch.float64
     assert plain.curves["gaussians"] == native.curves["gaussians"]
     assert len(set(native.curves["gaussians"])) > 1  # density control was at work
-    for name in ("loss", "photometric", "psnr"):
-        assert plain.curves[name] == pytest.approx(native.curves[name], rel=2e-3), name
+    assert_alike(plain, native)
     assert native.curves["loss"][-1] < native.curves["loss"][0]
 
 
@@ -128,8 +139,7 @@ def test_a_gpu_trains_as_the_native_core_does(scene: Scene) -> None:
     native, on_gpu = train_some(scene, torch.zeros(())), train_some(scene, like_on("cuda"))
     store = on_gpu.avatar.gaussian_store()
     assert all(store[name].is_cuda for name in store.names())
-    for name in ("loss", "photometric", "psnr"):
-        assert on_gpu.curves[name] == pytest.approx(native.curves[name], rel=5e-3), name
+    assert_alike(on_gpu, native)
 
 
 @pytest.mark.gpu
@@ -158,3 +168,34 @@ def test_what_a_gpu_trained_is_loaded_and_resumed_without_one(scene: Scene, tmp_
     whole = tmp_path / "whole"
     train([sequence], face_model, train_toy.CONFIG, replace(often, device="cuda"), whole, no_bar)
     assert len(load_avatar(whole).gaussian_store()) > 0
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("workspace")
+    write_toy_workspace(root)
+    return root
+
+
+def pictures(workspace: Path, out: Path, device: str) -> np.ndarray:
+    """What `mien render --device` wrote."""
+    options = ["--path", "turntable", "--frames", "2", "--size", "32", "--device", device]
+    assert main(["render", str(workspace), "--out", str(out), *options]) == 0
+    return np.stack([cv2.imread(str(path)).astype(np.float32) for path in sorted(out.glob("*.png"))])
+
+
+def test_pictures_are_the_same_wherever_they_are_drawn(
+    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    native = pictures(workspace, tmp_path / "native", "cpu")
+    # In place of a GPU: plain PyTorch in float64.
+    monkeypatch.setattr(render, "like_on", lambda device: torch.zeros((), dtype=torch.float64))
+    plain = pictures(workspace, tmp_path / "plain", "auto")
+    assert native.std() > 1
+    assert np.abs(native - plain).max() <= 1
+
+
+@pytest.mark.gpu
+def test_a_gpu_draws_the_same_pictures(workspace: Path, tmp_path: Path) -> None:
+    native = pictures(workspace, tmp_path / "native", "cpu")
+    assert np.abs(native - pictures(workspace, tmp_path / "cuda", "cuda")).max() <= 1

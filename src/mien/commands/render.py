@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from mien.commands.picture import PictureOptions
+from mien.devices import DeviceName, check_device, choose_device, like_on
 from mien.errors import UserError
 from mien.workspace import Workspace, open_workspace
 
@@ -48,10 +49,13 @@ class Command:
     """Magnification, 1 for what the camera saw in training."""
     sequence: str | None = None
     """Play this sequence's motion, a frame a timestep (`mien drive` has more)."""
+    device: DeviceName = "cpu"
+    """Where it is posed and drawn: cpu, cuda (an NVIDIA GPU, through gsplat), or auto: a GPU where there is one."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
     def check(self) -> None:
         """Tell what can be told without heavy libraries."""
+        check_device(self.device)
         workspace = open_workspace(self.workspace)
         workspace.pick_run(self.run_name)
         if self.sequence is not None or (self.path == "captured" and self.cameras is None):
@@ -62,7 +66,7 @@ class Command:
 
     def run(self) -> None:
         """Pose and render frame by frame; what depends on files is checked first."""
-        from mien.avatar import load_avatar
+        from mien.avatar import load_avatar, move_avatar
         from mien.commands.expression import with_expression
         from mien.commands.stages.pictures import draw, view, warn_of_white
         from mien.export.pictures import write_pictures
@@ -85,6 +89,9 @@ class Command:
         if cameras is None:
             camera = view(self.picture, run_camera(run_dir), self.zoom)
             cameras = self._path(camera, subject.head_translation[0], self._frames(timesteps))
+        like = like_on(choose_device(self.device))
+        move_avatar(avatar, like)
+        face = face.to(like)
         still = None if motion is not None else avatar.pose(face).gaussians.detach().timestep(0)
 
         def picture(index: int) -> "numpy.ndarray":

@@ -24,10 +24,9 @@ def view(look: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
 @torch.no_grad()
 def draw(look: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8[np.ndarray, "h w _"]:
     """RGB over the background, or RGBA with straight colours."""
-    rendering = rasterize(gaussians, camera, torch.tensor(look.colour()))
-    if look.background == "transparent":
-        return to_rgba(rendering.image.numpy(), rendering.alpha.numpy())
-    return to_rgb(rendering.image.numpy())
+    rendering = rasterize(gaussians, camera, torch.tensor(look.colour()).to(gaussians.means))
+    image, alpha = (tensor.float().cpu().numpy() for tensor in (rendering.image, rendering.alpha))
+    return to_rgba(image, alpha) if look.background == "transparent" else to_rgb(image)
 
 
 def warn_of_white(look: PictureOptions, run_dir: Path) -> None:
