@@ -81,6 +81,7 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
         },
         "iris_distance": _constancy(iris[seen & (yaw.abs() < _NEAR_FRONTAL)]),
         "focal_px": float(tracking.cameras[frontal].K[0, 0]),
+        "focal_from": _focal_from(capture, tracking),
         "depth_m": _summary(_depth(tracking, frontal)[valid]),
         "correlation_with_pitch": _correlations(tracking, face_model, pitch),
         "correlation_with_yaw": _correlations(tracking, face_model, yaw),
@@ -92,6 +93,12 @@ def seen_rotation(tracking: Tracking, camera: int) -> Float[Tensor, "t 3"]:
     facing = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
     R_seen_world = facing @ tracking.cameras[camera].viewmat[:3, :3]
     return axis_angle_from_matrix(R_seen_world @ matrix_from_axis_angle(tracking.face.head_rotation))
+
+
+def _focal_from(capture: Capture, tracking: Tracking) -> str:
+    if capture.calibration is not None:
+        return "calibrated"
+    return "assumed" if tracking.settings.get("focal") is None else "given"
 
 
 def _depth(tracking: Tracking, camera: int) -> Float[Tensor, " t"]:

@@ -27,10 +27,15 @@ _STYLE = (
 _JPEG_QUALITY = 85
 _SOME = 40
 """Frames that are named where there are many."""
+_FOCAL_FROM = {
+    "calibrated": "as calibrated",
+    "given": "as given",
+    "assumed": "assumed, since faces hardly tell it (--tracking.focal says it, which makes head turns more exact)",
+}
 _WAYS = {
     "landmarks": "Fitted to landmarks alone, as asked (schedule `landmarks`); pixels were not looked at.",
-    "fast": "Fitted to landmarks, then to pixels (schedule `fast`).",
-    "paper": "Fitted to landmarks, then to pixels (schedule `paper`).",
+    "fast": "Fitted to landmarks, then to pixels (schedule `fast`), which know better where the detector errs.",
+    "paper": "Fitted to landmarks, then to pixels (schedule `paper`), which know better where the detector errs.",
 }
 
 
@@ -118,12 +123,12 @@ def _figures(report: dict[str, Any]) -> list[tuple[str, str]]:
     colors, iris = report["residual_colors"], report["iris_distance"]
     rows = [
         ("Frames", str(report["frames"])),
-        ("Distance of landmarks: median, 95 %, largest", _three(report["residual_px"], 1, "px")),
+        ("Landmarks, from where the detector saw them: median, 95 %, largest", _three(report["residual_px"], 1, "px")),
     ]
     if colors is not None:
         rows.append(("Difference of colours: median, 95 %, largest", _three(colors, 100, "%")))
     rows += [
-        ("Focal length", f"{report['focal_px']:.0f} px"),
+        ("Focal length", f"{report['focal_px']:.0f} px, {_FOCAL_FROM[report['focal_from']]}"),
         ("Distance from the camera: median", _number(report["depth_m"]["median"], 1, "m")),
         ("Jitter of landmarks: detected, fitted", f"{_number(report['jitter']['detected_px'], 1, 'px')}, "
                                                   f"{_number(report['jitter']['fitted_px'], 1, 'px')}"),
