@@ -1,10 +1,10 @@
-# make setup | demo | test | sanitize | lint | bench. The environment is .venv; everything else is in pyproject.toml.
+# make setup | demo | test | sanitize | lint | bench | gpu. The environment is .venv; everything else is in pyproject.toml.
 PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || echo python3.11)
 BIN := .venv/bin
 NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UV_VERSION := 0.13.8
 
-.PHONY: setup build demo test sanitize lint format bench lock clean
+.PHONY: setup build demo test sanitize lint format bench gpu lock clean
 setup: .venv/.built
 
 .venv/.packages: requirements/lock.txt
@@ -55,6 +55,15 @@ lock: .venv/.packages
 
 bench: setup
 	$(BIN)/mien bench render
+
+# On a machine with an NVIDIA GPU and the CUDA toolkit (gsplat compiles its kernels at first use): the tests marked
+# gpu, then the figures for docs/results.md, into out/gpu.
+gpu: setup
+	VIRTUAL_ENV=.venv $(BIN)/uv pip install 'gsplat>=1.5'
+	$(BIN)/pytest -m gpu
+	mkdir -p out/gpu
+	$(BIN)/mien bench render --device cuda --json > out/gpu/render.json
+	$(BIN)/mien bench train-step --device cuda --json > out/gpu/train_step.json
 
 clean:
 	rm -rf build out .venv
