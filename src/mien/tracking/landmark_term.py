@@ -71,9 +71,10 @@ class LandmarkTerm:
         """The same term over some of the timesteps."""
         return replace(self, views=self.views.at(rows))
 
-    def _robust(
+    def robust(
         self, residual: Float[Tensor, "n l 2"], camera: Int[Tensor, " n"]
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n l"]]:
+        """Costs of pictures whose landmarks are off by this, and the weight of each square in them."""
         variance = self.sigma[camera][:, None] ** 2
         squared = (residual**2).sum(-1) / variance
         least = self.outlier**2
@@ -99,7 +100,7 @@ class LandmarkTerm:
 
     def cost(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
         """Of each timestep."""
-        of_pictures = torch.cat([self._robust(*part)[0] for part in self._offsets(state, subject, cameras)])
+        of_pictures = torch.cat([self.robust(*part)[0] for part in self._offsets(state, subject, cameras)])
         return self._prior(state)[0].index_add(0, self.views.row, of_pictures)
 
     def residuals(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "n l"]:
@@ -119,7 +120,7 @@ class LandmarkTerm:
                 state[seen], subject.identity, subject.bias, cameras[camera], place, with_identity
             )
             residual = at.pixels - views.detected[part]
-            cost, weights = self._robust(residual, camera)
+            cost, weights = self.robust(residual, camera)
             yield WeightedLinearization(at, row, residual, weights, cost)
 
     def equations(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> NormalEquations:

@@ -111,11 +111,8 @@ class Descent:
     def _is_lost(self, shown: Shown, by_landmarks: Float[Tensor, " p"]) -> bool:
         """Whether landmarks are far worse off than where they were fitted alone."""
         moving, _ = self._moving(shown, ())
-        now, then = (
-            float(landmark_terms(self.scene, shown, at, posed(self.scene, at)[0]))
-            for at in (moving, replace(moving, row=by_landmarks))
-        )
-        return now - then > _LOST**2 * self.scene.settings.landmark_share * float(self.scene.landmark_weights.sum())
+        now, then = (float(landmark_terms(self.scene, shown, at)) for at in (moving, replace(moving, row=by_landmarks)))
+        return now - then > _LOST**2 * float(self.scene.sequences[shown.sequence].terms[shown.row].weights.sum())
 
     def _fit_first(self, shown: Shown, first_of_all: bool) -> None:
         settings = self.scene.settings
@@ -197,7 +194,7 @@ class Descent:
             self._step_appearance(shown, moments, _fading(number, len(order)))
 
     def _cameras(self, sequence: int, row: int) -> list[int]:
-        return sorted(self.scene.sequences[sequence].detected[row])
+        return self.scene.sequences[sequence].seen_by(row)
 
     def _step_appearance(self, shown: Shown, moments: dict[str, Moments], rate: float) -> None:
         """One step of texture and light alone."""
@@ -271,7 +268,7 @@ class Descent:
         scene = self.scene
         vertices, _ = posed(scene, moving)
         own, rows = scene.sequences[shown.sequence], self.state.frames[shown.sequence]
-        cost = color_term(scene, shown, moving, vertices, weights) + landmark_terms(scene, shown, moving, vertices)
+        cost = color_term(scene, shown, moving, vertices, weights) + landmark_terms(scene, shown, moving)
         cost = cost + prior_term(scene, moving.row)
         # With the past alone, steady motion would go on past what pictures say: heads drifted by degrees.
         return cost if past_only else cost + smoothness_term(own, rows, shown.row, moving.row)

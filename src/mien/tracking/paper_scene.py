@@ -20,7 +20,7 @@ from mien.tracking.photometric_texture import HIDING_REGIONS, even_light
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
 from mien.tracking.solver import Smoothness
-from mien.tracking.stages import Fit, all_landmarks, smoothness_of
+from mien.tracking.stages import Fit, SequenceFit, all_landmarks, quiet_landmarks, smoothness_of
 from mien.tracking.views import CameraBatch
 
 _STIFF_REGIONS = ("eyes", "irises", "eyelids", "teeth", "tongue", "mouth", "eye_sockets", "scalp", "neck", "ears")
@@ -56,13 +56,22 @@ class SequenceScene:
     pictures: Pictures
     cameras: CameraBatch
     """float32, with the focal length of the fit to landmarks."""
-    detected: dict[int, dict[int, Float[Tensor, "l 2"]]]
-    """Of each row, by camera."""
-    sigma: Float[Tensor, " c"]
     smoothness: Smoothness
     lens: int | None
-    term: LandmarkTerm
-    """float64."""
+    terms: tuple[LandmarkTerm, ...]
+    """Landmarks of each row alone; float64."""
+
+    def seen_by(self, row: int) -> list[int]:
+        """The cameras that found a face."""
+        return self.terms[row].views.camera.tolist()
+
+    def cameras_at(self, log_focals: Float[Tensor, " g"]) -> CameraBatch:
+        """With the present focal lengths. Differentiable."""
+        if self.lens is None:
+            return self.cameras
+        factor, one = log_focals[self.lens].exp(), log_focals.new_ones(())
+        scale = torch.stack([torch.stack([factor, one, one]), torch.stack([one, factor, one]), torch.ones(3)])
+        return CameraBatch(self.cameras.K * scale, self.cameras.viewmat)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +82,8 @@ class PaperScene:
     layout: ParameterLayout
     precision: Float[Tensor, "p p"]
     landmarks: Landmarks
-    landmark_weights: Float[Tensor, " l"]
-    outlier: float
     bias: Float[Tensor, "l 3"]
+    """Of landmarks, as `Subject.bias`; float64."""
     mesh: LitMesh
     used: Float[Tensor, " f"]
     identity: Float[Tensor, " i"]
@@ -95,10 +103,10 @@ class PaperScene:
         `differences` is the sum of squares of the timestep's factors in the second differences that count.
         """
         own = self.sequences[sequence]
-        subject = Subject(self.identity.double(), self.bias.double())
+        subject = Subject(self.identity.double(), self.bias)
         cameras = CameraBatch(own.cameras.K.double(), own.cameras.viewmat.double())
         with torch.no_grad():
-            here = own.term.at(torch.tensor([row])).equations(state.double()[None], subject, cameras)
+            here = own.terms[row].equations(state.double()[None], subject, cameras)
             hessian = here.hessian[0] + torch.diag(differences * own.smoothness.precision.double())
             hessian += 1e-9 * torch.diag(hessian.diagonal())
             return torch.linalg.inv(torch.linalg.cholesky(hessian)).T.float().contiguous()
@@ -106,12 +114,8 @@ class PaperScene:
     def camera(self, sequence: int, camera: int, log_focals: Float[Tensor, " g"]) -> Camera:
         """Of a picture of the capture's size, with the present focal length."""
         own = self.sequences[sequence]
-        K, capture = own.cameras.K[camera], own.pictures.capture
-        if own.lens is not None:
-            factor = log_focals[own.lens].exp()
-            K = torch.stack([torch.cat([K[0, :1] * factor, K[0, 1:]]),
-                             torch.cat([K[1, :1], K[1, 1:2] * factor, K[1, 2:]]), K[2]])  # fmt: skip
-        return Camera(K, own.cameras.viewmat[camera], capture.width, capture.height)
+        cameras, capture = own.cameras_at(log_focals), own.pictures.capture
+        return Camera(cameras.K[camera], cameras.viewmat[camera], capture.width, capture.height)
 
 
 def paper_scene(
@@ -124,14 +128,13 @@ def paper_scene(
         face_model.faces.contiguous(), face_model.uv[face_model.uv_faces].contiguous(), used.float(),
         mesh_edges(face_model.faces, used),
     )  # fmt: skip
-    terms = [all_landmarks(model, shot.views, own, settings) for shot, own in zip(shots, fit.sequences, strict=True)]
     sequences = [
-        _sequence(model, shot, own.cameras, term, lens, settings)
-        for shot, own, term, lens in zip(shots, fit.sequences, terms, lenses, strict=True)
+        _sequence(model, shot, own, lens, settings)
+        for shot, own, lens in zip(shots, fit.sequences, lenses, strict=True)
     ]
     return PaperScene(
         face_model, model.layout, model.layout.precision.float(), face_model.landmarks["mediapipe"],
-        terms[0].weights.float(), terms[0].outlier, fit.subject.bias.float(), mesh, used.float(),
+        fit.subject.bias, mesh, used.float(),
         fit.subject.identity.float(), _offset_share(face_model), _neighbours(face_model), tuple(sequences),
         settings.paper,
     )  # fmt: skip
@@ -153,22 +156,16 @@ def first_state(scene: PaperScene, fit: Fit, lenses: Sequence[int | None]) -> Pa
 
 
 def _sequence(
-    model: LandmarkModel,
-    shot: Shot,
-    cameras: CameraBatch,
-    term: LandmarkTerm,
-    lens: int | None,
-    settings: TrackingSettings,
+    model: LandmarkModel, shot: Shot, own: SequenceFit, lens: int | None, settings: TrackingSettings
 ) -> SequenceScene:
-    detected: dict[int, dict[int, Tensor]] = {}
-    views = shot.views
-    for picture, (row, camera) in enumerate(zip(views.row.tolist(), views.camera.tolist(), strict=True)):
-        detected.setdefault(row, {})[camera] = views.detected[picture].float()
+    cameras = own.cameras
+    term = quiet_landmarks(all_landmarks(model, shot.views, own, settings), settings.paper.landmark_share)
     smoothness = smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, cameras)
     return SequenceScene(
         shot.valid.nonzero()[:, 0], Pictures(shot.capture, settings.paper.shrink),
-        CameraBatch(cameras.K.float(), cameras.viewmat.float()), detected, term.sigma.float(),
-        Smoothness(smoothness.precision.float(), smoothness.linked), lens, term,
+        CameraBatch(cameras.K.float(), cameras.viewmat.float()),
+        Smoothness(smoothness.precision.float(), smoothness.linked), lens,
+        tuple(term.at(torch.tensor([row])) for row in range(len(own.state))),
     )  # fmt: skip
 
 

@@ -13,9 +13,9 @@ from mien.camera import Camera
 from mien.face import FaceParams
 from mien.render.mesh import MeshFragments, rasterize_mesh, vertex_normals
 from mien.render.mesh_gradients import image_points, mesh_loss
-from mien.rotation import matrix_from_axis_angle
 from mien.tracking.paper_scene import PaperScene, SequenceScene
 from mien.tracking.solver import Smoothness
+from mien.tracking.views import CameraBatch
 
 GAPS = (
     (159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 373),  # lids
@@ -111,28 +111,21 @@ def see(vertices: Float[Tensor, "v 3"], scene: PaperScene, camera: Camera) -> Me
     return rasterize_mesh(vertices.detach(), scene.mesh.faces, fixed)
 
 
-def landmark_terms(
-    scene: PaperScene, shown: Shown, moving: Moving, vertices: Float[Tensor, "v 3"]
-) -> Float[Tensor, ""]:
-    """Landmarks in all pictures of the timestep, and the gaps between lids and lips."""
+def landmark_terms(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Tensor, ""]:
+    """Landmarks in all pictures of the timestep as a detector sees them, and the gaps between lids and between lips."""
     own = scene.sequences[shown.sequence]
-    marks = scene.landmarks.positions(vertices, scene.mesh.faces)
-    marks = marks + scene.bias @ matrix_from_axis_angle(moving.row[:3]).T
+    term, cameras = own.terms[shown.row], own.cameras_at(moving.log_focals)
+    views = term.views
+    # What offsets move of landmarks is worked out as `_as_fit` does in the end: as part of their bias.
+    moved = scene.landmarks.positions(moving.offsets, scene.mesh.faces).double()
+    cameras = CameraBatch(cameras.K.double(), cameras.viewmat.double())[views.camera]
+    state, identity = moving.row.double()[None], moving.identity.double()
+    projected = term.model.project(state, identity, scene.bias + moved, cameras, views.row)
+    residual = projected - views.detected
     upper, lower = (torch.tensor(column) for column in zip(*GAPS, strict=True))
-    total = vertices.new_zeros(())
-    for camera, detected in own.detected[shown.row].items():
-        pixels = scene.camera(shown.sequence, camera, moving.log_focals).project(marks)[0]
-        residual = (pixels - detected) / own.sigma[camera]
-        total = total + _robust(residual, scene.landmark_weights, scene.outlier)
-        gaps = residual[upper] - residual[lower]
-        weights = scene.settings.gap_weight * scene.landmark_weights[upper]
-        total = total + _robust(gaps, weights, scene.outlier)
-    return scene.settings.landmark_share * total
-
-
-def _robust(residual: Float[Tensor, "n 2"], weights: Float[Tensor, " n"], outlier: float) -> Float[Tensor, ""]:
-    squared, least = residual.square().sum(-1), outlier**2
-    return (weights * least * squared / (least + squared)).sum()
+    gap_weights = scene.settings.gap_weight * term.weights[upper]
+    gaps = replace(term, weights=gap_weights).robust(residual[:, upper] - residual[:, lower], views.camera)[0]
+    return (term.robust(residual, views.camera)[0] + gaps).sum().float()
 
 
 def prior_term(scene: PaperScene, row: Float[Tensor, " p"]) -> Float[Tensor, ""]:

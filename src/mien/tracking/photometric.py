@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.progress import progress_bar, say
-from mien.tracking.landmark_groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_EYELIDS, RIGHT_IRIS
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.photometric_fit import PhotometricFit, photometric_fit_of
@@ -31,7 +30,7 @@ from mien.tracking.resume import Keeper
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
 from mien.tracking.solver import NormalEquations, Smoothness, solve_chain
-from mien.tracking.stages import Fit, SequenceFit, all_landmarks, box_of, fit_bias, smoothness_of
+from mien.tracking.stages import Fit, SequenceFit, all_landmarks, box_of, fit_bias, quiet_landmarks, smoothness_of
 from mien.tracking.watch import Watch
 
 _DAMPING = 1e-3
@@ -150,7 +149,7 @@ def refine_photometrically(
     """
     own_settings = settings.photometric
     landmarks = [
-        _quiet(all_landmarks(model, shot.views, own, settings), own_settings.landmark_share)
+        quiet_landmarks(all_landmarks(model, shot.views, own, settings), own_settings.landmark_share)
         for shot, own in zip(shots, fit.sequences, strict=True)
     ]
     surface = surface_model(model.face_model, model.layout)
@@ -208,13 +207,6 @@ def _with_residuals(now: _Round, at: PhotometricFit) -> PhotometricFit:
         for term, own, improved in zip(now.terms(at), at.fit.sequences, at.improved, strict=True)
     ]
     return replace(at, residuals=tuple(found))
-
-
-def _quiet(term: LandmarkTerm, share: float) -> LandmarkTerm:
-    """With a share of the weight, but for what opens and closes: no texture shows a closed mouth and an open one."""
-    kept = torch.full_like(term.weights, share)
-    kept[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS + LEFT_IRIS + RIGHT_IRIS)] = 1
-    return replace(term, weights=term.weights * kept)
 
 
 def _step_sequences(

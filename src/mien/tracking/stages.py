@@ -248,6 +248,13 @@ def all_landmarks(model: LandmarkModel, views: Views, own: SequenceFit, settings
     return landmark_term(model, views, landmark_weights(), own.state, own.cameras, settings)
 
 
+def quiet_landmarks(term: LandmarkTerm, share: float) -> LandmarkTerm:
+    """With a share of the weight, but for what opens and closes: no texture shows a closed mouth and an open one."""
+    kept = torch.full_like(term.weights, share)
+    kept[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS + LEFT_IRIS + RIGHT_IRIS)] = 1
+    return replace(term, weights=term.weights * kept)
+
+
 def box_of(layout: ParameterLayout) -> Box:
     """The bounds of the parameters."""
     return Box(layout.lower, layout.upper)
