@@ -78,6 +78,17 @@ def test_the_last_persons_shape_is_not_taken_for_anothers() -> None:
     torch.testing.assert_close(model(without), model.vertices_reference(without), atol=1e-6, rtol=0)
 
 
+def test_a_shape_looked_at_without_gradients_still_has_them() -> None:
+    model = chained_model()
+    face = random_face(model, 1).detach()
+    assert face.vertex_offsets is not None
+    shape = [face.identity.requires_grad_(), face.vertex_offsets.requires_grad_()]
+    with torch.no_grad():
+        model(face)
+    for gradient in torch.autograd.grad(model(face).square().sum(), shape):
+        assert gradient.any()
+
+
 def test_the_same_bits_for_any_number_of_threads_and_any_batch() -> None:
     model = load_face_model("anny")
     face = random_face(model, 3).detach()

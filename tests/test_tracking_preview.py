@@ -63,7 +63,7 @@ def test_every_stage_is_shown_and_changes_nothing(tmp_path, seen):
 
 def test_two_sequences_and_the_paper_schedule_are_shown(tmp_path, seen):
     captures = [make_photometric_case(timesteps=timesteps).capture for timesteps in (5, 4)]
-    short = PaperSettings(first_steps=6, steps=2, epochs=1, texture_size=64)
+    short = PaperSettings(start="landmarks", first_steps=6, steps=2, epochs=1, texture_size=64)
     settings = replace(FAST, schedule="paper", paper=short)
     model = make_photometric_case(timesteps=4).model
     track_subject(captures, model, settings, preview=tmp_path / "preview.html")

@@ -91,7 +91,8 @@ class CompiledModel:
         if last and last.identity is identity and last.offsets is offsets and last.versions == versions:
             return last.shape
         shape = model.rest_vertices(face), model.rest_joints(face)
-        if not shape[0].requires_grad:
+        # What is kept has to do for gradients as well, though it may have been asked for without them.
+        if not (identity.requires_grad or (offsets is not None and offsets.requires_grad)):
             self._last = _Person(identity, offsets, versions, shape)
         return shape
 

@@ -8,6 +8,7 @@ import torch
 from mien.progress import progress_bar
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.paper_descent import Descent
+from mien.tracking.paper_frames import fit_looks, fit_sequence, look_around, recentre
 from mien.tracking.paper_scene import PaperScene, PaperState, first_state, paper_scene
 from mien.tracking.photometric_fit import PhotometricFit
 from mien.tracking.photometric_texture import Appearance, texture_space
@@ -26,48 +27,62 @@ def fit_by_descent(
     settings: TrackingSettings,
     keeper: Keeper,
     watch: Watch,
+    refined: PhotometricFit | None = None,
 ) -> PhotometricFit:
-    """A fit to landmarks refined as in the supplement of GaussianAvatars, section A.
+    """A fit refined as in the supplement of GaussianAvatars, section A: by its global epochs, if pixels were fitted to.
 
-    Frames whose landmarks a fit to pixels lost go back to where landmarks had them, and are not `improved`.
+    Otherwise all of it; frames whose landmarks were lost in its pass along the frames go back to where landmarks had
+    them, and are not `improved`.
 
     Args:
         model: The face model reduced to its landmarks.
         shots: The sequences.
         lenses: The unknown focal length of each (`lenses_of`).
-        fit: What landmarks led to.
+        fit: What landmarks, or the schedule `fast`, led to.
         settings: Of the whole tracking.
         keeper: Of what an interrupted fit of the same input goes on from.
         watch: Is told how far it has come.
+        refined: `fit` with texture and light, if it was fitted to pixels.
     """
-    scene = paper_scene(model, shots, lenses, fit, settings)
-    descent = Descent(scene, first_state(scene, fit, lenses), fit)
+    if refined is not None and not (refined.appearance.trust > 0).any():
+        return refined  # pictures show nothing that could be fitted
+    scene = paper_scene(model, shots, lenses, fit, settings, refined)
+    descent = Descent(scene, first_state(scene, fit, lenses, refined))
     descent.resume(keeper)
+    if refined is not None:
+        descent.done = max(descent.done, descent.frames)
     total = descent.frames * (1 + settings.paper.epochs)
     done = min(descent.done, total)
+
+    def outcome() -> PhotometricFit:
+        return _as_photometric(scene, descent, fit, refined)
+
     with torch.enable_grad(), progress_bar("Fitting to pixels", total, done) as advance:
 
         def step(amount: int = 1, status: str = "") -> None:
             nonlocal done
             done += amount
             advance(amount, status=status)
-            watch(f"pixels, {status}", done / total, lambda: _as_photometric(scene, descent, fit))
+            watch(f"pixels, {status}", done / total, outcome)
 
-        for sequence in range(len(shots)):
-            descent.fit_sequence(sequence, step, keeper)
+        for sequence in range(len(shots) if refined is None else 0):
+            fit_sequence(descent, sequence, step, keeper)
         if descent.done == descent.frames:
-            descent.recentre()
+            look_around(descent) if refined is not None else recentre(descent)
+            fit_looks(descent)
         for epoch in range(settings.paper.epochs):
             descent.fit_epoch(epoch, step, keeper)
-    return _as_photometric(scene, descent, fit)
+    return outcome()
 
 
-def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit) -> PhotometricFit:
+def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: PhotometricFit | None) -> PhotometricFit:
     """The fit with texture and light; texels are trusted as the triangles that they are on."""
     state, fit = descent.state, _as_fit(scene, descent.state, fit)
     fragments = texture_space(scene.face_model, scene.settings.texture_size).fragments
     trust = torch.cat([descent.trusted(), torch.zeros(1)])[fragments.face_index.long()]
     improved = [torch.ones(len(rows), dtype=torch.bool) for rows in state.frames]
+    if refined is not None:
+        improved = [own.clone() for own in refined.improved]
     for sequence, row in descent.lost:
         improved[sequence][row] = False
     appearance = Appearance(state.texture, trust, scene.settings.color_epsilon)

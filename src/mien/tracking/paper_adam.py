@@ -8,6 +8,10 @@ from torch import Tensor
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-12
 
+_SETTLED = 2.0
+"""Gradient of a cost of one that is off by one standard deviation. Plain Adam moves by its whole rate however little
+there is to gain: each frame trembled about its place by that."""
+
 
 @dataclass(eq=False)
 class Moments:
@@ -22,12 +26,12 @@ class Moments:
         """For values that have not moved yet."""
         return Moments(torch.zeros_like(values), torch.zeros_like(values))
 
-    def step(self, values: Tensor, gradient: Tensor, rate: Tensor | float) -> None:
-        """Move the values in place (Kingma and Ba 2015); `rate` may differ between entries."""
+    def step(self, values: Tensor, gradient: Tensor, rate: float, settled: float = _EPSILON) -> None:
+        """Move the values in place (Kingma and Ba 2015), by less than `rate` where gradients are about `settled`."""
         self.count += 1
         self.first.lerp_(gradient, 1 - _BETA1)
         self.second.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
-        root = (self.second / (1 - _BETA2**self.count)).sqrt_().add_(_EPSILON)
+        root = (self.second / (1 - _BETA2**self.count)).sqrt_().add_(settled)
         moved = self.first / root
         values.sub_(moved.mul_(rate).mul_(1 / (1 - _BETA1**self.count)))
 
@@ -39,13 +43,14 @@ class RowStepper:
     row: Float[Tensor, " p"]
     """Moved in place."""
     whitening: Float[Tensor, "p p"]
+    """From standard deviations that landmarks leave to parameters."""
     moments: Moments
     bounds: tuple[Float[Tensor, " p"], Float[Tensor, " p"]]
 
     @torch.no_grad()
     def step(self, gradient: Float[Tensor, " p"], rate: float) -> None:
-        """One step; within the bounds."""
+        """One step of at most about `rate` standard deviations; within the bounds."""
         move = torch.zeros_like(self.row)
-        self.moments.step(move, gradient @ self.whitening, rate)
+        self.moments.step(move, gradient @ self.whitening, rate, _SETTLED)
         self.row.add_(self.whitening @ move)
         self.row.copy_(torch.minimum(torch.maximum(self.row, self.bounds[0]), self.bounds[1]))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from mien.camera import Camera
 from mien.face import FaceModel, Landmarks
@@ -15,8 +16,9 @@ from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.paper_settings import PaperSettings
 from mien.tracking.parameters import ParameterLayout
+from mien.tracking.photometric_fit import PhotometricFit
 from mien.tracking.photometric_pictures import Pictures
-from mien.tracking.photometric_texture import HIDING_REGIONS, even_light
+from mien.tracking.photometric_texture import HIDING_REGIONS, even_light, texture_space
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.shot import Shot
 from mien.tracking.solver import Smoothness
@@ -119,13 +121,19 @@ class PaperScene:
 
 
 def paper_scene(
-    model: LandmarkModel, shots: Sequence[Shot], lenses: Sequence[int | None], fit: Fit, settings: TrackingSettings
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    lenses: Sequence[int | None],
+    fit: Fit,
+    settings: TrackingSettings,
+    refined: PhotometricFit | None = None,
 ) -> PaperScene:
-    """Constants of the fit, from what landmarks led to."""
+    """Constants of the fit, from what landmarks led to, or pixels as well."""
     face_model = model.face_model.to(torch.zeros(()))
     used = ~face_model.region_mask(*HIDING_REGIONS)
+    weights = used.float() if refined is None else used * _trust(face_model, refined)
     mesh = LitMesh(
-        face_model.faces.contiguous(), face_model.uv[face_model.uv_faces].contiguous(), used.float(),
+        face_model.faces.contiguous(), face_model.uv[face_model.uv_faces].contiguous(), weights,
         mesh_edges(face_model.faces, used),
     )  # fmt: skip
     sequences = [
@@ -134,25 +142,47 @@ def paper_scene(
     ]
     return PaperScene(
         face_model, model.layout, model.layout.precision.float(), face_model.landmarks["mediapipe"],
-        fit.subject.bias, mesh, used.float(),
+        fit.subject.bias, mesh, weights,
         fit.subject.identity.float(), _offset_share(face_model), _neighbours(face_model), tuple(sequences),
         settings.paper,
     )  # fmt: skip
 
 
-def first_state(scene: PaperScene, fit: Fit, lenses: Sequence[int | None]) -> PaperState:
-    """Where landmarks led to, with nothing known about texture and light."""
-    size = scene.settings.texture_size
-    lens_count = len({lens for lens in lenses if lens is not None})
+def _trust(face_model: FaceModel, refined: PhotometricFit) -> Float[Tensor, " f"]:
+    """The mean trust in each triangle's texels: where pictures contradict each other, as at glasses, they say less."""
+    trust, count = refined.appearance.trust, len(face_model.faces)
+    face_index = texture_space(face_model, len(trust)).fragments.face_index.long().flatten()
+    face_index = torch.where(face_index < 0, count, face_index)
+    texels = torch.bincount(face_index, minlength=count + 1)
+    sums = torch.bincount(face_index, weights=trust.flatten().double(), minlength=count + 1)
+    return (sums / texels.clamp_min(1))[:count].float()
+
+
+def first_state(
+    scene: PaperScene, fit: Fit, lenses: Sequence[int | None], refined: PhotometricFit | None = None
+) -> PaperState:
+    """Where a fit led to; texture and light are even unless pixels were looked at."""
+    lights = [even_light() for _ in scene.sequences] if refined is None else list(refined.lights)
     return PaperState(
         identity=scene.identity.clone(),
         offsets=torch.zeros_like(scene.face_model.template),
-        texture=torch.full((size, size, 3), 0.5),
-        lights=torch.stack([even_light() for _ in scene.sequences]),
-        log_focals=torch.zeros(lens_count),
+        texture=_first_texture(scene.settings.texture_size, refined),
+        lights=torch.stack(lights),
+        log_focals=torch.zeros(len({lens for lens in lenses if lens is not None})),
         frames=[own.state.float() for own in fit.sequences],
         sight=torch.zeros(len(scene.mesh.faces)),
     )
+
+
+def _first_texture(size: int, refined: PhotometricFit | None) -> Float[Tensor, "th tw 3"]:
+    """What is known of it, of the middle colour elsewhere."""
+    texture = torch.full((size, size, 3), 0.5)
+    if refined is None or not (refined.appearance.trust > 0).any():
+        return texture
+    albedo, known = refined.appearance.albedo, refined.appearance.trust > 0
+    filled = torch.where(known[..., None], albedo, albedo[known].median(0).values)
+    planes = interpolate(filled.movedim(2, 0)[None], (size, size), mode="bilinear", antialias=True)
+    return planes[0].movedim(0, 2).contiguous()
 
 
 def _sequence(

@@ -1,6 +1,7 @@
 """What a user may choose about the `paper` schedule."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -10,9 +11,9 @@ class PaperRates:
     frame: float = 0.3
     """Of a frame's own parameters, in standard deviations that its landmarks leave them (so that head rotation and
     translation, or two expressions that look alike, are not in each other's way)."""
-    identity: float = 5e-3
+    identity: float = 1e-2
     """Of identity coefficients."""
-    offsets: float = 5e-5
+    offsets: float = 1e-4
     """Of vertex offsets, metres."""
     texture: float = 1e-2
     """Of albedo, 0..1."""
@@ -24,21 +25,24 @@ class PaperRates:
 
 @dataclass(frozen=True)
 class PaperSettings:
-    """Tracking as in the supplement of GaussianAvatars (section A): by gradient descent, frame after frame."""
+    """Tracking as in the supplement of GaussianAvatars (section A), by gradient descent; started better."""
 
+    start: Literal["fast", "landmarks"] = "fast"
+    """fast: the global epochs begin where the schedule `fast` ends, which is better and quicker. landmarks: all as in
+    the supplement: the first frame to convergence, then each next one from the one before it, then the epochs."""
     first_steps: int = 500
-    """Optimiser steps at the first frame, half of them for texture and light alone."""
+    """Optimiser steps at the first frame, half of them for texture and light alone. Only from landmarks."""
     steps: int = 50
-    """Steps for each next frame, which starts where the frame before it ended."""
+    """Steps for each next frame, which starts where the frame before it ended. Only from landmarks."""
     epochs: int = 30
     """Passes over all frames in random order that refine everything."""
     texture_size: int = 512
     """Texels along each side."""
     texture_steps: int = 8
-    """Steps for texels that a frame shows better than those before it."""
+    """Steps for texels that a frame shows better than those before it. Only from landmarks."""
     shrink: int = 1
     """Fit to pictures shrunk by this: 2 is four times as fast, and less exact."""
-    color_weight: float = 1e4
+    color_weight: float = 3e3
     """Of the mean difference between picture and rendering (0..1); squared standard deviations count 1 each."""
     color_epsilon: float = 0.02
     """Differences of colours smaller than this pull less and less."""

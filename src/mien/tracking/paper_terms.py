@@ -13,7 +13,7 @@ from mien.camera import Camera
 from mien.face import FaceParams
 from mien.render.mesh import MeshFragments, rasterize_mesh, vertex_normals
 from mien.render.mesh_gradients import image_points, mesh_loss
-from mien.tracking.paper_scene import PaperScene, SequenceScene
+from mien.tracking.paper_scene import PaperScene, PaperState, SequenceScene
 from mien.tracking.solver import Smoothness
 from mien.tracking.views import CameraBatch
 
@@ -23,6 +23,8 @@ GAPS = (
 )  # fmt: skip
 """Pairs of landmarks, upper and lower, whose distance tells how far eyes and mouth are open."""
 
+_BLUR_AT = 4.0
+"""Pixels of standard deviation to which pictures are shrunk for a wide blur."""
 _LIGHT = 0.1
 """Differences of colours of more than this are not taken for light."""
 
@@ -100,9 +102,18 @@ def without_smooth_difference(scene: PaperScene, shown: Shown, moving: Moving, w
     lit = lit * (_LIGHT**2 / (_LIGHT**2 + difference.square().sum(-1, keepdim=True)))
     depth = float(camera.project(vertices.mean(0, keepdim=True))[1])
     sigma = max(scene.settings.light_extent * float(camera.K[0, 0]) / depth, 1.0)
-    sums = cv2.GaussianBlur(torch.cat([difference * lit, lit], dim=-1).numpy(), (0, 0), sigma)
+    sums = _blurred(torch.cat([difference * lit, lit], dim=-1).numpy(), sigma)
     smooth = torch.from_numpy(sums[..., :3] / np.maximum(sums[..., 3:], 1e-3)) * (lit > 0)
     return replace(shown, image=shown.image - smooth)
+
+
+def _blurred(image: Float[np.ndarray, "h w c"], sigma: float) -> Float[np.ndarray, "h w c"]:
+    """Blurred at a fraction of the size where that is wide: the same within a hundredth, many times faster."""
+    height, width = image.shape[:2]
+    factor = max(int(sigma / _BLUR_AT), 1)
+    small = cv2.resize(image, (max(width // factor, 1), max(height // factor, 1)), interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), sigma / factor)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def see(vertices: Float[Tensor, "v 3"], scene: PaperScene, camera: Camera) -> MeshFragments:
@@ -142,12 +153,14 @@ def smoothness_term(
     return Smoothness(own.smoothness.precision, own.smoothness.linked[first:last]).cost(window)
 
 
-def shared_terms(scene: PaperScene, moving: Moving) -> Float[Tensor, ""]:
+def shared_terms(scene: PaperScene, state: PaperState) -> Float[Tensor, ""]:
     """Of identity, offsets, light and focal lengths."""
     settings = scene.settings
-    total = ((moving.identity - scene.identity) / settings.identity_sigma).square().sum()
-    total = total + (moving.log_focals / settings.focal_sigma).square().sum()
-    return total + light_term(scene, moving.light) + offset_term(scene, moving.offsets)
+    total = ((state.identity - scene.identity) / settings.identity_sigma).square().sum()
+    total = total + (state.log_focals / settings.focal_sigma).square().sum()
+    for light in state.lights:
+        total = total + light_term(scene, light)
+    return total + offset_term(scene, state.offsets)
 
 
 def light_term(scene: PaperScene, light: Float[Tensor, "9 3"]) -> Float[Tensor, ""]:

@@ -93,10 +93,11 @@ def track_subject(
                 f"{names}: no face fits the landmarks; look at the pictures, and capture it again"
             ) from None
         refined: PhotometricFit | None = None
-        if settings.schedule == "fast":
+        if settings.schedule == "fast" or (settings.schedule == "paper" and settings.paper.start == "fast"):
             refined = refine_photometrically(model, shots, lenses, fit, settings, keeper, watch)
         if settings.schedule == "paper":
-            refined = fit_by_descent(model, shots, lenses, fit, settings, keeper, watch)
+            start = fit if refined is None else refined.fit
+            refined = fit_by_descent(model, shots, lenses, start, settings, keeper, watch, refined)
         watch(DONE, 1.0, lambda: refined or fit)
         fit = fit if refined is None else refined.fit
         trackings = [
