@@ -1,4 +1,4 @@
-"""The `paper` schedule: frame after frame by gradient descent, then all of them together in random order."""
+"""The `paper` schedule: all frames together by gradient descent in random order, from where `fast` ends."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -47,8 +47,8 @@ class TrackingSettings:
     smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
     """Over time."""
     schedule: Literal["landmarks", "fast", "paper"] = "fast"
-    """landmarks: fit landmarks alone. fast: then fit the pixels, by a texture common to all pictures. paper: fit the
-    pixels frame after frame by gradient descent, then all together (GaussianAvatars), which takes much longer."""
+    """landmarks: fit landmarks alone. fast: then fit the pixels, by a texture common to all pictures. paper: then
+    refine all by gradient descent over frames in random order (GaussianAvatars), which takes many times longer."""
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
     """Of the fast fit to pixels."""
     paper: PaperSettings = field(default_factory=PaperSettings)
