@@ -126,6 +126,36 @@ void head_poses_backward(const In<-1, 3>& rotation, const In<-1, 4, 4>& grad_tra
     mien::head_pose_backward(rotation.data() + 3 * i, grad_transforms.data() + 16 * i, grad_rotation.data() + 3 * i);
 }
 
+using Matrix = In<4, 4>;
+
+// first . second, added up from the first column to the last.
+void compose_rigid(const Matrix& first, const Matrix& second, const Out<4, 4>& out) {
+  const float *a = first.data(), *b = second.data();
+  for (int row = 0; row < 4; ++row) {
+    for (int column = 0; column < 4; ++column) {
+      float sum = a[4 * row] * b[column];
+      for (int k = 1; k < 4; ++k) sum += a[4 * row + k] * b[4 * k + column];
+      out.data()[4 * row + column] = sum;
+    }
+  }
+}
+
+void compose_rigid_backward(const Matrix& first, const Matrix& second, const Matrix& gradient,
+                            const Out<4, 4>& grad_first, const Out<4, 4>& grad_second) {
+  const float *a = first.data(), *b = second.data(), *g = gradient.data();
+  for (int row = 0; row < 4; ++row) {
+    for (int column = 0; column < 4; ++column) {
+      float by_first = 0, by_second = 0;
+      for (int k = 0; k < 4; ++k) {
+        by_first += g[4 * row + k] * b[4 * column + k];
+        by_second += a[4 * k + row] * g[4 * k + column];
+      }
+      grad_first.data()[4 * row + column] = by_first;
+      grad_second.data()[4 * row + column] = by_second;
+    }
+  }
+}
+
 }  // namespace
 
 void bind_face(nb::module_& module) {
@@ -141,6 +171,9 @@ void bind_face(nb::module_& module) {
              "grad_head_translation"_a, "Fills the gradients, one of each a timestep.");
   module.def("head_poses", &head_poses, "rotation"_a.noconvert(), "translation"_a.noconvert(),
              "transforms"_a.noconvert(), "Fills T_world_head of b timesteps.");
+  module.def("compose_rigid", &compose_rigid, "first"_a, "second"_a, "out"_a);
+  module.def("compose_rigid_backward", &compose_rigid_backward, "first"_a, "second"_a, "gradient"_a, "grad_first"_a,
+             "grad_second"_a);
   module.def("head_poses_backward", &head_poses_backward, "rotation"_a.noconvert(), "grad_transforms"_a.noconvert(),
              "grad_rotation"_a.noconvert());
 }

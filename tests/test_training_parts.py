@@ -212,7 +212,7 @@ def test_face_track_moves_only_the_timestep_that_was_used() -> None:
     for step in range(4):
         face = track.face(2)
         (face.expression.sum() + face.head_translation.sum()).backward()
-        adam.step(track.parameter_groups(face, 2), Progress(step, 10))
+        adam.step(track.parameter_groups(2), Progress(step, 10))
     tuned = track.params()
     # Adam moves by its rate in each step while the gradient keeps its sign.
     torch.testing.assert_close(tuned.expression[2], start.expression[2] - 0.04)
@@ -228,7 +228,7 @@ def test_face_track_is_still_where_tuning_is_off() -> None:
     track = FaceTrack(toy_face(6), FaceTuning(enabled=False))
     face = track.face(2)
     assert not face.expression.requires_grad
-    assert track.parameter_groups(face, 2) == []
+    assert track.parameter_groups(2) == []
     assert track.state() == {}
 
 
@@ -261,7 +261,7 @@ def test_corrections_stay_within_their_sequence() -> None:
     one.head_translation.grad = torch.ones(1, 3)
     for name in ("expression", "joints", "head_rotation"):
         getattr(one, name).grad = torch.zeros_like(getattr(one, name))
-    Adam().step(track.parameter_groups(one, 0), Progress(0, 10))
+    Adam().step(track.parameter_groups(0), Progress(0, 10))
     moved = track.params().head_translation
     assert (moved[0] < 0).all()
     torch.testing.assert_close(moved[1], moved[0])

@@ -5,6 +5,10 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mien import _native
+from mien.arrays import unpacked
 
 # Below this angle (radians, squared) the closed forms lose digits and their Taylor series take over.
 _SMALL_ANGLE_SQUARED = 1e-8
@@ -118,15 +122,26 @@ class _ComposeRigid(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:
+        first, second = first.detach().contiguous(), second.detach().contiguous()
         ctx.save_for_backward(first, second)
+        if first.dtype == torch.float32 and first.device.type == "cpu":
+            out = torch.empty_like(first)
+            _native.compose_rigid(*unpacked(first, second, out))
+            return out
         one, two, three, four = (first[:, :, None] * second).unbind(1)
         return ((one + two) + three) + four
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         first, second = ctx.saved_tensors
         of_first, of_second = ctx.needs_input_grad
-        return gradient @ second.T if of_first else None, first.T @ gradient if of_second else None
+        if first.dtype == torch.float32 and first.device.type == "cpu":
+            by_first, by_second = torch.empty_like(first), torch.empty_like(second)
+            _native.compose_rigid_backward(*unpacked(first, second, gradient.contiguous(), by_first, by_second))
+        else:
+            by_first, by_second = gradient @ second.T, first.T @ gradient
+        return by_first if of_first else None, by_second if of_second else None
 
 
 def invert_rigid(transforms: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:

@@ -1,7 +1,7 @@
 """FaceTrack: the face parameters of all timesteps as training sees them, tuned frame by frame where asked for."""
 
 from collections.abc import Sequence as Items
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,6 +11,14 @@ from mien.avatar import FaceTuning, Moments, ParameterGroup
 from mien.face import FaceParams
 
 _FIELDS = ("expression", "joints", "head_rotation", "head_translation")
+
+
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """One timestep of a track."""
+
+    face: FaceParams
+    groups: list[ParameterGroup]
 
 
 class FaceTrack:
@@ -30,6 +38,7 @@ class FaceTrack:
         assert sum(self._lengths) == len(face), "timesteps of the sequences"
         self._tuning = tuning
         self._fields = {name: getattr(self._start, name).clone() for name in _FIELDS}
+        self._rows: dict[int, _Row] = {}
         names = _FIELDS if tuning.enabled else ()
         self._moments = {name: Moments.zeros(self._fields[name]) for name in names}
         for moments in self._moments.values():
@@ -38,19 +47,28 @@ class FaceTrack:
 
     def face(self, index: int) -> FaceParams:
         """One timestep; where tuning is on, its tensors are leaves that share memory with the track."""
+        return self._row(index).face
+
+    def parameter_groups(self, index: int) -> list[ParameterGroup]:
+        """The groups of one timestep, whose `face(index)` was used since."""
+        return self._row(index).groups
+
+    def _row(self, index: int) -> "_Row":
+        # Made once: a dozen views would otherwise be made in every step. The track's tensors are never replaced.
+        if index not in self._rows:
+            self._rows[index] = self._make_row(index)
+        return self._rows[index]
+
+    def _make_row(self, index: int) -> "_Row":
         rows = {name: tensor[index : index + 1] for name, tensor in self._fields.items()}
         if self._tuning.enabled:
             rows = {name: row.detach().requires_grad_() for name, row in rows.items()}
-        return replace(self._start, **rows)
-
-    def parameter_groups(self, face: FaceParams, index: int) -> list[ParameterGroup]:
-        """The groups of one timestep, for the `face` that `face(index)` returned and that was used since."""
         groups = []
         for name, state in self._moments.items():
             row = Moments(state.first[index : index + 1], state.second[index : index + 1], state.step[index])
             rate = getattr(self._tuning, name)
-            groups.append(ParameterGroup(f"face.{name}", {name: getattr(face, name)}, rate, {name: row}))
-        return groups
+            groups.append(ParameterGroup(f"face.{name}", {name: rows[name]}, rate, {name: row}))
+        return _Row(replace(self._start, **rows), groups)
 
     def params(self) -> FaceParams:
         """All timesteps as they are now; those that training never saw get what it corrected in their neighbours.

@@ -133,7 +133,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     losses = picture_losses(rendering, target, weights) | avatar.regularizers(posed, rendering, progress)
     torch.autograd.backward(list(losses.values()))
 
-    groups = [*avatar.parameter_groups(), *state.track.parameter_groups(face, frame.track_index)]
+    groups = [*avatar.parameter_groups(), *state.track.parameter_groups(frame.track_index)]
     state.density.observe(posed, rendering)
     state.adam.step(groups, progress)
     random = partial(density_random, settings, state.step)
