@@ -12,39 +12,43 @@ struct TileGradients {
   alignas(64) float color[3][kBlocks][kBlock * kBlock];  // dL / d image
 };
 
-// One pixel's gradients; returns their absolute sum.
-MIEN_INLINE float load_pixel(const PictureGradient& p, int64_t pixel, int block, int lane, TileGradients& t) {
+typedef uint32_t Bits4 __attribute__((vector_size(16)));
+
+// One pixel's gradients; returns the bits that are set in any of them.
+MIEN_INLINE uint32_t load_pixel(const PictureGradient& p, int64_t pixel, int block, int lane, TileGradients& t) {
   const float grad_alpha = p.grad_alpha ? p.grad_alpha[pixel] : 0.0f;
-  float behind = -grad_alpha * (1.0f - p.alpha[pixel]), size = __builtin_fabsf(grad_alpha);
+  float behind = -grad_alpha * (1.0f - p.alpha[pixel]);
+  uint32_t bits, any;
+  memcpy(&any, &grad_alpha, sizeof any);
   for (int channel = 0; channel < 3; ++channel) {
     const float gradient = p.grad_image[3 * pixel + channel];
     t.color[channel][block][lane] = gradient;
     behind += gradient * p.image[3 * pixel + channel];
-    size += __builtin_fabsf(gradient);
+    memcpy(&bits, &gradient, sizeof bits);
+    any |= bits;
   }
   t.behind[block][lane] = behind;
-  return size;
-}
-
-MIEN_INLINE F4 magnitude(F4 value) {
-  typedef int32_t I4 __attribute__((vector_size(16)));
-  return (F4)((I4)value & 0x7fffffff);
+  return any;
 }
 
 // Four pixels in a row, from the first lane of a block's row on.
-MIEN_INLINE F4 load_four(const PictureGradient& p, int64_t pixel, int block, int lane, TileGradients& t) {
-  F4 gradient[3], color[3];
+MIEN_INLINE Bits4 load_four(const PictureGradient& p, int64_t pixel, int block, int lane, TileGradients& t) {
+  F4 gradient[3], color[3], behind{};
   split3(p.grad_image + 3 * pixel, gradient);
   split3(p.image + 3 * pixel, color);
-  const F4 grad_alpha = p.grad_alpha ? load4(p.grad_alpha + pixel) : F4{};
-  F4 behind = -grad_alpha * (1.0f - load4(p.alpha + pixel)), size = magnitude(grad_alpha);
+  Bits4 any{};
+  if (p.grad_alpha) {  // without one, alpha need not come from memory
+    const F4 grad_alpha = load4(p.grad_alpha + pixel);
+    behind = -grad_alpha * (1.0f - load4(p.alpha + pixel));
+    any = (Bits4)grad_alpha;
+  }
   for (int channel = 0; channel < 3; ++channel) {
     store4(&t.color[channel][block][lane], gradient[channel]);
     behind = behind + gradient[channel] * color[channel];
-    size = size + magnitude(gradient[channel]);
+    any |= (Bits4)gradient[channel];
   }
   store4(&t.behind[block][lane], behind);
-  return size;
+  return any;
 }
 
 MIEN_INLINE void prefetch_row(const PictureGradient& p, int64_t pixel, int columns) {
@@ -52,7 +56,10 @@ MIEN_INLINE void prefetch_row(const PictureGradient& p, int64_t pixel, int colum
     __builtin_prefetch(p.grad_image + 3 * pixel + x);
     __builtin_prefetch(p.image + 3 * pixel + x);
   }
-  for (int x = 0; x < columns; x += 16) __builtin_prefetch(p.alpha + pixel + x);
+  for (int x = 0; x < columns && p.grad_alpha; x += 16) {
+    __builtin_prefetch(p.grad_alpha + pixel + x);
+    __builtin_prefetch(p.alpha + pixel + x);
+  }
 }
 
 // Loads the gradients of a tile; false if all are zero.
@@ -65,17 +72,16 @@ MIEN_INLINE bool load_gradients(const PictureGradient& p, const View& view, int 
     memset(t.behind, 0, sizeof t.behind);
     memset(t.color, 0, sizeof t.color);
   }
-  F4 size{};
+  Bits4 any{};
   for (int y = 0; y < rows; ++y) {
     const int64_t pixel = (int64_t)(top + y) * view.width + left;
     const int first_block = y / kBlock * kTileBlocks, first_lane = y % kBlock * kBlock;
     prefetch_row(p, pixel + (int64_t)(y + 2 < rows ? 2 : 0) * view.width, columns);
     int x = 0;
-    for (; x + kBlock <= columns; x += kBlock)
-      size = size + load_four(p, pixel + x, first_block + x / kBlock, first_lane, t);
-    for (; x < columns; ++x) size[0] += load_pixel(p, pixel + x, first_block + x / kBlock, first_lane + x % kBlock, t);
+    for (; x + kBlock <= columns; x += kBlock) any |= load_four(p, pixel + x, first_block + x / kBlock, first_lane, t);
+    for (; x < columns; ++x) any[0] |= load_pixel(p, pixel + x, first_block + x / kBlock, first_lane + x % kBlock, t);
   }
-  return !(size[0] + size[1] + size[2] + size[3] == 0.0f);
+  return ((any[0] | any[1] | any[2] | any[3]) & 0x7fffffff) != 0;
 }
 
 struct Sums {
