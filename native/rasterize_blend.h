@@ -23,12 +23,14 @@ MIEN_INLINE F lane_y(int v) {
   return y;
 }
 
-// 2^high - 2^low for integers 0..8, 0 where high <= low.
-MIEN_INLINE I bits_between(F low, F high) {
+// The bits of the blocks of a row from the first of `rest` that are left to the end, and before `end`; both 0..8,
+// truncated.
+MIEN_INLINE I bits_between(F rest, F end) {
 #if defined(__AVX2__)
-  const I one = set1i(1), bits = (one << truncate(high)) - (one << truncate(low));
+  const I bits = (set1i(1) << truncate(end)) - (set1i(1 << kTileBlocks) >> truncate(rest));
 #else  // no shifts by lane: through the exponents
-  const I bits = truncate(from_bits((truncate(high) + 127) << 23) - from_bits((truncate(low) + 127) << 23));
+  const I above = (truncate(end) + 127) << 23, below = (127 + kTileBlocks - truncate(rest)) << 23;
+  const I bits = truncate(from_bits(above) - from_bits(below));
 #endif
   return bits & ~(bits >> 31);
 }
@@ -58,12 +60,15 @@ void find_blocks(const Splat* splats, const Entry* entries, int count, int avail
     for (int later = i + kGatherAhead; later < i + kGatherAhead + W && later < available; ++later)
       __builtin_prefetch(&splats[entries[later].gaussian]);
     const SplatShape s = gather_shapes(chosen);
-    const M there = less(iota(), set1((float)valid));
+    const M valid_lanes = less(iota(), set1((float)valid));
+    const Strips strips(s, (left + 0.5f) - s.x, kBlock, set1(kTileBlocks));
+    const F first_y = (top + 0.5f) - s.y;
     for (int row = 0; row < kTileBlocks; ++row) {
-      const F first_y = (top + 0.5f + kBlock * row) - s.y;
-      const Columns c = columns_touched(s, first_y, first_y + (kBlock - 1.0f), (left + 0.5f) - s.x, kBlock);
-      const F low = clamp(c.low, F{}, set1(kTileBlocks)), high = clamp(c.high + 1.0f, F{}, set1(kTileBlocks));
-      store_bytes(found.rows[row] + i, bits_between(low, keep(there, high)));
+      const F strip = first_y + (float)(kBlock * row);
+      F end, rest;
+      strips.touch(strip, strip + (kBlock - 1.0f), &end, &rest);
+      const F there = clamp(keep(valid_lanes, end), F{}, set1(kTileBlocks));
+      store_bytes(found.rows[row] + i, bits_between(clamp(rest, F{}, set1(kTileBlocks)), there));
     }
   }
   const int written = (count + W - 1) / W * W, used = (count + 63) / 64 * 64;

@@ -72,37 +72,48 @@ MIEN_INLINE SplatShape gather_shapes(const Splat* const* splats) {
   return {v[0], v[1], v[2], v[3], v[4], v[5], v[7]};
 }
 
-// The columns of pixel groups of `size` pixels that the ellipse touches in the rows of pixel centres top..bottom (both
-// relative to the centre): exact, because within a strip the ellipse is widest at its rightmost point or, if that lies
-// outside, at the edge nearer to it. `first` is the first group's first pixel centre relative to the splat's.
-struct Columns {
-  F low, high;  // not clamped; high < low where the ellipse misses the strip
-};
+// Where splats' ellipses cross strips of pixel rows, in groups of `size` pixels, `count` of them from the one whose
+// first pixel centre is `first` right of the splat's. Exact, because within a strip the ellipse is widest at its
+// rightmost point or, if that lies outside, at the edge nearer to it; then half a thousandth wider, for what is
+// rounded.
+struct Strips {
+  F slope, width2, width2_fall, half_height, y_rightmost;  // x in groups, y in pixels
+  F to_end, to_rest;
 
-MIEN_INLINE Columns columns_touched(const SplatShape& s, F top, F bottom, F first, float size) {
-  const F right_y = clamp(s.y_rightmost, top, bottom), left_y = clamp(-s.y_rightmost, top, bottom);
-  const F right_t = right_y * s.inverse_half_height, left_t = left_y * s.inverse_half_height;
-  const F right = s.slope * right_y + root_bound(s.width2 * (1.0f - right_t * right_t));
-  const F left = s.slope * left_y - root_bound(s.width2 * (1.0f - left_t * left_t));
-  const M hit = both(less_equal(top, s.half_height), less_equal(-s.half_height, bottom));
-  const float per_group = 1.0f / size;
-  const F low = -round_down((first + (size - 1.0f) - left) * per_group);
-  const F high = round_down((right - first) * per_group);
-  return {low, select(hit, high, set1(-1e6f))};
-}
+  MIEN_INLINE Strips(const SplatShape& s, F first, float size, F count)
+      : half_height(s.half_height), y_rightmost(s.y_rightmost) {
+    const float per_group = 1.0f / size;
+    slope = s.slope * per_group;
+    width2 = s.width2 * (1.001f * per_group * per_group);
+    width2_fall = width2 * s.inverse_half_height * s.inverse_half_height;
+    to_end = 1.0f - first * per_group;
+    to_rest = count + (first + (size - 1.0f)) * per_group;
+  }
+  MIEN_INLINE F half_width(F y) const { return root_estimate(maximum(width2 - width2_fall * y * y, set1(1e-30f))); }
+  // The strip of pixel centres top..bottom, relative to the splat's. To be clamped to 0..count and truncated: how many
+  // groups there are up to the last that is touched, and from the first that is touched.
+  MIEN_INLINE void touch(F top, F bottom, F* end, F* rest) const {
+    const F right_y = clamp(y_rightmost, top, bottom), left_y = clamp(-y_rightmost, top, bottom);
+    const M hit = both(less_equal(top, half_height), less_equal(-half_height, bottom));
+    *end = keep(hit, (slope * right_y + half_width(right_y)) + to_end);
+    *rest = to_rest - (slope * left_y - half_width(left_y));
+  }
+};
 
 // The tiles of W splats, for those that have any.
 MIEN_INLINE void store_spans(const SplatShape& s, TileGrid grid, int valid, TileSpan* spans) {
-  const F last_row = set1((float)(grid.rows - 1)), last_column = set1((float)(grid.columns - 1));
+  const F last_row = set1((float)(grid.rows - 1)), columns = set1((float)grid.columns);
   const F first_row = clamp(round_down((s.y - s.half_height - 0.5f) * (1.0f / kTile)), F{}, last_row);
   const F end_row = clamp(round_down((s.y + s.half_height - 0.5f) * (1.0f / kTile)), F{}, last_row);
   I low[2], high[2];
+  const Strips strips(s, 0.5f - s.x, kTile, columns);
   for (int row = 0; row < 2; ++row) {
     const F top = (first_row + (float)row) * (float)kTile + 0.5f - s.y;
-    const Columns c = columns_touched(s, top, top + (kTile - 1.0f), 0.5f - s.x, kTile);
-    low[row] = truncate(clamp(c.low, F{}, last_column + 1.0f));
-    const F hit = select(less_equal(first_row + (float)row, end_row), c.high, set1(-1.0f));
-    high[row] = truncate(clamp(hit, set1(-1.0f), last_column));
+    F end, rest;
+    strips.touch(top, top + (kTile - 1.0f), &end, &rest);
+    end = keep(less_equal(first_row + (float)row, end_row), end);
+    low[row] = set1i(grid.columns) - truncate(clamp(rest, F{}, columns));
+    high[row] = truncate(clamp(end, F{}, columns)) - 1;
   }
   const I first = truncate(first_row), count = truncate(end_row) - first + 1;
   // Two halves a word, as TileSpan has them.

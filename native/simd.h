@@ -79,6 +79,7 @@ MIEN_INLINE F minimum(F a, F b) { return _mm512_min_ps(a, b); }
 MIEN_INLINE F maximum(F a, F b) { return _mm512_max_ps(a, b); }
 MIEN_INLINE F square_root(F a) { return _mm512_sqrt_ps(a); }
 MIEN_INLINE F reciprocal_estimate(F a) { return _mm512_rcp14_ps(a); }
+// sqrt(a), a > 0, to 4e-4 (relative) or better.
 MIEN_INLINE F root_estimate(F a) { return a * _mm512_rsqrt14_ps(a); }
 MIEN_INLINE F round_down(F a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
 
@@ -145,9 +146,6 @@ struct NoDenormals {
 };
 
 MIEN_INLINE F clamp(F value, F low, F high) { return minimum(maximum(value, low), high); }
-
-// An upper bound of sqrt(a), at most 1e-3 too large; for a = 0 a tiny positive number.
-MIEN_INLINE F root_bound(F a) { return root_estimate(maximum(a, set1(1e-30f))) * 1.0005f; }
 
 // 1 / a to about 2e-7 (relative): the estimate and one Newton step.
 MIEN_INLINE F reciprocal(F a) {
