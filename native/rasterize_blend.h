@@ -50,14 +50,12 @@ struct BlockBits {
   }
 };
 
-// Of `available` entries from here on, the first `count`.
-void find_blocks(const Splat* splats, const Entry* entries, int count, int available, float left, float top,
-                 BlockBits& found) {
+void find_blocks(const Splat* splats, const Entry* entries, int count, float left, float top, BlockBits& found) {
   for (int i = 0; i < count; i += W) {
     const int valid = count - i < W ? count - i : W;
     const Splat* chosen[W];
     for (int lane = 0; lane < W; ++lane) chosen[lane] = &splats[entries[i + (lane < valid ? lane : 0)].gaussian];
-    for (int later = i + kGatherAhead; later < i + kGatherAhead + W && later < available; ++later)
+    for (int later = i + kGatherAhead; later < i + kGatherAhead + W && later < count; ++later)
       __builtin_prefetch(&splats[entries[later].gaussian]);
     const SplatShape s = gather_shapes(chosen);
     const M valid_lanes = less(iota(), set1((float)valid));
@@ -170,10 +168,13 @@ MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const Ch
 MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, int count, int available, float left,
                                  float top, uint64_t live, uint64_t* masks, TilePixels& pixels) {
   BlockBits found;
-  find_blocks(splats, entries, count, available, left, top, found);
+  find_blocks(splats, entries, count, left, top, found);
   const uint64_t live_before = live;
+  int ahead = count;  // the next chunk comes into the cache while there is work at hand
+  const int ahead_end = available < count + kChunk ? available : count + kChunk;
   for (uint64_t blocks = live; blocks; blocks &= blocks - 1) {
     const int block = __builtin_ctzll(blocks);
+    for (int i = 0; i < kAhead && ahead < ahead_end; ++i) __builtin_prefetch(&splats[entries[ahead++].gaussian]);
     const Chosen chosen(found, count, block);
     if (chosen.count == 0) continue;
     const float x = left + 0.5f + kBlock * (block % kTileBlocks), y = top + 0.5f + kBlock * (block / kTileBlocks);
