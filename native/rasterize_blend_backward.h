@@ -6,6 +6,8 @@
 
 namespace {
 
+constexpr int kRowsAhead = 8;  // rows of pixels: how far ahead pictures are fetched into the cache
+
 struct TileGradients {
   alignas(64) float product[kBlocks][kBlock * kBlock];   // as in the forward pass
   alignas(64) float behind[kBlocks][kBlock * kBlock];    // gradient . (colour behind what has been blended)
@@ -76,7 +78,7 @@ MIEN_INLINE bool load_gradients(const PictureGradient& p, const View& view, int 
   for (int y = 0; y < rows; ++y) {
     const int64_t pixel = (int64_t)(top + y) * view.width + left;
     const int first_block = y / kBlock * kTileBlocks, first_lane = y % kBlock * kBlock;
-    prefetch_row(p, pixel + (int64_t)(y + 2 < rows ? 2 : 0) * view.width, columns);
+    prefetch_row(p, pixel + (int64_t)(y + kRowsAhead < rows ? kRowsAhead : 0) * view.width, columns);
     int x = 0;
     for (; x + kBlock <= columns; x += kBlock) any |= load_four(p, pixel + x, first_block + x / kBlock, first_lane, t);
     for (; x < columns; ++x) any[0] |= load_pixel(p, pixel + x, first_block + x / kBlock, first_lane + x % kBlock, t);
