@@ -153,6 +153,12 @@ MIEN_INLINE F reciprocal(F a) {
   return estimate * (2.0f - a * estimate);
 }
 
+// Without overflow: far outside their range exponentials may be anything, but are computed.
+MIEN_INLINE I add_wrapping(I a, I b) {
+  typedef uint32_t U __attribute__((vector_size(4 * W)));
+  return (I)((U)a + (U)b);
+}
+
 // sum + a * b where `mask` is set, else sum.
 MIEN_INLINE F add_where(M mask, F a, F b, F sum) {
 #if defined(__AVX512F__)
@@ -173,7 +179,7 @@ MIEN_INLINE F exp2_fast(F a) {
   power = power * f + 2.4022119724e-1f;
   power = power * f + 6.9314696706e-1f;
   power = power * f + 1.0000000717f;
-  return from_bits(bits(power) + (bits(shifted) << 23));
+  return from_bits(add_wrapping(bits(power), bits(shifted) << 23));
 }
 
 // 2^a for what is seen of a splat: -8 < a <= 0, anything beyond; to 6e-7 (relative) with AVX-512, 4e-6 with AVX2. A
@@ -202,7 +208,7 @@ MIEN_INLINE F exp2_alpha(F a) {
 #else
   const I power = (I)_mm256_permutevar8x32_epi32((__m256i)powers, (__m256i)bits(shifted));
 #endif
-  return from_bits(power + (bits(shifted) << (23 - kPowerBits))) * (f * f + kParabolaRise);
+  return from_bits(add_wrapping(power, bits(shifted) << (23 - kPowerBits))) * (f * f + kParabolaRise);
 }
 #else
 MIEN_INLINE F exp2_alpha(F a) { return exp2_fast(a); }
