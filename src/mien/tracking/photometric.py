@@ -11,6 +11,7 @@ from torch import Tensor
 from mien.progress import progress_bar, say
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import LandmarkTerm, Subject
+from mien.tracking.outline_term import outline_term
 from mien.tracking.photometric_fit import PhotometricFit, photometric_fit_of
 from mien.tracking.photometric_pictures import Pictures
 from mien.tracking.photometric_settings import PhotometricSettings
@@ -162,6 +163,10 @@ def refine_photometrically(
     )  # fmt: skip
     rounds = [_Round(surface, space, shots, landmarks, own_settings, size) for size in own_settings.sizes]
 
+    outlines = [
+        outline_term(surface, shot.capture, shot.valid.nonzero()[:, 0], shot.views, own_settings.outline_weight)
+        for shot in shots
+    ]
     frames = sum(len(own.state) for own in fit.sequences)
     several = any(len(own.cameras) > 1 for own in fit.sequences)
     shared_steps = own_settings.shared_steps_of_cameras if several else own_settings.shared_steps
@@ -169,7 +174,7 @@ def refine_photometrically(
 
     def step_identity(now: _Round, at: PhotometricFit) -> PhotometricFit:
         at = now.look(at)
-        moved = step_shared(now.terms(at), at.fit, prior, now.keyframes)
+        moved = step_shared(now.terms(at), outlines, at.fit, prior, now.keyframes)
         return replace(at, fit=fit_bias(landmarks, moved))
 
     with progress_bar("Fitting to pixels", total=total) as advance:

@@ -5,15 +5,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from mien.tracking.outline_term import OutlineTerm
 from mien.tracking.photometric_term import PhotometricTerm
 from mien.tracking.shared_fit import placed
 from mien.tracking.solver import joined, joined_shared, solve_arrow
 from mien.tracking.stages import Fit, SequenceFit, box_of, choose_keyframes
 
-_DAMPING = 1e-3
+_DAMPING = 1e-6
+"""Hardly any: what tells the focal length from depth is a thousandth of what either does alone."""
+_SMOOTHING = 0.3
+"""Of how pose steps follow the pose, in keyframes."""
+_FOCAL_STEP = 0.2
+"""The logarithm of a focal length changes by no more than this in a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +31,7 @@ class SharedPrior:
     focal: Float[Tensor, " q"]
     """The focal length of each sequence that landmarks led to, pixels."""
     focal_sigma: float
+    """Of its logarithm."""
     identity_weight: float
 
     @property
@@ -33,20 +40,25 @@ class SharedPrior:
         return 1 + max((lens for lens in self.lenses if lens is not None), default=-1)
 
 
-def step_shared(terms: Sequence[PhotometricTerm], fit: Fit, prior: SharedPrior, keyframes: int) -> Fit:
+def step_shared(
+    terms: Sequence[PhotometricTerm], outlines: Sequence[OutlineTerm], fit: Fit, prior: SharedPrior, keyframes: int
+) -> Fit:
     """One Gauss-Newton step of identity and focal lengths, the keyframes' own parameters eliminated.
 
     A texture that was made with these very poses hardly resists a change that shifts every view alike, but it resists
-    one that the views contradict: what is gained is depth, from parallax.
+    one that the views contradict: what is gained is depth, from parallax. Outlines tell perspective.
     """
     subject, box = fit.subject, box_of(terms[0].layout)
     rows = [choose_keyframes(own.state[:, :6], keyframes) for own in fit.sequences]
     frames, shared = [], []
-    for term, own, chosen, lens in zip(terms, fit.sequences, rows, prior.lenses, strict=True):
+    for term, outline, own, chosen, lens in zip(terms, outlines, fit.sequences, rows, prior.lenses, strict=True):
         own_frames, own_shared = term.joint_equations(own.state, chosen, fit.subject, own.cameras)
+        if outline.weight > 0:
+            more_frames, more_shared = outline.joint_equations(own.state, chosen, fit.subject, own.cameras)
+            own_frames, own_shared = own_frames.plus(more_frames), own_shared.plus(more_shared)
         frames.append(own_frames)
         shared.append(placed(own_shared, lens, prior.groups))
-    precision, values = _prior(fit, prior, [len(chosen) for chosen in rows])
+    precision, values = _prior(fit, prior)
     equations = joined(frames)
     state = torch.cat([own.state[chosen] for own, chosen in zip(fit.sequences, rows, strict=True)])
     held = box.held(state, equations.gradient)
@@ -54,22 +66,36 @@ def step_shared(terms: Sequence[PhotometricTerm], fit: Fit, prior: SharedPrior, 
     step, shared_step = solve_arrow(equations, joined_shared(shared).with_prior(precision, values), held, _DAMPING)
     sequences = []
     steps = step.split([len(chosen) for chosen in rows])
-    for own, own_step, lens in zip(fit.sequences, steps, prior.lenses, strict=True):
-        factor = 1.0 if lens is None else math.exp(float(shared_step[len(subject.shared) + lens]))
-        # Every frame takes the keyframes' mean step: what the changed identity asks of all of them.
-        state = box.clip(own.state + own_step.mean(0))
-        sequences.append(SequenceFit(own.cameras.with_focal(factor), state))
+    for own, own_step, chosen, lens in zip(fit.sequences, steps, rows, prior.lenses, strict=True):
+        longer = 0.0 if lens is None else float(shared_step[len(subject.shared) + lens])
+        factor = math.exp(min(max(longer, -_FOCAL_STEP), _FOCAL_STEP))
+        sequences.append(SequenceFit(own.cameras.with_focal(factor), _moved(own.state, chosen, own_step)))
     response = terms[0].landmarks.model.response
     return Fit(subject.moved(shared_step[: len(subject.shared)], response), tuple(sequences))
 
 
-def _prior(fit: Fit, prior: SharedPrior, keyframes: Sequence[int]) -> tuple[Float[Tensor, " s"], Float[Tensor, " s"]]:
+def _moved(state: Float[Tensor, "v p"], chosen: Int[Tensor, " k"], step: Float[Tensor, "k p"]) -> Float[Tensor, "v p"]:
+    """All timesteps moved as keyframes are: head poses by a step that is affine in the pose, expressions not at all.
+
+    A longer lens moves heads away in proportion to their depth, and turns them farther in proportion to their turns.
+    """
+    pose = state[:, :6]
+    middle, scale = pose[chosen].mean(0), pose[chosen].std(0, correction=0).clamp_min(1e-3)
+    features = torch.cat([torch.ones_like(pose[:, :1]), (pose - middle) / scale], dim=1)
+    keys = features[chosen]
+    ridge = _SMOOTHING * torch.eye(7).to(pose)
+    ridge[0, 0] = 0
+    slopes = torch.linalg.solve(keys.T @ keys + ridge, keys.T @ step[:, :6])
+    return torch.cat([pose + features @ slopes, state[:, 6:]], dim=1)
+
+
+def _prior(fit: Fit, prior: SharedPrior) -> tuple[Float[Tensor, " s"], Float[Tensor, " s"]]:
     """Precisions of the shared parameters, and how far they are from what is expected."""
     identity = fit.subject.identity
     weights, values = identity.new_zeros(prior.groups), identity.new_zeros(prior.groups)
-    for own, lens, first, count in zip(fit.sequences, prior.lenses, prior.focal, keyframes, strict=True):
+    for own, lens, first in zip(fit.sequences, prior.lenses, prior.focal, strict=True):
         if lens is not None:
-            weights[lens] += count * prior.focal_sigma**-2
+            weights[lens] = prior.focal_sigma**-2
             values[lens] = (own.cameras.K[0, 0, 0] / first).log()
     precision = torch.ones_like(fit.subject.shared)
     precision[: len(identity)] = prior.identity_weight

@@ -12,6 +12,7 @@ from mien.render.mesh import vertex_normals
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.landmark_model import left_jacobian
 from mien.tracking.parameters import ParameterLayout
+from mien.tracking.views import CameraBatch
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,3 +155,12 @@ def _derivatives(function: Callable[[Tensor], Tensor], at: Float[Tensor, " q"]) 
     """Central differences in float64 of a function of many rows of parameters."""
     step = 1e-5 * torch.eye(len(at)).to(at)
     return (function(at + step) - function(at - step)) / 2e-5
+
+
+def by_log_focal(vertices: Float[Tensor, "v 3"], cameras: CameraBatch, seen_by: list[int]) -> Float[Tensor, "v 3 1"]:
+    """How vertices would have to move across the line of sight to look as through a longer lens."""
+    if len(seen_by) != 1:
+        return torch.zeros(len(vertices), 3, 1)  # several cameras are calibrated
+    viewmat = cameras.viewmat[seen_by[0]].float()
+    across = vertices @ viewmat[:2, :3].T + viewmat[:2, 3]
+    return (across @ viewmat[:2, :3])[..., None]

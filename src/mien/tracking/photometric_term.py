@@ -10,7 +10,7 @@ from mien import _native
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.parameters import ParameterLayout
 from mien.tracking.photometric_pictures import Pictures
-from mien.tracking.photometric_surface import PosedSurface, SurfaceModel
+from mien.tracking.photometric_surface import PosedSurface, SurfaceModel, by_log_focal
 from mien.tracking.photometric_texture import Sighting
 from mien.tracking.photometric_threads import in_threads
 from mien.tracking.solver import NormalEquations, SharedEquations, joined
@@ -110,7 +110,7 @@ class PhotometricTerm:
             posed, seen_by = self.model.pose(state[row], subject.identity, derive_identity=shared), self._seen_by(row)
             assert posed.jacobian is not None
             if shared:
-                by_focal = _by_log_focal(posed.vertices, cameras, seen_by)
+                by_focal = by_log_focal(posed.vertices, cameras, seen_by)
                 posed = replace(posed, jacobian=torch.cat([posed.jacobian, by_focal], dim=2).contiguous())
             parts = [self._align(posed, row, camera, cameras) for camera in seen_by]
             return NormalEquations(
@@ -136,12 +136,3 @@ class PhotometricTerm:
         sighting = Sighting(posed, picture, self.light)
         cost, _ = _native.align_mesh(self.surface, *sighting.arguments(), self.light_radius, *derivatives, None, None)
         return cost, gradient.double(), hessian.double()
-
-
-def _by_log_focal(vertices: Float[Tensor, "v 3"], cameras: CameraBatch, seen_by: list[int]) -> Float[Tensor, "v 3 1"]:
-    """How vertices would have to move across the line of sight to look as through a longer lens."""
-    if len(seen_by) != 1:
-        return torch.zeros(len(vertices), 3, 1)  # several cameras are calibrated
-    viewmat = cameras.viewmat[seen_by[0]].float()
-    across = vertices @ viewmat[:2, :3].T + viewmat[:2, 3]
-    return (across @ viewmat[:2, :3])[..., None]

@@ -21,6 +21,10 @@ class NormalEquations:
     gradient: Float[Tensor, "b p"]
     hessian: Float[Tensor, "b p p"]
 
+    def plus(self, other: "NormalEquations") -> "NormalEquations":
+        """Of both costs together."""
+        return NormalEquations(self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian)
+
 
 @dataclass(frozen=True, eq=False)
 class Box:
@@ -96,6 +100,11 @@ class SharedEquations:
     hessian: Float[Tensor, "s s"]
     gradient: Float[Tensor, " s"]
     """Half the gradient."""
+
+    def plus(self, other: "SharedEquations") -> "SharedEquations":
+        """Of both costs together."""
+        across, hessian = self.across + other.across, self.hessian + other.hessian
+        return SharedEquations(across, hessian, self.gradient + other.gradient)
 
     def with_prior(self, precision: Float[Tensor, " s"], values: Float[Tensor, " s"]) -> "SharedEquations":
         """Under a quadratic cost on the values."""
