@@ -24,7 +24,7 @@ class PhotometricSettings:
     """The same with several cameras: these see depth, so that shape goes on improving."""
     keyframes: int = 24
     """Timesteps of each sequence for these steps; of several cameras fewer, for twice as many pictures at most."""
-    focal_sigma: float = 0.3
+    focal_sigma: float = 0.1
     """How far the logarithm of an unknown focal length may go from the landmarks'."""
     outline_weight: float = 10.0
     """What the outline of a head in a keyframe is worth, where it ends against the background; 0: nothing."""
