@@ -34,8 +34,8 @@ _BESIDE = 1.5
 """Pixels outside of the outline where nothing of the mesh may be."""
 _SIGMA = 0.0015
 """Expected distance, metres."""
-_OUTLIER = 4.0
-"""In sigmas: hair, beards and collars stand out farther, and hardly count."""
+_OUTLIERS = (4.0, 2.0)
+"""In sigmas, of mattes that end inside of the mesh and outside: hair, beards and collars stand out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,8 @@ class OutlineTerm:
         moved = jacobian[outline.ends[:, 0]] + jacobian[outline.ends[:, 1]]
         slopes = 0.5 * torch.einsum("kc,kcq->kq", outwards, moved)
         sigma = _SIGMA * scale
-        squared, least = (distance[seen] / sigma).square(), _OUTLIER**2
+        squared = (distance[seen] / sigma).square()
+        least = torch.where(distance[seen] < 0, *_OUTLIERS) ** 2
         share = outline.lengths[seen] / outline.lengths.sum().clamp_min(1.0)
         weights = share * (least / (least + squared)).square() / sigma**2
         cost = float((share * least * squared / (least + squared)).sum())

@@ -164,7 +164,13 @@ def refine_photometrically(
     rounds = [_Round(surface, space, shots, landmarks, own_settings, size) for size in own_settings.sizes]
 
     outlines = [
-        outline_term(surface, shot.capture, shot.valid.nonzero()[:, 0], shot.views, own_settings.outline_weight)
+        outline_term(
+            surface,
+            shot.capture,
+            shot.valid.nonzero()[:, 0],
+            shot.views,
+            own_settings.outline_weight * (len(shot.cameras) == 1),  # several see depth by themselves
+        )
         for shot in shots
     ]
     frames = sum(len(own.state) for own in fit.sequences)

@@ -24,10 +24,11 @@ class PhotometricSettings:
     """The same with several cameras: these see depth, so that shape goes on improving."""
     keyframes: int = 24
     """Timesteps of each sequence for these steps; of several cameras fewer, for twice as many pictures at most."""
-    focal_sigma: float = 0.1
+    focal_sigma: float = 0.04
     """How far the logarithm of an unknown focal length may go from the landmarks'."""
     outline_weight: float = 10.0
-    """What the outline of a head in a keyframe is worth, where it ends against the background; 0: nothing."""
+    """What the outline of a head in a keyframe is worth, where it ends against the background; 0: nothing. For a single
+    camera, which sees perspective by it."""
     independent_pixels: float = 100.0
     """What all pixels of a picture are worth, whose errors go together: weighs them against landmarks and priors."""
     landmark_share: float = 0.3
