@@ -98,7 +98,7 @@ def pretend_gsplat(monkeypatch: pytest.MonkeyPatch, installed: bool) -> None:
 
 def test_cuda_without_a_gpu_or_without_gsplat_says_what_to_do(monkeypatch: pytest.MonkeyPatch, no_gpu: None) -> None:
     pretend_gsplat(monkeypatch, installed=False)
-    with pytest.raises(UserError, match=r"--device cuda: needs gsplat.*mien\[cuda\]"):
+    with pytest.raises(UserError, match=r"--device cuda: needs a CUDA GPU and gsplat.*uv pip install"):
         choose_device("cuda")
     pretend_gsplat(monkeypatch, installed=True)
     with pytest.raises(UserError, match=r"--device cuda: torch .*nvidia-smi"):

@@ -10,7 +10,9 @@ import pytest
 from damage import edit_json
 from mien.cli import main
 from mien.commands.stages.names import doubled_videos
-from mien.tracking import read_tracking
+from mien.errors import UserError
+from mien.tracking import TrackingSettings, read_tracking
+from mien.workspace import Workspace
 from toy_workspace import write_toy_workspace
 
 CAMERA = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
@@ -167,3 +169,21 @@ def test_an_avatar_of_an_older_version_says_train_again(
         path.write_bytes(whole)
     assert main(["render", "W", "--out", "größer.png", "--size", "16"]) == 0
     assert (place / "größer.png").is_file()
+
+
+@pytest.mark.parametrize("value", ["-3", "0", "nan", "inf"])
+def test_a_senseless_focal_length_is_refused_before_work(tmp_path: Path, value: str):
+    with pytest.raises(UserError, match=f"--tracking.focal {value}: give the focal length in pixels"):
+        TrackingSettings(focal=float(value)).check()
+
+
+def test_an_unfinished_run_does_not_ask_for_its_name(tmp_path: Path):
+    workspace = Workspace(tmp_path)
+    for run in ("good", "stopped"):
+        workspace.run_dir(run).mkdir(parents=True)
+        (workspace.run_dir(run) / "config.json").touch()
+    with pytest.raises(UserError, match="which run"):
+        workspace.pick_run(None)
+    (workspace.run_dir("good") / "avatar").mkdir()
+    assert workspace.pick_run(None) == "good"
+    assert workspace.pick_run("stopped") == "stopped"

@@ -23,8 +23,9 @@ def check_device(name: DeviceName) -> None:
     """
     if name == "cuda" and find_spec("gsplat") is None:
         raise UserError(
-            "--device cuda: needs gsplat, which is not installed; install it with `pip install 'mien[cuda]'` (it "
-            f"compiles its kernels at first use and needs the CUDA toolkit's nvcc for that), {_OR_CPU}"
+            "--device cuda: needs a CUDA GPU and gsplat, which is not installed; where there is such a GPU, install it "
+            "with `.venv/bin/uv pip install 'gsplat>=1.5'` (it compiles its kernels at first use and needs the CUDA "
+            f"toolkit's nvcc for that), {_OR_CPU}"
         )
 
 

@@ -44,12 +44,14 @@ class Workspace:
         return _pick("sequence", name, self.sequence_names(), self.root, "--sequence")
 
     def pick_run(self, name: str | None) -> str:
-        """`name`, or the only run there is.
+        """`name`, or the only run there is; one that has made no avatar yet counts if there is no other.
 
         Raises:
             UserError: there is none, several and no name, or none of that name.
         """
-        return _pick("run", name, self.run_names(), self.root, "--run")
+        names = self.run_names()
+        trained = [run for run in names if (self.run_dir(run) / "avatar").is_dir()]
+        return _pick("run", name, trained if name is None and trained else names, self.root, "--run")
 
 
 def open_workspace(root: Path) -> Workspace:

@@ -48,6 +48,7 @@ class Command:
         sequence_names(self.videos, self.name)
         run_name(self.run_name or self.options.method)
         self.capture.check()
+        self.tracking.check()
         check_new_workspace(self.out)
 
     def run(self) -> None:

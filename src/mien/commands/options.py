@@ -39,8 +39,8 @@ class TrainOptions:
     hold_out_cameras: tuple[str, ...] = ()
     """Ids of cameras that are not trained on, only scored (captures with several cameras)."""
     device: DeviceName = "cpu"
-    """Where training runs. cpu: the same bytes every time; cuda: an NVIDIA GPU, through gsplat (`pip install
-    'mien[cuda]'`); auto: a GPU where there is one. A run may be resumed on the other."""
+    """Where training runs. cpu: the same bytes every time; cuda: an NVIDIA GPU, through gsplat (docs/using.md
+    says how to install it); auto: a GPU where there is one. A run may be resumed on the other."""
     face_tuning: bool = True
     """Whether training also corrects the tracking of the frames it sees (held-out frames get what lies beside them)."""
 

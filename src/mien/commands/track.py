@@ -32,6 +32,7 @@ class Command:
 
     def check(self) -> None:
         """Tell what can be told without heavy libraries."""
+        self.settings.check()
         open_workspace(self.workspace)
 
     def run(self) -> None:

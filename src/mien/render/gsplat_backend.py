@@ -70,5 +70,6 @@ def _import_gsplat() -> ModuleType:
     try:
         import gsplat  # pyright: ignore[reportMissingImports]  # only there with the extra
     except ImportError as error:
-        raise UserError("rendering on a GPU needs gsplat: install it with `pip install 'mien[cuda]'`") from error
+        remedy = "install it with `.venv/bin/uv pip install 'gsplat>=1.5'`"
+        raise UserError(f"rendering on a GPU needs gsplat: {remedy}") from error
     return gsplat

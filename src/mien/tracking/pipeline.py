@@ -78,6 +78,7 @@ def track_subject(
             no face could have; or the model lacks the landmarks.
     """
     assert captures, "nothing to track"
+    settings.check()
     if "mediapipe" not in face_model.landmarks:
         raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; calibrate them for it first")
     shots, keeper = [shot_of(capture, settings) for capture in captures], Keeper(keep)

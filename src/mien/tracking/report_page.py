@@ -98,7 +98,8 @@ def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]
             found.append(("", f"Pixels took part in all {with_face} frames with a face."))
     if report["flagged_frames"]:
         flagged = report["flagged_frames"]
-        found.append(("odd", f"{len(flagged)} frames stand out and should be looked at: {named(flagged)}."))
+        stand_out = "1 frame stands" if len(flagged) == 1 else f"{len(flagged)} frames stand"
+        found.append(("odd", f"{stand_out} out and should be looked at: {named(flagged)}."))
     else:
         found.append(("", "No frame stands out."))
     if report["frames_without_face"]:

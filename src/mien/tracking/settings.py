@@ -1,10 +1,15 @@
 """What a user may choose about tracking."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from mien.errors import UserError
 from mien.tracking.paper_settings import PaperSettings
 from mien.tracking.photometric_settings import PhotometricSettings
+
+_FOCALS = (10.0, 1e6)
+"""Pixels that a focal length can have: a thumbnail's fish eye, and a telescope's 16K picture."""
 
 
 @dataclass(frozen=True)
@@ -53,3 +58,18 @@ class TrackingSettings:
     """Of the fast fit to pixels."""
     paper: PaperSettings = field(default_factory=PaperSettings)
     """Of the paper's fit to pixels."""
+
+    def check(self) -> None:
+        """Raise a UserError that names the first value that makes no sense."""
+        focal = self.focal
+        if focal is not None and not _FOCALS[0] <= focal <= _FOCALS[1]:
+            raise UserError(
+                f"--tracking.focal {focal:g}: give the focal length in pixels of the captured pictures, about 1 to 3 "
+                "times their width, or leave it out"
+            )
+        for name in ("landmark_sigma", "independent_landmarks", "outlier"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise UserError(f"--tracking.{name.replace('_', '-')} {value:g}: give a number above 0")
+        if self.keyframes < 1:
+            raise UserError(f"--tracking.keyframes {self.keyframes}: give 1 or more")
