@@ -15,7 +15,6 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.face import FaceModel
 from mien.render.mesh import rasterize_mesh
 from mien.render.mesh_gradients import mesh_edges
 from mien.tracking.landmark_term import Subject
@@ -66,6 +65,7 @@ class OutlineTerm:
     sides: Int[Tensor, "e 2"]
     """Their triangles."""
     used: Bool[Tensor, " f"]
+    """Triangles whose outline says something."""
     weight: float
     """What the outline of a picture is worth."""
 
@@ -168,11 +168,8 @@ def outline_term(
     edges = mesh_edges(model.face_model.faces)
     whole = (edges.faces >= 0).all(1)
     ends, sides = edges.vertices[whole].long(), edges.faces[whole].long()
-    return OutlineTerm(model, capture, timesteps, views, ends, sides, _used(model.face_model), weight)
-
-
-def _used(face_model: FaceModel) -> Bool[Tensor, " f"]:
-    return ~face_model.region_mask(*_HIDDEN_REGIONS)
+    used = ~model.face_model.region_mask(*_HIDDEN_REGIONS)
+    return OutlineTerm(model, capture, timesteps, views, ends, sides, used, weight)
 
 
 def _covered(drawn: Int[Tensor, "h w"], points: Float[Tensor, "k 2"]) -> Bool[Tensor, " k"]:

@@ -165,14 +165,11 @@ def refine_photometrically(
 
     outlines = [
         outline_term(
-            surface,
-            shot.capture,
-            shot.valid.nonzero()[:, 0],
-            shot.views,
-            own_settings.outline_weight * (len(shot.cameras) == 1),  # several see depth by themselves
+            surface, shot.capture, shot.valid.nonzero()[:, 0], shot.views,
+            own_settings.outline_weight if len(shot.cameras) == 1 else 0.0,  # several see depth by themselves
         )
         for shot in shots
-    ]
+    ]  # fmt: skip
     frames = sum(len(own.state) for own in fit.sequences)
     several = any(len(own.cameras) > 1 for own in fit.sequences)
     shared_steps = own_settings.shared_steps_of_cameras if several else own_settings.shared_steps

@@ -90,18 +90,17 @@ class PhotometricTerm:
         p, i = state.shape[1], len(subject.identity)
         marks, shared = self.landmarks.at(rows).joint_equations(state[rows], subject, cameras)
         pixels = self._pixel_equations(state, rows, subject, cameras, shared=True)
-        own = NormalEquations(
-            marks.cost + pixels.cost, marks.gradient + pixels.gradient[:, :p], marks.hessian + pixels.hessian[:, :p, :p]
-        )
+        own = marks.plus(NormalEquations(pixels.cost, pixels.gradient[:, :p], pixels.hessian[:, :p, :p]))
         # Pixels know nothing of what the landmark detector makes of the subject.
         placing = torch.zeros(i + 1, len(shared.gradient), dtype=torch.float64)
         placing[:i, :i] = torch.eye(i)
         placing[i, -1] = 1
-        return own, SharedEquations(
-            shared.across + pixels.hessian[:, :p, p:] @ placing,
-            shared.hessian + placing.T @ pixels.hessian[:, p:, p:].sum(0) @ placing,
-            shared.gradient + pixels.gradient[:, p:].sum(0) @ placing,
+        of_pixels = SharedEquations(
+            pixels.hessian[:, :p, p:] @ placing,
+            placing.T @ pixels.hessian[:, p:, p:].sum(0) @ placing,
+            pixels.gradient[:, p:].sum(0) @ placing,
         )
+        return own, shared.plus(of_pixels)
 
     def _pixel_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch, shared: bool
