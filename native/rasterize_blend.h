@@ -1,15 +1,14 @@
 // Forward: one tile of the picture, front to back.
 #pragma once
 
+#include "rasterize_pixels.h"
 #include "rasterize_project.h"
 
 namespace {
 
-constexpr int kVectors = kBlock * kBlock / W;  // vectors per block
-constexpr int kBlocks = kTileBlocks * kTileBlocks;
 constexpr int kGatherAhead = 32;  // entries: the same where little but their shapes is read
 constexpr int kAhead = 8;         // entries: how far ahead their splats are fetched into the cache
-constexpr int kChunk = 256;       // entries handled at a time: their splats stay in the cache
+constexpr int kChunk = 512;       // entries handled at a time: their splats stay in the cache
 
 // Pixel centres of vector `v` of a block, relative to the block's first pixel centre.
 MIEN_INLINE F lane_x() {
@@ -72,14 +71,6 @@ void find_blocks(const Splat* splats, const Entry* entries, int count, float lef
   const int written = (count + W - 1) / W * W, used = (count + 63) / 64 * 64;
   for (int row = 0; row < kTileBlocks; ++row) memset(found.rows[row] + written, 0, used - written);
 }
-
-struct TilePixels {
-  alignas(64) float transmittance[kBlocks][kBlock * kBlock];
-  // Goes on falling where transmittance stays: at kTransmittanceMin the pixel ends. That keeps the dependence of each
-  // splat on the one before it to one multiplication.
-  alignas(64) float product[kBlocks][kBlock * kBlock];
-  alignas(64) float color[3][kBlocks][kBlock * kBlock];
-};
 
 // The entries of a chunk that touch one block: 64 to a word, words without any left out.
 struct Chosen {
@@ -164,10 +155,12 @@ MIEN_INLINE int blend_vector(const Splat* splats, const Entry* entries, const Ch
 }
 
 // Blends the first `count` of `available` entries into all blocks in `live`; stores which entry was blended into which
-// blocks; returns what is live.
-MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, int count, int available, float left,
-                                 float top, uint64_t live, uint64_t* masks, TilePixels& pixels) {
+// blocks. With the last entries the blocks in `unwritten` are written: processors write while they blend the next
+// block. Returns what is live, and leaves what is unwritten.
+MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, int count, int available, uint64_t live,
+                                 uint64_t* unwritten, uint64_t* masks, const TilePicture& tile, TilePixels& pixels) {
   BlockBits found;
+  const float left = (float)tile.left, top = (float)tile.top;
   find_blocks(splats, entries, count, left, top, found);
   const uint64_t live_before = live;
   int ahead = count;  // the next chunk comes into the cache while there is work at hand
@@ -176,71 +169,27 @@ MIEN_INLINE uint64_t blend_chunk(const Splat* splats, const Entry* entries, int 
     const int block = __builtin_ctzll(blocks);
     for (int i = 0; i < kAhead && ahead < ahead_end; ++i) __builtin_prefetch(&splats[entries[ahead++].gaussian]);
     const Chosen chosen(found, count, block);
-    if (chosen.count == 0) continue;
-    const float x = left + 0.5f + kBlock * (block % kTileBlocks), y = top + 0.5f + kBlock * (block / kTileBlocks);
-    int ended = 0;
-    for (int v = 0; v < kVectors; ++v) {
-      const int here = blend_vector(splats, entries, chosen, x, y, block, v, pixels);
-      ended = ended < here ? here : ended;
+    if (chosen.count != 0) {
+      const float x = left + 0.5f + kBlock * (block % kTileBlocks), y = top + 0.5f + kBlock * (block / kTileBlocks);
+      int ended = 0;
+      for (int v = 0; v < kVectors; ++v) {
+        const int here = blend_vector(splats, entries, chosen, x, y, block, v, pixels);
+        ended = ended < here ? here : ended;
+      }
+      if (ended != kChunk) {
+        live &= ~(1ull << block);
+        uint8_t* row = found.rows[block / kTileBlocks];
+        for (int i = ended + 1; i < count; ++i) row[i] &= (uint8_t)~(1u << block % kTileBlocks);
+      }
     }
-    if (ended == kChunk) continue;
-    live &= ~(1ull << block);
-    uint8_t* row = found.rows[block / kTileBlocks];
-    for (int i = ended + 1; i < count; ++i) row[i] &= (uint8_t)~(1u << block % kTileBlocks);
+    if (count == available) {
+      prefetch_block(block + kBlocksAhead, tile);
+      write_block(pixels, block, tile);
+      *unwritten &= ~(1ull << block);
+    }
   }
   if (masks) found.store_masks(count, live_before, masks);
   return live;
-}
-
-MIEN_INLINE void write_block(const TilePixels& pixels, int block, const View& view, int left, int top, float* image,
-                             float* alpha) {
-  const int rows = view.height - top < kBlock ? view.height - top : kBlock;
-  const int columns = view.width - left < kBlock ? view.width - left : kBlock;
-  if (rows == kBlock && columns == kBlock) {
-    for (int row = 0; row < kBlock; ++row) {
-      const int64_t pixel = (int64_t)(top + row) * view.width + left;
-      const F4 remaining = load4(&pixels.transmittance[block][row * kBlock]);
-      F4 color[3];
-      for (int channel = 0; channel < 3; ++channel)
-        color[channel] = load4(&pixels.color[channel][block][row * kBlock]) + remaining * view.background[channel];
-      join3(image + 3 * pixel, color[0], color[1], color[2]);
-      store4(alpha + pixel, 1.0f - remaining);
-    }
-    return;
-  }
-  for (int row = 0; row < rows; ++row) {
-    const int64_t pixel = (int64_t)(top + row) * view.width + left;
-    for (int column = 0; column < columns; ++column) {
-      const int lane = row * kBlock + column;
-      const float remaining = pixels.transmittance[block][lane];
-      for (int channel = 0; channel < 3; ++channel)
-        image[3 * (pixel + column) + channel] =
-            pixels.color[channel][block][lane] + remaining * view.background[channel];
-      alpha[pixel + column] = 1.0f - remaining;
-    }
-  }
-}
-
-// A tile without splats.
-void fill_background(const View& view, int left, int top, float* image, float* alpha) {
-  const int bottom = top + kTile < view.height ? top + kTile : view.height;
-  const int columns = view.width - left < kTile ? view.width - left : kTile;
-  for (int y = top; y < bottom; ++y) {
-    float* row = image + 3 * ((int64_t)y * view.width + left);
-    for (int x = 0; x < columns; ++x)
-      for (int channel = 0; channel < 3; ++channel) row[3 * x + channel] = view.background[channel];
-    memset(alpha + (int64_t)y * view.width + left, 0, sizeof(float) * columns);
-  }
-}
-
-// The blocks of a tile that lie (partly) in the picture.
-MIEN_INLINE uint64_t blocks_in_picture(const View& view, int left, int top) {
-  uint64_t inside = 0;
-  for (int block = 0; block < kBlocks; ++block) {
-    const int x = left + kBlock * (block % kTileBlocks), y = top + kBlock * (block / kTileBlocks);
-    if (x < view.width && y < view.height) inside |= 1ull << block;
-  }
-  return inside;
 }
 
 void blend(const Splat* splats, const TileLists& lists, const View& view, int tile, float* image, float* alpha) {
@@ -261,21 +210,17 @@ void blend(const Splat* splats, const TileLists& lists, const View& view, int ti
       store(pixels.product[block] + v * W, set1(1.0f));
     }
   }
-  const uint64_t inside = blocks_in_picture(view, left, top);
-  uint64_t live = inside;
+  const TilePicture picture{view, left, top, image, alpha};
+  uint64_t unwritten = blocks_in_picture(view, left, top), live = unwritten;
   int i = begin;
   while (i < end && live) {
     const int count = end - i < kChunk ? end - i : kChunk;
-    live = blend_chunk(splats, lists.entries + i, count, end - i, (float)left, (float)top, live,
-                       lists.masks ? lists.masks + i : nullptr, pixels);
+    live = blend_chunk(splats, lists.entries + i, count, end - i, live, &unwritten,
+                       lists.masks ? lists.masks + i : nullptr, picture, pixels);
     i += count;
   }
   lists.ends[tile] = i;
-  for (uint64_t blocks = inside; blocks; blocks &= blocks - 1) {
-    const int block = __builtin_ctzll(blocks);
-    write_block(pixels, block, view, left + kBlock * (block % kTileBlocks), top + kBlock * (block / kTileBlocks), image,
-                alpha);
-  }
+  for (; unwritten; unwritten &= unwritten - 1) write_block(pixels, __builtin_ctzll(unwritten), picture);
 }
 
 }  // namespace

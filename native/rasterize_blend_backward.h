@@ -6,15 +6,13 @@
 
 namespace {
 
-constexpr int kRowsAhead = 8;  // rows of pixels: how far ahead pictures are fetched into the cache
+constexpr int kRowsAhead = 2 * kBlock;  // rows of pixels: how far ahead pictures are fetched into the cache
 
 struct TileGradients {
   alignas(64) float product[kBlocks][kBlock * kBlock];   // as in the forward pass
   alignas(64) float behind[kBlocks][kBlock * kBlock];    // gradient . (colour behind what has been blended)
   alignas(64) float color[3][kBlocks][kBlock * kBlock];  // dL / d image
 };
-
-typedef uint32_t Bits4 __attribute__((vector_size(16)));
 
 // One pixel's gradients; returns the bits that are set in any of them.
 MIEN_INLINE uint32_t load_pixel(const PictureGradient& p, int64_t pixel, int block, int lane, TileGradients& t) {
@@ -33,34 +31,39 @@ MIEN_INLINE uint32_t load_pixel(const PictureGradient& p, int64_t pixel, int blo
   return any;
 }
 
-// Four pixels in a row, from the first lane of a block's row on.
-MIEN_INLINE Bits4 load_four(const PictureGradient& p, int64_t pixel, int block, int lane, TileGradients& t) {
-  F4 gradient[3], color[3], behind{};
-  split3(p.grad_image + 3 * pixel, gradient);
-  split3(p.image + 3 * pixel, color);
-  Bits4 any{};
-  if (p.grad_alpha) {  // without one, alpha need not come from memory
-    const F4 grad_alpha = load4(p.grad_alpha + pixel);
-    behind = -grad_alpha * (1.0f - load4(p.alpha + pixel));
-    any = (Bits4)grad_alpha;
+// A block that lies in the picture, from its first pixel on.
+MIEN_INLINE I load_block(const PictureGradient& p, int64_t pixel, int width, int block, TileGradients& t) {
+  I any{};
+  for (int v = 0; v < kVectors; ++v, pixel += (int64_t)(W / kBlock) * width) {
+    F gradient[3], color[3], behind{};
+    split3(p.grad_image + 3 * pixel, 3 * width, gradient);
+    split3(p.image + 3 * pixel, 3 * width, color);
+    if (p.grad_alpha) {  // without one, alpha need not come from memory
+      const F grad_alpha = load_fours(p.grad_alpha + pixel, width);
+      behind = -grad_alpha * (1.0f - load_fours(p.alpha + pixel, width));
+      any |= bits(grad_alpha);
+    }
+    for (int channel = 0; channel < 3; ++channel) {
+      store(t.color[channel][block] + v * W, gradient[channel]);
+      behind = behind + gradient[channel] * color[channel];
+      any |= bits(gradient[channel]);
+    }
+    store(t.behind[block] + v * W, behind);
   }
-  for (int channel = 0; channel < 3; ++channel) {
-    store4(&t.color[channel][block][lane], gradient[channel]);
-    behind = behind + gradient[channel] * color[channel];
-    any |= (Bits4)gradient[channel];
-  }
-  store4(&t.behind[block][lane], behind);
   return any;
 }
 
-MIEN_INLINE void prefetch_row(const PictureGradient& p, int64_t pixel, int columns) {
-  for (int x = 0; x < 3 * columns; x += 16) {
-    __builtin_prefetch(p.grad_image + 3 * pixel + x);
-    __builtin_prefetch(p.image + 3 * pixel + x);
-  }
-  for (int x = 0; x < columns && p.grad_alpha; x += 16) {
-    __builtin_prefetch(p.grad_alpha + pixel + x);
-    __builtin_prefetch(p.alpha + pixel + x);
+// Fetches a row of blocks of a tile into the cache.
+MIEN_INLINE void prefetch_rows(const PictureGradient& p, int64_t pixel, int width, int rows, int columns) {
+  for (int row = 0; row < rows; ++row, pixel += width) {
+    for (int x = 0; x < 3 * columns; x += 16) {
+      __builtin_prefetch(p.grad_image + 3 * pixel + x);
+      __builtin_prefetch(p.image + 3 * pixel + x);
+    }
+    for (int x = 0; x < columns && p.grad_alpha; x += 16) {
+      __builtin_prefetch(p.grad_alpha + pixel + x);
+      __builtin_prefetch(p.alpha + pixel + x);
+    }
   }
 }
 
@@ -68,22 +71,35 @@ MIEN_INLINE void prefetch_row(const PictureGradient& p, int64_t pixel, int colum
 MIEN_INLINE bool load_gradients(const PictureGradient& p, const View& view, int left, int top, TileGradients& t) {
   const int rows = view.height - top < kTile ? view.height - top : kTile;
   const int columns = view.width - left < kTile ? view.width - left : kTile;
+  const auto prefetch = [&](int y) {
+    const int there = rows - y < kBlock ? rows - y : kBlock;
+    prefetch_rows(p, (int64_t)(top + y) * view.width + left, view.width, there, columns);
+  };
+  for (int y = 0; y < kRowsAhead; y += kBlock) prefetch(y);
   for (int block = 0; block < kBlocks; ++block)
     for (int v = 0; v < kVectors; ++v) store(t.product[block] + v * W, set1(1.0f));
   if (rows < kTile || columns < kTile) {
     memset(t.behind, 0, sizeof t.behind);
     memset(t.color, 0, sizeof t.color);
   }
-  Bits4 any{};
-  for (int y = 0; y < rows; ++y) {
-    const int64_t pixel = (int64_t)(top + y) * view.width + left;
-    const int first_block = y / kBlock * kTileBlocks, first_lane = y % kBlock * kBlock;
-    prefetch_row(p, pixel + (int64_t)(y + kRowsAhead < rows ? kRowsAhead : 0) * view.width, columns);
-    int x = 0;
-    for (; x + kBlock <= columns; x += kBlock) any |= load_four(p, pixel + x, first_block + x / kBlock, first_lane, t);
-    for (; x < columns; ++x) any[0] |= load_pixel(p, pixel + x, first_block + x / kBlock, first_lane + x % kBlock, t);
+  I any_block{};
+  uint32_t any_pixel = 0;
+  for (int y = 0; y < rows; y += kBlock) {
+    prefetch(y + kRowsAhead);
+    for (int x = 0; x < columns; x += kBlock) {
+      const int block = y / kBlock * kTileBlocks + x / kBlock;
+      const int64_t pixel = (int64_t)(top + y) * view.width + left + x;
+      if (rows - y >= kBlock && columns - x >= kBlock) {
+        any_block |= load_block(p, pixel, view.width, block, t);
+        continue;
+      }
+      for (int row = 0; row < kBlock && row < rows - y; ++row)
+        for (int column = 0; column < kBlock && column < columns - x; ++column)
+          any_pixel |= load_pixel(p, pixel + (int64_t)row * view.width + column, block, row * kBlock + column, t);
+    }
   }
-  return ((any[0] | any[1] | any[2] | any[3]) & 0x7fffffff) != 0;
+  for (int lane = 0; lane < W; ++lane) any_pixel |= (uint32_t)any_block[lane];
+  return (any_pixel & 0x7fffffff) != 0;
 }
 
 struct Sums {
