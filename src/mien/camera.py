@@ -33,8 +33,9 @@ class Camera:
 
     def to(self, like: Tensor) -> "Camera":
         """The same camera with the dtype and device of `like`."""
-        K, viewmat = self.K.to(like), self.viewmat.to(like)
-        return self if K is self.K and viewmat is self.viewmat else replace(self, K=K, viewmat=viewmat)
+        if all(tensor.dtype == like.dtype and tensor.device == like.device for tensor in (self.K, self.viewmat)):
+            return self
+        return replace(self, K=self.K.to(like), viewmat=self.viewmat.to(like))
 
     def in_frame(self, T_world_local: Float[Tensor, "4 4"]) -> "Camera":
         """The camera as seen from a local frame: it views local points as `self` views them in world space."""

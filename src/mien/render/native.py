@@ -34,7 +34,7 @@ def render_native(
                 "use backend='auto'"
             )
         own = (means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-        inputs += (t.contiguous() for t in (offset, *own, background, camera.viewmat, camera.K))
+        inputs += (offset, *(t.contiguous() for t in (*own, background, camera.viewmat, camera.K)))
     if not torch.is_grad_enabled():
         inputs = [tensor.detach() for tensor in inputs]
     sizes = [(camera.height, camera.width) for _, camera in views]
@@ -64,7 +64,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, sizes: list[tuple[int, int]], *inputs: Tensor) -> tuple[Tensor, ...]:
         outputs, tasks, kept = [], [], []
         for index, size in enumerate(sizes):
-            own = [tensor.detach() for tensor in inputs[_INPUTS * index + 1 : _INPUTS * (index + 1)]]
+            own = inputs[_INPUTS * index + 1 : _INPUTS * (index + 1)]
             kept += own[:5]
             count = len(own[0])
             view = (recycled(*size, 3), recycled(*size), torch.empty(count, dtype=torch.int32))
@@ -82,7 +82,7 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        pictures = [tensor.detach() for tensor in saved[5 * len(ctx.frames) :]]
+        pictures = saved[5 * len(ctx.frames) :]
         views, tasks = [], []
         for index, frame in enumerate(ctx.frames):
             own = saved[5 * index : 5 * index + 5]

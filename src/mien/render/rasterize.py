@@ -68,7 +68,8 @@ def rasterize(
         raise ValueError(f"rasterize: unknown backend {backend!r}, expected auto, {', '.join(_BACKENDS)}")
     batch = _views(gaussians, camera)
     shape = (len(gaussians), 2) if batch is None else (len(batch), len(gaussians), 2)
-    offset = gaussians.means.new_zeros(shape).requires_grad_(torch.is_grad_enabled())
+    # One zero seen everywhere: nothing is to be cleared, and its gradient is a whole tensor all the same.
+    offset = gaussians.means.new_zeros(()).expand(shape).requires_grad_(torch.is_grad_enabled())
     if batch is None:
         assert isinstance(camera, Camera)
         view = _in_local_frame(gaussians, camera)

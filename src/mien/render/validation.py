@@ -9,19 +9,21 @@ from mien.gaussians import Gaussians
 
 def check_shapes(gaussians: Gaussians, background: Tensor) -> None:
     """Raise ValueError for shapes, dtypes and devices that do not fit together."""
-    count = len(gaussians)
-    expected = {"quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
-    tensors = named_tensors(gaussians, background)
-    for name, shape in expected.items():
-        if tuple(tensors[name].shape[-len(shape) :]) != shape:
-            raise ValueError(f"rasterize: {name} has shape {tuple(tensors[name].shape)}, expected [..., {shape}]")
-    if tuple(gaussians.sh.shape[-3:]) not in [(count, coefficients, 3) for coefficients in (1, 4, 9, 16)]:
-        raise ValueError(f"rasterize: sh has shape {tuple(gaussians.sh.shape)}, expected [..., {count}, 1|4|9|16, 3]")
-    means = gaussians.means
-    for name, tensor in tensors.items():
-        if tensor.dtype != means.dtype or tensor.device != means.device:
+    means, quats, scales, opacities, sh = _parts(gaussians)
+    count, dtype, device = len(gaussians), means.dtype, means.device
+    for name, tensor, shape in (
+        ("quats", quats, (count, 4)), ("scales", scales, (count, 3)), ("opacities", opacities, (count,))
+    ):  # fmt: skip
+        if tensor.shape[-len(shape) :] != shape:
+            raise ValueError(f"rasterize: {name} has shape {tuple(tensor.shape)}, expected [..., {shape}]")
+    if sh.shape[-3::2] != (count, 3) or sh.shape[-2] not in (1, 4, 9, 16):
+        raise ValueError(f"rasterize: sh has shape {tuple(sh.shape)}, expected [..., {count}, 1|4|9|16, 3]")
+    for name, tensor in (
+        ("quats", quats), ("scales", scales), ("opacities", opacities), ("sh", sh), ("background", background)
+    ):  # fmt: skip
+        if tensor.dtype != dtype or tensor.device != device:
             raise ValueError(
-                f"rasterize: {name} is {tensor.dtype} on {tensor.device}, but means is {means.dtype} on {means.device}"
+                f"rasterize: {name} is {tensor.dtype} on {tensor.device}, but means is {dtype} on {device}"
             )
 
 
@@ -41,4 +43,8 @@ def check_finite(gaussians: Gaussians, camera: Camera, background: Tensor) -> No
 def named_tensors(gaussians: Gaussians, background: Tensor) -> dict[str, Tensor]:
     """The inputs under the names that users know them by."""
     names = ("means", "quats", "scales", "opacities", "sh")
-    return {name: getattr(gaussians, name) for name in names} | {"background": background}
+    return dict(zip(names, _parts(gaussians), strict=True)) | {"background": background}
+
+
+def _parts(gaussians: Gaussians) -> tuple[Tensor, ...]:
+    return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh
