@@ -47,8 +47,8 @@ thread_local bool t_in_loop = false;
 
 class Pool {
  public:
-  explicit Pool(int threads) {
-    for (int i = 1; i < threads; ++i) workers_.emplace_back([this] { serve(); });
+  explicit Pool(int threads) : shares_(threads) {
+    for (int i = 1; i < threads; ++i) workers_.emplace_back([this, i] { serve(i); });
   }
 
   ~Pool() {
@@ -57,7 +57,7 @@ class Pool {
     for (auto& worker : workers_) worker.join();
   }
 
-  int threads() const { return static_cast<int>(workers_.size()) + 1; }
+  int threads() const { return static_cast<int>(shares_.size()); }
 
   void run(int64_t count, detail::LoopBody body, void* context) {
     std::unique_lock<std::mutex> lock;
@@ -68,12 +68,14 @@ class Pool {
     }
     body_ = body;
     context_ = context;
-    count_ = count;
-    next_.store(0, std::memory_order_relaxed);
+    for (int i = 0; i < threads(); ++i) {
+      shares_[i].next.store(count * i / threads(), std::memory_order_relaxed);
+      shares_[i].end = count * (i + 1) / threads();
+    }
     state_.store(kOpen, std::memory_order_release);
     announce();
     t_in_loop = true;
-    work();
+    work(0);
     t_in_loop = false;
     // From here on no worker enters; wait for those inside.
     state_.fetch_and(~kOpen, std::memory_order_acq_rel);
@@ -92,8 +94,14 @@ class Pool {
     signal_.notify_all();
   }
 
-  void work() {
-    for (int64_t index; (index = next_.fetch_add(1, std::memory_order_relaxed)) < count_;) body_(context_, index);
+  // One's own share, then what is left of the others'.
+  void work(int self) {
+    for (int i = 0; i < threads(); ++i) {
+      Share& share = shares_[(self + i) % threads()];
+      for (int64_t index; (index = share.next.fetch_add(1, std::memory_order_relaxed)) < share.end;) {
+        body_(context_, index);
+      }
+    }
   }
 
   bool enter() {
@@ -104,7 +112,7 @@ class Pool {
     return false;
   }
 
-  void serve() {
+  void serve(int self) {
     t_in_loop = true;
     uint32_t seen = 0;
     std::chrono::microseconds spin = kMostSpin;
@@ -114,19 +122,26 @@ class Pool {
       seen = signal_.load(std::memory_order_acquire);
       if (stop_) return;
       if (enter()) {
-        work();
+        work(self);
         if (state_.fetch_sub(1, std::memory_order_acq_rel) == 1) state_.notify_one();
       }
     }
   }
 
+  // A part of the loop's indices. Each thread has the same one in every loop of that length, so that what it wrote last
+  // time is in its own caches: between cores that share none, fetching it takes longer than most of what is done with
+  // it.
+  struct alignas(64) Share {
+    std::atomic<int64_t> next{0};
+    int64_t end = 0;
+  };
+
+  std::vector<Share> shares_;
   std::vector<std::thread> workers_;
   std::mutex busy_;
   std::chrono::microseconds spin_ = kMostSpin;  // of whoever runs a loop
   detail::LoopBody body_ = nullptr;
   void* context_ = nullptr;
-  int64_t count_ = 0;
-  alignas(64) std::atomic<int64_t> next_{0};
   alignas(64) std::atomic<uint32_t> state_{0};
   alignas(64) std::atomic<uint32_t> signal_{0};
   std::atomic<bool> stop_{false};

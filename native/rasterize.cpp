@@ -81,6 +81,15 @@ bool is_finite(const View& view) {
   return std::isfinite(total);
 }
 
+// Calls body(tile) for each tile, run by run.
+template <typename Body>
+void for_tiles(Frame& frame, Body&& body) {
+  const int32_t* begins = frame.run_begins.data();
+  parallel_for(frame.runs, [&](int64_t run) {
+    for (int tile = begins[run]; tile < begins[run + 1]; ++tile) body(tile);
+  });
+}
+
 int64_t groups(int64_t count) { return (count + kGroup - 1) / kGroup; }
 
 }  // namespace
@@ -133,9 +142,7 @@ FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, co
   sort_by_depth(*frame, count);
   bin_into_tiles(*frame, count);
   const TileLists lists = frame->lists();
-  parallel_for(static_cast<int64_t>(lists.columns) * lists.rows, [&](int64_t tile) {
-    kernels.blend(splats, lists, view, static_cast<int>(tile), picture.image, picture.alpha);
-  });
+  for_tiles(*frame, [&](int tile) { kernels.blend(splats, lists, view, tile, picture.image, picture.alpha); });
   return frame;
 }
 
@@ -144,9 +151,7 @@ void rasterize_backward(Frame& frame, const GaussianArrays& gaussians, const Vie
   const Kernels& kernels = *isa().kernels;
   const TileLists lists = frame.lists();
   Moments* slots = frame.slots.reserve(frame.pairs);
-  parallel_for(static_cast<int64_t>(lists.columns) * lists.rows, [&](int64_t tile) {
-    kernels.blend_backward(frame.splats.data(), lists, view, static_cast<int>(tile), picture, slots);
-  });
+  for_tiles(frame, [&](int tile) { kernels.blend_backward(frame.splats.data(), lists, view, tile, picture, slots); });
   const int64_t count = gaussians.count, parts = groups(count);
   float* view_gradients = frame.view_gradients.reserve(parts * kViewGradients);
   parallel_for(parts, [&](int64_t group) {

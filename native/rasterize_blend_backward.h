@@ -3,104 +3,9 @@
 #pragma once
 
 #include "rasterize_blend.h"
+#include "rasterize_pixel_gradients.h"
 
 namespace {
-
-constexpr int kRowsAhead = 2 * kBlock;  // rows of pixels: how far ahead pictures are fetched into the cache
-
-struct TileGradients {
-  alignas(64) float product[kBlocks][kBlock * kBlock];   // as in the forward pass
-  alignas(64) float behind[kBlocks][kBlock * kBlock];    // gradient . (colour behind what has been blended)
-  alignas(64) float color[3][kBlocks][kBlock * kBlock];  // dL / d image
-};
-
-// One pixel's gradients; returns the bits that are set in any of them.
-MIEN_INLINE uint32_t load_pixel(const PictureGradient& p, int64_t pixel, int block, int lane, TileGradients& t) {
-  const float grad_alpha = p.grad_alpha ? p.grad_alpha[pixel] : 0.0f;
-  float behind = -grad_alpha * (1.0f - p.alpha[pixel]);
-  uint32_t bits, any;
-  memcpy(&any, &grad_alpha, sizeof any);
-  for (int channel = 0; channel < 3; ++channel) {
-    const float gradient = p.grad_image[3 * pixel + channel];
-    t.color[channel][block][lane] = gradient;
-    behind += gradient * p.image[3 * pixel + channel];
-    memcpy(&bits, &gradient, sizeof bits);
-    any |= bits;
-  }
-  t.behind[block][lane] = behind;
-  return any;
-}
-
-// A block that lies in the picture, from its first pixel on.
-MIEN_INLINE I load_block(const PictureGradient& p, int64_t pixel, int width, int block, TileGradients& t) {
-  I any{};
-  for (int v = 0; v < kVectors; ++v, pixel += (int64_t)(W / kBlock) * width) {
-    F gradient[3], color[3], behind{};
-    split3(p.grad_image + 3 * pixel, 3 * width, gradient);
-    split3(p.image + 3 * pixel, 3 * width, color);
-    if (p.grad_alpha) {  // without one, alpha need not come from memory
-      const F grad_alpha = load_fours(p.grad_alpha + pixel, width);
-      behind = -grad_alpha * (1.0f - load_fours(p.alpha + pixel, width));
-      any |= bits(grad_alpha);
-    }
-    for (int channel = 0; channel < 3; ++channel) {
-      store(t.color[channel][block] + v * W, gradient[channel]);
-      behind = behind + gradient[channel] * color[channel];
-      any |= bits(gradient[channel]);
-    }
-    store(t.behind[block] + v * W, behind);
-  }
-  return any;
-}
-
-// Fetches a row of blocks of a tile into the cache.
-MIEN_INLINE void prefetch_rows(const PictureGradient& p, int64_t pixel, int width, int rows, int columns) {
-  for (int row = 0; row < rows; ++row, pixel += width) {
-    for (int x = 0; x < 3 * columns; x += 16) {
-      __builtin_prefetch(p.grad_image + 3 * pixel + x);
-      __builtin_prefetch(p.image + 3 * pixel + x);
-    }
-    for (int x = 0; x < columns && p.grad_alpha; x += 16) {
-      __builtin_prefetch(p.grad_alpha + pixel + x);
-      __builtin_prefetch(p.alpha + pixel + x);
-    }
-  }
-}
-
-// Loads the gradients of a tile; false if all are zero.
-MIEN_INLINE bool load_gradients(const PictureGradient& p, const View& view, int left, int top, TileGradients& t) {
-  const int rows = view.height - top < kTile ? view.height - top : kTile;
-  const int columns = view.width - left < kTile ? view.width - left : kTile;
-  const auto prefetch = [&](int y) {
-    const int there = rows - y < kBlock ? rows - y : kBlock;
-    prefetch_rows(p, (int64_t)(top + y) * view.width + left, view.width, there, columns);
-  };
-  for (int y = 0; y < kRowsAhead; y += kBlock) prefetch(y);
-  for (int block = 0; block < kBlocks; ++block)
-    for (int v = 0; v < kVectors; ++v) store(t.product[block] + v * W, set1(1.0f));
-  if (rows < kTile || columns < kTile) {
-    memset(t.behind, 0, sizeof t.behind);
-    memset(t.color, 0, sizeof t.color);
-  }
-  I any_block{};
-  uint32_t any_pixel = 0;
-  for (int y = 0; y < rows; y += kBlock) {
-    prefetch(y + kRowsAhead);
-    for (int x = 0; x < columns; x += kBlock) {
-      const int block = y / kBlock * kTileBlocks + x / kBlock;
-      const int64_t pixel = (int64_t)(top + y) * view.width + left + x;
-      if (rows - y >= kBlock && columns - x >= kBlock) {
-        any_block |= load_block(p, pixel, view.width, block, t);
-        continue;
-      }
-      for (int row = 0; row < kBlock && row < rows - y; ++row)
-        for (int column = 0; column < kBlock && column < columns - x; ++column)
-          any_pixel |= load_pixel(p, pixel + (int64_t)row * view.width + column, block, row * kBlock + column, t);
-    }
-  }
-  for (int lane = 0; lane < W; ++lane) any_pixel |= (uint32_t)any_block[lane];
-  return (any_pixel & 0x7fffffff) != 0;
-}
 
 struct Sums {
   F red, green, blue, one, x, y, xx, xy, yy;
@@ -226,6 +131,10 @@ void blend_backward(const Splat* splats, const TileLists& lists, const View& vie
   TileGradients gradients;
   const bool needed = load_gradients(picture, view, left, top, gradients);
   const int last = needed ? lists.ends[tile] : begin;
+  // What the next tile needs comes into the cache meanwhile: its entries follow this tile's.
+  const int next = tile + 1, tiles = lists.columns * lists.rows, all = lists.begins[tiles];
+  PixelsAhead ahead(picture, view, next % lists.columns * kTile, next / lists.columns * kTile);
+  if (next == tiles || lists.begins[next + 1] == end) ahead.stop();
   // A splat's sums over its lanes are taken after the next splat's: there they wait for nothing.
   Sums sums[2];
   Moments* waiting = nullptr;
@@ -235,9 +144,12 @@ void blend_backward(const Splat* splats, const TileLists& lists, const View& vie
     const TileRoots tile_roots(splats, lists.entries + i, valid, (float)left, (float)top);
     for (int lane = 0; lane < valid; ++lane) {
       const Entry& entry = lists.entries[i + lane];
-      const int remaining = last - (i + lane) - 1;
+      const int remaining = all - (i + lane) - 1;
       __builtin_prefetch(&splats[(&entry)[remaining < kGatherAhead ? remaining : kGatherAhead].gaussian]);
-      __builtin_prefetch(&slots[(&entry)[remaining < kAhead ? remaining : kAhead].slot], 1);
+      const Moments& later = slots[(&entry)[remaining < kAhead ? remaining : kAhead].slot];
+      __builtin_prefetch(&later.red, 1);  // a slot may begin in one cache line and end in another
+      __builtin_prefetch(&later.yy, 1);
+      ahead.step();
       const Splat& s = splats[entry.gaussian];
       const uint64_t mask = lists.masks[i + lane];
       if (mask == 0) {

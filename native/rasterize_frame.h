@@ -94,12 +94,13 @@ struct Frame {
   Buffer<Entry> entries;
   Buffer<uint64_t> masks;
   Buffer<int32_t> tile_begins, tile_ends;
+  Buffer<int32_t> run_begins;  // [runs + 1]: tiles that one thread works on, one after the other
   Buffer<Moments> slots;
   Buffer<float> view_gradients;  // per group of Gaussians
   Buffer<SortPart> sort_parts;
   std::deque<BinChunk> chunks;
   int64_t drawn = 0, pairs = 0;
-  int columns = 0, rows = 0;
+  int columns = 0, rows = 0, runs = 0;
 
   TileLists lists() {
     uint64_t* const kept = differentiable ? masks.data() : nullptr;
@@ -111,8 +112,8 @@ struct Frame {
 // frame.depth_keys and frame.depth_ranges.
 void sort_by_depth(Frame& frame, int64_t count);
 
-// Fills the tiles' lists and the Gaussians' slots; reads frame.slot_counts, where it is 0. The result does not depend
-// on the number of threads.
+// Fills the tiles' lists and runs, and the Gaussians' slots; reads frame.slot_counts, where it is 0. The result does
+// not depend on the number of threads.
 void bin_into_tiles(Frame& frame, int64_t count);
 
 }  // namespace mien
