@@ -75,13 +75,13 @@ class _Round:
         extent = self.settings.light_extent * float(cameras.K[0, 0, 0] / depth)
         return max(round(extent / self.pictures(shot).shrink), 2)
 
-    def terms(self, at: PhotometricFit) -> list[PhotometricTerm]:
-        """The cost of every sequence."""
+    def terms(self, at: PhotometricFit, independent_pixels: float) -> list[PhotometricTerm]:
+        """The cost of every sequence; `independent_pixels` are what all of a picture are worth."""
         surface = self.space.native(at.appearance, self.settings.outlier)
         return [
             PhotometricTerm(
                 self.model, marks, self.pictures(shot), shot.valid.nonzero()[:, 0], surface, light,
-                self.light_radius(shot, own), self.settings.independent_pixels, at.appearance.sigma,
+                self.light_radius(shot, own), independent_pixels, at.appearance.sigma,
             )
             for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
         ]  # fmt: skip
@@ -177,7 +177,7 @@ def refine_photometrically(
 
     def step_identity(now: _Round, at: PhotometricFit) -> PhotometricFit:
         at = now.look(at)
-        moved = step_shared(now.terms(at), outlines, at.fit, prior, now.keyframes)
+        moved = step_shared(now.terms(at, own_settings.independent_pixels), outlines, at.fit, prior, now.keyframes)
         return replace(at, fit=fit_bias(landmarks, moved))
 
     with progress_bar("Fitting to pixels", total=total) as advance:
@@ -212,7 +212,9 @@ def refine_photometrically(
 def _with_residuals(now: _Round, at: PhotometricFit) -> PhotometricFit:
     found = [
         term.residuals(own.state, at.fit.subject, own.cameras).where(improved[:, None], torch.nan)
-        for term, own, improved in zip(now.terms(at), at.fit.sequences, at.improved, strict=True)
+        for term, own, improved in zip(
+            now.terms(at, now.settings.independent_pixels_of_frames), at.fit.sequences, at.improved, strict=True
+        )
     ]
     return replace(at, residuals=tuple(found))
 
@@ -227,7 +229,8 @@ def _step_sequences(
 ) -> PhotometricFit:
     """One step of all timesteps of every sequence; its parts are kept by names that begin with `name`."""
     sequences, improved = [], []
-    parts = zip(now.terms(at), now.shots, at.fit.sequences, at.improved, strict=True)
+    terms = now.terms(at, now.settings.independent_pixels_of_frames)
+    parts = zip(terms, now.shots, at.fit.sequences, at.improved, strict=True)
     for number, (term, shot, own, before) in enumerate(parts):
         smoothness = smoothness_of(term.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
         state, better = _step(term, at.fit.subject, own, smoothness, keeper, f"{name}-{number}", advance)

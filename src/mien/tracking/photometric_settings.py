@@ -30,7 +30,11 @@ class PhotometricSettings:
     """What the outline of a head in a keyframe is worth, where it ends against the background; 0: nothing. For a single
     camera, which sees perspective by it."""
     independent_pixels: float = 100.0
-    """What all pixels of a picture are worth, whose errors go together: weighs them against landmarks and priors."""
+    """What all pixels of a picture are worth, whose errors go together: weighs them against landmarks and priors. For
+    identity and focal length, which many pictures tell together."""
+    independent_pixels_of_frames: float = 30.0
+    """The same for the steps of frames: much more, and what texture, light and shape have wrong becomes expression, of
+    which most goes with the head's turns. Much less, and shape has nothing to go by but landmarks."""
     landmark_share: float = 0.3
     """Weight of landmarks, of theirs in the fit to landmarks alone; those of lips, lids and irises keep all of it."""
     light_extent: float = 0.012
