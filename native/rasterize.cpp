@@ -127,16 +127,15 @@ FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, co
   const Projected projected{{frame->columns, frame->rows},
                             splats,
                             frame->spans.reserve(count),
+                            frame->slot_counts.reserve(count),
                             frame->depth_keys.reserve(count),
                             frame->depth_ranges.reserve(groups(count)),
                             picture.radii};
   frame->differentiable = differentiable;
-  uint32_t* slot_counts = differentiable ? frame->slot_counts.reserve(count) : nullptr;
   std::atomic<bool> finite{true};
   parallel_for(groups(count), [&](int64_t group) {
     const int64_t first = group * kGroup, last = std::min(first + kGroup, count);
     if (!kernels.project(gaussians, view, first, last, projected)) finite = false;
-    if (slot_counts) std::memset(slot_counts + first, 0, sizeof(uint32_t) * (last - first));
   });
   if (!finite) return nullptr;
   sort_by_depth(*frame, count);

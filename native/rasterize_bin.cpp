@@ -119,16 +119,13 @@ void find_pairs(BinChunk& chunk, Frame& frame) {
   const int64_t count = chunk.last - chunk.first;
   const uint32_t* order = frame.order.data() + chunk.first;
   const TileSpan* spans = frame.spans.data();
-  uint32_t* const slot_counts = frame.differentiable ? frame.slot_counts.data() : nullptr;
   Buffer<Pair>& pairs = chunk.pairs;
   pairs.clear();
   constexpr int64_t kAhead = 16;  // by depth, Gaussians lie anywhere in memory
   for (int64_t i = 0; i < count; ++i) {
-    const uint32_t gaussian = order[i], later = order[std::min(i + kAhead, count - 1)];
-    __builtin_prefetch(&spans[later]);
-    if (slot_counts) __builtin_prefetch(&slot_counts[later], 1);
+    const uint32_t gaussian = order[i];
+    __builtin_prefetch(&spans[order[std::min(i + kAhead, count - 1)]]);
     const TileSpan& span = spans[gaussian];
-    const int64_t before = pairs.size();
     const int above = std::max(span.high[0] - span.low[0] + 1, 0), below = std::max(span.high[1] - span.low[1] + 1, 0);
     if (span.row_count <= 2 && above <= 2 && below <= 2) {
       // Without a branch on the number of tiles, which is as good as random: both are written, those that count stay.
@@ -142,9 +139,10 @@ void find_pairs(BinChunk& chunk, Frame& frame) {
       out[above + 1] = {gaussian, lower + 1};
       pairs.advance(above + below);
     } else {
+      const int64_t before = pairs.size();
       find_large(frame.splats[gaussian], gaussian, span, frame.columns, pairs);
+      frame.slot_counts[gaussian] = static_cast<uint32_t>(pairs.size() - before);
     }
-    if (slot_counts) slot_counts[gaussian] = static_cast<uint32_t>(pairs.size() - before);
   }
   const int tiles = frame.columns * frame.rows;
   int32_t* counts = chunk.counts.reserve(tiles);
@@ -196,12 +194,24 @@ void plan_runs(Frame& frame) {
 void place_slots(Frame& frame, int64_t count) {
   const uint32_t* counts = frame.slot_counts.data();
   uint32_t* begins = frame.slot_begins.reserve(count + 1);
-  uint32_t total = 0;
-  for (int64_t i = 0; i < count; ++i) {
-    begins[i] = total;
-    total += counts[i];
-  }
-  begins[count] = total;
+  const int64_t parts = std::clamp<int64_t>(count / 4096, 1, thread_count());
+  uint32_t* totals = frame.slot_totals.reserve(parts);
+  parallel_for(parts, [&](int64_t index) {
+    const Part part(count, index, parts);
+    uint32_t total = 0;
+    for (int64_t i = part.first; i < part.last; ++i) total += counts[i];
+    totals[index] = total;
+  });
+  parallel_for(parts, [&](int64_t index) {
+    const Part part(count, index, parts);
+    uint32_t total = 0;
+    for (int64_t before = 0; before < index; ++before) total += totals[before];
+    for (int64_t i = part.first; i < part.last; ++i) {
+      begins[i] = total;
+      total += counts[i];
+    }
+  });
+  begins[count] = static_cast<uint32_t>(frame.pairs);
 }
 
 void fill_lists(BinChunk& chunk, Frame& frame) {

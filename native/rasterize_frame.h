@@ -90,6 +90,7 @@ struct Frame {
   Buffer<uint32_t> depth_keys, sorted_keys, order, scratch_keys, scratch_order;
   Buffer<DepthRange> depth_ranges;  // per group of Gaussians
   Buffer<uint32_t> slot_counts;     // per Gaussian
+  Buffer<uint32_t> slot_totals;     // per thread
   Buffer<uint32_t> slot_begins;     // [n + 1]
   Buffer<Entry> entries;
   Buffer<uint64_t> masks;
@@ -112,7 +113,7 @@ struct Frame {
 // frame.depth_keys and frame.depth_ranges.
 void sort_by_depth(Frame& frame, int64_t count);
 
-// Fills the tiles' lists and runs, and the Gaussians' slots; reads frame.slot_counts, where it is 0. The result does
+// Fills the tiles' lists and runs, and the Gaussians' slots; reads frame.slot_counts and completes it. The result does
 // not depend on the number of threads.
 void bin_into_tiles(Frame& frame, int64_t count);
 

@@ -78,6 +78,7 @@ struct Projected {
   TileGrid grid;
   Splat* splats;
   TileSpan* spans;           // only where drawn
+  uint32_t* slot_counts;     // tiles in a span's first two rows; 0: not drawn
   uint32_t* depth_keys;      // all ones: not drawn
   DepthRange* depth_ranges;  // per group
   int32_t* radii;

@@ -100,8 +100,8 @@ struct Strips {
   }
 };
 
-// The tiles of W splats, for those that have any.
-MIEN_INLINE void store_spans(const SplatShape& s, TileGrid grid, int valid, TileSpan* spans) {
+// The tiles of W splats, for those that have any. Returns how many there are in the first two rows.
+MIEN_INLINE I store_spans(const SplatShape& s, TileGrid grid, int valid, TileSpan* spans) {
   const F last_row = set1((float)(grid.rows - 1)), columns = set1((float)grid.columns);
   const F first_row = clamp(round_down((s.y - s.half_height - 0.5f) * (1.0f / kTile)), F{}, last_row);
   const F end_row = clamp(round_down((s.y + s.half_height - 0.5f) * (1.0f / kTile)), F{}, last_row);
@@ -123,6 +123,8 @@ MIEN_INLINE void store_spans(const SplatShape& s, TileGrid grid, int valid, Tile
   float rows[3 * W];
   store_columns<3>(rows, 3, W, words);
   memcpy(spans, rows, sizeof(TileSpan) * valid);
+  const I above = high[0] - low[0] + 1, below = high[1] - low[1] + 1;
+  return (above & ~(above >> 31)) + (below & ~(below >> 31));  // none rather than fewer
 }
 
 // Of the drawn Gaussians in each lane so far.
@@ -187,10 +189,14 @@ MIEN_INLINE M project_group(const GaussianArrays& g, const View& view, int64_t i
                          F{}};
   store_columns<16>(&out.splats[i].x, 16, valid, columns);
   store_radii(p, o.drawn, valid, out.radii + i);
+  I tiles{};
   if (any(o.drawn)) {
     const SplatShape shape{columns[0], columns[1], columns[2], columns[3], columns[4], columns[5], columns[7]};
-    store_spans(shape, out.grid, valid, out.spans + i);
+    tiles = bits(keep(o.drawn, from_bits(store_spans(shape, out.grid, valid, out.spans + i))));
   }
+  alignas(64) int32_t counts[W];
+  store(counts, tiles);
+  memcpy(out.slot_counts + i, counts, sizeof(uint32_t) * valid);
   depths.add(p.camera.z, both(o.drawn, less(iota(), set1((float)valid))));
   const uint32_t drawn = lane_bits(o.drawn);
   for (int lane = 0; lane < valid; ++lane) {
