@@ -39,6 +39,7 @@ from mien.tracking.stages import (
     widen,
 )
 from mien.tracking.tracking import Tracking
+from mien.tracking.turn_habits import without_turn_habits
 from mien.tracking.watch import Watch, nobody
 
 DEFAULTS = TrackingSettings()
@@ -99,8 +100,9 @@ def track_subject(
         if settings.schedule == "paper":
             start = fit if refined is None else refined.fit
             refined = fit_by_descent(model, shots, lenses, start, settings, keeper, watch, refined)
+        fit = _without_turn_habits(model, shots, fit if refined is None else refined.fit, settings)
+        refined = None if refined is None else replace(refined, fit=fit)
         watch(DONE, 1.0, lambda: refined or fit)
-        fit = fit if refined is None else refined.fit
         trackings = [
             as_tracking(shot, face_model, model, fit.subject, own, settings)
             for shot, own in zip(shots, fit.sequences, strict=True)
@@ -109,6 +111,12 @@ def track_subject(
             trackings = with_pixels(trackings, shots, refined, face_model, settings)
     keeper.forget()
     return trackings
+
+
+def _without_turn_habits(model: LandmarkModel, shots: Sequence[Shot], fit: Fit, settings: TrackingSettings) -> Fit:
+    calm = [without_turn_habits(all_landmarks(model, shot.views, own, settings), fit.subject, own)
+            for shot, own in zip(shots, fit.sequences, strict=True)]  # fmt: skip
+    return replace(fit, sequences=tuple(calm))
 
 
 def _response(face_model: FaceModel, shots: Sequence[Shot], settings: TrackingSettings) -> DetectorResponse:

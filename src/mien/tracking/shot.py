@@ -12,6 +12,7 @@ from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.errors import UserError
 from mien.rotation import invert_rigid
+from mien.tracking.flicker import without_flicker
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.views import CameraBatch, Views, batch_of
 
@@ -75,6 +76,7 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
         raise UserError(
             f"{capture.name}: a face was found in {found} frames, tracking needs {_LEAST_FRAMES}; film longer"
         )
+    detected = without_flicker(detected, seen)
     row, camera = seen[valid].nonzero().unbind(1)
     views = Views(detected[valid][row, camera], row, camera)
     if capture.calibration is None:

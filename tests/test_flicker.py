@@ -1,0 +1,57 @@
+"""Landmarks that swing between two answers."""
+
+import torch
+
+from mien.tracking.flicker import without_flicker
+
+
+def _still(timesteps: int = 20, noise: float = 0.0) -> torch.Tensor:
+    random = torch.Generator().manual_seed(5)
+    face = 100 * torch.rand(1, 1, 478, 2, generator=random, dtype=torch.float64)
+    return face + noise * torch.randn(timesteps, 1, 478, 2, generator=random, dtype=torch.float64)
+
+
+def _all_seen(marks: torch.Tensor) -> torch.Tensor:
+    return torch.ones(marks.shape[:2], dtype=torch.bool)
+
+
+def _swinging(marks: torch.Tensor, frames: slice) -> torch.Tensor:
+    sign = (-1.0) ** torch.arange(len(marks), dtype=torch.float64)
+    found = marks.clone()
+    found[frames] += sign[frames, None, None, None] * torch.tensor([0.3, 0.8], dtype=torch.float64)
+    return found
+
+
+def test_swings_go():
+    marks = _still(noise=0.05)
+    found = without_flicker(_swinging(marks, slice(6, 15)), _all_seen(marks))
+    torch.testing.assert_close(found[6:15], marks[6:15], atol=0.35, rtol=0)
+    assert (found[8:13] - marks[8:13]).abs().mean() < 0.06
+    torch.testing.assert_close(found[:5], marks[:5], atol=0, rtol=0)
+    torch.testing.assert_close(found[16:], marks[16:], atol=0, rtol=0)
+
+
+def test_swings_from_end_to_end():
+    marks = _still(8)
+    found = without_flicker(_swinging(marks, slice(0, 8)), _all_seen(marks))
+    torch.testing.assert_close(found, marks, atol=1e-9, rtol=0)
+
+
+def test_noise_motion_and_blinks_stay():
+    marks = _still(40, noise=0.25)
+    marks[10:14, :, :50] += 6.0
+    marks[20, :, :50] -= 6.0  # of a single frame
+    marks[25:] += torch.linspace(0, 40, 15, dtype=torch.float64)[:, None, None, None]
+    torch.testing.assert_close(without_flicker(marks, _all_seen(marks)), marks, atol=0, rtol=0)
+
+
+def test_frames_without_a_face_part_runs():
+    marks, seen = _swinging(_still(12), slice(0, 12)), torch.ones(12, 1, dtype=torch.bool)
+    marks[[2, 5, 8]], seen[[2, 5, 8]] = torch.nan, False
+    found = without_flicker(marks, seen)
+    torch.testing.assert_close(found, marks, atol=0, rtol=0, equal_nan=True)
+
+
+def test_short_clips_stay():
+    marks = _swinging(_still(4), slice(0, 4))
+    assert without_flicker(marks, _all_seen(marks)) is marks

@@ -1,0 +1,73 @@
+"""Expressions that nod with the head: what the face hardly shows goes, what it shows stays."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mien.tracking import TrackingSettings
+from mien.tracking.landmark_model import reduce_face_model
+from mien.tracking.landmark_term import LandmarkTerm, unknown_subject
+from mien.tracking.parameters import layout_of
+from mien.tracking.shot import shot_of
+from mien.tracking.stages import SequenceFit, all_landmarks
+from mien.tracking.turn_habits import without_turn_habits
+from tracking_case import make_tracking_case
+
+PLAIN, FAINT = 6, 7
+"""Columns of an expression that moves landmarks by centimetres, and of one that does so by tenths of millimetres."""
+
+
+@pytest.fixture(scope="module")
+def term() -> LandmarkTerm:
+    case = make_tracking_case(timesteps=60)
+    shares = torch.ones(len(case.model.expression_basis), 1, 1, dtype=torch.float64)
+    shares[0], shares[FAINT - PLAIN] = 3, 0.01
+    model = replace(case.model, expression_basis=shares * case.model.expression_basis)
+    shot = shot_of(case.capture, TrackingSettings())
+    reduced = reduce_face_model(model, layout_of(model))
+    state = torch.zeros(60, reduced.layout.size, dtype=torch.float64)
+    state[:, 5] -= 0.9
+    return all_landmarks(reduced, shot.views, SequenceFit(shot.cameras, state), TrackingSettings())
+
+
+def _nodding(term: LandmarkTerm, turn: float) -> SequenceFit:
+    """Both expressions follow pitch, beside a motion of their own."""
+    time = torch.arange(60, dtype=torch.float64)
+    state = torch.zeros(60, term.model.layout.size, dtype=torch.float64)
+    state[:, 5] -= 0.9
+    state[:, 0] = turn * (0.4 * time).sin()
+    for column in (PLAIN, FAINT):
+        state[:, column] = 0.5 + 0.2 * (0.4 * time).sin() + 0.1 * (1.3 * time).sin()
+    shot_cameras = shot_of(make_tracking_case(timesteps=60).capture, TrackingSettings()).cameras
+    return SequenceFit(shot_cameras, state)
+
+
+def _following(state: torch.Tensor) -> torch.Tensor:
+    """Correlation of each column with pitch."""
+    turned = (state - state.mean(0)) / (state - state.mean(0)).norm(dim=0).clamp_min(1e-12)
+    return turned[:, 0] @ turned
+
+
+def test_only_what_the_face_hardly_shows_stops_nodding(term):
+    own = _nodding(term, 0.2)
+    found = without_turn_habits(term, unknown_subject(term.model), own)
+    before, after = _following(own.state), _following(found.state)
+    assert before[PLAIN] > 0.85
+    assert before[FAINT] > 0.85
+    assert after[PLAIN] > 0.85
+    assert after[FAINT] < 0.3
+    torch.testing.assert_close(found.state[:, PLAIN], own.state[:, PLAIN], atol=0.03, rtol=0)
+    # What is its own stays: beside pitch nothing has changed.
+    turn = own.state[:, :1] - own.state[:, :1].mean()
+    change = found.state[:, FAINT : FAINT + 1] - own.state[:, FAINT : FAINT + 1]
+    torch.testing.assert_close(change, turn * (turn.T @ change) / (turn.T @ turn), atol=1e-9, rtol=0)
+    stop = term.model.layout.expression_columns.stop
+    others = [column for column in range(own.state.shape[1]) if not PLAIN <= column < stop]
+    torch.testing.assert_close(found.state[:, others], own.state[:, others], atol=0, rtol=0)
+
+
+def test_a_head_that_does_not_turn_keeps_its_expressions(term):
+    own = _nodding(term, 0.0)
+    found = without_turn_habits(term, unknown_subject(term.model), own)
+    torch.testing.assert_close(found.state, own.state, atol=0, rtol=0)
