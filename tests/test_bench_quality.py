@@ -1,6 +1,7 @@
 """What `mien bench quality` measures: nothing where a tracking is the truth, and the right amount where it is not."""
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ from mien.benchmarking.quality import (
 )
 from mien.capture import Capture
 from mien.cli import main
-from mien.synthetic import RECIPES, Segment, SyntheticScene, truth_of
+from mien.commands.bench import CaptureName
+from mien.synthetic import RECIPES, REFERENCES, Segment, SyntheticScene, truth_of
 
 RECIPE = replace(
     RECIPES["demo"], width=128, height=128, fps=10.0, glasses=False, hair="none",
@@ -120,4 +122,5 @@ def test_the_table_names_hash_and_baselines():
 
 def test_an_unknown_capture_is_one_line(tmp_path, capsys):
     assert main(["bench", "quality", "--captures", "mono", "--out", str(tmp_path)]) == 2
-    assert "choose of: mono-short" in capsys.readouterr().err
+    assert "mono-short" in capsys.readouterr().err
+    assert set(get_args(CaptureName)) == set(REFERENCES), "the command line knows their names without importing them"

@@ -50,7 +50,7 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
 @pytest.mark.usefixtures("small")
 def test_scaling_as_json_with_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     chart = tmp_path / "chart.png"
-    assert main(["bench", "scaling", "--json", "--seconds", "0", "--plot", str(chart)]) == 0
+    assert main(["bench", "scaling", "--json", "--seconds", "0.001", "--plot", str(chart)]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["machine"]["gflops"] > 0
     rows = [BenchmarkRow(**row) for row in shown["rows"]]
@@ -75,6 +75,13 @@ def test_instruction_sets_are_compared_and_restored(monkeypatch: pytest.MonkeyPa
 def test_a_chart_of_another_kind_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "scaling", "--plot", str(tmp_path / "chart.jpg")]) == 2
     assert ".png, .svg, .pdf" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("what", ["render", "train-step", "scaling"])
+@pytest.mark.parametrize("seconds", ["-1", "0", "nan", "inf"])
+def test_no_time_to_measure_in_is_told_at_once(what: str, seconds: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", what, f"--seconds={seconds}"]) == 2
+    assert f"--seconds {seconds}: give a positive number" in capsys.readouterr().err
 
 
 def test_a_chart_has_a_line_for_every_size(tmp_path: Path) -> None:

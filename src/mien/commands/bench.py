@@ -1,10 +1,11 @@
 """`mien bench`."""
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
     import torch
 
     from mien.benchmarking.timing import BenchmarkRow, Machine
+
+
+CaptureName = Literal["mono-short", "mono-long", "ring-16", "beard", "long-hair", "glasses", "off-model"]
+"""The keys of `mien.synthetic.REFERENCES` (a test compares them): options are read before torch is imported."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +35,9 @@ class Render:
     """cuda: gsplat on a GPU instead, at the papers' sizes."""
 
     def check(self) -> None:
-        """Tell that CUDA lacks gsplat."""
+        """Tell that CUDA lacks gsplat, or that there is no time to measure in."""
         check_device(self.device)
+        _check_seconds(self.seconds)
 
     def run(self) -> None:
         """Measure and print."""
@@ -58,9 +64,10 @@ class Scaling:
     """Write a chart here: .png, .svg or .pdf."""
 
     def check(self) -> None:
-        """Find out before any measuring whether the chart can be written."""
+        """Find out before any measuring whether the chart can be written, and whether there is time to measure in."""
         from mien.benchmarking.chart_path import check_chart_path
 
+        _check_seconds(self.seconds)
         if self.plot is not None:
             check_chart_path(self.plot)
 
@@ -86,8 +93,9 @@ class TrainStep:
     """cuda: on a GPU instead (gsplat draws), at the papers' sizes."""
 
     def check(self) -> None:
-        """Tell that CUDA lacks gsplat."""
+        """Tell that CUDA lacks gsplat, or that there is no time to measure in."""
         check_device(self.device)
+        _check_seconds(self.seconds)
 
     def run(self) -> None:
         """Measure and print."""
@@ -109,8 +117,8 @@ class Quality:
     Each capture is drawn (once), captured, tracked, trained and evaluated; a stopped command goes on where it was.
     """
 
-    captures: tuple[str, ...] = ()
-    """Names of reference captures (default: all; an unknown name lists them)."""
+    captures: tuple[CaptureName, ...] = ()
+    """Names of reference captures (default: all)."""
     method: MethodName = "gaussian_avatars"
     """How the avatars are made."""
     steps: int = 0
@@ -151,6 +159,11 @@ class Command:
     def run(self) -> None:
         """Run the chosen benchmark."""
         self.what.run()
+
+
+def _check_seconds(seconds: float) -> None:
+    if not 0 < seconds < math.inf:
+        raise UserError(f"--seconds {seconds:g}: give a positive number; each row is measured for as long")
 
 
 def _gpu(name: DeviceName) -> "torch.Tensor | None":
