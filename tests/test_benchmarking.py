@@ -147,7 +147,7 @@ def test_benchmarks_of_a_gpu_say_what_is_missing(capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize("what", ["render", "train-step"])
 def test_a_gpu_is_measured(what: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_benchmark, "COUNTS", (1000,))
-    assert main(["bench", what, "--device", "cuda", "--json", "--seconds", "0"]) == 0
+    assert main(["bench", what, "--device", "cuda", "--json", "--seconds", "0.001"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["machine"]["gpu"]
     assert {(row["isa"], row["threads"]) for row in shown["rows"]} == {("cuda", 0)}
