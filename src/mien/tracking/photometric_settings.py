@@ -32,7 +32,7 @@ class PhotometricSettings:
     independent_pixels: float = 100.0
     """What all pixels of a picture are worth, whose errors go together: weighs them against landmarks and priors. For
     identity and focal length, which many pictures tell together."""
-    independent_pixels_of_frames: float = 30.0
+    independent_pixels_of_frames: float = 50.0
     """The same for the steps of frames: much more, and what texture, light and shape have wrong becomes expression, of
     which most goes with the head's turns. Much less, and shape has nothing to go by but landmarks."""
     landmark_share: float = 0.3
