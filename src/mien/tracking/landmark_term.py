@@ -36,6 +36,11 @@ class Subject:
         """Identity, then person: what all pictures tell together."""
         return torch.cat([self.identity, self.person])
 
+    @property
+    def columns_of_pixels(self) -> Int[Tensor, " _"]:
+        """Which of `shared` and the logarithm of the focal length pixels tell: not what a detector makes of people."""
+        return torch.cat([torch.arange(len(self.identity)), torch.tensor([len(self.shared)])])
+
     def moved(self, step: Float[Tensor, " s"], response: DetectorResponse) -> "Subject":
         """With `shared` changed by a step."""
         identity, person = step.split([len(self.identity), len(self.person)])

@@ -99,7 +99,7 @@ def _residuals(tracking: Tracking, shot: Shot, face_model: FaceModel) -> Float[T
 
     def compare(row: int) -> None:
         vertices = face_model(tracking.face[timesteps[row]])[0]
-        for camera in views.camera[views.row == row].tolist():
+        for camera in views.seen_by(row):
             found[row, camera] = pictures.compare(timesteps[row], camera, vertices).rms
 
     in_threads(compare, list(range(len(found))))

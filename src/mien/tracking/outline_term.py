@@ -73,15 +73,15 @@ class OutlineTerm:
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch
     ) -> tuple[NormalEquations, SharedEquations]:
         """Of some timesteps, and of what they share: `Subject.shared`, then the logarithm of the focal length."""
-        p, i, s = state.shape[1], len(subject.identity), len(subject.shared) + 1
-        shared = torch.cat([torch.arange(i), torch.tensor([s - 1])])
+        size = state.shape[1] + len(subject.columns_of_pixels)
 
         def of_row(row: int) -> tuple[float, Tensor, Tensor]:
             posed = self.model.pose(state[row], subject.identity, derive_identity=True)
             assert posed.jacobian is not None
-            jacobian = torch.cat([posed.jacobian, by_log_focal(posed.vertices, cameras, self._seen_by(row))], dim=2)
-            cost, gradient, hessian = 0.0, torch.zeros(p + i + 1).double(), torch.zeros(p + i + 1, p + i + 1).double()
-            for camera in self._seen_by(row):
+            seen_by = self.views.seen_by(row)
+            jacobian = torch.cat([posed.jacobian, by_log_focal(posed.vertices, cameras, seen_by)], dim=2)
+            cost, gradient, hessian = 0.0, torch.zeros(size).double(), torch.zeros(size, size).double()
+            for camera in seen_by:
                 slopes, distance, weights, own = self._residuals(posed.vertices, jacobian, row, camera, cameras)
                 cost += self.weight * own
                 gradient -= self.weight * (slopes.T @ (weights * distance))
@@ -91,16 +91,8 @@ class OutlineTerm:
         parts = in_threads(of_row, rows.tolist())
         cost = torch.tensor([part[0] for part in parts]).double()
         gradient, hessian = torch.stack([part[1] for part in parts]), torch.stack([part[2] for part in parts])
-        across = state.new_zeros(len(rows), p, s)
-        across[:, :, shared] = hessian[:, :p, p:]
-        whole, slope = state.new_zeros(s, s), state.new_zeros(s)
-        whole[shared[:, None], shared] = hessian[:, p:, p:].sum(0)
-        slope[shared] = gradient[:, p:].sum(0)
-        own = NormalEquations(cost, gradient[:, :p], hessian[:, :p, :p])
-        return own, SharedEquations(across, whole, slope)
-
-    def _seen_by(self, row: int) -> list[int]:
-        return self.views.camera[self.views.row == row].tolist()
+        whole = NormalEquations(cost, gradient, hessian)
+        return whole.split(state.shape[1], subject.columns_of_pixels, len(subject.shared) + 1)
 
     def _residuals(
         self,

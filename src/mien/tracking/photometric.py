@@ -111,7 +111,7 @@ class _Round:
 
         def sight(row: int) -> list[Sighting]:
             posed = self.model.pose(own.state[row], identity, derive=False)
-            cameras = landmarks.views.camera[landmarks.views.row == row].tolist()
+            cameras = landmarks.views.seen_by(row)
             return [
                 Sighting(
                     posed, pictures.picture(int(timesteps[row]), camera, own.cameras), light, float(shares[row])

@@ -62,7 +62,7 @@ class PhotometricTerm:
 
         def of_row(row: int) -> float:
             posed = self.model.pose(state[row], subject.identity, derive=False)
-            return sum(self._align(posed, row, camera, cameras)[0] for camera in self._seen_by(row))
+            return sum(self._align(posed, row, camera, cameras)[0] for camera in self.landmarks.views.seen_by(row))
 
         pixels = torch.tensor(in_threads(of_row, list(range(len(state)))), dtype=torch.float64)
         return self.landmarks.cost(state, subject, cameras) + self.weight * pixels
@@ -73,7 +73,7 @@ class PhotometricTerm:
 
         def of_row(row: int) -> None:
             posed = self.model.pose(state[row], subject.identity, derive=False)
-            for camera in self._seen_by(row):
+            for camera in self.landmarks.views.seen_by(row):
                 picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
                 seen = Sighting(posed, picture, self.light).arguments()
                 cost, weight = _native.align_mesh(self.surface, *seen, self.light_radius, None, None, None, None, None)
@@ -87,26 +87,17 @@ class PhotometricTerm:
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch
     ) -> tuple[NormalEquations, SharedEquations]:
         """Of some timesteps, and of what they share: `Subject.shared`, then the logarithm of the focal length."""
-        p, i = state.shape[1], len(subject.identity)
         marks, shared = self.landmarks.at(rows).joint_equations(state[rows], subject, cameras)
         pixels = self._pixel_equations(state, rows, subject, cameras, shared=True)
-        own = marks.plus(NormalEquations(pixels.cost, pixels.gradient[:, :p], pixels.hessian[:, :p, :p]))
-        # Pixels know nothing of what the landmark detector makes of the subject.
-        placing = torch.zeros(i + 1, len(shared.gradient), dtype=torch.float64)
-        placing[:i, :i] = torch.eye(i)
-        placing[i, -1] = 1
-        of_pixels = SharedEquations(
-            pixels.hessian[:, :p, p:] @ placing,
-            placing.T @ pixels.hessian[:, p:, p:].sum(0) @ placing,
-            pixels.gradient[:, p:].sum(0) @ placing,
-        )
-        return own, shared.plus(of_pixels)
+        own, of_pixels = pixels.split(state.shape[1], subject.columns_of_pixels, len(subject.shared) + 1)
+        return marks.plus(own), shared.plus(of_pixels)
 
     def _pixel_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch, shared: bool
     ) -> NormalEquations:
         def of_row(row: int) -> NormalEquations:
-            posed, seen_by = self.model.pose(state[row], subject.identity, derive_identity=shared), self._seen_by(row)
+            posed = self.model.pose(state[row], subject.identity, derive_identity=shared)
+            seen_by = self.landmarks.views.seen_by(row)
             assert posed.jacobian is not None
             if shared:
                 by_focal = by_log_focal(posed.vertices, cameras, seen_by)
@@ -119,10 +110,6 @@ class PhotometricTerm:
             )
 
         return joined(in_threads(of_row, rows.tolist()))
-
-    def _seen_by(self, row: int) -> list[int]:
-        views = self.landmarks.views
-        return views.camera[views.row == row].tolist()
 
     def _align(
         self, posed: PosedSurface, row: int, camera: int, cameras: CameraBatch

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 _DAMPING_START, _DAMPING_LEAST, _DAMPING_MOST = 1e-3, 1e-7, 1e7
@@ -24,6 +24,16 @@ class NormalEquations:
     def plus(self, other: "NormalEquations") -> "NormalEquations":
         """Of both costs together."""
         return NormalEquations(self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian)
+
+    def split(self, own: int, columns: Int[Tensor, " k"], size: int) -> "tuple[NormalEquations, SharedEquations]":
+        """Of each frame's first `own` parameters, and of the other k, which are `columns` of `size` shared ones."""
+        across = self.hessian.new_zeros(len(self.cost), own, size)
+        across[:, :, columns] = self.hessian[:, :own, own:]
+        hessian, gradient = self.hessian.new_zeros(size, size), self.gradient.new_zeros(size)
+        hessian[columns[:, None], columns] = self.hessian[:, own:, own:].sum(0)
+        gradient[columns] = self.gradient[:, own:].sum(0)
+        frames = NormalEquations(self.cost, self.gradient[:, :own], self.hessian[:, :own, :own])
+        return frames, SharedEquations(across, hessian, gradient)
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,6 +68,10 @@ class Views:
         kept = new_row[self.row] >= 0
         return Views(self.detected[kept], new_row[self.row[kept]], self.camera[kept])
 
+    def seen_by(self, row: int) -> list[int]:
+        """The cameras that have a picture of a timestep."""
+        return self.camera[self.row == row].tolist()
+
     def of_landmarks(self, landmarks: Int[Tensor, " k"]) -> "Views":
         """The same pictures with some of the landmarks only."""
         return replace(self, detected=self.detected[:, landmarks])
