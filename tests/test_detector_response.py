@@ -127,7 +127,7 @@ def _fitted_identity(detects: DetectorResponse, expects: DetectorResponse) -> fl
     detected = truth.project(
         state, person.identity, person.bias, cameras[torch.zeros(8, dtype=torch.long)], torch.arange(8)
     )
-    views = Views(detected, torch.arange(8), torch.zeros(8, dtype=torch.long))
+    views = Views(detected, torch.arange(8), torch.zeros(8, dtype=torch.long), torch.ones(8, dtype=torch.float64))
     settings = TrackingSettings(identity_weight=1.0)
     own = SequenceFit(cameras, state)
     term = all_landmarks(reduced, views, own, settings)

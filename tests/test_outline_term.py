@@ -23,7 +23,7 @@ def case() -> PhotometricCase:
 
 def term_of(case: PhotometricCase) -> OutlineTerm:
     rows = torch.arange(len(case.face))
-    views = Views(case.landmarks.double(), rows, torch.zeros_like(rows))
+    views = Views(case.landmarks.double(), rows, torch.zeros_like(rows), torch.ones(len(rows), dtype=torch.float64))
     return outline_term(surface_model(case.model, layout_of(case.model)), case.capture, rows, views, 10.0)
 
 

@@ -202,6 +202,15 @@ def test_cameras_tell_pose_and_metric_scale(ring):
     assert abs(float(single.face.identity[-1]) - 1.2) > 0.5
 
 
+def test_cameras_from_the_side_are_believed_less(ring):
+    """What a detector makes of a face from the side is off in its own way."""
+    face, capture, _ = ring
+    landmarks = capture.landmarks.copy()
+    landmarks[:, 2] += (0, 4)
+    _, distance = _pose_errors(face, track(replace(capture, landmarks=landmarks), _model_with_sizes(), FEW))
+    assert distance < 0.8
+
+
 def test_calibrated_cameras_stay(ring):
     _, capture, tracking = ring
     for given, kept in zip(capture.calibration, tracking.cameras, strict=True):

@@ -59,7 +59,8 @@ def unknown_subject(model: LandmarkModel) -> Subject:
 class LandmarkTerm:
     """Costs of the v timesteps of one sequence.
 
-    A timestep's is the sum of w_l rho(|r_l|^2 / sigma^2) over its pictures and their landmarks, plus the prior's.
+    A timestep's is the sum of t w_l rho(|r_l|^2 / sigma^2) over its pictures and their landmarks, plus the prior's;
+    t is the picture's trust.
     rho(s) = c^2 s / (c^2 + s) (Geman and McClure): an outlier's pull fades.
     """
 
@@ -77,14 +78,15 @@ class LandmarkTerm:
         return replace(self, views=self.views.at(rows))
 
     def robust(
-        self, residual: Float[Tensor, "n l 2"], camera: Int[Tensor, " n"]
+        self, residual: Float[Tensor, "n l 2"], pictures: Views
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n l"]]:
         """Costs of pictures whose landmarks are off by this, and the weight of each square in them."""
-        variance = self.sigma[camera][:, None] ** 2
+        variance = self.sigma[pictures.camera][:, None] ** 2
         squared = (residual**2).sum(-1) / variance
         least = self.outlier**2
-        cost = (self.weights * least * squared / (least + squared)).sum(-1)
-        return cost, self.weights * (least / (least + squared)) ** 2 / variance
+        weights = self.weights * pictures.trust[:, None]
+        cost = (weights * least * squared / (least + squared)).sum(-1)
+        return cost, weights * (least / (least + squared)) ** 2 / variance
 
     def _prior(self, state: Float[Tensor, "v p"]) -> tuple[Float[Tensor, " v"], Float[Tensor, "v p"]]:
         pull = state @ self.model.layout.precision
@@ -92,16 +94,15 @@ class LandmarkTerm:
 
     def _offsets(
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
-    ) -> Iterator[tuple[Float[Tensor, "m l 2"], Int[Tensor, " m"]]]:
-        """From detected to projected landmarks in all pictures, a bounded number at a time, and their cameras."""
-        views = self.views
-        for start in range(0, len(views.row), _PROJECTED):
-            part = slice(start, start + _PROJECTED)
-            camera = views.camera[part]
+    ) -> Iterator[tuple[Float[Tensor, "m l 2"], Views]]:
+        """From detected to projected landmarks in all pictures, a bounded number at a time, and these pictures."""
+        for start in range(0, len(self.views.row), _PROJECTED):
+            pictures = self.views.some(slice(start, start + _PROJECTED))
             # What is the same for all cameras of a timestep is worked out once.
-            seen, place = views.row[part].unique(return_inverse=True)
-            projected = self.model.project(state[seen], subject.identity, subject.bias, cameras[camera], place)
-            yield projected - views.detected[part], camera
+            seen, place = pictures.row.unique(return_inverse=True)
+            batch = cameras[pictures.camera]
+            projected = self.model.project(state[seen], subject.identity, subject.bias, batch, place)
+            yield projected - pictures.detected, pictures
 
     def cost(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
         """Of each timestep."""
@@ -116,17 +117,14 @@ class LandmarkTerm:
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch, with_identity: bool = False
     ) -> "Iterator[WeightedLinearization]":
         """Linearisations of all pictures, a bounded number at a time."""
-        views = self.views
-        for start in range(0, len(views.row), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            row, camera = views.row[part], views.camera[part]
-            seen, place = row.unique(return_inverse=True)
-            at = self.model.linearize(
-                state[seen], subject.identity, subject.bias, cameras[camera], place, with_identity
-            )
-            residual = at.pixels - views.detected[part]
-            cost, weights = self.robust(residual, camera)
-            yield WeightedLinearization(at, row, residual, weights, cost)
+        for start in range(0, len(self.views.row), _CHUNK):
+            pictures = self.views.some(slice(start, start + _CHUNK))
+            seen, place = pictures.row.unique(return_inverse=True)
+            batch = cameras[pictures.camera]
+            at = self.model.linearize(state[seen], subject.identity, subject.bias, batch, place, with_identity)
+            residual = at.pixels - pictures.detected
+            cost, weights = self.robust(residual, pictures)
+            yield WeightedLinearization(at, pictures.row, residual, weights, cost)
 
     def equations(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> NormalEquations:
         """Of each timestep on its own, the shared parameters fixed."""

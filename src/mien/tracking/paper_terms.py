@@ -135,8 +135,8 @@ def landmark_terms(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Ten
     residual = projected - views.detected
     upper, lower = (torch.tensor(column) for column in zip(*GAPS, strict=True))
     gap_weights = scene.settings.gap_weight * term.weights[upper]
-    gaps = replace(term, weights=gap_weights).robust(residual[:, upper] - residual[:, lower], views.camera)[0]
-    return (term.robust(residual, views.camera)[0] + gaps).sum().float()
+    gaps = replace(term, weights=gap_weights).robust(residual[:, upper] - residual[:, lower], views)[0]
+    return (term.robust(residual, views)[0] + gaps).sum().float()
 
 
 def prior_term(scene: PaperScene, row: Float[Tensor, " p"]) -> Float[Tensor, ""]:

@@ -78,7 +78,7 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
         )
     detected = without_flicker(detected, seen)
     row, camera = seen[valid].nonzero().unbind(1)
-    views = Views(detected[valid][row, camera], row, camera)
+    views = Views(detected[valid][row, camera], row, camera, torch.ones(len(row), dtype=torch.float64))
     if capture.calibration is None:
         batch, T_world_fit = batch_of((initial_camera(capture, settings),)), None
     else:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mien.tracking.facing import trust_of
 from mien.tracking.head_pose import landmark_term
 from mien.tracking.landmark_groups import (
     LEFT_EYELIDS,
@@ -244,7 +245,8 @@ def widen(pose: Float[Tensor, "v 6"], layout: ParameterLayout) -> Float[Tensor, 
 
 
 def all_landmarks(model: LandmarkModel, views: Views, own: SequenceFit, settings: TrackingSettings) -> LandmarkTerm:
-    """The cost of all landmarks at the depth of a fit."""
+    """The cost of all landmarks at the depth of a fit, whose head poses tell which pictures to trust."""
+    views = replace(views, trust=trust_of(views, own.state, own.cameras))
     return landmark_term(model, views, landmark_weights(), own.state, own.cameras, settings)
 
 

@@ -24,6 +24,11 @@ class CameraBatch:
         """The number of cameras, c."""
         return len(self.K)
 
+    @property
+    def centres(self) -> Float[Tensor, "c 3"]:
+        """Where the cameras are, world space."""
+        return -(self.viewmat[:, :3, :3].mT @ self.viewmat[:, :3, 3:])[..., 0]
+
     def project(self, points: Float[Tensor, "c l 3"]) -> Float[Tensor, "c l 2"]:
         """Each camera's own world-space points in its picture, pixels."""
         in_camera = points @ self.viewmat[:, :3, :3].mT + self.viewmat[:, None, :3, 3]
@@ -55,6 +60,8 @@ class Views:
     """Which of the v timesteps; every timestep has a picture at least."""
     camera: Int[Tensor, " n"]
     """Which of the sequence's cameras."""
+    trust: Float[Tensor, " n"]
+    """How much each picture's landmarks count, 0..1 (`mien.tracking.facing`)."""
 
     @property
     def rows(self) -> int:
@@ -66,11 +73,15 @@ class Views:
         new_row = torch.full((self.rows,), -1)
         new_row[rows] = torch.arange(len(rows))
         kept = new_row[self.row] >= 0
-        return Views(self.detected[kept], new_row[self.row[kept]], self.camera[kept])
+        return Views(self.detected[kept], new_row[self.row[kept]], self.camera[kept], self.trust[kept])
 
     def seen_by(self, row: int) -> list[int]:
         """The cameras that have a picture of a timestep."""
         return self.camera[self.row == row].tolist()
+
+    def some(self, pictures: slice) -> "Views":
+        """Some of the pictures; timesteps keep their numbers."""
+        return Views(self.detected[pictures], self.row[pictures], self.camera[pictures], self.trust[pictures])
 
     def of_landmarks(self, landmarks: Int[Tensor, " k"]) -> "Views":
         """The same pictures with some of the landmarks only."""

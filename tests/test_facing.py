@@ -1,0 +1,54 @@
+"""Pictures that see a face from the side count little beside those that it faces."""
+
+import torch
+
+from mien.camera import look_at
+from mien.tracking.facing import trust_of
+from mien.tracking.views import CameraBatch, Views
+from tracking_case import still_camera
+
+HEAD = torch.tensor([0.0, 0.0, -0.9], dtype=torch.float64)
+
+
+def cameras_at(*angles: float) -> CameraBatch:
+    """Around the head, radians to the subject's left of where it looks with no rotation."""
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    turned = torch.tensor(angles, dtype=torch.float64)
+    places = HEAD + 0.9 * torch.stack([turned.sin(), 0 * turned, turned.cos()], dim=1)
+    return CameraBatch(
+        still_camera().K.expand(len(angles), 3, 3), torch.stack([look_at(place, HEAD, up) for place in places])
+    )
+
+
+def views_of(*pictures: tuple[int, int]) -> Views:
+    """Of pairs of a timestep and a camera."""
+    row, camera = torch.tensor(pictures).unbind(1)
+    nothing = torch.zeros(len(row), 1, 2, dtype=torch.float64)
+    return Views(nothing, row, camera, torch.ones(len(row), dtype=torch.float64))
+
+
+def heads_turned(*angles: float) -> torch.Tensor:
+    state = torch.zeros(len(angles), 6, dtype=torch.float64)
+    state[:, 1] = torch.tensor(angles, dtype=torch.float64)
+    state[:, 3:6] = HEAD
+    return state
+
+
+def test_side_views_count_little():
+    trust = trust_of(views_of((0, 0), (0, 1), (0, 2)), heads_turned(0.0), cameras_at(0.0, 0.4, -1.2))
+    torch.testing.assert_close(trust[:2], torch.tensor([1.0, 0.5]).double(), atol=1e-6, rtol=0)
+    assert trust[2] < 0.02
+
+
+def test_trust_goes_with_the_head():
+    cameras = cameras_at(0.0, 1.0)
+    trust = trust_of(views_of((0, 0), (0, 1), (1, 0), (1, 1)), heads_turned(0.0, 1.0), cameras)
+    assert trust[0] == trust[3] == 1
+    assert trust[1:3].max() < 0.05
+
+
+def test_the_best_picture_of_a_timestep_counts_whole():
+    """Also where a head is seen from the side alone: else priors would decide."""
+    trust = trust_of(views_of((0, 0), (1, 1), (2, 0), (2, 1)), heads_turned(0.0, 0.0, 0.0), cameras_at(1.2, -1.5))
+    assert trust[:3].eq(1).all()
+    assert 0.2 < trust[3] < 0.6
