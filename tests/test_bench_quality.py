@@ -96,6 +96,8 @@ def test_distances_do_not_see_rotation_scale_and_shift():
     turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
     assert aligned_distance(3 * points @ turn.T + 5, points) < 1e-9
+    assert aligned_distance(points @ turn.T + 5, points, rigid=True) < 1e-9
+    assert aligned_distance(3 * points @ turn.T + 5, points, rigid=True) > 1  # a wrong scale counts there
     assert aligned_distance(points * [1, 1, -1], points) > 0.1  # but they do see a mirror
 
 

@@ -30,7 +30,8 @@ class TrackingErrors:
     """Means over the tracked timesteps of one sequence; None where there is nothing to measure."""
 
     vertex_mm: float
-    """Distance of the face region's visible vertices after a similarity alignment of each frame, millimetres."""
+    """Distance of the face region's visible vertices after an alignment of each frame, millimetres: a rigid one where
+    calibrated cameras tell scale, else a similarity."""
     landmark_px: float
     """Distance of the tracked model's landmarks, projected, from the true ones, capture pixels; visible cameras."""
     rotation_deg: float
@@ -63,7 +64,8 @@ def tracking_errors(tracking: Tracking, capture: Capture, truth: Truth, face_mod
     for timestep in timesteps:
         vertices = face_model(tracking.face[timestep])[0]
         visible = _visible(truth, face_model, timestep)
-        vertex.append(aligned_distance(vertices[index].numpy()[visible], truth.vertices[timestep][visible]))
+        rigid = len(tracking.cameras) > 1
+        vertex.append(aligned_distance(vertices[index].numpy()[visible], truth.vertices[timestep][visible], rigid))
         points = face_model.landmark_positions(vertices, "mediapipe")
         placed[timestep] = points.numpy()
         for camera, view in enumerate(tracking.cameras):
@@ -95,13 +97,14 @@ def crop_landmarks(landmarks: Float[np.ndarray, "t c l 2"], capture: Capture) ->
     return (landmarks - np.array([crop["left"], crop["top"]], np.float32)) * scale
 
 
-def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> float:
-    """Mean distance after the best rotation, scale and shift of `points` (Umeyama 1991), in the target's unit."""
+def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], rigid: bool = False) -> float:
+    """Mean distance after the best rotation, shift and, unless `rigid`, scale of `points` (Umeyama 1991), in the
+    target's unit."""
     a, b = points.astype(np.float64), target.astype(np.float64)
     a, b = a - a.mean(0), b - b.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
     sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation, scale = (u * sign) @ vt, (s * sign).sum() / (a * a).sum()
+    rotation, scale = (u * sign) @ vt, 1.0 if rigid else (s * sign).sum() / (a * a).sum()
     return float(np.linalg.norm(scale * a @ rotation.T - b, axis=-1).mean())
 
 
