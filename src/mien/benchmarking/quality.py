@@ -98,8 +98,7 @@ def crop_landmarks(landmarks: Float[np.ndarray, "t c l 2"], capture: Capture) ->
 
 
 def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], rigid: bool = False) -> float:
-    """Mean distance after the best rotation, shift and, unless `rigid`, scale of `points` (Umeyama 1991), in the
-    target's unit."""
+    """Mean distance after the best rotation, shift and, unless `rigid`, scale of `points` (Umeyama 1991)."""
     a, b = points.astype(np.float64), target.astype(np.float64)
     a, b = a - a.mean(0), b - b.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
