@@ -35,7 +35,7 @@ def heads_turned(*angles: float) -> torch.Tensor:
 
 
 def test_side_views_count_little():
-    trust = trust_of(views_of((0, 0), (0, 1), (0, 2)), heads_turned(0.0), cameras_at(0.0, 0.4, -1.2))
+    trust = trust_of(views_of((0, 0), (0, 1), (0, 2)), heads_turned(0.0), cameras_at(0.0, 0.3, -1.2))
     torch.testing.assert_close(trust[:2], torch.tensor([1.0, 0.5]).double(), atol=1e-6, rtol=0)
     assert trust[2] < 0.02
 

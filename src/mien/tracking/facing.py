@@ -12,7 +12,7 @@ from torch import Tensor
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.views import CameraBatch, Views
 
-_SIDEWAYS = 0.4
+_SIDEWAYS = 0.3
 """Radians between the way the face looks and the camera at which a picture counts half."""
 
 
