@@ -41,6 +41,26 @@ def test_help_of_every_command(name: str, capsys: pytest.CaptureFixture[str]) ->
     assert f"usage: mien {name}" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", ["create", "capture", "track"])
+def test_help_leaves_details_to_help_all(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = []
+    for flag in ("--help", "--help-all"):
+        with pytest.raises(SystemExit):
+            main([name, flag])
+        shown.append(capsys.readouterr().out)
+    short, whole = shown
+    assert len(short.splitlines()) < 125
+    assert short.rstrip().endswith(f"mien {name} --help-all")
+    detail = "--capture.max-frames" if name == "capture" else "--tracking.photometric.sizes"
+    assert detail in whole
+    assert detail not in short
+    assert all(option in short for option in ("--tracking.schedule",) if name != "capture")
+
+
+def test_details_are_options_still(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert "--tracking.keyframes -1" in complaint(capsys, f"track {tmp_path} --tracking.keyframes -1")
+
+
 def test_help_is_quick_and_needs_no_torch() -> None:
     code = "import sys, mien.cli; mien.cli.main(['--help']); assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

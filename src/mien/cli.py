@@ -16,6 +16,7 @@ from pathlib import Path
 
 import mien
 from mien.errors import UserError
+from mien.help_text import without_details
 
 COMMANDS = {
     "create": "video in, avatar, report and metrics out: all stages in one command",
@@ -97,11 +98,18 @@ def _run(name: str, rest: list[str]) -> int:
     import tyro
 
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
+    options, more = module.Command, ""
+    if "--help-all" in rest:
+        rest = ["--help" if argument == "--help-all" else argument for argument in rest]
+    elif "-h" in rest or "--help" in rest:
+        options, groups = without_details(module.Command)
+        names = " and ".join(f"--{group}.*" for group in groups)
+        more = f"More options ({names}), for those who compare and tune: mien {name} --help-all" if groups else ""
     complaints = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaints):
             command = tyro.cli(
-                module.Command,
+                options,
                 prog=f"mien {name}",
                 description=inspect.getdoc(module.Command),
                 args=rest,
@@ -109,6 +117,7 @@ def _run(name: str, rest: list[str]) -> int:
             )
     except SystemExit as stop:
         if stop.code != EXIT_USER_ERROR:
+            print(more, end="\n" if more else "")
             raise
         raise UserError(f"{_in_one_line(complaints.getvalue())}; see mien {name} --help") from None
     sys.stderr.write(complaints.getvalue())

@@ -31,7 +31,7 @@ class CaptureSettings:
     fps: float = 25.0
     """Frames a second of a folder of pictures; videos know their own."""
     cuts: bool = True
-    """Do (or do not) part the video where it cuts to another shot, into NAME-1, NAME-2, ..."""
+    """Parts the video where it cuts to another shot, into NAME-1, NAME-2, ...; with --capture.no-cuts it stays one."""
     shortest_part: float = 1.0
     """Seconds; parts between two cuts that are shorter are left out."""
     clean_plate: Path | None = None

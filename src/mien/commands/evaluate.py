@@ -32,7 +32,7 @@ class Command:
     pictures: bool = False
     """Also write every scored picture and its truth as png: what other programs can be scored against."""
     perceptual: bool = True
-    """Whether ST-LPIPS is computed, which takes most of the time."""
+    """ST-LPIPS is computed, which takes most of the time; with --no-perceptual it is not."""
     perceptual_frames: int = 32
     """ST-LPIPS is computed on at most this many frames, evenly spread; 0 for all."""
     compare: bool = False

@@ -42,7 +42,8 @@ class TrainOptions:
     """Where training runs. cpu: the same bytes every time; cuda: an NVIDIA GPU, through gsplat (docs/using.md
     says how to install it); auto: a GPU where there is one. A run may be resumed on the other."""
     face_tuning: bool = True
-    """Whether training also corrects the tracking of the frames it sees (held-out frames get what lies beside them)."""
+    """Training also corrects the tracking of the frames it sees (held-out frames get what lies beside them); with
+    --no-face-tuning it does not."""
 
     def settings(self) -> TrainSettings:
         """The preset with these changes.
