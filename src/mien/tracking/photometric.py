@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.progress import progress_bar, say
+from mien.tracking.eyelids import place_lids
 from mien.tracking.landmark_model import LandmarkModel
 from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.outline_term import outline_term
@@ -39,8 +40,9 @@ _WORSE = 1.02
 """A frame whose cost grows by more than this factor in a step goes back to where it was."""
 _FRAMES_AT_ONCE = 256
 """Timesteps whose equations are kept together: some seconds of work, and some 10 MB."""
-_SHARED_COST, _LOOK_COST = 100, 40
-"""About how long a step of identity and a look at the texture take, in timesteps of a step of all frames."""
+_SHARED_COST, _LOOK_COST, _LIDS_PART = 100, 40, 4
+"""About how long a step of identity and a look at the texture take, in timesteps of a step of all frames; and how many
+times longer such a step takes than lids do."""
 _LEAST_KEYFRAMES = 3
 """However many cameras there are: the mouth must be seen open and closed."""
 _LEAST_SHARE = 0.03
@@ -137,7 +139,8 @@ def refine_photometrically(
 
     In each round: identity and unknown focal lengths from keyframes (from the second round on), the albedo by robust
     least squares a texel in turn with SH light, then one Gauss-Newton step of all timesteps of each sequence under
-    their smoothness cost. Landmarks stay in the cost with less weight: irises, lids and lips need them. Deterministic.
+    their smoothness cost. Landmarks stay in the cost with less weight: irises, lids and lips need them. Lids are put
+    where pictures have them at the end (`place_lids`). Deterministic.
 
     Args:
         model: The face model reduced to its landmarks.
@@ -174,6 +177,7 @@ def refine_photometrically(
     several = any(len(own.cameras) > 1 for own in fit.sequences)
     shared_steps = own_settings.shared_steps_of_cameras if several else own_settings.shared_steps
     total, done = len(rounds) * (_LOOK_COST + frames) + (len(rounds) - 1) * shared_steps * _SHARED_COST, 0
+    total += frames // _LIDS_PART
 
     def step_identity(now: _Round, at: PhotometricFit) -> PhotometricFit:
         at = now.look(at)
@@ -206,6 +210,12 @@ def refine_photometrically(
             step_all = partial(_step_sequences, now, at, settings, keeper, f"step-{number}")
             at = kept(f"round-{number}", status, partial(step_all, partial(advance_by, status=f"{status}, frames")))
             keeper.drop(f"step-{number}")
+
+        def blink() -> PhotometricFit:
+            return replace(at, fit=place_lids(model, shots, at.fit, own_settings.lids))
+
+        at = kept("lids", "lids", blink)
+        advance_by(frames // _LIDS_PART, "lids")
     return _with_residuals(rounds[0], rounds[0].look(at))
 
 

@@ -42,3 +42,6 @@ class PhotometricSettings:
     outlier: float = 10.0
     """Beyond this many standard deviations of its colour a pixel's pull fades. Faces that are off by some pixels make
     most of them differ by several: those are what there is to learn from."""
+    lids: float = 1.0
+    """What colours in the eyes count, against where landmarks and skin put the lids: 1 as measured, 0 for nothing. The
+    detector misses blinks behind glasses."""

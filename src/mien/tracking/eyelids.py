@@ -1,0 +1,172 @@
+"""Lids put where the picture has them: blinks that a landmark detector misses, behind glasses above all.
+
+Skin is tracked by its texture, but what lids uncover is no part of it. So each picture is asked apart which position of
+the lids explains it best: every pixel that the lids may cover looks like this person's eyeball or like the skin around
+the eye (`eyelid_colors`). The answer is weighed against where the fit has the lids, which is right within a few
+hundredths of a blink or wrong altogether. Nothing is smoothed over time, and nothing assumes that anybody blinks: the
+position of lids in most frames is taken from the fit, that of closed lids from the model, where they meet.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.tracking.eyelid_colors import EyeColors, learn_colors
+from mien.tracking.eyelid_crops import EyeCrop, eye_crop
+from mien.tracking.eyelid_eyes import Eye, eyes_of
+from mien.tracking.landmark_model import LandmarkModel
+from mien.tracking.photometric_threads import in_threads
+from mien.tracking.shot import Shot
+from mien.tracking.stages import Fit, SequenceFit, box_of
+
+_POSITIONS = np.linspace(-0.4, 1.2, 13)
+"""Of the lids: 0 at rest, 1 where they meet. Below 0 they are wider open than at rest."""
+_BAND = 4
+"""Positions over which lashes and the edge of the upper lid reach, a little generously."""
+_FINE, _BLUR = 0.01, 0.08
+"""Step, and standard deviation of the smoothing, of costs between the positions."""
+_DOUBT = 8.0
+"""What costs are divided by: neighbouring pixels err together."""
+_DISAGREEMENT = 0.07
+"""Where, in a quarter of the frames, the fit's lids cost more than this part of the range of costs above the best ones,
+the colours mislead."""
+_SIGMA = 0.12
+"""How far a good fit's lids are off."""
+_FAR = 0.4
+"""The same for what is left of it where only the middle is asked for."""
+_LEARNED_FROM = 100
+"""Pictures."""
+_LEAST_PICTURES = 10
+_LEAST_FACING = 0.35
+"""Cosine between an eye's direction and that to the camera."""
+
+
+def place_lids(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    fit: Fit,
+    weight: float,
+) -> Fit:
+    """The fit with lids where pictures have them; as it is where the model's lids cannot close, or eyes are too small.
+
+    Args:
+        model: The face model reduced to its landmarks.
+        shots: The sequences.
+        fit: Of them; everything but the lids stays.
+        weight: Of pictures against the fit: 1 as measured, 0 for the fit alone.
+    """
+    eyes = eyes_of(model.face_model.to(torch.zeros(())), model.layout) if weight > 0 else []
+    sequences = []
+    for shot, own in zip(shots, fit.sequences, strict=True):
+        if eyes:
+            own = replace(own, state=_placed(_Sequence(model, shot, fit, own, eyes), weight))
+        sequences.append(own)
+    return replace(fit, sequences=tuple(sequences))
+
+
+class _Sequence:
+    """The pictures of one sequence, at the lids' positions so far."""
+
+    def __init__(self, model: LandmarkModel, shot: Shot, fit: Fit, own: SequenceFit, eyes: Sequence[Eye]):
+        self.model, self.shot, self.fit, self.own, self.eyes = model, shot, fit, own, eyes
+        self.face_model = model.face_model.to(torch.zeros(()))
+        self.timesteps = shot.valid.nonzero()[:, 0].tolist()
+
+    def crops(self, row: int, positions: list[float]) -> list[EyeCrop | None]:
+        """Of each eye, by the camera that it faces."""
+        columns = [eye.column for eye in self.eyes]
+        states = self.own.state[[row, row]].clone()
+        states[0, columns], states[1, columns] = 0.0, states.new_tensor([eye.closed for eye in self.eyes])
+        face = self.model.layout.face_params(states, self.fit.subject.identity)
+        face = replace(face.to(self.face_model.template), vertex_offsets=self.fit.subject.vertex_offsets)
+        vertices, turn = self.face_model(face), face.T_world_head[0, :3, :3]
+        return [self._crop(eye, row, vertices[:, eye.vertices], turn @ eye.forward, positions) for eye in self.eyes]
+
+    def _crop(
+        self,
+        eye: Eye,
+        row: int,
+        corners: Float[Tensor, "2 n 3"],
+        forward: Float[Tensor, " 3"],
+        positions: list[float],
+    ) -> EyeCrop | None:
+        middle = corners[0].mean(0)
+        capture, best, facing = self.shot.capture, None, _LEAST_FACING
+        for index in self.shot.views.seen_by(row):
+            K, viewmat = self.own.cameras.K[index].float(), self.own.cameras.viewmat[index].float()
+            camera = Camera(K, viewmat, capture.width, capture.height)
+            towards = camera.position - middle
+            cosine = float(forward @ towards / towards.norm())
+            if cosine > facing:
+                best, facing = (index, camera), cosine
+        if best is None:
+            return None
+        picture = np.asarray(capture.images[self.timesteps[row], best[0]])
+        tracked = float(self.own.state[row, eye.column]) / eye.closed
+        return eye_crop(eye, picture, best[1], corners, tracked, positions)
+
+
+def _placed(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
+    state = sequence.own.state.clone()
+    colors = _learned(sequence)
+
+    def of_row(row: int) -> list[Float[np.ndarray, " k"] | None]:
+        crops = sequence.crops(row, _POSITIONS.tolist())
+        return [_costs(*pair) for pair in zip(crops, colors, strict=True)]
+
+    costs = in_threads(of_row, list(range(len(state))))
+    for number, eye in enumerate(sequence.eyes):
+        of_eye = [row[number] for row in costs]
+        seen = np.array([cost is not None for cost in of_eye])
+        if seen.sum() >= _LEAST_PICTURES:
+            known = np.stack([cost for cost in of_eye if cost is not None])
+            before = state[torch.from_numpy(seen), eye.column].numpy() / eye.closed
+            state[torch.from_numpy(seen), eye.column] = torch.from_numpy(weighed(known, before, weight)) * eye.closed
+    return box_of(sequence.model.layout).clip(state)
+
+
+def _costs(crop: EyeCrop | None, colors: EyeColors | None) -> Float[np.ndarray, " k"] | None:
+    return None if crop is None or colors is None else colors.costs(crop, _BAND)
+
+
+def _learned(sequence: _Sequence) -> list[EyeColors | None]:
+    """The colours of each eye."""
+    rows = torch.linspace(0, len(sequence.own.state) - 1, min(_LEARNED_FROM, len(sequence.own.state)))
+    ends = [float(_POSITIONS[0])]
+    crops = in_threads(lambda row: sequence.crops(row, ends), rows.round().long().unique().tolist())
+    return [
+        learn_colors([crop for row in crops if (crop := row[number]) is not None])
+        for number in range(len(sequence.eyes))
+    ]
+
+
+def weighed(
+    costs: Float[np.ndarray, "n k"], tracked: Float[np.ndarray, " n"], weight: float
+) -> Float[np.ndarray, " n"]:
+    """Positions of lids in n frames that costs of k positions and the tracked ones agree on best.
+
+    What the colours find too open or too closed in most frames is corrected by the fit there, and not where lids meet.
+    If they contradict the fit in many frames, they count for little in all.
+    """
+    fine = np.arange(_POSITIONS[0], _POSITIONS[-1] + _FINE / 2, _FINE)
+    near = np.exp(-0.5 * ((fine[:, None] - _POSITIONS) / _BLUR) ** 2)
+    costs = costs @ (near / near.sum(1, keepdims=True)).T
+    at = np.round((tracked - fine[0]) / _FINE).astype(int).clip(0, len(fine) - 1)
+    above = (costs[np.arange(len(costs)), at] - costs.min(1)) / np.ptp(costs, axis=1).clip(1e-9)
+    costs = costs * (weight / _DOUBT / max(1.0, float(np.quantile(above, 0.75)) / _DISAGREEMENT) ** 4)
+
+    usual = np.median(tracked)
+    often = tracked < usual + 0.1
+    middle = fine[(costs + 0.5 * ((fine - tracked[:, None]) / _FAR) ** 2).argmin(1)]
+    shift = np.median((middle - tracked)[often])
+    share = ((1 - fine) / max(1 - np.median(tracked[often]), 0.3)).clip(0, 1.2)
+    # Where the most open position is the best one, what is seen is no eye: hair, a brow, a hand.
+    costs[costs[:, 0] <= costs.min(1)] = 0
+    corrected = fine - shift * share
+    far = np.log1p(((corrected - tracked[:, None]) / _SIGMA) ** 2)
+    return corrected[(costs + far).argmin(1)]
