@@ -32,7 +32,7 @@ from mien.tracking import (
 from mien.training import outdated_sequences
 from mien.workspace import Workspace
 
-_TRACKING_RECIPE = 11
+_TRACKING_RECIPE = 12
 """Raised whenever the same captures would be tracked otherwise, so that old trackings are not taken for current."""
 
 
