@@ -10,6 +10,7 @@ from blink_case import SKIN, BlinkCase
 from mien.tracking.eyelid_eyes import eyes_of
 from mien.tracking.eyelids import place_lids, weighed
 from mien.tracking.parameters import layout_of
+from mien.tracking.views import CameraBatch, Views
 from small_face_model import make_small_face_model
 
 TIMESTEPS = 24
@@ -71,6 +72,27 @@ def test_what_pictures_do_not_show_stays_as_tracked(case, what):
     shot = case.shot(true, size, **({"white": SKIN} if what == "eyes like skin" else {}))
     found = place_lids(case.reduced, [shot], case.fit(tracked, size), 0.0 if what == "no weight" else 1.0)
     np.testing.assert_allclose(case.lids_of(found), tracked, atol=0.05 if what == "eyes like skin" else 0)
+
+
+def test_of_several_cameras_the_one_that_an_eye_faces_tells(case):
+    true = blinks()
+    front, tracked = case.shot(true), case.fit(still())
+    cameras = tracked.sequences[0].cameras
+    side = cameras.viewmat[0].clone()
+    side[:3, 3] += torch.tensor([0.5, 0.0, 0.0])  # sees the head from 35 degrees to the side
+    cameras = CameraBatch(cameras.K.repeat(2, 1, 1), torch.stack([cameras.viewmat[0], side]))
+    one = front.capture
+    capture = replace(
+        one, camera_ids=("front", "side"), images=np.concatenate([one.images, np.full_like(one.images, 128)], axis=1),
+        mattes=np.repeat(one.mattes, 2, axis=1), landmarks=np.repeat(one.landmarks, 2, axis=1),
+        valid=np.repeat(one.valid, 2, axis=1), principal_point=np.repeat(one.principal_point, 2, axis=0),
+    )  # fmt: skip
+    picture = torch.arange(2 * TIMESTEPS)
+    detected = front.views.detected.repeat_interleave(2, 0)
+    views = Views(detected, picture // 2, picture % 2, torch.ones(len(picture), dtype=torch.float64))
+    shot, own = replace(front, views=views, capture=capture), replace(tracked.sequences[0], cameras=cameras)
+    found = place_lids(case.reduced, [shot], replace(tracked, sequences=(own,)), 1.0)
+    np.testing.assert_allclose(case.lids_of(found), true, atol=0.2)
 
 
 def test_is_the_same_with_any_number_of_threads(case, monkeypatch):
