@@ -141,3 +141,36 @@ def test_a_bug_keeps_its_traceback_in_a_log(
     assert "bug in mien" in shown
     assert "Traceback" not in shown
     assert "ZeroDivisionError" in next(tmp_path.glob("mien-crash-*.log")).read_text()
+
+
+def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "sequences" / "me" / "tracking").mkdir(parents=True)
+    told = complaint(capsys, "track", str(tmp_path))
+    assert "the capture of me is gone" in told
+    assert f"mien capture VIDEO --out {tmp_path} --name me" in told
+
+
+def test_a_terminated_command_removes_what_is_unfinished(tmp_path: Path) -> None:
+    """As after Ctrl-C; by default a signal would end the process on the spot."""
+    program = f"""
+import os, signal, sys, types
+from dataclasses import dataclass
+from pathlib import Path
+from mien.cli import main
+from mien.files import write_atomically
+
+@dataclass(frozen=True)
+class Command:
+    def check(self): pass
+    def run(self):
+        def write(path):
+            path.write_text("half")
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        write_atomically(Path({str(tmp_path / "film.mp4")!r}), write)
+
+sys.modules["mien.commands.demo"] = types.SimpleNamespace(Command=Command)
+sys.exit(main(["demo"]))
+"""
+    assert subprocess.run([sys.executable, "-c", program], check=False, capture_output=True).returncode == 143
+    assert list(tmp_path.iterdir()) == []

@@ -10,6 +10,8 @@ from mien.errors import UserError
 from mien.face import load_face_model
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import TrackingSettings, residual_report, track
+from mien.tracking.paper_settings import PaperSettings
+from mien.tracking.photometric_settings import PhotometricSettings
 from mien.tracking.shot import initial_camera
 from small_face_model import make_small_face_model
 from tracking_case import FOCAL, capture_of, make_tracking_case
@@ -187,3 +189,14 @@ def test_anny_lips_and_lids_part():
     for upper, lower in ((159, 145), (386, 374)):
         gap = np.linalg.norm(marks[:, upper] - marks[:, lower], axis=-1)
         assert gap[2] < 0.6 * gap[0]
+
+
+def test_settings_that_a_schedule_does_not_use_do_not_count():
+    """A tracking by pixels is current whatever was asked of the other schedule."""
+    paper, sizes = PaperSettings(epochs=2), PhotometricSettings(sizes=(64,))
+    asked = TrackingSettings(paper=paper, photometric=sizes)
+    assert asked.in_effect() == TrackingSettings(photometric=sizes)
+    assert replace(asked, schedule="landmarks").in_effect() == TrackingSettings(schedule="landmarks")
+    assert replace(asked, schedule="paper").in_effect() == replace(asked, schedule="paper")
+    alone = replace(asked, schedule="paper", paper=replace(paper, start="landmarks"))
+    assert alone.in_effect() == replace(alone, photometric=PhotometricSettings())

@@ -8,6 +8,7 @@ import inspect
 import io
 import os
 import shlex
+import signal
 import sys
 import tempfile
 import traceback
@@ -38,6 +39,7 @@ Its `check()` tells what can be told of options and paths without heavy librarie
 
 EXIT_USER_ERROR = 2
 EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
 _USERS_ERRNOS = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG}
 )
@@ -122,9 +124,16 @@ def _run(name: str, rest: list[str]) -> int:
         raise UserError(f"{_in_one_line(complaints.getvalue())}; see mien {name} --help") from None
     sys.stderr.write(complaints.getvalue())
     command.check()
+    with contextlib.suppress(ValueError):  # signals are for the main thread
+        signal.signal(signal.SIGTERM, _terminated)
     _use_one_torch_thread()
     command.run()
     return 0
+
+
+def _terminated(number: int, frame: object) -> None:
+    """Stop as Ctrl-C does, so that unfinished files go; the exit code is that of a process that was terminated."""
+    raise SystemExit(EXIT_TERMINATED)
 
 
 def _in_one_line(box: str) -> str:

@@ -70,6 +70,12 @@ def open_workspace(root: Path) -> Workspace:
     if not workspace.sequence_names() and not workspace.run_names():
         told = f"{root}: not a mien workspace (no sequences/NAME/capture, no runs/NAME)"
         whole = root.resolve()
+        bare = sorted(path.name for path in root.glob("sequences/[!.]*") if path.is_dir())
+        if bare:
+            raise UserError(
+                f"{root}: the capture of {', '.join(bare)} is gone; make it again from its video: "
+                f"{shlex.join(['mien', 'capture', 'VIDEO', '--out', str(root), '--name', bare[0]])}"
+            )
         if whole.parent.name == "runs" and whole.name in Workspace(whole.parent.parent).run_names():
             typed = root.parent.parent if len(root.parts) > 2 else whole.parent.parent
             raise UserError(f"{told}; did you mean {shlex.join([str(typed), '--run', whole.name])}?")

@@ -3,6 +3,17 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from mien.tracking.ranges import COUNT_OR_NONE, NOT_NEGATIVE, POSITIVE, TEXELS, check_ranges
+
+_RANGES = {
+    "first_steps": COUNT_OR_NONE, "steps": COUNT_OR_NONE, "epochs": COUNT_OR_NONE, "texture_size": TEXELS,
+    "texture_steps": COUNT_OR_NONE, "shrink": (1, 64), "color_weight": NOT_NEGATIVE, "color_epsilon": POSITIVE,
+    "light_extent": POSITIVE, "landmark_share": (0.0, 1.0), "gap_weight": NOT_NEGATIVE, "identity_sigma": POSITIVE,
+    "offset_sigma": NOT_NEGATIVE, "offset_bend": POSITIVE, "texture_roughness": NOT_NEGATIVE, "light_sigma": POSITIVE,
+    "grey_sigma": POSITIVE, "focal_sigma": POSITIVE,
+}  # fmt: skip
+_RATES = {name: NOT_NEGATIVE for name in ("frame", "identity", "offsets", "texture", "light", "focal")}
+
 
 @dataclass(frozen=True)
 class PaperRates:
@@ -68,3 +79,8 @@ class PaperSettings:
     """Of the logarithm of an unknown focal length, beside where landmarks had it."""
     rates: PaperRates = field(default_factory=PaperRates)
     """Step sizes."""
+
+    def check(self) -> None:
+        """Raise a UserError that names the first value that makes no sense."""
+        check_ranges(self, "--tracking.paper.", _RANGES)
+        check_ranges(self.rates, "--tracking.paper.rates.", _RATES)

@@ -2,6 +2,16 @@
 
 from dataclasses import dataclass
 
+from mien.tracking.ranges import COUNT, COUNT_OR_NONE, NOT_NEGATIVE, POSITIVE, TEXELS, check_ranges
+
+_RANGES = {
+    "sizes": (16, 8192), "texture_size": TEXELS, "texture_frames": COUNT, "reference_angle": POSITIVE,
+    "shared_steps": COUNT_OR_NONE, "shared_steps_of_cameras": COUNT_OR_NONE, "keyframes": COUNT,
+    "focal_sigma": POSITIVE, "outline_weight": NOT_NEGATIVE, "independent_pixels": POSITIVE,
+    "independent_pixels_of_frames": POSITIVE, "landmark_share": (0.0, 1.0), "light_extent": POSITIVE,
+    "outlier": POSITIVE, "lids": NOT_NEGATIVE,
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class PhotometricSettings:
@@ -45,3 +55,7 @@ class PhotometricSettings:
     lids: float = 1.0
     """What colours in the eyes count, against where landmarks and skin put the lids: 1 as measured, 0 for nothing. The
     detector misses blinks behind glasses."""
+
+    def check(self) -> None:
+        """Raise a UserError that names the first value that makes no sense."""
+        check_ranges(self, "--tracking.photometric.", _RANGES)

@@ -1,15 +1,19 @@
 """What a user may choose about tracking."""
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
 from mien.errors import UserError
 from mien.tracking.paper_settings import PaperSettings
 from mien.tracking.photometric_settings import PhotometricSettings
+from mien.tracking.ranges import COUNT, NOT_NEGATIVE, POSITIVE, check_ranges
 
 _FOCALS = (10.0, 1e6)
 """Pixels that a focal length can have: a thumbnail's fish eye, and a telescope's 16K picture."""
+_RANGES = {
+    "keyframes": COUNT, "landmark_sigma": POSITIVE, "independent_landmarks": POSITIVE, "outlier": POSITIVE,
+    "identity_weight": NOT_NEGATIVE, "bias_sigma": POSITIVE,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -67,9 +71,15 @@ class TrackingSettings:
                 f"--tracking.focal {focal:g}: give the focal length in pixels of the captured pictures, about 1 to 3 "
                 "times their width, or leave it out"
             )
-        for name in ("landmark_sigma", "independent_landmarks", "outlier"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise UserError(f"--tracking.{name.replace('_', '-')} {value:g}: give a number above 0")
-        if self.keyframes < 1:
-            raise UserError(f"--tracking.keyframes {self.keyframes}: give 1 or more")
+        check_ranges(self, "--tracking.", _RANGES)
+        for name, value in asdict(self.smoothness).items():
+            if not value > 0:  # nor NaN
+                raise UserError(f"--tracking.smoothness.{name} {value:g}: give a number above 0, or inf for none")
+        self.photometric.check()
+        self.paper.check()
+
+    def in_effect(self) -> "TrackingSettings":
+        """With the settings that this schedule does not use at their defaults: what a tracking depends on."""
+        paper = self.paper if self.schedule == "paper" else PaperSettings()
+        by_pixels = self.schedule == "fast" or (self.schedule == "paper" and paper.start == "fast")
+        return replace(self, paper=paper, photometric=self.photometric if by_pixels else PhotometricSettings())

@@ -81,7 +81,7 @@ def _tracking_fingerprint(
     workspace: Workspace, names: list[str], face_model: FaceModel, settings: TrackingSettings
 ) -> str:
     captures = [(name, read_capture_hash(workspace.sequence_dir(name) / "capture")) for name in names]
-    content = [_TRACKING_RECIPE, captures, face_model.name, face_model.content_hash, asdict(settings)]
+    content = [_TRACKING_RECIPE, captures, face_model.name, face_model.content_hash, asdict(settings.in_effect())]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
