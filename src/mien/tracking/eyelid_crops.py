@@ -114,10 +114,10 @@ def _part(
 
 
 def _uncovered(eye: Eye, vertices: Float[Tensor, "n 3"], sharper: Camera) -> Float[np.ndarray, "h w"]:
-    seen = rasterize_mesh(vertices, eye.moving, sharper).face_index
-    ball = ((seen >= 0) & (seen < eye.ball)).float()
-    height, width = sharper.height // _SHARPER, sharper.width // _SHARPER
-    return ball.reshape(height, _SHARPER, width, _SHARPER).mean((1, 3)).numpy()
+    seen = rasterize_mesh(vertices, eye.moving, sharper, cull_backfaces=True).face_index.numpy()
+    ball = ((seen >= 0) & (seen < eye.ball)).astype(np.float32)
+    size = sharper.width // _SHARPER, sharper.height // _SHARPER
+    return cv2.resize(ball, size, interpolation=cv2.INTER_AREA)
 
 
 def _around(
