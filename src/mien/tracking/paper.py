@@ -57,7 +57,7 @@ def fit_by_descent(
     def outcome() -> PhotometricFit:
         return _as_photometric(scene, descent, fit, refined)
 
-    with torch.enable_grad(), progress_bar("Fitting to pixels", total, done) as advance:
+    with torch.enable_grad(), progress_bar("Refining by descent", total, done) as advance:
 
         def step(amount: int = 1, status: str = "") -> None:
             nonlocal done

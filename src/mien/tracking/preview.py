@@ -170,7 +170,7 @@ def _plot(
     curves: Sequence[Float[np.ndarray, " n"]], before: Sequence[Float[np.ndarray, " n"]], labels: Sequence[str]
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Residuals over the frames, one below the other; grey is what they were at the last look."""
-    names = ("landmarks, median distance in px", "colours, difference in %")
+    names = ("landmarks, median distance in px", "colours, rms of the three channels, whole pictures, in %")
     shown = [index for index, values in enumerate(curves) if np.isfinite(values).any()]
     plots = [np.full((1, _WIDTH, 3), _PAPER, np.uint8)]
     for index in shown:
