@@ -10,13 +10,12 @@ from mien.camera import camera_from_fov
 from mien.face import load_face_model, loading
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.tracking.landmark_embedding import (
-    IBUG68,
     EmbeddingSettings,
     Views,
     _best_point,
     embed_landmarks,
 )
-from mien.tracking.landmark_groups import LEFT_EYELIDS, RIGHT_EYELIDS
+from mien.tracking.landmark_groups import IBUG68, LEFT_EYELIDS, RIGHT_EYELIDS
 from small_face_model import make_small_face_model
 
 

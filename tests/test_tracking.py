@@ -10,6 +10,7 @@ from mien.errors import UserError
 from mien.face import load_face_model
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import TrackingSettings, residual_report, track
+from mien.tracking.landmark_groups import landmark_weights
 from mien.tracking.paper_settings import PaperSettings
 from mien.tracking.photometric_settings import PhotometricSettings
 from mien.tracking.shot import initial_camera
@@ -39,6 +40,23 @@ def test_recovers_the_truth(tracked):
     depth = face.head_translation[:, 2] / case.face.head_translation[:, 2]
     assert depth.std() < 0.003
     assert (depth.mean() - 1).abs() < 0.02
+
+
+def test_a_few_landmarks_will_do():
+    """300-W's without their contour, and irises: what the others show does not count."""
+    case = make_tracking_case(timesteps=20)
+    settings = replace(KNOWN_FOCAL, landmarks="ibug51")
+    counted = landmark_weights("ibug51") > 0
+    assert counted.sum() == 51 + 10
+    moved = case.capture.landmarks.copy()
+    moved[:, :, ~counted.numpy()] += 5
+    few, same = (
+        track(capture, make_small_face_model(), settings)
+        for capture in (case.capture, replace(case.capture, landmarks=moved))
+    )
+    pixels = case.camera.project(case.model.landmark_positions(case.model(few.face.to(case.pixels)), "mediapipe"))[0]
+    assert (pixels - case.pixels).norm(dim=-1).median() < 0.8
+    assert (few.face.expression - same.face.expression).abs().median() < 0.01
 
 
 def test_says_what_it_is(tracked):

@@ -24,17 +24,7 @@ from mien.face.loading import load_face_model_without_landmarks, write_landmarks
 from mien.progress import say, track_progress
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.rotation import rigid_transform
-from mien.tracking.landmark_groups import LANDMARKS, LEFT_IRIS, RIGHT_IRIS
-
-IBUG68 = (
-    127, 234, 93, 58, 172, 136, 149, 148, 152, 377, 378, 365, 397, 288, 323, 454, 356,  # contour, right to left ear
-    70, 63, 105, 66, 107, 336, 296, 334, 293, 300,  # brows
-    168, 197, 5, 4, 98, 97, 2, 326, 327,  # nose
-    33, 160, 158, 133, 153, 144, 362, 385, 387, 263, 373, 380,  # eyes
-    61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181,  # outer lips
-    78, 82, 13, 312, 308, 317, 14, 87,  # inner lips
-)  # fmt: skip
-"""MediaPipe's landmark for each of 300-W's 68 points. The first 17 are the silhouette there, and fixed points here."""
+from mien.tracking.landmark_groups import IBUG68, LANDMARKS, LEFT_IRIS, RIGHT_IRIS
 
 _FACE_REGIONS = ("skin", "face", "lips", "eyelids", "brows", "nose", "scalp", "ears")
 _EYE_REGIONS = ("eyes", "irises")

@@ -1,5 +1,7 @@
 """Which of MediaPipe's 478 landmarks show what, and how much a tracker trusts each."""
 
+from typing import Literal
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -27,14 +29,35 @@ RIGHT_IRIS = (468, 469, 470, 471, 472)
 """The centre, then the rim, of the subject's right iris."""
 LEFT_IRIS = (473, 474, 475, 476, 477)
 
+IBUG68 = (
+    127, 234, 93, 58, 172, 136, 149, 148, 152, 377, 378, 365, 397, 288, 323, 454, 356,  # contour, right to left ear
+    70, 63, 105, 66, 107, 336, 296, 334, 293, 300,  # brows
+    168, 197, 5, 4, 98, 97, 2, 326, 327,  # nose
+    33, 160, 158, 133, 153, 144, 362, 385, 387, 263, 373, 380,  # eyes
+    61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181,  # outer lips
+    78, 82, 13, 312, 308, 317, 14, 87,  # inner lips
+)  # fmt: skip
+"""MediaPipe's landmark for each of 300-W's 68 points. The first 17 are the silhouette there, and fixed points here."""
+
+_CONTOUR = 17
+"""How many of them are the contour's."""
+
 _WEIGHTS = ((OVAL, 0.15), (NOSE, 3.0), (LIPS, 3.0), (LEFT_EYELIDS + RIGHT_EYELIDS, 5.0), (LEFT_IRIS + RIGHT_IRIS, 4.0))
 
 
-def landmark_weights() -> Float[Tensor, " l"]:
-    """How much each landmark counts in a fit; the mean is 1."""
+LandmarkSet = Literal["mediapipe", "ibug51"]
+"""All 478; or 300-W's 68 without their contour (supplement of GaussianAvatars, section A), and irises."""
+
+
+def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"]:
+    """How much each landmark counts in a fit, 0 for those that are not of the set; the mean is 1."""
     weights = torch.ones(LANDMARKS, dtype=torch.float64)
     for group, weight in _WEIGHTS:
         weights[list(group)] = weight
+    if landmarks == "ibug51":
+        left_out = torch.ones(LANDMARKS, dtype=torch.bool)
+        left_out[list(IBUG68[_CONTOUR:] + LEFT_IRIS + RIGHT_IRIS)] = False
+        weights[left_out] = 0
     return weights / weights.mean()
 
 

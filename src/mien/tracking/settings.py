@@ -40,6 +40,9 @@ class TrackingSettings:
     move it a little: landmarks of a face hardly tell it. Calibrated cameras keep their own."""
     same_camera: bool = False
     """Whether all sequences were filmed with the same camera and zoom, so that they share one focal length."""
+    landmarks: Literal["mediapipe", "ibug51"] = "mediapipe"
+    """Which landmarks count: all 478 of MediaPipe, or as in GaussianAvatars the 68 of 300-W without their 17 contour
+    points. Irises always do, for the gaze."""
     keyframes: int = 20
     """Frames of each sequence from which identity is fitted, chosen for their spread of head poses."""
     landmark_sigma: float = 0.0015

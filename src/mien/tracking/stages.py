@@ -247,7 +247,7 @@ def widen(pose: Float[Tensor, "v 6"], layout: ParameterLayout) -> Float[Tensor, 
 def all_landmarks(model: LandmarkModel, views: Views, own: SequenceFit, settings: TrackingSettings) -> LandmarkTerm:
     """The cost of all landmarks at the depth of a fit, whose head poses tell which pictures to trust."""
     views = replace(views, trust=trust_of(views, own.state, own.cameras))
-    return landmark_term(model, views, landmark_weights(), own.state, own.cameras, settings)
+    return landmark_term(model, views, landmark_weights(settings.landmarks), own.state, own.cameras, settings)
 
 
 def quiet_landmarks(term: LandmarkTerm, share: float) -> LandmarkTerm:
