@@ -119,7 +119,8 @@ def _run(name: str, rest: list[str]) -> int:
             )
     except SystemExit as stop:
         if stop.code != EXIT_USER_ERROR:
-            print(more, end="\n" if more else "")
+            if more:
+                print(more)
             raise
         raise UserError(f"{_in_one_line(complaints.getvalue())}; see mien {name} --help") from None
     sys.stderr.write(complaints.getvalue())

@@ -14,7 +14,8 @@ def without_details(command: type) -> tuple[type, list[str]]:
     """The options of a command without the rarely needed ones, and the groups that lack some.
 
     Args:
-        command: A dataclass as tyro reads it; groups of settings are dataclasses with `tyro.conf.arg(name=...)`.
+        command: A dataclass as tyro reads it. A field that is a dataclass is a group of settings, by the field's name
+            or that of its `tyro.conf.arg`.
     """
     shown: dict[str, Any] = {}
     groups = []

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.synthetic import Truth
 from mien.tracking import Tracking, frontal_camera
+from mien.tracking.landmark_groups import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
 
-LIDS = ((159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 373))
+LIDS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS)
 """Pairs of landmarks across the eyes' openings, and of their corners (`_CORNERS`): MediaPipe's numbers."""
 _CORNERS = ((33, 133), (362, 263))
 _LEAST_BLINK = 0.25

@@ -1,10 +1,10 @@
 """Which of MediaPipe's 478 landmarks show what, and how much a tracker trusts each."""
 
-from typing import Literal
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from mien.tracking.settings import LandmarkSet
 
 LANDMARKS = 478
 """468 of the face mesh and 5 of each iris."""
@@ -43,10 +43,6 @@ _CONTOUR = 17
 """How many of them are the contour's."""
 
 _WEIGHTS = ((OVAL, 0.15), (NOSE, 3.0), (LIPS, 3.0), (LEFT_EYELIDS + RIGHT_EYELIDS, 5.0), (LEFT_IRIS + RIGHT_IRIS, 4.0))
-
-
-LandmarkSet = Literal["mediapipe", "ibug51"]
-"""All 478; or 300-W's 68 without their contour (supplement of GaussianAvatars, section A), and irises."""
 
 
 def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"]:

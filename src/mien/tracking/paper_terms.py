@@ -13,14 +13,12 @@ from mien.camera import Camera
 from mien.face import FaceParams
 from mien.render.mesh import MeshFragments, rasterize_mesh, vertex_normals
 from mien.render.mesh_gradients import image_points, mesh_loss
+from mien.tracking.landmark_groups import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
 from mien.tracking.paper_scene import PaperScene, PaperState, SequenceScene
 from mien.tracking.solver import Smoothness
 from mien.tracking.views import CameraBatch
 
-GAPS = (
-    (159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 373),  # lids
-    (13, 14), (82, 87), (312, 317), (81, 178), (311, 402),  # lips
-)  # fmt: skip
+GAPS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS, (13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
 """Pairs of landmarks, upper and lower, whose distance tells how far eyes and mouth are open."""
 
 _BLUR_AT = 4.0

@@ -33,7 +33,8 @@ def check_ranges(settings: Any, option: str, ranges: Mapping[str, tuple[float | 
         if numbers and all(math.isfinite(number) and least <= number <= most for number in numbers):
             continue
         given = " ".join(f"{number:g}" for number in numbers) or "(nothing)"
-        wanted = {POSITIVE: "a number above 0", NOT_NEGATIVE: "0 or a number above it"}.get(
-            (least, most), f"a number from {least:g} to {most:g}"
-        )
+        wanted = {
+            POSITIVE: f"a number above 0, {most:g} at most",
+            NOT_NEGATIVE: f"0 or a number above it, {most:g} at most",
+        }.get((least, most), f"a number from {least:g} to {most:g}")
         raise UserError(f"{option}{name.replace('_', '-')} {given}: give {wanted}")

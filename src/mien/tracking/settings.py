@@ -15,6 +15,9 @@ _RANGES = {
     "identity_weight": NOT_NEGATIVE, "bias_sigma": POSITIVE,
 }  # fmt: skip
 
+LandmarkSet = Literal["mediapipe", "ibug51"]
+"""All 478; or 300-W's 68 without their contour (supplement of GaussianAvatars, section A), and irises."""
+
 
 @dataclass(frozen=True)
 class SmoothnessSettings:
@@ -40,7 +43,7 @@ class TrackingSettings:
     move it a little: landmarks of a face hardly tell it. Calibrated cameras keep their own."""
     same_camera: bool = False
     """Whether all sequences were filmed with the same camera and zoom, so that they share one focal length."""
-    landmarks: Literal["mediapipe", "ibug51"] = "mediapipe"
+    landmarks: LandmarkSet = "mediapipe"
     """Which landmarks count: all 478 of MediaPipe, or as in GaussianAvatars the 68 of 300-W without their 17 contour
     points. Irises always do, for the gaze."""
     keyframes: int = 20
