@@ -1,25 +1,28 @@
-# make setup | demo | test | sanitize | lint | bench | gpu. The environment is .venv; everything else is in pyproject.toml.
-PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || echo python3.11)
-BIN := .venv/bin
+# make setup | demo | test | test-312 | sanitize | lint | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
+PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
+PYTHON312 ?= python3.12
+VENV ?= .venv
+BIN := $(VENV)/bin
 NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UV_VERSION := 0.13.8
 
-.PHONY: setup build demo test sanitize lint format bench gpu lock clean
-setup: .venv/.built
+.PHONY: setup build demo test test-312 test-312-part sanitize lint format bench gpu lock clean
+setup: $(VENV)/.built
 
-.venv/.packages: requirements/lock.txt
-	@command -v $(PYTHON) >/dev/null || { echo "mien needs Python 3.11 or 3.12: install it, or run 'make PYTHON=/path/to/python3.11 ...'"; exit 1; }
+$(VENV)/.packages: requirements/lock.txt
+	@"$(PYTHON)" -c "" 2>/dev/null || { echo "mien needs Python 3.11 or 3.12: install it, or run 'make PYTHON=/path/to/python3.11 ...'"; exit 1; }
 	@command -v $${CXX:-g++} >/dev/null || { echo "mien needs a C++20 compiler: install g++ 11 or newer"; exit 1; }
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV)
 	test -x $(BIN)/uv || $(BIN)/python -m pip install --disable-pip-version-check uv==$(UV_VERSION)
 	@echo "Installing packages (torch alone is about 3 GB to download; this is the long part) ..."
-	VIRTUAL_ENV=.venv $(BIN)/uv pip sync --require-hashes requirements/lock.txt
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip sync --require-hashes requirements/lock.txt
 	touch $@
 
-# An editable install: Python from src/, the native core built into .venv.
-.venv/.built: .venv/.packages pyproject.toml $(NATIVE)
+# An editable install: Python from src/, the native core built into VENV.
+$(VENV)/.built: $(VENV)/.packages pyproject.toml $(NATIVE)
 	@echo "compiling the C++ core: one to four minutes ..."
-	VIRTUAL_ENV=.venv $(BIN)/uv pip install --no-build-isolation --no-deps --reinstall-package mien -e .
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --no-build-isolation --no-deps --reinstall-package mien -e .
 	touch $@
 
 build: setup
@@ -27,8 +30,18 @@ build: setup
 demo: setup
 	$(BIN)/mien demo --out out/demo
 
+# One process a core, each with one thread (tests/conftest.py says how many).
 test: setup
-	MIEN_THREADS=2 $(BIN)/pytest
+	MIEN_THREADS=1 $(BIN)/pytest -n auto
+
+# A broad and fast part of the suite on Python 3.12, in an environment of its own. All of it: make test VENV=.venv312 PYTHON=python3.12
+PART := arrays files startup cli native
+test-312:
+	@if "$(PYTHON312)" -c "" 2>/dev/null; then $(MAKE) VENV=.venv312 PYTHON="$(PYTHON312)" test-312-part; \
+	else echo "No Python 3.12: skipped. Install it, or run 'make PYTHON312=/path/to/python3.12 test-312'."; fi
+
+test-312-part: setup
+	MIEN_THREADS=1 $(BIN)/pytest -n auto $(PART:%=tests/test_%.py)
 
 # The native core's own checks under AddressSanitizer, UndefinedBehaviorSanitizer and ThreadSanitizer; needs no Python.
 sanitize:
@@ -40,7 +53,7 @@ lint: setup
 	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 	$(BIN)/typos
 	$(BIN)/lint-imports
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 format: setup
 	$(BIN)/ruff check --fix src tests examples benchmarks
@@ -48,7 +61,7 @@ format: setup
 	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 
 # Re-resolve the locked requirements (both Pythons, every platform) after a change in pyproject.toml or overrides.txt.
-lock: .venv/.packages
+lock: $(VENV)/.packages
 	$(BIN)/uv pip compile pyproject.toml --group dev --overrides requirements/overrides.txt --universal \
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --custom-compile-command "make lock" \
 	  -o requirements/lock.txt
@@ -59,11 +72,11 @@ bench: setup
 # On a machine with an NVIDIA GPU and the CUDA toolkit (gsplat compiles its kernels at first use): the tests marked
 # gpu, then the figures for docs/results.md, into out/gpu.
 gpu: setup
-	VIRTUAL_ENV=.venv $(BIN)/uv pip install 'gsplat>=1.5'
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install 'gsplat>=1.5'
 	$(BIN)/pytest -m gpu
 	mkdir -p out/gpu
 	$(BIN)/mien bench render --device cuda --json > out/gpu/render.json
 	$(BIN)/mien bench train-step --device cuda --json > out/gpu/train_step.json
 
 clean:
-	rm -rf build out .venv
+	rm -rf build out .venv .venv312

@@ -1,16 +1,24 @@
-"""Shared fixtures; says at the end which tests lacked their data or device."""
+"""Shared fixtures; how tests are shared out among processes; what is said of skipped ones at the end."""
 
 import os
+from collections import Counter
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import settings
 
+from needs import NO_GPU, NO_TEST_DATA, skipped_lines
+
 torch.set_num_threads(1)
 # The same examples on every machine, however busy it is.
 settings.register_profile("mien", deadline=None, derandomize=True)
 settings.load_profile("mien")
+
+MOST_WORKERS = 4
+"""More gain little, since the longest files take a quarter of the time."""
+MEMORY_OF_A_WORKER = 3 << 30
+"""Bytes."""
 
 
 def _test_data() -> Path | None:
@@ -24,21 +32,28 @@ def test_data() -> Path:
     """The folder named by MIEN_TEST_DATA (default: ../shared/data beside the checkout)."""
     folder = _test_data()
     if folder is None:
-        pytest.skip("no test data: set MIEN_TEST_DATA")
+        pytest.skip(NO_TEST_DATA)
     return folder
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """`-n auto`: one worker a core, as far as memory goes."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return max(1, min(len(os.sched_getaffinity(0)), MOST_WORKERS, memory // MEMORY_OF_A_WORKER))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("gpu") and not torch.cuda.is_available():
-            item.add_marker(pytest.mark.skip(reason="no CUDA device"))
+            item.add_marker(pytest.mark.skip(reason=NO_GPU))
+    if hasattr(config, "workerinput"):
+        # Workers take whole files in this order: what is long comes first, so that all of them end at about one time.
+        slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+        items.sort(key=lambda item: -slow[item.path])
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    reasons = [str(report.longrepr) for report in terminalreporter.stats.get("skipped", [])]
-    no_data = sum("no test data" in reason for reason in reasons)
-    no_gpu = sum("no CUDA device" in reason for reason in reasons)
-    terminalreporter.write_line(
-        f"test data: {_test_data() and 'found' or 'MISSING, ' + str(no_data) + ' tests skipped'}; "
-        f"CUDA: {'found' if torch.cuda.is_available() else 'none, ' + str(no_gpu) + ' tests skipped'}"
-    )
+    skipped = terminalreporter.stats.get("skipped", [])
+    terminalreporter.section("skipped")
+    for line in skipped_lines(report.longrepr[2] for report in skipped):
+        terminalreporter.write_line(line)

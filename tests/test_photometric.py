@@ -7,6 +7,7 @@ from torch.nn.functional import conv2d, interpolate
 
 from mien import _native
 from mien.training.photometric import Box, photometric_loss, photometric_loss_reference, ssim, ssim_map
+from needs import use_instructions
 
 WHOLE_AND_PARTS = [
     (64, 48, None),
@@ -23,8 +24,7 @@ WHOLE_AND_PARTS = [
 @pytest.fixture(params=["avx512", "avx2", "sse4", "baseline"])
 def isa(request: pytest.FixtureRequest):
     before = _native.rasterize_isa()
-    if not _native.set_rasterize_isa(request.param):
-        pytest.skip(f"this machine has no {request.param}")
+    use_instructions(request.param)
     yield request.param
     assert _native.set_rasterize_isa(before)
 

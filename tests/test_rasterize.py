@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mien import _native
 from mien.render.rasterize import Backend
+from needs import use_instructions
 from rasterize_scenes import (
     GSPLAT,
     WeightedSum,
@@ -35,8 +36,7 @@ def restore_native_settings() -> Iterator[None]:
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 @pytest.mark.parametrize("isa", ISAS)
 def test_native_matches_reference(coefficients: int, isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not _native.set_rasterize_isa(isa):
-        pytest.skip(f"this machine has no {isa}")
+    use_instructions(isa)
     assert_matches_reference(random_scene(coefficients, coefficients=coefficients), monkeypatch)
 
 

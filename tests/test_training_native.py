@@ -9,6 +9,7 @@ from mien.avatar import Moments
 from mien.avatar.penalties import triangle_penalties, triangle_penalties_reference
 from mien.training.adam import Update, update_all, update_reference
 from mien.training.density import observe_reference
+from needs import use_instructions
 
 COUNTS = (0, 1, 15, 16, 4097)
 ISAS = ("avx512", "avx2", "sse4")
@@ -17,8 +18,7 @@ ISAS = ("avx512", "avx2", "sse4")
 @pytest.fixture(params=ISAS)
 def isa(request: pytest.FixtureRequest):
     before = _native.rasterize_isa()
-    if not _native.set_rasterize_isa(request.param):
-        pytest.skip(f"this machine has no {request.param}")
+    use_instructions(request.param)
     yield request.param
     assert _native.set_rasterize_isa(before)
 

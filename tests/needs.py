@@ -1,0 +1,44 @@
+"""What tests may need and a machine may lack: the reason they are skipped with, and what to do to have them run."""
+
+from collections import Counter
+from collections.abc import Iterable
+
+import pytest
+
+from mien import _native
+
+NO_GPU = "no CUDA device"
+NO_TEST_DATA = "no test data"
+IS_ROOT = "root may write everywhere"
+NO_PROC = "no /proc"
+NO_PACKAGE = "could not import"
+NO_INSTRUCTIONS = "this processor has no "
+HAS_GPU = "there is a GPU"
+
+_REMEDIES = {
+    NO_GPU: "run `make gpu` on a machine with an NVIDIA GPU and the CUDA toolkit",
+    NO_TEST_DATA: "set MIEN_TEST_DATA to the folder that holds it",
+    IS_ROOT: "run the tests as another user",
+    NO_PROC: "run them on Linux",
+    NO_PACKAGE: "run `make setup`; some packages exist on some platforms only",
+    NO_INSTRUCTIONS: "run them on one that has",
+    HAS_GPU: "run them with CUDA_VISIBLE_DEVICES=",
+}
+
+
+def use_instructions(isa: str) -> None:
+    """Let the native core use that instruction set; skip the test where the processor lacks it."""
+    if not _native.set_rasterize_isa(isa):
+        pytest.skip(NO_INSTRUCTIONS + isa)
+
+
+def skipped_lines(reasons: Iterable[str]) -> list[str]:
+    """What to print of the tests that were skipped: their number by reason, each with its remedy if there is one."""
+    counts = Counter(reason.removeprefix("Skipped: ") for reason in reasons)
+    if not counts:
+        return ["No test was skipped."]
+    lines = [f"{counts.total()} tests were skipped:"]
+    for reason, count in counts.most_common():
+        remedy = next((f"; {remedy}" for start, remedy in _REMEDIES.items() if reason.startswith(start)), "")
+        lines.append(f"{count:6}  {reason}{remedy}")
+    return lines
