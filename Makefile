@@ -23,6 +23,8 @@ $(VENV)/.packages: requirements/lock.txt
 $(VENV)/.built: $(VENV)/.packages pyproject.toml $(NATIVE)
 	@echo "compiling the C++ core: one to four minutes ..."
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --no-build-isolation --no-deps --reinstall-package mien -e .
+	@# Python reads .pth files in the locale's encoding, and under LC_ALL=C dies of an absolute path with an umlaut.
+	sed -i 's|^/.*/src$$|../../../../src|' $(VENV)/lib/python3*/site-packages/_editable_skbc_mien.pth
 	touch $@
 
 build: setup
