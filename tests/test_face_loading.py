@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from mien.errors import UserError
-from mien.face import available_face_models, load_face_model, loading
+from mien.face import available_face_models, cache, load_face_model, loading
 from small_face_model import make_small_face_model
 
 
@@ -120,3 +121,28 @@ def test_a_baked_model_loads_without_its_source():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("home", [None, "unwritable"])
+def test_without_a_home_folder_models_are_baked_for_this_process(home, bakes, monkeypatch, tmp_path, capsys):
+    for name in ("MIEN_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    cache._temporary_folder.cache_clear()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    if home is None:
+
+        def unknown(user):
+            raise KeyError(user)
+
+        monkeypatch.setattr("pwd.getpwuid", unknown)
+    else:
+        monkeypatch.setenv("HOME", "/proc/nowhere")
+    assert load_face_model("small").content_hash == load_face_model("small").content_hash
+    assert len(bakes) == 1
+    said = capsys.readouterr().err
+    assert said.count("MIEN_CACHE names a folder to keep them") == 1
+    assert ("there is no home folder" if home is None else "/proc/nowhere/.cache/mien cannot be written to") in said
+    (folder,) = tmp_path.glob("mien-cache-*")
+    assert loading._is_baked("small", loading._SOURCES["small"])
+    assert str(folder) in said
+    cache._temporary_folder.cache_clear()

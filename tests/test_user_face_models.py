@@ -16,7 +16,7 @@ from mien.cli import main
 from mien.commands.stages import face_models as stage
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, available_face_models, load_face_model
-from mien.face.loading import cache_folder
+from mien.face.cache import cache_folder
 from mien.runtime import load as load_portable
 from mien.synthetic import SyntheticRecipe, synthesize
 from mien.tracking import TrackingSettings, read_tracking, track

@@ -1,7 +1,6 @@
 """Face models by name: baked once into the user's cache, then read in a moment."""
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -15,6 +14,7 @@ from torch import Tensor
 from mien.errors import UserError
 from mien.face.anny import bake_anny
 from mien.face.anny_source import anny_tag
+from mien.face.cache import cache_folder
 from mien.face.model import FaceModel, Landmarks
 from mien.storage import read_json, read_tensors, write_atomically, write_json, write_tensors
 
@@ -55,8 +55,8 @@ class _Source:
 def load_face_model(name: str = "anny") -> FaceModel:
     """The face model of that name, ready to use; its first load bakes it (about half a minute, with a progress bar).
 
-    Baked models are kept in the folder MIEN_CACHE names, or else in ~/.cache/mien (XDG_CACHE_HOME is honoured), and so
-    are those that the user added (`mien face-models --add`).
+    Baked models are kept in `mien.face.cache.cache_folder()`, and so are those that the user added (`mien face-models
+    --add`).
 
     Raises:
         UserError: there is no such model, or its package is not installed.
@@ -118,14 +118,6 @@ def added_from(name: str) -> dict[str, Any] | None:
     except UserError:
         return None
     return content if content.get("recipe") == ADDED_RECIPE and {"path", "sha256"} <= content.keys() else None
-
-
-def cache_folder() -> Path:
-    """Where this user's baked files are kept."""
-    if named := os.environ.get("MIEN_CACHE"):
-        return Path(named).expanduser()
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "mien"
 
 
 def write_face_model(stem: Path, model: FaceModel) -> None:

@@ -20,7 +20,7 @@ from mien.evaluation.pictures import side_by_side
 from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
 from mien.face import FaceModel, FaceParams
-from mien.face.loading import cache_folder
+from mien.face.cache import cache_folder
 from mien.face.params import concatenate
 from mien.motion import read_blendshape_json, read_live_link_face
 from mien.progress import say, track_progress

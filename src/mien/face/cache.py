@@ -1,0 +1,48 @@
+"""The folder of what mien keeps for a user: baked face models, tracked drivers."""
+
+import atexit
+import os
+import shutil
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+
+from mien.errors import UserError
+from mien.files import check_writable
+from mien.progress import say
+
+
+def cache_folder() -> Path:
+    """Where this user's baked files are kept.
+
+    The folder that MIEN_CACHE names, or else ~/.cache/mien (XDG_CACHE_HOME is honoured). Where that has nothing yet and
+    cannot be written to, as without a home folder: a temporary folder, which goes when this process ends. That is said.
+    """
+    wanted = _wanted_folder()
+    if wanted is None:
+        return _temporary_folder("there is no home folder")
+    if not (wanted / "face_models").is_dir():
+        try:
+            check_writable(wanted, folder=True)
+        except UserError:
+            return _temporary_folder(f"{wanted} cannot be written to")
+    return wanted
+
+
+@lru_cache(maxsize=1)
+def _temporary_folder(reason: str) -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="mien-cache-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    say(f"{reason}: face models are baked into {folder} for this command alone; MIEN_CACHE names a folder to keep them")
+    return folder
+
+
+def _wanted_folder() -> Path | None:
+    if named := os.environ.get("MIEN_CACHE"):
+        return Path(named).expanduser()
+    if base := os.environ.get("XDG_CACHE_HOME"):
+        return Path(base) / "mien"
+    try:
+        return Path.home() / ".cache" / "mien"
+    except RuntimeError:  # no HOME, and the system does not know the user either
+        return None
