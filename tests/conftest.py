@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from needs import NO_GPU, NO_TEST_DATA, skipped_lines
+from needs import NO_GPU, NO_TEST_DATA, find_test_data, skipped_lines
 
 torch.set_num_threads(1)
 # The same examples on every machine, however busy it is.
@@ -21,16 +21,10 @@ MEMORY_OF_A_WORKER = 3 << 30
 """Bytes."""
 
 
-def _test_data() -> Path | None:
-    named = os.environ.get("MIEN_TEST_DATA")
-    folder = Path(named) if named else Path(__file__).parent.parent.parent / "shared" / "data"
-    return folder if (folder / "MANIFEST.md").is_file() else None
-
-
 @pytest.fixture(scope="session")
 def test_data() -> Path:
     """The folder named by MIEN_TEST_DATA (default: ../shared/data beside the checkout)."""
-    folder = _test_data()
+    folder = find_test_data()
     if folder is None:
         pytest.skip(NO_TEST_DATA)
     return folder

@@ -1,7 +1,9 @@
 """What tests may need and a machine may lack: the reason they are skipped with, and what to do to have them run."""
 
+import os
 from collections import Counter
 from collections.abc import Iterable
+from pathlib import Path
 
 import pytest
 
@@ -24,6 +26,13 @@ _REMEDIES = {
     NO_INSTRUCTIONS: "run them on one that has",
     HAS_GPU: "run them with CUDA_VISIBLE_DEVICES=",
 }
+
+
+def find_test_data() -> Path | None:
+    """The folder that MIEN_TEST_DATA names, or shared/data beside the checkout, if it is there."""
+    named = os.environ.get("MIEN_TEST_DATA")
+    folder = Path(named) if named else Path(__file__).parent.parent.parent / "shared" / "data"
+    return folder if (folder / "MANIFEST.md").is_file() else None
 
 
 def use_instructions(isa: str) -> None:

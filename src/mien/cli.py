@@ -52,6 +52,7 @@ _INDENT_OF_DESCRIPTION = 8
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one sub-command; returns the exit code: 0, 2 for the user's mistakes, 1 for ours, 130 after Ctrl-C."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    _print_what_can_be_printed()
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return 0 if arguments else EXIT_USER_ERROR
@@ -83,6 +84,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(f"{error.filename or 'a file'}: {error.strerror}; mend that and run the same command again")
     except Exception:
         return _crash()
+
+
+def _print_what_can_be_printed() -> None:
+    """A character that standard output's encoding lacks becomes a question mark: help and names of files have some."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
 
 
 def _crash() -> int:
