@@ -5,7 +5,6 @@ import os
 import shlex
 import socket
 import sys
-import time
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,7 +17,6 @@ _BEGINNING = b'{"format": "mien.lock"'
 _MOST_BYTES = 4096
 _SHOWN = {"host": 60, "since": 30, "command": 200}
 """Characters of what a holder says about itself that are shown."""
-_PATIENCE_SECONDS, _STEP_SECONDS = 0.25, 0.01
 
 
 def sign(handle: int, file: Path) -> None:
@@ -44,18 +42,16 @@ def sign(handle: int, file: Path) -> None:
         os.pwrite(handle, text, 0)
 
 
-def read_holder(handle: int) -> str:
-    """Who holds the lock of an open lock file, in words on one line; what the file says is not trusted."""
-    patience = time.monotonic() + _PATIENCE_SECONDS
-    while True:
-        about = _parsed(os.pread(handle, _MOST_BYTES, 0))
-        if about is not None and _may_live(about):
-            words = {name: _shown(about.get(name), longest) for name, longest in _SHOWN.items()}
-            return f"process {about['pid']} on {words['host']}, since {words['since']}: {words['command']}"
-        # It has the lock and has not signed yet: the file is empty, or has the name of one that was killed.
-        if time.monotonic() > patience:
-            return "which did not leave its name"
-        time.sleep(_STEP_SECONDS)
+def read_holder(handle: int) -> str | None:
+    """Who holds the lock of an open lock file, in words on one line; what the file says is not trusted.
+
+    None where it does not say, or names a process that has ended: the holder has not signed yet.
+    """
+    about = _parsed(os.pread(handle, _MOST_BYTES, 0))
+    if about is None or not _may_live(about):
+        return None
+    words = {name: _shown(about.get(name), longest) for name, longest in _SHOWN.items()}
+    return f"process {about['pid']} on {words['host']}, since {words['since']}: {words['command']}"
 
 
 def _parsed(text: bytes) -> dict[str, Any] | None:

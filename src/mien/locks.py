@@ -36,8 +36,12 @@ _AGAIN = "try again when it is done"
 _LONGEST_NAME = 240
 """Bytes; file systems allow 255."""
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
-_PATIENCE_SECONDS, _STEP_SECONDS = 0.25, 0.01
-"""How long a writer asks again: readers look at a lock for a moment, and a process that was killed takes one to end."""
+_REMOVED = frozenset({errno.ENOENT, errno.ESTALE})
+"""By who released it (ESTALE: on another machine), with folders that stayed empty."""
+_PATIENCE_SECONDS, _STEP_SECONDS = 0.5, 0.01
+"""How long a lock is asked for again whose holder does not say its name: it may be a reader that looks at it for a
+moment, a process that was killed and is about to end, or one that signs in a moment."""
+_NAMELESS = "which has not left its name"
 _PAUSES_SECONDS = (0.0, 0.02, 0.05, 0.1)
 """Before a reader reads again what a writer has changed under its hands."""
 
@@ -94,7 +98,7 @@ def holder_of(place: Path) -> str | None:
             return None
         fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
-        return read_holder(handle)
+        return _wait_for_name(handle)
     except OSError:
         return None
     finally:
@@ -163,34 +167,47 @@ def _acquire(place: Path, file: Path, remedy: str) -> int | None:
     patience = time.monotonic() + _PATIENCE_SECONDS
     while True:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with suppress(FileNotFoundError):  # another one that releases its lock removes folders that stay empty
+        locked, holder, handle = True, None, None
+        try:
             handle = _open_own(file)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if _is_named(handle, file):
-                    sign(handle, file)
-                    _ours[handle] = _identity(os.fstat(handle))
-                    return handle
-            except BlockingIOError:
-                if time.monotonic() > patience:
-                    holder = read_holder(handle)
-                    os.close(handle)
-                    raise _being_written(place, holder, remedy) from None
-            except OSError as error:
-                if error.errno in _NO_LOCKS:
-                    os.close(handle)
-                    _warn_of_no_locks(file)
-                    return None
-                if error.errno != errno.ESTALE:  # of a network: removed by another machine
-                    os.close(handle)
-                    raise
-            except BaseException:
-                os.close(handle)
+            locked = _try_lock(handle)
+            if locked and _is_named(handle, file):
+                sign(handle, file)
+                _ours[handle] = _identity(os.fstat(handle))
+                return handle
+            holder = None if locked else read_holder(handle)
+        except OSError as error:
+            if error.errno in _NO_LOCKS:
+                _warn_of_no_locks(file)
+                return None
+            if error.errno not in _REMOVED:
                 raise
-            os.close(handle)
-        if time.monotonic() > patience + _PATIENCE_SECONDS:
-            raise OSError(errno.EAGAIN, "its lock cannot be taken", str(file))
+        finally:
+            if handle is not None and handle not in _ours:
+                os.close(handle)
+        patient = time.monotonic() < patience
+        if holder is not None or not (locked or patient):
+            raise _being_written(place, holder or _NAMELESS, remedy)
+        if not patient:
+            raise OSError(errno.EAGAIN, "its lock file is removed again and again", str(file))
         time.sleep(_STEP_SECONDS)
+
+
+def _try_lock(handle: int) -> bool:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _wait_for_name(handle: int) -> str:
+    for _ in range(round(_PATIENCE_SECONDS / 2 / _STEP_SECONDS)):
+        holder = read_holder(handle)
+        if holder is not None:
+            return holder
+        time.sleep(_STEP_SECONDS)
+    return _NAMELESS
 
 
 def _release(file: Path, handle: int | None) -> None:

@@ -107,6 +107,9 @@ def _read_capture(path: Path) -> Capture:
     if content.get("capture_hash") != _hash(data, layout, digests):
         raise UserError(f"{path / ARRAYS_NAME}: does not belong to the {JSON_NAME} beside it; {REMEDY}")
     images, mattes = map_frames(layout, content["capture_hash"], digests)
+    if read_capture_hash(path) != content["capture_hash"]:
+        # The maps may be of the one and the other: the folder was exchanged between them.
+        raise UserError(f"{path}: was replaced while it was read; run the same command again")
     return Capture(
         name=data.name,
         camera_ids=data.camera_ids,
