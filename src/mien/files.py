@@ -3,10 +3,12 @@
 `mien.storage` adds torch tensors. Nothing here knows what is stored.
 """
 
+import ctypes
 import errno
 import hashlib
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -28,6 +30,8 @@ _LARGEST_JSON = 64 << 20
 """Bytes; the largest that mien writes has some megabytes."""
 _LARGEST_HEADER = 100 << 20
 """Bytes of a safetensors header, as its specification has it."""
+_AT_CURRENT_FOLDER, _EXCHANGE = -100, 2
+"""AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
@@ -87,6 +91,35 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             raise
     except OSError as error:
         raise cannot_write(path, error) from None
+
+
+def replace_folder(path: Path, finished: Path) -> None:
+    """Put the folder `finished`, which lies on the same disk, in the place `path`; a folder that is there goes.
+
+    In one step where the system can exchange two names, so that readers find the one or the other.
+
+    Raises:
+        OSError: it cannot be done.
+    """
+    if not path.exists():
+        finished.rename(path)
+        return
+    if not _exchange(path, finished):
+        old = path.parent / f".{path.name}.old"
+        shutil.rmtree(old, ignore_errors=True)
+        path.rename(old)
+        finished.rename(path)
+        finished = old
+    shutil.rmtree(finished, ignore_errors=True)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two paths change places (Linux); False where the system or the file system cannot."""
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (OSError, AttributeError):
+        return False
+    return rename(_AT_CURRENT_FOLDER, os.fsencode(one), _AT_CURRENT_FOLDER, os.fsencode(other), _EXCHANGE) == 0
 
 
 def cannot_write(path: Path, error: OSError) -> CannotWriteError:

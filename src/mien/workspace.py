@@ -58,7 +58,7 @@ def open_workspace(root: Path) -> Workspace:
     """An existing workspace.
 
     Raises:
-        UserError: the folder is not there or holds no sequences and no runs.
+        UserError: the folder is not there or holds no sequences and no runs, or not yet.
     """
     workspace = Workspace(root)
     if root.is_file():
@@ -68,6 +68,7 @@ def open_workspace(root: Path) -> Workspace:
             f"{root}: no such folder; make a workspace with `mien create VIDEO --out {shlex.quote(str(root))}`"
         )
     if not workspace.sequence_names() and not workspace.run_names():
+        _check_first_captures(workspace)
         told = f"{root}: not a mien workspace (no sequences/NAME/capture, no runs/NAME)"
         whole = root.resolve()
         bare = sorted(path.name for path in root.glob("sequences/[!.]*") if path.is_dir())
@@ -81,6 +82,18 @@ def open_workspace(root: Path) -> Workspace:
             raise UserError(f"{told}; did you mean {shlex.join([str(typed), '--run', whole.name])}?")
         raise UserError(f"{told}; see `mien create --help`")
     return workspace
+
+
+def _check_first_captures(workspace: Workspace) -> None:
+    """Tell that a workspace without a sequence is one that is being made.
+
+    Raises:
+        BeingWrittenError: another process captures its first sequence.
+    """
+    from mien.locks import check_free  # brings numpy
+
+    for file in sorted(workspace.root.glob("sequences/.*.lock")):
+        check_free(workspace.sequence_dir(file.name[1:].removesuffix(".lock")), "try again when it is done")
 
 
 def check_new_workspace(root: Path) -> None:

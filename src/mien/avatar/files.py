@@ -13,6 +13,7 @@ from mien.config import decode, encode
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
+from mien.locks import read_beside_writers
 from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
@@ -57,8 +58,13 @@ def load_avatar(folder: Path) -> Avatar:
     """The avatar of a run folder, or of an avatar folder itself.
 
     Raises:
-        UserError: the folder holds no avatar, a damaged one, or one whose face model is not to be had.
+        UserError: the folder holds no avatar, a damaged one, one that is being written, or one whose face model is not
+            to be had.
     """
+    return read_beside_writers(lambda: _load_avatar(folder), [folder, folder / "avatar"], [folder, folder.parent])
+
+
+def _load_avatar(folder: Path) -> Avatar:
     folder = folder / "avatar" if (folder / "avatar").is_dir() else folder
     if not (folder / "avatar.json").is_file():
         raise UserError(

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, CacheWriter, FrameLayout, read_png
-from mien.errors import UserError
+from mien.errors import CannotWriteError, UserError
+from mien.locks import BeingWrittenError, hold
 from mien.picture_files import map_pictures
 from mien.progress import progress_bar
 from mien.storage import read_json, write_json
@@ -21,7 +22,7 @@ from mien.storage import read_json, write_json
 _FORMAT, _VERSION = "mien.capture_cache", 1
 _THREADS = 2
 _IN_FLIGHT = 16
-_SCRATCH_PREFIX = "mien-capture-"
+_SCRATCH_PREFIX, _ASIDE_PREFIX = "mien-capture-", ".making-"
 
 
 def stamp_cache(layout: FrameLayout, capture_hash: str) -> None:
@@ -88,27 +89,46 @@ def _fingerprint(layout: FrameLayout) -> str:
 
 
 def _rebuild(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarray]) -> FrameLayout:
-    """Decode everything into the cache, or into a scratch folder where the capture's own cannot be written."""
+    """Decode everything into the cache, or into a scratch folder where the capture's own cannot be written now.
+
+    Others may map the cache meanwhile: it is made aside and put in their place. One process at a time makes it.
+    """
     try:
-        _decode_all(layout, layout, digests)
-        stamp_cache(layout, capture_hash)
+        with hold(layout.raw(FRAMES)):
+            if not _is_valid(layout, capture_hash):
+                _replace_cache(layout, digests)
+                stamp_cache(layout, capture_hash)
         return layout
-    except OSError:
+    except (OSError, BeingWrittenError):
         scratch = replace(layout, folder=Path(tempfile.mkdtemp(prefix=_SCRATCH_PREFIX)))
         try:
             _decode_all(layout, scratch, digests)
         except BaseException as error:
             shutil.rmtree(scratch.folder, ignore_errors=True)
             if isinstance(error, OSError):
-                raise UserError(
-                    f"{layout.folder}: no room for the decoded frames ({error.strerror}); free some disk space"
+                raise CannotWriteError(
+                    f"{layout.folder}: no room for the decoded frames ({error.strerror}); free some disk space", error
                 ) from None
             raise
         return scratch
 
 
+def _replace_cache(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
+    cache = layout.folder / CACHE
+    for left in cache.glob(f"{_ASIDE_PREFIX}*"):  # by a process that was killed
+        shutil.rmtree(left, ignore_errors=True)
+    for old in (cache / "stamp.json", layout.raw(FRAMES), layout.raw(MATTES)):  # there may be no room for both
+        old.unlink(missing_ok=True)
+    aside = replace(layout, folder=Path(tempfile.mkdtemp(dir=cache, prefix=_ASIDE_PREFIX)))
+    try:
+        _decode_all(layout, aside, digests)
+        for kind in (FRAMES, MATTES):
+            aside.raw(kind).replace(layout.raw(kind))
+    finally:
+        shutil.rmtree(aside.folder, ignore_errors=True)
+
+
 def _decode_all(source: FrameLayout, target: FrameLayout, digests: dict[str, np.ndarray]) -> None:
-    (target.folder / CACHE / "stamp.json").unlink(missing_ok=True)
     writer = CacheWriter(target)
 
     def decode(kind: str, timestep: int, camera: int) -> None:

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 
 from mien.capture.capture import Capture
+from mien.capture.finished import read_finished, read_source
 from mien.capture.frame_files import FrameLayout
 from mien.capture.given import GivenMattes, check_mattes, read_landmarks
 from mien.capture.outcome import CAMERA_ID, Origin, finish_part
@@ -19,10 +19,11 @@ from mien.capture.parts import find_parts, whole_part
 from mien.capture.process import Means, Part, Reel, process_part
 from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, FrameSource, open_source, read_image
-from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, partial_folder, read_capture
+from mien.capture.store import JSON_NAME, check_replaceable, partial_folder, read_capture
 from mien.capture.survey import Survey, survey_source
 from mien.capture.upright import check_upright
 from mien.errors import UserError
+from mien.locks import hold
 from mien.progress import say
 from mien.storage import cannot_write, file_digest, read_json, write_json
 
@@ -58,11 +59,19 @@ def capture_video(
         replace: whether a capture of another source may be replaced, too.
 
     Raises:
-        UserError: the source is no video or shows no face, or `out` cannot be written or is damaged.
+        UserError: the source is no video or shows no face, or `out` cannot be written, is damaged or being written.
     """
     job = _job(source, settings or CaptureSettings(), name, replace)
-    key = _part_key(job, 1, 1)
-    capture = _read_finished(out, key)
+    capture = read_finished(out, _part_key(job, 1, 1), tell=False)
+    if capture is not None:
+        return capture
+    with hold(out):
+        return _capture_whole(out, job)
+
+
+def _capture_whole(out: Path, job: _Job) -> Capture:
+    # Another process may have finished it before this one got the lock.
+    capture = read_finished(out, _part_key(job, 1, 1))
     if capture is not None:
         return capture
     _check_place(out, job)
@@ -70,7 +79,7 @@ def capture_video(
     with _tidy(out, scratch) as survey_folder:
         means = _means(job)
         survey = _survey(job, survey_folder, means)
-        part = whole_part(survey, job.settings, source, job.name)
+        part = whole_part(survey, job.settings, job.frames.path, job.name)
         _process(job, Reel(job.frames), part, (1, 1), means, out)
     return read_capture(out)
 
@@ -97,9 +106,18 @@ def capture_video_parts(
         The captures in the video's order; their `name` is their folder's.
 
     Raises:
-        UserError: the source is no video or shows no face, or a folder cannot be written or is damaged.
+        UserError: the source is no video or shows no face, or a folder cannot be written, is damaged or being written.
     """
     job = _job(source, settings or CaptureSettings(), name, replace)
+    finished = _read_finished_parts(sequences, job, tell=False)
+    if finished:
+        return finished
+    with hold(sequences / job.name):
+        return _capture_parts(sequences, job)
+
+
+def _capture_parts(sequences: Path, job: _Job) -> list[Capture]:
+    # Another process may have finished them before this one got the lock.
     finished = _read_finished_parts(sequences, job)
     if finished:
         return finished
@@ -108,12 +126,13 @@ def capture_video_parts(
     with _tidy(_place(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
         means = _means(job)
         survey = _survey(job, survey_folder, means)
-        parts = find_parts(survey, job.settings, source, job.name)
-        for part in parts:
-            _check_place(_place(sequences, part.name), job)
-        reel = Reel(job.frames)
-        for number, part in enumerate(parts, 1):
-            _process(job, reel, part, (number, len(parts)), means, _place(sequences, part.name))
+        parts = find_parts(survey, job.settings, job.frames.path, job.name)
+        with hold(*(sequences / part.name for part in parts if part.name != job.name)):
+            for part in parts:
+                _check_place(_place(sequences, part.name), job)
+            reel = Reel(job.frames)
+            for number, part in enumerate(parts, 1):
+                _process(job, reel, part, (number, len(parts)), means, _place(sequences, part.name))
     _tell_leftovers(sequences, job, {part.name for part in parts})
     return [read_capture(_place(sequences, part.name)) for part in parts]
 
@@ -147,38 +166,18 @@ def _place(sequences: Path, name: str) -> Path:
     return sequences / name / "capture"
 
 
-def _read_source(out: Path) -> dict[str, Any] | None:
-    """Where the capture in a folder came from; none where there is none, or none that can be read."""
-    try:
-        source = read_json(out / JSON_NAME, FORMAT, VERSION).get("source")
-    except UserError:
-        return None
-    return source if isinstance(source, dict) else None
-
-
-def _read_finished(out: Path, key: str) -> Capture | None:
-    source = _read_source(out)
-    if source is None or source.get("key") != key:
-        return None
-    try:
-        return read_capture(out)
-    except UserError as error:
-        say(f"{str(error).split('; ')[0]}; it is captured again")
-        return None
-
-
-def _read_finished_parts(sequences: Path, job: _Job) -> list[Capture]:
+def _read_finished_parts(sequences: Path, job: _Job, tell: bool = True) -> list[Capture]:
     """All parts, if all are finished; none otherwise."""
-    whole = _read_finished(_place(sequences, job.name), _part_key(job, 1, 1))
+    whole = read_finished(_place(sequences, job.name), _part_key(job, 1, 1), tell)
     if whole is not None:
         return [whole]
-    source = _read_source(_place(sequences, f"{job.name}-1")) or {}
+    source = read_source(_place(sequences, f"{job.name}-1")) or {}
     part = source.get("part")
     count = part.get("count") if isinstance(part, dict) else None
     if not isinstance(count, int):
         return []
     keys = {f"{job.name}-{number}": _part_key(job, number, count) for number in range(1, count + 1)}
-    captures = [_read_finished(_place(sequences, name), key) for name, key in keys.items()]
+    captures = [read_finished(_place(sequences, name), key, tell) for name, key in keys.items()]
     found = [capture for capture in captures if capture is not None]
     return found if len(found) == count else []
 
@@ -195,7 +194,7 @@ def _check_place(out: Path, job: _Job) -> None:
         raise cannot_write(out, error) from None
     if job.replace or not (out / JSON_NAME).exists():
         return
-    source = _read_source(out)
+    source = read_source(out)
     if source is None:
         say(f"{out}: the capture in it is damaged or of another version; it is made again")
     elif source.get("content_hash") != job.frames.content_hash:
@@ -275,7 +274,7 @@ def _survey(job: _Job, folder: Path, means: Means) -> Survey:
 def _process(job: _Job, reel: Reel, part: Part, place: tuple[int, int], means: Means, out: Path) -> None:
     """Capture one part, unless that is done."""
     key = _part_key(job, *place)
-    if _read_finished(out, key) is not None:
+    if read_finished(out, key) is not None:
         return
     work = _prepare(partial_folder(out), key)
     layout = FrameLayout(work, (CAMERA_ID,), part.timesteps, part.crop.height, part.crop.width)
@@ -286,7 +285,7 @@ def _process(job: _Job, reel: Reel, part: Part, place: tuple[int, int], means: M
 def _tell_leftovers(sequences: Path, job: _Job, names: set[str]) -> None:
     """Name sequences that an earlier capture of the same video left under other numbers."""
     for path in sorted(sequences.glob(f"*/capture/{JSON_NAME}")):
-        source = _read_source(path.parent) or {}
+        source = read_source(path.parent) or {}
         part = source.get("part")
         is_ours = isinstance(part, dict) and part.get("of") == job.name
         if is_ours and path.parent.parent.name not in names:

@@ -17,8 +17,9 @@ from mien.capture.capture import Capture
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, STAGE, FrameLayout, FrameWriter
 from mien.capture.quality import FrameQuality
 from mien.errors import UserError
+from mien.locks import read_beside_writers
 from mien.progress import progress_bar
-from mien.storage import cannot_write, read_arrays, read_json, write_arrays, write_json
+from mien.storage import cannot_write, read_arrays, read_json, replace_folder, write_arrays, write_json
 
 FORMAT, VERSION = "mien.capture", 1
 JSON_NAME, ARRAYS_NAME, REPORT_NAME = "capture.json", "landmarks.safetensors", "report.json"
@@ -93,8 +94,12 @@ def read_capture(path: Path) -> Capture:
     """Read a capture; its images and mattes are memory maps of the decoded cache, which is rebuilt where it is stale.
 
     Raises:
-        UserError: the folder is missing, damaged, incomplete, or of another version.
+        UserError: the folder is missing, damaged, incomplete, of another version, or being written.
     """
+    return read_beside_writers(lambda: _read_capture(path), [path], [path, path.parent])
+
+
+def _read_capture(path: Path) -> Capture:
     if not path.is_dir():
         raise UserError(f"{path}: no capture there; run `mien capture` first, or check the path")
     content = read_json(path / JSON_NAME, FORMAT, VERSION, STAGE)
@@ -102,6 +107,9 @@ def read_capture(path: Path) -> Capture:
     if content.get("capture_hash") != _hash(data, layout, digests):
         raise UserError(f"{path / ARRAYS_NAME}: does not belong to the {JSON_NAME} beside it; {REMEDY}")
     images, mattes = map_frames(layout, content["capture_hash"], digests)
+    if read_capture_hash(path) != content["capture_hash"]:
+        # The maps may be of the one and the other: the folder was exchanged between them.
+        raise UserError(f"{path}: was replaced while it was read; run the same command again")
     return Capture(
         name=data.name,
         camera_ids=data.camera_ids,
@@ -170,12 +178,7 @@ def finish_capture(
         "source": data.source,
     }
     write_json(folder / JSON_NAME, FORMAT, VERSION, content)
-    old = path.parent / f".{path.name}.old"
-    shutil.rmtree(old, ignore_errors=True)
-    if path.exists():
-        path.rename(old)
-    folder.rename(path)
-    shutil.rmtree(old, ignore_errors=True)
+    replace_folder(path, folder)
     return capture_hash
 
 

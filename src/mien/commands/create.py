@@ -60,13 +60,14 @@ class Command:
         from mien.commands.stages.tracking import tracking_stage
         from mien.commands.stages.training import training_stage
         from mien.progress import say
-        from mien.training import check_held_out, check_run
+        from mien.training import check_held_out, check_run, check_untouched
 
         began = time.monotonic()
         method, settings = self.options.method_config(), self.options.settings()
         names = sequence_names(self.videos, self.name)
         workspace, run = Workspace(self.out), run_name(self.run_name or self.options.method)
         check_run(workspace.run_dir(run), method, settings)
+        check_untouched(workspace.run_dir(run))
         face_model_of(self.face_model)
         for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
             say(f"warning: {warning}")

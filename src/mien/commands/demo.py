@@ -39,6 +39,7 @@ class Command:
         """Write the video unless it is there, then create."""
         from dataclasses import replace
 
+        from mien.locks import hold
         from mien.synthetic import RECIPES, write_synthetic_video
 
         recipe = RECIPES["demo"]
@@ -46,7 +47,8 @@ class Command:
             recipe = replace(recipe, seconds=self.seconds)
         video = self.out / f"synthetic-{self.seed}-{recipe.seconds:g}s.mp4"
         if not video.is_file():
-            write_synthetic_video(recipe, video, self.seed)
+            with hold(video):
+                write_synthetic_video(recipe, video, self.seed)
         options = TrainOptions(preset=self.preset, steps=self.steps)
         create = Create(videos=(video,), out=self.out, name=("synthetic",), options=options)
         create.check()

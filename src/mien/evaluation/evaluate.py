@@ -16,6 +16,7 @@ from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_f
 from mien.evaluation.report import RunRecord, write_report
 from mien.evaluation.report_video import ReportVideo
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
+from mien.locks import hold
 from mien.storage import expect_whole, file_digest, read_json, write_json
 from mien.training import read_curves, read_run_config, read_training_summary
 
@@ -43,9 +44,16 @@ def evaluate(
         The content of metrics.json: `protocols` and `training`.
 
     Raises:
-        UserError: the run is not finished, the sequences are others, or nothing was held out.
+        UserError: the run is not finished, the sequences are others, or nothing was held out; or another process
+            writes the run.
     """
-    settings = settings or EvaluationSettings()
+    with hold(run_dir):
+        return _evaluate(run_dir, sequence_dirs, settings or EvaluationSettings(), driver_dirs)
+
+
+def _evaluate(
+    run_dir: Path, sequence_dirs: Items[Path], settings: EvaluationSettings, driver_dirs: Items[Path]
+) -> dict[str, Any]:
     summary = read_training_summary(run_dir)
     experiments = load_experiments(run_dir, sequence_dirs)
     if not experiments and not driver_dirs:

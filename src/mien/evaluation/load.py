@@ -37,6 +37,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
     if [folder.name for folder in sequence_dirs] != wanted:
         given = ", ".join(folder.name for folder in sequence_dirs)
         raise UserError(f"{run_dir}: was trained on {', '.join(wanted)}, not on {given}; give it those sequences")
+    digests = tuple(_digests(folder) for folder in sequence_dirs)
     scorings = tuple(
         read_scoring(folder / "scoring", read_capture_hash(folder / "capture")) for folder in sequence_dirs
     )
@@ -44,6 +45,9 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
         Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), scoring.masks)
         for folder, scoring in zip(sequence_dirs, scorings, strict=True)
     )
+    for folder, digest in zip(sequence_dirs, digests, strict=True):
+        if _digests(folder) != digest:
+            raise UserError(f"{folder}: was written anew while it was read; run the same command again")
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
     faces = _faces_of_run(run_dir, sequences)
     base = Experiment(
@@ -55,7 +59,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
         training_frames=tuple(Frame(f.sequence, f.timestep, f.camera) for f in training_frames(sequences, settings)),
         held_out_frames=(),
         split=settings.split,
-        digests=tuple(_digests(folder) for folder in sequence_dirs),
+        digests=digests,
     )
     return {
         protocol: replace(base, held_out_frames=frames, split=split, face_source=_face_source(sequences, faces, frames))

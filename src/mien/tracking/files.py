@@ -9,6 +9,7 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.errors import UserError
 from mien.face import FaceParams
+from mien.locks import read_beside_writers
 from mien.storage import read_json, read_tensors, write_json, write_tensors
 from mien.tracking.tracking import Looks, Tracking
 
@@ -59,8 +60,12 @@ def read_tracking(path: Path) -> Tracking:
     """Read what `write_tracking` wrote.
 
     Raises:
-        UserError: something is missing, damaged, of another version, or not finite.
+        UserError: something is missing, damaged, of another version, not finite, or being written.
     """
+    return read_beside_writers(lambda: _read_tracking(path), [path], [path.parent])
+
+
+def _read_tracking(path: Path) -> Tracking:
     content = read_json(path / _JSON, _FORMAT, _VERSION, _STAGE)
     tensors = read_tensors(path / _TENSORS, _STAGE)
     if _digest(path / _TENSORS) != content.get("tensors_sha256"):

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 
 from mien.errors import UserError
+from mien.locks import read_beside_writers
 from mien.picture_files import PictureStack
-from mien.storage import read_arrays, read_json, write_arrays, write_json
+from mien.storage import read_arrays, read_json, replace_folder, write_arrays, write_json
 from mien.tracking.scoring import Scoring
 
 _FORMAT, _VERSION = "mien.scoring", 1
@@ -45,8 +46,7 @@ def write_scoring(path: Path, scoring: Scoring, capture_hash: str | None = None)
     try:
         _write_into(temporary, scoring, capture_hash)
         temporary.chmod(0o755)
-        shutil.rmtree(path, ignore_errors=True)
-        temporary.rename(path)
+        replace_folder(path, temporary)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
@@ -60,8 +60,12 @@ def read_scoring(path: Path, capture_hash: str | None = None) -> Scoring:
         capture_hash: of the capture that it has to belong to; None for any.
 
     Raises:
-        UserError: something is missing, damaged, not what was written, or of another capture.
+        UserError: something is missing, damaged, not what was written, of another capture, or being written.
     """
+    return read_beside_writers(lambda: _read_scoring(path, capture_hash), [path], [path.parent])
+
+
+def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
     content = read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE)
     if capture_hash is not None and content.get("capture_hash", capture_hash) != capture_hash:
         raise UserError(

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from mien.training.run import (
         check_data,
         check_run,
+        check_untouched,
         outdated_sequences,
         read_curves,
         read_run_config,
@@ -25,6 +26,7 @@ else:
             "run": [
                 "check_data",
                 "check_run",
+                "check_untouched",
                 "outdated_sequences",
                 "read_curves",
                 "read_run_config",
@@ -46,6 +48,7 @@ __all__ = [
     "check_data",
     "check_held_out",
     "check_run",
+    "check_untouched",
     "held_out",
     "outdated_sequences",
     "read_curves",

@@ -17,6 +17,7 @@ from mien.avatar import MethodConfig, method_of, write_avatar
 from mien.camera import Camera
 from mien.config import encode
 from mien.errors import UserError
+from mien.locks import WAIT, check_free
 from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
 from mien.tracking import Tracking
 from mien.training.checkpoint import TrainingState
@@ -27,6 +28,8 @@ _FORMAT, _VERSION = "mien.run", 1
 _SUMMARY = "mien.training"
 _REMEDY = "put a copy back, or train again under another name (--run NAME); the run's folder holds the trained avatar"
 _AGAIN = "delete the run's training.json and run the same `mien train` again, which goes on from the last checkpoint"
+ANOTHER_RUN = f"{WAIT}, or give this run another name (--run NAME)"
+"""What to do where another process trains the run."""
 _FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
 """Settings that say how a run is made, not what it is: it may go on with others."""
 
@@ -122,6 +125,16 @@ def run_camera(run_dir: Path) -> Camera:
 def is_finished(run_dir: Path) -> bool:
     """Whether the run was trained to its end."""
     return (run_dir / "training.json").is_file()
+
+
+def check_untouched(run_dir: Path) -> None:
+    """Find before any work that no other process is at a run that is to be trained.
+
+    Raises:
+        BeingWrittenError: one is.
+    """
+    if not is_finished(run_dir):
+        check_free(run_dir, ANOTHER_RUN)
 
 
 def write_results(run_dir: Path, state: TrainingState) -> None:

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture import Capture, read_capture, read_capture_hash
+from mien.errors import UserError
+from mien.locks import read_beside_writers
 from mien.tracking import Tracking, read_scoring, read_tracking
 from mien.training.photometric import Box
 
@@ -144,7 +146,16 @@ def read_sequence(folder: Path) -> Sequence:
     """The sequence in FOLDER/{capture,tracking,scoring}; its name is the folder's.
 
     Raises:
-        UserError: a part is missing, damaged or of another version, or the scoring is of other pictures.
+        UserError: a part is missing, damaged, of another version or being written, or the scoring is of other pictures.
     """
-    masks = read_scoring(folder / "scoring", read_capture_hash(folder / "capture")).masks
-    return Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), masks)
+    parts = [folder / name for name in ("capture", "tracking", "scoring")]
+    return read_beside_writers(lambda: _read_parts(folder), parts, [folder])
+
+
+def _read_parts(folder: Path) -> Sequence:
+    capture_hash = read_capture_hash(folder / "capture")
+    masks = read_scoring(folder / "scoring", capture_hash).masks
+    sequence = Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), masks)
+    if read_capture_hash(folder / "capture") != capture_hash:
+        raise UserError(f"{folder / 'capture'}: was replaced while it was read; run the same command again")
+    return sequence

@@ -17,6 +17,7 @@ from mien.avatar import Avatar, MethodConfig, Progress, load_avatar, method_name
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
 from mien.face import FaceModel, concatenate
+from mien.locks import hold
 from mien.progress import Advance, progress_bar
 from mien.render import rasterize
 from mien.training.adam import Adam
@@ -25,7 +26,7 @@ from mien.training.density import density_strategy
 from mien.training.face_track import FaceTrack
 from mien.training.frames import FrameOrder, background_at, density_random, training_frames
 from mien.training.losses import picture_losses, train_psnr
-from mien.training.run import claim_run, is_finished, write_results
+from mien.training.run import ANOTHER_RUN, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Targets
 from mien.training.settings import TrainSettings
 
@@ -56,19 +57,30 @@ def train(
     bytes as if it had never stopped; if that run is finished, its avatar is loaded.
 
     Raises:
-        UserError: `run_dir` holds another run; the face model is not the one the sequences were tracked with; they
-            were not tracked together; nothing is left to train on.
+        UserError: `run_dir` holds another run, or another process writes it; the face model is not the one the
+            sequences were tracked with; they were not tracked together; nothing is left to train on.
         KeyboardInterrupt: after Ctrl-C, when a checkpoint is safe.
     """
-    _check_trackings(sequences, face_model)
+    check_trackings(sequences, face_model)
     order = FrameOrder(training_frames(sequences, settings), settings.seed)
-    claim_run(run_dir, sequences, method_config, settings)
     if is_finished(run_dir):
+        claim_run(run_dir, sequences, method_config, settings)
         return load_avatar(run_dir)
-    like = like_on(choose_device(settings.device))
-    targets = [Targets(sequence, settings.resolution, len(sequences), like) for sequence in sequences]
-    data = TrainingData(order, tuple(targets))
-    state = start(sequences, face_model, method_config, settings, like)
+    with hold(run_dir, remedy=ANOTHER_RUN):
+        claim_run(run_dir, sequences, method_config, settings)
+        if is_finished(run_dir):  # by another process, before this one got the lock
+            return load_avatar(run_dir)
+        like = like_on(choose_device(settings.device))
+        targets = [Targets(sequence, settings.resolution, len(sequences), like) for sequence in sequences]
+        state = start(sequences, face_model, method_config, settings, like)
+        _train_to_the_end(state, TrainingData(order, tuple(targets)), settings, run_dir, progress)
+    return state.avatar
+
+
+def _train_to_the_end(
+    state: TrainingState, data: TrainingData, settings: TrainSettings, run_dir: Path, progress: ProgressBar
+) -> None:
+    """Go on from the newest checkpoint, if there is one, and write the results."""
     resume(run_dir / "checkpoints", state)
     with _one_torch_thread(), _deferred_interrupt() as interrupted:
         with progress("training", settings.steps, state.step) as advance:
@@ -80,10 +92,14 @@ def train(
                 if interrupted():
                     raise KeyboardInterrupt
         write_results(run_dir, state)
-    return state.avatar
 
 
-def _check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
+def check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
+    """Sequences go together: one person, fitted with this face model.
+
+    Raises:
+        UserError: they were tracked apart, or with another face model.
+    """
     for sequence in sequences:
         if sequence.tracking.face_model_hash != face_model.content_hash:
             raise UserError(

@@ -6,7 +6,8 @@ from pathlib import Path
 from mien.errors import UserError
 from mien.face import FaceModel, add_face_model, added_from, load_face_model
 from mien.face.flame import flame_face_model, read_flame
-from mien.face.loading import is_built_in
+from mien.face.loading import cache_folder, is_built_in
+from mien.locks import hold
 from mien.progress import say
 from mien.storage import file_digest
 from mien.tracking.landmark_embedding import EmbeddingSettings, embed_landmarks
@@ -47,6 +48,11 @@ def add_face_model_stage(path: Path, name: str | None = None, shareable: bool = 
         raise UserError(f"{name!r}: give the face model a name of letters, digits, '-' and '_' with --name")
     if not path.is_file():
         raise UserError(f"{path}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz")
+    with hold(cache_folder() / "face_models" / "added" / name):
+        return _add(path, name, shareable)
+
+
+def _add(path: Path, name: str, shareable: bool) -> FaceModel:
     digest, known = file_digest(path), added_from(name)
     other = f"add this one under another: mien face-models --add {path} --name NAME"
     if is_built_in(name):

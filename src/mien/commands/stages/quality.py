@@ -25,8 +25,9 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import EvaluationSettings
 from mien.face import load_face_model
+from mien.locks import WAIT, hold
 from mien.progress import say
-from mien.storage import read_json, write_atomically, write_json
+from mien.storage import read_json, replace_folder, write_atomically, write_json
 from mien.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
 from mien.tracking import TrackingSettings, read_tracking
 from mien.training import TrainSettings, read_training_summary
@@ -43,10 +44,17 @@ def quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int,
     """Walk the reference captures and print their figures; writes OUT/quality.json, quality.md and contact_sheet.png.
 
     Raises:
-        UserError: a capture or the method is unknown.
+        UserError: a capture or the method is unknown, or another process walks them in the same folder.
     """
     references = [reference_named(name) for name in captures or REFERENCES]
     method_named(method)
+    with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
+        rows = _walk(references, out, method, steps)
+    print(json.dumps([row.as_json() for row in rows]) if as_json else markdown_table(rows))
+    say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
+
+
+def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int) -> list[QualityRow]:
     rows, strips = [], []
     for reference in references:
         row, strip = run_reference(reference, out, method, steps or reference.steps)
@@ -56,8 +64,7 @@ def quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int,
         write_json(out / "quality.json", _FORMAT, _VERSION, json.loads(json.dumps(content)))
         write_atomically(out / "quality.md", lambda path: path.write_text(markdown_table(rows), encoding="utf-8"))
         _write_png(out / "contact_sheet.png", np.concatenate(strips))
-    print(json.dumps([row.as_json() for row in rows]) if as_json else markdown_table(rows))
-    say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
+    return rows
 
 
 def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
@@ -105,10 +112,10 @@ def _capture(workspace: Workspace, drawn: Path, name: str) -> None:
     if target.is_dir() and read_capture_hash(target) == read_capture_hash(drawn / "capture"):
         return
     aside = target.with_name(".capture.partial")
-    for folder in (aside, target):
-        shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(drawn / "capture", aside)
-    aside.rename(target)
+    with hold(workspace.sequence_dir(name)):
+        shutil.rmtree(aside, ignore_errors=True)
+        shutil.copytree(drawn / "capture", aside)
+        replace_folder(target, aside)
 
 
 def _errors(workspace: Workspace, drawn: Path, name: str) -> TrackingErrors:

@@ -14,6 +14,7 @@ from mien.capture.video import count_frames
 from mien.commands.stages.face_models import face_model_of
 from mien.errors import UserError
 from mien.face import FaceModel
+from mien.locks import hold
 from mien.progress import say
 from mien.tracking import (
     Tracking,
@@ -52,18 +53,53 @@ def tracking_stage(
 
     The face model is given by its name or by a file (`face_model_of`). Writes overlays and, once for ever, the scoring
     masks. Sequences with too few faces are left out, unless that leaves
-    none; returns the others' trackings by name.
+    none; returns the others' trackings by name. Nobody else may write any of the sequences meanwhile, unless all is
+    current and nothing is written.
+
+    Raises:
+        BeingWrittenError: another process writes one of the sequences.
     """
     face_model = face_model_of(face_model_choice)
     names = workspace.sequence_names()
     if not names:
         raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")
-    fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
-    trackings = None if again else _current_trackings(workspace, names, fingerprint)
-    if trackings is None:
-        trackings = _track(workspace, names, face_model, settings, fingerprint, preview)
-    else:
-        say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
+    finished = None if again else _finished_trackings(workspace, names, face_model, settings, overlay)
+    if finished is not None:
+        say(f"{', '.join(finished)}: the tracking is current, nothing to do")
+        return finished
+    with hold(*(workspace.sequence_dir(name) for name in names)):
+        fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
+        trackings = None if again else _current_trackings(workspace, names, fingerprint)
+        if trackings is None:
+            trackings = _track(workspace, names, face_model, settings, fingerprint, preview)
+        else:
+            say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
+        _write_what_follows(workspace, trackings, face_model, overlay)
+    return trackings
+
+
+def _finished_trackings(
+    workspace: Workspace, names: list[str], face_model: FaceModel, settings: TrackingSettings, overlay: Overlay
+) -> dict[str, Tracking] | None:
+    """The trackings, if all that the stage writes is there and current."""
+    try:
+        fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
+        trackings = _current_trackings(workspace, names, fingerprint, tell=False)
+        for name, tracking in (trackings or {}).items():
+            folder = workspace.sequence_dir(name)
+            if not scoring_exists(folder / "scoring", read_capture_hash(folder / "capture")):
+                return None
+            if not all(_is_shown(folder, tracking, overlay)):
+                return None
+    except UserError:  # told where it is written again
+        return None
+    return trackings
+
+
+def _write_what_follows(
+    workspace: Workspace, trackings: Mapping[str, Tracking], face_model: FaceModel, overlay: Overlay
+) -> None:
+    """Scoring masks, reports and overlays, where they are missing or older."""
     for name, tracking in trackings.items():
         folder = workspace.sequence_dir(name)
         capture_hash = read_capture_hash(folder / "capture")
@@ -74,7 +110,6 @@ def tracking_stage(
             scoring = make_scoring(capture, tracking, face_model, scratch=folder)
             write_scoring(folder / "scoring", scoring, capture_hash)
         _show_tracking(folder, tracking, face_model, overlay)
-    return trackings
 
 
 def _tracking_fingerprint(
@@ -85,8 +120,10 @@ def _tracking_fingerprint(
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-def _current_trackings(workspace: Workspace, names: list[str], fingerprint: str) -> dict[str, Tracking] | None:
-    """The trackings that are there, if they are what these captures and settings give; says why where not."""
+def _current_trackings(
+    workspace: Workspace, names: list[str], fingerprint: str, tell: bool = True
+) -> dict[str, Tracking] | None:
+    """The trackings that are there, if they are what these captures and settings give; `tell` says why where not."""
     found, missing = {}, []
     for name in names:
         folder = workspace.sequence_dir(name) / "tracking"
@@ -96,7 +133,8 @@ def _current_trackings(workspace: Workspace, names: list[str], fingerprint: str)
         try:
             found[name] = read_tracking(folder)
         except UserError as error:
-            say(f"{str(error).split('; ')[0]}; tracking again")
+            if tell:
+                say(f"{str(error).split('; ')[0]}; tracking again")
             return None
     together = {member for tracking in found.values() for member in tracking.settings.get("tracked_together", [])}
     if not found:
@@ -104,6 +142,8 @@ def _current_trackings(workspace: Workspace, names: list[str], fingerprint: str)
     if all(tracking.settings.get("fingerprint") == fingerprint for tracking in found.values()):
         # Those without a tracking had too few faces, or tracking was stopped before they were written.
         return None if set(missing) & together else found
+    if not tell:
+        return None
     added = [name for name in missing if name not in together]
     reason = f"{', '.join(added)} came new" if added else "captures or settings changed"
     say(f"{reason}: all {len(names)} sequences are tracked again, so that they share one identity" if len(names) > 1
@@ -157,20 +197,33 @@ def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking])
 
 def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, overlay: Overlay) -> None:
     """Write the residual report and overlay.mp4, unless those there are newer than the tracking."""
-    video, report, written = (folder / "tracking" / name for name in ("overlay.mp4", "report.html", "tracking.json"))
-    every = overlay_stride(len(tracking.valid)) if overlay == "auto" else 1
-    shown = _is_newer(video, written) and count_frames(video) == len(range(0, len(tracking.valid), every))
-    if _is_newer(report, written) and (shown or overlay == "none"):
+    reported, shown = _is_shown(folder, tracking, overlay)
+    if reported and shown:
         return
     capture: Capture = read_capture(folder / "capture")
-    if not _is_newer(report, written):
+    if not reported:
         findings = write_residual_report(folder / "tracking", capture, tracking, face_model)
-        say(f"{capture.name}: {findings} See {report}")
-    if not shown and overlay != "none":
+        say(f"{capture.name}: {findings} See {folder / 'tracking' / 'report.html'}")
+    if not shown:
+        every = _stride(tracking, overlay)
         if every > 1:
             say(f"{capture.name}: the overlay shows every {every}th frame of {len(tracking.valid)}; `--overlay all` "
                 "shows them all")  # fmt: skip
-        write_overlay(video, capture, tracking, face_model, every)
+        write_overlay(folder / "tracking" / "overlay.mp4", capture, tracking, face_model, every)
+
+
+def _is_shown(folder: Path, tracking: Tracking, overlay: Overlay) -> tuple[bool, bool]:
+    """Whether the residual report, and the overlay that is asked for, are there and newer than the tracking."""
+    video, report, written = (folder / "tracking" / name for name in ("overlay.mp4", "report.html", "tracking.json"))
+    if overlay == "none":
+        return _is_newer(report, written), True
+    frames = len(range(0, len(tracking.valid), _stride(tracking, overlay)))
+    return _is_newer(report, written), _is_newer(video, written) and count_frames(video) == frames
+
+
+def _stride(tracking: Tracking, overlay: Overlay) -> int:
+    """The overlay shows every so many-th frame."""
+    return overlay_stride(len(tracking.valid)) if overlay == "auto" else 1
 
 
 def _is_newer(path: Path, than: Path) -> bool:

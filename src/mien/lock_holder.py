@@ -1,0 +1,82 @@
+"""Who holds a lock: signed into the lock file, read by those who come too late. `mien.locks` has the locks."""
+
+import json
+import os
+import shlex
+import socket
+import sys
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from mien.errors import UserError
+
+_BEGINNING = b'{"format": "mien.lock"'
+"""Every lock file of ours begins so."""
+_MOST_BYTES = 4096
+_SHOWN = {"host": 60, "since": 30, "command": 200}
+"""Characters of what a holder says about itself that are shown."""
+
+
+def sign(handle: int, file: Path) -> None:
+    """Write into an open lock file that this process holds it: pid, host, time and command line.
+
+    Raises:
+        UserError: the file is not one of ours, and is left as it is.
+    """
+    found = os.pread(handle, len(_BEGINNING), 0)
+    if found != _BEGINNING[: len(found)]:
+        raise UserError(f"{file}: is no lock file of mien; it takes the place of one; move it away")
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]) if sys.argv else "python"
+    about = {
+        "format": "mien.lock",
+        "pid": os.getpid(),
+        "host": socket.gethostname()[: _SHOWN["host"]],
+        "since": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
+        "command": command[: _SHOWN["command"] + 1],
+    }
+    text = json.dumps(about).encode()
+    with suppress(OSError):  # a full disk, or another user's file: the lock holds without a name in it
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, text, 0)
+
+
+def read_holder(handle: int) -> str | None:
+    """Who holds the lock of an open lock file, in words on one line; what the file says is not trusted.
+
+    None where it does not say, or names a process that has ended: the holder has not signed yet.
+    """
+    about = _parsed(os.pread(handle, _MOST_BYTES, 0))
+    if about is None or not _may_live(about):
+        return None
+    words = {name: _shown(about.get(name), longest) for name, longest in _SHOWN.items()}
+    return f"process {about['pid']} on {words['host']}, since {words['since']}: {words['command']}"
+
+
+def _parsed(text: bytes) -> dict[str, Any] | None:
+    try:
+        about = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    pid = about.get("pid") if isinstance(about, dict) else None
+    return about if isinstance(pid, int) and 0 < pid < 1 << 31 else None
+
+
+def _may_live(about: dict[str, Any]) -> bool:
+    """False where it is a process of this machine that has ended."""
+    if about.get("host") != socket.gethostname()[: _SHOWN["host"]]:
+        return True
+    try:
+        os.kill(about["pid"], 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # another user's
+        return True
+    return True
+
+
+def _shown(text: object, longest: int) -> str:
+    """Untrusted text for a terminal: on one line, without control characters, cut."""
+    plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text)[: longest + 1])
+    return plain if len(plain) <= longest else plain[:longest] + "..."

@@ -1,0 +1,165 @@
+"""Two processes that run `mien` at the same moment, many times; and a workspace for them on which all is quick."""
+
+import contextlib
+import importlib
+import io
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from mien.cli import main
+from mien.face import add_face_model
+from mien.storage import write_arrays
+from toy_scene import toy_capture, toy_face_model, toy_tracking
+
+WORK = {
+    "train": ("mien.training.trainer", "_train_to_the_end"),
+    "capture": ("mien.capture.from_video", "survey_source"),
+    "evaluate": ("mien.evaluation.evaluate", "_evaluate"),
+}
+"""What a command does while it writes: module and function."""
+_TIMESTEPS, _SIZE = 5, 48
+_PATIENCE_SECONDS = 120
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended."""
+
+    pid: int
+    code: int
+    told: str
+    """Standard error."""
+    worked: list[tuple[str, float, float]]
+    """What of `WORK` was done, from when to when on the system's clock."""
+
+
+class Pair:
+    """Two processes that have imported everything, and start each round together."""
+
+    def __init__(self, cache: Path, without_locks: bool = False) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._barrier = barrier = context.Barrier(2)  # kept: it goes with its last name
+        self._ends, self._processes = [], []
+        for _ in range(2):
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_serve, args=(theirs, barrier, cache, without_locks), daemon=True)
+            process.start()
+            self._ends.append(ours)
+            self._processes.append(process)
+
+    def run(self, *commands: list[str]) -> list[Outcome]:
+        """One command in each process, begun at once."""
+        for end, command in zip(self._ends, commands, strict=True):
+            end.send(command)
+        assert all(end.poll(_PATIENCE_SECONDS) for end in self._ends), "a command does not end"
+        return [end.recv() for end in self._ends]
+
+    def close(self) -> None:
+        for end, process in zip(self._ends, self._processes, strict=True):
+            with contextlib.suppress(OSError):
+                end.send(None)
+            process.join(10)
+            process.kill()
+
+
+def _serve(pipe: Connection, barrier: Barrier, cache: Path, without_locks: bool) -> None:
+    os.environ |= {"MIEN_CACHE": str(cache), "MIEN_THREADS": "1"}
+    torch.set_num_threads(1)
+    worked: list[tuple[str, float, float]] = []
+    for kind, (module, name) in WORK.items():
+        _watch(importlib.import_module(module), name, kind, worked)
+    if without_locks:
+        for module in ("mien.training.trainer", "mien.capture.from_video", "mien.evaluation.evaluate"):
+            importlib.import_module(module).hold = lambda *_, **__: contextlib.nullcontext()  # type: ignore[attr-defined]
+    for kind in ("capture", "create", "evaluate", "train", "render"):
+        importlib.import_module(f"mien.commands.{kind}")
+    for stage in ("capturing", "evaluating", "tracking", "training", "pictures"):
+        importlib.import_module(f"mien.commands.stages.{stage}")
+    while (command := pipe.recv()) is not None:
+        worked.clear()
+        sys.argv = ["mien", *command]
+        with contextlib.redirect_stderr(io.StringIO()) as told, contextlib.redirect_stdout(io.StringIO()):
+            barrier.wait(_PATIENCE_SECONDS)
+            code = main(command)
+        pipe.send(Outcome(os.getpid(), code, told.getvalue(), list(worked)))
+
+
+def _watch(module: Any, name: str, kind: str, worked: list[tuple[str, float, float]]) -> None:
+    original = getattr(module, name)
+
+    def watched(*arguments: Any, **named: Any) -> Any:
+        began = time.monotonic()
+        try:
+            return original(*arguments, **named)
+        finally:
+            worked.append((kind, began, time.monotonic()))
+
+    setattr(module, name, watched)
+
+
+@contextlib.contextmanager
+def pair(cache: Path, without_locks: bool = False) -> Iterator[Pair]:
+    """Two processes with this folder of face models; `without_locks` breaks them, to see what the tests say."""
+    both = Pair(cache, without_locks)
+    try:
+        yield both
+    finally:
+        both.close()
+
+
+@dataclass(frozen=True)
+class Studio:
+    """A filmed toy head: a workspace in which it is captured and tracked, and the commands that made it."""
+
+    root: Path
+    video: Path
+    given: list[str]
+    """Options of a capture: mattes and landmarks, so that nothing needs to be detected."""
+    look: list[str]
+    """Options of `create` that find everything up to the tracking current, and train for a moment."""
+
+
+def toy_studio(folder: Path, cache: Path) -> Studio:
+    """Film, capture and track the toy head, without any detector; MIEN_CACHE has to be `cache`."""
+    from mien.commands.stages.tracking import _tracking_fingerprint
+    from mien.tracking import Scoring, TrackingSettings, write_scoring, write_tracking
+    from mien.workspace import Workspace
+
+    assert os.environ["MIEN_CACHE"] == str(cache)
+    model = toy_face_model()
+    add_face_model(model, folder / "toy.npz", "none")
+    film, alpha = toy_capture(model, _TIMESTEPS, _SIZE)
+    (folder / "mattes").mkdir(parents=True)
+    (folder / "pictures").mkdir()
+    for timestep in range(_TIMESTEPS):
+        cv2.imwrite(str(folder / "mattes" / f"{timestep}.png"), alpha[timestep, 0])
+        cv2.imwrite(str(folder / "pictures" / f"{timestep}.png"), film.images[timestep, 0][..., ::-1])
+    marks = np.random.default_rng(0).uniform(8, 40, (_TIMESTEPS, 478, 2)).astype(np.float32)
+    write_arrays(folder / "landmarks.safetensors", {"landmarks": marks})
+    given = ["--capture.crop", "none", "--capture.mattes", str(folder / "mattes")]
+    given += ["--capture.landmarks", str(folder / "landmarks.safetensors")]
+    root, video = folder / "workspace", folder / "pictures"
+    assert main(["capture", str(video), "--out", str(root), "--name", "clip", *given]) == 0
+    workspace, sequence = Workspace(root), root / "sequences" / "clip"
+    fingerprint = _tracking_fingerprint(workspace, ["clip"], model, TrackingSettings())
+    made_from = {"fingerprint": fingerprint, "tracked_together": ["clip"]}
+    write_tracking(sequence / "tracking", replace(toy_tracking(model, _TIMESTEPS, _SIZE), settings=made_from))
+    (sequence / "tracking" / "report.html").write_text("a report")
+    crops = np.tile(np.array([4, 4, 30, 30], np.int64), (_TIMESTEPS, 1, 1))
+    from mien.capture import read_capture_hash
+
+    write_scoring(sequence / "scoring", Scoring(alpha, crops), read_capture_hash(sequence / "capture"))
+    look = ["--name", "clip", "--face-model", "toy", "--overlay", "none", "--steps", "3", "--split", "tail", *given]
+    return Studio(root, video, given, look)
