@@ -16,7 +16,7 @@ if TYPE_CHECKING:
         run_camera,
     )
     from mien.training.sequence import Sequence, read_sequence
-    from mien.training.settings import Split, TrainSettings, check_held_out
+    from mien.training.settings import DIALS, Split, TrainSettings, check_held_out
     from mien.training.split import held_out
     from mien.training.trainer import train
 else:
@@ -34,13 +34,14 @@ else:
                 "run_camera",
             ],
             "sequence": ["Sequence", "read_sequence"],
-            "settings": ["Split", "TrainSettings", "check_held_out"],
+            "settings": ["DIALS", "Split", "TrainSettings", "check_held_out"],
             "split": ["held_out"],
             "trainer": ["train"],
         },
     )
 
 __all__ = [
+    "DIALS",
     "PRESETS",
     "Preset",
     "Sequence",
