@@ -77,7 +77,7 @@ def overlay(base: Settings, changes: Any, where: str, owner: str) -> Settings:
 
 
 def no_such_setting(given: str, owner: str, near: Sequence[str], known: Sequence[str]) -> str:
-    """What to tell about a setting that there is not: the nearest name, if any is near, and all names that there are."""
+    """What to tell about a setting that there is not: the nearest name, if one is near, and all that there are."""
     hint = f"did you mean {near[0]}? " if near else ""
     return f"{given}: {owner} has no such setting; {hint}there are: {', '.join(known)}"
 

@@ -45,8 +45,12 @@ class Range:
         return all(self.least <= number <= self.most or (self.or_zero and number == 0) for number in numbers)
 
     def __str__(self) -> str:
-        """The range for people: "0, or from 16 to 8192"."""
-        bounds = self.words or f"from {_short(self.least)} to {_short(self.most)}"
+        """The range for people: "from 0 to 3"."""
+        return self.asked("")
+
+    def asked(self, numbers: str) -> str:
+        """What to ask for, where `numbers` says what kind: "a number from 0 to 3"."""
+        bounds = self.words or f"{numbers} from {_short(self.least)} to {_short(self.most)}".strip()
         return ("0, or " if self.or_zero else "") + bounds + (", ascending" if self.ascending else "")
 
 
@@ -99,8 +103,8 @@ def check_range(value: Any, allowed: Range, option: str) -> None:
         UserError: it is out of range; names `option`, the value and the range.
     """
     if not allowed.holds(value):
-        article = "" if allowed.words else "a number " if not isinstance(value, tuple) else "numbers "
-        raise UserError(f"{option} {shown(value)}: give {article}{allowed}")
+        asked = allowed.asked("numbers" if isinstance(value, tuple) else "a number")
+        raise UserError(f"{option} {shown(value)}: give {asked}")
 
 
 def range_of(hint: Any) -> Range | None:

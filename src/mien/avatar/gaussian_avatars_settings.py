@@ -40,7 +40,7 @@ class GaussianAvatarsConfig(MethodConfig):
     scale_weight: Annotated[float, NOT_NEGATIVE] = 1.0
     """Weight of the scale penalty: how far scales exceed that threshold."""
     density: GradientSettings = field(default_factory=GradientSettings)
-    """When and where Gaussians grow and are removed."""
+    """Density control: when and where Gaussians grow and are removed."""
 
 
 PRESETS = {"draft": GaussianAvatarsConfig(), "standard": GaussianAvatarsConfig()}

@@ -42,8 +42,8 @@ class HeadGasConfig(MethodConfig):
     network_rate: Rate = Rate(2e-3, 2e-4)
     """Learning rate of the network, per step."""
     density: GradientSettings = field(default_factory=_density)
-    """When and where Gaussians grow and are removed. Opacities come from the network, so none is ever reset; the
-    first of `opacity_resets` still says when large Gaussians begin to be removed."""
+    """Density control: when and where Gaussians grow and are removed. Opacities come from the network, so none is ever
+    reset; the first of `opacity_resets` still says when large Gaussians begin to be removed."""
 
 
 PRESETS = {"draft": HeadGasConfig(), "standard": HeadGasConfig()}

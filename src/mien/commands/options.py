@@ -107,20 +107,18 @@ class TrainOptions:
             config = applied(config, self.method_settings)
         # Face tuning has two options that say the same: one that differs from the default was typed.
         default = type(self).face_tuning
-        typed = default not in (
-            self.face_tuning and config.face_tuning.enabled,
-            self.face_tuning or config.face_tuning.enabled,
-        )
+        typed = {self.face_tuning, config.face_tuning.enabled} != {default}
         config = replace(config, face_tuning=replace(config.face_tuning, enabled=default != typed))
         config.check()
         return config
 
-    def ignored(self) -> str | None:
-        """What the file says that a run does not take from it, for people."""
+    def say_what_is_ignored(self) -> None:
+        """Say what the file holds that the run does not take from it: the data that its own run was trained on."""
+        from mien.progress import say
+
         sequences = read_config_file(self.config).sequences if self.config else ()
-        if not sequences:
-            return None
-        return f"{self.config}: method and settings are taken from it, not the data it was trained on ({', '.join(sequences)})"
+        if sequences:
+            say(f"{self.config}: method and settings are taken from it, not its sequences ({', '.join(sequences)})")
 
 
 def training_options(command: type) -> str | None:
@@ -143,7 +141,7 @@ def with_settings(command: type, arguments: Sequence[str]) -> type:
     chosen = _chosen(arguments)
     if name is None or chosen.method not in (None, *METHODS) or chosen.preset not in (None, *PRESETS):
         return command  # for wrong names, which tyro tells
-    file = read_config_file(Path(chosen.config)) if chosen.config else None
+    file = read_config_file(Path(chosen.config)) if chosen.config is not None else None
     options = _with_defaults(chosen.method, chosen.preset or TrainOptions.preset, file, arguments)
     hint = get_type_hints(command, include_extras=True)[name]
     marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()

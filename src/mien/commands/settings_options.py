@@ -45,12 +45,12 @@ class Leaf:
 
 
 def leaves(settings: Any, prefix: str, names: Sequence[str] | None = None) -> list[Leaf]:
-    """All fields that hold values, with what the help says about them; only some of the outermost, if `names` are given.
+    """All fields that hold values, with what the help says about them.
 
     Args:
         settings: A dataclass whose values are the defaults.
         prefix: How its options begin: "method" for --method.NAME.
-        names: Outermost fields to take.
+        names: Outermost fields to take; all of them without it.
     """
     about = (inspect.getdoc(type(settings)) or "").splitlines()[0]
     taken = [name for name in _names(settings) if names is None or name in names]
