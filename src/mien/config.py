@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from mien.errors import UserError
-from mien.ranges import check_range, range_of
+from mien.ranges import ToLoad, check_range, marks_of, range_of
 
 Settings = TypeVar("Settings")
 
@@ -32,7 +32,8 @@ def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make i
     """What `encode` encoded, as the type `hint`; fields that are missing get their defaults.
 
     Raises:
-        UserError: a field is unknown, is missing without a default, or has a value of another type; ends in `remedy`.
+        UserError: a field is unknown, is missing without a default, or has a value of another type or out of its range;
+            ends in `remedy`.
     """
     try:
         return _decode(hint, value, where)
@@ -69,25 +70,27 @@ def overlay(base: Settings, changes: Any, where: str, owner: str) -> Settings:
         if is_dataclass(value):
             changed[name] = overlay(value, change, place, owner)
             continue
-        allowed = range_of(hints[name])
-        changed[name] = _decode_or_ask(hints[name], change, place)
-        if allowed is not None:
+        plain = get_args(hints[name])[0] if get_origin(hints[name]) is Annotated else hints[name]
+        try:
+            changed[name] = _decode(plain, change, place)
+        except UserError:
+            raise UserError(f"{place} {_in_short(change)}: give {_in_words(plain)}") from None
+        if (allowed := range_of(hints[name])) is not None:
             check_range(changed[name], allowed, place)
     return replace(base, **changed)
+
+
+def for_loading(settings: Settings) -> Settings:
+    """The same settings with the least of what counts only when an avatar is begun (`ToLoad`)."""
+    hints = get_type_hints(type(settings), include_extras=True)
+    marks = {name: mark for name, hint in hints.items() for mark in marks_of(hint) if isinstance(mark, ToLoad)}
+    return replace(settings, **{name: mark.value for name, mark in marks.items()})
 
 
 def no_such_setting(given: str, owner: str, near: Sequence[str], known: Sequence[str]) -> str:
     """What to tell about a setting that there is not: the nearest name, if one is near, and all that there are."""
     hint = f"did you mean {near[0]}? " if near else ""
     return f"{given}: {owner} has no such setting; {hint}there are: {', '.join(known)}"
-
-
-def _decode_or_ask(hint: Any, value: Any, place: str) -> Any:
-    plain = get_args(hint)[0] if get_origin(hint) is Annotated else hint
-    try:
-        return _decode(plain, value, place)
-    except UserError:
-        raise UserError(f"{place} {_in_short(value)}: give {_in_words(plain)}") from None
 
 
 def _in_words(hint: Any) -> str:
@@ -107,6 +110,11 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
     if hint is Any:
         return value
     origin = get_origin(hint)
+    if origin is Annotated:
+        found = _decode(get_args(hint)[0], value, where)
+        if (allowed := range_of(hint)) is not None:
+            check_range(found, allowed, where)
+        return found
     if origin in (Union, types.UnionType):
         return _decode_union(get_args(hint), value, where)
     if is_dataclass(hint):
@@ -136,7 +144,7 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
 def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
         raise UserError(f"{where}: {_in_short(value)} is not a {hint.__name__}")
-    hints = get_type_hints(hint)
+    hints = get_type_hints(hint, include_extras=True)
     known = {f.name: f for f in fields(hint)}
     unknown = set(value) - set(known) - {"kind"}
     missing = [

@@ -61,6 +61,16 @@ class NotBelow:
     other: str
 
 
+@dataclass(frozen=True)
+class ToLoad:
+    """A mark beside a field that counts only when an avatar is begun.
+
+    An avatar whose tensors are about to be loaded is made with this value, so that no more is made than is read.
+    """
+
+    value: int
+
+
 FRACTION = Range(0, 1)
 """A share, an opacity, or a time as a fraction of the run."""
 POSITIVE = Range(1e-9, 1e9, words=f"a number above 0, {1e9:g} at most")
@@ -90,7 +100,7 @@ def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
         allowed = range_of(hint)
         if allowed is not None:
             check_range(value, allowed, option(field.name))
-        for mark in _marks(hint):
+        for mark in marks_of(hint):
             if isinstance(mark, NotBelow) and value < getattr(settings, mark.other):
                 other = f"{option(mark.other)} {shown(getattr(settings, mark.other))}"
                 raise UserError(f"{option(field.name)} {shown(value)}: give at least as much as {other}")
@@ -109,7 +119,7 @@ def check_range(value: Any, allowed: Range, option: str) -> None:
 
 def range_of(hint: Any) -> Range | None:
     """The range in a field's type hint, if it has one."""
-    return next((mark for mark in _marks(hint) if isinstance(mark, Range)), None)
+    return next((mark for mark in marks_of(hint) if isinstance(mark, Range)), None)
 
 
 def shown(value: Any) -> str:
@@ -121,7 +131,8 @@ def shown(value: Any) -> str:
     return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "..."
 
 
-def _marks(hint: Any) -> tuple[Any, ...]:
+def marks_of(hint: Any) -> tuple[Any, ...]:
+    """What stands in a field's type hint besides its type."""
     return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
 
 

@@ -4,10 +4,8 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import MAX_GAUSSIANS, GradientSettings, MethodConfig
-from mien.ranges import Range
-
-_WIDTH = Range(1, 4096)
+from mien.avatar.settings import GradientSettings, MethodConfig
+from mien.ranges import Range, ToLoad
 
 
 def _density() -> GradientSettings:
@@ -18,15 +16,15 @@ def _density() -> GradientSettings:
 class HeadGasConfig(MethodConfig):
     """Settings of HeadGaS; defaults suit a CPU and runs of some thousand steps."""
 
-    points: Annotated[int, Range(4, MAX_GAUSSIANS.most)] = 2500
+    points: Annotated[int, Range(4, 1_000_000), ToLoad(4)] = 2500
     """Number of Gaussians to begin with, sampled on the subject's mesh."""
-    features: Annotated[int, _WIDTH] = 16
+    features: Annotated[int, Range(1, 1024)] = 16
     """Number of latent features of each Gaussian (paper: 32). Memory and time of a step grow with it."""
-    hidden: Annotated[int, _WIDTH] = 64
+    hidden: Annotated[int, Range(1, 4096)] = 64
     """Width of the network's one hidden layer."""
-    encoding_bands: Annotated[int, Range(1, 32)] = 4
+    encoding_bands: Annotated[int, Range(0, 24)] = 4
     """Number of octaves of the positional encoding."""
-    encoding_length: Annotated[float, Range(1e-4, 100)] = 0.05
+    encoding_length: Annotated[float, Range(1e-4, 1e4)] = 0.05
     """Length that counts as one unit in the positional encoding, in metres."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics that colour depends on the view by (paper: 3). With one camera, colours that
