@@ -6,12 +6,10 @@ import types
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from mien.errors import UserError
 from mien.ranges import ToLoad, check_range, marks_of, range_of
-
-Settings = TypeVar("Settings")
 
 
 def encode(value: Any) -> Any:
@@ -41,7 +39,7 @@ def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make i
         raise UserError(f"{error} (made by another version of mien?); {remedy}") from None
 
 
-def overlay(base: Settings, changes: Any, where: str, owner: str) -> Settings:
+def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
     """Settings with some fields changed, as json holds them; what is not named stays, also in settings within settings.
 
     Args:
@@ -80,7 +78,7 @@ def overlay(base: Settings, changes: Any, where: str, owner: str) -> Settings:
     return replace(base, **changed)
 
 
-def for_loading(settings: Settings) -> Settings:
+def for_loading(settings: Any) -> Any:
     """The same settings with the least of what counts only when an avatar is begun (`ToLoad`)."""
     hints = get_type_hints(type(settings), include_extras=True)
     marks = {name: mark for name, hint in hints.items() for mark in marks_of(hint) if isinstance(mark, ToLoad)}
