@@ -146,9 +146,20 @@ def test_face_tuning_has_two_options_that_agree(line: str, choices: Any) -> None
 def test_options_that_make_no_sense_are_refused_before_any_work(
     line: str, words: str, workspace: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for command in (["train", str(workspace)], ["create", str(workspace), "--out", str(workspace / "new")]):
-        assert words in complaint(capsys, [*command, *line.split()])
-    assert not list(workspace.glob("runs")) + list(workspace.glob("new"))
+    assert words in complaint(capsys, ["train", str(workspace), *line.split()])
+    assert not (workspace / "runs").exists()
+
+
+def test_create_refuses_them_as_train_does(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (workspace / "file.json").write_text('{"settings": {"steps": -1}}')
+    for line, words in (
+        ("--method.sh-degre 2", "did you mean --method.sh-degree?"),
+        ("--method.sh-degree 4", "--method.sh-degree 4: give a number from 0 to 3"),
+        (f"--config {workspace / 'file.json'}", "settings.steps -1: give a number from 1"),
+    ):
+        arguments = ["create", str(workspace), "--out", str(workspace / "new"), *line.split()]
+        assert words in complaint(capsys, arguments)
+    assert not (workspace / "new").exists()
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
@@ -187,8 +198,8 @@ def test_what_is_held_out_follows_the_file(workspace: Path, choices: Any, capsys
         ('{"format": "mien.capture"}', "has format 'mien.capture' version 1; give a run's config.json"),
         ('{"version": 2}', "version 2"),
         ('{"methods": {}}', "methods: a file of settings has no such setting; did you mean method?"),
-        ('{"method": {"kind": "nerf"}}', "no method 'nerf'; there are: gaussian_avatars"),
-        ('{"method": {"kind": []}}', "no method '[]'"),
+        ('{"method": {"kind": "nerf"}}', "method.kind nerf: give the name of a method: gaussian_avatars"),
+        ('{"method": {"kind": []}}', "method.kind (nothing): give the name of a method"),
         ('{"method": 3}', "method is no object of settings"),
         ('{"settings": {"stepps": 3}}', "settings.stepps: a run has no such setting; did you mean steps? there are"),
         ('{"settings": {"kind": "GaussianAvatarsConfig"}}', "settings.kind 'GaussianAvatarsConfig': give 'TrainSett"),
@@ -220,6 +231,10 @@ def test_what_is_held_out_follows_the_file(workspace: Path, choices: Any, capsys
         (f'{{"method": {{"scale_weight": 1{"0" * 400}}}}}', "method.scale_weight 1000"),
         (f'{{"settings": {{"steps": 1{"0" * 4000}}}}}', "settings.steps 1000"),
         ("[" * 100_000, "cannot be read as json"),
+        ('{"' + "x" * 3000 + '": 1}', "xxx...: a file of settings has no such setting"),
+        ('{"method": {"' + "x" * 3000 + '": 1}}', "xxx: gaussian_avatars has no such setting"),
+        ('{"method": {"kind": "' + "x" * 3000 + '"}}', "method.kind xxx"),
+        ('{"format": "' + "x" * 3000 + '"}', "has format 'xxx"),
         ('{"method": {"face_tuning": {"enabled": 1}}}', "method.face_tuning.enabled 1: give true or false"),
     ],
 )

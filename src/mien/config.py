@@ -62,8 +62,8 @@ def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
         if name == "kind":
             continue
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            raise UserError(no_such_setting(f"{where}.{name}", owner, near, known))
+            near = difflib.get_close_matches(name[:_LONGEST_SHOWN], known, 1)
+            raise UserError(no_such_setting(f"{where}.{name[:_LONGEST_SHOWN]}", owner, near, known))
         place, value = f"{where}.{name}", getattr(base, name)
         if is_dataclass(value):
             changed[name] = overlay(value, change, place, owner)

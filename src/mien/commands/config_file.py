@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mien.avatar import METHODS, method_named
+from mien.avatar import METHODS
 from mien.config import no_such_setting
 from mien.errors import UserError
+from mien.ranges import shown
 
 _FORMAT, _VERSION = "mien.run", 1
 _TAKEN = ("method", "settings")
@@ -43,28 +44,28 @@ def read_config_file(path: Path) -> ConfigFile:
     content = _read(path)
     for name in content:
         if name not in _TAKEN + _NOT_TAKEN:
-            near = difflib.get_close_matches(name, _TAKEN, 1)
-            raise UserError(no_such_setting(f"{path}: {name}", "a file of settings", near, _TAKEN))
+            short = shown(name)
+            near = difflib.get_close_matches(short, _TAKEN, 1)
+            raise UserError(no_such_setting(f"{path}: {short}", "a file of settings", near, _TAKEN))
     found = (content.get("format", _FORMAT), content.get("version", _VERSION))
     if found != (_FORMAT, _VERSION):
-        raise UserError(
-            f"{path}: has format {found[0]!r} version {found[1]!r}; give a run's config.json ({_FORMAT!r} version "
-            f"{_VERSION}), or leave out format and version"
-        )
+        wanted = f"a run's config.json ({_FORMAT!r} version {_VERSION})"
+        told = f"has format {found[0]!r:.80} version {found[1]!r:.80}"
+        raise UserError(f"{path}: {told}; give {wanted}, or leave out format and version")
     parts = {name: content.get(name, {}) for name in _TAKEN}
     for name, part in parts.items():
         if not isinstance(part, dict):
             raise UserError(f"{path}: {name} is no object of settings; give {{...}}")
     method = parts["method"].get("kind")
     if method is not None and (not isinstance(method, str) or method not in METHODS):
-        method_named(str(method))
+        raise UserError(f"{path}: method.kind {shown(method)}: give the name of a method: {', '.join(METHODS)}")
     changes = {name: value for name, value in parts["method"].items() if name != "kind"}
     return ConfigFile(path, method, changes, parts["settings"], _sequences(content.get("data")))
 
 
 def _sequences(data: Any) -> tuple[str, ...]:
     entries = data if isinstance(data, list) else []
-    return tuple(str(entry["sequence"]) for entry in entries if isinstance(entry, dict) and "sequence" in entry)
+    return tuple(shown(entry["sequence"]) for entry in entries if isinstance(entry, dict) and "sequence" in entry)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -96,5 +97,5 @@ def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(content) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{twice!r} stands there twice")
+        raise ValueError(f"{shown(twice)!r} stands there twice")
     return content
