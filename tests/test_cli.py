@@ -50,7 +50,9 @@ def test_help_leaves_details_to_help_all(name: str, capsys: pytest.CaptureFixtur
         shown.append(capsys.readouterr().out)
     short, whole = shown
     assert len(short.splitlines()) < 125
-    assert short.rstrip().endswith(f"mien {name} --help-all")
+    last = short.rstrip().splitlines()[-1]
+    assert f": mien {name} " in last
+    assert last.endswith("--help-all")
     detail = "--capture.max-frames" if name == "capture" else "--tracking.photometric.sizes"
     assert detail in whole
     assert detail not in short

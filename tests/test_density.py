@@ -113,6 +113,15 @@ def test_faint_and_huge_ones_go() -> None:
     assert len(early) == 1, "size is judged only after a reset that follows the start"
 
 
+def test_an_avatar_keeps_one_gaussian_whatever_is_pruned() -> None:
+    store = make_store([0.001] * 3)
+    store.assign("opacity_logits", torch.logit(torch.tensor([0.1, 0.3, 0.2])))
+    strategy = control(store, replace(EVERY_STEP, prune_opacity=0.9))
+    strategy.observe(pose(store), rendering([0.0] * 3))
+    strategy.control(store, pose(store), Progress(0, 100), random)
+    assert store["face_index"].tolist() == [1]
+
+
 def test_no_triangle_is_emptied() -> None:
     store = make_store([0.001] * 5, faces=[7, 7, 8, 8, 8])
     prune = torch.tensor([True, True, True, False, True])

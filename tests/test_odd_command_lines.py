@@ -95,7 +95,7 @@ ODD = [
     ("train W --hold-out none", "--hold-out none: no such sequence"),
     ("train W --hold-out clip", "leaves no sequence to train on"),
     ("track W --face-model none", "no face model 'none'"),
-    ("track W --tracking.photometric.sizes 0", "--tracking.photometric.sizes 0: give a number from 16 to 8192"),
+    ("track W --tracking.photometric.sizes 0", "--tracking.photometric.sizes 0: give numbers from 16 to 8192"),
     ("track W --tracking.photometric.sizes", "--tracking.photometric.sizes (nothing)"),
     ("track W --tracking.photometric.focal-sigma 0", "--tracking.photometric.focal-sigma 0: give a number above 0"),
     ("track W --tracking.paper.shrink 0", "--tracking.paper.shrink 0"),

@@ -16,7 +16,7 @@ from mien.commands.picture import LARGEST_SIDE
 from mien.evaluation import cameras
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
-LAZY_ROOMS = ["capture", "export", "tracking", "training"]
+LAZY_ROOMS = ["avatar", "capture", "export", "tracking", "training"]
 SCRIPT = """
 import json, os, sys
 from mien.cli import main
@@ -47,6 +47,7 @@ def expect_light(lines: list[list[str]], folder: Path, code: int) -> None:
 
 def test_help_and_wrong_options_import_nothing_heavy(tmp_path: Path) -> None:
     expect_light([[name, "--help"] for name in COMMANDS], tmp_path, 0)
+    expect_light([[name, "--help-all"] for name in ("create", "train")], tmp_path, 0)
     expect_light([[name, "--no-such-option"] for name in COMMANDS], tmp_path, 2)
 
 
@@ -66,6 +67,9 @@ def test_wrong_values_and_paths_import_nothing_heavy(tmp_path: Path) -> None:
         create a.mp4 a.mp4 --out w
         create a.mp4 --out w --steps -3
         create a.mp4 --out w --method nerf
+        create a.mp4 --out w --method.sh-degree 9
+        create a.mp4 --out w --method.no-such-setting 1
+        create a.mp4 --out w --config gone.json
         create a.mp4 --out w --run a/b
         create a.mp4 --out a.csv
         track gone

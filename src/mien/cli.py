@@ -106,14 +106,20 @@ def _crash() -> int:
 def _run(name: str, rest: list[str]) -> int:
     import tyro
 
+    from mien.commands.options import settings_groups, with_settings
+
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
     options, more = module.Command, ""
     if "--help-all" in rest:
         rest = ["--help" if argument == "--help-all" else argument for argument in rest]
+        options = with_settings(module.Command, rest)
     elif "-h" in rest or "--help" in rest:
         options, groups = without_details(module.Command)
-        names = " and ".join(f"--{group}.*" for group in groups)
-        more = f"More options ({names}), for those who compare and tune: mien {name} --help-all" if groups else ""
+        further, words = settings_groups(module.Command, rest)
+        names = ", ".join(f"--{group}.*" for group in groups + further)
+        more = f"More options ({names}), for those who compare and tune: mien {name}{words} --help-all" if names else ""
+    else:
+        options = with_settings(module.Command, rest)
     complaints = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaints):

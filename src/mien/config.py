@@ -1,12 +1,15 @@
 """Settings as json: nested frozen dataclasses, with a `kind` wherever a field may hold one of several classes."""
 
+import contextlib
+import difflib
 import types
-from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from mien.errors import UserError
+from mien.ranges import ToLoad, check_range, marks_of, range_of
 
 
 def encode(value: Any) -> Any:
@@ -27,7 +30,8 @@ def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make i
     """What `encode` encoded, as the type `hint`; fields that are missing get their defaults.
 
     Raises:
-        UserError: a field is unknown, is missing without a default, or has a value of another type; ends in `remedy`.
+        UserError: a field is unknown, is missing without a default, or has a value of another type or out of its range;
+            ends in `remedy`.
     """
     try:
         return _decode(hint, value, where)
@@ -35,10 +39,80 @@ def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make i
         raise UserError(f"{error} (made by another version of mien?); {remedy}") from None
 
 
+def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
+    """Settings with some fields changed, as json holds them; what is not named stays, also in settings within settings.
+
+    Args:
+        base: A dataclass.
+        changes: Field name -> value. A `kind` may stand there too, as `encode` writes it.
+        where: What to name in messages, followed by the field: "config.json: method".
+        owner: Whose settings these are, for a message about one that there is not.
+
+    Raises:
+        UserError: a field is unknown, of another type, or out of its range.
+    """
+    if not isinstance(changes, dict):
+        raise UserError(f"{where} {_in_short(changes)}: give an object of settings, {{...}}")
+    if changes.get("kind", type(base).__name__) != type(base).__name__:
+        raise UserError(f"{where}.kind {_in_short(changes['kind'])}: give {type(base).__name__!r}, or leave it out")
+    hints = get_type_hints(type(base), include_extras=True)
+    known = [f.name for f in fields(base)]
+    changed = {}
+    for name, change in changes.items():
+        if name == "kind":
+            continue
+        if name not in known:
+            near = difflib.get_close_matches(name[:_LONGEST_SHOWN], known, 1)
+            raise UserError(no_such_setting(f"{where}.{name[:_LONGEST_SHOWN]}", owner, near, known))
+        place, value = f"{where}.{name}", getattr(base, name)
+        if is_dataclass(value):
+            changed[name] = overlay(value, change, place, owner)
+            continue
+        plain = get_args(hints[name])[0] if get_origin(hints[name]) is Annotated else hints[name]
+        try:
+            changed[name] = _decode(plain, change, place)
+        except UserError:
+            raise UserError(f"{place} {_in_short(change)}: give {_in_words(plain)}") from None
+        if (allowed := range_of(hints[name])) is not None:
+            check_range(changed[name], allowed, place)
+    return replace(base, **changed)
+
+
+def for_loading(settings: Any) -> Any:
+    """The same settings with the least of what counts only when an avatar is begun (`ToLoad`)."""
+    hints = get_type_hints(type(settings), include_extras=True)
+    marks = {name: mark for name, hint in hints.items() for mark in marks_of(hint) if isinstance(mark, ToLoad)}
+    return replace(settings, **{name: mark.value for name, mark in marks.items()})
+
+
+def no_such_setting(given: str, owner: str, near: Sequence[str], known: Sequence[str]) -> str:
+    """What to tell about a setting that there is not: the nearest name, if one is near, and all that there are."""
+    hint = f"did you mean {near[0]}? " if near else ""
+    return f"{given}: {owner} has no such setting; {hint}there are: {', '.join(known)}"
+
+
+def _in_words(hint: Any) -> str:
+    """What to give for a setting of some type, in a json file."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return "one of " + ", ".join(str(part) for part in parts)
+    if origin is tuple:
+        return f"a list, each entry {_in_words(parts[0])}"
+    if origin in (Union, types.UnionType):
+        return " or ".join(_in_words(part) for part in parts)
+    plain = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", type(None): "null"}
+    return plain.get(hint, f"a {hint}")
+
+
 def _decode(hint: Any, value: Any, where: str) -> Any:
     if hint is Any:
         return value
     origin = get_origin(hint)
+    if origin is Annotated:
+        found = _decode(get_args(hint)[0], value, where)
+        if (allowed := range_of(hint)) is not None:
+            check_range(found, allowed, where)
+        return found
     if origin in (Union, types.UnionType):
         return _decode_union(get_args(hint), value, where)
     if is_dataclass(hint):
@@ -54,7 +128,8 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
     if origin is Literal and value in get_args(hint):
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
+        with contextlib.suppress(OverflowError):  # a whole number of hundreds of digits
+            return float(value)
     if hint is Path and isinstance(value, str):
         return Path(value)
     # True is an int to Python, not to people.
@@ -67,7 +142,7 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
 def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
         raise UserError(f"{where}: {_in_short(value)} is not a {hint.__name__}")
-    hints = get_type_hints(hint)
+    hints = get_type_hints(hint, include_extras=True)
     known = {f.name: f for f in fields(hint)}
     unknown = set(value) - set(known) - {"kind"}
     missing = [

@@ -28,7 +28,7 @@ def without_details(command: type) -> tuple[type, list[str]]:
             settings = _hiding(kind, _COMMON[group])
             shown[name] = Annotated[(settings, *marks)] if marks else settings
     defaults = {name: field(default_factory=getattr(hint, "__origin__", hint)) for name, hint in shown.items()}
-    return _subclass(command, shown, defaults), groups
+    return subclass_with(command, shown, defaults), groups
 
 
 def _hiding(settings: type, kept: tuple[str, ...]) -> type:
@@ -41,10 +41,11 @@ def _hiding(settings: type, kept: tuple[str, ...]) -> type:
         name: field(default=one.default) if one.default is not MISSING else field(default_factory=one.default_factory)
         for name, one in hidden.items()
     }
-    return _subclass(settings, {name: Annotated[hints[name], tyro.conf.Suppress] for name in hidden}, defaults)
+    return subclass_with(settings, {name: Annotated[hints[name], tyro.conf.Suppress] for name in hidden}, defaults)
 
 
-def _subclass(parent: type, annotations: dict[str, Any], defaults: dict[str, Any]) -> type:
+def subclass_with(parent: type, annotations: dict[str, Any], defaults: dict[str, Any]) -> type:
+    """The same dataclass with other types and defaults of some fields."""
     # A subclass: tyro finds the descriptions of the fields in the parent's source.
     namespace = {"__annotations__": annotations, "__doc__": parent.__doc__, "__module__": parent.__module__, **defaults}
     return dataclass(frozen=True)(type(parent.__name__, (parent,), namespace))

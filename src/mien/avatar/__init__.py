@@ -1,36 +1,54 @@
-"""Avatars: functions from face parameters to Gaussians, one file a method."""
+"""Avatars: functions from face parameters to Gaussians, one file a method and one for its settings."""
 
-from mien.avatar.avatar import (
-    TRAINED,
-    Avatar,
-    FaceTuning,
-    MethodConfig,
-    ParameterGroup,
-    Photometric,
-    Posed,
-    Progress,
-    Rate,
-    move_avatar,
-    network_group,
-    neutral_of,
-    store_group,
-)
-from mien.avatar.baked import BakedAvatar, pose_baked
-from mien.avatar.density import (
-    DensityControl,
-    FixedDensity,
-    GradientDensity,
-    GradientSettings,
-    RefillDensity,
-    RefillSettings,
-)
-from mien.avatar.files import load_avatar, write_avatar
-from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
-from mien.avatar.headgas import HeadGas, HeadGasConfig
-from mien.avatar.methods import METHODS, Method, method_named, method_of
-from mien.avatar.mono_gaussian_avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig
-from mien.avatar.portable import make_portable, read_baked
-from mien.avatar.store import GaussianStore, Moments
+from typing import TYPE_CHECKING
+
+from mien.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from mien.avatar.avatar import Avatar, ParameterGroup, Posed, move_avatar, network_group, neutral_of, store_group
+    from mien.avatar.baked import BakedAvatar, pose_baked
+    from mien.avatar.density import DensityControl, FixedDensity, GradientDensity, RefillDensity
+    from mien.avatar.files import load_avatar, write_avatar
+    from mien.avatar.gaussian_avatars import GaussianAvatars
+    from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
+    from mien.avatar.headgas import HeadGas
+    from mien.avatar.headgas_settings import HeadGasConfig
+    from mien.avatar.methods import METHODS, Method, method_named, method_of
+    from mien.avatar.mono_gaussian_avatar import MonoGaussianAvatar
+    from mien.avatar.mono_gaussian_avatar_settings import MonoGaussianAvatarConfig
+    from mien.avatar.portable import make_portable, read_baked
+    from mien.avatar.schedules import TRAINED, Progress, Rate
+    from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, Photometric, RefillSettings
+    from mien.avatar.store import GaussianStore, Moments
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "avatar": [
+                "Avatar",
+                "ParameterGroup",
+                "Posed",
+                "move_avatar",
+                "network_group",
+                "neutral_of",
+                "store_group",
+            ],
+            "baked": ["BakedAvatar", "pose_baked"],
+            "density": ["DensityControl", "FixedDensity", "GradientDensity", "RefillDensity"],
+            "files": ["load_avatar", "write_avatar"],
+            "gaussian_avatars": ["GaussianAvatars"],
+            "gaussian_avatars_settings": ["GaussianAvatarsConfig"],
+            "headgas": ["HeadGas"],
+            "headgas_settings": ["HeadGasConfig"],
+            "methods": ["METHODS", "Method", "method_named", "method_of"],
+            "mono_gaussian_avatar": ["MonoGaussianAvatar"],
+            "mono_gaussian_avatar_settings": ["MonoGaussianAvatarConfig"],
+            "portable": ["make_portable", "read_baked"],
+            "schedules": ["TRAINED", "Progress", "Rate"],
+            "settings": ["FaceTuning", "GradientSettings", "MethodConfig", "Photometric", "RefillSettings"],
+            "store": ["GaussianStore", "Moments"],
+        },
+    )
 
 __all__ = [
     "METHODS",

@@ -1,108 +1,26 @@
 """The seam: an avatar is a function from face parameters to Gaussians.
 
-A new method is one file with a config dataclass and an `Avatar`, and one line in `mien.avatar.methods`.
+A new method is one file with an `Avatar`, one with its settings, and one line in `mien.avatar.methods`.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from mien.avatar.baked import BakedAvatar
 from mien.avatar.density import DensityControl
+from mien.avatar.schedules import TRAINED, Progress, Rate
+from mien.avatar.settings import MethodConfig
 from mien.avatar.store import GaussianStore, Moments
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 
 _CALM_SHARE = 0.1
-"""Of the timesteps that count as at rest."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far training is: all that schedules may depend on."""
-
-    step: int
-    """Steps done before this one."""
-    steps: int
-    """Of the whole run."""
-    epoch: int = 0
-    """Passes over the training frames done before this one."""
-
-    @property
-    def fraction(self) -> float:
-        """0 at the first step, 1 after the last."""
-        return self.step / self.steps
-
-
-TRAINED = Progress(step=1, steps=1, epoch=1_000_000)
-"""The state after training: every schedule at its end."""
-
-
-@dataclass(frozen=True)
-class Rate:
-    """A learning rate over the run: constant, or log-linear from `start` to `end`."""
-
-    start: float
-    """At the first step (or at `begin`)."""
-    end: float | None = None
-    """At the last step; None for a constant rate."""
-    begin: float = 0.0
-    """Fraction of the run before which the rate is 0."""
-
-    def at(self, progress: Progress) -> float:
-        """The rate of one step."""
-        if progress.fraction < self.begin:
-            return 0.0
-        if self.end is None:
-            return self.start
-        along = (progress.fraction - self.begin) / max(1 - self.begin, 1e-9)
-        return math.exp((1 - along) * math.log(self.start) + along * math.log(self.end))
-
-
-@dataclass(frozen=True)
-class Photometric:
-    """Weights of the losses that compare a rendering with its target."""
-
-    l1_weight: float = 0.8
-    """Of the mean absolute difference."""
-    ssim_weight: float = 0.2
-    """Of 1 - SSIM (11x11 window, sigma 1.5)."""
-    alpha_weight: float = 0.0
-    """Of the mean absolute difference between the rendering's alpha and the matte."""
-
-
-@dataclass(frozen=True)
-class FaceTuning:
-    """Learning rates of the per-frame face parameters, where training may change them.
-
-    Only the frame of a step moves: unlike a dense Adam, momentum does not push frames that were not looked at.
-    """
-
-    enabled: bool = True
-    """What is corrected in training frames is passed on to the held-out frames between them (`FaceTrack.params`)."""
-    expression: Rate = Rate(1e-3)
-    """Coefficients."""
-    joints: Rate = Rate(1e-3)
-    """Radians."""
-    head_rotation: Rate = Rate(1e-3)
-    """Radians."""
-    head_translation: Rate = Rate(3e-4)
-    """Metres."""
-
-
-@dataclass(frozen=True)
-class MethodConfig:
-    """What every method's config holds; methods add their own fields."""
-
-    photometric: Photometric = field(default_factory=Photometric)
-    """The trainer computes these losses; the method's own come from `Avatar.regularizers`."""
-    face_tuning: FaceTuning = field(default_factory=FaceTuning)
-    """Whether and how training changes the tracked face parameters."""
+"""Share of the timesteps that count as at rest."""
 
 
 @dataclass(frozen=True, eq=False)

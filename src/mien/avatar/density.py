@@ -10,39 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mien.avatar.settings import GradientSettings, RefillSettings
 from mien.avatar.store import GaussianStore
 from mien.rotation import matrix_from_quaternion
-
-
-@dataclass(frozen=True)
-class GradientSettings:
-    """Gradient-based density control (3D Gaussian Splatting, section 5).
-
-    Times are fractions of the run, so that a schedule fits runs of any length.
-    """
-
-    start: float = 0.1
-    """When the first round happens."""
-    stop: float = 0.7
-    """When the last round happens."""
-    rounds: int = 16
-    """Rounds from `start` to `stop`, evenly spread."""
-    grow_gradient: float = 2e-4
-    """Gaussians whose mean gradient with respect to the centre, in normalised device coordinates, reaches this grow."""
-    split_size: float = 0.0025
-    """Metres: of those that grow, larger ones split in two, smaller ones duplicate."""
-    prune_opacity: float = 0.005
-    """Gaussians below this opacity go."""
-    prune_size: float = 0.1
-    """Metres: larger Gaussians go, after the first opacity reset that follows `start`."""
-    prune_radius: float = 0.0
-    """Pixels: Gaussians that look larger go, from the same time on; 0 for never."""
-    opacity_resets: tuple[float, ...] = (0.1, 0.4)
-    """When opacities are lowered to `reset_opacity`."""
-    reset_opacity: float = 0.01
-    """The ceiling at a reset."""
-    max_gaussians: int = 40_000
-    """Growth stops here; what pulls most grows first."""
 
 
 def keep_all_prunes(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
@@ -84,18 +54,6 @@ class GradientDensity:
     """(store, parents, standard normal noise) -> what differs between parents and children, by tensor name."""
     may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = keep_all_prunes
     """(store, prunes asked for) -> prunes granted."""
-
-
-@dataclass(frozen=True)
-class RefillSettings:
-    """Prune and refill (MonoGaussianAvatar, PointAvatar). Times are fractions of the run."""
-
-    times: tuple[float, ...]
-    """When the rounds happen, ascending."""
-    targets: tuple[int, ...]
-    """The number of Gaussians after each round."""
-    prune_opacity: float = 0.1
-    """Gaussians whose opacity was never this high in any view since the last round go."""
 
 
 @dataclass(frozen=True)

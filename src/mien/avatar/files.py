@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar
 from mien.avatar.methods import method_named, method_of
-from mien.config import decode, encode
+from mien.config import decode, encode, for_loading
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
@@ -88,7 +88,8 @@ def _load_avatar(folder: Path) -> Avatar:
             face = FaceParams(**subject)
         except TypeError as error:
             raise UserError(f"{folder}: its subject is incomplete ({error}); train it again") from None
-        avatar = method.avatar(config, face_model, face)
+        avatar = method.avatar(for_loading(config), face_model, face)
+    avatar.config = config
     overwrite(avatar, _with_prefix(tensors, "avatar."), content.gaussians, folder)
     return avatar
 

@@ -4,53 +4,22 @@ Written from the paper and its supplement; what the published code does differen
 it matters. Lengths and scales in the store are in units of the triangle's own scale (`mien.avatar.rig`).
 """
 
-from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar.avatar import TRAINED, Avatar, MethodConfig, ParameterGroup, Posed, Progress, Rate, store_group
+from mien.avatar.avatar import Avatar, ParameterGroup, Posed, store_group
 from mien.avatar.baked import Attributes, MeshBound, bake_rig
-from mien.avatar.density import GradientDensity, GradientSettings
+from mien.avatar.density import GradientDensity
+from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
 from mien.avatar.penalties import triangle_penalties
 from mien.avatar.ride import ride
+from mien.avatar.schedules import TRAINED, Progress, Rate
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
 from mien.render.rendering import Rendering
-
-
-@dataclass(frozen=True)
-class GaussianAvatarsConfig(MethodConfig):
-    """Settings of GaussianAvatars; defaults suit one fixed camera and runs of some thousand steps."""
-
-    sh_degree: int = 0
-    """0..3. With one camera, colours that depend on the view absorb the head's pose: keep 0."""
-    sh_frame: Literal["world", "head"] = "world"
-    """In which frame SH are evaluated: `world` as in the paper, `head` so that light turns with the head."""
-    sh_warmup: float = 0.3
-    """Fraction of the run over which SH degrees are switched on one after the other."""
-    means_rate: Rate = Rate(5e-3, 5e-5)
-    """Of centres, triangle units. The paper multiplies it by the cameras' extent, which is 0 for one camera: 1 here."""
-    log_scales_rate: Rate = Rate(0.017)
-    """Of log scales."""
-    quats_rate: Rate = Rate(1e-3)
-    """Of rotations."""
-    opacity_rate: Rate = Rate(0.05)
-    """Of opacity logits."""
-    colour_rate: Rate = Rate(2.5e-3)
-    """Of constant SH coefficients; the others get a twentieth."""
-    position_threshold: float = 1.0
-    """Triangle units: centres nearer than this to their triangle's are free."""
-    position_weight: float = 0.01
-    """Of what exceeds the threshold."""
-    scale_threshold: float = 0.6
-    """Triangle units: smaller scales are free."""
-    scale_weight: float = 1.0
-    """Of what exceeds the threshold."""
-    density: GradientSettings = field(default_factory=GradientSettings)
-    """When and what to grow and prune."""
 
 
 class GaussianAvatars(Avatar):

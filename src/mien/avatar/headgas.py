@@ -7,63 +7,23 @@ vector (nothing else would move the gaze), rates, the encoding's bands and lengt
 Not there yet: the perceptual loss.
 """
 
-from dataclasses import dataclass, field
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from mien.avatar.activation import sigmoid
-from mien.avatar.avatar import (
-    TRAINED,
-    Avatar,
-    MethodConfig,
-    ParameterGroup,
-    Posed,
-    Progress,
-    Rate,
-    network_group,
-    store_group,
-)
+from mien.avatar.avatar import Avatar, ParameterGroup, Posed, network_group, store_group
 from mien.avatar.baked import AttributeNetwork, Attributes, Static
-from mien.avatar.density import GradientDensity, GradientSettings
+from mien.avatar.density import GradientDensity
 from mien.avatar.encoding import positional_encoding
+from mien.avatar.headgas_settings import HeadGasConfig
+from mien.avatar.schedules import TRAINED, Progress
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 
 _CHUNK = 512
-
-
-@dataclass(frozen=True)
-class HeadGasConfig(MethodConfig):
-    """Settings of HeadGaS; defaults suit a CPU and runs of some thousand steps."""
-
-    points: int = 2500
-    """Gaussians to begin with, sampled on the subject's mesh."""
-    features: int = 16
-    """Latent features of each Gaussian (paper: 32); memory and time of a step grow with it."""
-    hidden: int = 64
-    """Width of the network's one hidden layer."""
-    encoding_bands: int = 4
-    """Octaves of the positional encoding."""
-    encoding_length: float = 0.05
-    """Metres that count as one unit in the positional encoding."""
-    sh_degree: int = 0
-    """0..3 (paper: 3). With one camera, colours that depend on the view absorb the head's pose."""
-    means_rate: Rate = Rate(1e-4, 1e-6)
-    """Of centres, metres."""
-    log_scales_rate: Rate = Rate(5e-3)
-    """Of log scales."""
-    quats_rate: Rate = Rate(1e-3)
-    """Of rotations."""
-    features_rate: Rate = Rate(2.5e-3)
-    """Of feature bases and neutral features."""
-    network_rate: Rate = Rate(2e-3, 2e-4)
-    """Of the network."""
-    density: GradientSettings = field(default_factory=lambda: GradientSettings(opacity_resets=(), max_gaussians=8_000))
-    """When and what to grow and prune. Opacities come from the network: there is nothing to reset."""
 
 
 class HeadGas(Avatar):

@@ -1,26 +1,49 @@
-"""The methods there are: a new one is one line here."""
+"""The methods there are: a new one is one line here.
 
+Settings are imported at once, so that the command line can list and check them; avatars, which need torch, at their
+first use.
+"""
+
+import importlib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from mien.avatar.avatar import Avatar, MethodConfig
-from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
-from mien.avatar.headgas import HeadGas, HeadGasConfig
-from mien.avatar.mono_gaussian_avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig
+from mien.avatar import gaussian_avatars_settings, headgas_settings, mono_gaussian_avatar_settings
+from mien.avatar.settings import MethodConfig
 from mien.errors import UserError
+
+if TYPE_CHECKING:
+    from mien.avatar.avatar import Avatar
 
 
 @dataclass(frozen=True)
 class Method:
-    """A method: its settings, and the class of its avatars, which is called with (config, face_model, face)."""
+    """A method: its settings by preset, and the class of its avatars."""
 
-    config: type[MethodConfig]
-    avatar: type[Avatar]
+    presets: Mapping[str, MethodConfig]
+    """What each preset of `mien.training.PRESETS` means for this method; all of one class."""
+    avatar_class: str
+    """"MODULE:CLASS"; see `avatar`."""
+
+    @property
+    def config(self) -> type[MethodConfig]:
+        """The class of the method's settings."""
+        return type(self.presets["standard"])
+
+    @property
+    def avatar(self) -> "type[Avatar]":
+        """The class of the method's avatars, which is called with (config, face_model, face)."""
+        module, name = self.avatar_class.split(":")
+        return getattr(importlib.import_module(module), name)
 
 
 METHODS = {
-    "gaussian_avatars": Method(GaussianAvatarsConfig, GaussianAvatars),
-    "headgas": Method(HeadGasConfig, HeadGas),
-    "mono_gaussian_avatar": Method(MonoGaussianAvatarConfig, MonoGaussianAvatar),
+    "gaussian_avatars": Method(gaussian_avatars_settings.PRESETS, "mien.avatar.gaussian_avatars:GaussianAvatars"),
+    "headgas": Method(headgas_settings.PRESETS, "mien.avatar.headgas:HeadGas"),
+    "mono_gaussian_avatar": Method(
+        mono_gaussian_avatar_settings.PRESETS, "mien.avatar.mono_gaussian_avatar:MonoGaussianAvatar"
+    ),
 }
 
 

@@ -10,27 +10,17 @@ networks are small enough for a CPU. Not there yet: the perceptual loss, batches
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.avatar.activation import sigmoid
-from mien.avatar.avatar import (
-    TRAINED,
-    Avatar,
-    MethodConfig,
-    ParameterGroup,
-    Photometric,
-    Posed,
-    Progress,
-    Rate,
-    network_group,
-    store_group,
-)
+from mien.avatar.avatar import Avatar, ParameterGroup, Posed, network_group, store_group
 from mien.avatar.baked import AttributeNetwork, Attributes, BlendSkinned, bake_rig
-from mien.avatar.density import RefillDensity, RefillSettings
+from mien.avatar.density import RefillDensity
+from mien.avatar.mono_gaussian_avatar_settings import MonoGaussianAvatarConfig
 from mien.avatar.mono_networks import (
     ATTRIBUTE_WIDTHS,
     ATTRIBUTES,
@@ -39,6 +29,8 @@ from mien.avatar.mono_networks import (
     AttributeNet,
     DeformationNet,
 )
+from mien.avatar.schedules import TRAINED, Progress
+from mien.avatar.settings import RefillSettings
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians, sh_from_rgb
@@ -56,40 +48,6 @@ _SHRINKAGE = (
     # Epoch 100 shrinks it once more: here that is the end of the run, after which nothing learns to live with it.
     *((time / 100, 0.75) for time in (65, 70, 75, 80, 85, 90, 95)),
 )
-
-
-@dataclass(frozen=True)
-class MonoGaussianAvatarConfig(MethodConfig):
-    """Settings of MonoGaussianAvatar; defaults suit a CPU and runs of some thousand steps."""
-
-    photometric: Photometric = field(default_factory=lambda: Photometric(l1_weight=1.0, ssim_weight=0.25))
-    """The paper's weights of L1 and 1 - SSIM."""
-    points: int = 400
-    """Gaussians to begin with, on a sphere."""
-    sphere_radius: float = 0.125
-    """Metres: of that sphere about the head frame's origin."""
-    max_points: int = 6_000
-    """Growth ends here (paper: 100,000)."""
-    rounds: int = 50
-    """How often points are pruned and refilled (paper: 100, once an epoch)."""
-    attribute_width: int = 64
-    """Of the attribute network (paper: 256)."""
-    attribute_layers: int = 4
-    """Of the attribute network (paper: 7)."""
-    deformation_width: int = 64
-    """Of the deformation network (paper: 128)."""
-    change_width: int = 32
-    """Of the network that changes attributes with motion (paper: 64)."""
-    scale_gain: float = 0.00625
-    """Metres: the networks' largest scale (paper: 0.0025 for pictures of 1024x1024)."""
-    means_rate: Rate = Rate(1e-4, 1e-5)
-    """Of points, metres."""
-    network_rate: Rate = Rate(1e-3, 1e-4)
-    """Of the networks (paper: 1e-4, over some hundred thousand steps)."""
-    face_weight: float = 10.0
-    """Of staying near the face model; halves at 0.2, 0.3, 0.5 and 0.7 of the run."""
-    face_points: int = 512
-    """How many points are held near the face model each step, in turn."""
 
 
 class MonoGaussianAvatar(Avatar):

@@ -44,7 +44,7 @@ class Command:
         """Tell what can be told without heavy libraries: options, names, paths."""
         from mien.commands.stages.names import run_name, sequence_names
 
-        self.options.settings()
+        self.options.check()
         sequence_names(self.videos, self.name)
         run_name(self.run_name or self.options.method)
         self.capture.check()
@@ -68,6 +68,7 @@ class Command:
         workspace, run = Workspace(self.out), run_name(self.run_name or self.options.method)
         check_run(workspace.run_dir(run), method, settings)
         check_untouched(workspace.run_dir(run))
+        self.options.say_what_is_ignored()
         face_model_of(self.face_model)
         for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
             say(f"warning: {warning}")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mien.commands.create import Command as Create
-from mien.commands.options import Preset, TrainOptions
+from mien.commands.options import PresetName, TrainOptions
 from mien.errors import UserError
 
 _LONGEST = 600.0
@@ -17,7 +17,7 @@ class Command:
 
     out: Path = Path("out/demo")
     """Workspace folder; the video lies in it."""
-    preset: Preset = "draft"
+    preset: PresetName = "draft"
     """As for `mien create`."""
     steps: int = 0
     """As for `mien create`."""

@@ -1,29 +1,44 @@
 """What several sub-commands ask: which method, how thorough, which settings in detail."""
 
-from dataclasses import dataclass, replace
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
+import tyro
+
+from mien.avatar import METHODS, MethodConfig
+from mien.commands.config_file import ConfigFile, read_config_file
+from mien.commands.settings_options import applied, check_names, leaves, options_type
+from mien.config import overlay
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
-from mien.training import PRESETS, Split, TrainSettings
+from mien.help_text import subclass_with
+from mien.training import DIALS, PRESETS, Split, TrainSettings
 from mien.workspace import open_workspace
 
 if TYPE_CHECKING:
-    import mien.avatar
+    MethodName = str
+    PresetName = str
+else:
+    MethodName = Literal[tuple(METHODS)]
+    PresetName = Literal[tuple(PRESETS)]
 
-MethodName = Literal["gaussian_avatars", "headgas", "mono_gaussian_avatar"]
-"""The keys of `mien.avatar.METHODS` (a test compares them): options are read before torch is imported."""
-Preset = Literal["draft", "standard"]
+_IN_DETAIL = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]
+"""Options that depend on the method: `with_settings` puts them here."""
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """The dials of training; everything else is the preset's and the method's own."""
+    """The dials of training; everything else is the preset's, the file's and the method's own."""
 
     method: MethodName = "gaussian_avatars"
     """How the avatar is made (docs/results.md compares them)."""
-    preset: Preset = "standard"
+    config: Path | None = None
+    """A .json with settings, such as the config.json of a run, which this repeats (docs/settings.md). Options win over
+    the file, the file wins over the preset."""
+    preset: PresetName = "standard"
     """draft: minutes; standard: the figures of docs/results.md."""
     split: Split = "blocks"
     """What is held out for scoring: every fifth block of 10 frames, the last 20 % (tail), or nothing (none)."""
@@ -44,19 +59,32 @@ class TrainOptions:
     face_tuning: bool = True
     """Training also corrects the tracking of the frames it sees (held-out frames get what lies beside them); with
     --no-face-tuning it does not."""
+    training: _IN_DETAIL = None
+    """The other settings of the run."""
+    method_settings: _IN_DETAIL = None
+    """The method's own settings."""
 
-    def settings(self) -> TrainSettings:
-        """The preset with these changes.
+    def check(self) -> None:
+        """Find that all settings make sense together, before any work.
 
         Raises:
-            UserError: the number of steps is negative; CUDA is asked for without gsplat.
+            UserError: one is out of range; CUDA is asked for without gsplat.
+        """
+        self.settings()
+        self.method_config()
+
+    def settings(self) -> TrainSettings:
+        """The settings of the run: the preset's or the file's with these changes.
+
+        Raises:
+            UserError: one is out of range; CUDA is asked for without gsplat.
         """
         check_device(self.device)
         if self.steps < 0:
             raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's")
-        preset = PRESETS[self.preset]
-        return replace(
-            preset,
+        preset = PRESETS[self.preset].settings
+        settings = replace(
+            preset if self.training is None else applied(preset, self.training),
             split=self.split,
             background=self.background,
             seed=self.seed,
@@ -65,13 +93,104 @@ class TrainOptions:
             held_out_sequences=tuple(sorted(set(self.hold_out))),
             held_out_cameras=tuple(sorted(set(self.hold_out_cameras))),
         )
+        settings.check()
+        return settings
 
-    def method_config(self) -> "mien.avatar.MethodConfig":
-        """The method's settings."""
-        from mien.avatar import method_named
+    def method_config(self) -> MethodConfig:
+        """The method's settings: the preset's or the file's with these changes.
 
-        config = method_named(self.method).config()
-        return replace(config, face_tuning=replace(config.face_tuning, enabled=self.face_tuning))
+        Raises:
+            UserError: one is out of range.
+        """
+        config = PRESETS[self.preset].config(self.method)
+        if self.method_settings is not None:
+            config = applied(config, self.method_settings)
+        # Face tuning has two options that say the same: one that differs from the default was typed.
+        default = type(self).face_tuning
+        typed = {self.face_tuning, config.face_tuning.enabled} != {default}
+        config = replace(config, face_tuning=replace(config.face_tuning, enabled=default != typed))
+        config.check()
+        return config
+
+    def say_what_is_ignored(self) -> None:
+        """Say what the file holds that the run does not take from it: the data that its own run was trained on."""
+        from mien.progress import say
+
+        sequences = read_config_file(self.config).sequences if self.config else ()
+        if sequences:
+            say(f"{self.config}: method and settings are taken from it, not its sequences ({', '.join(sequences)})")
+
+
+def training_options(command: type) -> str | None:
+    """The field of a command that holds `TrainOptions`, if it has them."""
+    for name, hint in get_type_hints(command).items():
+        if hint is TrainOptions:
+            return name
+    return None
+
+
+def with_settings(command: type, arguments: Sequence[str]) -> type:
+    """A command with an option for every setting of the method that its arguments, or their --config, name.
+
+    Defaults are what the preset and the file say, so that options win over the file, and the file over the preset.
+
+    Raises:
+        UserError: the file cannot be used, or an option is a setting that the method does not have.
+    """
+    name = training_options(command)
+    chosen = _chosen(arguments)
+    if name is None or chosen.method not in (None, *METHODS) or chosen.preset not in (None, *PRESETS):
+        return command  # for wrong names, which tyro tells
+    file = read_config_file(Path(chosen.config)) if chosen.config is not None else None
+    options = _with_defaults(chosen.method, chosen.preset or TrainOptions.preset, file, arguments)
+    hint = get_type_hints(command, include_extras=True)[name]
+    marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+    return subclass_with(command, {name: Annotated[(options, *marks)]}, {name: field(default_factory=options)})
+
+
+def settings_groups(command: type, arguments: Sequence[str]) -> tuple[list[str], str]:
+    """Prefixes of the options that `with_settings` adds to a command, and what to type besides to see them."""
+    if training_options(command) is None:
+        return [], ""
+    method = _chosen(arguments).method
+    return ["training", "method"], f" --method {method if method in METHODS else TrainOptions.method}"
+
+
+def _with_defaults(method: str | None, preset: str, file: ConfigFile | None, arguments: Sequence[str]) -> type:
+    if file and file.method and method and file.method != method:
+        raise UserError(
+            f"--config {file.path}: has settings of {file.method}, but --method asks for {method}; leave --method out, "
+            'or give a file that has "settings" alone'
+        )
+    name = method or (file.method if file else None) or TrainOptions.method
+    settings, config = PRESETS[preset].settings, PRESETS[preset].config(name)
+    if file:
+        settings = overlay(settings, file.settings_changes, f"{file.path}: settings", "a run")
+        config = overlay(config, file.method_changes, f"{file.path}: method", name)
+    own = leaves(config, "method")
+    check_names(arguments, "method", own, name)
+    rest = [one.name for one in fields(settings) if one.name not in DIALS]
+    in_detail = {
+        "training": options_type(leaves(settings, "training", rest), "training"),
+        "method_settings": options_type(own, "method"),
+    }
+    dials = {dial: getattr(settings, dial) for dial in ("split", "background", "seed", "device")}
+    dials |= {"hold_out": settings.held_out_sequences, "hold_out_cameras": settings.held_out_cameras}
+    dials |= {"method": name, "face_tuning": config.face_tuning.enabled}
+    if file and "steps" in file.settings_changes:
+        dials["steps"] = settings.steps
+    hints = get_type_hints(TrainOptions, include_extras=True) | {"method": Literal[tuple(METHODS)]}
+    defaults = {dial: field(default=value) for dial, value in dials.items()}
+    defaults |= {group: field(default_factory=kind) for group, kind in in_detail.items()}
+    return subclass_with(TrainOptions, {dial: hints[dial] for dial in dials} | in_detail, defaults)
+
+
+def _chosen(arguments: Sequence[str]) -> argparse.Namespace:
+    """What the words of a command line say about method, preset and file; None where they do not."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in ("method", "preset", "config"):
+        parser.add_argument(f"--{name}", nargs="?")
+    return parser.parse_known_args(list(arguments))[0]
 
 
 def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> None:

@@ -28,6 +28,7 @@ class Command:
         """Tell what can be told without heavy libraries."""
         from mien.commands.stages.names import run_name
 
+        self.options.check()
         workspace, settings = open_workspace(self.workspace), self.options.settings()
         run_name(self.run_name or self.options.method)
         check_held_out(self._names(workspace), settings)
@@ -43,6 +44,7 @@ class Command:
         run = run_name(self.run_name or self.options.method)
         names = self._names(workspace)
         check_run(workspace.run_dir(run), method, settings, names)
+        self.options.say_what_is_ignored()
         training_stage(workspace, names, run, method, settings)
 
     def _names(self, workspace: Workspace) -> list[str]:

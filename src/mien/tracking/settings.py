@@ -1,19 +1,17 @@
 """What a user may choose about tracking."""
 
-from dataclasses import asdict, dataclass, field, replace
-from typing import Literal
+import math
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Literal
 
 from mien.errors import UserError
+from mien.ranges import COUNT, NOT_NEGATIVE, POSITIVE, Range, check_ranges
 from mien.tracking.paper_settings import PaperSettings
 from mien.tracking.photometric_settings import PhotometricSettings
-from mien.tracking.ranges import COUNT, NOT_NEGATIVE, POSITIVE, check_ranges
 
 _FOCALS = (10.0, 1e6)
 """Pixels that a focal length can have: a thumbnail's fish eye, and a telescope's 16K picture."""
-_RANGES = {
-    "keyframes": COUNT, "landmark_sigma": POSITIVE, "independent_landmarks": POSITIVE, "outlier": POSITIVE,
-    "identity_weight": NOT_NEGATIVE, "bias_sigma": POSITIVE,
-}  # fmt: skip
+_DEVIATION = Range(5e-324, math.inf, words="a number above 0, or inf for none")
 
 LandmarkSet = Literal["mediapipe", "ibug51"]
 """All 478; or 300-W's 68 without their contour (supplement of GaussianAvatars, section A), and irises."""
@@ -23,13 +21,13 @@ LandmarkSet = Literal["mediapipe", "ibug51"]
 class SmoothnessSettings:
     """Standard deviations of accelerations, a second squared: smaller is smoother. Infinite switches a term off."""
 
-    translation: float = 0.1
+    translation: Annotated[float, _DEVIATION] = 0.1
     """Of the head across the line of sight, metres a second squared."""
-    depth: float = 0.2
+    depth: Annotated[float, _DEVIATION] = 0.2
     """Of the head along the line of sight, which one camera sees least well."""
-    rotation: float = 2.0
+    rotation: Annotated[float, _DEVIATION] = 2.0
     """Of the head, radians a second squared."""
-    expression: float = 100.0
+    expression: Annotated[float, _DEVIATION] = 100.0
     """Of expression coefficients except those of the eyelids, which blink too fast to be smoothed."""
 
 
@@ -46,17 +44,17 @@ class TrackingSettings:
     landmarks: LandmarkSet = "mediapipe"
     """Which landmarks count: all 478 of MediaPipe, or as in GaussianAvatars the 68 of 300-W without their 17 contour
     points. Irises always do, for the gaze."""
-    keyframes: int = 20
+    keyframes: Annotated[int, COUNT] = 20
     """Frames of each sequence from which identity is fitted, chosen for their spread of head poses."""
-    landmark_sigma: float = 0.0015
+    landmark_sigma: Annotated[float, POSITIVE] = 0.0015
     """Expected error of a landmark, metres on the face."""
-    independent_landmarks: float = 25.0
+    independent_landmarks: Annotated[float, POSITIVE] = 25.0
     """What 478 landmarks are worth, whose errors go together: weighs them against priors and smoothness."""
-    outlier: float = 6.0
+    outlier: Annotated[float, POSITIVE] = 6.0
     """Beyond this many sigmas a landmark's pull fades."""
-    identity_weight: float = 4.0
+    identity_weight: Annotated[float, NOT_NEGATIVE] = 4.0
     """Weight of the identity's unit-variance prior."""
-    bias_sigma: float = 0.003
+    bias_sigma: Annotated[float, POSITIVE] = 0.003
     """How far a landmark's point on the subject may lie from the model's, metres; one offset for all sequences. For
     face models only that the detector's habits were not measured on (`mien.tracking.detector_response`)."""
     smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
@@ -77,12 +75,7 @@ class TrackingSettings:
                 f"--tracking.focal {focal:g}: give the focal length in pixels of the captured pictures, about 1 to 3 "
                 "times their width, or leave it out"
             )
-        check_ranges(self, "--tracking.", _RANGES)
-        for name, value in asdict(self.smoothness).items():
-            if not value > 0:  # nor NaN
-                raise UserError(f"--tracking.smoothness.{name} {value:g}: give a number above 0, or inf for none")
-        self.photometric.check()
-        self.paper.check()
+        check_ranges(self, lambda name: f"--tracking.{name.replace('_', '-')}")
 
     def in_effect(self) -> "TrackingSettings":
         """With the settings that this schedule does not use at their defaults: what a tracking depends on."""

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from mien.training.presets import PRESETS, Preset
     from mien.training.run import (
         check_data,
         check_run,
@@ -16,13 +17,14 @@ if TYPE_CHECKING:
         run_camera,
     )
     from mien.training.sequence import Sequence, read_sequence
-    from mien.training.settings import PRESETS, Split, TrainSettings, check_held_out
+    from mien.training.settings import DIALS, Split, TrainSettings, check_held_out
     from mien.training.split import held_out
     from mien.training.trainer import train
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
+            "presets": ["PRESETS", "Preset"],
             "run": [
                 "check_data",
                 "check_run",
@@ -34,14 +36,16 @@ else:
                 "run_camera",
             ],
             "sequence": ["Sequence", "read_sequence"],
-            "settings": ["PRESETS", "Split", "TrainSettings", "check_held_out"],
+            "settings": ["DIALS", "Split", "TrainSettings", "check_held_out"],
             "split": ["held_out"],
             "trainer": ["train"],
         },
     )
 
 __all__ = [
+    "DIALS",
     "PRESETS",
+    "Preset",
     "Sequence",
     "Split",
     "TrainSettings",

@@ -107,6 +107,9 @@ class GradientStrategy(DensityStrategy):
         settings = self._control.settings
         sizes = posed.gaussians.scales.detach().reshape(len(store), 3).amax(-1)
         prune = self._control.may_prune(store, self._to_prune(store, sizes, progress))
+        if bool(prune.all()):
+            # An avatar of no Gaussians has no gradients to grow by: keep the one that was most visible.
+            prune[self._opacity.argmax()] = False
         grow = self._to_grow(~prune, budget=settings.max_gaussians - int((~prune).sum()))
         split = grow & (sizes > settings.split_size)
         parents = (grow & ~split).nonzero()[:, 0]

@@ -1,11 +1,12 @@
-"""TrainSettings: what a run is, apart from the method; presets are plain instances."""
+"""TrainSettings: what a run is, apart from the method."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from mien.devices import DeviceName
 from mien.errors import UserError
+from mien.ranges import Range, check_ranges
 
 Split = Literal["blocks", "tail", "none"]
 """Which timesteps are held out (`mien.training.split`)."""
@@ -15,29 +16,37 @@ Split = Literal["blocks", "tail", "none"]
 class TrainSettings:
     """Settings of a training run. The method's own (losses, rates, density control) are in its config."""
 
-    steps: int = 15_000
-    """Optimiser steps, one frame each; all schedules stretch with it."""
+    steps: Annotated[int, Range(1, 1_000_000_000)] = 15_000
+    """Number of optimiser steps, one frame each. All schedules stretch with it."""
     split: Split = "blocks"
-    """What is held out: every fifth block of 10 timesteps, the last 20 % (`tail`), or nothing."""
+    """What is held out: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none)."""
     background: Literal["white", "random"] = "white"
-    """What pictures are composited on. A random colour each step keeps Gaussians from painting the background, which
+    """What pictures are composited on. A random colour in each step keeps Gaussians from painting the background, which
     can show as white needles in new poses; it costs 0.1 to 0.4 dB over white."""
-    resolution: int = 0
-    """Longer side of the training pictures in pixels; 0 for the capture's own."""
-    seed: int = 0
-    """Same seed, same settings, same data: same bytes (on a CPU)."""
-    threads: int = 0
-    """Threads of native operations; 0 for MIEN_THREADS or all cores. Results do not depend on it."""
+    resolution: Annotated[int, Range(16, 8192, or_zero=True)] = 0
+    """Longer side of the training pictures, in pixels. 0 keeps the capture's own; pictures are never enlarged."""
+    seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
+    """Seed of all random numbers. The same seed, settings and data give the same bytes on a CPU."""
+    threads: Annotated[int, Range(0, 256)] = 0
+    """Number of threads of native operations. 0 takes MIEN_THREADS or all cores. Results do not depend on it."""
     device: DeviceName = "cpu"
     """Where training runs. On `cuda` (through gsplat) the same seed does not give the same bytes."""
-    checkpoint_every: int = 1_000
-    """Steps between checkpoints."""
-    record_every: int = 10
-    """Steps between entries of the curves."""
+    checkpoint_every: Annotated[int, Range(1, 1_000_000_000)] = 1_000
+    """Number of steps between checkpoints."""
+    record_every: Annotated[int, Range(1, 1_000_000_000)] = 10
+    """Number of steps between entries of the curves."""
     held_out_sequences: tuple[str, ...] = ()
-    """Whole sequences that are not trained on; the split divides the others."""
+    """Names of whole sequences that are not trained on. The split divides the others."""
     held_out_cameras: tuple[str, ...] = ()
-    """Camera ids that are not trained on, in any sequence."""
+    """Ids of cameras that are not trained on, in any sequence."""
+
+    def check(self) -> None:
+        """Find that all numbers are in their ranges.
+
+        Raises:
+            UserError: names the first option and value that is not, and the range.
+        """
+        check_ranges(self, lambda name: ("--" if name in DIALS else "--training.") + name.replace("_", "-"))
 
     @property
     def holds_out(self) -> bool:
@@ -45,11 +54,8 @@ class TrainSettings:
         return self.split != "none" or bool(self.held_out_sequences or self.held_out_cameras)
 
 
-PRESETS = {
-    "draft": TrainSettings(steps=8_000),
-    "standard": TrainSettings(),
-}
-"""From quick to good."""
+DIALS = ("steps", "split", "background", "seed", "device", "held_out_sequences", "held_out_cameras")
+"""Fields that the command line asks by options of their own; the others are `--training.NAME`."""
 
 
 def check_held_out(names: Sequence[str], settings: TrainSettings) -> None:

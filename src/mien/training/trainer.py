@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from mien import _native
 from mien.avatar import Avatar, MethodConfig, Progress, load_avatar, method_named, method_of, move_avatar
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
@@ -57,10 +58,12 @@ def train(
     bytes as if it had never stopped; if that run is finished, its avatar is loaded.
 
     Raises:
-        UserError: `run_dir` holds another run, or another process writes it; the face model is not the one the
-            sequences were tracked with; they were not tracked together; nothing is left to train on.
+        UserError: a setting is out of range; `run_dir` holds another run, or another process writes it; the face model
+            is not the one the sequences were tracked with; they were not tracked together; nothing is left to train on.
         KeyboardInterrupt: after Ctrl-C, when a checkpoint is safe.
     """
+    method_config.check()
+    settings.check()
     check_trackings(sequences, face_model)
     order = FrameOrder(training_frames(sequences, settings), settings.seed)
     if is_finished(run_dir):
@@ -82,7 +85,7 @@ def _train_to_the_end(
 ) -> None:
     """Go on from the newest checkpoint, if there is one, and write the results."""
     resume(run_dir / "checkpoints", state)
-    with _one_torch_thread(), _deferred_interrupt() as interrupted:
+    with _one_torch_thread(), _native_threads(settings.threads), _deferred_interrupt() as interrupted:
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
                 status = step(state, data, settings)
@@ -177,6 +180,19 @@ def _one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextmanager
+def _native_threads(count: int) -> Iterator[None]:
+    """Give native operations so many threads; 0 leaves them as they are."""
+    before = _native.thread_count()
+    if count > 0:
+        _native.set_thread_count(count)
+    try:
+        yield
+    finally:
+        if count > 0:
+            _native.set_thread_count(before)
 
 
 @contextmanager

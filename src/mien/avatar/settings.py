@@ -1,0 +1,107 @@
+"""What the settings of several methods are made of; without torch, because the command line lists and checks them.
+
+Every number has its range beside it (`mien.ranges`), and every field a sentence that `--help-all` shows.
+"""
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from mien.avatar.schedules import Rate
+from mien.ranges import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
+
+MAX_GAUSSIANS = Range(1, 10_000_000)
+"""Numbers of Gaussians: a few make a picture, and tens of millions fit into no memory."""
+
+
+@dataclass(frozen=True)
+class Photometric:
+    """Weights of the losses that compare a rendering with its target."""
+
+    l1_weight: Annotated[float, NOT_NEGATIVE] = 0.8
+    """Weight of the mean absolute difference of colours."""
+    ssim_weight: Annotated[float, NOT_NEGATIVE] = 0.2
+    """Weight of 1 - SSIM (11x11 window, sigma 1.5)."""
+    alpha_weight: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Weight of the mean absolute difference between the rendering's alpha and the matte."""
+
+
+@dataclass(frozen=True)
+class FaceTuning:
+    """Whether and how fast training changes the tracked face parameters of each frame.
+
+    Only the frame of a step moves: unlike a dense Adam, momentum does not push frames that were not looked at.
+    """
+
+    enabled: bool = True
+    """Whether training corrects the tracking. Corrections are passed on to the held-out frames between training
+    frames."""
+    expression: Rate = Rate(1e-3)
+    """Learning rate of the expression coefficients, per step."""
+    joints: Rate = Rate(1e-3)
+    """Learning rate of the free joints' angles, in radians per step."""
+    head_rotation: Rate = Rate(1e-3)
+    """Learning rate of the head's rotation, in radians per step."""
+    head_translation: Rate = Rate(3e-4)
+    """Learning rate of the head's position, in metres per step."""
+
+
+@dataclass(frozen=True)
+class GradientSettings:
+    """Gradient-based density control (3D Gaussian Splatting, section 5): when and where Gaussians grow and go.
+
+    Times are fractions of the run, so that a schedule fits runs of any length.
+    """
+
+    start: Annotated[float, FRACTION] = 0.1
+    """Time of the first round, as a fraction of the run."""
+    stop: Annotated[float, FRACTION, NotBelow("start")] = 0.7
+    """Time of the last round, as a fraction of the run."""
+    rounds: Annotated[int, COUNT_OR_NONE] = 16
+    """Number of rounds, evenly spread from `start` to `stop`. With 0, the number of Gaussians never changes."""
+    grow_gradient: Annotated[float, NOT_NEGATIVE] = 2e-4
+    """Gaussians grow if the mean gradient with respect to their centre, in normalised device coordinates, reaches
+    this."""
+    split_size: Annotated[float, NOT_NEGATIVE] = 0.0025
+    """Gaussians that grow split in two if they are larger than this, in metres, and duplicate if they are smaller."""
+    prune_opacity: Annotated[float, FRACTION] = 0.005
+    """Gaussians below this opacity are removed."""
+    prune_size: Annotated[float, NOT_NEGATIVE] = 0.1
+    """Gaussians larger than this, in metres, are removed, once the first opacity reset after `start` has passed."""
+    prune_radius: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Gaussians that look larger than this radius, in pixels, are removed from the same time on. With 0, none is."""
+    opacity_resets: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = (0.1, 0.4)
+    """Times at which opacities are lowered to `reset_opacity`, as fractions of the run."""
+    reset_opacity: Annotated[float, Range(1e-6, 1)] = 0.01
+    """The highest opacity that a reset leaves."""
+    max_gaussians: Annotated[int, MAX_GAUSSIANS] = 40_000
+    """Growth stops at this number of Gaussians; those with the largest gradients grow first."""
+
+
+@dataclass(frozen=True)
+class RefillSettings:
+    """Prune and refill (MonoGaussianAvatar, PointAvatar). Times are fractions of the run."""
+
+    times: Annotated[tuple[float, ...], Range(0, 1, ascending=True)]
+    """Times of the rounds, as fractions of the run."""
+    targets: Annotated[tuple[int, ...], MAX_GAUSSIANS]
+    """Number of Gaussians after each round."""
+    prune_opacity: Annotated[float, FRACTION] = 0.1
+    """Gaussians whose opacity was never this high in any view since the last round are removed."""
+
+
+@dataclass(frozen=True)
+class MethodConfig:
+    """What every method's settings hold; a method adds its own fields."""
+
+    photometric: Photometric = field(default_factory=Photometric)
+    """Weights of the losses that compare a rendering with its target."""
+    face_tuning: FaceTuning = field(default_factory=FaceTuning)
+    """Whether and how fast training changes the tracked face parameters of each frame."""
+
+    def check(self) -> None:
+        """Find that all numbers are in their ranges.
+
+        Raises:
+            UserError: names the first option and value that is not, and the range.
+        """
+        check_ranges(self, lambda name: f"--method.{name.replace('_', '-')}")

@@ -1,0 +1,101 @@
+"""`--config FILE.json`: settings from a file, such as a run's config.json, whole or in parts."""
+
+import difflib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mien.avatar import METHODS
+from mien.config import no_such_setting
+from mien.errors import UserError
+from mien.ranges import shown
+
+_FORMAT, _VERSION = "mien.run", 1
+_TAKEN = ("method", "settings")
+_NOT_TAKEN = ("format", "version", "checksum", "data", "mien", "command_line")
+"""What else a run's config.json holds: what it was trained on, by which version, by which command."""
+_LARGEST = 16 << 20
+"""Bytes; a run's config.json has some kilobytes."""
+
+
+@dataclass(frozen=True)
+class ConfigFile:
+    """What a file asks for; its fields and values are not checked yet."""
+
+    path: Path
+    method: str | None
+    """Name of the method, if it says so."""
+    method_changes: dict[str, Any]
+    """The method's settings by name, without `kind`."""
+    settings_changes: dict[str, Any]
+    """Settings of the run by name."""
+    sequences: tuple[str, ...]
+    """What the run of this file was trained on, which is not taken over."""
+
+
+def read_config_file(path: Path) -> ConfigFile:
+    """Read a config.json: of a run, also edited (its checksum is not asked for), or written by hand.
+
+    Raises:
+        UserError: the file is not there, is no json, is something else than settings, or names a method that there
+            is not.
+    """
+    content = _read(path)
+    for name in content:
+        if name not in _TAKEN + _NOT_TAKEN:
+            short = shown(name)
+            near = difflib.get_close_matches(short, _TAKEN, 1)
+            raise UserError(no_such_setting(f"{path}: {short}", "a file of settings", near, _TAKEN))
+    found = (content.get("format", _FORMAT), content.get("version", _VERSION))
+    if found != (_FORMAT, _VERSION):
+        wanted = f"a run's config.json ({_FORMAT!r} version {_VERSION})"
+        told = f"has format {found[0]!r:.80} version {found[1]!r:.80}"
+        raise UserError(f"{path}: {told}; give {wanted}, or leave out format and version")
+    parts = {name: content.get(name, {}) for name in _TAKEN}
+    for name, part in parts.items():
+        if not isinstance(part, dict):
+            raise UserError(f"{path}: {name} is no object of settings; give {{...}}")
+    method = parts["method"].get("kind")
+    if method is not None and (not isinstance(method, str) or method not in METHODS):
+        raise UserError(f"{path}: method.kind {shown(method)}: give the name of a method: {', '.join(METHODS)}")
+    changes = {name: value for name, value in parts["method"].items() if name != "kind"}
+    return ConfigFile(path, method, changes, parts["settings"], _sequences(content.get("data")))
+
+
+def _sequences(data: Any) -> tuple[str, ...]:
+    entries = data if isinstance(data, list) else []
+    return tuple(shown(entry["sequence"]) for entry in entries if isinstance(entry, dict) and "sequence" in entry)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if path.is_dir():
+        inside = path / "config.json"
+        raise UserError(f"--config {path}: is a folder; " + (f"give {inside}" if inside.is_file() else "give a file"))
+    if not path.exists():
+        raise UserError(f"--config {path}: no such file; give a json file, such as DIR/runs/NAME/config.json")
+    if not path.is_file():
+        raise UserError(f"--config {path}: is no ordinary file; give a json file")
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise ValueError(f"{path.stat().st_size} bytes are too many")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows put a mark at the beginning
+        content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_each_once)
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"--config {path}: cannot be read as json ({error}); mend it or give another file") from None
+    if not isinstance(content, dict):
+        raise UserError(f'--config {path}: holds no object; give {{"method": {{...}}, "settings": {{...}}}}')
+    return content
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"it holds the number {name}")
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{shown(twice)!r} stands there twice")
+    return content

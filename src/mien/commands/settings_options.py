@@ -1,0 +1,173 @@
+"""Options for every field of some settings: `density.max_gaussians` of the method is --method.density.max-gaussians.
+
+The settings say it all themselves (`mien.avatar.settings`): names, types, ranges, and a sentence for the help. Options
+stand under a heading for each group of settings, and the learning rates of a group under one heading together.
+"""
+
+import ast
+import difflib
+import inspect
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
+from functools import cache
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+from mien.avatar import Rate
+from mien.config import no_such_setting
+from mien.errors import UserError
+from mien.ranges import Range, range_of
+
+Settings = TypeVar("Settings")
+_RATES = "Learning rates over the run: constant, or log-linear from start to end."
+_AS_FIELD = "__"
+"""Stands for the dot of a dotted name where Python wants an identifier."""
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One field that holds a value, in some settings or in settings within them."""
+
+    name: str
+    """Dotted: `density.max_gaussians`."""
+    heading: str
+    """Prefix of the options it stands with in the help."""
+    about_heading: str
+    about: str
+    kind: Any
+    """Its type, without marks."""
+    allowed: Range | None
+    value: Any
+
+    def option(self, prefix: str) -> str:
+        """What people type."""
+        return f"--{prefix}.{self.name.replace('_', '-')}"
+
+
+def leaves(settings: Any, prefix: str, names: Sequence[str] | None = None) -> list[Leaf]:
+    """All fields that hold values, with what the help says about them.
+
+    Args:
+        settings: A dataclass whose values are the defaults.
+        prefix: How its options begin: "method" for --method.NAME.
+        names: Outermost fields to take; all of them without it.
+    """
+    about = (inspect.getdoc(type(settings)) or "").splitlines()[0]
+    taken = [name for name in _names(settings) if names is None or name in names]
+    return [leaf for name in taken for leaf in _leaves_of(settings, name, "", prefix, about)]
+
+
+def _leaves_of(settings: Any, name: str, path: str, heading: str, about_heading: str) -> list[Leaf]:
+    value, about = getattr(settings, name), field_docs(type(settings)).get(name, "")
+    hint = get_type_hints(type(settings), include_extras=True)[name]
+    if not is_dataclass(value):
+        kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+        return [Leaf(path + name, heading, about_heading, about, kind, range_of(hint), value)]
+    inside = (f"{heading}.rates", _RATES) if isinstance(value, Rate) else (f"{heading}.{name.replace('_', '-')}", about)
+    found = [leaf for one in _names(value) for leaf in _leaves_of(value, one, f"{path}{name}.", *inside)]
+    if isinstance(value, Rate):
+        # They stand with other rates, so the first of them says which rate it is.
+        found[0] = replace(found[0], about=f"{about} {found[0].about}")
+    return found
+
+
+def options_type(listed: Sequence[Leaf], prefix: str) -> type:
+    """A dataclass that tyro turns into these options: a field for each heading, in it a field for each leaf."""
+    import tyro
+
+    # What belongs to no group comes first.
+    headings: dict[str, list[tuple[str, Any, Any]]] = {prefix: [], f"{prefix}.rates": []}
+    for leaf in listed:
+        limits = "" if leaf.allowed is None else f"{leaf.allowed}; "
+        marks = tyro.conf.arg(
+            name=leaf.option(prefix).removeprefix("--"),
+            prefix_name=False,
+            help=leaf.about.replace("\n", " "),
+            help_behavior_hint=lambda default, limits=limits: f"({limits}default: {default})",
+        )
+        hint: Any = Annotated[leaf.kind, tyro.conf.FlagConversionOff, marks]
+        headings.setdefault(leaf.heading, []).append((_identifier(leaf.name), hint, field(default=leaf.value)))
+    about = {leaf.heading: leaf.about_heading for leaf in reversed(listed)}
+    groups = []
+    for heading, own in headings.items():
+        if not own:
+            continue
+        group = make_dataclass(_identifier(heading), own, frozen=True)
+        mark = tyro.conf.arg(name=heading, prefix_name=False, help=about[heading].replace("\n", " "))
+        groups.append((_identifier(heading), Annotated[group, mark], field(default_factory=group)))
+    return make_dataclass(f"{prefix}_options", groups, frozen=True)
+
+
+def applied(settings: Settings, options: Any) -> Settings:
+    """Settings with the values of such options, an instance of what `options_type` made."""
+    groups = [getattr(options, group.name) for group in fields(options)]
+    typed = {one.name.replace(_AS_FIELD, "."): getattr(group, one.name) for group in groups for one in fields(group)}
+    return _replaced(settings, typed)
+
+
+def check_names(arguments: Sequence[str], prefix: str, listed: Sequence[Leaf], owner: str) -> None:
+    """Find among the words of a command line a setting that there is not.
+
+    Raises:
+        UserError: names it, the nearest one, and those that there are in its group.
+    """
+    known = [leaf.option(prefix) for leaf in listed]
+    for argument in arguments:
+        option = argument.split("=", 1)[0].replace("_", "-")
+        if not option.startswith(f"--{prefix}.") or option in known:
+            continue
+        group = option
+        while not (inside := [name for name in known if name.startswith(f"{group}.")]):
+            group = group.rpartition(".")[0]
+        shown = [*dict.fromkeys(_one_level(name, group) for name in inside)]
+        if group == option:
+            raise UserError(f"{option}: is a group of settings of {owner}; there are: {', '.join(shown)}")
+        raise UserError(no_such_setting(option, owner, _near(option, known), shown))
+
+
+def _near(option: str, known: Sequence[str]) -> list[str]:
+    """The option that is nearest, if one is near by its last part: a name may be right and its group forgotten."""
+    names = [*known, *{name.rpartition(".")[0] for name in known}]
+    lasts = {name: name.rpartition(".")[2] for name in names}
+    near = difflib.get_close_matches(option.rpartition(".")[2], set(lasts.values()), 3)
+    return difflib.get_close_matches(option, sorted(name for name in names if lasts[name] in near), 1, 0.5)
+
+
+@cache
+def field_docs(kind: type) -> Mapping[str, str]:
+    """The string below each field of a dataclass, by the field's name."""
+    found: dict[str, str] = {}
+    for base in reversed([base for base in kind.__mro__ if is_dataclass(base)]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
+        assert isinstance(body, ast.ClassDef)
+        for before, after in zip(body.body, body.body[1:], strict=False):
+            if not isinstance(before, ast.AnnAssign) or not isinstance(before.target, ast.Name):
+                continue
+            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+                found[before.target.id] = inspect.cleandoc(str(after.value.value))
+    return found
+
+
+def _replaced(settings: Any, values: Mapping[str, Any]) -> Any:
+    own = {name: value for name, value in values.items() if "." not in name}
+    inner: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        group, dot, rest = name.partition(".")
+        if dot:
+            inner.setdefault(group, {})[rest] = value
+    own |= {group: _replaced(getattr(settings, group), within) for group, within in inner.items()}
+    return replace(settings, **own)
+
+
+def _one_level(option: str, group: str) -> str:
+    """An option of a group, or the group within the group that it belongs to: `--method.density.*`."""
+    first, dot, _ = option.removeprefix(f"{group}.").partition(".")
+    return f"{group}.{first}" + (".*" if dot else "")
+
+
+def _identifier(name: str) -> str:
+    return name.replace("-", "_").replace(".", _AS_FIELD)
+
+
+def _names(settings: Any) -> list[str]:
+    return [one.name for one in fields(settings)]

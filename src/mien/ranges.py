@@ -1,0 +1,140 @@
+"""Which numbers a setting may have: bounds stand beside the field and are checked in one place.
+
+    rounds: Annotated[int, Range(0, 100_000)] = 16
+
+Everything here is plain Python, because settings are read and checked before any heavy library is imported.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+from mien.errors import UserError
+
+_LONGEST_SHOWN = 60
+"""Characters of a value in a message."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """The numbers from `least` to `most`, both included; NaN is never one of them.
+
+    A tuple is in range if each of its entries is.
+    """
+
+    least: float | int
+    most: float | int
+    or_zero: bool = False
+    """Whether 0 is allowed besides, to switch something off."""
+    ascending: bool = False
+    """Whether the entries of a tuple have to grow from one to the next."""
+    filled: bool = False
+    """Whether a tuple needs an entry at least."""
+    words: str = ""
+    """What to ask for; without words, the bounds say it."""
+
+    def holds(self, value: Any) -> bool:
+        """Whether a number, or every number of a tuple, is in range. None, which stands for no number, always is."""
+        if value is None:
+            return True
+        numbers = value if isinstance(value, tuple) else (value,)
+        if self.filled and not numbers:
+            return False
+        if self.ascending and any(later <= before for before, later in zip(numbers, numbers[1:], strict=False)):
+            return False
+        return all(self.least <= number <= self.most or (self.or_zero and number == 0) for number in numbers)
+
+    def __str__(self) -> str:
+        """The range for people: "from 0 to 3"."""
+        return self.asked("")
+
+    def asked(self, numbers: str) -> str:
+        """What to ask for, where `numbers` says what kind: "a number from 0 to 3"."""
+        bounds = self.words or f"{numbers} from {_short(self.least)} to {_short(self.most)}".strip()
+        return ("0, or " if self.or_zero else "") + bounds + (", ascending" if self.ascending else "")
+
+
+@dataclass(frozen=True)
+class NotBelow:
+    """A mark beside a field: its number is never smaller than that of another field of the same settings."""
+
+    other: str
+
+
+@dataclass(frozen=True)
+class ToLoad:
+    """A mark beside a field that counts only when an avatar is begun.
+
+    An avatar whose tensors are about to be loaded is made with this value, so that no more is made than is read.
+    """
+
+    value: int
+
+
+FRACTION = Range(0, 1)
+"""A share, an opacity, or a time as a fraction of the run."""
+POSITIVE = Range(1e-9, 1e9, words=f"a number above 0, {1e9:g} at most")
+"""A length, a scale."""
+NOT_NEGATIVE = Range(0, 1e9, words=f"0 or a number above it, {1e9:g} at most")
+"""A weight that may be switched off."""
+COUNT = Range(1, 100_000)
+COUNT_OR_NONE = Range(0, 100_000)
+
+
+def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
+    """Check every number of some settings, and of the settings in them, against the range beside its field.
+
+    Args:
+        settings: A dataclass.
+        option: What people type to set the field of a dotted name: `density.rounds` -> "--method.density.rounds".
+
+    Raises:
+        UserError: names the first option and value that is out of range, and the range.
+    """
+    hints = get_type_hints(type(settings), include_extras=True)
+    for field in fields(settings):
+        value, hint = getattr(settings, field.name), hints[field.name]
+        if is_dataclass(value):
+            check_ranges(value, lambda name, group=field.name: option(f"{group}.{name}"))
+            continue
+        allowed = range_of(hint)
+        if allowed is not None:
+            check_range(value, allowed, option(field.name))
+        for mark in marks_of(hint):
+            if isinstance(mark, NotBelow) and value < getattr(settings, mark.other):
+                other = f"{option(mark.other)} {shown(getattr(settings, mark.other))}"
+                raise UserError(f"{option(field.name)} {shown(value)}: give at least as much as {other}")
+
+
+def check_range(value: Any, allowed: Range, option: str) -> None:
+    """Check one value.
+
+    Raises:
+        UserError: it is out of range; names `option`, the value and the range.
+    """
+    if not allowed.holds(value):
+        asked = allowed.asked("numbers" if isinstance(value, tuple) else "a number")
+        raise UserError(f"{option} {shown(value)}: give {asked}")
+
+
+def range_of(hint: Any) -> Range | None:
+    """The range in a field's type hint, if it has one."""
+    return next((mark for mark in marks_of(hint) if isinstance(mark, Range)), None)
+
+
+def shown(value: Any) -> str:
+    """A value of a setting in few characters."""
+    if isinstance(value, (tuple, list)):
+        text = " ".join(shown(item) for item in value) or "(nothing)"
+    else:
+        text = _short(value) if isinstance(value, float) else str(value)
+    return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "..."
+
+
+def marks_of(hint: Any) -> tuple[Any, ...]:
+    """What stands in a field's type hint besides its type."""
+    return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+
+
+def _short(number: float | int) -> str:
+    return str(number) if isinstance(number, int) else f"{number:g}"

@@ -1,0 +1,28 @@
+"""Presets: from quick to good, one name for the settings of a run and of its method."""
+
+from dataclasses import dataclass
+
+from mien.avatar import MethodConfig, method_named
+from mien.training.settings import TrainSettings
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What a preset means: for the run it says so here, for each method in the file of its settings."""
+
+    name: str
+    settings: TrainSettings
+
+    def config(self, method: str) -> MethodConfig:
+        """The settings of a method.
+
+        Raises:
+            UserError: there is no method of that name.
+        """
+        return method_named(method).presets[self.name]
+
+
+PRESETS = {
+    preset.name: preset for preset in (Preset("draft", TrainSettings(steps=8_000)), Preset("standard", TrainSettings()))
+}
+"""By name, from quick to good."""

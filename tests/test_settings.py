@@ -1,0 +1,487 @@
+"""Settings of methods and runs: by option, by file, in which order, and what is refused before any work."""
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+import pytest
+
+import train_toy
+from mien import _native
+from mien.avatar import (
+    METHODS,
+    FaceTuning,
+    GaussianAvatarsConfig,
+    GradientSettings,
+    HeadGasConfig,
+    Method,
+    MethodConfig,
+    Progress,
+    Rate,
+    RefillSettings,
+)
+from mien.cli import main
+from mien.commands.settings_options import field_docs, leaves
+from mien.commands.stages import training
+from mien.errors import UserError
+from mien.ranges import FRACTION, NotBelow, Range, check_ranges
+from mien.training import DIALS, PRESETS, TrainSettings, train
+from toy_scene import toy_face_model, toy_sequence
+from toy_workspace import write_toy_workspace
+
+Choices = tuple[MethodConfig, TrainSettings]
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    """What `mien train` looks at before any work: a tracked sequence."""
+    for name in ("capture/capture.json", "tracking/tracking.json"):
+        path = tmp_path / "w" / "sequences" / "clip" / name
+        path.parent.mkdir(parents=True)
+        path.touch()
+    return tmp_path / "w"
+
+
+@pytest.fixture
+def choices(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """What `mien train` with some options would train with."""
+    asked: list[Choices] = []
+
+    def remember(workspace: object, names: object, run: object, method: MethodConfig, settings: TrainSettings) -> None:
+        asked.append((method, settings))
+
+    monkeypatch.setattr(training, "training_stage", remember)
+
+    def choose(line: str, file: object = None) -> Choices:
+        words = ["train", str(workspace), *line.split()]
+        if file is not None:
+            (workspace / "file.json").write_text(json.dumps(file))
+            words += ["--config", str(workspace / "file.json")]
+        assert main(words) == 0
+        return asked.pop()
+
+    return choose
+
+
+def complaint(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
+    """The one line about a command that must fail by the user's mistake."""
+    assert main(words) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+    return line
+
+
+# -- options ----------------------------------------------------------------------------------------------------------
+
+
+def test_without_options_a_run_is_the_preset(choices: Any) -> None:
+    for name, method in METHODS.items():
+        assert choices(f"--method {name}") == (method.config(), TrainSettings())
+        assert choices(f"--method {name} --preset draft") == (method.presets["draft"], TrainSettings(steps=8000))
+
+
+def test_options_reach_every_depth(choices: Any) -> None:
+    line = """--method.sh-degree 2 --method.sh-frame head --method.density.max-gaussians=20000 --training.resolution 256
+        --method.means-rate.start 4e-3 --method.means-rate.end 4e-5 --method.photometric.alpha_weight 0.1 --steps 70
+        --method.density.opacity-resets 0.2 0.5 --training.checkpoint-every 50 --training.record-every 5
+        --method.face-tuning.head-translation.begin 0.5 --training.threads 1"""
+    config, settings = choices(line)
+    plain = GaussianAvatarsConfig()
+    assert config == GaussianAvatarsConfig(
+        sh_degree=2,
+        sh_frame="head",
+        means_rate=Rate(4e-3, 4e-5),
+        photometric=replace(plain.photometric, alpha_weight=0.1),
+        density=GradientSettings(max_gaussians=20_000, opacity_resets=(0.2, 0.5)),
+        face_tuning=FaceTuning(head_translation=Rate(3e-4, begin=0.5)),
+    )
+    assert settings == TrainSettings(steps=70, resolution=256, checkpoint_every=50, record_every=5, threads=1)
+
+
+def test_options_are_those_of_the_method(choices: Any) -> None:
+    config, _ = choices("--method headgas --method.features 8 --method.density.rounds 3")
+    assert config == HeadGasConfig(features=8, density=replace(HeadGasConfig().density, rounds=3))
+
+
+@pytest.mark.parametrize("line", ["--no-face-tuning", "--method.face-tuning.enabled False"])
+def test_face_tuning_has_two_options_that_agree(line: str, choices: Any) -> None:
+    off = FaceTuning(enabled=False)
+    assert choices(line)[0] == GaussianAvatarsConfig(face_tuning=off)
+    file = {"method": {"face_tuning": {"enabled": False}}}
+    assert choices("", file)[0] == GaussianAvatarsConfig(face_tuning=off)
+    assert choices(line.replace("--no-", "--").replace("False", "True"), file)[0] == GaussianAvatarsConfig()
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("--method.sh-degre 2", "gaussian_avatars has no such setting; did you mean --method.sh-degree? there are: "),
+        ("--method.features 2", "--method.features: gaussian_avatars has no such setting; there are: --method.photo"),
+        ("--method.max-gaussians 2", "did you mean --method.density.max-gaussians?"),
+        ("--method.density.split 2", "did you mean --method.density.split-size? there are: --method.density.start"),
+        ("--method.density 2", "--method.density: is a group of settings of gaussian_avatars; there are: --method.de"),
+        ("--method headgas --method.sh-warmup 1", "headgas has no such setting"),
+        ("--training.resolutions 3", "--training.resolution"),
+        ("--method.sh-degree 4", "--method.sh-degree 4: give a number from 0 to 3"),
+        ("--method.sh-degree 1.5", "--method.sh-degree"),
+        ("--method.sh-frame upside-down", "world"),
+        ("--method.scale-weight nan", "--method.scale-weight nan: give 0 or a number above it"),
+        ("--method.means-rate.start -1", "--method.means-rate.start -1: give a number from 0 to 100"),
+        ("--method.means-rate.end 0", "--method.means-rate.end 0: give a number from 1e-12 to 100"),
+        (
+            "--method.density.start 0.8",
+            "--method.density.stop 0.7: give at least as much as --method.density.start 0.8",
+        ),
+        ("--method.density.opacity-resets 0.4 0.1", "opacity-resets 0.4 0.1: give numbers from 0 to 1, ascending"),
+        ("--method.density.max-gaussians -3", "--method.density.max-gaussians -3: give a number from 1 to 10000000"),
+        ("--method.photometric.l1-weight inf", "--method.photometric.l1-weight inf: give 0 or"),
+        ("--training.resolution 3", "--training.resolution 3: give 0, or a number from 16 to 8192"),
+        ("--training.record-every 0", "--training.record-every 0: give a number from 1 to"),
+        ("--steps 99999999999", "--steps 99999999999: give a number from 1 to 1000000000"),
+        ("--seed 99999999999999999999", "--seed 99999999999999999999: give a number from -9223372036854775808"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused_before_any_work(
+    line: str, words: str, workspace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert words in complaint(capsys, ["train", str(workspace), *line.split()])
+    assert not (workspace / "runs").exists()
+
+
+def test_create_refuses_them_as_train_does(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (workspace / "file.json").write_text('{"settings": {"steps": -1}}')
+    for line, words in (
+        ("--method.sh-degre 2", "did you mean --method.sh-degree?"),
+        ("--method.sh-degree 4", "--method.sh-degree 4: give a number from 0 to 3"),
+        (f"--config {workspace / 'file.json'}", "settings.steps -1: give a number from 1"),
+    ):
+        arguments = ["create", str(workspace), "--out", str(workspace / "new"), *line.split()]
+        assert words in complaint(capsys, arguments)
+    assert not (workspace / "new").exists()
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def test_options_win_over_the_file_and_the_file_over_the_preset(choices: Any) -> None:
+    file = {
+        "method": {"kind": "headgas", "features": 32, "density": {"rounds": 5}},
+        "settings": {"steps": 2000, "seed": 3, "held_out_sequences": ["smile"], "record_every": 7},
+    }
+    density = replace(HeadGasConfig().density, rounds=5)
+    assert choices("--hold-out", file) == (
+        HeadGasConfig(features=32, density=density),
+        TrainSettings(steps=2000, seed=3, record_every=7),
+    )
+    config, settings = choices("--hold-out --method.features 8 --steps 50 --preset draft --seed 0", file)
+    assert (config, settings) == (HeadGasConfig(features=8, density=density), TrainSettings(steps=50, record_every=7))
+    assert choices("--preset draft", {"settings": {"split": "tail"}})[1] == TrainSettings(steps=8000, split="tail")
+    assert choices("--method headgas", {"settings": {"seed": 1}}) == (HeadGasConfig(), TrainSettings(seed=1))
+    assert choices("", {}) == choices("")
+
+
+def test_what_is_held_out_follows_the_file(workspace: Path, choices: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    (workspace / "file.json").write_text('{"settings": {"held_out_sequences": ["nobody"]}}')
+    words = ["train", str(workspace), "--config", str(workspace / "file.json")]
+    assert "--hold-out nobody: no such sequence" in complaint(capsys, words)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "cannot be read as json"),
+        ("[]", "holds no object"),
+        ('{"method": {"sh_degree": NaN}}', "it holds the number NaN"),
+        ('{"method": {"sh_degree": 1, "sh_degree": 2}}', "'sh_degree' stands there twice"),
+        ('{"format": "mien.capture"}', "has format 'mien.capture' version 1; give a run's config.json"),
+        ('{"version": 2}', "version 2"),
+        ('{"methods": {}}', "methods: a file of settings has no such setting; did you mean method?"),
+        ('{"method": {"kind": "nerf"}}', "method.kind nerf: give the name of a method: gaussian_avatars"),
+        ('{"method": {"kind": []}}', "method.kind (nothing): give the name of a method"),
+        ('{"method": 3}', "method is no object of settings"),
+        ('{"settings": {"stepps": 3}}', "settings.stepps: a run has no such setting; did you mean steps? there are"),
+        ('{"settings": {"kind": "GaussianAvatarsConfig"}}', "settings.kind 'GaussianAvatarsConfig': give 'TrainSett"),
+        ('{"settings": {"steps": "many"}}', "settings.steps 'many': give a whole number"),
+        ('{"settings": {"steps": true}}', "settings.steps True: give a whole number"),
+        ('{"settings": {"steps": 0}}', "settings.steps 0: give a number from 1"),
+        ('{"settings": {"split": "half"}}', "settings.split 'half': give one of blocks, tail, none"),
+        ('{"settings": {"device": "tpu"}}', "settings.device 'tpu': give one of"),
+        (
+            '{"settings": {"held_out_sequences": "a"}}',
+            "settings.held_out_sequences 'a': give a list, each entry a text",
+        ),
+        ('{"method": {"features": 3}}', "method.features: gaussian_avatars has no such setting"),
+        (
+            '{"method": {"density": {"round": 3}}}',
+            "method.density.round: gaussian_avatars has no such setting; did you",
+        ),
+        ('{"method": {"density": 3}}', "method.density 3: give an object of settings"),
+        ('{"method": {"density": {"kind": "RefillSettings"}}}', "method.density.kind 'RefillSettings'"),
+        (
+            '{"method": {"density": {"opacity_resets": [0.5, 0.5]}}}',
+            "opacity_resets 0.5 0.5: give numbers from 0 to 1,",
+        ),
+        ('{"method": {"density": {"stop": 0.05}}}', "--method.density.stop 0.05: give at least as much as"),
+        (
+            '{"method": {"means_rate": {"end": null, "start": 1e999}}}',
+            "method.means_rate.start inf: give a number from",
+        ),
+        (f'{{"method": {{"scale_weight": 1{"0" * 400}}}}}', "method.scale_weight 1000"),
+        (f'{{"settings": {{"steps": 1{"0" * 4000}}}}}', "settings.steps 1000"),
+        ("[" * 100_000, "cannot be read as json"),
+        ('{"' + "x" * 3000 + '": 1}', "xxx...: a file of settings has no such setting"),
+        ('{"method": {"' + "x" * 3000 + '": 1}}', "xxx: gaussian_avatars has no such setting"),
+        ('{"method": {"kind": "' + "x" * 3000 + '"}}', "method.kind xxx"),
+        ('{"format": "' + "x" * 3000 + '"}', "has format 'xxx"),
+        ('{"method": {"face_tuning": {"enabled": 1}}}', "method.face_tuning.enabled 1: give true or false"),
+    ],
+)
+def test_files_that_make_no_sense_are_refused_before_any_work(
+    content: str, words: str, workspace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (workspace / "file.json").write_text(content)
+    line = complaint(capsys, ["train", str(workspace), "--config", str(workspace / "file.json")])
+    assert words in line
+    assert len(line) < 1000
+    assert not (workspace / "runs").exists()
+
+
+def test_paths_that_are_no_file_are_refused(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (workspace / "runs" / "a").mkdir(parents=True)
+    (workspace / "runs" / "a" / "config.json").touch()
+    for path, words in (
+        (workspace / "gone.json", "gone.json: no such file"),
+        (workspace / "runs" / "a", f"is a folder; give {workspace / 'runs' / 'a' / 'config.json'}"),
+        (workspace / "runs", "is a folder; give a file"),
+        (Path("/dev/null"), "is no ordinary file"),
+    ):
+        assert words in complaint(capsys, ["train", str(workspace), "--config", str(path)])
+    assert "is a folder" in complaint(capsys, ["train", str(workspace), "--config="])
+
+
+def test_a_file_of_another_method_than_asked_for_is_refused(
+    workspace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (workspace / "file.json").write_text('{"method": {"kind": "headgas"}}')
+    words = ["train", str(workspace), "--config", str(workspace / "file.json"), "--method", "gaussian_avatars"]
+    assert "has settings of headgas, but --method asks for gaussian_avatars" in complaint(capsys, words)
+
+
+def test_a_run_is_repeated_from_its_config_to_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_toy_workspace(tmp_path)
+    monkeypatch.setattr(training, "load_face_model", lambda name: toy_face_model())
+    runs = tmp_path / "runs"
+    words = ["train", str(tmp_path), "--config", str(runs / "toy" / "config.json")]
+    assert main([*words, "--run", "again"]) == 0
+    told = capsys.readouterr().err
+    assert "config.json: method and settings are taken from it, not its sequences (clip)" in told
+    for name in ("avatar/avatar.safetensors", "avatar/avatar.json", "face_track.safetensors"):
+        assert (runs / "again" / name).read_bytes() == (runs / "toy" / name).read_bytes(), name
+    first, second = (json.loads((runs / run / "config.json").read_text()) for run in ("toy", "again"))
+    assert [first[part] for part in ("method", "settings", "data")] == [
+        second[part] for part in ("method", "settings", "data")
+    ]
+    # Edited, as its checksum would tell; a run reads its own config.json as strictly as before.
+    (runs / "again" / "config.json").write_text(json.dumps({**first, "settings": {**first["settings"], "steps": 4}}))
+    words[-1] = str(runs / "again" / "config.json")
+    assert main([*words, "--run", "shorter"]) == 0
+    assert json.loads((runs / "shorter" / "training.json").read_text())["steps"] == 4
+    capsys.readouterr()
+    assert "damaged or edited" in complaint(capsys, ["evaluate", str(tmp_path), "--run", "again"])
+
+
+# -- ranges -----------------------------------------------------------------------------------------------------------
+
+CONFIGS: list[Any] = [method.config() for method in METHODS.values()]
+EVERYTHING: list[Any] = [*CONFIGS, TrainSettings(), RefillSettings((0.1, 0.2), (10, 20))]
+
+
+def numbers(settings: Any, path: str = "") -> Iterator[tuple[str, Any, Any, Any]]:
+    """Dotted name, owner, hint and value of every field that holds numbers."""
+    hints = get_type_hints(type(settings), include_extras=True)
+    for field in fields(settings):
+        value, hint = getattr(settings, field.name), hints[field.name]
+        if is_dataclass(value):
+            yield from numbers(value, f"{path}{field.name}.")
+        elif {int, float} & ({hint} | set(get_args(hint)) | {a for arg in get_args(hint) for a in get_args(arg)}):
+            yield path + field.name, settings, hint, value
+
+
+def changed(settings: Any, path: str, value: Any) -> Any:
+    """Settings with another value of a dotted name."""
+    name, _, rest = path.partition(".")
+    return replace(settings, **{name: changed(getattr(settings, name), rest, value) if rest else value})
+
+
+@pytest.mark.parametrize("settings", EVERYTHING, ids=lambda settings: type(settings).__name__)
+def test_every_number_has_a_range_that_is_checked(settings: Any) -> None:
+    names = [name for name, *_ in numbers(settings)]
+    assert len(names) >= 3
+    for name, owner, hint, value in numbers(settings):
+        marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+        (allowed,) = [mark for mark in marks if isinstance(mark, Range)]
+        assert allowed.holds(value), name
+        whole = isinstance(allowed.least, int) and (isinstance(value, int) or "int" in str(hint))
+        wrong = [math.nan, math.inf, -math.inf] if not whole else []
+        wrong += [allowed.most + 1 if whole else allowed.most * 1.001 + 1e-3, allowed.least - (1 if whole else 1e-3)]
+        for bad in wrong:
+            value_ = (type(value[0] if value else 0.1)(bad),) if isinstance(value, tuple) else bad
+            with pytest.raises(UserError) as told:
+                check_ranges(changed(settings, name, value_), lambda name: f"--{name}")
+            assert f"--{name} " in str(told.value), (name, bad, type(owner))
+            assert "give " in str(told.value)
+
+
+def test_what_is_in_range_passes() -> None:
+    for settings in (*CONFIGS, *(preset.settings for preset in PRESETS.values())):
+        settings.check()
+    GaussianAvatarsConfig(density=GradientSettings(start=0.5, stop=0.5, opacity_resets=())).check()
+    TrainSettings(resolution=16).check()
+
+
+def test_ranges_in_words() -> None:
+    @dataclass(frozen=True)
+    class Some:
+        sizes: Annotated[tuple[int, ...], Range(16, 64, filled=True)] = (16,)
+        first: Annotated[float, FRACTION] = 0.0
+        last: Annotated[float, FRACTION, NotBelow("first")] = 1.0
+
+    for some, words in (
+        (Some(sizes=()), "--sizes (nothing): give numbers from 16 to 64"),
+        (Some(sizes=(16, 70)), "--sizes 16 70: give numbers from 16 to 64"),
+        (Some(first=1.5), "--first 1.5: give a number from 0 to 1"),
+        (Some(first=0.5, last=0.25), "--last 0.25: give at least as much as --first 0.5"),
+    ):
+        with pytest.raises(UserError) as told:
+            check_ranges(some, lambda name: f"--{name}")
+        assert str(told.value) == words
+
+
+def test_training_refuses_settings_out_of_range(tmp_path: Path) -> None:
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    with pytest.raises(UserError, match="--training.record-every 0"):
+        train([sequence], face_model, train_toy.CONFIG, TrainSettings(record_every=0), tmp_path / "run")
+    config = replace(train_toy.CONFIG, sh_degree=4)
+    with pytest.raises(UserError, match="--method.sh-degree 4"):
+        train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_rate_that_starts_at_nothing_stays_there() -> None:
+    assert Rate(0.0, 1e-3).at(Progress(5, 10)) == 0
+    assert Rate(1e-2, 1e-4).at(Progress(5, 10)) == pytest.approx(1e-3)
+
+
+def test_threads_of_a_run_are_those_it_asks_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, seen = _native.thread_count(), []
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    settings = replace(train_toy.SETTINGS, steps=1, threads=before + 1)
+    monkeypatch.setattr("mien.training.trainer.step", lambda state, *_: _end(state, seen))
+    monkeypatch.setattr("mien.training.trainer.write_results", lambda *_: None)
+    train([sequence], face_model, train_toy.CONFIG, settings, tmp_path)
+    assert seen == [before + 1]
+    assert _native.thread_count() == before
+
+
+def _end(state: Any, seen: list[int]) -> str:
+    seen.append(_native.thread_count())
+    state.step += 1
+    return ""
+
+
+# -- help and presets -------------------------------------------------------------------------------------------------
+
+
+def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    assert stop.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = help_of(capsys, "train", "--method", method, "--help-all")
+    listed = leaves(METHODS[method].config(), "method")
+    for leaf in listed:
+        assert f" {leaf.option('method')} " in shown
+    for heading in {leaf.heading for leaf in listed}:
+        assert f" {heading} options " in shown
+    rest = [field.name for field in fields(TrainSettings) if field.name not in DIALS]
+    assert rest
+    assert all(f"--training.{name.replace('_', '-')} " in shown for name in rest)
+    assert f"--method.{'density.max-gaussians' if method != 'mono_gaussian_avatar' else 'max-points'}" in shown
+
+
+def test_help_all_shows_what_a_file_asks_for(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (workspace / "file.json").write_text('{"method": {"kind": "headgas", "features": 321}}')
+    shown = help_of(capsys, "train", "--config", str(workspace / "file.json"), "--help-all")
+    assert "default: 321" in " ".join(shown.split())
+
+
+def test_help_stays_short_and_says_how_to_see_more(capsys: pytest.CaptureFixture[str]) -> None:
+    short = help_of(capsys, "train", "--method", "headgas", "--help")
+    assert len(short.splitlines()) < 60
+    assert "--method.features" not in short
+    assert short.rstrip().endswith("mien train --method headgas --help-all")
+
+
+@pytest.mark.parametrize("settings", [*EVERYTHING, FaceTuning(), Rate(1.0)], ids=lambda one: type(one).__name__)
+def test_every_field_has_a_sentence(settings: Any) -> None:
+    docs = field_docs(type(settings))
+    for field in fields(settings):
+        about = docs[field.name]
+        assert about[0].isupper(), field.name
+        assert about.endswith("."), field.name
+        assert not about.startswith("Of "), field.name
+        if is_dataclass(getattr(settings, field.name)):
+            test_every_field_has_a_sentence(getattr(settings, field.name))
+
+
+def test_presets_are_the_same_for_all_methods() -> None:
+    for name, method in METHODS.items():
+        assert set(method.presets) == set(PRESETS)
+        assert all(type(config) is method.config for config in method.presets.values())
+        # A change of what a preset means is meant, and told in the changelog.
+        assert all(preset.config(name) == method.config() for preset in PRESETS.values())
+
+
+@dataclass(frozen=True)
+class Dust:
+    """How dust settles."""
+
+    grains: Annotated[int, Range(1, 10)] = 3
+    """Number of grains."""
+
+
+@dataclass(frozen=True)
+class ToyConfig(MethodConfig):
+    """Settings of a toy."""
+
+    colour: Literal["red", "blue"] = "red"
+    """Colour of the toy."""
+    shines: bool = False
+    """Whether the toy shines."""
+    dust: Dust = Dust()
+    """How dust settles on it."""
+
+
+def test_settings_of_an_added_method_appear_by_themselves(
+    choices: Any, workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    presets = {"draft": ToyConfig(dust=Dust(1)), "standard": ToyConfig()}
+    monkeypatch.setitem(METHODS, "toy", Method(presets, "toy_module:Toy"))
+    shown = help_of(capsys, "train", "--method", "toy", "--help-all")
+    assert "--method.dust.grains INT" in shown
+    assert "Colour of the toy." in shown
+    monkeypatch.setattr("mien.training.run.check_run", lambda *_: False)
+    line = "--method toy --method.colour blue --method.shines True --preset draft --method.photometric.ssim-weight 0.5"
+    config, _ = choices(line)
+    expected = ToyConfig(colour="blue", shines=True, dust=Dust(1))
+    assert config == replace(expected, photometric=replace(expected.photometric, ssim_weight=0.5))
+    told = complaint(capsys, ["train", str(workspace), *["--method", "toy", "--method.dust.grains", "11"]])
+    assert "--method.dust.grains 11: give a number from 1 to 10" in told
