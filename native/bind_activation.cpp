@@ -2,23 +2,21 @@
 #include <nanobind/ndarray.h>
 
 #include "activation.h"
+#include "arrays.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
 
-void sigmoid(const nb::ndarray<const float, nb::c_contig, nb::device::cpu>& values,
-             const nb::ndarray<float, nb::c_contig, nb::device::cpu>& out) {
-  if (values.size() != out.size()) throw nb::value_error("the output does not fit");
+void sigmoid(const Array<const float>& values, const Array<float>& out) {
+  require(same_shape(values, out), "the output does not fit");
   const nb::gil_scoped_release release;
   mien::sigmoid(values.data(), static_cast<int64_t>(values.size()), out.data());
 }
 
-void sigmoid_backward(const nb::ndarray<const float, nb::c_contig, nb::device::cpu>& outputs,
-                      const nb::ndarray<const float, nb::c_contig, nb::device::cpu>& gradient,
-                      const nb::ndarray<float, nb::c_contig, nb::device::cpu>& out) {
-  if (outputs.size() != out.size() || gradient.size() != out.size()) throw nb::value_error("the output does not fit");
+void sigmoid_backward(const Array<const float>& outputs, const Array<const float>& gradient, const Array<float>& out) {
+  require(same_shape(outputs, out) && same_shape(gradient, out), "the output does not fit");
   const nb::gil_scoped_release release;
   mien::sigmoid_backward(outputs.data(), gradient.data(), static_cast<int64_t>(out.size()), out.data());
 }

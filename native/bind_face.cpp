@@ -20,23 +20,23 @@ mien::FaceModelData make_model(const In<-1, -1, 3>& expression_basis, const std:
                                const In<-1, -1>& skinning_weights, const std::vector<int>& parents,
                                const std::vector<bool>& is_free) {
   mien::FaceModelData sizes;
-  sizes.vertices = static_cast<int>(skinning_weights.shape(0));
-  sizes.expressions = static_cast<int>(expression_basis.shape(0));
-  sizes.joints = static_cast<int>(skinning_weights.shape(1));
+  sizes.vertices = checked_length(skinning_weights.shape(0), mien::kMostFaceVertices, "vertices");
+  sizes.expressions = checked_length(expression_basis.shape(0), mien::kMostFaceShapes, "blendshapes");
+  sizes.joints = checked_length(skinning_weights.shape(1), mien::kMostFaceJoints, "joints");
   const size_t e = expression_basis.shape(0), v = skinning_weights.shape(0), k = skinning_weights.shape(1);
   require(expression_basis.shape(1) == v && rotation_basis.shape(0) == e && rotation_basis.shape(1) == k &&
               translation_basis.shape(0) == e && translation_basis.shape(1) == k && parents.size() == k &&
               is_free.size() == k,
           "the arrays of a face model do not fit together");
   for (size_t joint = 0; joint < k; ++joint) {
-    require(parents[joint] < static_cast<int>(joint), "a joint comes after its parent");
+    require(parents[joint] >= -1 && parents[joint] < static_cast<int>(joint), "a joint comes after its parent");
     sizes.parents.push_back(parents[joint]);
     sizes.free_index.push_back(is_free[joint] ? sizes.free_joints++ : -1);
   }
   require(
       !pose_basis || (pose_basis->shape(0) == 9 * static_cast<size_t>(sizes.free_joints) && pose_basis->shape(1) == v),
       "the pose basis has 9 shapes a free joint");
-  require(e + 9 * sizes.free_joints <= mien::kMostFaceShapes, "a face model has at most 256 blendshapes");
+  checked_length(e + 9 * static_cast<size_t>(sizes.free_joints), mien::kMostFaceShapes, "blendshapes");
   sizes.joint_rotation_basis.assign(rotation_basis.data(), rotation_basis.data() + rotation_basis.size());
   sizes.joint_translation_basis.assign(translation_basis.data(), translation_basis.data() + translation_basis.size());
   return mien::make_face_model(std::move(sizes), expression_basis.data(), pose_basis ? pose_basis->data() : nullptr,
@@ -79,7 +79,7 @@ void forward(const mien::FaceModelData& model, const In<-1, 3>& rest, const In<-
   const Batch batch{model, rest, joint_rest, expression, joints, head_rotation, head_translation};
   batch.check();
   const size_t floats = 3 * static_cast<size_t>(model.vertices);
-  require(shaped.size() == batch.size() * floats && vertices.size() == shaped.size(), "the outputs do not fit");
+  require(has_shape(shaped, batch.size(), model.vertices, 3) && same_shape(vertices, shaped), "the outputs do not fit");
   const nb::gil_scoped_release release;
   mien::parallel_for(static_cast<int64_t>(batch.size()), [&](int64_t b) {
     mien::pose_face(model, batch.pose(b), shaped.data() + b * floats, vertices.data() + b * floats);
@@ -96,10 +96,10 @@ void backward(const mien::FaceModelData& model, const In<-1, 3>& rest, const In<
   const Batch batch{model, rest, joint_rest, expression, joints, head_rotation, head_translation};
   batch.check();
   const size_t b = batch.size(), floats = 3 * static_cast<size_t>(model.vertices);
-  require(shaped.size() == b * floats && grad_vertices.size() == b * floats && grad_rest.size() == b * floats &&
-              grad_joint_rest.size() == b * 3 * model.joints && grad_expression.size() == b * model.expressions &&
-              grad_joints.size() == b * 3 * model.free_joints && grad_head_rotation.size() == 3 * b &&
-              grad_head_translation.size() == 3 * b,
+  require(has_shape(shaped, b, model.vertices, 3) && same_shape(grad_vertices, shaped) &&
+              same_shape(grad_rest, shaped) && has_shape(grad_joint_rest, b, model.joints, 3) &&
+              same_shape(grad_expression, expression) && same_shape(grad_joints, joints) &&
+              has_shape(grad_head_rotation, b, 3) && has_shape(grad_head_translation, b, 3),
           "a gradient must have the shape of its array");
   const nb::gil_scoped_release release;
   mien::parallel_for(static_cast<int64_t>(b), [&](int64_t i) {

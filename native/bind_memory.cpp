@@ -2,6 +2,8 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
+#include <cstdint>
+#include <memory>
 #include <new>
 #include <vector>
 
@@ -12,22 +14,17 @@ using namespace nb::literals;
 
 namespace {
 
-struct Lease {
-  void* memory;
-  size_t bytes;
-};
-
 nb::ndarray<nb::pytorch, float, nb::device::cpu> recycled(const std::vector<size_t>& shape) {
-  size_t bytes = sizeof(float);
-  for (const size_t length : shape) bytes *= length;
-  void* const memory = mien::take_memory(bytes);
-  if (!memory) throw std::bad_alloc();
-  const nb::capsule owner(new Lease{memory, bytes}, [](void* lease) noexcept {
-    const auto* own = static_cast<Lease*>(lease);
-    mien::give_memory(own->memory, own->bytes);
-    delete own;
-  });
-  return {memory, shape.size(), shape.data(), owner};
+  constexpr size_t kMost = SIZE_MAX / 8;
+  size_t count = 1;
+  for (const size_t length : shape) {
+    if (length > kMost || (length != 0 && count > kMost / length)) throw std::bad_alloc();
+    count *= length;
+  }
+  using Memory = mien::Recycled<float>;
+  auto memory = std::make_unique<Memory>(count);
+  const nb::capsule owner(memory.get(), [](void* own) noexcept { delete static_cast<Memory*>(own); });
+  return {memory.release()->data(), shape.size(), shape.data(), owner};
 }
 
 }  // namespace

@@ -3,7 +3,6 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 
-#include <algorithm>
 #include <optional>
 #include <stdexcept>
 #include <utility>
@@ -26,43 +25,43 @@ using Pairs = Array<const int32_t, nb::shape<-1, 2>>;
 template <typename T>
 using Grad = std::optional<Array<T>>;
 
-template <typename T>
-T* data_or_null(const Grad<T>& array, size_t size, const char* name) {
-  if (!array) return nullptr;
-  if (array->size() != size) throw nb::value_error(name);
-  return array->data();
-}
-
 template <typename T, typename A>
-void check_range(const A& array, T count, const char* what, T least = 0) {
-  const auto in_range = [=](auto index) { return index >= least && static_cast<T>(index) < count; };
-  if (!std::all_of(array.data(), array.data() + array.size(), in_range)) throw std::out_of_range(what);
+T* data_or_null(const Grad<T>& gradient, const A& array, const char* message) {
+  if (!gradient) return nullptr;
+  require(same_shape(*gradient, array), message);
+  return gradient->data();
 }
 
 mien::Fragments fragments_of(const Array<const int32_t, nb::ndim<2>>& face_index, const Image& barycentric,
                              const Gray& depth, int64_t faces) {
-  if (barycentric.size() != 3 * face_index.size() || depth.size() != face_index.size()) {
-    throw nb::value_error("face_index, barycentric and depth must be of one picture");
-  }
-  check_range<int64_t>(face_index, faces, "the fragments name a triangle that does not exist", -1);
-  return {face_index.data(), barycentric.data(), depth.data(), static_cast<int>(face_index.shape(1)),
-          static_cast<int>(face_index.shape(0))};
+  const PictureSize size = picture_size(face_index);
+  require(has_shape(barycentric, size.height, size.width, 3) && same_shape(depth, face_index),
+          "face_index, barycentric and depth must be of one picture");
+  check_indices(face_index, faces, "the fragments name a triangle that does not exist", -1);
+  return {face_index.data(), barycentric.data(), depth.data(), size.width, size.height};
 }
 
 mien::ImageMesh mesh_of(const Points& points, const Faces& faces) {
-  check_range<int64_t>(faces, static_cast<int64_t>(points.shape(0)), "a face names a vertex that does not exist");
-  return {points.data(), static_cast<int64_t>(points.shape(0)), faces.data(), static_cast<int64_t>(faces.shape(0))};
+  const int point_count = checked_length(points.shape(0), "vertices");
+  const int face_count = checked_length(faces.shape(0), "triangles");
+  check_indices(faces, point_count, "a face names a vertex that does not exist");
+  return {points.data(), point_count, faces.data(), face_count};
 }
 
 mien::MeshEdges edges_of(const Pairs& vertices, const Pairs& faces, const Array<const int32_t, nb::ndim<1>>& opposite,
                          const mien::ImageMesh& mesh) {
-  if (vertices.shape(0) != faces.shape(0) || opposite.shape(0) != faces.shape(0)) {
-    throw nb::value_error("edges: vertices, faces and opposite must have one row an edge");
+  require(vertices.shape(0) == faces.shape(0) && opposite.shape(0) == faces.shape(0),
+          "edges: vertices, faces and opposite must have one row an edge");
+  const int count = checked_length(vertices.shape(0), "edges");
+  check_indices(vertices, mesh.point_count, "an edge names a vertex that does not exist");
+  check_indices(opposite, mesh.point_count, "an edge names a vertex that does not exist");
+  check_indices(faces, mesh.face_count, "an edge names a triangle that does not exist", -1);
+  for (int edge = 0; edge < count; ++edge) {  // only the second one may be missing
+    if (faces.data()[2 * static_cast<int64_t>(edge)] < 0) {
+      throw std::out_of_range("an edge names a triangle that does not exist");
+    }
   }
-  check_range<int64_t>(vertices, mesh.point_count, "an edge names a vertex that does not exist");
-  check_range<int64_t>(opposite, mesh.point_count, "an edge names a vertex that does not exist");
-  check_range<int64_t>(faces, mesh.face_count, "an edge names a triangle that does not exist", -1);
-  return {vertices.data(), faces.data(), opposite.data(), static_cast<int64_t>(vertices.shape(0))};
+  return {vertices.data(), faces.data(), opposite.data(), count};
 }
 
 using FaceIndex = Array<const int32_t, nb::ndim<2>>;
@@ -71,9 +70,8 @@ using Opposite = Array<const int32_t, nb::ndim<1>>;
 void barycentric_backward(const FaceIndex& face_index, const Image& barycentric, const Gray& depth,
                           const Points& points, const Faces& faces, const Image& grad_barycentric,
                           const Array<double, nb::shape<-1, 3>>& grad_points) {
-  if (grad_barycentric.size() != barycentric.size() || grad_points.size() != points.size()) {
-    throw nb::value_error("gradients must have the sizes of what they are of");
-  }
+  require(same_shape(grad_barycentric, barycentric) && same_shape(grad_points, points),
+          "gradients must have the sizes of what they are of");
   const nb::gil_scoped_release release;
   const mien::ImageMesh mesh = mesh_of(points, faces);
   mien::barycentric_backward(fragments_of(face_index, barycentric, depth, mesh.face_count), mesh,
@@ -83,34 +81,32 @@ void barycentric_backward(const FaceIndex& face_index, const Image& barycentric,
 void interpolate_backward(const FaceIndex& face_index, const Image& barycentric, const Rows& attributes,
                           const Faces& corners, const Image& grad_out, const Grad<float>& grad_attributes,
                           const Grad<float>& grad_barycentric) {
-  const int channels = static_cast<int>(attributes.shape(1));
-  if (grad_out.size() != face_index.size() * attributes.shape(1) || barycentric.size() != 3 * face_index.size()) {
-    throw nb::value_error("grad_out must hold one row of attributes a pixel");
-  }
-  float* by_attributes = data_or_null(grad_attributes, attributes.size(), "grad_attributes has another size");
-  float* by_barycentric = data_or_null(grad_barycentric, barycentric.size(), "grad_barycentric has another size");
+  const int channels = checked_length(attributes.shape(1), "numbers a vertex");
+  const PictureSize size = picture_size(face_index);
+  require(has_shape(grad_out, size.height, size.width, channels) && has_shape(barycentric, size.height, size.width, 3),
+          "grad_out must hold one row of attributes a pixel");
+  float* by_attributes = data_or_null(grad_attributes, attributes, "grad_attributes has another size");
+  float* by_barycentric = data_or_null(grad_barycentric, barycentric, "grad_barycentric has another size");
   const nb::gil_scoped_release release;
-  check_range<int64_t>(corners, static_cast<int64_t>(attributes.shape(0)), "a face names a vertex that does not exist");
-  check_range<int64_t>(face_index, static_cast<int64_t>(corners.shape(0)),
-                       "the fragments name a triangle that does not exist", -1);
-  const mien::Fragments fragments{face_index.data(), barycentric.data(), nullptr, static_cast<int>(face_index.shape(1)),
-                                  static_cast<int>(face_index.shape(0))};
+  check_indices(corners, static_cast<int64_t>(attributes.shape(0)), "a face names a vertex that does not exist");
+  check_indices(face_index, static_cast<int64_t>(corners.shape(0)), "the fragments name a triangle that does not exist",
+                -1);
+  const mien::Fragments fragments{face_index.data(), barycentric.data(), nullptr, size.width, size.height};
   mien::interpolate_backward(fragments, attributes.data(), corners.data(), channels, grad_out.data(), by_attributes,
                              by_barycentric);
 }
 
-mien::TextureView texture_of(const Image& texture) {
-  if (texture.size() == 0) throw nb::value_error("the texture is empty");
-  return {texture.data(), static_cast<int>(texture.shape(1)), static_cast<int>(texture.shape(0)),
-          static_cast<int>(texture.shape(2))};
+template <typename T>
+mien::TextureView texture_of(const T& texture) {
+  require(texture.size() > 0, "the texture is empty");
+  const PictureSize size = picture_size(texture);
+  return {texture.data(), size.width, size.height, checked_length(texture.shape(2), "channels")};
 }
 
 void sample_texture(const Image& texture, const Array<const float, nb::shape<-1, 2>>& uv,
                     const Array<float, nb::ndim<2>>& out) {
   const mien::TextureView view = texture_of(texture);
-  if (out.shape(0) != uv.shape(0) || out.shape(1) != texture.shape(2)) {
-    throw nb::value_error("out must hold one colour a point");
-  }
+  require(has_shape(out, uv.shape(0), texture.shape(2)), "out must hold one colour a point");
   const nb::gil_scoped_release release;
   mien::sample_texture(view, uv.data(), static_cast<int64_t>(uv.shape(0)), out.data());
 }
@@ -118,11 +114,9 @@ void sample_texture(const Image& texture, const Array<const float, nb::shape<-1,
 void sample_texture_backward(const Image& texture, const Array<const float, nb::shape<-1, 2>>& uv, const Rows& grad_out,
                              const Grad<float>& grad_texture, const Grad<float>& grad_uv) {
   const mien::TextureView view = texture_of(texture);
-  if (grad_out.shape(0) != uv.shape(0) || grad_out.shape(1) != texture.shape(2)) {
-    throw nb::value_error("grad_out must hold one colour a point");
-  }
-  float* by_texels = data_or_null(grad_texture, texture.size(), "grad_texture has another size");
-  float* by_uv = data_or_null(grad_uv, uv.size(), "grad_uv has another size");
+  require(has_shape(grad_out, uv.shape(0), texture.shape(2)), "grad_out must hold one colour a point");
+  float* by_texels = data_or_null(grad_texture, texture, "grad_texture has another size");
+  float* by_uv = data_or_null(grad_uv, uv, "grad_uv has another size");
   const nb::gil_scoped_release release;
   mien::sample_texture_backward(view, uv.data(), static_cast<int64_t>(uv.shape(0)), grad_out.data(), by_texels, by_uv);
 }
@@ -130,10 +124,9 @@ void sample_texture_backward(const Image& texture, const Array<const float, nb::
 void antialias(const FaceIndex& face_index, const Image& barycentric, const Gray& depth, const Points& points,
                const Faces& faces, const Pairs& edge_vertices, const Pairs& edge_faces, const Opposite& opposite,
                const Image& image, const Array<float, nb::ndim<3>>& out) {
-  const auto channels = static_cast<int>(image.shape(2));
-  if (image.size() != face_index.size() * image.shape(2) || out.size() != image.size()) {
-    throw nb::value_error("image and out must be of the fragments' size");
-  }
+  const int channels = checked_length(image.shape(2), "channels");
+  require(has_shape(image, face_index.shape(0), face_index.shape(1), channels) && same_shape(out, image),
+          "image and out must be of the fragments' size");
   const nb::gil_scoped_release release;
   const mien::ImageMesh mesh = mesh_of(points, faces);
   thread_local std::vector<mien::Crossing> crossings;
@@ -147,17 +140,17 @@ void antialias_backward(const FaceIndex& face_index, const Image& barycentric, c
                         const Opposite& opposite, const Image& image, const Image& grad_out,
                         const Array<float, nb::ndim<3>>& grad_image,
                         const Array<double, nb::shape<-1, 3>>& grad_points) {
-  if (image.size() != face_index.size() * image.shape(2) || grad_out.size() != image.size() ||
-      grad_image.size() != image.size() || grad_points.size() != points.size()) {
-    throw nb::value_error("gradients must have the sizes of what they are of");
-  }
+  const int channels = checked_length(image.shape(2), "channels");
+  require(has_shape(image, face_index.shape(0), face_index.shape(1), channels) && same_shape(grad_out, image) &&
+              same_shape(grad_image, image) && same_shape(grad_points, points),
+          "gradients must have the sizes of what they are of");
   const nb::gil_scoped_release release;
   const mien::ImageMesh mesh = mesh_of(points, faces);
   const mien::MeshEdges edges = edges_of(edge_vertices, edge_faces, opposite, mesh);
   thread_local std::vector<mien::Crossing> crossings;
   mien::find_crossings(fragments_of(face_index, barycentric, depth, mesh.face_count), mesh, edges, crossings);
-  mien::antialias_backward(crossings, mesh, edges, image.data(), static_cast<int64_t>(face_index.size()),
-                           static_cast<int>(image.shape(2)), grad_out.data(), grad_image.data(), grad_points.data());
+  mien::antialias_backward(crossings, mesh, edges, image.data(), static_cast<int64_t>(face_index.size()), channels,
+                           grad_out.data(), grad_image.data(), grad_points.data());
 }
 
 std::pair<double, double> mesh_loss(
@@ -168,18 +161,16 @@ std::pair<double, double> mesh_loss(
     const Array<const float, nb::shape<-1, -1, 3>>& target, const Gray& mask, float epsilon, const Grad<float>& picture,
     const Array<double, nb::shape<-1, 3>>& grad_points, const Array<float, nb::shape<-1, 3>>& grad_normals,
     const Array<float, nb::shape<-1, -1, 3>>& grad_texture, const Array<double, nb::shape<9, 3>>& grad_light) {
-  if (normals.size() != points.size() || grad_points.size() != points.size() || grad_normals.size() != points.size() ||
-      uv.shape(0) != faces.shape(0) || face_weights.shape(0) != faces.shape(0) ||
-      target.size() != 3 * face_index.size() || mask.size() != face_index.size() ||
-      grad_texture.size() != texture.size() || texture.size() == 0) {
-    throw nb::value_error("mesh_loss: arrays do not belong together");
-  }
-  float* drawn = data_or_null(picture, target.size(), "picture has another size");
+  require(same_shape(normals, points) && same_shape(grad_points, points) && same_shape(grad_normals, points) &&
+              uv.shape(0) == faces.shape(0) && face_weights.shape(0) == faces.shape(0) &&
+              has_shape(target, face_index.shape(0), face_index.shape(1), 3) && same_shape(mask, face_index) &&
+              same_shape(grad_texture, texture),
+          "mesh_loss: arrays do not belong together");
+  float* drawn = data_or_null(picture, target, "picture has another size");
+  const mien::TextureView view = texture_of(texture);
   const nb::gil_scoped_release release;
   const mien::ImageMesh mesh = mesh_of(points, faces);
   const mien::MeshEdges edges = edges_of(edge_vertices, edge_faces, opposite, mesh);
-  const mien::TextureView view{texture.data(), static_cast<int>(texture.shape(1)), static_cast<int>(texture.shape(0)),
-                               3};
   const mien::LossValue value = mien::mesh_loss(
       fragments_of(face_index, barycentric, depth, mesh.face_count), mesh, edges,
       {normals.data(), uv.data(), face_weights.data(), view, light.data()}, {target.data(), mask.data(), epsilon},

@@ -5,7 +5,6 @@
 
 #include <algorithm>
 #include <array>
-#include <cstring>
 #include <optional>
 
 #include "arrays.h"
@@ -24,9 +23,11 @@ constexpr int kMargin = 6;  // pixels: one more than the window's reach
 // What is compared: the box and all of `drawn` (one number a pixel, 0 for nothing), with a margin beyond what windows
 // reach; the whole box if `drawn` is not there.
 mien::Box compared(const std::array<int, 4>& box, const std::optional<In<-1, -1>>& drawn, int width, int height) {
-  const int left = box[0], top = box[1], right = left + box[2], bottom = top + box[3];
-  require(left >= 0 && top >= 0 && box[2] >= 0 && box[3] >= 0 && right <= width && bottom <= height,
+  const int left = box[0], top = box[1];
+  require(left >= 0 && top >= 0 && box[2] >= 0 && box[3] >= 0 && left <= width && top <= height &&
+              box[2] <= width - left && box[3] <= height - top,
           "the box must lie inside the picture");
+  const int right = left + box[2], bottom = top + box[3];
   if (!drawn) return {left, top, right, bottom};
   mien::PixelBox all = mien::box_of_nonzero(drawn->data(), width, height);
   if (box[2] > 0 && box[3] > 0) {
@@ -43,17 +44,18 @@ void photometric_loss(const std::array<int, 4>& box, const std::array<double, 2>
                       const Picture<const float>& image, const nb::ndarray<nb::c_contig, nb::device::cpu>& target,
                       const std::optional<In<-1, -1>>& drawn, const std::optional<Picture<float>>& gradient,
                       const Array<float, nb::shape<>>& loss) {
-  const int height = static_cast<int>(image.shape(0)), width = static_cast<int>(image.shape(1));
+  const auto [width, height] = picture_size(image);
   const bool bytes = target.dtype() == nb::dtype<uint8_t>();
   require(bytes || target.dtype() == nb::dtype<float>(), "a target is of float32 or uint8");
-  require(target.size() == image.size() && (!gradient || gradient->size() == image.size()) &&
-              (!drawn || 3 * drawn->size() == image.size()),
+  require(bytes || reinterpret_cast<uintptr_t>(target.data()) % alignof(float) == 0, "a target must be aligned");
+  require(same_shape(target, image) && (!gradient || same_shape(*gradient, image)) &&
+              (!drawn || has_shape(*drawn, height, width)),
           "pictures differ in size");
   require(width >= 6, "a picture must be at least 6 pixels wide");
   const nb::gil_scoped_release release;
   const mien::Box inside = compared(box, drawn, width, height);
   if (inside.left >= inside.right || inside.top >= inside.bottom) {
-    if (gradient) std::memset(gradient->data(), 0, sizeof(float) * gradient->size());
+    if (gradient) std::fill_n(gradient->data(), gradient->size(), 0.0f);
     *loss.data() = 0;
     return;
   }
@@ -66,7 +68,7 @@ void photometric_loss(const std::array<int, 4>& box, const std::array<double, 2>
 }  // namespace
 
 void bind_photometric(nb::module_& module) {
-  module.def("photometric_loss", &photometric_loss, "box"_a, "weights"_a, "image"_a, "target"_a, "drawn"_a.none(),
-             "gradient"_a.none(), "loss"_a,
+  module.def("photometric_loss", &photometric_loss, "box"_a, "weights"_a, "image"_a, "target"_a.noconvert(),
+             "drawn"_a.none(), "gradient"_a.none(), "loss"_a,
              "Fills the loss of a picture, and its gradient, within a box; or within it, what is drawn, and a margin.");
 }

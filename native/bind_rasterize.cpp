@@ -22,12 +22,14 @@ struct RasterizeFrame {
   mien::FramePtr frame;
   mien::View view;
   int64_t count;
+  int sh_count;
   bool differentiable;
 };
 
 mien::GaussianArrays gaussian_arrays(const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1, 3>& scales,
                                      const In<-1>& opacities, const In<-1, -1, 3>& sh) {
   const size_t n = means.shape(0), k = sh.shape(1);
+  checked_length(n, "Gaussians");
   require(quats.shape(0) == n && scales.shape(0) == n && opacities.shape(0) == n && sh.shape(0) == n,
           "the arrays of the Gaussians must be equally long");
   require(k == 1 || k == 4 || k == 9 || k == 16, "sh must have 1, 4, 9 or 16 coefficients");
@@ -35,7 +37,7 @@ mien::GaussianArrays gaussian_arrays(const In<-1, 3>& means, const In<-1, 4>& qu
           scales.data(),           opacities.data(),    sh.data()};
 }
 
-mien::View make_view(const In<4, 4>& viewmat, const In<3, 3>& K, int width, int height, const float* background) {
+mien::View make_view(const In<4, 4>& viewmat, const In<3, 3>& K, PictureSize size, const float* background) {
   mien::View view;
   const float *m = viewmat.data(), *k = K.data();
   for (int row = 0; row < 3; ++row) {
@@ -47,14 +49,22 @@ mien::View make_view(const In<4, 4>& viewmat, const In<3, 3>& K, int width, int 
   view.fy = k[4];
   view.cx = k[2];
   view.cy = k[5];
-  view.width = width;
-  view.height = height;
+  view.width = size.width;
+  view.height = size.height;
   return view;
 }
 
-template <typename T>
-T item(const nb::tuple& task, size_t index) {
-  return nb::cast<T>(task[index]);
+// The tuple, if it has as many items as there are arrays.
+const nb::tuple& checked(const nb::tuple& task, size_t length) {
+  if (task.size() == length) return task;
+  throw nb::type_error(
+      ("a view is a tuple of " + std::to_string(length) + " items, not of " + std::to_string(task.size())).c_str());
+}
+
+RasterizeFrame& frame_of(const nb::tuple& task) {
+  RasterizeFrame* frame = nullptr;
+  if (nb::try_cast<RasterizeFrame*>(task[0], frame, false) && frame) return *frame;
+  throw nb::type_error("frame: what `rasterize_views` returned belongs there");
 }
 
 // One view's arrays, in the order of the tuple.
@@ -72,24 +82,24 @@ struct ForwardTask {
   Array<int32_t, nb::shape<-1>> radii;
 
   explicit ForwardTask(const nb::tuple& t)
-      : means(item<In<-1, 3>>(t, 0)),
-        quats(item<In<-1, 4>>(t, 1)),
-        scales(item<In<-1, 3>>(t, 2)),
-        opacities(item<In<-1>>(t, 3)),
-        sh(item<In<-1, -1, 3>>(t, 4)),
-        background(item<In<3>>(t, 5)),
-        viewmat(item<In<4, 4>>(t, 6)),
-        K(item<In<3, 3>>(t, 7)),
-        image(item<Out<-1, -1, 3>>(t, 8)),
-        alpha(item<Out<-1, -1>>(t, 9)),
-        radii(item<Array<int32_t, nb::shape<-1>>>(t, 10)) {
-    require(alpha.shape(0) == image.shape(0) && alpha.shape(1) == image.shape(1), "alpha must be as large as image");
+      : means(item<In<-1, 3>>(checked(t, 11), 0, "means")),
+        quats(item<In<-1, 4>>(t, 1, "quats")),
+        scales(item<In<-1, 3>>(t, 2, "scales")),
+        opacities(item<In<-1>>(t, 3, "opacities")),
+        sh(item<In<-1, -1, 3>>(t, 4, "sh")),
+        background(item<In<3>>(t, 5, "background")),
+        viewmat(item<In<4, 4>>(t, 6, "viewmat")),
+        K(item<In<3, 3>>(t, 7, "K")),
+        image(item<Out<-1, -1, 3>>(t, 8, "image")),
+        alpha(item<Out<-1, -1>>(t, 9, "alpha")),
+        radii(item<Array<int32_t, nb::shape<-1>>>(t, 10, "radii")) {
+    const PictureSize size = picture_size(image);
+    require(size.width > 0 && size.height > 0, "a picture must have pixels");
+    require(has_shape(alpha, size.height, size.width), "alpha must be as large as image");
     require(radii.shape(0) == means.shape(0), "radii must have one entry a Gaussian");
   }
   mien::GaussianArrays gaussians() const { return gaussian_arrays(means, quats, scales, opacities, sh); }
-  mien::View view() const {
-    return make_view(viewmat, K, static_cast<int>(image.shape(1)), static_cast<int>(image.shape(0)), background.data());
-  }
+  mien::View view() const { return make_view(viewmat, K, picture_size(image), background.data()); }
 };
 
 struct BackwardTask {
@@ -113,42 +123,44 @@ struct BackwardTask {
   Out<3, 3> grad_K;
 
   explicit BackwardTask(const nb::tuple& t)
-      : frame(nb::cast<RasterizeFrame&>(t[0])),
-        means(item<In<-1, 3>>(t, 1)),
-        quats(item<In<-1, 4>>(t, 2)),
-        scales(item<In<-1, 3>>(t, 3)),
-        opacities(item<In<-1>>(t, 4)),
-        sh(item<In<-1, -1, 3>>(t, 5)),
-        image(item<In<-1, -1, 3>>(t, 6)),
-        alpha(item<In<-1, -1>>(t, 7)),
-        grad_image(item<In<-1, -1, 3>>(t, 8)),
-        grad_means(item<Out<-1, 3>>(t, 10)),
-        grad_quats(item<Out<-1, 4>>(t, 11)),
-        grad_scales(item<Out<-1, 3>>(t, 12)),
-        grad_opacities(item<Out<-1>>(t, 13)),
-        grad_sh(item<Out<-1, -1, 3>>(t, 14)),
-        grad_means2d(item<Out<-1, 2>>(t, 15)),
-        grad_viewmat(item<Out<4, 4>>(t, 16)),
-        grad_K(item<Out<3, 3>>(t, 17)) {
-    if (!t[9].is_none()) grad_alpha = item<In<-1, -1>>(t, 9);
-    const size_t n = means.shape(0), pixels = static_cast<size_t>(frame.view.width) * frame.view.height;
+      : frame(frame_of(checked(t, 18))),
+        means(item<In<-1, 3>>(t, 1, "means")),
+        quats(item<In<-1, 4>>(t, 2, "quats")),
+        scales(item<In<-1, 3>>(t, 3, "scales")),
+        opacities(item<In<-1>>(t, 4, "opacities")),
+        sh(item<In<-1, -1, 3>>(t, 5, "sh")),
+        image(item<In<-1, -1, 3>>(t, 6, "image")),
+        alpha(item<In<-1, -1>>(t, 7, "alpha")),
+        grad_image(item<In<-1, -1, 3>>(t, 8, "grad_image")),
+        grad_means(item<Out<-1, 3>>(t, 10, "grad_means")),
+        grad_quats(item<Out<-1, 4>>(t, 11, "grad_quats")),
+        grad_scales(item<Out<-1, 3>>(t, 12, "grad_scales")),
+        grad_opacities(item<Out<-1>>(t, 13, "grad_opacities")),
+        grad_sh(item<Out<-1, -1, 3>>(t, 14, "grad_sh")),
+        grad_means2d(item<Out<-1, 2>>(t, 15, "grad_means2d")),
+        grad_viewmat(item<Out<4, 4>>(t, 16, "grad_viewmat")),
+        grad_K(item<Out<3, 3>>(t, 17, "grad_K")) {
+    if (!t[9].is_none()) grad_alpha = item<In<-1, -1>>(t, 9, "grad_alpha");
+    const mien::GaussianArrays own = gaussians();
+    const int64_t n = own.count;
     require(frame.differentiable, "the forward pass was not differentiable");
-    require(static_cast<int64_t>(n) == frame.count, "these are not the Gaussians of the forward pass");
-    require(image.size() == 3 * pixels && grad_image.size() == 3 * pixels && alpha.size() == pixels &&
-                (!grad_alpha || grad_alpha->size() == pixels),
+    require(n == frame.count && own.sh_count == frame.sh_count, "these are not the Gaussians of the forward pass");
+    require(has_shape(image, frame.view.height, frame.view.width, 3) && same_shape(grad_image, image) &&
+                has_shape(alpha, frame.view.height, frame.view.width) &&
+                (!grad_alpha || same_shape(*grad_alpha, alpha)),
             "these are not the pictures of the forward pass");
-    require(grad_means.shape(0) == n && grad_quats.shape(0) == n && grad_scales.shape(0) == n &&
-                grad_opacities.shape(0) == n && grad_sh.size() == sh.size() && grad_means2d.shape(0) == n,
+    require(same_shape(grad_means, means) && same_shape(grad_quats, quats) && same_shape(grad_scales, scales) &&
+                same_shape(grad_opacities, opacities) && same_shape(grad_sh, sh) && has_shape(grad_means2d, n, 2),
             "a gradient must have the shape of its array");
   }
+  mien::GaussianArrays gaussians() const { return gaussian_arrays(means, quats, scales, opacities, sh); }
   void run() const {
     const mien::PictureGradient picture{image.data(), alpha.data(), grad_image.data(),
                                         grad_alpha ? grad_alpha->data() : nullptr};
     const mien::GaussianGradients gradients{grad_means.data(),     grad_quats.data(), grad_scales.data(),
                                             grad_opacities.data(), grad_sh.data(),    grad_means2d.data()};
     float view[mien::kViewGradients];
-    mien::rasterize_backward(*frame.frame, gaussian_arrays(means, quats, scales, opacities, sh), frame.view, picture,
-                             gradients, view);
+    mien::rasterize_backward(*frame.frame, gaussians(), frame.view, picture, gradients, view);
     float *m = grad_viewmat.data(), *k = grad_K.data();
     for (int row = 0; row < 3; ++row) {
       for (int column = 0; column < 3; ++column) m[4 * row + column] = view[3 * row + column];
@@ -172,7 +184,8 @@ std::vector<std::optional<RasterizeFrame>> forward(const std::vector<nb::tuple>&
     const mien::View view = task.view();
     auto frame = mien::rasterize_forward(gaussians[i], view, {task.image.data(), task.alpha.data(), task.radii.data()},
                                          differentiable);
-    if (frame) frames[i] = RasterizeFrame{std::move(frame), view, gaussians[i].count, differentiable};
+    if (!frame) return;
+    frames[i] = RasterizeFrame{std::move(frame), view, gaussians[i].count, gaussians[i].sh_count, differentiable};
   });
   return frames;
 }
@@ -199,7 +212,8 @@ void bind_rasterize(nb::module_& module) {
              "grad_image, grad_alpha or None, grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, "
              "grad_means2d, grad_viewmat, grad_K).");
   module.def("thread_count", &mien::thread_count, "The number of threads that native operations use.");
-  module.def("set_thread_count", &mien::set_thread_count, "count"_a, "Replaces the threads; 0 for the default.");
+  module.def("set_thread_count", &mien::set_thread_count, "count"_a, nb::call_guard<nb::gil_scoped_release>(),
+             "Replaces the threads; 0 for the default.");
   module.def("rasterize_isa", &mien::rasterize_isa, "The instruction set of the rasterizer's kernels.");
   module.def(
       "set_rasterize_isa", [](const std::string& name) { return mien::set_rasterize_isa(name.c_str()); }, "name"_a,

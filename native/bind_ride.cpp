@@ -4,7 +4,6 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 
-#include <new>
 #include <optional>
 
 #include "activation.h"
@@ -18,28 +17,27 @@ using namespace nb::literals;
 
 namespace {
 
-// Memory that was in use before, given back at the end of its life.
-template <typename T>
-class Buffer {
- public:
-  explicit Buffer(size_t count) : bytes_(count * sizeof(T)), data_(static_cast<T*>(mien::take_memory(bytes_))) {
-    if (!data_) throw std::bad_alloc();
-  }
-  Buffer(Buffer&& other) noexcept : bytes_(other.bytes_), data_(other.data_) { other.data_ = nullptr; }
-  ~Buffer() {
-    if (data_) mien::give_memory(data_, bytes_);
-  }
-  T* data() const { return data_; }
-
- private:
-  size_t bytes_;
-  T* data_;
-};
-
 // What the backward pass needs of its forward pass.
 struct Ride {
-  Buffer<float> shaped, vertices;
-  Buffer<mien::TriangleFrame> frames;
+  // Whose it is: not read, and maybe gone. Another model at the same place would have to be of the same sizes.
+  const void *model, *topology;
+  int vertex_count;
+  size_t face_count;
+  mien::Recycled<float> shaped, vertices;
+  mien::Recycled<mien::TriangleFrame> frames;
+
+  Ride(const mien::FaceModelData& model, const mien::RigTopology& topology)
+      : model(&model),
+        topology(&topology),
+        vertex_count(model.vertices),
+        face_count(topology.faces.size() / 3),
+        shaped(3 * static_cast<size_t>(vertex_count)),
+        vertices(3 * static_cast<size_t>(vertex_count)),
+        frames(face_count) {}
+  bool is_of(const mien::FaceModelData& other, const mien::RigTopology& others) const {
+    return model == &other && topology == &others && vertex_count == other.vertices &&
+           face_count == others.faces.size() / 3;
+  }
 };
 
 // The inputs of both passes.
@@ -89,12 +87,12 @@ Ride forward(const mien::FaceModelData& model, const mien::RigTopology& topology
   const Rider rider{model,   topology, rest,  joint_rest, expression,    joints, head_rotation, head_translation,
                     in_head, means,    quats, log_scales, opacity_logits};
   rider.check();
-  const size_t count = rider.count(), floats = 3 * static_cast<size_t>(model.vertices);
+  const size_t count = rider.count();
   require(world_means.shape(1) == count && world_quats.shape(1) == count && world_scales.shape(1) == count &&
               opacities.shape(0) == count,
           "the outputs do not fit");
   const nb::gil_scoped_release release;
-  Ride ride{Buffer<float>(floats), Buffer<float>(floats), Buffer<mien::TriangleFrame>(topology.faces.size() / 3)};
+  Ride ride(model, topology);
   mien::pose_face(model, rider.pose(), ride.shaped.data(), ride.vertices.data());
   mien::rig_forward(rider.rig(ride), ride.frames.data(), {world_means.data(), world_quats.data(), world_scales.data()});
   mien::sigmoid(opacity_logits.data(), static_cast<int64_t>(count), opacities.data());
@@ -115,17 +113,18 @@ void backward(const Ride& ride, const mien::FaceModelData& model, const mien::Ri
   const Rider rider{model,   topology, rest,  joint_rest, expression,    joints, head_rotation, head_translation,
                     in_head, means,    quats, log_scales, opacity_logits};
   rider.check();
+  require(ride.is_of(model, topology), "the ride is another model's or another topology's");
   const size_t count = rider.count(), floats = 3 * static_cast<size_t>(model.vertices);
   for (const size_t length : {world_scales.shape(1), opacities.shape(0), by_means.shape(1), by_quats.shape(1),
                               by_scales.shape(1), by_opacities.shape(0), grad_means.shape(0), grad_quats.shape(0),
                               grad_log_scales.shape(0), grad_logits.shape(0)})
     require(length == count, "one row of every gradient a Gaussian");
   const bool face = grad_expression.has_value();
-  require(!face || (grad_joints && grad_rotation && grad_translation && grad_expression->size() == expression.size() &&
-                    grad_joints->size() == joints.size()),
+  require(!face || (grad_joints && grad_rotation && grad_translation && same_shape(*grad_expression, expression) &&
+                    same_shape(*grad_joints, joints)),
           "a gradient must have the shape of its array");
   const nb::gil_scoped_release release;
-  std::optional<Buffer<float>> by_vertices, by_rest;
+  std::optional<mien::Recycled<float>> by_vertices, by_rest;
   if (face) by_vertices.emplace(floats), by_rest.emplace(floats + 3 * static_cast<size_t>(model.joints));
   mien::rig_backward(topology, rider.rig(ride), ride.frames.data(), world_scales.data(),
                      {by_means.data(), by_quats.data(), by_scales.data(), false, grad_means.data(), grad_quats.data(),

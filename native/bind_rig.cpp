@@ -3,7 +3,6 @@
 #include <nanobind/stl/optional.h>
 
 #include <optional>
-#include <stdexcept>
 
 #include "arrays.h"
 #include "rig.h"
@@ -19,33 +18,23 @@ using Rows3 = Array<const float, nb::shape<-1, 3>>;
 using Rows4 = Array<const float, nb::shape<-1, 4>>;
 using Frames = nb::shape<-1, -1, mien::kTriangleFrameFloats>;
 
-void check_range(const int64_t* begin, size_t size, size_t count, const char* message) {
-  // Without a branch, several at a time: the highest bit is set where an index, or what is left beyond it, is negative.
-  const uint64_t last = count - 1;
-  uint64_t bits = 0;
-  for (size_t i = 0; i < size; ++i) bits |= static_cast<uint64_t>(begin[i]) | (last - static_cast<uint64_t>(begin[i]));
-  if (bits >> 63) throw std::out_of_range(message);
-}
-
 mien::RigArrays rig_arrays(const Array<const float, nb::shape<-1, -1, 3>>& vertices, const Faces& faces,
                            const FaceIndex& face_index, const Rows3& local_means, const Rows4& local_quats,
                            const Rows3& log_scales) {
   const size_t count = face_index.shape(0);
-  if (local_means.shape(0) != count || local_quats.shape(0) != count || log_scales.shape(0) != count) {
-    throw std::invalid_argument("one row of every parameter a Gaussian");
-  }
-  check_range(faces.data(), faces.size(), vertices.shape(1), "a face names a vertex that does not exist");
-  check_range(face_index.data(), count, faces.shape(0), "a Gaussian names a face that does not exist");
-  return {vertices.data(),    static_cast<int64_t>(vertices.shape(1)),
-          faces.data(),       static_cast<int64_t>(faces.shape(0)),
-          face_index.data(),  static_cast<int64_t>(count),
-          local_means.data(), local_quats.data(),
-          log_scales.data()};
+  require(local_means.shape(0) == count && local_quats.shape(0) == count && log_scales.shape(0) == count,
+          "one row of every parameter a Gaussian");
+  const auto vertex_count = static_cast<int64_t>(vertices.shape(1)), face_count = static_cast<int64_t>(faces.shape(0));
+  check_indices(faces, vertex_count, "a face names a vertex that does not exist");
+  check_indices(face_index, face_count, "a Gaussian names a face that does not exist");
+  return {vertices.data(),    vertex_count,       faces.data(),
+          face_count,         face_index.data(),  static_cast<int64_t>(count),
+          local_means.data(), local_quats.data(), log_scales.data()};
 }
 
 template <typename A>
 void check_batch(const A& array, size_t batch, size_t rows) {
-  if (array.shape(0) != batch || array.shape(1) != rows) throw std::invalid_argument("arrays of different rigs");
+  require(array.shape(0) == batch && array.shape(1) == rows, "arrays of different rigs");
 }
 
 void rig_forward(const Array<const float, nb::shape<-1, -1, 3>>& vertices, const Faces& faces,
@@ -70,6 +59,9 @@ void rig_forward(const Array<const float, nb::shape<-1, -1, 3>>& vertices, const
 
 mien::RigTopology make_topology(size_t vertex_count, const Faces& faces, const FaceIndex& face_index) {
   const nb::gil_scoped_release release;
+  checked_length(vertex_count, mien::kMostRigVertices, "vertices");
+  checked_length(faces.shape(0), mien::kMostRigFaces, "faces");
+  checked_length(face_index.shape(0), "Gaussians");
   return {static_cast<int64_t>(vertex_count), faces.data(), static_cast<int64_t>(faces.shape(0)), face_index.data(),
           static_cast<int64_t>(face_index.shape(0))};
 }
@@ -93,10 +85,9 @@ void rig_backward(const mien::RigTopology& topology, const Array<const float, nb
   for (const auto& array : {scales, grad_means, grad_scales}) check_batch(array, batch, count);
   check_batch(grad_quats, batch, count);
   if (grad_vertices) check_batch(*grad_vertices, batch, vertex_count);
-  if (local_means.shape(0) != count || local_quats.shape(0) != count || log_scales.shape(0) != count ||
-      grad_local_means.shape(0) != count || grad_local_quats.shape(0) != count || grad_log_scales.shape(0) != count) {
-    throw std::invalid_argument("one row of every parameter and gradient a Gaussian");
-  }
+  for (const size_t length : {local_means.shape(0), local_quats.shape(0), log_scales.shape(0),
+                              grad_local_means.shape(0), grad_local_quats.shape(0), grad_log_scales.shape(0)})
+    require(length == count, "one row of every parameter and gradient a Gaussian");
   for (size_t b = 0; b < batch; ++b) {
     const mien::RigArrays rig = mien::rig_arrays(topology, vertices.data() + b * vertex_count * 3, local_means.data(),
                                                  local_quats.data(), log_scales.data());

@@ -22,19 +22,41 @@ using Rows3 = Array<const float, nb::shape<-1, 3>>;
 constexpr double kBeta1 = 0.9, kBeta2 = 0.999;  // of the bias corrections, which Python works out in the same numbers
 using Radii = Array<const int32_t, nb::ndim<1>>;
 
-// Addresses instead of arrays: unpacking forty arrays would cost as much as the update itself.
-using AdamArguments = std::tuple<uintptr_t, uintptr_t, uintptr_t, uintptr_t, uintptr_t, int64_t, double>;
+// One tensor's arrays, which stay alive while this does.
+struct AdamArrays {
+  Array<float> values, first, second;
+  Array<const float> gradient;
+  Array<float, nb::shape<>> steps;
+  double rate = 0;
 
-void adam_update(const std::vector<AdamArguments>& arguments) {
-  std::vector<mien::AdamTask> tasks;
-  tasks.reserve(arguments.size());
-  for (const auto& [values, gradient, first, second, steps, count, rate] : arguments) {
-    const double step = *reinterpret_cast<float*>(steps) += 1;
-    tasks.push_back({reinterpret_cast<float*>(values), reinterpret_cast<const float*>(gradient),
-                     reinterpret_cast<float*>(first), reinterpret_cast<float*>(second), count,
-                     static_cast<float>(rate / (1 - std::pow(kBeta1, step))),
-                     static_cast<float>(1 / std::sqrt(1 - std::pow(kBeta2, step)))});
+  explicit AdamArrays(const nb::tuple& task) {
+    require(task.size() == 6, "a task is (values, gradient, first, second, steps, rate)");
+    values = item<Array<float>>(task, 0, "values");
+    gradient = item<Array<const float>>(task, 1, "gradient");
+    first = item<Array<float>>(task, 2, "first");
+    second = item<Array<float>>(task, 3, "second");
+    steps = item<Array<float, nb::shape<>>>(task, 4, "steps");
+    if (!nb::try_cast(task[5], rate)) throw nb::type_error("a rate is a number");
+    require(same_shape(gradient, values) && same_shape(first, values) && same_shape(second, values),
+            "gradient and moments must have the shape of the values");
   }
+  mien::AdamTask step() const {
+    const double count = *steps.data() += 1;
+    return {values.data(),
+            gradient.data(),
+            first.data(),
+            second.data(),
+            static_cast<int64_t>(values.size()),
+            static_cast<float>(rate / (1 - std::pow(kBeta1, count))),
+            static_cast<float>(1 / std::sqrt(1 - std::pow(kBeta2, count)))};
+  }
+};
+
+void adam_update(const std::vector<nb::tuple>& arguments) {
+  const std::vector<AdamArrays> arrays(arguments.begin(), arguments.end());
+  std::vector<mien::AdamTask> tasks;
+  tasks.reserve(arrays.size());
+  for (const AdamArrays& own : arrays) tasks.push_back(own.step());
   const nb::gil_scoped_release release;
   mien::adam_update(tasks.data(), static_cast<int>(tasks.size()));
 }
@@ -69,13 +91,13 @@ void observe_view(const std::array<float, 2>& scale, const Array<const float, nb
 
 std::tuple<int, int, int, int> box_of_nonzero(const Array<const float, nb::ndim<2>>& values) {
   const nb::gil_scoped_release release;
-  const mien::PixelBox box =
-      mien::box_of_nonzero(values.data(), static_cast<int>(values.shape(1)), static_cast<int>(values.shape(0)));
+  const auto [width, height] = picture_size(values);
+  const mien::PixelBox box = mien::box_of_nonzero(values.data(), width, height);
   return {box.left, box.top, box.right - box.left, box.bottom - box.top};
 }
 
 double mean_squared_difference(const Array<const float>& image, const Array<const uint8_t>& target) {
-  require(image.size() == target.size(), "the pictures must be equally large");
+  require(same_shape(image, target), "the pictures must be equally large");
   const nb::gil_scoped_release release;
   return mien::mean_squared_difference(image.data(), target.data(), static_cast<int64_t>(image.size()));
 }
@@ -84,8 +106,7 @@ double mean_squared_difference(const Array<const float>& image, const Array<cons
 
 void bind_training(nb::module_& module) {
   module.def("adam_update", &adam_update, "tasks"_a,
-             "Each task: the addresses of values, gradient, first and second moments and of the number of steps, which "
-             "grows by one; count, rate.");
+             "Each task: values, gradient, first and second moments, the number of steps, which grows by one; rate.");
   module.def("triangle_penalties", &triangle_penalties, "thresholds"_a, "weights"_a, "means"_a, "log_scales"_a,
              "radii"_a, "grad_means"_a, "grad_log_scales"_a, "position"_a, "scale"_a,
              "Fills the position and the scale penalty, and their gradients.");

@@ -9,7 +9,9 @@ namespace mien {
 constexpr int kFaceBlock = 16;                    // vertices that share a list of blendshapes
 constexpr int kFaceBlockFloats = 3 * kFaceBlock;  // x y z x y z ...
 constexpr int kMostFaceShapes = 256;
-constexpr int kFaceParts = 4;  // of the vertices: sums run part by part, whoever computes which
+constexpr int kMostFaceVertices = 1 << 24;
+constexpr int kMostFaceJoints = 127;  // joints of all vertices are listed with 32-bit numbers
+constexpr int kFaceParts = 4;         // of the vertices: sums run part by part, whoever computes which
 
 // A model's constants. Most blendshapes move a sixth of the vertices: only blocks with a motion are kept.
 struct FaceModelData {

@@ -39,13 +39,18 @@ void* take_memory(size_t bytes) {
       return memory;
     }
   }
-  return std::aligned_alloc(64, (bytes + 63) / 64 * 64);
+  return std::aligned_alloc(64, bytes < 64 ? 64 : (bytes + 63) / 64 * 64);
 }
 
-void give_memory(void* memory, size_t bytes) {
+void give_memory(void* memory, size_t bytes) noexcept {
   Spare& kept = spare();
   const std::lock_guard<std::mutex> lock(kept.mutex);
-  kept.blocks.push_back({memory, bytes});
+  try {
+    kept.blocks.push_back({memory, bytes});
+  } catch (const std::bad_alloc&) {
+    std::free(memory);
+    return;
+  }
   kept.bytes += bytes;
   while (kept.bytes > kMostBytes) {
     std::free(kept.blocks.front().memory);

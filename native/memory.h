@@ -2,12 +2,33 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
+#include <new>
+#include <utility>
 
 namespace mien {
 
 // At least `bytes`, aligned to a cache line; what it holds is undefined. Null where there is no memory.
 void* take_memory(size_t bytes);
 // Keeps it for the next `take_memory` of the same size, or frees it. `bytes` are those it was taken with.
-void give_memory(void* memory, size_t bytes);
+void give_memory(void* memory, size_t bytes) noexcept;
+
+// Memory for `count` values that goes back at the end of its life. Throws std::bad_alloc.
+template <typename T>
+class Recycled {
+ public:
+  explicit Recycled(size_t count) : bytes_(count * sizeof(T)) {
+    if (count > SIZE_MAX / 2 / sizeof(T) || !(data_ = static_cast<T*>(take_memory(bytes_)))) throw std::bad_alloc();
+  }
+  Recycled(Recycled&& other) noexcept : bytes_(other.bytes_), data_(std::exchange(other.data_, nullptr)) {}
+  ~Recycled() {
+    if (data_) give_memory(data_, bytes_);
+  }
+  T* data() const { return data_; }
+
+ private:
+  size_t bytes_;
+  T* data_ = nullptr;
+};
 
 }  // namespace mien

@@ -95,7 +95,7 @@ void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian,
 
   static constexpr int kBlockOf[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
   for (const int32_t face : w.hit) {
-    float* sums = w.sums.data() + static_cast<int64_t>(face) * kSums;
+    const float* sums = w.sums.data() + static_cast<int64_t>(face) * kSums;
     for (int k = 0; k < 3; ++k) {
       const int64_t row = w.row_of[mesh.faces[3 * static_cast<int64_t>(face) + k]];
       float *product_x = w.product.data() + row * row_size, *product_y = product_x + parameters;
@@ -112,7 +112,6 @@ void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian,
       w.force[2 * row] += sums[kBlocks + 2 * k];
       w.force[2 * row + 1] += sums[kBlocks + 2 * k + 1];
     }
-    std::fill_n(sums, kSums, 0.0f);
   }
   std::fill_n(out.hessian, static_cast<int64_t>(parameters) * parameters, 0.0f);
   std::fill_n(out.gradient, parameters, 0.0f);
@@ -140,7 +139,6 @@ void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian,
 void collect_residuals(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
                        const AlignOptions& options, const DrawnMesh& drawn, Workspace& w) {
   w.residuals.clear();
-  w.touched.resize(mesh.face_count, 0);
   int right = 0, bottom = 0;
   w.left = frame.view.width, w.top = frame.view.height;
   for_pixels(
@@ -170,7 +168,8 @@ void box_sums(const float* in, float* out, int count, int64_t stride, int radius
 }
 
 // The residuals' weighted mean around each of them: two box filters in a row, which make a triangle.
-void smooth_residuals(int radius, const AlignOptions& options, Workspace& w) {
+void smooth_residuals(HighPass high_pass, const AlignOptions& options, Workspace& w) {
+  const int radius = std::min(high_pass.radius, std::max(w.columns, w.rows));  // more would find nothing more
   const size_t size = 4 * static_cast<size_t>(w.columns) * w.rows;
   w.smooth.assign(size, 0.0f);
   w.rows_of_sums.resize(size);
@@ -194,6 +193,26 @@ void smooth_residuals(int radius, const AlignOptions& options, Workspace& w) {
   }
 }
 
+// Triangles' sums and marks are zero between calls, also where one ends early for want of memory.
+struct CleanTriangles {
+  Workspace& w;
+
+  CleanTriangles(Workspace& workspace, const Mesh& mesh) : w(workspace) {
+    w.sums.resize(static_cast<size_t>(mesh.face_count) * kSums, 0.0f);
+    w.touched.resize(mesh.face_count, 0);
+    w.hit.reserve(std::min<size_t>(w.residuals.size(), mesh.face_count));
+  }
+  CleanTriangles(const CleanTriangles&) = delete;
+  CleanTriangles& operator=(const CleanTriangles&) = delete;
+  ~CleanTriangles() {
+    for (const int32_t face : w.hit) {
+      std::fill_n(w.sums.data() + static_cast<int64_t>(face) * kSums, kSums, 0.0f);
+      w.touched[face] = 0;
+    }
+    w.hit.clear();
+  }
+};
+
 Workspace& own_workspace() {
   thread_local Workspace workspace;  // kept between calls: fresh pages cost as much as the work
   return workspace;
@@ -208,9 +227,8 @@ AlignResult align_mesh(const Mesh& mesh, const TexturedSurface& surface, const A
   DrawnMesh& drawn = own_drawing();
   draw(mesh, frame.view, drawn);
   collect_residuals(mesh, surface, frame, options, drawn, w);
-  if (high_pass.radius > 0) smooth_residuals(high_pass.radius, options, w);
-  w.hit.clear();
-  w.sums.resize(static_cast<size_t>(mesh.face_count) * kSums, 0.0f);
+  if (high_pass.radius > 0) smooth_residuals(high_pass, options, w);
+  const CleanTriangles clean(w, mesh);
   const int width = frame.view.width;
   const int64_t values = 3 * static_cast<int64_t>(width) * frame.view.height;
   if (out.residual) std::fill_n(out.residual, values, std::numeric_limits<float>::quiet_NaN());
@@ -239,7 +257,6 @@ AlignResult align_mesh(const Mesh& mesh, const TexturedSurface& surface, const A
     add_pixel(w.sums.data() + static_cast<int64_t>(one.face) * kSums, drawn.barycentric.data() + 3 * pixel, gradient,
               residual, one.weight * fade * fade * inverse_variance);
   }
-  for (const int32_t face : w.hit) w.touched[face] = 0;
   const double scale = total > 0 ? 1 / total : 0;
   if (out.hessian) project_sums(mesh, frame.view, jacobian, parameters, scale, w, out);
   return {cost * scale, total};

@@ -35,6 +35,7 @@ inline Color shade(const float* normal, const float* light) {
 
 // Bilinear among the texels that are known; the weight is their trust.
 inline Sample sample_texture(const TexturedSurface& surface, float u, float v) {
+  if (!(u == u && v == v)) return {};  // not a number shows nothing
   const float x = std::clamp(u, 0.0f, 1.0f) * surface.texture_width - 0.5f;
   const float y = (1 - std::clamp(v, 0.0f, 1.0f)) * surface.texture_height - 0.5f;
   const int x0 = static_cast<int>(std::floor(x)), y0 = static_cast<int>(std::floor(y));

@@ -4,10 +4,18 @@
 
 #include <algorithm>
 #include <atomic>
+#include <charconv>
 #include <chrono>
 #include <cstdlib>
+#include <cstring>
+#include <exception>
 #include <mutex>
+#include <new>
+#include <stdexcept>
+#include <string>
+#include <system_error>
 #include <thread>
+#include <utility>
 #include <vector>
 
 namespace mien {
@@ -47,17 +55,26 @@ thread_local bool t_in_loop = false;
 
 class Pool {
  public:
+  // With fewer threads than asked for where the system starts no more.
   explicit Pool(int threads) : shares_(threads) {
-    for (int i = 1; i < threads; ++i) workers_.emplace_back([this, i] { serve(i); });
+    workers_.reserve(threads - 1);
+    try {
+      for (int i = 1; i < threads; ++i) workers_.emplace_back([this, i] { serve(i); });
+    } catch (const std::system_error&) {  // a limit of processes or of address space
+    } catch (const std::bad_alloc&) {
+    }
+    threads_ = static_cast<int>(workers_.size()) + 1;  // workers read it within loops only, which come later
   }
 
-  ~Pool() {
+  // Ends the workers, after the loop that is running. Whoever still holds this pool runs loops on his own thread.
+  void retire() {
+    const std::lock_guard<std::mutex> lock(busy_);
     stop_ = true;
     announce();
     for (auto& worker : workers_) worker.join();
   }
 
-  int threads() const { return static_cast<int>(shares_.size()); }
+  int threads() const { return threads_; }
 
   void run(int64_t count, detail::LoopBody body, void* context) {
     std::unique_lock<std::mutex> lock;
@@ -80,10 +97,12 @@ class Pool {
     // From here on no worker enters; wait for those inside.
     state_.fetch_and(~kOpen, std::memory_order_acq_rel);
     const auto left = [this] { return state_.load(std::memory_order_acquire) == 0; };
-    if (spin_until(left, spin_)) return;
-    for (uint32_t inside; (inside = state_.load(std::memory_order_acquire)) != 0;) {
-      state_.wait(inside, std::memory_order_acquire);
+    if (!spin_until(left, spin_)) {
+      for (uint32_t inside; (inside = state_.load(std::memory_order_acquire)) != 0;) {
+        state_.wait(inside, std::memory_order_acquire);
+      }
     }
+    if (error_) std::rethrow_exception(std::exchange(error_, nullptr));
   }
 
  private:
@@ -94,13 +113,19 @@ class Pool {
     signal_.notify_all();
   }
 
-  // One's own share, then what is left of the others'.
-  void work(int self) {
-    for (int i = 0; i < threads(); ++i) {
-      Share& share = shares_[(self + i) % threads()];
-      for (int64_t index; (index = share.next.fetch_add(1, std::memory_order_relaxed)) < share.end;) {
-        body_(context_, index);
+  // One's own share, then what is left of the others'. An exception would end the process if it left a worker.
+  void work(int self) noexcept {
+    try {
+      for (int i = 0; i < threads(); ++i) {
+        Share& share = shares_[(self + i) % threads()];
+        for (int64_t index; (index = share.next.fetch_add(1, std::memory_order_relaxed)) < share.end;) {
+          body_(context_, index);
+        }
       }
+    } catch (...) {
+      for (Share& share : shares_) share.next.store(share.end, std::memory_order_relaxed);  // nobody begins more
+      const std::lock_guard<std::mutex> lock(error_mutex_);
+      if (!error_) error_ = std::current_exception();
     }
   }
 
@@ -138,7 +163,9 @@ class Pool {
 
   std::vector<Share> shares_;
   std::vector<std::thread> workers_;
-  std::mutex busy_;
+  int threads_ = 1;
+  std::mutex busy_, error_mutex_;
+  std::exception_ptr error_;                    // the first of a loop
   std::chrono::microseconds spin_ = kMostSpin;  // of whoever runs a loop
   detail::LoopBody body_ = nullptr;
   void* context_ = nullptr;
@@ -150,24 +177,46 @@ class Pool {
 // Never destroyed: the threads end with the process. A forked child has no workers, so it forgets its parent's pool.
 std::atomic<Pool*> g_pool{nullptr};
 std::mutex* g_creation = new std::mutex;
+// Pools that were replaced: another thread may be about to run a loop on one.
+std::vector<Pool*>* g_retired = new std::vector<Pool*>;
 
 void forget_pool() {
   g_pool = nullptr;
   g_creation = new std::mutex;
 }
 
+void forget_in_children() {
+  static const int registered = pthread_atfork(nullptr, nullptr, forget_pool);
+  static_cast<void>(registered);
+}
+
+int checked_threads(const char* what, long long count) {
+  if (count < 0 || count > kMostThreads) {
+    throw std::invalid_argument(std::string(what) + " is " + std::to_string(count) + "; give a number from 1 to " +
+                                std::to_string(kMostThreads) + ", or 0 for one thread a core");
+  }
+  const int cores = std::clamp(static_cast<int>(std::thread::hardware_concurrency()), 1, kMostThreads);
+  return count > 0 ? static_cast<int>(count) : cores;
+}
+
 int default_threads() {
   const char* text = std::getenv("MIEN_THREADS");
-  const int wanted = text ? std::atoi(text) : 0;
-  return wanted > 0 ? wanted : std::max(1, static_cast<int>(std::thread::hardware_concurrency()));
+  if (!text || !*text) return checked_threads("MIEN_THREADS", 0);
+  long long count = 0;
+  const char* const end = text + std::strlen(text);
+  const auto [stop, error] = std::from_chars(text, end, count);
+  if (error != std::errc() || stop != end) {
+    throw std::invalid_argument("MIEN_THREADS is '" + std::string(text) + "'; give a number from 1 to " +
+                                std::to_string(kMostThreads) + ", or 0 for one thread a core");
+  }
+  return checked_threads("MIEN_THREADS", count);
 }
 
 Pool& pool() {
   if (Pool* existing = g_pool.load(std::memory_order_acquire)) return *existing;
   const std::lock_guard<std::mutex> lock(*g_creation);
   if (!g_pool) {
-    static const int registered = pthread_atfork(nullptr, nullptr, forget_pool);
-    static_cast<void>(registered);
+    forget_in_children();
     g_pool = new Pool(default_threads());
   }
   return *g_pool;
@@ -178,9 +227,14 @@ Pool& pool() {
 int thread_count() { return pool().threads(); }
 
 void set_thread_count(int count) {
-  pool();
+  const int threads = count == 0 ? default_threads() : checked_threads("the number of threads", count);
   const std::lock_guard<std::mutex> lock(*g_creation);
-  delete g_pool.exchange(new Pool(count > 0 ? count : default_threads()));
+  forget_in_children();
+  g_retired->reserve(g_retired->size() + 1);
+  Pool* const before = g_pool.exchange(new Pool(threads));
+  if (!before) return;
+  before->retire();
+  g_retired->push_back(before);
 }
 
 void detail::run_loop(int64_t count, LoopBody body, void* context) {

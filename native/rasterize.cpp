@@ -61,7 +61,11 @@ std::mutex& spare_mutex() {
   return *mutex;
 }
 std::vector<Frame*>& spare_frames() {
-  static auto* frames = new std::vector<Frame*>;
+  static auto* frames = [] {
+    auto* const own = new std::vector<Frame*>;
+    own->reserve(kSpareFrames);  // so that a frame always finds its way back
+    return own;
+  }();
   return *frames;
 }
 
@@ -94,7 +98,7 @@ int64_t groups(int64_t count) { return (count + kGroup - 1) / kGroup; }
 
 }  // namespace
 
-void ReturnFrame::operator()(Frame* frame) const {
+void ReturnFrame::operator()(Frame* frame) const noexcept {
   const std::lock_guard<std::mutex> lock(spare_mutex());
   if (spare_frames().size() < kSpareFrames) {
     spare_frames().push_back(frame);
@@ -147,6 +151,7 @@ FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, co
 
 void rasterize_backward(Frame& frame, const GaussianArrays& gaussians, const View& view, const PictureGradient& picture,
                         const GaussianGradients& gradients, float* view_gradient) {
+  const std::lock_guard<std::mutex> lock(frame.backward);
   const Kernels& kernels = *isa().kernels;
   const TileLists lists = frame.lists();
   Moments* slots = frame.slots.reserve(frame.pairs);

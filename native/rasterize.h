@@ -53,16 +53,22 @@ struct PictureGradient {
 // a training loop allocates nothing; any number may be alive at a time.
 struct Frame;
 struct ReturnFrame {
-  void operator()(Frame* frame) const;
+  void operator()(Frame* frame) const noexcept;
 };
 using FramePtr = std::unique_ptr<Frame, ReturnFrame>;
 
+// Tiles along a side, which are counted in 16 bits, times their size.
+constexpr int kMostPictureSide = 32767 * 32;
+// Pairs of a Gaussian and a tile that it touches: they are counted in 32 bits, with room for what looks ahead.
+constexpr int64_t kMostPairs = 2'000'000'000;
+
 // Null if an input that was read is NaN or infinite; the picture is then undefined. Without `differentiable` there can
-// be no backward pass.
+// be no backward pass. A picture has 1 to kMostPictureSide pixels along each side (the caller checks). Throws
+// std::length_error where there are more than kMostPairs, before their memory is taken.
 FramePtr rasterize_forward(const GaussianArrays& gaussians, const View& view, const Picture& picture,
                            bool differentiable);
 
-// Writes all of `gradients` and `view_gradient` [kViewGradients].
+// Writes all of `gradients` and `view_gradient` [kViewGradients]. A second call with one frame waits for the first.
 void rasterize_backward(Frame& frame, const GaussianArrays& gaussians, const View& view, const PictureGradient& picture,
                         const GaussianGradients& gradients, float* view_gradient);
 

@@ -1,8 +1,11 @@
 // Depth order and tile lists: one sort of the Gaussians, then a counting sort of (Gaussian, tile) pairs by tile.
 #include <algorithm>
+#include <atomic>
 #include <bit>
 #include <cmath>
 #include <cstring>
+#include <stdexcept>
+#include <string>
 
 #include "pool.h"
 #include "rasterize_frame.h"
@@ -98,8 +101,14 @@ void row_span(const Splat& s, int row, int columns, int* low, int* high) {
   *high = static_cast<int>(std::clamp(std::floor((right - 0.5f) / kTile), -1.0f, static_cast<float>(columns - 1)));
 }
 
-// The pairs of a splat that touches more than two rows of tiles or more than two tiles in a row.
-void find_large(const Splat& splat, uint32_t gaussian, const TileSpan& span, int columns, Buffer<Pair>& pairs) {
+// Whether a splat touches at most two rows of tiles, and at most two tiles in each: most do.
+bool is_small(const TileSpan& span) {
+  return span.row_count <= 2 && span.high[0] - span.low[0] < 2 && span.high[1] - span.low[1] < 2;
+}
+
+// Calls body(first tile, number of tiles) for each row of tiles that a splat touches.
+template <typename Body>
+void for_rows(const Splat& splat, const TileSpan& span, int columns, Body&& body) {
   for (int row = 0; row < span.row_count; ++row) {
     int low, high;
     if (row < 2) {
@@ -108,11 +117,40 @@ void find_large(const Splat& splat, uint32_t gaussian, const TileSpan& span, int
     } else {
       row_span(splat, span.first_row + row, columns, &low, &high);
     }
-    const int first = (span.first_row + row) * columns;
-    Pair* out = pairs.extend(std::max(high - low + 1, 0));
-    for (int column = low; column <= high; ++column) *out++ = {gaussian, static_cast<uint32_t>(first + column)};
-    pairs.advance(std::max(high - low + 1, 0));
+    body((span.first_row + row) * columns + low, std::max(high - low + 1, 0));
   }
+}
+
+// The pairs of a splat that touches more than two rows of tiles or more than two tiles in a row.
+void find_large(const Splat& splat, uint32_t gaussian, const TileSpan& span, int columns, Buffer<Pair>& pairs) {
+  for_rows(splat, span, columns, [&](int first, int count) {
+    Pair* out = pairs.extend(count);
+    for (int tile = first; tile < first + count; ++tile) *out++ = {gaussian, static_cast<uint32_t>(tile)};
+    pairs.advance(count);
+  });
+}
+
+// Counts in 64 bits, before any pair is written. Few scenes could have too many: the others are not counted.
+void check_pair_count(Frame& frame) {
+  if (frame.drawn * frame.columns * frame.rows <= kMostPairs) return;
+  std::atomic<int64_t> pairs{0};
+  parallel_for(static_cast<int64_t>(frame.chunks.size()), [&](int64_t c) {
+    int64_t own = 0;
+    for (int64_t rank = frame.chunks[c].first; rank < frame.chunks[c].last; ++rank) {
+      const uint32_t gaussian = frame.order[rank];
+      const TileSpan& span = frame.spans[gaussian];
+      if (is_small(span)) {
+        own += frame.slot_counts[gaussian];
+      } else {
+        for_rows(frame.splats[gaussian], span, frame.columns, [&](int, int count) { own += count; });
+      }
+    }
+    pairs += own;
+  });
+  if (pairs <= kMostPairs) return;
+  throw std::length_error("too many pairs of a Gaussian and a tile that it touches: " + std::to_string(pairs) +
+                          ", at most " + std::to_string(kMostPairs) +
+                          "; take fewer or smaller Gaussians, or a smaller picture");
 }
 
 void find_pairs(BinChunk& chunk, Frame& frame) {
@@ -127,7 +165,7 @@ void find_pairs(BinChunk& chunk, Frame& frame) {
     __builtin_prefetch(&spans[order[std::min(i + kAhead, count - 1)]]);
     const TileSpan& span = spans[gaussian];
     const int above = std::max(span.high[0] - span.low[0] + 1, 0), below = std::max(span.high[1] - span.low[1] + 1, 0);
-    if (span.row_count <= 2 && above <= 2 && below <= 2) {
+    if (span.row_count <= 2 && above <= 2 && below <= 2) {  // is_small
       // Without a branch on the number of tiles, which is as good as random: both are written, those that count stay.
       const uint32_t first = static_cast<uint32_t>(span.first_row * frame.columns);
       const uint32_t upper = first + static_cast<uint32_t>(span.low[0]);
@@ -155,7 +193,7 @@ void place_chunks(Frame& frame) {
   const int tiles = frame.columns * frame.rows;
   int32_t* begins = frame.tile_begins.reserve(tiles + 1);
   frame.tile_ends.reserve(tiles);
-  int32_t total = 0;
+  int32_t total = 0;  // at most kMostPairs
   for (int tile = 0; tile < tiles; ++tile) {
     begins[tile] = total;
     for (BinChunk& chunk : frame.chunks) {
@@ -263,6 +301,7 @@ void bin_into_tiles(Frame& frame, int64_t count) {
     frame.chunks[c].first = frame.drawn * c / chunks;
     frame.chunks[c].last = frame.drawn * (c + 1) / chunks;
   }
+  check_pair_count(frame);
   parallel_for(chunks, [&](int64_t c) { find_pairs(frame.chunks[c], frame); });
   place_chunks(frame);
   plan_runs(frame);

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cstdlib>
 #include <deque>
+#include <mutex>
 #include <new>
 #include <utility>
 
@@ -102,6 +103,7 @@ struct Frame {
   std::deque<BinChunk> chunks;
   int64_t drawn = 0, pairs = 0;
   int columns = 0, rows = 0, runs = 0;
+  std::mutex backward;  // `slots` and `view_gradients` are one backward pass's
 
   TileLists lists() {
     uint64_t* const kept = differentiable ? masks.data() : nullptr;
@@ -114,7 +116,7 @@ struct Frame {
 void sort_by_depth(Frame& frame, int64_t count);
 
 // Fills the tiles' lists and runs, and the Gaussians' slots; reads frame.slot_counts and completes it. The result does
-// not depend on the number of threads.
+// not depend on the number of threads. Throws std::length_error where there are more than kMostPairs pairs.
 void bin_into_tiles(Frame& frame, int64_t count);
 
 }  // namespace mien

@@ -6,6 +6,9 @@
 
 namespace mien {
 
+constexpr int kMostRigVertices = 1 << 24;
+constexpr int kMostRigFaces = 1 << 29;  // their corners are counted in 32 bits
+
 // Which Gaussians ride on a triangle, and which corners of triangles meet at a vertex, both in ascending order: so that
 // sums over them can run side by side and still add up in one order. Throws std::out_of_range where an index does not
 // exist.

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from mien import _native
+from mien.arrays import unpacked
 from mien.avatar import Moments, ParameterGroup, Progress
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
@@ -88,16 +89,11 @@ def update_reference(update: Update) -> None:
     values.addcdiv_(moments.first, denominator, value=-rate / (1 - _BETA1**step))
 
 
-def _native_task(update: Update) -> tuple[int, int, int, int, int, int, float] | None:
-    """The update as the core takes it, by addresses; None where the tensors are not what it takes."""
+def _native_task(update: Update) -> tuple[Any, Any, Any, Any, Any, float] | None:
+    """The update as the core takes it; None where the tensors are not what it takes."""
     values, gradient, moments, rate = update
-    first, second = moments.first, moments.second
-    for tensor in (values, gradient, first, second, moments.step):
+    arrays = (values, gradient, moments.first, moments.second, moments.step)
+    for tensor in arrays:
         if not (tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous()):
             return None
-    shape = values.shape
-    assert gradient.shape == shape, "a gradient has its tensor's shape"
-    assert first.shape == shape, "moments have their tensor's shape"
-    assert second.shape == shape, "moments have their tensor's shape"
-    addresses = (values.data_ptr(), gradient.data_ptr(), first.data_ptr(), second.data_ptr())
-    return *addresses, moments.step.data_ptr(), values.numel(), rate
+    return *unpacked(*arrays), rate

@@ -1,0 +1,237 @@
+"""Calls that must be refused, and what must hold after one, in a process of their own: `test_native_calls.py` runs it.
+
+Prints a line of JSON for each case: its name and what came of it. Ends early where the core crashes.
+"""
+
+import json
+import resource
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mien import _native
+
+sys.path.insert(0, str(Path(__file__).parent / "fuzzing"))
+from native_baselines import BASELINES  # noqa: E402
+
+F32, I32, I64 = np.float32, np.int32, np.int64
+MOST = 2**31 - 1
+WIDEST = 32767 * 32
+
+
+def arguments(name: str, seed: int = 0) -> list[Any]:
+    return BASELINES[name](_native, np.random.default_rng(seed))
+
+
+def call(name: str, **changes: Any) -> Any:
+    """A valid call with some arguments replaced, by position (`_3`)."""
+    given = arguments(name)
+    for place, value in changes.items():
+        given[int(place[1:])] = value
+    return getattr(_native, name)(*given)
+
+
+def wide_splats(count: int, width: int = WIDEST, height: int = 1) -> list[Any]:
+    """Gaussians as wide as the picture: each touches all of its tiles."""
+    means = np.zeros((count, 3), F32)
+    means[:, 2] = np.linspace(1, 2, count)
+    quats = np.tile(np.array([1, 0, 0, 0], F32), (count, 1))
+    gaussians = [means, quats, np.full((count, 3), 3, F32), np.full(count, 0.5, F32), np.zeros((count, 1, 3), F32)]
+    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], F32)
+    pictures = [np.zeros((height, width, 3), F32), np.zeros((height, width), F32), np.zeros(count, I32)]
+    return [*gaussians, np.ones(3, F32), np.eye(4, dtype=F32), K, *pictures]
+
+
+def picture_of_small_scene() -> bytes:
+    view = arguments("rasterize_forward", seed=7)
+    _native.rasterize_forward(*view)
+    return view[8].tobytes() + view[9].tobytes()
+
+
+def with_room(megabytes: float, body: Callable[[], Any]) -> Any:
+    """Calls it where so much more address space can be had."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + int(megabytes * 2**20), before[1]))
+    try:
+        return body()
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def memory_that_is_not_there() -> str:
+    """Fails at different places of a forward pass, on every thread; after each the same call gives the same bytes."""
+    _native.set_thread_count(3)
+    scene, expected, failed = wide_splats(3000), picture_of_small_scene(), 0
+    for megabytes in (0, 1, 4, 9, 20, 50, 90, 200, 300, 500):
+        try:
+            with_room(megabytes, lambda: _native.rasterize_views([tuple(scene)], True))
+        except MemoryError:
+            failed += 1
+        assert picture_of_small_scene() == expected
+    return f"{failed} failures"
+
+
+def memory_for_several_views() -> None:
+    """Views side by side: each is drawn by a thread of its own, where an exception would end the process."""
+    _native.set_thread_count(3)
+    views = [tuple(wide_splats(2000, width=WIDEST // 2)) for _ in range(3)]
+    with_room(30, lambda: _native.rasterize_views(views, False))
+
+
+def threads_that_cannot_be_had() -> str:
+    def many() -> str:
+        _native.set_thread_count(600)
+        return "fewer" if 1 <= _native.thread_count() < 600 else "all"
+
+    expected = picture_of_small_scene()
+    result = with_room(100, many)
+    assert picture_of_small_scene() == expected
+    _native.set_thread_count(2)
+    assert picture_of_small_scene() == expected
+    return result
+
+
+def a_ride_of_another_model() -> None:
+    mine, others = arguments("ride_backward", 1), arguments("ride_backward", 5)
+    assert len(mine[3]) != len(others[3])
+    _native.ride_backward(others[0], *mine[1:])
+
+
+def surface_of_faces(vertex: int) -> Any:
+    faces, *rest = arguments("AlignSurface")
+    return _native.AlignSurface(np.full_like(faces, vertex), *rest)
+
+
+def other_coefficients() -> None:
+    """A backward pass with more of them than the forward pass had."""
+    ((frame, *task), *_) = arguments("rasterize_views_backward", 3)[0]
+    more = np.zeros((len(task[0]), 16, 3), F32)
+    assert task[4].shape != more.shape
+    _native.rasterize_views_backward([(frame, *task[:4], more, *task[5:13], more.copy(), *task[14:])])
+
+
+def faces_changed_after_the_check() -> str:
+    made = arguments("AlignSurface")
+    rng = np.random.default_rng(0)
+    surface = _native.AlignSurface(*made)
+    made[0][:] = 2**40
+    seen = arguments("align_mesh", 3)[1:9]
+    v = 41
+    vertices = rng.standard_normal((v, 3)).astype(F32)
+    _native.align_mesh(surface, vertices, vertices, *seen[2:], *[None] * 5)
+    return "its own copy"
+
+
+def high_pass_of(radius: int) -> bytes:
+    given = arguments("align_mesh", 3)
+    given[8], given[12], given[13] = radius, np.zeros_like(given[5]), np.zeros_like(given[5])
+    _native.align_mesh(*given)
+    return given[12].tobytes() + given[13].tobytes()
+
+
+def largest_high_pass() -> str:
+    return "the same" if high_pass_of(MOST) == high_pass_of(1000) == high_pass_of(MOST - 1) else "different"
+
+
+def large_picture() -> None:
+    """More than 2^31 pixels, in a file of holes that takes no memory."""
+    with tempfile.TemporaryFile() as file:
+        file.truncate(4 * 65536 * 32769)
+        _native.box_of_nonzero(np.memmap(file, F32, "r+", shape=(32769, 65536)))
+
+
+def unaligned() -> None:
+    memory = np.zeros(4 * 6 + 1, np.uint8)
+    _native.sigmoid(memory[1:].view(F32), np.zeros(6, F32))
+
+
+def edges_with(first: int, second: int) -> None:
+    given = arguments("antialias")
+    given[6][0] = first, second
+    _native.antialias(*given)
+
+
+def one_frame_twice() -> str:
+    (task,) = arguments("rasterize_views_backward", 3)[0][:1]
+    again = (*task[:10], *(np.zeros_like(array) for array in task[10:]))
+    _native.set_thread_count(3)
+    for _ in range(20):
+        _native.rasterize_views_backward([task, again])
+        assert all(np.array_equal(a, b) for a, b in zip(task[10:], again[10:], strict=True))
+    return "one after the other"
+
+
+def picture_without_rows() -> None:
+    scene = wide_splats(40, 640, 1)
+    scene[8], scene[9] = np.zeros((0, 640, 3), F32), np.zeros((0, 640), F32)
+    _native.rasterize_forward(*scene)
+
+
+def adam(place: int, value: Any) -> None:
+    ((task, *_),) = arguments("adam_update")
+    _native.adam_update([(*task[:place], value, *task[place + 1 :])])
+
+
+CASES: dict[str, Callable[[], Any]] = {
+    "short tuple": lambda: _native.rasterize_forward(np.zeros((1, 3), F32)),
+    "no tuple": lambda: _native.rasterize_forward(),
+    "short tuple of views": lambda: _native.rasterize_views([tuple(wide_splats(1, 64)[:-1])], True),
+    "short tuple backward": lambda: _native.rasterize_views_backward([()]),
+    "no frame": lambda: _native.rasterize_views_backward([(None, *arguments("rasterize_views_backward")[0][0][1:])]),
+    "one frame twice": one_frame_twice,
+    "other coefficients": other_coefficients,
+    "another model's ride": a_ride_of_another_model,
+    "face beyond the vertices": lambda: call("align_mesh", _0=surface_of_faces(10**6)),
+    "largest face": lambda: call("align_mesh", _0=surface_of_faces(2**63 - 1)),
+    "negative face": lambda: call("align_mesh", _0=surface_of_faces(-(2**63))),
+    "faces changed later": faces_changed_after_the_check,
+    "edge without a first triangle": lambda: edges_with(-1, 0),
+    "edge with the largest triangle": lambda: edges_with(0, MOST),
+    "edge with a triangle below none": lambda: edges_with(0, -2),
+    "largest high_pass": largest_high_pass,
+    "negative high_pass": lambda: call("align_mesh", _8=-1),
+    "box beyond the largest integer": lambda: call("photometric_loss", _0=(1, 1, MOST, MOST)),
+    "box at the largest integer": lambda: call("photometric_loss", _0=(MOST, 0, MOST, 1)),
+    "parent of no joint": lambda: call("make_face_model", _5=[-5] * len(arguments("make_face_model")[5])),
+    "topology of too many vertices": lambda: call("make_rig_topology", _0=2**40),
+    "topology of fewer vertices": lambda: call("make_rig_topology", _0=1),
+    "negative fragment": lambda: call("interpolate_mesh", _0=np.full_like(arguments("interpolate_mesh")[0], -2)),
+    "picture of no rows": picture_without_rows,
+    "picture too wide": lambda: _native.rasterize_forward(*wide_splats(1, WIDEST + 1)),
+    "too many pixels": large_picture,
+    "lengths beyond 32 bits": lambda: _native.box_of_nonzero(np.zeros((2**32 + 1, 0), F32)),
+    "products beyond 64 bits": lambda: _native.interpolate_mesh(
+        np.zeros((2**20, 2**4), I32) - I32(1), np.zeros((2**20, 2**4, 3), F32), np.zeros((0, 2**40), F32),
+        np.zeros((0, 3), I64), np.zeros((0, 1, 1), F32),
+    ),
+    "unaligned": unaligned,
+    "copies are not written": lambda: call("pose_face", _7=arguments("pose_face")[7].astype(np.float64)),
+    "strided": lambda: call("pose_face", _1=np.repeat(arguments("pose_face")[1], 2, 1)[:, ::2]),
+    "adam by addresses": lambda: adam(0, 4096),
+    "adam of other sizes": lambda: adam(1, np.zeros(1, F32)),
+    "adam of many steps": lambda: adam(4, np.zeros(2, F32)),
+    "too many pairs": lambda: _native.rasterize_forward(*wide_splats(70_000)),
+    "too many threads": lambda: _native.set_thread_count(100_000),
+    "negative threads": lambda: _native.set_thread_count(-3),
+    "memory that is not there": memory_that_is_not_there,
+    "memory for several views": memory_for_several_views,
+    "threads that cannot be had": threads_that_cannot_be_had,
+}  # fmt: skip
+
+
+def main() -> None:
+    for name in sys.argv[1:] or CASES:
+        try:
+            result, message = "accepted", str(CASES[name]())
+        except (TypeError, ValueError, IndexError, OverflowError, MemoryError) as error:
+            result, message = type(error).__name__, str(error).splitlines()[0]
+        print(json.dumps([name, result, message]), flush=True)
+
+
+if __name__ == "__main__":
+    main()
