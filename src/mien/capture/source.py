@@ -1,6 +1,7 @@
 """Where frames come from: a video file or a folder of images, and which of its frames are taken."""
 
 import hashlib
+import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -202,7 +203,7 @@ def _hash_files(paths: list[Path], with_names: bool) -> str:
     digest = hashlib.sha256()
     for path in paths:
         if with_names:
-            digest.update(path.name.encode() + b"\0")
+            digest.update(os.fsencode(path.name) + b"\0")
         with path.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()

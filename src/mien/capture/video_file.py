@@ -28,9 +28,9 @@ _CONTAINERS = (
     "mov", "matroska", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "flv", "live_flv", "asf", "ogg", "mxf", "gxf",
     "nut", "dv", "gif", "apng", "ivf", "obu", "av1", "h261", "h263", "h264", "hevc", "vvc", "vc1", "dirac", "dnxhd",
     "mjpeg", "yuv4mpegpipe", "wtv", "rm", "swf", "dhav", "cine", "webp_anim", "png_pipe", "jpeg_pipe", "webp_pipe",
-    "bmp_pipe", "tiff_pipe",
+    "bmp_pipe", "tiff_pipe", "wav", "mp3", "flac", "aac", "aiff", "caf",
 )  # fmt: skip
-"""FFmpeg's names of the containers that are opened. None of them leads to other files."""
+"""FFmpeg's names of the containers that are opened. None of them leads to other files. Sound alone is told as such."""
 _LISTS = (
     (rb"\A(\xef\xbb\xbf)?\s*#EXTM3U", "a playlist (.m3u8)"),
     (rb"\Affconcat version", "a list of files for FFmpeg (concat)"),

@@ -28,6 +28,7 @@ from mien.face import load_face_model
 from mien.progress import say
 from mien.storage import read_json, write_atomically, write_json
 from mien.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
+from mien.terminal import show
 from mien.tracking import TrackingSettings, read_tracking
 from mien.training import TrainSettings, read_training_summary
 from mien.workspace import Workspace
@@ -56,7 +57,7 @@ def quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int,
         write_json(out / "quality.json", _FORMAT, _VERSION, json.loads(json.dumps(content)))
         write_atomically(out / "quality.md", lambda path: path.write_text(markdown_table(rows), encoding="utf-8"))
         _write_png(out / "contact_sheet.png", np.concatenate(strips))
-    print(json.dumps([row.as_json() for row in rows]) if as_json else markdown_table(rows))
+    show(json.dumps([row.as_json() for row in rows]) if as_json else markdown_table(rows))
     say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
 
 
