@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mien.capture.picture import decode_picture
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.errors import UserError
 
@@ -154,13 +155,9 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """An 8-bit sRGB picture, turned by its EXIF orientation.
 
     Raises:
-        UserError: it is missing or damaged.
+        UserError: it is missing, damaged or too large.
     """
-    try:
-        data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
-    except (OSError, cv2.error):
-        image = None
+    image = decode_picture(path, cv2.IMREAD_COLOR_RGB)
     if image is None:
         raise UserError(f"{path}: cannot be read as an image; remove or replace it")
     return image.astype(np.uint8, copy=False)
