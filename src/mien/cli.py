@@ -18,6 +18,8 @@ from pathlib import Path
 import mien
 from mien.errors import UserError
 from mien.help_text import without_details
+from mien.terminal import drop_output, open_closed_streams, printable, show, tell
+from mien.threads import asked_threads
 
 COMMANDS = {
     "create": "video in, avatar, report and metrics out: all stages in one command",
@@ -39,7 +41,11 @@ Its `check()` tells what can be told of options and paths without heavy librarie
 
 EXIT_USER_ERROR = 2
 EXIT_INTERRUPTED = 130
+EXIT_CLOSED_PIPE = 141
+"""As of a program that the system ends because nobody reads its output any more (`mien ... | head -1`)."""
 EXIT_TERMINATED = 143
+_OPENCVS_LIMIT, _MOST_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS", 8192 * 8192
+"""`mien.capture.picture.LARGEST_PICTURE` once more, for OpenCV itself, which reads it when it is imported."""
 _USERS_ERRNOS = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG}
 )
@@ -50,32 +56,37 @@ _INDENT_OF_DESCRIPTION = 8
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one sub-command; returns the exit code: 0, 2 for the user's mistakes, 1 for ours, 130 after Ctrl-C."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    """Run one sub-command; returns the exit code.
+
+    0, 2 for the user's mistakes, 1 for ours, 130 after Ctrl-C, 141 when nobody reads the output any more.
+    """
+    open_closed_streams()
     _print_what_can_be_printed()
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_overview())
-        return 0 if arguments else EXIT_USER_ERROR
-    if arguments[0] == "--version":
-        print(f"mien {mien.__version__}")
-        return 0
-    name, rest = arguments[0], arguments[1:]
-    if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, 1)
-        hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(COMMANDS)}"
-        return _complain(f"no sub-command {name!r}; {hint}")
-    if "" in rest:
-        # As a path, nothing is the current folder: an unset variable of a shell must not fill that with pictures.
-        return _complain(f"argument {rest.index('') + 1} after {name} is empty (an unset variable?); give it a value")
     try:
-        return _run(name, rest)
+        try:
+            return _main(list(sys.argv[1:] if arguments is None else arguments))
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        return EXIT_CLOSED_PIPE
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            _complain(f"standard output: cannot be written ({error.strerror}); mend that and run it again")
+        return EXIT_USER_ERROR
+    finally:
+        drop_output()
+
+
+def _main(arguments: list[str]) -> int:
+    try:
+        return _dispatch(arguments)
     except UserError as error:
         return _complain(str(error))
     except KeyboardInterrupt:
-        print("mien: stopped; the same command goes on where it was, or begins anew", file=sys.stderr)
+        tell("mien: stopped; the same command goes on where it was, or begins anew")
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        return 0
+        raise
     except MemoryError as error:
         return _complain(f"not enough memory ({error}); close other programs, or ask for a smaller size")
     except OSError as error:
@@ -92,14 +103,29 @@ def _print_what_can_be_printed() -> None:
         sys.stdout.reconfigure(errors="replace")
 
 
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        show(_overview())
+        return 0 if arguments else EXIT_USER_ERROR
+    if arguments[0] == "--version":
+        show(f"mien {mien.__version__}")
+        return 0
+    name, rest = arguments[0], arguments[1:]
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, 1)
+        hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(COMMANDS)}"
+        raise UserError(f"no sub-command {name!r}; {hint}")
+    if "" in rest:
+        # As a path, nothing is the current folder: an unset variable of a shell must not fill that with pictures.
+        raise UserError(f"argument {rest.index('') + 1} after {name} is empty (an unset variable?); give it a value")
+    return _run(name, rest)
+
+
 def _crash() -> int:
     """Say that it is a bug; its traceback goes to a file."""
     log = _write_crash_log()
-    print(
-        f"mien: this is a bug in mien, not your mistake: {traceback.format_exc().splitlines()[-1]}\n"
-        f"mien: the traceback is in {log}; please report it with the command",
-        file=sys.stderr,
-    )
+    tell(f"mien: this is a bug in mien, not your mistake: {traceback.format_exc().splitlines()[-1]}")
+    tell(f"mien: the traceback is in {log}; please report it with the command")
     return 1
 
 
@@ -108,6 +134,7 @@ def _run(name: str, rest: list[str]) -> int:
 
     from mien.commands.options import settings_groups, with_settings
 
+    os.environ.setdefault(_OPENCVS_LIMIT, str(_MOST_PIXELS))
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
     options, more = module.Command, ""
     if "--help-all" in rest:
@@ -133,10 +160,11 @@ def _run(name: str, rest: list[str]) -> int:
     except SystemExit as stop:
         if stop.code != EXIT_USER_ERROR:
             if more:
-                print(more)
+                show(more)
             raise
         raise UserError(f"{_in_one_line(complaints.getvalue())}; see mien {name} --help") from None
-    sys.stderr.write(complaints.getvalue())
+    sys.stderr.write(printable(complaints.getvalue(), lines=True))
+    asked_threads()
     command.check()
     with contextlib.suppress(ValueError):  # signals are for the main thread
         signal.signal(signal.SIGTERM, _terminated)
@@ -187,13 +215,14 @@ def _overview() -> str:
 
 
 def _complain(message: str) -> int:
-    print(f"mien: {message}", file=sys.stderr)
+    tell(f"mien: {message}")
     return EXIT_USER_ERROR
 
 
 def _write_crash_log() -> Path:
     handle, name = tempfile.mkstemp(prefix="mien-crash-", suffix=".log")
-    with os.fdopen(handle, "w", encoding="utf-8") as log:
+    # Names of files may hold bytes that are no text.
+    with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as log:
         log.write(f"mien {mien.__version__}\n{shlex.join(sys.argv)}\n\n{traceback.format_exc()}")
     return Path(name)
 

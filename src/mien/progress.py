@@ -9,8 +9,18 @@ from typing import Protocol, TypeVar, runtime_checkable
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from mien.terminal import printable, tell
+
 Item = TypeVar("Item")
-console = Console(stderr=True, highlight=False)
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Leave it to the command line, as everything else that nobody reads any more; rich would end the process."""
+        raise BrokenPipeError
+
+
+console = _Console(stderr=True, highlight=False, markup=False, emoji=False)
 """Where people read: standard error, so that standard output stays for results."""
 
 _PLAIN_INTERVAL_SECONDS = 10.0
@@ -29,18 +39,19 @@ class Advance(Protocol):
 @contextmanager
 def progress_bar(title: str, total: int, completed: int = 0) -> Iterator[Advance]:
     """A bar from `completed` to `total`; into a log file it prints a line every ten seconds instead."""
+    title = printable(title)
     if not sys.stderr.isatty():
         with _plain_progress(title, total, completed) as advance:
             yield advance
         return
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("ETA"),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[status]}"),
+        TextColumn("{task.fields[status]}", markup=False),
     )
     with Progress(*columns, console=console, refresh_per_second=5) as bars:
         task = bars.add_task(title, total=total, completed=completed, status="")
@@ -48,7 +59,7 @@ def progress_bar(title: str, total: int, completed: int = 0) -> Iterator[Advance
         def advance(amount: int = 1, status: str = "") -> None:
             bars.update(task, advance=amount)
             if status:
-                bars.update(task, status=status)
+                bars.update(task, status=printable(status))
 
         yield advance
 
@@ -67,7 +78,7 @@ def _plain_progress(title: str, total: int, completed: int) -> Iterator[Advance]
         eta = f", ETA {(total - done) / rate:.0f} s" if rate > 0 and done < total else ""
         line = f"{title}: {done}/{total} in {elapsed:.0f} s{eta} {latest}".rstrip()
         if told != f"{done} {latest}":
-            print(line, file=sys.stderr, flush=True)
+            tell(line)
         told = f"{done} {latest}"
 
     def advance(amount: int = 1, status: str = "") -> None:
@@ -92,5 +103,5 @@ def track_progress(items: Iterable[Item], title: str, total: int) -> Iterator[It
 
 
 def say(message: str) -> None:
-    """One line for people, on standard error."""
-    console.print(message, markup=False, soft_wrap=True)
+    """One line for people, on standard error; what would act on the terminal is shown instead (`mien.terminal`)."""
+    console.print(printable(message), soft_wrap=True)

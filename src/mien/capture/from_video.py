@@ -26,6 +26,7 @@ from mien.errors import UserError
 from mien.locks import hold
 from mien.progress import say
 from mien.storage import cannot_write, file_digest, read_json, write_json
+from mien.terminal import plain_name
 
 _RECIPE = 4
 """Raised whenever the same video would give another capture, so that old ones are not taken for current."""
@@ -141,7 +142,7 @@ def _job(source: Path, settings: CaptureSettings, name: str | None, replace_othe
     settings.check()
     selection = FrameSelection(settings.start, settings.end, settings.stride, settings.max_frames)
     frames = open_source(source, selection, settings.fps, settings.turn // 90)
-    name = name or source.resolve().stem
+    name = name or plain_name(source.resolve().stem)
     # Files count by what is in them.
     contents = {
         "clean_plate": file_digest(settings.clean_plate) if settings.clean_plate else None,

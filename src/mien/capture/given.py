@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from mien.capture.crop import Crop, whole_picture
 from mien.capture.faces import LANDMARKS
+from mien.capture.picture import decode_picture
 from mien.capture.source import FrameSelection, FrameSource, list_images, open_source
 from mien.errors import UserError
 from mien.storage import read_arrays
@@ -126,10 +127,7 @@ def check_mattes(path: Path, source: FrameSource) -> None:
 
 def _read_matte(path: Path) -> UInt8[np.ndarray, "h w"]:
     """A grey picture, or the alpha channel of one that has it, 8 bit."""
-    try:
-        matte = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, cv2.error):
-        matte = None
+    matte = decode_picture(path, cv2.IMREAD_UNCHANGED)
     if matte is None or matte.dtype not in (np.uint8, np.uint16):
         raise UserError(f"{path}: cannot be read as a matte; write a grey picture of 8 or 16 bit")
     if matte.ndim == 3:

@@ -1,6 +1,7 @@
 """Where frames come from: a video file or a folder of images, and which of its frames are taken."""
 
 import hashlib
+import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mien.capture.picture import decode_picture
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.errors import UserError
 
@@ -153,13 +155,9 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """An 8-bit sRGB picture, turned by its EXIF orientation.
 
     Raises:
-        UserError: it is missing or damaged.
+        UserError: it is missing, damaged or too large.
     """
-    try:
-        data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
-    except (OSError, cv2.error):
-        image = None
+    image = decode_picture(path, cv2.IMREAD_COLOR_RGB)
     if image is None:
         raise UserError(f"{path}: cannot be read as an image; remove or replace it")
     return image.astype(np.uint8, copy=False)
@@ -202,7 +200,7 @@ def _hash_files(paths: list[Path], with_names: bool) -> str:
     digest = hashlib.sha256()
     for path in paths:
         if with_names:
-            digest.update(path.name.encode() + b"\0")
+            digest.update(os.fsencode(path.name) + b"\0")
         with path.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()

@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -19,13 +18,13 @@ from jaxtyping import UInt8
 
 from mien.capture.display import ACCURATE, Display
 from mien.capture.tone import HLG, PQ
+from mien.capture.video_file import TOO_MANY_PIXELS, create_video, open_video
 from mien.errors import UserError
 from mien.progress import say
 from mien.storage import write_atomically
 
 _THREADS = 2
 _DEFAULT_FPS = 25.0
-_VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ def probe_video(path: Path) -> VideoInfo:
     Raises:
         UserError: the file is missing or is no video.
     """
-    with _open_video(path) as (container, stream):
+    with open_video(path) as (container, stream):
         fps = float(stream.average_rate or stream.guessed_rate or _DEFAULT_FPS)
         if stream.duration is not None and stream.time_base is not None:
             seconds = float(stream.duration * stream.time_base)
@@ -71,9 +70,10 @@ def count_frames(path: Path) -> int:
     Raises:
         UserError: the file is missing or is no video.
     """
-    with _open_video(path) as (container, stream):
+    with open_video(path) as (container, stream):
         try:
-            return sum(packet.size > 0 for packet in container.demux(stream))
+            # An edit list leaves frames out that others need to be decoded.
+            return sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
         except av.error.FFmpegError as error:
             raise UserError(f"{path}: is damaged ({error.strerror or error}); copy or record it again") from None
 
@@ -97,7 +97,7 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
 
 def read_lazily(path: Path, longest_side: int = 0) -> Iterator[LazyFrame]:
     """As `read_video_frames`, but pictures that nobody asks for are not converted, which is most of the work."""
-    with _open_video(path) as (container, stream):
+    with open_video(path) as (container, stream):
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = _THREADS
         interval = 1.0 / float(stream.average_rate or stream.guessed_rate or _DEFAULT_FPS)
@@ -148,7 +148,7 @@ def _encode(
     path: Path, frames: Iterable[np.ndarray], shape: tuple[int, ...], fps: int | float, options: dict[str, str]
 ) -> None:
     height, width = shape[:2]
-    with av.open(str(path), "w") as container:
+    with create_video(path) as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001), options=options)
         stream.width, stream.height, stream.pix_fmt = width + width % 2, height + height % 2, "yuv420p"
         context = stream.codec_context
@@ -172,26 +172,6 @@ def _encode(
         container.mux(stream.encode())
 
 
-@contextmanager
-def _open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    if not path.exists():
-        raise UserError(f"{path}: no such file; check the path")
-    if not path.is_file():
-        raise UserError(f"{path}: is no file; name a video file")
-    if path.stat().st_size == 0:
-        raise UserError(f"{path}: is empty; copy or record it again")
-    try:
-        container = av.open(str(path), "r")
-    except (av.error.FFmpegError, OSError) as error:
-        named_so = path.suffix.lower() in _VIDEO_ENDINGS
-        remedy = "incomplete? copy it again" if named_so else "give a video file, such as .mp4 or .mov"
-        raise UserError(f"{path}: cannot be read as a video ({error.strerror or error}); {remedy}") from None
-    with container:
-        if not container.streams.video:
-            raise UserError(f"{path}: has no video stream; give a file with pictures in it")
-        yield container, container.streams.video[0]
-
-
 def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
     """All frames; what cannot be decoded is skipped, counted, and reported at the end."""
     damaged, decoded = 0, 0
@@ -202,6 +182,8 @@ def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Itera
         except av.error.FFmpegError:
             damaged += 1
             break
+        except OSError as error:
+            raise UserError(f"{path}: cannot be read ({error.strerror}); copy it again") from None
         if packet is None:
             break
         try:
@@ -213,6 +195,9 @@ def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Itera
             decoded += 1
             yield frame
     if decoded == 0:
-        raise UserError(f"{path}: no frame of the video can be decoded; convert it to H.264 or record it again")
+        raise UserError(
+            f"{path}: no frame of the video can be decoded (it is damaged, or has {TOO_MANY_PIXELS}); convert it to "
+            "H.264 or record it again"
+        )
     if damaged:
         say(f"warning: {path}: {damaged} damaged parts of the video were skipped")

@@ -12,6 +12,7 @@ import tyro
 from mien.commands.options import MethodName
 from mien.devices import DeviceName, check_device, choose_device, like_on
 from mien.errors import UserError
+from mien.terminal import show
 
 if TYPE_CHECKING:
     import torch
@@ -181,11 +182,11 @@ def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) 
     torch.set_num_threads(1)
     machine, shown = measure_machine(gpu), []
     if not as_json:
-        print(format_machine(machine), flush=True)
+        show(format_machine(machine))
     for row in rows:
         shown.append(row)
         if not as_json:
-            print(format_row(row), flush=True)
+            show(format_row(row))
     if as_json:
-        print(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
+        show(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
     return machine, shown

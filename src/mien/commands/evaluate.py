@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from mien.errors import UserError
+from mien.terminal import show
 from mien.workspace import open_workspace
 
 JsonFlag = Annotated[bool, tyro.conf.arg(name="json")]
@@ -96,7 +97,7 @@ class Command:
         if self.as_json:
             _print_json(comparison.content())
         else:
-            print(comparison_text(comparison, bold=sys.stdout.isatty()))
+            show(comparison_text(comparison, bold=sys.stdout.isatty()), styled=True)
 
     def _check_images(self) -> None:
         if self.images is None or self.truth is None:
@@ -119,8 +120,8 @@ class Command:
         if self.as_json:
             _print_json(scores)
         else:
-            print("\n".join(scores_lines(scores)))
+            show("\n".join(scores_lines(scores)))
 
 
 def _print_json(content: dict[str, Any]) -> None:
-    print(json.dumps(content, indent=1))
+    show(json.dumps(content, indent=1))

@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from mien.errors import UserError
+from mien.terminal import show
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Command:
             load_face_model(self.bake)
         rows = [asdict(info) for info in available_face_models()]
         if self.as_json:
-            print(json.dumps(rows, indent=1, default=str))
+            show(json.dumps(rows, indent=1, default=str))
             return
         for row in rows:
-            print("  ".join(f"{key}: {value}" for key, value in row.items()))
+            show("  ".join(f"{key}: {value}" for key, value in row.items()))

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from mien.evaluation.compare import COLUMNS, Comparison, Row, Table, figure
+from mien.terminal import printable
 
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
 _PARTS = ((None, "whole frame"), ("head", "head crop"))
@@ -11,14 +12,14 @@ _PARTS = ((None, "whole frame"), ("head", "head crop"))
 def comparison_text(comparison: Comparison, bold: bool = False) -> str:
     """All tables, then the warnings."""
     parts = [_table_text(table, bold) for table in comparison.tables]
-    parts += [f"warning: {warning}" for warning in comparison.warnings]
+    parts += [printable(f"warning: {warning}") for warning in comparison.warnings]
     return "\n".join(parts)
 
 
 def _table_text(table: Table, bold: bool) -> str:
     """A heading and an aligned table; whole frame, then head crop."""
     sequences = ", ".join(sorted(set(table.rows[0].entry["per_frame"]["sequence"])))
-    title = f"{table.protocol}: {table.frames} frames held out of {sequences} ({table.split})"
+    title = printable(f"{table.protocol}: {table.frames} frames held out of {sequences} ({table.split})")
     extra = ("Gaussians", "training", "ms/frame")
     heads = [
         "",
@@ -41,7 +42,7 @@ def _table_text(table: Table, bold: bool) -> str:
 
 def _cells(table: Table, row: Row) -> list[tuple[str, bool]]:
     """A row's texts, and which of them are the best of their column."""
-    cells = [(row.label, False), (row.faces, False)]
+    cells = [(printable(row.label), False), (printable(row.faces), False)]
     for part, _ in _PARTS:
         for metric, _, digits, higher in COLUMNS:
             value = figure(row.entry, part, metric)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mien.capture.picture import decode_picture
 from mien.capture.video import read_video_frames
 from mien.errors import UserError
 from mien.progress import say
@@ -69,18 +70,14 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
     """A picture of 8 bits a channel as RGB or RGBA; grey becomes RGB.
 
     Raises:
-        UserError: it is no picture, is cut off, or has more than 8 bits.
+        UserError: it is no picture, is cut off, is too large, or has more than 8 bits.
     """
     try:
-        data = path.read_bytes()
+        # libpng returns the upper half of a truncated file.
+        cut = path.suffix.lower() == ".png" and _end_of(path) != b"IEND\xaeB`\x82"
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check the file") from None
-    # libpng returns the upper half of a truncated file.
-    cut = path.suffix.lower() == ".png" and not data.endswith(b"IEND\xaeB`\x82")
-    try:
-        picture = None if cut or not data else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:  # a header that asks for more pixels than OpenCV allows
-        picture = None
+    picture = None if cut else decode_picture(path, cv2.IMREAD_UNCHANGED)
     if picture is None:
         raise UserError(f"{path}: no whole picture; write it again")
     if picture.dtype != np.uint8:
@@ -89,3 +86,9 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
         return np.repeat(picture[..., None], 3, axis=2)
     order = [2, 1, 0, 3][: picture.shape[2]]
     return np.ascontiguousarray(picture[..., order])
+
+
+def _end_of(path: Path) -> bytes:
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 8))
+        return file.read(8)

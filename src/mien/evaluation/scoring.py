@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.errors import UserError
 from mien.evaluation.metrics import Box, crop_to, l1, psnr, ssim
 from mien.evaluation.perceptual import MINIMUM_SIZE, Backbone, PerceptualDistance, load_perceptual
 from mien.evaluation.pictures import to_uint8
+from mien.threads import asked_threads
 
 METRICS = ("psnr", "ssim", "l1", "perceptual")
 _MOST_THREADS = 8
@@ -98,14 +98,11 @@ def worker_threads(threads: int) -> int:
     """How many frames to work on at a time.
 
     Raises:
-        UserError: MIEN_THREADS is no positive number.
+        UserError: MIEN_THREADS is no number of threads.
     """
     if threads > 0:
         return threads
-    wanted = os.environ.get("MIEN_THREADS", "")
-    if wanted and (not wanted.isdecimal() or int(wanted) == 0):
-        raise UserError(f"MIEN_THREADS={wanted}: give a number from 1 up, or unset it")
-    return int(wanted) if wanted else min(_MOST_THREADS, os.cpu_count() or 1)
+    return asked_threads() or min(_MOST_THREADS, os.cpu_count() or 1)
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:

@@ -16,9 +16,10 @@ from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from jaxtyping import Float32, UInt8
 
 from mien.capture.video import write_video
+from mien.capture.video_file import create_video
 from mien.errors import UserError
 from mien.export.output import Output
-from mien.storage import write_atomically
+from mien.storage import cannot_write, write_atomically
 
 _ROWS = 512
 """Of a picture are converted at once: an 8192x8192 picture would otherwise be held four times."""
@@ -43,7 +44,7 @@ def write_pictures(output: Output, pictures: Iterable[UInt8[np.ndarray, "h w _"]
             for index, picture in enumerate(pictures):
                 write_png(output.path if output.kind == "still" else output.numbered(index), picture)
     except OSError as error:
-        raise UserError(f"{output.path}: cannot be written ({error.strerror or error}); choose another place") from None
+        raise cannot_write(output.path, error) from None
 
 
 def write_png(path: Path, picture: UInt8[np.ndarray, "h w _"]) -> None:
@@ -90,7 +91,7 @@ def _encode_webm(path: Path, pictures: Iterator[np.ndarray], shape: tuple[int, .
     if channels == 4:
         # Alternate reference frames and alpha do not go together in libvpx.
         options["auto-alt-ref"] = "0"
-    with av.open(str(path), "w", format="webm") as container:
+    with create_video(path) as container:
         stream = container.add_stream("libvpx-vp9", rate=Fraction(fps).limit_denominator(1001), options=options)
         stream.width, stream.height = width + width % 2, height + height % 2
         stream.pix_fmt = "yuva420p" if channels == 4 else "yuv420p"

@@ -22,6 +22,7 @@ from mien.errors import UserError
 from mien.face.chart import unwrap
 from mien.face.inert_pickle import read_inert_pickle
 from mien.face.model import FaceModel
+from mien.face.npz import read_npz
 
 JOINTS = ("head", "neck", "jaw", "left_eye", "right_eye")
 REGIONS = ("skin", "neck", "eyes", "irises")
@@ -43,6 +44,13 @@ _SIZES = (0.1, 0.6)
 _SHAPES = {
     "v_template": "v 3", "f": "f 3", "shapedirs": "v 3 n", "posedirs": "v 3 36", "J_regressor": "5 v", "weights": "v 5",
 }  # fmt: skip
+
+_KEYS = frozenset({*_SHAPES, "kintree_table", "identities", "vt", "ft"})
+_OTHERS = frozenset({"lmk_face_idx", "lmk_bary_coords", "mean"})
+"""Keys of FLAME's other files, by which they are told."""
+_NAMED = 20
+_LARGEST_NUMBER = 1e6
+"""Metres, weights and indices are all below."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +77,10 @@ def read_flame(path: Path) -> FlameFile:
     Raises:
         UserError: the file is missing, damaged, or lacks something; the message names the key and what to do.
     """
-    arrays = _arrays_of(path)
+    names, arrays = _arrays_of(path)
     for key in _SHAPES:
         if key not in arrays:
-            raise UserError(f"{path}: has no {key!r}, so it is not in FLAME's schema; {_remedy(arrays)}")
+            raise UserError(f"{path}: has no {key!r}, so it is not in FLAME's schema; {_remedy(names)}")
     sizes: dict[str, int] = {}
     for key, wanted in _SHAPES.items():
         _check_shape(path, key, arrays[key], wanted, sizes)
@@ -81,9 +89,12 @@ def read_flame(path: Path) -> FlameFile:
     faces = _indices(path, "f", arrays["f"], sizes["v"])
     uv, uv_faces = (arrays["vt"], arrays["ft"]) if {"vt", "ft"} <= arrays.keys() else (None, None)
     if uv is not None and uv_faces is not None:
-        if uv.ndim != 2 or uv.shape[1] != 2 or uv_faces.shape != faces.shape:
+        numbers = uv.dtype.kind in "iuf" and uv_faces.dtype.kind in "iuf"
+        if uv.ndim != 2 or uv.shape[1] != 2 or uv_faces.shape != faces.shape or not numbers:
             raise UserError(f"{path}: 'vt' {uv.shape} and 'ft' {uv_faces.shape} are no texture coordinates of 'f' "
                             f"{faces.shape}; leave both out, and they are made")  # fmt: skip
+        _check_values(path, "vt", uv)
+        _check_values(path, "ft", uv_faces)
         uv_faces = _indices(path, "ft", uv_faces, len(uv))
     shapes = np.moveaxis(arrays["shapedirs"], 2, 0).astype(np.float64)
     flame = FlameFile(
@@ -163,26 +174,28 @@ def _regions(flame: FlameFile, eyes: list[np.ndarray], centres: Float[np.ndarray
     return regions
 
 
-def _arrays_of(path: Path) -> dict[str, np.ndarray]:
+def _arrays_of(path: Path) -> tuple[list[str], dict[str, np.ndarray]]:
+    """The names of all that the file holds, and those of its arrays that the schema knows."""
     if not path.is_file():
         raise UserError(f"{path}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz")
     if path.suffix.lower() == ".npz":
         try:
-            with np.load(path, allow_pickle=False) as file:
-                return {key: file[key] for key in file.files}
+            return read_npz(path, _KEYS)
         except Exception as error:  # a damaged archive may fail in any way
-            raise UserError(f"{path}: cannot be read as .npz ({error}); save plain arrays with numpy.savez") from None
+            reason = " ".join(str(error).split())[:200]
+            raise UserError(f"{path}: cannot be read as .npz ({reason}); save plain arrays with numpy.savez") from None
     if path.suffix.lower() in (".pkl", ".pickle"):
-        return {key: np.asarray(value) for key, value in read_inert_pickle(path).items()}
+        found = {key: np.asarray(value) for key, value in read_inert_pickle(path, _KEYS | _OTHERS).items()}
+        return list(found), found
     raise UserError(f"{path}: is neither .npz nor .pkl; give a head model in FLAME's schema as one of these")
 
 
-def _remedy(arrays: dict[str, np.ndarray]) -> str:
-    if {"lmk_face_idx", "lmk_bary_coords"} & arrays.keys():
+def _remedy(names: list[str]) -> str:
+    if {"lmk_face_idx", "lmk_bary_coords"} & set(names):
         return "this is a landmark embedding: give the model itself (generic_model.pkl or flame2023.pkl)"
-    if {"mean", "tex_dir"} & arrays.keys():
+    if {"mean", "tex_dir"} & set(names):
         return "this is FLAME's texture space: give the model itself (generic_model.pkl or flame2023.pkl)"
-    return f"it needs {', '.join(_SHAPES)} and kintree_table (here: {', '.join(sorted(arrays)) or 'nothing'})"
+    return f"it needs {', '.join(_SHAPES)} and kintree_table (here: {', '.join(sorted(names)[:_NAMED]) or 'nothing'})"
 
 
 def _check_shape(path: Path, key: str, array: np.ndarray, wanted: str, sizes: dict[str, int]) -> None:
@@ -195,15 +208,27 @@ def _check_shape(path: Path, key: str, array: np.ndarray, wanted: str, sizes: di
             f"{path}: {key!r} is {array.dtype} [{' '.join(map(str, array.shape))}], but has to be numbers [{known}]; "
             "give a head model in FLAME's schema"
         )
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
+    _check_values(path, key, array)
+
+
+def _check_values(path: Path, key: str, array: np.ndarray) -> None:
+    if array.dtype.kind != "f":
+        return
+    if not np.isfinite(array).all():
         raise UserError(f"{path}: {key!r} holds numbers that are not finite; download it again")
+    largest = max(float(array.max(initial=0)), -float(array.min(initial=0)))
+    if largest > _LARGEST_NUMBER:
+        raise UserError(
+            f"{path}: {key!r} holds {largest:g}, and no number of a head is above {_LARGEST_NUMBER:g}; download it again"
+        )
 
 
 def _check_chain(path: Path, table: np.ndarray | None) -> None:
     if table is None:
         raise UserError(f"{path}: has no 'kintree_table', which says how its joints hang together; add FLAME's")
     # The root's parent is -1, or 2**32 - 1 where it was written without a sign.
-    parents = table[0].astype(np.int64) if table.ndim == 2 and table.dtype.kind in "iuf" else np.zeros(0)
+    fits = table.ndim == 2 and len(table) > 0 and table.dtype.kind in "iuf" and bool((np.abs(table) < 2**33).all())
+    parents = table[0].astype(np.int64) if fits else np.zeros(0)
     parents = np.where(parents == 2**32 - 1, -1, parents)
     if tuple(parents) != _CHAIN:
         raise UserError(
@@ -214,7 +239,9 @@ def _check_chain(path: Path, table: np.ndarray | None) -> None:
 
 def _identities(path: Path, arrays: dict[str, np.ndarray], columns: int) -> int:
     given = arrays.get("identities")
-    split = _SPLITS.get(columns) if given is None else int(given)
+    if given is not None and (given.size != 1 or given.dtype.kind not in "iu"):
+        raise UserError(f"{path}: 'identities' is {given.dtype} {list(given.shape)}, but has to be one whole number")
+    split = _SPLITS.get(columns) if given is None else int(given.item())
     if split is None:
         raise UserError(
             f"{path}: 'shapedirs' has {columns} directions; FLAME's 400 are 300 of identity, then 100 of expression. "

@@ -1,89 +1,272 @@
 """Numbers out of a pickle without running anything that it names: some face models come as nothing else.
 
-A pickle is a program: it names functions, and reading it calls them. Here every name leads to a stand-in that only
-remembers what it was given, so the worst that a hostile file can do is to be refused. Of what the stand-ins hold,
-numpy's arrays, scipy's compressed matrices and the values of chumpy's variables are turned into arrays (none of the
-three has to be installed, numpy apart); everything else is dropped.
+A pickle is a program for a machine with a stack: it names functions, and reading it calls them. Here the program is
+followed by a machine of our own, in which every name leads to a stand-in that only remembers what it was given. So the
+worst that a hostile file can do is to be refused. Nor can it take more memory than its own size explains: the opcodes
+are counted, and strings are as long as what lies in the file. Of what the stand-ins hold, numpy's arrays, scipy's
+compressed matrices and the values of chumpy's variables are turned into arrays (none of the three has to be installed,
+numpy apart); everything else is dropped.
 """
 
-import pickle
+import codecs
+import io
+import math
+import pickletools
 import re
+from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from mien.errors import UserError
+from mien.face.npz import LARGEST_MODEL
 
+_LARGEST_FILE = LARGEST_MODEL + (16 << 20)
+"""Bytes."""
+_MOST_OPCODES = 400_000
+"""FLAME's files have some hundreds; each costs up to some hundred bytes of memory."""
 _NUMBERS = re.compile(r"[biuf][1248]")
 """Type codes of numpy for arrays of plain numbers."""
+_OPCODES = {ord(opcode.code): opcode for opcode in pickletools.opcodes}
 
 
-class _StandIn(dict):
-    """Whatever a pickle builds: remembers the arguments and the state, does nothing."""
+class _StandIn:
+    """Whatever a pickle names or builds: remembers the arguments, the state and the entries, does nothing."""
 
-    name = ""
-    """Module and name in the pickle."""
-    arguments: tuple[Any, ...] = ()
-    state: Any = None
+    __slots__ = ("arguments", "entries", "name", "state")
 
-    def __new__(cls, *arguments: Any, **_: Any) -> "_StandIn":
-        made = super().__new__(cls)
-        made.arguments = arguments
-        return made
-
-    def __init__(self, *_: Any, **__: Any):
-        super().__init__()
-
-    def __call__(self, *_: Any, **__: Any) -> "_StandIn":
-        return _StandIn()
-
-    def __setstate__(self, state: Any) -> None:
-        self.state = state
-
-    def append(self, value: Any) -> None:
-        """A list's, of which nothing is wanted."""
-
-    def extend(self, values: Any) -> None:
-        """A list's, of which nothing is wanted."""
+    def __init__(self, name: str = "", arguments: Any = (), entries: dict[str, Any] | None = None) -> None:
+        self.name = name
+        """Module and name in the pickle."""
+        self.arguments: tuple[Any, ...] = arguments if isinstance(arguments, tuple) else ()
+        self.state: Any = None
+        self.entries = entries
 
 
-class _Unpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) == ("_codecs", "encode"):
-            return _encoded
-        if name == "_reconstructor":
-            # copyreg's, with the class as its first argument.
-            return lambda kind, *_: kind() if isinstance(kind, type) and issubclass(kind, _StandIn) else _StandIn()
-        return type("_StandIn", (_StandIn,), {"name": f"{module}.{name}"})
-
-
-def read_inert_pickle(path: Path) -> dict[str, Any]:
+def read_inert_pickle(path: Path, wanted: Collection[str] | None = None) -> dict[str, Any]:
     """The named arrays (and numbers and texts) of a pickled dictionary; what is none of these is left out.
 
+    Args:
+        path: Of the pickle.
+        wanted: Names that are looked at; by default all of them.
+
     Raises:
-        UserError: the file is missing, is no pickle or a damaged one, or holds no dictionary.
+        UserError: the file is missing, is no pickle or a damaged one, is too large, or holds no dictionary.
     """
     try:
-        with path.open("rb") as file:
-            content = _load(file)
-        values = {str(key): _plain(value) for key, value in content.items()} if isinstance(content, dict) else {}
+        if path.stat().st_size > _LARGEST_FILE:
+            raise UserError(f"{path}: has more than {_LARGEST_FILE:,} bytes, too many for a face model")
+        content = _Machine(path.read_bytes()).run()
+        named = content.entries if isinstance(content, _StandIn) else content
+        values = {} if not isinstance(named, dict) else _arrays(named, wanted)
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); give the face model's file") from None
+    except UserError:
+        raise
     except Exception as error:  # a damaged pickle may fail in any way
-        raise UserError(f"{path}: is no pickle, or a damaged one ({error}); download it again") from None
-    if not isinstance(content, dict):
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: is no pickle, or a damaged one ({reason}); download it again") from None
+    if not isinstance(named, dict):
         raise UserError(f"{path}: holds a {type(content).__name__}, not named arrays; give the face model's own file")
-    return {key: value for key, value in values.items() if value is not None}
+    return values
 
 
-def _load(file: IO[bytes]) -> Any:
-    # latin1 is how numpy's arrays in pickles of Python 2 are read: their bytes were text there.
-    return _Unpickler(file, encoding="latin1").load()
+class _Machine:
+    """Follows the opcodes of a pickle."""
+
+    def __init__(self, data: bytes) -> None:
+        self._file = io.BytesIO(data)
+        self._stack: list[Any] = []
+        self._outer: list[list[Any]] = []
+        """Stacks below the marks."""
+        self._memo: dict[int, Any] = {}
+
+    def run(self) -> Any:
+        """What the pickle makes."""
+        for _ in range(_MOST_OPCODES):
+            code = self._file.read(1)
+            if not code or code[0] not in _OPCODES:
+                raise ValueError("it has no end" if not code else f"unknown opcode {code!r}")
+            opcode = _OPCODES[code[0]]
+            if opcode.name == "STOP":
+                return self._stack.pop()
+            argument = None if opcode.arg is None else self._argument(opcode)
+            act = _ACTIONS.get(opcode.name)
+            if act is None:
+                raise ValueError(f"it uses {opcode.name}, which no file of arrays does")
+            act(self, argument)
+        raise ValueError(f"it has more than {_MOST_OPCODES:,} opcodes")
+
+    def _argument(self, opcode: pickletools.OpcodeInfo) -> Any:
+        if opcode.name != "STRING":
+            return opcode.arg.reader(self._file)
+        # latin1 is how numpy's arrays in pickles of Python 2 are read, as their bytes were text there; pickletools would
+        # take this one kind of text for ASCII.
+        quoted = self._file.readline().strip()
+        if len(quoted) < 2 or quoted[:1] not in b"'\"" or quoted[-1:] != quoted[:1]:
+            raise ValueError("a text without quotes")
+        return codecs.escape_decode(quoted[1:-1])[0].decode("latin1")
+
+    def push(self, value: Any) -> None:
+        """A value."""
+        self._stack.append(value)
+
+    def pop(self) -> Any:
+        """The value on top."""
+        return self._stack.pop()
+
+    def top(self) -> Any:
+        """The value on top, which stays."""
+        return self._stack[-1]
+
+    def mark(self) -> None:
+        """Begin a group of values."""
+        self._outer.append(self._stack)
+        self._stack = []
+
+    def group(self) -> list[Any]:
+        """The values since the last mark, which goes."""
+        values, self._stack = self._stack, self._outer.pop()
+        return values
+
+    def drop(self) -> None:
+        """A value, or a mark that nothing follows."""
+        if self._stack:
+            self._stack.pop()
+        else:
+            self.group()
+
+    def keep(self, number: int | None) -> None:
+        """Remember the value on top."""
+        self._memo[len(self._memo) if number is None else number] = self._stack[-1]
+
+    def recall(self, number: int) -> None:
+        """Push what was remembered."""
+        self._stack.append(self._memo[number])
+
+    def call(self, arguments: Any) -> None:
+        """What calling the name on top would make: a stand-in."""
+        called = self.pop()
+        name = called.name if isinstance(called, _StandIn) else ""
+        if name.endswith("._reconstructor") and isinstance(arguments, tuple) and arguments:
+            # copyreg's, with the class as its first argument.
+            name = arguments[0].name if isinstance(arguments[0], _StandIn) else ""
+        self.push(_StandIn(name, arguments))
+
+    def set_state(self) -> None:
+        """Give the value below a state."""
+        state = self.pop()
+        if isinstance(self.top(), _StandIn):
+            self.top().state = state
+
+    def set_entries(self, values: list[Any]) -> None:
+        """Keys and values in turn, into the dictionary on top; keys that are no text are dropped."""
+        target = self.top()
+        if isinstance(target, _StandIn):
+            target.entries = target.entries if target.entries is not None else {}
+            target = target.entries
+        if isinstance(target, dict):
+            target.update((key, value) for key, value in _pairs(values) if isinstance(key, str))
+
+    def append(self, values: list[Any]) -> None:
+        """Values at the end of the list on top."""
+        if isinstance(self.top(), list):
+            self.top().extend(values)
 
 
-def _encoded(text: str, *_: Any) -> bytes:
-    return text.encode("latin1")
+def _pairs(values: list[Any]) -> Any:
+    return zip(values[::2], values[1::2], strict=True)
+
+
+def _tuple_of(count: int) -> Callable[[_Machine, Any], None]:
+    def act(machine: _Machine, _: Any) -> None:
+        values = [machine.pop() for _ in range(count)]
+        machine.push(tuple(reversed(values)))
+
+    return act
+
+
+def _drop_group(machine: _Machine, _: Any) -> None:
+    machine.group()
+
+
+def _instance(machine: _Machine, _: Any) -> None:
+    kind, *arguments = machine.group()
+    machine.push(kind)
+    machine.call(tuple(arguments))
+
+
+def _new_object_with_names(machine: _Machine, _: Any) -> None:
+    machine.pop()
+    machine.call(machine.pop())
+
+
+def _dictionary(machine: _Machine, _: Any) -> None:
+    machine.push({key: value for key, value in _pairs(machine.group()) if isinstance(key, str)})
+
+
+def _set_entry(machine: _Machine, _: Any) -> None:
+    value, key = machine.pop(), machine.pop()
+    machine.set_entries([key, value])
+
+
+_LITERALS = (
+    "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT", "STRING", "BINSTRING",
+    "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8", "UNICODE", "BINUNICODE",
+    "SHORT_BINUNICODE", "BINUNICODE8",
+)  # fmt: skip
+_ACTIONS: dict[str, Callable[[_Machine, Any], None]] = {
+    **dict.fromkeys(_LITERALS, lambda machine, value: machine.push(value)),
+    **dict.fromkeys(("PROTO", "FRAME"), lambda machine, _: None),
+    **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"), lambda machine, number: machine.keep(number)),
+    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda machine, number: machine.recall(number)),
+    **dict.fromkeys(("REDUCE", "NEWOBJ"), lambda machine, _: machine.call(machine.pop())),
+    "NONE": lambda machine, _: machine.push(None),
+    "NEWTRUE": lambda machine, _: machine.push(True),
+    "NEWFALSE": lambda machine, _: machine.push(False),
+    "EMPTY_LIST": lambda machine, _: machine.push([]),
+    "EMPTY_TUPLE": lambda machine, _: machine.push(()),
+    "EMPTY_DICT": lambda machine, _: machine.push({}),
+    "EMPTY_SET": lambda machine, _: machine.push([]),
+    "MARK": lambda machine, _: machine.mark(),
+    "LIST": lambda machine, _: machine.push(machine.group()),
+    "FROZENSET": lambda machine, _: machine.push(machine.group()),
+    "TUPLE": lambda machine, _: machine.push(tuple(machine.group())),
+    "TUPLE1": _tuple_of(1),
+    "TUPLE2": _tuple_of(2),
+    "TUPLE3": _tuple_of(3),
+    "DICT": _dictionary,
+    "APPEND": lambda machine, _: machine.append([machine.pop()]),
+    "APPENDS": lambda machine, _: machine.append(machine.group()),
+    "ADDITEMS": lambda machine, _: machine.append(machine.group()),
+    "SETITEM": _set_entry,
+    "SETITEMS": lambda machine, _: machine.set_entries(machine.group()),
+    "POP": lambda machine, _: machine.drop(),
+    "POP_MARK": _drop_group,
+    "DUP": lambda machine, _: machine.push(machine.top()),
+    "GLOBAL": lambda machine, name: machine.push(_StandIn(".".join(name.split(" ", 1)))),
+    "STACK_GLOBAL": lambda machine, _: machine.push(_StandIn(".".join(reversed([machine.pop(), machine.pop()])))),
+    "BUILD": lambda machine, _: machine.set_state(),
+    "OBJ": _instance,
+    "INST": lambda machine, name: machine.push(_StandIn(".".join(name.split(" ", 1)), tuple(machine.group()))),
+    "NEWOBJ_EX": _new_object_with_names,
+}
+"""What each opcode does, by its name in `pickletools`."""
+
+
+def _arrays(named: dict[str, Any], wanted: Collection[str] | None) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    left = LARGEST_MODEL
+    for key, value in named.items():
+        made = _plain(value) if wanted is None or key in wanted else None
+        if made is None:
+            continue
+        left -= made.nbytes if isinstance(made, np.ndarray) else 0
+        if left < 0:
+            raise ValueError(f"its arrays have more than {LARGEST_MODEL:,} bytes together")
+        found[key] = made
+    return found
 
 
 def _plain(value: Any) -> Any:
@@ -95,7 +278,7 @@ def _plain(value: Any) -> Any:
         return _array(value.state)
     if value.name.endswith("._frombuffer"):
         raw, kind, shape, order, *axes = value.arguments
-        array = _array((1, shape, kind, order == "F", bytes(raw)))
+        array = _array((1, shape, kind, order == "F", raw))
         return array.transpose(axes[0]) if array is not None and order == "K" and axes else array
     if not isinstance(value.state, dict):
         return None
@@ -105,14 +288,23 @@ def _plain(value: Any) -> Any:
     return _plain(value.state.get("x"))
 
 
+def _raw(value: Any) -> bytes | None:
+    """Bytes, or text that stands for bytes as it did in Python 2, or what `_codecs.encode` would make of text."""
+    if isinstance(value, _StandIn) and value.name == "_codecs.encode" and value.arguments:
+        value = value.arguments[0]
+    if isinstance(value, str):
+        return value.encode("latin1")
+    return bytes(value) if isinstance(value, (bytes, bytearray)) else None
+
+
 def _array(state: Any) -> np.ndarray | None:
     """Numpy's state of an array: version, shape, type, whether columns come first, bytes."""
     if not isinstance(state, tuple) or len(state) != 5:
         return None
-    _, shape, kind, by_column, raw = state
+    _, shape, kind, by_column, content = state
     code = kind.arguments[0] if isinstance(kind, _StandIn) and kind.arguments else None
-    raw = raw.encode("latin1") if isinstance(raw, str) else raw
-    if not isinstance(code, str) or not _NUMBERS.fullmatch(code) or not isinstance(raw, bytes):
+    raw = _raw(content)
+    if not isinstance(code, str) or not _NUMBERS.fullmatch(code) or raw is None:
         return None
     big = isinstance(kind.state, tuple) and ">" in kind.state
     values = np.frombuffer(raw, np.dtype(code).newbyteorder(">" if big else "<"))
@@ -126,7 +318,12 @@ def _dense(state: dict[str, Any], by_column: bool) -> np.ndarray | None:
     if data is None or indices is None or starts is None or shape is None:
         return None
     rows, columns = (int(size) for size in shape)
+    if rows < 0 or columns < 0 or 8 * math.prod((rows, columns)) > LARGEST_MODEL:
+        raise ValueError(f"a matrix of {rows} x {columns} numbers is too large for a face model")
+    lengths = np.diff(starts)
+    lines = columns if by_column else rows
+    if starts.shape != (lines + 1,) or (lengths < 0).any() or lengths.sum() != len(data) or (indices < 0).any():
+        raise ValueError("a compressed matrix that does not fit together")
     matrix = np.zeros((columns, rows) if by_column else (rows, columns))
-    line = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    np.add.at(matrix, (line, indices), data)
+    np.add.at(matrix, (np.repeat(np.arange(lines), lengths), indices), data)
     return matrix.T if by_column else matrix

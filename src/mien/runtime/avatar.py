@@ -12,6 +12,7 @@ from mien.runtime.file import read_portable
 from mien.runtime.model import Camera, PortableAvatar
 from mien.runtime.posing import Face, Gaussians, pose
 from mien.runtime.rotation import compose_rigid
+from mien.threads import asked_threads
 
 Vector = Sequence[float | int] | np.ndarray
 """Three numbers."""
@@ -96,8 +97,9 @@ def load(path: Path | str) -> Avatar:
         >>> image, alpha = avatar.render(gaussians, avatar.camera.resized(512, 512))
 
     Raises:
-        UserError: the file is missing, damaged, or of another version.
+        UserError: the file is missing, damaged, or of another version; MIEN_THREADS is no number of threads.
     """
+    asked_threads()
     return Avatar(read_portable(Path(path)))
 
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -20,6 +19,7 @@ from mien.synthetic.painter import develop, draw, to_uint8, wall
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.rig import cameras_of
 from mien.synthetic.subject import Subject, build_subject, pose_subject
+from mien.threads import thread_count
 from mien.tracking import Tracking
 from mien.tracking.neck_line import fit_neck_lines
 
@@ -124,7 +124,7 @@ class SyntheticScene:
         """Pictures of some timesteps in order, by up to MIEN_THREADS threads, a few ahead of what was asked for."""
         assert self.subject is not None
         assert self.background is not None
-        threads = int(os.environ.get("MIEN_THREADS", 0)) or os.cpu_count() or 1
+        threads = thread_count()
         before = torch.get_num_threads()
         torch.set_num_threads(1)
         try:

@@ -1,12 +1,13 @@
 """Frames side by side: one thread each."""
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 import torch
+
+from mien.threads import thread_count
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -16,7 +17,7 @@ _AHEAD = 2
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """The function's results in order, by up to MIEN_THREADS threads (all cores) that share no work between them."""
-    threads = min(_threads(), len(items))
+    threads = min(thread_count(), len(items))
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -30,22 +31,18 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
 
 def stream_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
     """As `in_threads`, one result after another: only a few more than there are threads wait to be taken."""
-    with ThreadPoolExecutor(_threads(), initializer=_prepare) as pool:
+    with ThreadPoolExecutor(thread_count(), initializer=_prepare) as pool:
         waiting: deque[Future[Result]] = deque()
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))
-                if len(waiting) > _threads() + _AHEAD:
+                if len(waiting) > thread_count() + _AHEAD:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
         finally:
             for future in waiting:
                 future.cancel()
-
-
-def _threads() -> int:
-    return int(os.environ.get("MIEN_THREADS", 0)) or os.cpu_count() or 1
 
 
 def _prepare() -> None:

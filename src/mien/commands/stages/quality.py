@@ -29,6 +29,7 @@ from mien.locks import WAIT, hold
 from mien.progress import say
 from mien.storage import read_json, replace_folder, write_atomically, write_json
 from mien.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
+from mien.terminal import show
 from mien.tracking import TrackingSettings, read_tracking
 from mien.training import TrainSettings, read_training_summary
 from mien.workspace import Workspace
@@ -50,7 +51,7 @@ def quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int,
     method_named(method)
     with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
         rows = _walk(references, out, method, steps)
-    print(json.dumps([row.as_json() for row in rows]) if as_json else markdown_table(rows))
+    show(json.dumps([row.as_json() for row in rows]) if as_json else markdown_table(rows))
     say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
 
 

@@ -1,0 +1,149 @@
+"""The one door through which video files are opened and made.
+
+FFmpeg takes names for more than names: `take:1.mp4` for an address, `%03d.png` for a row of files, a playlist for leave
+to open what it lists. So it never sees a name here. It reads and writes through a file that Python opened, may open
+nothing else, and takes only containers that hold their own pictures.
+"""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import av
+import av.error
+import av.logging
+from av.container import InputContainer, OutputContainer
+from av.stream import Disposition
+from av.video.stream import VideoStream
+
+from mien.errors import UserError
+
+LARGEST_FRAME = 8192 * 4608
+"""Pixels of a video's pictures: 8K of every kind. A decoder holds up to 17 pictures at a time."""
+TOO_MANY_PIXELS = f"more than the {LARGEST_FRAME:,} pixels (8192x4608) that mien takes of a video"
+_VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+_CONTAINERS = (
+    "mov", "matroska", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "flv", "live_flv", "asf", "ogg", "mxf", "gxf",
+    "nut", "dv", "gif", "apng", "ivf", "obu", "av1", "h261", "h263", "h264", "hevc", "vvc", "vc1", "dirac", "dnxhd",
+    "mjpeg", "yuv4mpegpipe", "wtv", "rm", "swf", "dhav", "cine", "webp_anim", "png_pipe", "jpeg_pipe", "webp_pipe",
+    "bmp_pipe", "tiff_pipe", "wav", "mp3", "flac", "aac", "aiff", "caf",
+)  # fmt: skip
+"""FFmpeg's names of the containers that are opened. None of them leads to other files. Sound alone is told as such."""
+_LISTS = (
+    (rb"\A(\xef\xbb\xbf)?\s*#EXTM3U", "a playlist (.m3u8)"),
+    (rb"\Affconcat version", "a list of files for FFmpeg (concat)"),
+    (rb"<MPD[\s>]", "a DASH manifest (.mpd)"),
+    (rb"<SmoothStreamingMedia|<CompositionPlaylist|<AssetMap", "a manifest that names other files"),
+    (rb"\Av=0\r?\n(?s:.*)\nm=", "the description of a stream (.sdp)"),
+    (rb"\A\[InternetShortcut\]|\A\[playlist\]|\A<asx", "a link or a playlist"),
+)
+"""What begins so names other files or addresses instead of holding pictures."""
+_SNIFFED = 4096
+_BUFFER = 1 << 16
+"""Bytes that FFmpeg asks for at a time."""
+
+
+class _Local:
+    """A file as FFmpeg sees it: without a name, apart from an ending that chooses the container that is written."""
+
+    def __init__(self, file: IO[bytes], name: str = "video") -> None:
+        self.read, self.write, self.seek, self.tell = file.read, file.write, file.seek, file.tell
+        self.name = name
+        self.readable, self.writable, self.seekable = file.readable, file.writable, file.seekable
+
+
+@contextmanager
+def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """A video file and its first stream of moving pictures (a cover picture is none), ready to be decoded.
+
+    Raises:
+        UserError: the file is missing, is no video, is of a container or codec that is not read, or has pictures of
+            more than `LARGEST_FRAME` pixels.
+    """
+    if not path.exists():
+        raise UserError(f"{path}: no such file; check the path")
+    if not path.is_file():
+        raise UserError(f"{path}: is no file; name a video file")
+    if path.stat().st_size == 0:
+        raise UserError(f"{path}: is empty; copy or record it again")
+    limit = {"max_pixels": str(LARGEST_FRAME)}
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+    with file:
+        try:
+            container = av.open(
+                _Local(file),
+                "r",
+                options=limit,
+                container_options={"format_whitelist": ",".join(_CONTAINERS), "protocol_whitelist": "none"},
+                metadata_errors="replace",  # titles come in any encoding
+                buffer_size=_BUFFER,
+            )
+        except (av.error.FFmpegError, OSError) as error:
+            raise UserError(f"{path}: {_why_not(path, error)}") from None
+        with container:
+            stream = _moving_pictures(path, container)
+            _check_size(path, stream.codec_context.width, stream.codec_context.height)
+            stream.codec_context.options = limit
+            yield container, stream
+
+
+@contextmanager
+def create_video(path: Path) -> Iterator[OutputContainer]:
+    """A new video file; the ending of `path` chooses the container.
+
+    Raises:
+        OSError: the file cannot be written, with the system's own reason.
+    """
+    with path.open("wb") as file, av.open(_Local(file, f"video{path.suffix}"), "w") as container:
+        yield container
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width * height > LARGEST_FRAME:
+        raise UserError(f"{path}: its pictures have {width}x{height} pixels, {TOO_MANY_PIXELS}; make it smaller")
+
+
+def _why_not(path: Path, error: av.error.FFmpegError | OSError) -> str:
+    """What a file that FFmpeg refused is, as far as its beginning tells, and what to do."""
+    with path.open("rb") as file:
+        start = file.read(_SNIFFED)
+    for pattern, kind in _LISTS:
+        if re.search(pattern, start):
+            return f"is {kind}, which names other files; mien opens none of those: give the video itself"
+    if isinstance(error, av.error.ArgumentError):
+        return "is a file of a kind that mien does not open; convert it to .mp4 or .mov"
+    named_so = path.suffix.lower() in _VIDEO_ENDINGS
+    remedy = "incomplete? copy it again" if named_so else "give a video file, such as .mp4 or .mov"
+    return f"cannot be read as a video ({error.strerror or error}); {remedy}"
+
+
+def _moving_pictures(path: Path, container: InputContainer) -> VideoStream:
+    streams = container.streams.video
+    if not streams:
+        raise UserError(f"{path}: has no video stream; give a file with pictures in it")
+    moving = [stream for stream in streams if not stream.disposition & Disposition.attached_pic]
+    if not moving:
+        raise UserError(f"{path}: has a cover picture, but no video stream; give a file with moving pictures in it")
+    # PyAV has no codec context for a codec that FFmpeg lacks.
+    known = [stream for stream in moving if stream.codec_context is not None]
+    if not known:
+        codec = _codec_name(container, moving[0].index)
+        raise UserError(f"{path}: FFmpeg does not know its codec ({codec}); convert it to H.264")
+    return known[0]
+
+
+def _codec_name(container: InputContainer, index: int) -> str:
+    """The codec's name or four-character code, from FFmpeg's own words: PyAV tells neither of a codec without decoder."""
+    level = av.logging.get_level()
+    av.logging.set_level(av.logging.INFO)
+    try:
+        described = container.dumps_format()
+    finally:
+        av.logging.set_level(level)
+    match = re.search(rf"Stream #\d+:{index}\b[^\n]*?: Video: (?:none \()?([^,\n]+?)(?: / 0x\w+\))?[,\n]", described)
+    return match.group(1) if match else "it has no name"

@@ -1,0 +1,89 @@
+"""Arrays of an .npz that somebody hands in: what a member announces is looked at before memory is taken for it.
+
+`numpy.load` believes the headers, and a member of 6 MB may unpack to gigabytes.
+"""
+
+import math
+import zipfile
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+
+LARGEST_MODEL = 256 << 20
+"""Bytes of all arrays of a face model together; FLAME 2023 has 60 MB."""
+_LARGEST_DIRECTORY = 1 << 20
+"""Bytes of the list of members at the end of the archive; each member takes 50 or so."""
+_END, _END_SIZE = b"PK\x05\x06", 22
+_END_OF_LARGE = b"PK\x06\x07"
+"""Of archives with more than 65,534 members, or of 4 GB and more."""
+_LONGEST_COMMENT = 65535
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+_ENDING = ".npy"
+
+
+def read_npz(path: Path, wanted: Collection[str]) -> tuple[list[str], dict[str, np.ndarray]]:
+    """The names of all members of an .npz, and those arrays of plain numbers that are wanted and there.
+
+    Raises:
+        ValueError: a wanted member is no array of plain numbers, stands there twice, or is damaged; or the arrays are
+            larger than `LARGEST_MODEL`.
+        Exception: what Python's `zipfile` raises for an archive that is none or is damaged.
+    """
+    _check_directory(path)
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        names = [member.filename.removesuffix(_ENDING) for member in members]
+        arrays: dict[str, np.ndarray] = {}
+        left = LARGEST_MODEL
+        for name, member in zip(names, members, strict=True):
+            if name not in wanted:
+                continue
+            if name in arrays:
+                raise ValueError(f"{name!r} stands in it twice")
+            try:
+                arrays[name] = _read_member(archive, member, left)
+            except ValueError as error:
+                raise ValueError(f"{name!r}: {error}") from None
+            left -= arrays[name].nbytes
+    return names, arrays
+
+
+def _check_directory(path: Path) -> None:
+    """Refuse archives whose list of members alone would fill the memory."""
+    with path.open("rb") as file:
+        size = path.stat().st_size
+        file.seek(max(0, size - _LONGEST_COMMENT - _END_SIZE))
+        tail = file.read()
+    place = tail.rfind(_END)
+    if place < 0 or len(tail) < place + _END_SIZE:
+        raise ValueError("it has no end: copy it again")
+    directory = int.from_bytes(tail[place + 12 : place + 16], "little")
+    if directory > _LARGEST_DIRECTORY or tail[max(0, place - 20) : place].startswith(_END_OF_LARGE):
+        raise ValueError("it has far more members than a face model")
+
+
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, limit: int) -> np.ndarray:
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError("is compressed as numpy never does it")
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        if version not in _HEADERS:
+            raise ValueError(f"is of version {version} of numpy's format")
+        shape, by_column, kind = _HEADERS[version](file)
+        if kind.kind not in "biuf":
+            raise ValueError(f"holds {kind}, not plain numbers")
+        size = math.prod(shape) * kind.itemsize
+        if not all(length >= 0 for length in shape):
+            raise ValueError(f"has the shape {shape}")
+        if size > limit:
+            raise ValueError(f"has {size:,} bytes; the arrays of a face model have at most {LARGEST_MODEL:,} together")
+        data = file.read(size)
+        # Reading on to the end has the checksum compared.
+        if len(data) != size or file.read(1):
+            raise ValueError("is not as long as it says")
+    values = np.frombuffer(data, kind).reshape(shape, order="F" if by_column else "C")
+    return values.astype(kind.newbyteorder("="))

@@ -1,0 +1,228 @@
+"""Face models that somebody hands in to do harm: refused in one line, quickly, before they take memory."""
+
+import pickle
+import struct
+import time
+import tracemalloc
+import zipfile
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flame_like import flame_like, write_npz
+from mien.errors import UserError
+from mien.face import inert_pickle, load_face_model, npz
+from mien.face.flame import read_flame
+from mien.face.inert_pickle import read_inert_pickle
+from mien.face.npz import LARGEST_MODEL
+
+MIB = 1 << 20
+
+
+@pytest.fixture(scope="module")
+def arrays() -> dict[str, np.ndarray]:
+    return flame_like(load_face_model("anny"))
+
+
+@contextmanager
+def within(mebibytes: int, seconds: float = 10.0) -> Iterator[None]:
+    began = time.monotonic()
+    tracemalloc.start()
+    try:
+        yield
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < mebibytes * MIB, f"{peak / MIB:.0f} MiB"
+    assert time.monotonic() - began < seconds
+
+
+def refused(path: Path, words: str) -> None:
+    with within(24), pytest.raises(UserError, match=words) as error:
+        read_flame(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 600
+
+
+# Pickles --------------------------------------------------------------------------------------------------------------
+
+HUGE = struct.pack("<Q", 1 << 40)
+PICKLES = {
+    "bytes of a tebibyte": b"\x80\x04\x8e" + HUGE + b".",
+    "a bytearray of a tebibyte": b"\x80\x05\x96" + HUGE + b".",
+    "a text of a tebibyte": b"\x80\x04\x8d" + HUGE + b".",
+    "a frame of a tebibyte": b"\x80\x04\x95" + HUGE + b".",
+    "a memo of two billion": b"]r\xff\xff\xff\x7f.",
+    "a memo of digits": b"]p" + b"9" * 4000 + b"\n.",
+    "a number of two gigabytes": b"\x8b\xff\xff\xff\x7f.",
+    "digits": b"I" + b"9" * 10_000 + b"\n.",
+    "a doubled tuple": b"}(X\x01\x00\x00\x00a" + b"2\x86" * 200 + b"u.",
+    "a doubled tuple for a key": b"}(X\x01\x00\x00\x00a" + b"2\x86" * 200 + b"N" + b"u.",
+    "a doubled set": b"\x8f(X\x01\x00\x00\x00a" + b"2\x86" * 200 + b"\x90.",
+    "thousands of dictionaries": b"}" * 20_000 + b".",
+    "names without end": b"ca\nb\n" * 20_000 + b".",
+    "a stack that is empty": b"0.",
+    "a mark that is missing": b"t.",
+    "a persistent name": b"Pname\n.",
+    "an extension": b"\x82\x01.",
+    "a cycle": b"}(X\x01\x00\x00\x00fca\nb\n)\x81q\x01}X\x01\x00\x00\x00xh\x01sbu.",
+}
+
+
+@pytest.mark.parametrize("name", PICKLES)
+def test_a_pickle_takes_no_more_than_its_own_size(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.pkl"
+    path.write_bytes(PICKLES[name])
+    if len(PICKLES[name]) > 10_000:
+        # What the checks of types cost for each opcode is not what is tested.
+        monkeypatch.setattr(inert_pickle, "_MOST_OPCODES", 2_000)
+    refused(path, r"is no pickle, or a damaged one|has no 'v_template'|not named arrays")
+
+
+def test_arrays_that_repeat_or_unpack_one_text_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many names for one array would be many arrays; a sparse matrix may be dense in memory only."""
+    monkeypatch.setattr(inert_pickle, "LARGEST_MODEL", 8 * MIB)
+    path = tmp_path / "a.pkl"
+    one = np.zeros(MIB // 8)
+    path.write_bytes(pickle.dumps({f"name{i}": one for i in range(20)}, protocol=2))
+    with within(48), pytest.raises(UserError, match="more than 8,388,608 bytes together"):
+        read_inert_pickle(path)
+
+    class Sparse:
+        __module__, __qualname__ = "builtins", "dict"
+
+        def __reduce__(self):
+            state = {"data": np.ones(1), "indices": np.zeros(1, int), "indptr": np.array([0, 1]), "_shape": (9**6, 9**6)}
+            return (OrderedDict, (), state)
+
+    path.write_bytes(pickle.dumps({"J_regressor": Sparse()}, protocol=2))
+    with within(24), pytest.raises(UserError, match="a matrix of 531441 x 531441 numbers is too large"):
+        read_inert_pickle(path)
+
+
+def test_a_large_pickle_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.pkl"
+    with path.open("wb") as file:
+        file.truncate(LARGEST_MODEL + 100 * MIB)
+    refused(path, "too many for a face model")
+
+
+def test_texts_of_python_2_and_ordered_dictionaries_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.pkl"
+    path.write_bytes(b"(dp0\nS'a\\xff\"'\np1\nI7\nsS\"b\"\nS'\\x00\\xe4'\ns.")
+    assert read_inert_pickle(path) == {'a\xff"': 7, "b": "\x00\xe4"}
+    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+        path.write_bytes(pickle.dumps(OrderedDict(a=np.arange(6.0).reshape(2, 3).T, b=(1, 2), c=2.5), protocol))
+        found = read_inert_pickle(path)
+        np.testing.assert_array_equal(found["a"], np.arange(6.0).reshape(2, 3).T)
+        assert found.keys() == {"a", "c"}
+
+
+# Archives -------------------------------------------------------------------------------------------------------------
+
+
+def header(kind: str, shape: object, version: tuple[int, int] = (1, 0)) -> bytes:
+    text = f"{{'descr': {kind!r}, 'fortran_order': False, 'shape': {shape!r}, }}"
+    size = struct.pack("<H" if version == (1, 0) else "<I", len(text) + 1)
+    return b"\x93NUMPY" + bytes(version) + size + text.encode() + b"\n"
+
+
+def write_members(path: Path, *members: tuple[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, data in members:
+            archive.writestr(name, data)
+    return path
+
+
+MEMBERS = {
+    "huge": (header("<f8", (5_000_000_000, 3)), "has 120,000,000,000 bytes; the arrays of a face model have at most"),
+    "negative": (header("<f8", (-5, -3)), "has the shape"),
+    "text": (header("<U3", (1,)) + bytes(12), "holds <U3, not plain numbers"),
+    "complex": (header("<c16", (1,)) + bytes(16), "holds complex128, not plain numbers"),
+    "objects": (header("|O", (1,)) + pickle.dumps([1]), "holds object, not plain numbers"),
+    "structure": (header("[('a', '<f8')]", (1,)) + bytes(8), "cannot be read as .npz"),
+    "no array": (b"v 0 0 0\n", "cannot be read as .npz"),
+    "empty": (b"", "cannot be read as .npz"),
+    "short": (header("<f8", (4, 3)) + bytes(8), "is not as long as it says"),
+    "long": (header("<f8", (4, 3)) + bytes(104), "is not as long as it says"),
+    "other version": (header("<f8", (4, 3), (3, 0)), "version"),
+    "a long header": (header("<f8", (1,) * 9000), "cannot be read as .npz"),
+    "no dimension": (header("<f8", ()) + bytes(8), "'v_template' is float64 .*, but has to be numbers"),
+}
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_odd_members_of_an_archive_are_told(name: str, tmp_path: Path) -> None:
+    data, words = MEMBERS[name]
+    others = {key: header("<f8", ()) + bytes(8) for key in ("f", "shapedirs", "posedirs", "J_regressor", "weights")}
+    members = {"v_template": data, **others}
+    refused(write_members(tmp_path / "a.npz", *((f"{key}.npy", value) for key, value in members.items())), words)
+
+
+def test_a_bomb_is_refused_by_its_header(tmp_path: Path) -> None:
+    """50 KB that would unpack to 50 MB, of which the limit is told, and not one byte unpacked."""
+    path = write_members(tmp_path / "a.npz", ("v_template.npy", header("<f8", (6_500_000,)) + bytes(52_000_000)))
+    assert path.stat().st_size < 100_000
+    limit = npz.LARGEST_MODEL
+    npz.LARGEST_MODEL = 50_000_000
+    try:
+        refused(path, "at most 50,000,000 together")
+    finally:
+        npz.LARGEST_MODEL = limit
+
+
+def test_names_that_stand_twice_and_ends_that_lie_are_told(tmp_path: Path) -> None:
+    member = ("weights.npy", header("<f8", (1,)) + bytes(8))
+    with pytest.warns(UserWarning, match="Duplicate name"):
+        path = write_members(tmp_path / "a.npz", member, member)
+    refused(path, "'weights' stands in it twice")
+    data = write_members(path, member).read_bytes()
+    path.write_bytes(data[:-10] + struct.pack("<I", 2 * MIB) + data[-6:])
+    refused(path, "far more members than a face model")
+    path.write_bytes(b"PK\x05\x06" + bytes(8) + b"\xff" * 10)
+    refused(path, "cannot be read as .npz")
+    write_members(path, member, method=zipfile.ZIP_LZMA)
+    refused(path, "compressed as numpy never does it")
+
+
+def test_what_is_not_looked_at_may_be_anything(arrays: dict[str, np.ndarray], tmp_path: Path) -> None:
+    path = write_npz(tmp_path / "a.npz", arrays)
+    with zipfile.ZipFile(path, "a") as archive:
+        for name, data in (("note.txt", b"text"), ("x\x00y.npy", b""), ("huge.npy", header("<f8", (1 << 50,)))):
+            archive.writestr(name, data)
+    assert len(read_flame(path).template) == len(arrays["v_template"])
+
+
+ODD = {
+    "identities as a list": ("identities", np.array([1, 2, 3]), "has to be one whole number"),
+    "identities as text": ("identities", np.array(2.5), "has to be one whole number"),
+    "identities that are huge": ("identities", np.array(2**63, np.uint64), "leaves no expression"),
+    "a chain without rows": ("kintree_table", np.zeros((0, 5), int), "gives the joints the parents"),
+    "a chain of nothing": ("kintree_table", np.array(3), "gives the joints the parents"),
+    "a chain of NaN": ("kintree_table", np.full((2, 5), np.nan), "gives the joints the parents"),
+    "huge numbers": ("shapedirs", None, "'shapedirs' holds 1e\\+30, and no number of a head"),
+    "texture of complex numbers": ("vt", np.zeros((4, 2), bool), "no texture coordinates"),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_odd_arrays_are_told(name: str, arrays: dict[str, np.ndarray], tmp_path: Path) -> None:
+    key, value, words = ODD[name]
+    if value is None:
+        value = np.where(np.arange(arrays[key].shape[2]) == 3, 1e30, arrays[key])
+    changed = {**arrays, "ft": arrays["f"], "vt": np.zeros((len(arrays["v_template"]), 2)), key: value}
+    with pytest.raises(UserError, match=words):
+        read_flame(write_npz(tmp_path / "a.npz", changed))
+
+
+def test_arrays_of_the_other_byte_order_are_the_same(arrays: dict[str, np.ndarray], tmp_path: Path) -> None:
+    swapped = {key: value.astype(value.dtype.newbyteorder(">")) for key, value in arrays.items()}
+    expected = read_flame(write_npz(tmp_path / "a.npz", arrays))
+    found = read_flame(write_npz(tmp_path / "b.npz", swapped))
+    np.testing.assert_array_equal(found.template, expected.template)
+    np.testing.assert_array_equal(found.faces, expected.faces)
