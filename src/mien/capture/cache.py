@@ -14,6 +14,7 @@ import numpy as np
 
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, CacheWriter, FrameLayout, read_png
 from mien.errors import UserError
+from mien.inside import drop_if_shared
 from mien.picture_files import map_pictures
 from mien.progress import progress_bar
 from mien.storage import read_json, write_json
@@ -89,7 +90,10 @@ def _fingerprint(layout: FrameLayout) -> str:
 
 def _rebuild(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarray]) -> FrameLayout:
     """Decode everything into the cache, or into a scratch folder where the capture's own cannot be written."""
+    _read_first(layout, digests)
     try:
+        for path in (layout.folder / CACHE, *(layout.raw(kind) for kind in (FRAMES, MATTES))):
+            drop_if_shared(path)
         _decode_all(layout, layout, digests)
         stamp_cache(layout, capture_hash)
         return layout
@@ -107,8 +111,17 @@ def _rebuild(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarr
         return scratch
 
 
+def _read_first(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
+    """Find a size that no picture has before room is made for all of them.
+
+    Raises:
+        UserError: the first frame or matte is damaged or of another size.
+    """
+    for kind in (FRAMES, MATTES):
+        read_png(layout.png(kind, 0, 0), layout.shape(kind)[2:], int(digests[kind][0, 0]))
+
+
 def _decode_all(source: FrameLayout, target: FrameLayout, digests: dict[str, np.ndarray]) -> None:
-    (target.folder / CACHE / "stamp.json").unlink(missing_ok=True)
     writer = CacheWriter(target)
 
     def decode(kind: str, timestep: int, camera: int) -> None:

@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from mien.avatar import load_avatar
-from mien.capture import read_capture, read_capture_hash
+from mien.capture import read_capture_hash
 from mien.config import decode
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, FaceSource, Frame
 from mien.face import FaceParams
 from mien.storage import expect_whole, read_tensors
-from mien.tracking import read_scoring, read_scoring_hash, read_tracking
+from mien.tracking import read_scoring, read_scoring_hash
 from mien.training import Sequence, TrainSettings, check_data, read_run_config
 from mien.training.frames import training_frames
+from mien.training.sequence import sequence_of
 from mien.training.split import held_out
 
 
@@ -41,7 +42,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
         read_scoring(folder / "scoring", read_capture_hash(folder / "capture")) for folder in sequence_dirs
     )
     sequences = tuple(
-        Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), scoring.masks)
+        sequence_of(folder, scoring)
         for folder, scoring in zip(sequence_dirs, scorings, strict=True)
     )
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture import Capture, read_capture, read_capture_hash
-from mien.tracking import Tracking, read_scoring, read_tracking
+from mien.errors import UserError
+from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, read_tracking
 from mien.training.photometric import Box
 
 _CACHE_BYTES = 1 << 30
@@ -144,7 +145,19 @@ def read_sequence(folder: Path) -> Sequence:
     """The sequence in FOLDER/{capture,tracking,scoring}; its name is the folder's.
 
     Raises:
-        UserError: a part is missing, damaged or of another version, or the scoring is of other pictures.
+        UserError: a part is missing, damaged or of another version, or is not of the same pictures as the others.
     """
-    masks = read_scoring(folder / "scoring", read_capture_hash(folder / "capture")).masks
-    return Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), masks)
+    return sequence_of(folder, read_scoring(folder / "scoring", read_capture_hash(folder / "capture")))
+
+
+def sequence_of(folder: Path, scoring: Scoring) -> Sequence:
+    """`read_sequence` where its scoring is read already.
+
+    Raises:
+        UserError: as `read_sequence`.
+    """
+    capture, tracking = read_capture(folder / "capture"), read_tracking(folder / "tracking")
+    check_tracking_of(capture, tracking, folder / "tracking")
+    if scoring.masks.shape != capture.mattes.shape:
+        raise UserError(f"{folder / 'scoring'}: is not of the capture beside it; delete it and run `mien track` again")
+    return Sequence(folder.name, capture, tracking, scoring.masks)

@@ -9,6 +9,7 @@ from mien.evaluation.compare_report import write_comparison
 from mien.evaluation.evaluate import evaluate, is_evaluated, read_metrics
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.words import driven_line, protocol_line
+from mien.inside import check_tree
 from mien.progress import say
 from mien.training import read_run_config
 from mien.workspace import Workspace, open_workspace
@@ -72,6 +73,7 @@ def _driver_folders(drivers: Items[Path]) -> list[Path]:
     folders: list[Path] = []
     for driver in drivers:
         if (driver / "tracking").is_dir():
+            check_tree(driver)
             folders.append(driver)
             continue
         workspace = open_workspace(driver)

@@ -7,16 +7,17 @@ from pathlib import Path
 
 from mien.errors import UserError
 from mien.files import file_digest
+from mien.inside import is_plain_name
 
 
 def sequence_name(video: Path, name: str | None) -> str:
     """`name`, or the video's name without its ending, if it can be a folder's.
 
     Raises:
-        UserError: it is empty or holds a path separator.
+        UserError: it is empty, too long, or holds path separators or control characters.
     """
     name = video.stem if name is None else name
-    if not name or name in (".", "..") or "/" in name:
+    if not is_plain_name(name):
         raise UserError(f"{name!r} cannot be the name of a folder; give another with --name or --run")
     return name
 
@@ -25,7 +26,7 @@ def run_name(name: str) -> str:
     """`name`, if it can be a folder's.
 
     Raises:
-        UserError: it is empty or holds a path separator.
+        UserError: it is empty, too long, or holds path separators or control characters.
     """
     return sequence_name(Path(name), name)
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -14,6 +13,7 @@ from mien.capture.video import count_frames
 from mien.commands.stages.face_models import face_model_of
 from mien.errors import UserError
 from mien.face import FaceModel
+from mien.inside import remove_tree
 from mien.progress import say
 from mien.tracking import (
     Tracking,
@@ -126,7 +126,7 @@ def _track(
     keep = workspace.root / "sequences" / f".tracking-{fingerprint}"
     for other in workspace.root.glob("sequences/.tracking-*"):
         if other != keep and other.is_dir():
-            shutil.rmtree(other, ignore_errors=True)  # of other captures or settings
+            remove_tree(other)  # of other captures or settings
     page = workspace.root / "tracking_preview.html" if preview else None
     if page is not None:
         say(f"Open {page} in a browser: it is renewed while the fit goes on")
