@@ -1,8 +1,9 @@
 """Settings as json: nested frozen dataclasses, with a `kind` wherever a field may hold one of several classes."""
 
+import sys
 import types
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -21,6 +22,24 @@ def encode(value: Any) -> Any:
         return str(value)
     assert value is None or isinstance(value, (bool, int, float, str)), f"settings cannot hold {type(value)}"
     return value
+
+
+def ranged(default: Any, low: int | float, high: int | float, *, to_load: Any = None) -> Any:
+    """A field of settings that `decode` refuses beyond some bounds: sizes ask for memory and time.
+
+    Args:
+        default: its default.
+        low: the least that may be read.
+        high: the most.
+        to_load: what an avatar is built with when its tensors are about to be loaded (`for_loading`), if that is less.
+    """
+    return field(default=default, metadata={"range": (low, high), "to_load": to_load})
+
+
+def for_loading(settings: Any) -> Any:
+    """The same settings with the least of what counts only when an avatar is begun."""
+    least = {f.name: f.metadata["to_load"] for f in fields(settings) if f.metadata.get("to_load") is not None}
+    return replace(settings, **least)
 
 
 def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make it again") -> Any:
@@ -51,9 +70,12 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
         return tuple(_decode(kind, item, where) for kind, item in zip(kinds, value, strict=True))
     if origin is dict and isinstance(value, dict):
         return {key: _decode(get_args(hint)[1], item, where) for key, item in value.items()}
-    if origin is Literal and value in get_args(hint):
+    # Not asked of arrays, which compare by their items.
+    if origin is Literal and isinstance(value, (str, int)) and value in get_args(hint):
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not abs(value) <= sys.float_info.max:
+            raise UserError(f"{where}: {_in_short(value)} is no finite number")
         return float(value)
     if hint is Path and isinstance(value, str):
         return Path(value)
@@ -75,13 +97,18 @@ def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
     ]
     if unknown or missing:
         raise UserError(f"{where}: unknown {sorted(unknown)}, missing {missing}")
-    return hint(**{name: _decode(hints[name], value[name], f"{where}.{name}") for name in known if name in value})
+    found = {name: _decode(hints[name], value[name], f"{where}.{name}") for name in known if name in value}
+    for name, item in found.items():
+        low, high = known[name].metadata.get("range", (None, None))
+        if low is not None and not low <= item <= high:
+            raise UserError(f"{where}.{name}: {_in_short(item)} is not within {low} to {high}")
+    return hint(**found)
 
 
 def _decode_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
     if value is None and type(None) in options:
         return None
-    if isinstance(value, dict) and "kind" in value:
+    if isinstance(value, dict) and isinstance(value.get("kind"), str):
         for option in options:
             if is_dataclass(option) and isinstance(option, type) and option.__name__ == value["kind"]:
                 return _decode_dataclass(option, value, where)

@@ -17,6 +17,7 @@ from mien.avatar.density import GradientDensity, GradientSettings
 from mien.avatar.penalties import triangle_penalties
 from mien.avatar.ride import ride
 from mien.avatar.store import GaussianStore
+from mien.config import ranged
 from mien.face import FaceModel, FaceParams
 from mien.render.rendering import Rendering
 
@@ -25,7 +26,7 @@ from mien.render.rendering import Rendering
 class GaussianAvatarsConfig(MethodConfig):
     """Settings of GaussianAvatars; defaults suit one fixed camera and runs of some thousand steps."""
 
-    sh_degree: int = 0
+    sh_degree: int = ranged(0, 0, 3)
     """0..3. With one camera, colours that depend on the view absorb the head's pose: keep 0."""
     sh_frame: Literal["world", "head"] = "world"
     """In which frame SH are evaluated: `world` as in the paper, `head` so that light turns with the head."""

@@ -29,6 +29,7 @@ from mien.avatar.baked import AttributeNetwork, Attributes, Static
 from mien.avatar.density import GradientDensity, GradientSettings
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.store import GaussianStore
+from mien.config import ranged
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
@@ -40,17 +41,17 @@ _CHUNK = 512
 class HeadGasConfig(MethodConfig):
     """Settings of HeadGaS; defaults suit a CPU and runs of some thousand steps."""
 
-    points: int = 2500
+    points: int = ranged(2500, 4, 1_000_000, to_load=4)
     """Gaussians to begin with, sampled on the subject's mesh."""
-    features: int = 16
+    features: int = ranged(16, 1, 1024)
     """Latent features of each Gaussian (paper: 32); memory and time of a step grow with it."""
-    hidden: int = 64
+    hidden: int = ranged(64, 1, 4096)
     """Width of the network's one hidden layer."""
-    encoding_bands: int = 4
+    encoding_bands: int = ranged(4, 0, 24)
     """Octaves of the positional encoding."""
-    encoding_length: float = 0.05
+    encoding_length: float = ranged(0.05, 1e-4, 1e4)
     """Metres that count as one unit in the positional encoding."""
-    sh_degree: int = 0
+    sh_degree: int = ranged(0, 0, 3)
     """0..3 (paper: 3). With one camera, colours that depend on the view absorb the head's pose."""
     means_rate: Rate = Rate(1e-4, 1e-6)
     """Of centres, metres."""

@@ -40,6 +40,7 @@ from mien.avatar.mono_networks import (
     DeformationNet,
 )
 from mien.avatar.store import GaussianStore
+from mien.config import ranged
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.rendering import Rendering
@@ -64,7 +65,7 @@ class MonoGaussianAvatarConfig(MethodConfig):
 
     photometric: Photometric = field(default_factory=lambda: Photometric(l1_weight=1.0, ssim_weight=0.25))
     """The paper's weights of L1 and 1 - SSIM."""
-    points: int = 400
+    points: int = ranged(400, 1, 1_000_000, to_load=1)
     """Gaussians to begin with, on a sphere."""
     sphere_radius: float = 0.125
     """Metres: of that sphere about the head frame's origin."""
@@ -72,15 +73,15 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Growth ends here (paper: 100,000)."""
     rounds: int = 50
     """How often points are pruned and refilled (paper: 100, once an epoch)."""
-    attribute_width: int = 64
+    attribute_width: int = ranged(64, 1, 1024)
     """Of the attribute network (paper: 256)."""
-    attribute_layers: int = 4
+    attribute_layers: int = ranged(4, 1, 32)
     """Of the attribute network (paper: 7)."""
-    deformation_width: int = 64
+    deformation_width: int = ranged(64, 1, 1024)
     """Of the deformation network (paper: 128)."""
-    change_width: int = 32
+    change_width: int = ranged(32, 1, 1024)
     """Of the network that changes attributes with motion (paper: 64)."""
-    scale_gain: float = 0.00625
+    scale_gain: float = ranged(0.00625, 0, 1e3)
     """Metres: the networks' largest scale (paper: 0.0025 for pictures of 1024x1024)."""
     means_rate: Rate = Rate(1e-4, 1e-5)
     """Of points, metres."""
