@@ -13,7 +13,7 @@ from mien.avatar import METHODS
 from mien.cli import COMMANDS
 from mien.commands.options import MethodName
 from mien.commands.picture import LARGEST_SIDE
-from mien.evaluation import cameras
+from mien import limits
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
 LAZY_ROOMS = ["capture", "export", "tracking", "training"]
@@ -104,7 +104,7 @@ def test_wrong_values_and_paths_import_nothing_heavy(tmp_path: Path) -> None:
 
 def test_what_is_written_twice_to_keep_options_light_agrees() -> None:
     assert get_args(MethodName) == tuple(METHODS)
-    assert LARGEST_SIDE == cameras.LARGEST_SIDE
+    assert LARGEST_SIDE == limits.LARGEST_SIDE
 
 
 @pytest.mark.parametrize("room", LAZY_ROOMS)

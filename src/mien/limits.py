@@ -62,7 +62,7 @@ def camera_fault(K: Any, viewmat: Any, width: object, height: object) -> str | N
         try:
             side(value)
         except ValueError:
-            return f"{width!r:.40} x {height!r:.40} pixels, not whole numbers from 1 to {LARGEST_SIDE}"
+            return f"{width!r:.40}x{height!r:.40} pixels, not whole numbers from 1 to {LARGEST_SIDE}"
     K, viewmat = (np.asarray(matrix, np.float64) for matrix in (K, viewmat))
     if K.shape != (3, 3) or viewmat.shape != (4, 4):
         return "K must be 3x3 and viewmat 4x4 numbers"

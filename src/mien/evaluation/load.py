@@ -11,7 +11,8 @@ from mien.capture import read_capture_hash
 from mien.config import decode
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, FaceSource, Frame
-from mien.face import FaceParams
+from mien.face import FaceModel, FaceParams
+from mien.face.checks import check_face_params
 from mien.storage import expect_whole, read_tensors
 from mien.tracking import read_scoring, read_scoring_hash
 from mien.training import Sequence, TrainSettings, check_data, read_run_config
@@ -46,9 +47,12 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
         for folder, scoring in zip(sequence_dirs, scorings, strict=True)
     )
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
-    faces = _faces_of_run(run_dir, sequences)
+    avatar = load_avatar(run_dir)
+    for folder, sequence in zip(sequence_dirs, sequences, strict=True):
+        check_face_params(avatar.face_model, sequence.tracking.face, str(folder), "track it again")
+    faces = _faces_of_run(run_dir, sequences, avatar.face_model)
     base = Experiment(
-        avatar=load_avatar(run_dir),
+        avatar=avatar,
         sequences=sequences,
         faces=faces,
         face_source="as_tracked",
@@ -97,12 +101,13 @@ def held_out_by_protocol(
     return {protocol: entry for protocol, entry in found.items() if entry[1]}
 
 
-def _faces_of_run(run_dir: Path, sequences: Items[Sequence]) -> tuple[FaceParams, ...]:
+def _faces_of_run(run_dir: Path, sequences: Items[Sequence], face_model: FaceModel) -> tuple[FaceParams, ...]:
     """The face parameters that training ended with, one a sequence."""
     path = run_dir / "face_track.safetensors"
     tensors = read_tensors(path, "`mien train`")
     with expect_whole(path, "train it again"):
         tuned = FaceParams(**tensors)
+    check_face_params(face_model, tuned, str(path), "train it again")
     lengths = [sequence.capture.timesteps for sequence in sequences]
     if len(tuned) != sum(lengths):
         raise UserError(f"{run_dir}: has face parameters of {len(tuned)} timesteps, not {sum(lengths)}; train it again")

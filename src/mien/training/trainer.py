@@ -17,6 +17,7 @@ from mien.avatar import Avatar, MethodConfig, Progress, load_avatar, method_name
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
 from mien.face import FaceModel, concatenate
+from mien.face.checks import check_face_params
 from mien.progress import Advance, progress_bar
 from mien.render import rasterize
 from mien.training.adam import Adam
@@ -90,6 +91,7 @@ def _check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
                 f"{sequence.name}: tracked with face model {sequence.tracking.face_model!r} "
                 f"{sequence.tracking.face_model_hash}, not {face_model.name!r} {face_model.content_hash}; track again"
             )
+        check_face_params(face_model, sequence.tracking.face, sequence.name, "track again")
         if not sequence.tracking.face.identity.equal(sequences[0].tracking.face.identity):
             raise UserError(
                 f"{sequences[0].name} and {sequence.name}: tracked apart, with two identities; "
