@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from mien.camera import Camera
 from mien.capture.cache import map_frames, stamp_cache
 from mien.capture.capture import Capture
+from mien.capture.faces import LANDMARKS
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, STAGE, FrameLayout, FrameWriter
 from mien.capture.quality import FrameQuality
 from mien.errors import UserError
@@ -282,8 +283,7 @@ def _check_numbers(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _check_arrays(path: Path, arrays: dict[str, np.ndarray], timesteps: int, cameras: int) -> None:
-    landmarks = arrays["landmarks"].shape[2] if "landmarks" in arrays and arrays["landmarks"].ndim == 4 else 0
-    sizes = {"t": timesteps, "c": cameras, "l": landmarks, "2": 2, "3": 3, "4": 4}
+    sizes = {"t": timesteps, "c": cameras, "l": LANDMARKS, "2": 2, "3": 3, "4": 4}
     wanted = dict(_ARRAYS)
     for optional in _OPTIONAL_ARRAYS:
         wanted |= optional if arrays.keys() & optional.keys() else {}

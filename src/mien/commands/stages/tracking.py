@@ -13,11 +13,13 @@ from mien.capture.video import count_frames
 from mien.commands.stages.face_models import face_model_of
 from mien.errors import UserError
 from mien.face import FaceModel
+from mien.face.checks import check_face_params
 from mien.inside import remove_tree
 from mien.progress import say
 from mien.tracking import (
     Tracking,
     TrackingSettings,
+    check_tracking_of,
     has_enough_faces,
     make_scoring,
     overlay_stride,
@@ -59,7 +61,7 @@ def tracking_stage(
     if not names:
         raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")
     fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
-    trackings = None if again else _current_trackings(workspace, names, fingerprint)
+    trackings = None if again else _current_trackings(workspace, names, fingerprint, face_model)
     if trackings is None:
         trackings = _track(workspace, names, face_model, settings, fingerprint, preview)
     else:
@@ -71,6 +73,7 @@ def tracking_stage(
             if scoring_exists(folder / "scoring"):
                 say(f"{name}: the pictures changed, so the scoring mask is made anew")
             capture = read_capture(folder / "capture")
+            check_tracking_of(capture, tracking, folder / "tracking")
             scoring = make_scoring(capture, tracking, face_model, scratch=folder)
             write_scoring(folder / "scoring", scoring, capture_hash)
         _show_tracking(folder, tracking, face_model, overlay)
@@ -85,7 +88,9 @@ def _tracking_fingerprint(
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-def _current_trackings(workspace: Workspace, names: list[str], fingerprint: str) -> dict[str, Tracking] | None:
+def _current_trackings(
+    workspace: Workspace, names: list[str], fingerprint: str, face_model: FaceModel
+) -> dict[str, Tracking] | None:
     """The trackings that are there, if they are what these captures and settings give; says why where not."""
     found, missing = {}, []
     for name in names:
@@ -95,6 +100,8 @@ def _current_trackings(workspace: Workspace, names: list[str], fingerprint: str)
             continue
         try:
             found[name] = read_tracking(folder)
+            if found[name].face_model_hash == face_model.content_hash:
+                check_face_params(face_model, found[name].face, str(folder), "tracking again")
         except UserError as error:
             say(f"{str(error).split('; ')[0]}; tracking again")
             return None
@@ -130,7 +137,7 @@ def _track(
     page = workspace.root / "tracking_preview.html" if preview else None
     if page is not None:
         say(f"Open {page} in a browser: it is renewed while the fit goes on")
-    tracked = track_subject(list(usable.values()), face_model, settings, keep, page)
+    tracked = _track_or_begin_again(list(usable.values()), face_model, settings, keep, page)
     trackings = {}
     for name, tracking in zip(usable, tracked, strict=True):
         made_from = {"fingerprint": fingerprint, "tracked_together": list(usable)}
@@ -139,6 +146,21 @@ def _track(
         say(f"{name}: tracked with a median landmark residual of {tracking.residuals.nanmedian():.2f} pixels")
     _tell_outdated_runs(workspace, trackings)
     return trackings
+
+
+def _track_or_begin_again(
+    captures: list[Capture], face_model: FaceModel, settings: TrackingSettings, keep: Path, page: Path | None
+) -> list[Tracking]:
+    """`track_subject`; from the start where what was kept of an earlier one, whole as its files are, is of no use."""
+    begun = keep.is_dir()
+    try:
+        return track_subject(captures, face_model, settings, keep, page)
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError):
+        if not begun:
+            raise
+    say("What was kept of an interrupted tracking is of no use; tracking begins again")
+    remove_tree(keep)
+    return track_subject(captures, face_model, settings, keep, page)
 
 
 def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking]) -> None:
@@ -163,6 +185,7 @@ def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, over
     if _is_newer(report, written) and (shown or overlay == "none"):
         return
     capture: Capture = read_capture(folder / "capture")
+    check_tracking_of(capture, tracking, folder / "tracking")
     if not _is_newer(report, written):
         findings = write_residual_report(folder / "tracking", capture, tracking, face_model)
         say(f"{capture.name}: {findings} See {report}")
