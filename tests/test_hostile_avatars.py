@@ -1,5 +1,7 @@
 """Avatars, face models and checkpoints from a stranger: refused where they are read, whatever their checksums say."""
 
+import hashlib
+import itertools
 import json
 import shutil
 import struct
@@ -28,6 +30,7 @@ from mien.training.trainer import start
 from toy_scene import toy_camera, toy_face_model, toy_sequence
 
 HUGE = 10**400
+WRONG_NUMBERS = (float("nan"), float("inf"), 3e38)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +49,7 @@ def received(avatars: dict[str, Path], method: str, place: Path) -> Path:
     return shutil.copytree(avatars[method], place / "avatar")
 
 
-def refused(folder: Path, match: str = "") -> None:
+def refused(folder: Path, match: str = ".") -> None:
     with pytest.raises(UserError, match=match) as error:
         load_avatar(folder)
     assert "\n" not in str(error.value)
@@ -63,16 +66,15 @@ def change(folder: Path, edit: Callable[[dict[str, Tensor]], object]) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, 3e38])
-def test_numbers_that_cannot_be_drawn(method: str, value: float, avatars: dict[str, Path], tmp_path: Path) -> None:
-    """One number in each tensor of floats in turn."""
+def test_numbers_that_cannot_be_drawn(method: str, avatars: dict[str, Path], tmp_path: Path) -> None:
+    """One number in a dozen of the tensors, spread over all."""
     names = [name for name, tensor in read_tensors(avatars[method] / "avatar.safetensors").items()
              if tensor.is_floating_point() and tensor.numel()]  # fmt: skip
     folder = received(avatars, method, tmp_path)
     whole = (folder / "avatar.safetensors").read_bytes()
-    for name in names:
+    for name, value in zip(names[:: -(-len(names) // 12)], itertools.cycle(WRONG_NUMBERS), strict=False):
         (folder / "avatar.safetensors").write_bytes(whole)
-        change(folder, lambda tensors, name=name: tensors[name].flatten()[-1:].fill_(value))
+        change(folder, lambda tensors, name=name, value=value: tensors[name].flatten()[-1:].fill_(value))
         refused(folder)
 
 
@@ -113,7 +115,6 @@ SETTINGS: dict[str, tuple[str, Callable[[dict[str, Any]], object]]] = {
     "degree huge": ("headgas", of_config(sh_degree=HUGE)),
     "frame": ("gaussian_avatars", of_config(sh_frame=["world"])),
     "rate huge": ("gaussian_avatars", of_config(means_rate={"kind": "Rate", "start": HUGE})),
-    "kind": ("gaussian_avatars", of_config(means_rate={"kind": ["Rate"], "start": 1})),
     "density": ("headgas", of_config(density=[1])),
     "hidden": ("headgas", of_config(hidden=10**9)),
     "features": ("headgas", of_config(features=10**9)),
@@ -273,8 +274,6 @@ def new_portable(method: str) -> portable.PortableAvatar:
 
 def rewrite(path: Path, edit: Callable[[dict[str, Any], dict[str, np.ndarray]], object]) -> None:
     """Change a .mien file and make all of its checksums right again, by the format's own description."""
-    import hashlib
-
     with safetensors.safe_open(path, framework="numpy") as file:
         header = json.loads(file.metadata()["mien"])
     arrays = safetensors.numpy.load_file(path)
@@ -343,16 +342,17 @@ def test_portable_files_that_cannot_be(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
-def test_numbers_of_portable_files_that_cannot_be(method: str, value: float, tmp_path: Path) -> None:
+def test_numbers_of_portable_files_that_cannot_be(method: str, tmp_path: Path) -> None:
     path = tmp_path / "a.mien"
     runtime.write_portable(path, new_portable(method))
     whole = path.read_bytes()
-    names = [name for name, array in safetensors.numpy.load_file(path).items() if array.dtype.kind == "f" and array.size]
-    for name in names:
+    names = [
+        name for name, array in safetensors.numpy.load_file(path).items() if array.dtype.kind == "f" and array.size
+    ]
+    for name, value in zip(names, itertools.cycle(WRONG_NUMBERS), strict=False):
         path.write_bytes(whole)
 
-        def put(content: dict[str, Any], arrays: dict[str, np.ndarray], name: str = name) -> None:
+        def put(content: dict[str, Any], arrays: dict[str, np.ndarray], name: str = name, value: float = value) -> None:
             arrays[name] = np.array(arrays[name])
             arrays[name].flat[-1] = value
 

@@ -233,7 +233,9 @@ def test_new_files_and_removed_folders_leave_what_links_lead_to(tmp_path: Path, 
         assert not os.path.lexists(tmp_path / name)
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "../x", "/x", "a/b", "a\\b", "a\0b", "a\x1b[2J", NOT_ONE_LINE, "é" * 200, 3])
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "../x", "/x", "a/b", "a\\b", "a\0b", "a\x1b[2J", NOT_ONE_LINE, "é" * 200, 3]
+)
 def test_names_that_lead_elsewhere(name: Any, tmp_path: Path) -> None:
     assert not is_plain_name(name)
     with pytest.raises(UserError, match="give a plain name"):

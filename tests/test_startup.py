@@ -9,11 +9,11 @@ from typing import get_args
 
 import pytest
 
+from mien import limits
 from mien.avatar import METHODS
 from mien.cli import COMMANDS
 from mien.commands.options import MethodName
 from mien.commands.picture import LARGEST_SIDE
-from mien import limits
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
 LAZY_ROOMS = ["capture", "export", "tracking", "training"]

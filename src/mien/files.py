@@ -148,8 +148,8 @@ def read_json(
     found = (content.get("format"), content.get("version")) if isinstance(content, dict) else (None, None)
     if found != (format_name, version):
         raise UserError(
-            f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {format_name!r} version {version}; "
-            + (remedy or f"run {stage} again")
+            f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {format_name!r} version {version}"
+            "; " + (remedy or f"run {stage} again")
         )
     if _CHECKSUM in content and content.pop(_CHECKSUM) != _canonical_checksum(content):
         remedy = remedy or f"delete its folder and run {stage} again"

@@ -48,7 +48,7 @@ def inside(folder: Path, name: object) -> Path:
 
 
 def check_tree(folder: Path) -> None:
-    """Find that below a folder, which may be missing, there are only files and folders. The folder itself may be a link.
+    """Find that below a folder there are only files and folders. The folder itself may be a link, or missing.
 
     Raises:
         UserError: something below is a link, a pipe, a device or a socket, or cannot be looked at.

@@ -116,7 +116,7 @@ class PictureStack:
 
 
 def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndarray, "..."]:
-    """A picture that mien wrote inside a workspace, [h, w] or [h, w, 3] (RGB); its size is looked at before room is made.
+    """A picture that mien wrote inside a workspace, [h, w] or [h, w, 3] (RGB); its header's size is looked at first.
 
     Args:
         path: of the file, no link.

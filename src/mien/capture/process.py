@@ -23,7 +23,7 @@ from mien.capture.source import FrameSource, SourceFrame
 from mien.capture.survey import Survey
 from mien.errors import UserError
 from mien.progress import Advance, progress_bar
-from mien.storage import read_arrays, write_arrays
+from mien.storage import expect_whole, read_arrays, write_arrays
 
 _CHUNK = 256
 """Frames after which progress is kept. Detectors start anew at each chunk, also when nothing is interrupted."""
@@ -165,7 +165,11 @@ def _read(path: Path) -> Chunk:
     arrays = read_arrays(path)
     with expect_whole(path, "delete its folder and run `mien capture` again"):
         t = len(arrays["landmarks"])
-        if not 0 < t <= _CHUNK or arrays["landmarks"].shape[1:] != (LANDMARKS, 2) or arrays["quality"].shape != (t, MEASURES):
+        if (
+            not 0 < t <= _CHUNK
+            or arrays["landmarks"].shape[1:] != (LANDMARKS, 2)
+            or arrays["quality"].shape != (t, MEASURES)
+        ):
             raise ValueError("landmarks or quality of another size")
         if any(arrays[name].shape != (t, 1) for name in ("frame_digests", "matte_digests")):
             raise ValueError("digests of another number")

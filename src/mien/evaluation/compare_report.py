@@ -109,7 +109,9 @@ def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> str
         # One run's avatar and sequences at a time: memory does not grow with the number of runs.
         experiment = load_experiments(run.run_dir, sequence_dirs[run.run_dir]).get(table.protocol)
         if experiment is None or len(experiment.held_out_frames) != count:
-            raise UserError(f"{run.run_dir / 'metrics.json'}: is of other frames than the run held out; evaluate it again")
+            raise UserError(
+                f"{run.run_dir / 'metrics.json'}: is of other frames than the run held out; evaluate it again"
+            )
         frames = [experiment.held_out_frames[place] for place in places]
         boxes = [head_box(experiment, [frame]) for frame in frames]
         columns.append([_drawn(experiment, frame, box) for frame, box in zip(frames, boxes, strict=True)])

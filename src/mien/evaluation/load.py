@@ -42,10 +42,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
     scorings = tuple(
         read_scoring(folder / "scoring", read_capture_hash(folder / "capture")) for folder in sequence_dirs
     )
-    sequences = tuple(
-        sequence_of(folder, scoring)
-        for folder, scoring in zip(sequence_dirs, scorings, strict=True)
-    )
+    sequences = tuple(sequence_of(folder, scoring) for folder, scoring in zip(sequence_dirs, scorings, strict=True))
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
     avatar = load_avatar(run_dir)
     for folder, sequence in zip(sequence_dirs, sequences, strict=True):

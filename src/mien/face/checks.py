@@ -65,7 +65,7 @@ def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: st
 
 
 def _faults(model: FaceModel) -> Iterator[str]:
-    texts = (model.name, *model.region_names, *model.expression_names)
+    texts = (model.name, *model.region_names, *model.expression_names, *model.joint_names)
     if not all(isinstance(text, str) and is_one_line(text) for text in texts):
         yield "a name in it is no text, or not in one line"
     fault = skeleton_fault(model.joint_names, model.joint_parents, model.joint_free)
