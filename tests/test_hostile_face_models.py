@@ -97,7 +97,12 @@ def test_arrays_that_repeat_or_unpack_one_text_are_counted(tmp_path: Path, monke
         __module__, __qualname__ = "builtins", "dict"
 
         def __reduce__(self):
-            state = {"data": np.ones(1), "indices": np.zeros(1, int), "indptr": np.array([0, 1]), "_shape": (9**6, 9**6)}
+            state = {
+                "data": np.ones(1),
+                "indices": np.zeros(1, int),
+                "indptr": np.array([0, 1]),
+                "_shape": (9**6, 9**6),
+            }
             return (OrderedDict, (), state)
 
     path.write_bytes(pickle.dumps({"J_regressor": Sparse()}, protocol=2))

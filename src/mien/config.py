@@ -125,7 +125,8 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
         return tuple(_decode(kind, item, where) for kind, item in zip(kinds, value, strict=True))
     if origin is dict and isinstance(value, dict):
         return {key: _decode(get_args(hint)[1], item, where) for key, item in value.items()}
-    if origin is Literal and value in get_args(hint):
+    # Not asked of arrays, which compare by their items.
+    if origin is Literal and isinstance(value, (str, int)) and value in get_args(hint):
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         with contextlib.suppress(OverflowError):  # a whole number of hundreds of digits
@@ -156,7 +157,7 @@ def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
 def _decode_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
     if value is None and type(None) in options:
         return None
-    if isinstance(value, dict) and "kind" in value:
+    if isinstance(value, dict) and isinstance(value.get("kind"), str):
         for option in options:
             if is_dataclass(option) and isinstance(option, type) and option.__name__ == value["kind"]:
                 return _decode_dataclass(option, value, where)

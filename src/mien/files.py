@@ -8,10 +8,10 @@ import errno
 import hashlib
 import json
 import os
-import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +19,25 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from mien.bounded import open_ordinary, parse_json, read_bytes
 from mien.errors import CannotWriteError, UserError
+from mien.inside import remove_tree
 
 _KEPT_OF_NAME = 100
 """Characters of a file's name that its temporary name keeps: file systems allow 255 bytes in all."""
 _CHECKSUM = "checksum"
 """Of everything else in a json file, or in the header and data of a safetensors file."""
 _ANY_STAGE = "the stage that writes it"
-_LARGEST_JSON = 64 << 20
-"""Bytes; the largest that mien writes has some megabytes."""
-_LARGEST_HEADER = 100 << 20
-"""Bytes of a safetensors header, as its specification has it."""
 _AT_CURRENT_FOLDER, _EXCHANGE = -100, 2
 """AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
+_LARGEST_JSON = 32 << 20
+"""Bytes; the largest that mien writes has some megabytes, and empty lists take twenty times their text in memory."""
+_LARGEST_HEADER = 8 << 20
+"""Bytes of a safetensors header; what mien writes has some kilobytes."""
+_LARGEST_TENSORS = 1 << 30
+"""Bytes of a safetensors file; the largest that mien writes has some hundred megabytes."""
+_PIECE = 1 << 20
+"""Bytes that are hashed at a time."""
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
@@ -106,11 +112,11 @@ def replace_folder(path: Path, finished: Path) -> None:
         return
     if not _exchange(path, finished):
         old = path.parent / f".{path.name}.old"
-        shutil.rmtree(old, ignore_errors=True)
+        remove_tree(old)
         path.rename(old)
         finished.rename(path)
         finished = old
-    shutil.rmtree(finished, ignore_errors=True)
+    remove_tree(finished)
 
 
 def _exchange(one: Path, other: Path) -> bool:
@@ -164,23 +170,21 @@ def read_json(
         UserError: the file is missing, is no json, has another format or version, or was changed since.
     """
     try:
-        if path.stat().st_size > _LARGEST_JSON:
-            raise ValueError(f"{path.stat().st_size} bytes are too many")
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+        content = parse_json(read_bytes(path, _LARGEST_JSON).decode("utf-8"))
     except FileNotFoundError:
         asked = remedy if remedy and stage == _ANY_STAGE else f"run {stage} again"
         raise UserError(f"{path}: missing; {asked}") from None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise UserError(
             f"{path}: cannot be read as json ({error}); {remedy or f'delete its folder and run {stage} again'}"
         ) from None
     found = (content.get("format"), content.get("version")) if isinstance(content, dict) else (None, None)
     if found != (format_name, version):
         raise UserError(
-            f"{path}: has format {found[0]!r} version {found[1]!r}, expected {format_name!r} version {version}; "
-            + (remedy or f"run {stage} again")
+            f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {format_name!r} version {version}"
+            "; " + (remedy or f"run {stage} again")
         )
-    if _CHECKSUM in content and content.pop(_CHECKSUM) != _json_checksum(content):
+    if _CHECKSUM in content and content.pop(_CHECKSUM) != _canonical_checksum(content):
         remedy = remedy or f"delete its folder and run {stage} again"
         raise UserError(
             f"{path}: was damaged or edited after it was written; {remedy} "
@@ -190,12 +194,13 @@ def read_json(
 
 
 def _json_checksum(content: Mapping[str, Any]) -> str:
-    canonical = json.dumps(json.loads(json.dumps(content)), sort_keys=True, separators=(",", ":"))
+    return _canonical_checksum(json.loads(json.dumps(content)))
+
+
+def _canonical_checksum(content: Any) -> str:
+    """Of what was parsed from json: tuples are lists, and keys are texts."""
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:32]
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"holds the number {name}")
 
 
 def file_digest(path: Path) -> str:
@@ -214,7 +219,7 @@ def write_safetensors(path: Path, data: bytes, metadata: Mapping[str, str] | Non
     """Write the bytes of a safetensors file, with a checksum of header and data in its metadata."""
     size = int.from_bytes(data[:8], "little")
     header, body = json.loads(data[8 : 8 + size]), memoryview(data)[8 + size :]
-    checksum = _tensor_checksum(header, body)
+    checksum = _tensor_checksum(header, [body])
     text = json.dumps({"__metadata__": {**(metadata or {}), _CHECKSUM: checksum}, **header}, separators=(",", ":"))
     packed = text.encode()
     packed += b" " * (-len(packed) % 8)
@@ -259,19 +264,24 @@ def read_safetensors(
 
 def _check_safetensors(path: Path) -> None:
     """Compare with the checksum that `write_safetensors` left; files of other programs have none."""
-    with path.open("rb") as file:
+    with open_ordinary(path) as file:
+        whole = os.fstat(file.fileno()).st_size
+        if whole > _LARGEST_TENSORS:
+            raise ValueError(f"{whole} bytes are too many")
         size = int.from_bytes(file.read(8), "little")
-        if not 2 <= size <= min(_LARGEST_HEADER, path.stat().st_size - 8):
+        if not 2 <= size <= min(_LARGEST_HEADER, whole - 8):
             raise ValueError("its header does not fit into the file")
-        header = json.loads(file.read(size))
-        if not isinstance(header, dict):
-            raise ValueError("its header is no object")
-        stored = header.pop("__metadata__", {}).get(_CHECKSUM)
-        if stored is not None and stored != _tensor_checksum(header, file.read()):
+        header = parse_json(file.read(size).decode("utf-8"))
+        metadata = header.pop("__metadata__", {}) if isinstance(header, dict) else None
+        if not isinstance(header, dict) or not isinstance(metadata, dict):
+            raise ValueError("its header or metadata is no object")
+        stored = metadata.get(_CHECKSUM)
+        if stored is not None and stored != _tensor_checksum(header, iter(partial(file.read, _PIECE), b"")):
             raise ValueError("it is not what was written")
 
 
-def _tensor_checksum(header: Mapping[str, Any], body: bytes | memoryview) -> str:
+def _tensor_checksum(header: Mapping[str, Any], body: Iterable[bytes | memoryview]) -> str:
     digest = hashlib.sha256(json.dumps(header, sort_keys=True, separators=(",", ":")).encode())
-    digest.update(body)
+    for part in body:
+        digest.update(part)
     return digest.hexdigest()

@@ -1,20 +1,28 @@
 """Many pictures of one size: written one after the other, read as an array that does not fill the memory."""
 
+import contextlib
 import math
 import mmap
 import os
+import struct
 import tempfile
 import weakref
 from pathlib import Path
 from typing import Any, cast
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mien.errors import UserError
 from mien.files import cannot_write
+from mien.inside import open_to_read
 
 _KEPT = 256 << 20
 """Bytes of a map that are handed out before its pages are given back, and of a stack that are held in memory."""
+_PNG_SIGNATURE, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+_PNG_HEADERS = 1 << 16
+"""Bytes of a file beside those of its pixels, at most."""
 _DONT_NEED = getattr(mmap, "MADV_DONTNEED", None)
 """None where the system cannot be told (Windows)."""
 
@@ -105,6 +113,40 @@ class PictureStack:
     def array(self) -> UInt8[np.ndarray, "t c h w"]:
         """All pictures; zero where none was written."""
         return self._array if self._file is None else map_pictures(self._file, self._shape)
+
+
+def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndarray, "..."]:
+    """A picture that mien wrote inside a workspace, [h, w] or [h, w, 3] (RGB); its header's size is looked at first.
+
+    Args:
+        path: of the file, no link.
+        shape: that it has to have.
+        remedy: what to do where it has not.
+
+    Raises:
+        UserError: it is missing, damaged, or of another shape.
+    """
+    try:
+        with open_to_read(path) as file:
+            # Noise takes a little more than its pixels; what is longer than that counts as damaged.
+            most = 2 * math.prod(shape) + _PNG_HEADERS
+            data = file.read(min(most, os.fstat(file.fileno()).st_size))
+    except FileNotFoundError:
+        raise UserError(f"{path}: missing; {remedy}") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+    if not data.endswith(_PNG_END):
+        # Checked here, because libpng would print its complaint and return half a picture.
+        raise UserError(f"{path}: truncated; {remedy}")
+    picture = None
+    # Its width and height stand at the beginning; what they promise would be allocated.
+    if data[:8] == _PNG_SIGNATURE and struct.unpack(">II", data[16:24]) == (shape[1], shape[0]):
+        with contextlib.suppress(cv2.error):
+            flags = cv2.IMREAD_COLOR_RGB if len(shape) == 3 else cv2.IMREAD_GRAYSCALE
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if picture is None or picture.shape != shape:
+        raise UserError(f"{path}: damaged, or not of {shape[1]}x{shape[0]} pixels; {remedy}")
+    return picture.astype(np.uint8, copy=False)
 
 
 def write_at(file: int, picture: UInt8[np.ndarray, "..."], offset: int) -> None:

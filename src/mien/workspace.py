@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mien.errors import UserError
+from mien.inside import check_subtrees, inside
+
+_FOLDERS = ("sequences", "runs")
 
 
 @dataclass(frozen=True)
@@ -14,12 +17,20 @@ class Workspace:
     root: Path
 
     def sequence_dir(self, name: str) -> Path:
-        """Folder of one sequence."""
-        return self.root / "sequences" / name
+        """Folder of one sequence.
+
+        Raises:
+            UserError: the name leads out of the workspace.
+        """
+        return inside(self.root / "sequences", name)
 
     def run_dir(self, name: str) -> Path:
-        """Folder of one training run."""
-        return self.root / "runs" / name
+        """Folder of one training run.
+
+        Raises:
+            UserError: the name leads out of the workspace.
+        """
+        return inside(self.root / "runs", name)
 
     def sequence_names(self) -> list[str]:
         """Names of the sequences that were captured, sorted."""
@@ -55,10 +66,10 @@ class Workspace:
 
 
 def open_workspace(root: Path) -> Workspace:
-    """An existing workspace.
+    """An existing workspace, which nothing leads out of.
 
     Raises:
-        UserError: the folder is not there or holds no sequences and no runs, or not yet.
+        UserError: the folder is not there, holds no sequences and no runs, or holds links (`mien.inside`).
     """
     workspace = Workspace(root)
     if root.is_file():
@@ -67,6 +78,7 @@ def open_workspace(root: Path) -> Workspace:
         raise UserError(
             f"{root}: no such folder; make a workspace with `mien create VIDEO --out {shlex.quote(str(root))}`"
         )
+    check_subtrees(root, *_FOLDERS)
     if not workspace.sequence_names() and not workspace.run_names():
         _check_first_captures(workspace)
         told = f"{root}: not a mien workspace (no sequences/NAME/capture, no runs/NAME)"
@@ -100,15 +112,16 @@ def check_new_workspace(root: Path) -> None:
     """A workspace may begin or go on here.
 
     Raises:
-        UserError: the folder cannot be written, or belongs to another workspace.
+        UserError: the folder cannot be written, belongs to another workspace, or holds links (`mien.inside`).
     """
     from mien.files import check_writable  # brings numpy
 
     check_writable(root, folder=True)
+    check_subtrees(root, *_FOLDERS)
     whole = root.resolve()
     for folder in (whole, *whole.parents):
         outer = Workspace(folder.parent)
-        if folder.name in ("sequences", "runs") and (outer.sequence_names() or outer.run_names()):
+        if folder.name in _FOLDERS and (outer.sequence_names() or outer.run_names()):
             raise UserError(f"{root}: lies inside the workspace {folder.parent}; name that, or a folder beside it")
 
 

@@ -204,7 +204,13 @@ def align_mesh(native: Any, rng: Rng) -> Arguments:
     surface, seen, _, _ = sighting(native, rng)
     p, out = int(rng.integers(1, 6)), [empty(*seen[4].shape), empty(*seen[4].shape)]
     derivatives = [normal(rng, len(seen[0]), 3, p), empty(p, p), empty(p)] if rng.random() < 0.7 else [None] * 3
-    return [surface, *seen, int(rng.integers(0, 9)), *derivatives, *(one if rng.random() < 0.7 else None for one in out)]
+    return [
+        surface,
+        *seen,
+        int(rng.integers(0, 9)),
+        *derivatives,
+        *(one if rng.random() < 0.7 else None for one in out),
+    ]
 
 
 def bake_texture(native: Any, rng: Rng) -> Arguments:
@@ -279,10 +285,17 @@ def ride_backward(native: Any, rng: Rng) -> Arguments:
 
 # Pictures of Gaussians
 
+
 def view(rng: Rng, height: int, width: int) -> tuple[Any, ...]:
     n, k = int(rng.choice([0, 1, 5, 17, 300])), int(rng.choice([1, 4, 9, 16]))
     scales = np.exp(normal(rng, n, 3) - 3).astype(F32)
-    gaussians = [normal(rng, n, 3, scale=0.5), normal(rng, n, 4), scales, rng.random(n).astype(F32), normal(rng, n, k, 3)]
+    gaussians = [
+        normal(rng, n, 3, scale=0.5),
+        normal(rng, n, 4),
+        scales,
+        rng.random(n).astype(F32),
+        normal(rng, n, k, 3),
+    ]
     K, viewmat = camera(rng, height, width)
     out = empty(height, width, 3), empty(height, width), empty(n, dtype=I32)
     return *gaussians, np.ones(3, F32), viewmat, K, *out
@@ -308,6 +321,7 @@ def rasterize_views_backward(native: Any, rng: Rng) -> Arguments:
 
 
 # Training
+
 
 def photometric_loss(native: Any, rng: Rng) -> Arguments:
     h, w = picture(rng)

@@ -9,12 +9,17 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar
 from mien.avatar.methods import method_named, method_of
+from mien.avatar.portable import as_numpy
 from mien.config import decode, encode, for_loading
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
+from mien.face.checks import check_face_params
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
+from mien.inside import check_subtrees, check_tree
+from mien.limits import LARGEST_NUMBER
 from mien.locks import read_beside_writers
-from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
+from mien.runtime.checks import baked_fault
+from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
 _REMEDY = "delete the run's training.json, if it is there, and train it again with `mien train`"
@@ -58,14 +63,16 @@ def load_avatar(folder: Path) -> Avatar:
     """The avatar of a run folder, or of an avatar folder itself.
 
     Raises:
-        UserError: the folder holds no avatar, a damaged one, one that is being written, or one whose face model is not
-            to be had.
+        UserError: the folder holds no avatar, a damaged one, one that cannot be posed, one that is being written, one
+            whose face model is not to be had, or a link.
     """
     return read_beside_writers(lambda: _load_avatar(folder), [folder, folder / "avatar"], [folder, folder.parent])
 
 
 def _load_avatar(folder: Path) -> Avatar:
     folder = folder / "avatar" if (folder / "avatar").is_dir() else folder
+    check_subtrees(folder.parent, *([folder.name] if folder.name == "avatar" else []))
+    check_tree(folder)
     if not (folder / "avatar.json").is_file():
         raise UserError(
             f"{folder}: holds no trained avatar (no avatar.json); train one with `mien train` or `mien create`"
@@ -82,31 +89,51 @@ def _load_avatar(folder: Path) -> Avatar:
         raise UserError(f"{folder / 'avatar.safetensors'}: is not what was written; {_REMEDY}")
     face_model = _face_model_of(folder, content)
     config = decode(method.config, content.config, where, _REMEDY)
-    subject = _with_prefix(tensors, "subject.")
+    with expect_whole(folder, _REMEDY):
+        face = FaceParams(**_with_prefix(tensors, "subject."))
+    check_face_params(face_model, face, str(folder), _REMEDY)
+    if len(face) != 1:
+        raise UserError(f"{folder}: its subject is {len(face)} timesteps at rest, not one; {_REMEDY}")
     with torch.random.fork_rng(devices=[]):
-        try:
-            face = FaceParams(**subject)
-        except TypeError as error:
-            raise UserError(f"{folder}: its subject is incomplete ({error}); train it again") from None
         avatar = method.avatar(for_loading(config), face_model, face)
     avatar.config = config
     overwrite(avatar, _with_prefix(tensors, "avatar."), content.gaussians, folder)
     return avatar
 
 
+@torch.no_grad()
 def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: Path) -> None:
     """Replace every tensor of an avatar, which may have had another number of Gaussians.
 
     Raises:
-        UserError: `state`, which came from `source`, is not of this method and config.
+        UserError: `state`, which came from `source`, is not of this method and config, or cannot be posed.
     """
-    if gaussians not in {len(tensor) for tensor in state.values() if tensor.ndim > 0}:
-        raise UserError(f"{source}: does not fit its settings ({gaussians} Gaussians, by no tensor); train it again")
+    misfit = _misfit(avatar.state_dict(), state, gaussians)
+    if misfit is not None:
+        raise UserError(f"{source}: does not fit its settings ({misfit}); train it again")
     avatar.gaussian_store().resize(gaussians)
     try:
         avatar.load_state_dict(state)
     except RuntimeError as error:
-        raise UserError(f"{source}: does not fit its settings ({error}); train it again") from None
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{source}: does not fit its settings ({reason}); train it again") from None
+    fault = baked_fault(as_numpy(avatar.bake()))
+    if fault is not None:
+        raise UserError(f"{source}: cannot be posed ({fault}); train it again")
+
+
+def _misfit(own: dict[str, Tensor], state: dict[str, Tensor], gaussians: int) -> str | None:
+    """Why `state` cannot replace `own`, found before room is made for so many Gaussians; None if it can."""
+    for name, tensor in own.items():
+        if name not in state:
+            return f"lacks {name!r}"
+        found = state[name]
+        if found.dtype != tensor.dtype or found.shape[1:] != tensor.shape[1:] or found.ndim != tensor.ndim:
+            return f"{name!r} is {found.dtype} {list(found.shape)}"
+        if found.is_floating_point() and not (found.numel() == 0 or bool(found.abs().max() <= LARGEST_NUMBER)):
+            return f"{name!r} holds NaN or numbers beyond {LARGEST_NUMBER:g}"
+    known = {len(tensor) for tensor in state.values() if tensor.ndim > 0 and tensor[:1].numel() > 0}
+    return None if gaussians == 0 or gaussians in known else f"{gaussians} Gaussians, by no tensor"
 
 
 def _face_model_of(folder: Path, content: _Content) -> FaceModel:

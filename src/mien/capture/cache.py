@@ -14,6 +14,7 @@ import numpy as np
 
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, CacheWriter, FrameLayout, read_png
 from mien.errors import CannotWriteError, UserError
+from mien.inside import drop_if_shared
 from mien.locks import BeingWrittenError, hold
 from mien.picture_files import map_pictures
 from mien.progress import progress_bar
@@ -93,7 +94,9 @@ def _rebuild(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarr
 
     Others may map the cache meanwhile: it is made aside and put in their place. One process at a time makes it.
     """
+    _read_first(layout, digests)
     try:
+        drop_if_shared(layout.folder / CACHE)
         with hold(layout.raw(FRAMES)):
             if not _is_valid(layout, capture_hash):
                 _replace_cache(layout, digests)
@@ -126,6 +129,16 @@ def _replace_cache(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
             aside.raw(kind).replace(layout.raw(kind))
     finally:
         shutil.rmtree(aside.folder, ignore_errors=True)
+
+
+def _read_first(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
+    """Find a size that no picture has before room is made for all of them.
+
+    Raises:
+        UserError: the first frame or matte is damaged or of another size.
+    """
+    for kind in (FRAMES, MATTES):
+        read_png(layout.png(kind, 0, 0), layout.shape(kind)[2:], int(digests[kind][0, 0]))
 
 
 def _decode_all(source: FrameLayout, target: FrameLayout, digests: dict[str, np.ndarray]) -> None:

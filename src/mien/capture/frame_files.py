@@ -1,6 +1,7 @@
 """Frames on disk: lossless PNGs, and beside them the decoded pixels as raw files that are read as memory maps."""
 
 import hashlib
+import math
 import os
 from collections import deque
 from collections.abc import Callable
@@ -14,7 +15,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.errors import UserError
-from mien.picture_files import write_at
+from mien.inside import open_new, open_to_change
+from mien.picture_files import decode_png, write_at
 
 FRAMES, MATTES, CACHE = "frames", "mattes", "cache"
 STAGE = "`mien capture`"
@@ -58,18 +60,29 @@ class FrameLayout:
 
     def raw_size(self, kind: str) -> int:
         """Bytes of the cache file."""
-        return int(np.prod(self.shape(kind)))
+        return math.prod(self.shape(kind))
 
 
 class CacheWriter:
     """Fills the raw files picture by picture, by plain writes: a full disk is an error then, not a crash."""
 
     def __init__(self, layout: FrameLayout) -> None:
+        """What the files hold already is kept.
+
+        Raises:
+            UserError: something there is a link, no file, or has a second name.
+            OSError: the files cannot be written.
+        """
         self._layout = layout
         (layout.folder / CACHE).mkdir(parents=True, exist_ok=True)
-        self._files = {kind: os.open(layout.raw(kind), os.O_RDWR | os.O_CREAT, 0o644) for kind in (FRAMES, MATTES)}
-        for kind, file in self._files.items():
-            os.truncate(file, layout.raw_size(kind))
+        self._files = {}
+        try:
+            for kind in (FRAMES, MATTES):
+                self._files[kind] = open_to_change(layout.raw(kind))
+                os.truncate(self._files[kind], layout.raw_size(kind))
+        except BaseException:
+            self.close()
+            raise
 
     def write(self, kind: str, timestep: int, camera: int, picture: np.ndarray) -> None:
         """Put one picture in its place."""
@@ -149,22 +162,7 @@ def read_png(path: Path, shape: tuple[int, ...], expected_digest: int) -> UInt8[
     Raises:
         UserError: it is missing, damaged, or not what was written.
     """
-    try:
-        data = np.fromfile(path, np.uint8)
-    except FileNotFoundError:
-        raise UserError(f"{path}: missing; {REMEDY}") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); {REMEDY}") from None
-    if not data.tobytes().endswith(b"IEND\xaeB`\x82"):
-        # Checked here, because libpng would print its complaint and return half a picture.
-        raise UserError(f"{path}: truncated; {REMEDY}")
-    try:
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB if len(shape) == 3 else cv2.IMREAD_GRAYSCALE)
-    except cv2.error:
-        picture = None
-    if picture is None or picture.shape != shape:
-        raise UserError(f"{path}: damaged, or not of {shape[1]}x{shape[0]} pixels; {REMEDY}")
-    picture = picture.astype(np.uint8, copy=False)
+    picture = decode_png(path, shape, REMEDY)
     if picture_digest(picture) != expected_digest:
         raise UserError(f"{path}: has other pixels than when it was captured; {REMEDY}")
     return picture
@@ -174,4 +172,5 @@ def _write_png(path: Path, picture: np.ndarray) -> None:
     stored = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
     written, data = cv2.imencode(".png", stored, _PNG_OPTIONS)
     assert written
-    path.write_bytes(data.tobytes())
+    with open_new(path) as file:
+        file.write(data)

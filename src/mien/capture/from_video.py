@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -23,6 +22,7 @@ from mien.capture.store import JSON_NAME, check_replaceable, partial_folder, rea
 from mien.capture.survey import Survey, survey_source
 from mien.capture.upright import check_upright
 from mien.errors import UserError
+from mien.inside import check_tree, has_other_names, remove_tree
 from mien.locks import hold
 from mien.progress import say
 from mien.storage import cannot_write, file_digest, read_json, write_json
@@ -177,10 +177,13 @@ def _read_finished_parts(sequences: Path, job: _Job, tell: bool = True) -> list[
     count = part.get("count") if isinstance(part, dict) else None
     if not isinstance(count, int):
         return []
-    keys = {f"{job.name}-{number}": _part_key(job, number, count) for number in range(1, count + 1)}
-    captures = [read_finished(_place(sequences, name), key, tell) for name, key in keys.items()]
-    found = [capture for capture in captures if capture is not None]
-    return found if len(found) == count else []
+    found: list[Capture] = []
+    for number in range(1, count + 1):
+        capture = read_finished(_place(sequences, f"{job.name}-{number}"), _part_key(job, number, count), tell)
+        if capture is None:
+            return []
+        found.append(capture)
+    return found
 
 
 def _check_place(out: Path, job: _Job) -> None:
@@ -216,14 +219,14 @@ def _tidy(out: Path, survey_folder: Path) -> Iterator[Path]:
     except OSError as error:
         raise cannot_write(out, error) from None
     except UserError:
-        shutil.rmtree(survey_folder, ignore_errors=True)
+        remove_tree(survey_folder)
         for folder in missing:
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
         raise
     finally:
         cv2.setNumThreads(threads)
-    shutil.rmtree(survey_folder, ignore_errors=True)
+    remove_tree(survey_folder)
 
 
 def _prepare(work: Path, key: str) -> Path:
@@ -232,11 +235,20 @@ def _prepare(work: Path, key: str) -> Path:
         kept = read_json(work / _STATE, "mien.capture_state", 1).get("key") == key
     except UserError:
         kept = False
-    if not kept:
-        shutil.rmtree(work, ignore_errors=True)
+    if not kept or _leads_out(work):
+        remove_tree(work)
         work.mkdir(parents=True)
         write_json(work / _STATE, "mien.capture_state", 1, {"key": key})
     return work
+
+
+def _leads_out(work: Path) -> bool:
+    """Whether unfinished work could make us write somewhere else; then it is not ours."""
+    try:
+        check_tree(work)
+        return work.is_symlink() or has_other_names(work)
+    except UserError:
+        return True
 
 
 def _means(job: _Job) -> Means:

@@ -1,6 +1,5 @@
 """The end of a capture: what was found in all frames, written down beside them."""
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from mien.capture.process import Chunk, Part
 from mien.capture.quality import quality_report, relative_quality
 from mien.capture.source import FrameSource
 from mien.capture.store import CaptureData, finish_capture
+from mien.inside import remove_tree
 from mien.progress import say
 
 CAMERA_ID = "0"
@@ -46,7 +46,7 @@ def finish_part(
     landmarks = np.concatenate([chunk.landmarks for chunk in chunks])
     valid = np.concatenate([chunk.valid for chunk in chunks])
     if not valid.any():
-        shutil.rmtree(layout.folder)
+        remove_tree(layout.folder)
         raise no_face(origin.frames.path, len(valid))
     survey, crop = part.survey, part.crop
     timestamps = survey.timestamps - survey.timestamps[0]
@@ -88,7 +88,7 @@ def finish_part(
     report |= quality_report(part.name, quality)
     for name in scaffolding:
         path = layout.folder / name
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+        remove_tree(path)
     finish_capture(layout, out, data, digests, report)
 
 

@@ -23,7 +23,7 @@ from mien.capture.source import FrameSource, SourceFrame
 from mien.capture.survey import Survey
 from mien.errors import UserError
 from mien.progress import Advance, progress_bar
-from mien.storage import read_arrays, write_arrays
+from mien.storage import expect_whole, read_arrays, write_arrays
 
 _CHUNK = 256
 """Frames after which progress is kept. Detectors start anew at each chunk, also when nothing is interrupted."""
@@ -156,6 +156,28 @@ class PartProcessor:
         return self._part.crop.to_output(self._means.landmarks[number]) if self._part.person.seen[timestep] else None
 
 
+def _read(path: Path) -> Chunk:
+    """What an interrupted call kept.
+
+    Raises:
+        UserError: it is damaged, or no chunk.
+    """
+    arrays = read_arrays(path)
+    with expect_whole(path, "delete its folder and run `mien capture` again"):
+        t = len(arrays["landmarks"])
+        if (
+            not 0 < t <= _CHUNK
+            or arrays["landmarks"].shape[1:] != (LANDMARKS, 2)
+            or arrays["quality"].shape != (t, MEASURES)
+        ):
+            raise ValueError("landmarks or quality of another size")
+        if any(arrays[name].shape != (t, 1) for name in ("frame_digests", "matte_digests")):
+            raise ValueError("digests of another number")
+        if len({len(array) for array in arrays.values()}) > 1:
+            raise ValueError("arrays of several lengths")
+        return Chunk(**arrays)
+
+
 def process_part(reel: Reel, part: Part, means: Means, layout: FrameLayout, memory: Path) -> list[Chunk]:
     """Process all frames of a part; chunks that an earlier, interrupted call left in the folder `memory` are kept.
 
@@ -165,7 +187,7 @@ def process_part(reel: Reel, part: Part, means: Means, layout: FrameLayout, memo
     """
     memory.mkdir(exist_ok=True)
     paths = {start: memory / f"{start:06d}.safetensors" for start in range(0, layout.timesteps, _CHUNK)}
-    chunks = [Chunk(**read_arrays(path)) for path in itertools.takewhile(Path.exists, paths.values())]
+    chunks = [_read(path) for path in itertools.takewhile(Path.exists, paths.values())]
     done = sum(len(chunk.valid) for chunk in chunks)
     if done == layout.timesteps:
         return chunks

@@ -1,8 +1,6 @@
 """Captures on disk: `capture.json`, `landmarks.safetensors`, `frames/`, `mattes/`, and a `cache/` that may go."""
 
 import hashlib
-import math
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +12,23 @@ from jaxtyping import Bool, Float
 from mien.camera import Camera
 from mien.capture.cache import map_frames, stamp_cache
 from mien.capture.capture import Capture
+from mien.capture.faces import LANDMARKS
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, STAGE, FrameLayout, FrameWriter
 from mien.capture.quality import FrameQuality
 from mien.errors import UserError
+from mien.inside import check_tree, is_one_line, is_plain_name, remove_tree
+from mien.limits import LARGEST_NUMBER, camera_fault, side
 from mien.locks import read_beside_writers
 from mien.progress import progress_bar
-from mien.storage import cannot_write, read_arrays, read_json, replace_folder, write_arrays, write_json
+from mien.storage import (
+    cannot_write,
+    expect_whole,
+    read_arrays,
+    read_json,
+    replace_folder,
+    write_arrays,
+    write_json,
+)
 
 FORMAT, VERSION = "mien.capture", 1
 JSON_NAME, ARRAYS_NAME, REPORT_NAME = "capture.json", "landmarks.safetensors", "report.json"
@@ -37,6 +46,10 @@ _CALIBRATION_ARRAYS = {"K": ("c33", np.float64), "viewmat": ("c44", np.float64)}
 """Also there where the cameras are calibrated."""
 _QUALITY_ARRAYS = {"sharpness": ("tc", np.float32), "brightness": ("tc", np.float32), "clipped": ("tc", np.float32)}
 """Also there where the faces were measured."""
+_SLOWEST, _FASTEST = 1e-3, 1e5
+"""Frames a second."""
+_LONGEST = 1e7
+"""Seconds from the first frame to the last."""
 _OPTIONAL_ARRAYS = (_CALIBRATION_ARRAYS, _QUALITY_ARRAYS)
 
 
@@ -65,7 +78,7 @@ def write_capture(path: Path, capture: Capture) -> str:
     partial = partial_folder(path)
     try:
         check_replaceable(path)
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_tree(partial)
         layout = FrameLayout(partial, capture.camera_ids, capture.timesteps, capture.height, capture.width)
         with FrameWriter(layout) as writer, progress_bar(f"write {capture.name}", capture.timesteps) as advance:
             for timestep in range(capture.timesteps):
@@ -94,7 +107,7 @@ def read_capture(path: Path) -> Capture:
     """Read a capture; its images and mattes are memory maps of the decoded cache, which is rebuilt where it is stale.
 
     Raises:
-        UserError: the folder is missing, damaged, incomplete, of another version, or being written.
+        UserError: the folder is missing, damaged, incomplete, of another version, or being written, or holds a link.
     """
     return read_beside_writers(lambda: _read_capture(path), [path], [path, path.parent])
 
@@ -102,6 +115,7 @@ def read_capture(path: Path) -> Capture:
 def _read_capture(path: Path) -> Capture:
     if not path.is_dir():
         raise UserError(f"{path}: no capture there; run `mien capture` first, or check the path")
+    check_tree(path)
     content = read_json(path / JSON_NAME, FORMAT, VERSION, STAGE)
     layout, data, digests = _checked(path, content, read_arrays(path / ARRAYS_NAME, STAGE))
     if content.get("capture_hash") != _hash(data, layout, digests):
@@ -213,16 +227,18 @@ def _checked(
 ) -> tuple[FrameLayout, CaptureData, dict[str, np.ndarray]]:
     """Everything but the pictures, after checks of every field's type, range and size."""
     camera_ids: Any = content.get("camera_ids")
-    timesteps, height, width = (_positive_int(content.get(key)) for key in ("timesteps", "height", "width"))
     name, fps, source = content.get("name"), content.get("fps"), content.get("source")
+    with expect_whole(path / JSON_NAME, REMEDY):
+        timesteps, (height, width) = content["timesteps"], (side(content[key]) for key in ("height", "width"))
     if not (
         (isinstance(camera_ids, list) and camera_ids and all(map(is_file_name, camera_ids)))
-        and (timesteps and height and width)
-        and (isinstance(fps, int | float) and math.isfinite(fps) and fps > 0)
-        and (isinstance(name, str) and isinstance(source, dict))
+        and (len(set(camera_ids)) == len(camera_ids) and _is_count(timesteps))
+        and (isinstance(fps, int | float) and _SLOWEST <= fps <= _FASTEST)
+        and (is_one_line(name) and isinstance(source, dict))
     ):
         raise UserError(f"{path / JSON_NAME}: has missing or wrong entries; {REMEDY}")
     _check_arrays(path / ARRAYS_NAME, arrays, timesteps, len(camera_ids))
+    _check_numbers(path / ARRAYS_NAME, arrays)
     data = CaptureData(
         name=name,
         camera_ids=tuple(camera_ids),
@@ -242,25 +258,43 @@ def _checked(
 def _calibration(path: Path, arrays: dict[str, np.ndarray], width: int, height: int) -> tuple[Camera, ...] | None:
     if "K" not in arrays:
         return None
-    if not all(np.isfinite(arrays[name]).all() for name in _CALIBRATION_ARRAYS):
-        raise UserError(f"{path}: the cameras' K or viewmat is not finite; {REMEDY}")
+    for K, viewmat in zip(arrays["K"], arrays["viewmat"], strict=True):
+        fault = camera_fault(K, viewmat, width, height)
+        if fault is not None:
+            raise UserError(f"{path}: a camera is none ({fault}); {REMEDY}")
     pairs = zip(arrays["K"].astype(np.float32), arrays["viewmat"].astype(np.float32), strict=True)
     return tuple(Camera(torch.from_numpy(K), torch.from_numpy(viewmat), width, height) for K, viewmat in pairs)
 
 
-def _positive_int(value: object) -> int:
-    """The value, or 0 where it is no positive whole number."""
-    return value if isinstance(value, int) and not isinstance(value, bool) and value > 0 else 0
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 
 def is_file_name(name: object) -> bool:
-    """Whether a camera's name can be a folder's."""
-    return isinstance(name, str) and name not in {"", ".", ".."} and not set(name) & set('/\\\0:*?"<>|')
+    """Whether a camera's name can be a folder's, on any system."""
+    return is_plain_name(name) and not set(str(name)) & set(':*?"<>|')
+
+
+def _check_numbers(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Times go on, and nothing is infinite or far outside of any picture; landmarks are NaN where there is no face."""
+    times, valid = arrays["timestamps"], arrays["valid"]
+    with np.errstate(invalid="ignore"):
+        near = {
+            "timestamps": np.isfinite(times).all() and bool((np.diff(times) >= 0).all()) and np.ptp(times) < _LONGEST,
+            "landmarks": not np.isnan(arrays["landmarks"][valid]).any(),
+            "principal_point": np.isfinite(arrays["principal_point"]).all(),
+        }
+        for name in ("landmarks", "principal_point"):
+            near[name] = near[name] and not (np.abs(arrays[name]) > LARGEST_NUMBER).any()
+        for name in arrays.keys() & _QUALITY_ARRAYS.keys():
+            near[name] = not np.isinf(arrays[name]).any()
+    for name, sound in near.items():
+        if not sound:
+            raise UserError(f"{path}: {name} holds numbers that cannot be; {REMEDY}")
 
 
 def _check_arrays(path: Path, arrays: dict[str, np.ndarray], timesteps: int, cameras: int) -> None:
-    landmarks = arrays["landmarks"].shape[2] if "landmarks" in arrays and arrays["landmarks"].ndim == 4 else 0
-    sizes = {"t": timesteps, "c": cameras, "l": landmarks, "2": 2, "3": 3, "4": 4}
+    sizes = {"t": timesteps, "c": cameras, "l": LANDMARKS, "2": 2, "3": 3, "4": 4}
     wanted = dict(_ARRAYS)
     for optional in _OPTIONAL_ARRAYS:
         wanted |= optional if arrays.keys() & optional.keys() else {}

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int64, UInt8
 from mien.capture.faces import FaceFinder
 from mien.capture.source import FrameSource, SourceFrame
 from mien.progress import Advance, progress_bar
-from mien.storage import read_arrays, write_arrays
+from mien.storage import expect_whole, read_arrays, write_arrays
 
 MOST_FACES = 4
 """The largest so many faces of a frame are looked at."""
@@ -58,9 +58,9 @@ def survey_source(frames: FrameSource, memory: Path, landmarks: Float[np.ndarray
     memory.mkdir(parents=True, exist_ok=True)
     whole, done = memory / "survey.safetensors", []
     if whole.is_file():
-        return Survey(**read_arrays(whole))
+        return _read(whole)
     for path in itertools.takewhile(Path.exists, (_chunk_path(memory, index) for index in itertools.count())):
-        done.append(Survey(**read_arrays(path)))
+        done.append(_read(path))
     first = next(frames.frames()).picture()
     size = np.array([first.shape[1], first.shape[0]], np.int64)
     stream = itertools.islice(frames.frames(SURVEY_SIZE), len(done) * _CHUNK, None)
@@ -76,6 +76,26 @@ def survey_source(frames: FrameSource, memory: Path, landmarks: Float[np.ndarray
     for index in range(len(done)):
         _chunk_path(memory, index).unlink()
     return survey
+
+
+def _read(path: Path) -> Survey:
+    """What was kept of an earlier call.
+
+    Raises:
+        UserError: it is damaged, or no survey.
+    """
+    arrays = read_arrays(path)
+    t, side = len(arrays.get("numbers", ())), _THUMBNAIL[::-1]
+    kinds = {
+        "numbers": ((t,), np.int64), "timestamps": ((t,), np.float64), "boxes": ((t, MOST_FACES, 4), np.float64),
+        "looks": ((t, MOST_FACES, 3 * _LOOK**2), np.float64), "thumbnails": ((t, *side, 3), np.uint8),
+        "picture_size": ((2,), np.int64),
+    }  # fmt: skip
+    with expect_whole(path, "delete its folder and run `mien capture` again"):
+        for name, (shape, dtype) in kinds.items():
+            if arrays[name].shape != shape or arrays[name].dtype != dtype or t == 0:
+                raise ValueError(f"{name} is {arrays[name].dtype} {arrays[name].shape}")
+        return Survey(**arrays)
 
 
 def slice_survey(survey: Survey, span: slice) -> Survey:

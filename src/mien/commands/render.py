@@ -70,6 +70,7 @@ class Command:
         from mien.commands.expression import with_expression
         from mien.commands.stages.pictures import draw, view, warn_of_white
         from mien.export.pictures import write_pictures
+        from mien.face.checks import check_face_params
         from mien.progress import say, track_progress
         from mien.training import read_sequence, run_camera
 
@@ -84,8 +85,10 @@ class Command:
         warn_of_white(self.picture, run_dir)
         avatar = load_avatar(run_dir)
         subject = avatar.subject
-        face = with_expression(subject if motion is None else motion, avatar.face_model, self.set)
-        face = replace(face, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
+        face = replace(motion or subject, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
+        told = "choose a sequence that was tracked with the avatar's face model"
+        check_face_params(avatar.face_model, face, f"--sequence {self.sequence}", told)
+        face = with_expression(face, avatar.face_model, self.set)
         if cameras is None:
             camera = view(self.picture, run_camera(run_dir), self.zoom)
             cameras = self._path(camera, subject.head_translation[0], self._frames(timesteps))

@@ -3,8 +3,9 @@
 from mien.evaluation.cameras import orbit, turntable
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.driving import drive
-from mien.evaluation.evaluate import evaluate, read_metrics
+from mien.evaluation.evaluate import evaluate
 from mien.evaluation.image_folders import ImageFolders, score_folders
+from mien.evaluation.metrics_file import read_metrics
 from mien.evaluation.protocols import EvaluationSettings
 
 __all__ = [

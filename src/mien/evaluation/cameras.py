@@ -12,12 +12,11 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.errors import UserError
+from mien.limits import camera_fault
 from mien.rotation import invert_rigid, matrix_from_axis_angle, rigid_transform
 from mien.storage import read_json, write_json
 
 FORMAT, VERSION = "mien.cameras", 1
-LARGEST_SIDE = 8192
-"""Pixels."""
 _WORLD_UP = (0.0, 1.0, 0.0)
 
 
@@ -110,16 +109,14 @@ def read_cameras(path: Path) -> list[Camera]:
 def _camera_of(entry: Any, where: str) -> Camera:
     try:
         K, viewmat = torch.tensor(entry["K"], dtype=torch.float32), torch.tensor(entry["viewmat"], dtype=torch.float32)
-        width, height = int(entry["width"]), int(entry["height"])
+        # Other programs write 512.0.
+        width, height = (int(size) if isinstance(size, float) and size.is_integer() else size
+                         for size in (entry["width"], entry["height"]))  # fmt: skip
     except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise UserError(f"{where}: needs K [3][3], viewmat [4][4], width and height ({error!r})") from None
-    if K.shape != (3, 3) or viewmat.shape != (4, 4) or not (K.isfinite().all() and viewmat.isfinite().all()):
-        raise UserError(f"{where}: K must be 3x3 and viewmat 4x4 finite numbers")
-    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE) or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise UserError(f"{where}: {width}x{height}, focal {float(K[0, 0]):g}; sizes are 1..{LARGEST_SIDE}, focal > 0")
-    turned = viewmat[:3, :3]
-    if not torch.allclose(turned @ turned.T, torch.eye(3), atol=1e-3) or torch.det(turned) < 0:
-        raise UserError(f"{where}: viewmat is no rotation and translation (world to camera, OpenCV axes)")
+    fault = camera_fault(K.numpy(), viewmat.numpy(), width, height)
+    if fault is not None:
+        raise UserError(f"{where}: {fault}")
     return Camera(K, viewmat, width, height)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mien.errors import UserError
-from mien.evaluation.evaluate import read_metrics
+from mien.evaluation.metrics_file import read_figures
 from mien.evaluation.words import FACES, NAMES
 from mien.training import read_run_config
 
@@ -100,7 +100,7 @@ def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
             warnings.append(f"{label}: was not evaluated; run `mien evaluate` on it")
             continue
         method = read_run_config(run_dir)["method"]["kind"]
-        runs.append(ScoredRun(label, run_dir, method, read_metrics(run_dir)))
+        runs.append(ScoredRun(label, run_dir, method, read_figures(run_dir)))
     if not runs:
         listed = ", ".join(run_dirs) or "there is none"
         raise UserError(f"no evaluated run to compare ({listed}); run `mien evaluate DIR --run NAME` first")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from mien.errors import UserError
 from mien.evaluation.compare import COLUMNS, Comparison, Row, Table, figure
 from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
 from mien.evaluation.load import load_experiments
@@ -106,7 +107,11 @@ def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> str
     captions: list[str] = []
     for run in track_progress(runs, f"pictures {table.protocol}", len(runs)):
         # One run's avatar and sequences at a time: memory does not grow with the number of runs.
-        experiment = load_experiments(run.run_dir, sequence_dirs[run.run_dir])[table.protocol]
+        experiment = load_experiments(run.run_dir, sequence_dirs[run.run_dir]).get(table.protocol)
+        if experiment is None or len(experiment.held_out_frames) != count:
+            raise UserError(
+                f"{run.run_dir / 'metrics.json'}: is of other frames than the run held out; evaluate it again"
+            )
         frames = [experiment.held_out_frames[place] for place in places]
         boxes = [head_box(experiment, [frame]) for frame in frames]
         columns.append([_drawn(experiment, frame, box) for frame, box in zip(frames, boxes, strict=True)])

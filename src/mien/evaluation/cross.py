@@ -23,10 +23,11 @@ from mien.evaluation.redetection import MEASURED_BY, FaceReader, Motion, motion,
 from mien.evaluation.scoring import evenly_spread
 from mien.evaluation.videos import labelled_row, same_size
 from mien.face import FaceParams
+from mien.face.checks import check_face_params
 from mien.progress import track_progress
 from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking import Tracking, read_tracking
+from mien.tracking import Tracking, check_tracking_of, read_tracking
 
 _FRAMES = 100
 _MEANS = (
@@ -73,6 +74,9 @@ def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
             f"{driver_dir}: was tracked with the face model {tracking.face_model}, the avatar has another "
             f"({avatar.face_model.name}); track the driver with the avatar's"
         )
+    check_face_params(avatar.face_model, tracking.face, str(driver_dir), "track it again")
+    capture = read_capture(driver_dir / "capture")
+    check_tracking_of(capture, tracking, driver_dir / "tracking")
     valid = torch.nonzero(tracking.valid)[:, 0].tolist()
     if not valid:
         raise UserError(f"{driver_dir}: no frame of it was tracked; choose another driver")
@@ -83,7 +87,7 @@ def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
         avatar=avatar,
         camera=cameras[frontal_camera(cameras, avatar.subject)],
         faces=faces,
-        driver=read_capture(driver_dir / "capture"),
+        driver=capture,
         tracking=tracking,
         driver_camera=frontal_camera(tracking.cameras, at_rest),
         by_rest=tuple(sorted(valid, key=_activity(tracking.face, at_rest).__getitem__)),

@@ -11,18 +11,18 @@ from mien.evaluation.cross import cross_reenactment
 from mien.evaluation.cross_report import cross_section
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.load import load_experiments
+from mien.evaluation.metrics_file import FORMAT, VERSION, read_metrics
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
 from mien.evaluation.report import RunRecord, write_report
 from mien.evaluation.report_video import ReportVideo
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
+from mien.inside import check_tree
 from mien.locks import hold
-from mien.storage import expect_whole, file_digest, read_json, write_json
+from mien.storage import file_digest, write_json
 from mien.training import read_curves, read_run_config, read_training_summary
 
-_FORMAT, _VERSION = "mien.metrics", 1
 _RECIPE = 2
-_REMEDY = "delete this file, not its folder, and run `mien evaluate` again"
 """Raised whenever the same frame would be scored otherwise."""
 
 
@@ -47,6 +47,7 @@ def evaluate(
         UserError: the run is not finished, the sequences are others, or nothing was held out; or another process
             writes the run.
     """
+    check_tree(run_dir)
     with hold(run_dir):
         return _evaluate(run_dir, sequence_dirs, settings or EvaluationSettings(), driver_dirs)
 
@@ -87,7 +88,7 @@ def _evaluate(
     run = RunRecord(run_dir.name, read_run_config(run_dir), summary, read_curves(run_dir))
     section = cross_section(driven["cross_reenactment"], driven_videos, run_dir) if driven else ""
     write_report(run_dir / "report.html", run, protocols, results, videos, section)
-    write_json(run_dir / "metrics.json", _FORMAT, _VERSION, content)
+    write_json(run_dir / "metrics.json", FORMAT, VERSION, content)
     for partial in partials.values():
         partial.remove()
     return content
@@ -125,16 +126,3 @@ def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings:
         settings.baselines, settings.perceptual, settings.perceptual_frames, settings.backbone,
     ]  # fmt: skip
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
-
-
-def read_metrics(run_dir: Path) -> dict[str, Any]:
-    """What `evaluate` wrote.
-
-    Raises:
-        UserError: the run was not evaluated, or the file is damaged.
-    """
-    path = run_dir / "metrics.json"
-    content = read_json(path, _FORMAT, _VERSION, "`mien evaluate`", _REMEDY)
-    with expect_whole(path, _REMEDY):
-        _ = content["protocols"].keys(), content["training"].keys()
-    return {name: value for name, value in content.items() if name not in ("format", "version")}

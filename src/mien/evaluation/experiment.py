@@ -15,6 +15,7 @@ from mien.evaluation.metrics import Box
 from mien.evaluation.scoring import evenly_spread
 from mien.face import FaceParams
 from mien.render import rasterize
+from mien.render.validation import drawable
 from mien.tracking import Scoring
 from mien.training.sequence import Sequence, composite
 
@@ -102,7 +103,12 @@ def scored_on(experiment: Experiment, frames: Items[Frame]) -> dict[str, dict[st
 
 @torch.no_grad()
 def avatar_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
-    """The avatar posed and seen as in a frame, over white, clamped to 0..1."""
+    """The avatar posed and seen as in a frame, over white, clamped to 0..1.
+
+    Raises:
+        UserError: what it is posed as, or it itself, gives Gaussians that are not finite.
+    """
     gaussians = experiment.avatar.pose(experiment.face(frame)).gaussians.timestep(0)
     white = torch.ones(3).to(gaussians.means)
-    return rasterize(gaussians, experiment.camera(frame), white).image.clamp(0, 1).cpu()
+    with drawable(f"{experiment.sequences[frame.sequence].name}, timestep {frame.timestep}", "train again"):
+        return rasterize(gaussians, experiment.camera(frame), white).image.clamp(0, 1).cpu()

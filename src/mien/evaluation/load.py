@@ -7,15 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from mien.avatar import load_avatar
-from mien.capture import read_capture, read_capture_hash
+from mien.capture import read_capture_hash
 from mien.config import decode
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, FaceSource, Frame
-from mien.face import FaceParams
+from mien.face import FaceModel, FaceParams
+from mien.face.checks import check_face_params
 from mien.storage import expect_whole, read_tensors
-from mien.tracking import read_scoring, read_scoring_hash, read_tracking
+from mien.tracking import read_scoring, read_scoring_hash
 from mien.training import Sequence, TrainSettings, check_data, read_run_config
 from mien.training.frames import training_frames
+from mien.training.sequence import sequence_of
 from mien.training.split import held_out
 
 
@@ -41,17 +43,17 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
     scorings = tuple(
         read_scoring(folder / "scoring", read_capture_hash(folder / "capture")) for folder in sequence_dirs
     )
-    sequences = tuple(
-        Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), scoring.masks)
-        for folder, scoring in zip(sequence_dirs, scorings, strict=True)
-    )
+    sequences = tuple(sequence_of(folder, scoring) for folder, scoring in zip(sequence_dirs, scorings, strict=True))
     for folder, digest in zip(sequence_dirs, digests, strict=True):
         if _digests(folder) != digest:
             raise UserError(f"{folder}: was written anew while it was read; run the same command again")
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
-    faces = _faces_of_run(run_dir, sequences)
+    avatar = load_avatar(run_dir)
+    for folder, sequence in zip(sequence_dirs, sequences, strict=True):
+        check_face_params(avatar.face_model, sequence.tracking.face, str(folder), "track it again")
+    faces = _faces_of_run(run_dir, sequences, avatar.face_model)
     base = Experiment(
-        avatar=load_avatar(run_dir),
+        avatar=avatar,
         sequences=sequences,
         faces=faces,
         face_source="as_tracked",
@@ -100,12 +102,13 @@ def held_out_by_protocol(
     return {protocol: entry for protocol, entry in found.items() if entry[1]}
 
 
-def _faces_of_run(run_dir: Path, sequences: Items[Sequence]) -> tuple[FaceParams, ...]:
+def _faces_of_run(run_dir: Path, sequences: Items[Sequence], face_model: FaceModel) -> tuple[FaceParams, ...]:
     """The face parameters that training ended with, one a sequence."""
     path = run_dir / "face_track.safetensors"
     tensors = read_tensors(path, "`mien train`")
     with expect_whole(path, "train it again"):
         tuned = FaceParams(**tensors)
+    check_face_params(face_model, tuned, str(path), "train it again")
     lengths = [sequence.capture.timesteps for sequence in sequences]
     if len(tuned) != sum(lengths):
         raise UserError(f"{run_dir}: has face parameters of {len(tuned)} timesteps, not {sum(lengths)}; train it again")

@@ -6,8 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mien.bounded import parse_json, read_bytes
 from mien.evaluation.experiment import Frame
 from mien.evaluation.scoring import Scores
+from mien.inside import open_to_append
+from mien.limits import whole
+from mien.storage import write_atomically
+
+_LARGEST = 256 << 20
+"""Bytes of the file, or the number of a frame; a frame takes some hundred bytes."""
 
 Scored = tuple[dict[str, Scores], float]
 """A frame's figures by what was scored, and the seconds of rendering the avatar."""
@@ -27,7 +34,7 @@ class PartialScores:
         Cuts the file back to its good lines (a killed process may leave half a line), or begins it.
         """
         good, found = [json.dumps({"scores_of": self.fingerprint})], {}
-        lines = self.path.read_text(encoding="utf-8", errors="replace").splitlines() if self.path.is_file() else []
+        lines = self._lines()
         if lines[:1] == good:
             for line in lines[1:]:
                 frame = _parsed(line)
@@ -35,13 +42,20 @@ class PartialScores:
                     break
                 found[frame[0]] = frame[1]
                 good.append(line)
-        self.path.write_text("\n".join(good) + "\n", encoding="utf-8")
+        text = "\n".join(good) + "\n"
+        write_atomically(self.path, lambda aside: aside.write_text(text, encoding="utf-8"))
         return found
+
+    def _lines(self) -> list[str]:
+        try:
+            return read_bytes(self.path, _LARGEST).decode("utf-8", "replace").splitlines()
+        except (OSError, ValueError):
+            return []
 
     def add(self, frame: Frame, scores: Mapping[str, Scores], seconds: float) -> None:
         """Keep one more frame."""
         line = json.dumps({"frame": list(frame), "scores": dict(scores), "seconds": seconds})
-        with self.path.open("a", encoding="utf-8") as file:
+        with open_to_append(self.path) as file:
             file.write(line + "\n")
 
     def remove(self) -> None:
@@ -52,7 +66,15 @@ class PartialScores:
 def _parsed(line: str) -> tuple[Frame, Scored] | None:
     """A line's frame and figures, or none where it is no whole line."""
     try:
-        content: dict[str, Any] = json.loads(line)
-        return Frame(*content["frame"]), (content["scores"], float(content["seconds"]))
-    except (ValueError, KeyError, TypeError):
+        content: dict[str, Any] = parse_json(line)
+        frame = Frame(*(whole(number, 0, _LARGEST) for number in content["frame"]))
+        scores = {str(name): _figures(row) for name, row in content["scores"].items()}
+        return frame, (scores, float(content["seconds"]))
+    except (ValueError, LookupError, TypeError, AttributeError):
         return None
+
+
+def _figures(row: Mapping[str, Any]) -> Scores:
+    if not all(isinstance(value, int | float) for value in row.values()):
+        raise ValueError("a figure is no number")
+    return {name: float(value) for name, value in row.items()}

@@ -1,7 +1,7 @@
 """Protocols with a truth: the avatar and both baselines on the same held-out frames, by the same metrics."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
@@ -28,6 +28,8 @@ from mien.progress import progress_bar
 
 AVATAR, AS_TRACKED, MEAN_FRAME, MESH = "avatar", "as_tracked", "mean_frame", "mesh"
 _TRAINING_FRAMES = 200
+_ALWAYS = {f"{part}{metric}" for part in ("", "head_") for metric in ("psnr", "ssim", "l1")}
+"""Figures that every frame has."""
 _MASK = "frozen scoring mask: matte cut below the neck line, over white"
 _CROP = "frozen head box of each frame"
 
@@ -77,7 +79,10 @@ def evaluate_frames(
     """
     assert experiment.held_out_frames, "nothing is held out"
     frames = experiment.held_out_frames
-    done = partial.read() if partial is not None else {}
+    subjects = {AVATAR} | ({AS_TRACKED} if experiment.face_source != "as_tracked" else set())
+    subjects |= {MEAN_FRAME, MESH} if settings.baselines else set()
+    kept = partial.read() if partial is not None else {}
+    done = {frame: scored for frame, scored in kept.items() if _is_complete(scored[0], subjects)}
     metric = perceptual_metric(settings)
     judged = set(spread_frames(frames, settings.perceptual_frames))
     baselines = make_baselines(experiment) if settings.baselines else None
@@ -99,6 +104,11 @@ def evaluate_frames(
     scores = {subject: tuple(row[subject] for row in rows) for subject in rows[0]}
     seconds = sorted(done[frame][1] for frame in frames)
     return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, _training_psnr(experiment))
+
+
+def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
+    """Whether all are scored, by what is asked for of every frame."""
+    return scores.keys() == subjects and all(row.keys() >= _ALWAYS for row in scores.values())
 
 
 def _drawn(

@@ -15,7 +15,9 @@ from mien.errors import UserError
 from mien.face.anny import bake_anny
 from mien.face.anny_source import anny_tag
 from mien.face.cache import cache_folder
+from mien.face.checks import check_face_model
 from mien.face.model import FaceModel, Landmarks
+from mien.inside import is_plain_name
 from mien.storage import read_json, read_tensors, write_atomically, write_json, write_tensors
 
 FORMAT, VERSION = "mien.face_model", 1
@@ -133,7 +135,7 @@ def read_face_model(stem: Path, remedy: str = "delete it and load the model agai
     """Read what `write_face_model` wrote, without landmarks; `remedy` is what to say where that fails.
 
     Raises:
-        UserError: a file is missing, damaged or of another version.
+        UserError: a file is missing, damaged or of another version, or its arrays do not fit each other.
     """
     content = read_json(_json_file(stem), FORMAT, VERSION, remedy=remedy)
     tensors = read_tensors(_tensor_file(stem), remedy=remedy)
@@ -144,6 +146,7 @@ def read_face_model(stem: Path, remedy: str = "delete it and load the model agai
         model = FaceModel(name=content["name"], landmarks={}, **values)
     except (KeyError, TypeError) as error:
         raise UserError(f"{stem}: incomplete face model ({error}); {remedy}") from None
+    check_face_model(model, str(stem), remedy)
     if model.content_hash != content.get("content_hash"):
         raise UserError(f"{stem}: the face model's content does not match its hash; {remedy}")
     return model
@@ -153,8 +156,10 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
     """The landmark sets of a face model: those that ship with mien, or that were placed when the user added it.
 
     Raises:
-        UserError: they were made for another mesh.
+        UserError: they were made for another mesh, or the name leads to other folders.
     """
+    if not is_plain_name(name):
+        raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
     file: Any = resources.files("mien.face") / "data" / f"{name}_landmarks.json"
     if not file.is_file():
         file = _landmark_file(_added_file(name))

@@ -1,9 +1,13 @@
 """What a rasterizer refuses, in words."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor
 
 from mien.camera import Camera
+from mien.errors import UserError
 from mien.gaussians import Gaussians
 
 
@@ -28,7 +32,7 @@ def check_shapes(gaussians: Gaussians, background: Tensor) -> None:
 
 
 def check_finite(gaussians: Gaussians, camera: Camera, background: Tensor) -> None:
-    """Raise ValueError that names the first NaN or infinity by tensor and index."""
+    """Raise `NotFiniteError` that names the first NaN or infinity by tensor and index."""
     tensors = named_tensors(gaussians, background) | {"camera.viewmat": camera.viewmat, "camera.K": camera.K}
     # One question for all: on a GPU every answer makes the host wait.
     if bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors.values()]).all()):
@@ -37,7 +41,25 @@ def check_finite(gaussians: Gaussians, camera: Camera, background: Tensor) -> No
         bad = ~torch.isfinite(tensor)
         if bad.any():
             index = bad.nonzero()[0].tolist()
-            raise ValueError(f"rasterize: {name}{index} is {tensor[tuple(index)].item()}; every input must be finite")
+            told = f"rasterize: {name}{index} is {tensor[tuple(index)].item()}; every input must be finite"
+            raise NotFiniteError(told)
+
+
+class NotFiniteError(ValueError):
+    """NaN or infinity where Gaussians, a camera or a background are to be drawn."""
+
+
+@contextmanager
+def drawable(what: str, remedy: str) -> Iterator[None]:
+    """Tell the user where an avatar that was read, posed as asked, cannot be drawn.
+
+    Raises:
+        UserError: inside, a rasterizer met NaN or infinity.
+    """
+    try:
+        yield
+    except NotFiniteError as error:
+        raise UserError(f"{what}: cannot be drawn ({error}); {remedy}") from None
 
 
 def named_tensors(gaussians: Gaussians, background: Tensor) -> dict[str, Tensor]:

@@ -7,14 +7,28 @@ from typing import Any
 import numpy as np
 
 from mien.errors import UserError
-from mien.runtime.model import AttributeNetwork, Attributes, BlendSkinned, MeshBound, PortableAvatar, Rig, Static
+from mien.inside import is_one_line
+from mien.limits import LARGEST_NUMBER, are_indices, camera_fault, is_moderate, skeleton_fault
+from mien.runtime.model import (
+    AttributeNetwork,
+    Attributes,
+    Baked,
+    BlendSkinned,
+    LinearBases,
+    MeshBound,
+    PortableAvatar,
+    Rig,
+    Static,
+)
 
 MOST_SHAPES = 256
 """Expressions, and nine of each free joint, that native/face.h takes."""
+_LARGEST_LOG_SCALE = 30
+"""Its exponential, and the square of that, are still float32 numbers."""
 
 
 def check(avatar: PortableAvatar, where: str) -> None:
-    """Finite numbers, indices within their arrays, as many names as rows.
+    """Moderate numbers, indices within their arrays, as many names as rows.
 
     Raises:
         UserError: something does not hold; `where` is the file it came from.
@@ -23,46 +37,108 @@ def check(avatar: PortableAvatar, where: str) -> None:
         raise UserError(f"{where}: {reason}; export it again with `mien export`")
 
 
+def baked_fault(baked: Baked) -> str | None:
+    """Why a baked avatar cannot be posed; None where it can."""
+    return next(_baked_faults(baked), None)
+
+
 def _faults(avatar: PortableAvatar) -> Iterator[str]:
-    for name, array in _arrays(avatar, ""):
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            yield f"{name} holds NaN or infinity"
     baked, e = avatar.baked, len(avatar.expression_names)
+    yield from _number_faults(avatar)
+    names, free = _names(baked)
+    if len(names) + 9 * len(free) > MOST_SHAPES:
+        yield f"{len(names)} expressions and {len(free)} free joints, more than can be posed"
+    yield from _baked_faults(baked)
     if avatar.expression_bounds.shape[0] != e or avatar.neutral.expression.shape[0] != e:
         yield f"{e} expression names, but bounds of {avatar.expression_bounds.shape[0]}"
     if len(avatar.joint_names) != len(avatar.neutral.joints):
         yield f"{len(avatar.joint_names)} joint names, but {len(avatar.neutral.joints)} joints at rest"
-    if isinstance(baked, Static):
-        names, free = baked.expression_names, baked.joint_names
-    else:
-        names, free = baked.rig.expression_names, _free_names(baked.rig)
-        yield from _rig_faults(baked.rig)
     if (names, free) != (avatar.expression_names, avatar.joint_names):
         yield "its parts have different expressions or joints"
-    if baked.attributes.sh.shape[1] not in (1, 4, 9, 16):
-        yield f"{baked.attributes.sh.shape[1]} SH coefficients, not 1, 4, 9 or 16"
+    camera = avatar.camera
+    fault = camera_fault(camera.K, camera.viewmat, camera.width, camera.height)
+    if fault is not None:
+        yield f"its camera is none: {fault}"
+    texts = [getattr(avatar.about, f.name) for f in fields(avatar.about)]
+    if not all(map(is_one_line, (*texts, *avatar.expression_names, *avatar.joint_names))):
+        yield "a name in it is not in one line"
+
+
+def _names(baked: Baked) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Of expressions and free joints."""
+    if isinstance(baked, Static):
+        return baked.expression_names, baked.joint_names
+    return baked.rig.expression_names, _free_names(baked.rig)
+
+
+def _baked_faults(baked: Baked) -> Iterator[str]:
+    yield from _number_faults(baked)
+    names, free = _names(baked)
+    attributes, n = baked.attributes, len(baked.attributes.quats)
+    parts = [getattr(attributes, f.name) for f in fields(attributes)]
+    if any(len(part) != n for part in parts):
+        yield "its Gaussians' attributes are of different numbers"
+    if not np.abs(attributes.log_scales).max(initial=0) <= _LARGEST_LOG_SCALE:
+        yield f"a scale beyond exp({_LARGEST_LOG_SCALE})"
+    if attributes.sh.shape[1] not in (1, 4, 9, 16):
+        yield f"{attributes.sh.shape[1]} SH coefficients, not 1, 4, 9 or 16"
+    if not isinstance(baked, Static):
+        yield from _rig_faults(baked.rig)
     if isinstance(baked, MeshBound):
-        if _outside(baked.faces, len(baked.rig.template)) or _outside(baked.face_index, len(baked.faces)):
+        if not (are_indices(baked.faces, len(baked.rig.template)) and are_indices(baked.face_index, len(baked.faces))):
             yield "a triangle or Gaussian names what does not exist"
+        if not len(baked.face_index) == len(baked.means) == n:
+            yield "its Gaussians' places are of another number"
         return
-    if isinstance(baked, BlendSkinned) and len(baked.rig.template) != len(baked.attributes.quats):
-        yield f"{len(baked.rig.template)} points, but {len(baked.attributes.quats)} Gaussians"
+    if isinstance(baked, BlendSkinned) and len(baked.rig.template) != n:
+        yield f"{len(baked.rig.template)} points, but {n} Gaussians"
+    if isinstance(baked, BlendSkinned):
+        if max(abs(baked.scale_gain), abs(baked.scale_offset)) > LARGEST_NUMBER:
+            yield f"scales of {baked.scale_gain:g} metres"
+        if baked.colour_activation == "sigmoid" and attributes.sh.shape[1] != 1:
+            yield "a colour of several SH coefficients"
+    if isinstance(baked, Static) and len(baked.means) != n:
+        yield f"{len(baked.means)} points, but {n} Gaussians"
+    if baked.bases is not None:
+        yield from _bases_faults(baked.bases, attributes, len(names), mean_moves=isinstance(baked, Static))
     if baked.network is not None:
-        yield from _network_faults(baked.network, baked.attributes, e, len(avatar.joint_names))
-    if avatar.camera.width < 1 or avatar.camera.height < 1:
-        yield "its camera has no pixels"
+        yield from _network_faults(baked.network, attributes, len(names), len(free))
+
+
+def _number_faults(value: Any) -> Iterator[str]:
+    for name, array in _arrays(value, ""):
+        if array.dtype.kind == "f" and not is_moderate(array):
+            yield f"{name} holds NaN, infinity or a number beyond {LARGEST_NUMBER:g}"
+
+
+def _bases_faults(bases: LinearBases, attributes: Attributes, e: int, mean_moves: bool) -> Iterator[str]:
+    shapes = {f.name: getattr(attributes, f.name).shape for f in fields(attributes)}
+    shapes["means"] = (len(attributes.quats), 3)
+    for f in fields(bases):
+        basis = getattr(bases, f.name)
+        if basis is not None and basis.shape != (e, *shapes[f.name]):
+            yield f"its basis of {f.name} does not fit"
+    if bases.means is not None and not mean_moves:
+        yield "a basis of its means, which its rig has already"
 
 
 def _rig_faults(rig: Rig) -> Iterator[str]:
-    k = len(rig.joint_names)
-    if not len(rig.joint_parents) == len(rig.joint_free) == len(rig.joint_template) == k or k == 0:
-        yield "joints of different numbers"
-    elif any(not -1 <= parent < index for index, parent in enumerate(rig.joint_parents)):
-        yield "a joint comes before its parent"
+    fault = skeleton_fault(rig.joint_names, rig.joint_parents, rig.joint_free)
+    if fault is not None:
+        yield fault
+        return
+    e, m, k = len(rig.expression_names), len(rig.template), len(rig.joint_names)
+    shapes = {
+        "template": (m, 3), "expression_basis": (e, m, 3), "joint_template": (k, 3),
+        "joint_rotation_basis": (e, k, 3), "joint_translation_basis": (e, k, 3), "skinning_weights": (m, k),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        if getattr(rig, name).shape != shape:
+            yield f"its rig's {name} does not fit"
+    if rig.pose_basis is not None and rig.pose_basis.shape[1:] != (m, 3):
+        yield "its rig's pose_basis does not fit"
     if rig.pose_basis is not None and len(rig.pose_basis) != 9 * sum(rig.joint_free):
         yield f"{len(rig.pose_basis)} pose correctives for {sum(rig.joint_free)} free joints"
-    if len(rig.expression_names) + 9 * sum(rig.joint_free) > MOST_SHAPES:
-        yield f"{len(rig.expression_names)} expressions and {sum(rig.joint_free)} free joints, more than can be posed"
 
 
 def _network_faults(network: AttributeNetwork, attributes: Attributes, e: int, j: int) -> Iterator[str]:
@@ -70,6 +146,10 @@ def _network_faults(network: AttributeNetwork, attributes: Attributes, e: int, j
     if not set(network.outputs) <= set(widths):
         yield f"its network gives {network.outputs}"
         return
+    if len(network.base) != len(attributes.quats):
+        yield "its network is of other Gaussians"
+    if len(set(network.outputs)) != len(network.outputs):
+        yield "its network gives something twice"
     if not network.weights or len(network.weights) != len(network.biases):
         yield "its network has no layers, or layers without biases"
         return
@@ -82,7 +162,9 @@ def _network_faults(network: AttributeNetwork, attributes: Attributes, e: int, j
         yield "its network's outputs do not fit"
     if network.input == "features":
         features = network.basis.shape[2]
-        joints = network.joint_basis
+        joints, n = network.joint_basis, len(network.base)
+        if network.basis.shape[1] != n or (joints is not None and joints.shape[1] != n):
+            yield "its network's bases are of other Gaussians"
         if network.basis.shape[0] != e or features > network.base.shape[1]:
             yield "its network's basis does not fit"
         if joints is not None and (joints.shape[0] != 3 * j or joints.shape[2] != features):
@@ -91,10 +173,6 @@ def _network_faults(network: AttributeNetwork, attributes: Attributes, e: int, j
 
 def _free_names(rig: Rig) -> tuple[str, ...]:
     return tuple(name for name, free in zip(rig.joint_names, rig.joint_free, strict=False) if free)
-
-
-def _outside(indices: np.ndarray, count: int) -> bool:
-    return indices.size > 0 and not (int(indices.min()) >= 0 and int(indices.max()) < count)
 
 
 def _arrays(value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:

@@ -15,9 +15,10 @@ import numpy as np
 import safetensors
 from jaxtyping import jaxtyped
 
+from mien.bounded import parse_json
 from mien.config import decode
 from mien.errors import UserError
-from mien.files import check_writable, read_safetensors, write_arrays
+from mien.files import check_writable, expect_whole, read_safetensors, write_arrays
 from mien.runtime.checks import check
 from mien.runtime.model import PortableAvatar
 
@@ -55,13 +56,13 @@ def read_portable(path: Path) -> PortableAvatar:
         reason = str(error).split("; ")[0].partition("file (")[2].removesuffix(")")
         raise UserError(f"{path}: is no .mien file, or a damaged one ({reason}); {_REMEDY}") from None
     try:
-        header = json.loads(metadata.get("mien", "{}"))
+        header = parse_json(metadata.get("mien", "{}"))
         found = (header.get("format"), header.get("version"))
         if found == (None, None):
             raise UserError(f"{path}: is no .mien file; {_REMEDY}")
         if found != (FORMAT, VERSION):
             raise UserError(
-                f"{path}: has format {found[0]!r} version {found[1]!r}, expected {FORMAT!r} version {VERSION}; "
+                f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {FORMAT!r} version {VERSION}; "
                 "export it again with `mien export`"
             )
         if header["sha256"] != _digest(header["content"], arrays):
@@ -69,7 +70,7 @@ def read_portable(path: Path) -> PortableAvatar:
         tree = _restored(header["content"], arrays)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: damaged ({error!r}); export it again with `mien export`") from None
-    with jaxtyped("context"):
+    with expect_whole(path, "export it again with `mien export`"), jaxtyped("context"):
         avatar: PortableAvatar = decode(PortableAvatar, tree, str(path), "export it again with `mien export`")
     check(avatar, str(path))
     return avatar

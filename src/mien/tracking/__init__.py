@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from mien.tracking.files import read_tracking, write_tracking
+    from mien.tracking.files import check_tracking_of, read_tracking, write_tracking
     from mien.tracking.overlay import draw_overlay, draw_overlay_grid, frontal_camera, overlay_stride, write_overlay
     from mien.tracking.pipeline import track, track_subject
     from mien.tracking.report import residual_report, write_residual_report
@@ -18,7 +18,7 @@ else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
-            "files": ["read_tracking", "write_tracking"],
+            "files": ["check_tracking_of", "read_tracking", "write_tracking"],
             "overlay": ["draw_overlay", "draw_overlay_grid", "frontal_camera", "overlay_stride", "write_overlay"],
             "pipeline": ["track", "track_subject"],
             "report": ["residual_report", "write_residual_report"],
@@ -36,6 +36,7 @@ __all__ = [
     "SmoothnessSettings",
     "Tracking",
     "TrackingSettings",
+    "check_tracking_of",
     "draw_overlay",
     "draw_overlay_grid",
     "frontal_camera",

@@ -1,16 +1,19 @@
 """A tracking on disk: tracking.json (what it is) and tracking.safetensors (the numbers)."""
 
-import hashlib
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from mien.camera import Camera
+from mien.capture import Capture
 from mien.errors import UserError
 from mien.face import FaceParams
+from mien.inside import check_tree, is_one_line
+from mien.limits import LARGEST_NUMBER, camera_fault
 from mien.locks import read_beside_writers
-from mien.storage import read_json, read_tensors, write_json, write_tensors
+from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.tracking.tracking import Looks, Tracking
 
 _FORMAT, _VERSION = "mien.tracking", 1
@@ -29,6 +32,7 @@ _REMEDY = "delete the folder and run `mien track` again"
 
 def write_tracking(path: Path, tracking: Tracking) -> None:
     """Write a tracking into the folder `path`. The json goes last and vouches for the numbers by their hash."""
+    check_tree(path)
     tensors = {
         **tracking.face.tensors(),
         "valid": tracking.valid.to(torch.uint8),
@@ -51,7 +55,7 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
         "residual": _residual_summary(tracking.residuals),
         "looks": None if tracking.looks is None else _numbers_of(tracking.looks),
         "settings": tracking.settings,
-        "tensors_sha256": _digest(path / _TENSORS),
+        "tensors_sha256": file_digest(path / _TENSORS),
     }
     write_json(path / _JSON, _FORMAT, _VERSION, content)
 
@@ -60,37 +64,68 @@ def read_tracking(path: Path) -> Tracking:
     """Read what `write_tracking` wrote.
 
     Raises:
-        UserError: something is missing, damaged, of another version, not finite, or being written.
+        UserError: something is missing, damaged, of another version, not finite, beyond `mien.limits`, being written,
+            or a link.
     """
     return read_beside_writers(lambda: _read_tracking(path), [path], [path.parent])
 
 
 def _read_tracking(path: Path) -> Tracking:
+    check_tree(path)
     content = read_json(path / _JSON, _FORMAT, _VERSION, _STAGE)
     tensors = read_tensors(path / _TENSORS, _STAGE)
-    if _digest(path / _TENSORS) != content.get("tensors_sha256"):
+    if file_digest(path / _TENSORS) != content.get("tensors_sha256"):
         raise UserError(f"{path / _TENSORS}: is not what {_JSON} was written with; {_REMEDY}")
     _check_shapes(path, tensors)
-    try:
-        sizes = [(int(camera["width"]), int(camera["height"])) for camera in content["cameras"]]
-        cameras = tuple(
-            Camera(K, viewmat, width, height)
-            for K, viewmat, (width, height) in zip(tensors["camera_K"], tensors["camera_viewmats"], sizes, strict=True)
-        )
+    with expect_whole(path / _JSON, _REMEDY):
         return Tracking(
-            face_model=str(content["face_model"]),
-            face_model_hash=str(content["face_model_hash"]),
+            face_model=_text(content["face_model"]),
+            face_model_hash=_text(content["face_model_hash"]),
             face=FaceParams(**{name: tensors[name] for name in _FACE if name in tensors}),
             valid=tensors["valid"].bool(),
-            cameras=cameras,
+            cameras=_cameras(content["cameras"], tensors["camera_K"], tensors["camera_viewmats"]),
             neck_lines=tensors["neck_lines"],
             residuals=tensors["residuals"],
             pixel_residuals=tensors.get("pixel_residuals"),
             looks=_read_looks(content.get("looks"), tensors),
-            settings=dict(content["settings"]),
+            settings=_read_settings(content["settings"]),
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path / _JSON}: incomplete ({error}); {_REMEDY}") from None
+
+
+def check_tracking_of(capture: Capture, tracking: Tracking, where: Path) -> None:
+    """Find that a tracking has the timesteps, cameras and picture sizes of a capture.
+
+    Raises:
+        UserError: it has not; `where` is the tracking's folder.
+    """
+    sizes = {(camera.width, camera.height) for camera in tracking.cameras}
+    found = (len(tracking.face), len(tracking.cameras), sizes)
+    if found != (capture.timesteps, len(capture.camera_ids), {(capture.width, capture.height)}):
+        raise UserError(f"{where}: is of other pictures than the capture beside it has; {_REMEDY}")
+
+
+def _cameras(entries: Any, Ks: Tensor, viewmats: Tensor) -> tuple[Camera, ...]:
+    cameras = []
+    for entry, K, viewmat in zip(entries, Ks, viewmats, strict=True):
+        fault = camera_fault(K.numpy(), viewmat.numpy(), entry["width"], entry["height"])
+        if fault is not None:
+            raise ValueError(f"a camera is none: {fault}")
+        cameras.append(Camera(K, viewmat, entry["width"], entry["height"]))
+    return tuple(cameras)
+
+
+def _text(value: object) -> str:
+    if not (isinstance(value, str) and is_one_line(value)):
+        raise ValueError(f"{value!r:.40} is no name")
+    return value
+
+
+def _read_settings(settings: Any) -> dict[str, Any]:
+    """As they are, but for what is looked at before a tracking is made again."""
+    together = settings.get("tracked_together", [])
+    if not (isinstance(together, list) and all(isinstance(name, str) for name in together)):
+        raise ValueError("tracked_together is no list of names")
+    return dict(settings)
 
 
 def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
@@ -107,6 +142,11 @@ def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
         )
         if not agrees:
             raise UserError(f"{path / _TENSORS}: {name!r} has the shape {list(shape)}; {_REMEDY}")
+        floats = name != "valid"
+        if tensors[name].dtype != (torch.float32 if floats else torch.uint8):
+            raise UserError(f"{path / _TENSORS}: {name!r} is {tensors[name].dtype}; {_REMEDY}")
+        if floats and (tensors[name].abs() > LARGEST_NUMBER).any():
+            raise UserError(f"{path / _TENSORS}: {name!r} holds numbers beyond {LARGEST_NUMBER:g}; {_REMEDY}")
         finite = tensors[name].isfinite()
         if name == "pixel_residuals":
             finite |= tensors[name].isnan()
@@ -124,6 +164,8 @@ def _read_looks(numbers: dict[str, float] | None, tensors: dict[str, Tensor]) ->
     if numbers is None:
         return None
     sigma, light_extent = float(numbers["sigma"]), float(numbers["light_extent"])
+    if not (0 <= sigma <= LARGEST_NUMBER and 0 <= light_extent <= LARGEST_NUMBER):
+        raise ValueError(f"looks {sigma:g}, {light_extent:g}")
     return Looks(tensors["texture"], tensors["trust"], tensors["light"], sigma, light_extent)
 
 
@@ -132,7 +174,3 @@ def _residual_summary(residuals: Tensor) -> dict[str, float | None]:
     if len(known) == 0:
         return {"median_px": None, "p95_px": None}
     return {"median_px": float(known.median()), "p95_px": float(known.quantile(0.95))}
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -4,11 +4,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from shutil import rmtree
 
 from torch import Tensor
 
 from mien.errors import UserError
+from mien.inside import remove_tree
 from mien.progress import say
 from mien.storage import read_tensors, write_tensors
 
@@ -66,7 +66,7 @@ class Keeper:
     def forget(self) -> None:
         """The fit is done."""
         if self.folder is not None:
-            rmtree(self.folder, ignore_errors=True)
+            remove_tree(self.folder)
 
     def _path(self, name: str) -> Path | None:
         return None if self.folder is None else self.folder / f"{name}{_ENDING}"

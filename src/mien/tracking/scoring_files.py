@@ -1,7 +1,6 @@
 """The scoring mask on disk: scoring.json, crops.safetensors, masks/CAMERA/000000.png. Written once, never changed."""
 
 import hashlib
-import shutil
 import tempfile
 from pathlib import Path
 
@@ -9,9 +8,11 @@ import cv2
 import numpy as np
 
 from mien.errors import UserError
+from mien.inside import check_tree, open_new, remove_tree
+from mien.limits import side
 from mien.locks import read_beside_writers
-from mien.picture_files import PictureStack
-from mien.storage import read_arrays, read_json, replace_folder, write_arrays, write_json
+from mien.picture_files import PictureStack, decode_png
+from mien.storage import expect_whole, read_arrays, read_json, replace_folder, write_arrays, write_json
 from mien.tracking.scoring import Scoring
 
 _FORMAT, _VERSION = "mien.scoring", 1
@@ -48,7 +49,7 @@ def write_scoring(path: Path, scoring: Scoring, capture_hash: str | None = None)
         temporary.chmod(0o755)
         replace_folder(path, temporary)
     except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
+        remove_tree(temporary)
         raise
 
 
@@ -60,33 +61,40 @@ def read_scoring(path: Path, capture_hash: str | None = None) -> Scoring:
         capture_hash: of the capture that it has to belong to; None for any.
 
     Raises:
-        UserError: something is missing, damaged, not what was written, of another capture, or being written.
+        UserError: something is missing, damaged, not what was written, of another capture, being written, or a link.
     """
     return read_beside_writers(lambda: _read_scoring(path, capture_hash), [path], [path.parent])
 
 
 def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
+    check_tree(path)
     content = read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE)
     if capture_hash is not None and content.get("capture_hash", capture_hash) != capture_hash:
         raise UserError(
             f"{path}: its masks are of other pictures than the capture beside it has; run `mien track` again, "
             "which makes them anew"
         )
-    try:
-        shape = tuple(int(content[name]) for name in ("timesteps", "cameras", "height", "width"))
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path / 'scoring.json'}: incomplete ({error}); {_REMEDY}") from None
+    with expect_whole(path / "scoring.json", _REMEDY):
+        sides = side(content["height"]), side(content["width"])
+        counts = content["timesteps"], content["cameras"]
     crops = read_arrays(path / "crops.safetensors", _STAGE).get("crops")
-    if crops is None or crops.shape != (*shape[:2], 4):
-        raise UserError(f"{path / 'crops.safetensors'}: has not 4 numbers for each frame; {_REMEDY}")
+    # Its size bounds what is looked for: the json may name any number.
+    if crops is None or crops.shape != (*counts, 4) or crops.dtype != np.int32 or crops.size == 0:
+        raise UserError(f"{path / 'crops.safetensors'}: has not 4 whole numbers for each frame; {_REMEDY}")
+    shape = (*crops.shape[:2], *sides)
+    left, top, width, height = np.moveaxis(crops.astype(np.int64), -1, 0)
+    if min(left.min(), top.min(), width.min(), height.min()) < 0 or not (
+        (left + width).max() <= shape[3] and (top + height).max() <= shape[2]
+    ):
+        raise UserError(f"{path / 'crops.safetensors'}: a crop reaches out of the picture; {_REMEDY}")
     # Before room is made for all: a damaged size may ask for more memory than there is.
     missing = [t_c for t_c in np.ndindex(*shape[:2]) if not _mask_file(path, *t_c).is_file()]
     if missing:
         raise UserError(f"{_mask_file(path, *missing[0])}: missing; {_REMEDY}")
-    _read_mask(_mask_file(path, 0, 0), shape[2:])
+    decode_png(_mask_file(path, 0, 0), shape[2:], _REMEDY)
     masks, digest = PictureStack(shape, path), hashlib.sha256()
     for timestep, camera in np.ndindex(*shape[:2]):
-        mask = _read_mask(_mask_file(path, timestep, camera), shape[2:])
+        mask = decode_png(_mask_file(path, timestep, camera), shape[2:], _REMEDY)
         masks.write(timestep, camera, mask)
         digest.update(mask.tobytes())
     digest.update(crops.astype(np.int32).tobytes())
@@ -114,26 +122,14 @@ def _write_into(folder: Path, scoring: Scoring, capture_hash: str | None) -> Non
         digest.update(mask.tobytes())
         encoded, data = cv2.imencode(".png", mask)
         assert encoded
-        file.write_bytes(data.tobytes())
+        with open_new(file) as opened:
+            opened.write(data)
     crops = scoring.crops.astype(np.int32)
     write_arrays(folder / "crops.safetensors", {"crops": crops})
     size = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width}
     origin = {} if capture_hash is None else {"capture_hash": capture_hash}
     digest.update(crops.tobytes())
     write_json(folder / "scoring.json", _FORMAT, _VERSION, {**size, **origin, "sha256": digest.hexdigest()})
-
-
-def _read_mask(file: Path, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        data = np.frombuffer(file.read_bytes(), np.uint8)
-    except OSError:
-        raise UserError(f"{file}: missing; {_REMEDY}") from None
-    # libpng would print its complaint about a truncated file and return half a picture.
-    whole = data.tobytes().endswith(b"IEND\xaeB`\x82")
-    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if whole else None
-    if mask is None or mask.shape != shape:
-        raise UserError(f"{file}: damaged, or not of {shape[1]}x{shape[0]} pixels; {_REMEDY}")
-    return mask
 
 
 def _mask_file(folder: Path, timestep: int, camera: int) -> Path:

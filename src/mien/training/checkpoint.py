@@ -16,6 +16,8 @@ from mien.training.density import DensityStrategy
 from mien.training.face_track import FaceTrack
 
 _KEPT = 2
+_CURVES = {"step", "loss", "psnr", "gaussians", "step_ms"}
+"""That every run has."""
 
 
 @dataclass(eq=False)
@@ -87,21 +89,47 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
     def part(prefix: str) -> dict[str, Tensor]:
         return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
+    for name, tensor in tensors.items():
+        if not name.startswith("curves.") and not bool(tensor.isfinite().all()):
+            raise ValueError(f"{name} is not finite")
     overwrite(state.avatar, part("avatar."), int(tensors["gaussians"]), path)
     store = state.avatar.gaussian_store()
     like = store[store.names()[0]]
-    store.moments.update(_moments(part("store."), like))
-    state.adam.load_state(_moments(part("adam."), like))
+    store.moments.update(_moments(part("store."), like, {name: store[name] for name in store.names()}))
+    groups = {
+        f"{group.name}/{name}": tensor
+        for group in state.avatar.parameter_groups()
+        if group.moments is None
+        for name, tensor in group.tensors.items()
+    }
+    state.adam.load_state(_moments(part("adam."), like, groups))
+    _check_like(part("density."), state.density.state(), len(store))
     state.density.load_state(part("density."))
+    _check_like(part("track."), state.track.state(), None)
     state.track.load_state(part("track."))
-    state.curves = {name: curve.tolist() for name, curve in part("curves.").items()}
     state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
+    curves = part("curves.")
+    if state.step < 0 or state.seconds < 0 or any(curve.ndim != 1 for curve in curves.values()):
+        raise ValueError("its step or curves cannot be")
+    if len({len(curve) for curve in curves.values()}) > 1 or not (curves.keys() >= _CURVES or state.step == 0):
+        raise ValueError("its curves are incomplete")
+    state.curves = {name: curve.tolist() for name, curve in curves.items()}
 
 
-def _moments(tensors: dict[str, Tensor], like: Tensor) -> dict[str, Moments]:
-    """On the device of `like`, but for the numbers of steps."""
+def _check_like(found: dict[str, Tensor], own: dict[str, Tensor], gaussians: int | None) -> None:
+    """Tensors of the same names, types and shapes; where there are any, first axes are `gaussians`."""
+    for name, tensor in own.items():
+        shape = tensor.shape if gaussians is None else (gaussians, *tensor.shape[1:])
+        if found[name].dtype != tensor.dtype or found[name].shape != shape:
+            raise ValueError(f"{name} is {found[name].dtype} {list(found[name].shape)}")
+
+
+def _moments(tensors: dict[str, Tensor], like: Tensor, owners: dict[str, Tensor]) -> dict[str, Moments]:
+    """Of tensors by name, on the device of `like`, but for the numbers of steps."""
     moments = {}
     for name in dict.fromkeys(key.rpartition(":")[0] for key in tensors):
         first, second = (tensors[f"{name}:{field}"].to(like.device) for field in ("first", "second"))
+        if not first.shape == second.shape == owners[name].shape or tensors[f"{name}:step"].ndim:
+            raise ValueError(f"the moments of {name} are of another shape")
         moments[name] = Moments(first, second, tensors[f"{name}:step"])
     return moments

@@ -17,6 +17,8 @@ from mien.avatar import MethodConfig, method_of, write_avatar
 from mien.camera import Camera
 from mien.config import encode
 from mien.errors import UserError
+from mien.inside import check_tree, is_plain_name
+from mien.limits import camera_fault
 from mien.locks import WAIT, check_free
 from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
 from mien.tracking import Tracking
@@ -30,6 +32,7 @@ _REMEDY = "put a copy back, or train again under another name (--run NAME); the 
 _AGAIN = "delete the run's training.json and run the same `mien train` again, which goes on from the last checkpoint"
 ANOTHER_RUN = f"{WAIT}, or give this run another name (--run NAME)"
 """What to do where another process trains the run."""
+_SUMMARIES, _MOST = ("steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"), 1 << 62
 _FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
 """Settings that say how a run is made, not what it is: it may go on with others."""
 
@@ -40,6 +43,7 @@ def claim_run(run_dir: Path, sequences: Items[Sequence], method_config: MethodCo
     Raises:
         UserError: the folder holds a run with other settings, method or data.
     """
+    check_tree(run_dir)
     names = [sequence.name for sequence in sequences]
     if check_run(run_dir, method_config, settings, names):
         check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
@@ -105,7 +109,11 @@ def read_run_config(run_dir: Path) -> dict[str, Any]:
     path = run_dir / "config.json"
     content = read_json(path, _FORMAT, _VERSION, remedy=_REMEDY)
     with expect_whole(path, _REMEDY):
-        _ = content["method"]["kind"], content["settings"]["split"], [entry["sequence"] for entry in content["data"]]
+        _ = content["settings"]["split"], content["settings"].keys()
+        names = [entry["sequence"] for entry in content["data"]]
+        texts = [content["method"]["kind"], content["mien"], *content["command_line"]]
+        if not (names and all(map(is_plain_name, names)) and all(isinstance(text, str) for text in texts)):
+            raise ValueError("a name in it is none")
     return content
 
 
@@ -118,8 +126,11 @@ def run_camera(run_dir: Path) -> Camera:
     config = read_run_config(run_dir)
     with expect_whole(run_dir / "config.json", _REMEDY):
         stored = config["data"][0]["camera"]
-        K, viewmat = torch.tensor(stored["K"]), torch.tensor(stored["viewmat"])
-        return Camera(K, viewmat, int(stored["width"]), int(stored["height"]))
+        K, viewmat = (torch.tensor(stored[name], dtype=torch.float32) for name in ("K", "viewmat"))
+        fault = camera_fault(K.numpy(), viewmat.numpy(), stored["width"], stored["height"])
+        if fault is not None:
+            raise ValueError(f"its camera is none: {fault}")
+        return Camera(K, viewmat, stored["width"], stored["height"])
 
 
 def is_finished(run_dir: Path) -> bool:
@@ -160,6 +171,10 @@ def read_training_summary(run_dir: Path) -> dict[str, Any]:
         UserError: the run was not trained to its end.
     """
     content = read_json(run_dir / "training.json", _SUMMARY, _VERSION, "`mien train`", _AGAIN)
+    with expect_whole(run_dir / "training.json", _AGAIN):
+        for name in _SUMMARIES:
+            if not (isinstance(content[name], int | float) and 0 <= content[name] < _MOST):
+                raise ValueError(f"{name} is no number that could be")
     return {name: value for name, value in content.items() if name not in ("format", "version")}
 
 
@@ -169,7 +184,12 @@ def read_curves(run_dir: Path) -> dict[str, np.ndarray]:
     Raises:
         UserError: they are missing or damaged.
     """
-    return {name: curve.numpy() for name, curve in read_tensors(run_dir / "curves.safetensors", remedy=_AGAIN).items()}
+    path = run_dir / "curves.safetensors"
+    curves = {name: curve.numpy() for name, curve in read_tensors(path, remedy=_AGAIN).items()}
+    shapes = {curve.shape for curve in curves.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 1 or any(curve.dtype != np.float64 for curve in curves.values()):
+        raise UserError(f"{path}: holds no curves of one length; {_AGAIN}")
+    return curves
 
 
 def _choices(method_config: MethodConfig, settings: TrainSettings) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from mien.camera import Camera
 from mien.capture import Capture, read_capture, read_capture_hash
 from mien.errors import UserError
 from mien.locks import read_beside_writers
-from mien.tracking import Tracking, read_scoring, read_tracking
+from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, read_tracking
 from mien.training.photometric import Box
 
 _CACHE_BYTES = 1 << 30
@@ -146,7 +146,8 @@ def read_sequence(folder: Path) -> Sequence:
     """The sequence in FOLDER/{capture,tracking,scoring}; its name is the folder's.
 
     Raises:
-        UserError: a part is missing, damaged, of another version or being written, or the scoring is of other pictures.
+        UserError: a part is missing, damaged, of another version or being written, or is not of the same pictures as
+            the others.
     """
     parts = [folder / name for name in ("capture", "tracking", "scoring")]
     return read_beside_writers(lambda: _read_parts(folder), parts, [folder])
@@ -154,8 +155,20 @@ def read_sequence(folder: Path) -> Sequence:
 
 def _read_parts(folder: Path) -> Sequence:
     capture_hash = read_capture_hash(folder / "capture")
-    masks = read_scoring(folder / "scoring", capture_hash).masks
-    sequence = Sequence(folder.name, read_capture(folder / "capture"), read_tracking(folder / "tracking"), masks)
+    sequence = sequence_of(folder, read_scoring(folder / "scoring", capture_hash))
     if read_capture_hash(folder / "capture") != capture_hash:
         raise UserError(f"{folder / 'capture'}: was replaced while it was read; run the same command again")
     return sequence
+
+
+def sequence_of(folder: Path, scoring: Scoring) -> Sequence:
+    """`read_sequence` where its scoring is read already.
+
+    Raises:
+        UserError: as `read_sequence`.
+    """
+    capture, tracking = read_capture(folder / "capture"), read_tracking(folder / "tracking")
+    check_tracking_of(capture, tracking, folder / "tracking")
+    if scoring.masks.shape != capture.mattes.shape:
+        raise UserError(f"{folder / 'scoring'}: is not of the capture beside it; delete it and run `mien track` again")
+    return Sequence(folder.name, capture, tracking, scoring.masks)

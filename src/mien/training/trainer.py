@@ -18,6 +18,7 @@ from mien.avatar import Avatar, MethodConfig, Progress, load_avatar, method_name
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
 from mien.face import FaceModel, concatenate
+from mien.face.checks import check_face_params
 from mien.locks import hold
 from mien.progress import Advance, progress_bar
 from mien.render import rasterize
@@ -109,6 +110,7 @@ def check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
                 f"{sequence.name}: tracked with face model {sequence.tracking.face_model!r} "
                 f"{sequence.tracking.face_model_hash}, not {face_model.name!r} {face_model.content_hash}; track again"
             )
+        check_face_params(face_model, sequence.tracking.face, sequence.name, "track again")
         if not sequence.tracking.face.identity.equal(sequences[0].tracking.face.identity):
             raise UserError(
                 f"{sequences[0].name} and {sequence.name}: tracked apart, with two identities; "

@@ -15,6 +15,7 @@ from mien.commands.picture import PictureOptions
 from mien.commands.stages.capturing import capture_stage
 from mien.commands.stages.pictures import draw, view
 from mien.commands.stages.tracking import tracking_stage
+from mien.errors import UserError
 from mien.evaluation.driving import drive, face_of_motion
 from mien.evaluation.pictures import side_by_side
 from mien.export.output import plan_output
@@ -85,6 +86,10 @@ def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[s
 
 def _driver_of(folders: list[Path]) -> Driver:
     sequences = [read_sequence(folder) for folder in folders]
+    shapes = {(one.tracking.face.expression.shape[1], one.tracking.face.joints.shape[1]) for one in sequences}
+    if len(shapes) > 1 or not any(bool(one.tracking.valid.any()) for one in sequences):
+        told = ", ".join(map(str, folders))
+        raise UserError(f"{told}: no frame was tracked, or with several face models; track them again")
     face = concatenate([one.tracking.face for one in sequences])
     at_rest = neutral_of(concatenate([one.tracking.face[one.tracking.valid] for one in sequences]))
     places = [(one, timestep) for one in sequences for timestep in range(one.capture.timesteps)]

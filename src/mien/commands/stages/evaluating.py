@@ -6,9 +6,11 @@ from typing import Any
 
 from mien.evaluation.compare import Comparison, compare_runs
 from mien.evaluation.compare_report import write_comparison
-from mien.evaluation.evaluate import evaluate, is_evaluated, read_metrics
+from mien.evaluation.evaluate import evaluate, is_evaluated
+from mien.evaluation.metrics_file import read_figures
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.words import driven_line, protocol_line
+from mien.inside import check_tree
 from mien.progress import say
 from mien.training import read_run_config
 from mien.workspace import Workspace, open_workspace
@@ -34,7 +36,7 @@ def evaluation_stage(
     run_dir = workspace.run_dir(run)
     folders = run_sequences(workspace, run_dir)
     if not again and not drivers and is_evaluated(run_dir, folders, settings):
-        metrics = read_metrics(run_dir)
+        metrics = read_figures(run_dir)
     else:
         metrics = evaluate(run_dir, folders, settings, _driver_folders(drivers))
     for name, entry in metrics["protocols"].items():
@@ -72,6 +74,7 @@ def _driver_folders(drivers: Items[Path]) -> list[Path]:
     folders: list[Path] = []
     for driver in drivers:
         if (driver / "tracking").is_dir():
+            check_tree(driver)
             folders.append(driver)
             continue
         workspace = open_workspace(driver)

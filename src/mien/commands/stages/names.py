@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mien.errors import UserError
 from mien.files import file_digest
+from mien.inside import is_plain_name
 from mien.terminal import plain_name
 
 
@@ -14,10 +15,10 @@ def sequence_name(video: Path, name: str | None) -> str:
     """`name`, or the video's name without its ending (with "_" for control characters), if it can be a folder's.
 
     Raises:
-        UserError: it is empty or holds a path separator or a control character.
+        UserError: it is empty, too long, or holds path separators or control characters.
     """
     name = plain_name(video.stem) if name is None else name
-    if not name or name in (".", "..") or "/" in name or name != plain_name(name):
+    if not is_plain_name(name):
         raise UserError(f"{name!r} cannot be the name of a folder; give another with --name or --run")
     return name
 
@@ -26,7 +27,7 @@ def run_name(name: str) -> str:
     """`name`, if it can be a folder's.
 
     Raises:
-        UserError: it is empty or holds a path separator or a control character.
+        UserError: it is empty, too long, or holds path separators or control characters.
     """
     return sequence_name(Path(name), name)
 

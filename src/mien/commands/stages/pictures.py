@@ -13,6 +13,7 @@ from mien.export.pictures import to_rgb, to_rgba
 from mien.gaussians import Gaussians
 from mien.progress import say
 from mien.render import rasterize
+from mien.render.validation import drawable
 from mien.training import read_run_config
 
 
@@ -24,7 +25,9 @@ def view(look: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
 @torch.no_grad()
 def draw(look: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8[np.ndarray, "h w _"]:
     """RGB over the background, or RGBA with straight colours."""
-    rendering = rasterize(gaussians, camera, torch.tensor(look.colour()).to(gaussians.means))
+    background = torch.tensor(look.colour()).to(gaussians.means)
+    with drawable("the avatar posed like this", "choose another pose or camera, or train it again"):
+        rendering = rasterize(gaussians, camera, background)
     image, alpha = (tensor.float().cpu().numpy() for tensor in (rendering.image, rendering.alpha))
     return to_rgba(image, alpha) if look.background == "transparent" else to_rgb(image)
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -14,11 +13,14 @@ from mien.capture.video import count_frames
 from mien.commands.stages.face_models import face_model_of
 from mien.errors import UserError
 from mien.face import FaceModel
+from mien.face.checks import check_face_params
+from mien.inside import remove_tree
 from mien.locks import hold
 from mien.progress import say
 from mien.tracking import (
     Tracking,
     TrackingSettings,
+    check_tracking_of,
     has_enough_faces,
     make_scoring,
     overlay_stride,
@@ -69,7 +71,7 @@ def tracking_stage(
         return finished
     with hold(*(workspace.sequence_dir(name) for name in names)):
         fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
-        trackings = None if again else _current_trackings(workspace, names, fingerprint)
+        trackings = None if again else _current_trackings(workspace, names, fingerprint, face_model)
         if trackings is None:
             trackings = _track(workspace, names, face_model, settings, fingerprint, preview)
         else:
@@ -84,7 +86,7 @@ def _finished_trackings(
     """The trackings, if all that the stage writes is there and current."""
     try:
         fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
-        trackings = _current_trackings(workspace, names, fingerprint, tell=False)
+        trackings = _current_trackings(workspace, names, fingerprint, face_model, tell=False)
         for name, tracking in (trackings or {}).items():
             folder = workspace.sequence_dir(name)
             if not scoring_exists(folder / "scoring", read_capture_hash(folder / "capture")):
@@ -107,6 +109,7 @@ def _write_what_follows(
             if scoring_exists(folder / "scoring"):
                 say(f"{name}: the pictures changed, so the scoring mask is made anew")
             capture = read_capture(folder / "capture")
+            check_tracking_of(capture, tracking, folder / "tracking")
             scoring = make_scoring(capture, tracking, face_model, scratch=folder)
             write_scoring(folder / "scoring", scoring, capture_hash)
         _show_tracking(folder, tracking, face_model, overlay)
@@ -121,7 +124,7 @@ def _tracking_fingerprint(
 
 
 def _current_trackings(
-    workspace: Workspace, names: list[str], fingerprint: str, tell: bool = True
+    workspace: Workspace, names: list[str], fingerprint: str, face_model: FaceModel, tell: bool = True
 ) -> dict[str, Tracking] | None:
     """The trackings that are there, if they are what these captures and settings give; `tell` says why where not."""
     found, missing = {}, []
@@ -132,6 +135,8 @@ def _current_trackings(
             continue
         try:
             found[name] = read_tracking(folder)
+            if found[name].face_model_hash == face_model.content_hash:
+                check_face_params(face_model, found[name].face, str(folder), "tracking again")
         except UserError as error:
             if tell:
                 say(f"{str(error).split('; ')[0]}; tracking again")
@@ -166,11 +171,11 @@ def _track(
     keep = workspace.root / "sequences" / f".tracking-{fingerprint}"
     for other in workspace.root.glob("sequences/.tracking-*"):
         if other != keep and other.is_dir():
-            shutil.rmtree(other, ignore_errors=True)  # of other captures or settings
+            remove_tree(other)  # of other captures or settings
     page = workspace.root / "tracking_preview.html" if preview else None
     if page is not None:
         say(f"Open {page} in a browser: it is renewed while the fit goes on")
-    tracked = track_subject(list(usable.values()), face_model, settings, keep, page)
+    tracked = _track_or_begin_again(list(usable.values()), face_model, settings, keep, page)
     trackings = {}
     for name, tracking in zip(usable, tracked, strict=True):
         made_from = {"fingerprint": fingerprint, "tracked_together": list(usable)}
@@ -179,6 +184,21 @@ def _track(
         say(f"{name}: tracked with a median landmark residual of {tracking.residuals.nanmedian():.2f} pixels")
     _tell_outdated_runs(workspace, trackings)
     return trackings
+
+
+def _track_or_begin_again(
+    captures: list[Capture], face_model: FaceModel, settings: TrackingSettings, keep: Path, page: Path | None
+) -> list[Tracking]:
+    """`track_subject`; from the start where what was kept of an earlier one, whole as its files are, is of no use."""
+    begun = keep.is_dir()
+    try:
+        return track_subject(captures, face_model, settings, keep, page)
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError):
+        if not begun:
+            raise
+    say("What was kept of an interrupted tracking is of no use; tracking begins again")
+    remove_tree(keep)
+    return track_subject(captures, face_model, settings, keep, page)
 
 
 def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking]) -> None:
@@ -201,6 +221,7 @@ def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, over
     if reported and shown:
         return
     capture: Capture = read_capture(folder / "capture")
+    check_tracking_of(capture, tracking, folder / "tracking")
     if not reported:
         findings = write_residual_report(folder / "tracking", capture, tracking, face_model)
         say(f"{capture.name}: {findings} See {folder / 'tracking' / 'report.html'}")

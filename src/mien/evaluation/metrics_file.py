@@ -1,0 +1,105 @@
+"""metrics.json as it is read: every figure that is compared or shown is there and is a number."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mien.evaluation.words import FACES, NAMES
+from mien.inside import is_one_line
+from mien.storage import expect_whole, read_json
+
+FORMAT, VERSION = "mien.metrics", 1
+_REMEDY = "delete this file, not its folder, and run `mien evaluate` again"
+_METRICS = ("psnr", "ssim", "l1", "perceptual")
+_DRIVEN = ("expression_error", "expression_error_still", "head_rotation_error_degrees",
+           "head_rotation_error_still_degrees", "faces_found")  # fmt: skip
+_MOST = 1e12
+"""Of any figure: seconds, decibels, numbers of Gaussians."""
+
+
+def read_metrics(run_dir: Path) -> dict[str, Any]:
+    """What `evaluate` wrote.
+
+    Raises:
+        UserError: the run was not evaluated, or the file is damaged.
+    """
+    path = run_dir / "metrics.json"
+    content = read_json(path, FORMAT, VERSION, "`mien evaluate`", _REMEDY)
+    with expect_whole(path, _REMEDY):
+        _ = content["protocols"].keys(), content["training"].keys()
+    return {name: value for name, value in content.items() if name not in ("format", "version")}
+
+
+def read_figures(run_dir: Path) -> dict[str, Any]:
+    """`read_metrics`, with every figure that tables, pages and lines show.
+
+    Raises:
+        UserError: as `read_metrics`; or a figure is missing or of another type, as after an edit.
+    """
+    content, path = read_metrics(run_dir), run_dir / "metrics.json"
+    with expect_whole(path, _REMEDY):
+        for name, entry in content["protocols"].items():
+            _require(is_one_line(name), "a protocol's name")
+            if "psnr" in entry:
+                _check_protocol(entry)
+            else:
+                _check_driven(entry)
+        _number(content["training"], "gaussians", whole=True)
+        _number(content["training"], "seconds")
+    return content
+
+
+def _check_protocol(entry: Mapping[str, Any]) -> None:
+    _check_row(entry)
+    _require(is_one_line(entry["split"]) and entry["face_params"] in FACES, "split or face_params")
+    _number(entry, "frames", whole=True)
+    _number(entry, "seconds_per_frame")
+    if entry["face_params"] != "as_tracked":
+        _check_row(entry["as_tracked"])
+    for name, row in entry["baselines"].items():
+        _require(name in NAMES, "a baseline's name")
+        _check_row(row)
+    for name in ("perceptual_backbone", "pixels"):
+        _require(entry.get(name) is None or is_one_line(entry[name]), name)
+    _require(isinstance(entry.get("perceptual_frames"), int | None), "perceptual_frames")
+    for name, digests in entry.get("scored_on", {}).items():
+        _require(all(map(is_one_line, (name, *digests, *digests.values()))), "scored_on")
+    _check_frames(entry["per_frame"])
+
+
+def _check_frames(frames: Mapping[str, Sequence[Any]]) -> None:
+    columns = [frames[name] for name in ("sequence", "camera_id", "timestep", "psnr", "head_psnr")]
+    _require(all(isinstance(column, list) for column in columns), "per_frame")
+    _require(len({len(column) for column in columns}) == 1 and bool(columns[0]), "per_frame")
+    _require(all(map(is_one_line, (*columns[0], *columns[1]))), "per_frame")
+    for column in columns[2:]:
+        for value in column:
+            _require(_is_number(value), "per_frame")
+
+
+def _check_row(row: Mapping[str, Any]) -> None:
+    """Figures of the whole frame and of the head crop; only the perceptual one may be left out."""
+    for part in (row, row["head"]):
+        for name in _METRICS:
+            _require(_is_number(part.get(name)) or (name != "psnr" and part.get(name) is None), name)
+
+
+def _check_driven(entry: Mapping[str, Any]) -> None:
+    _require(isinstance(entry["drivers"], list), "drivers")
+    _number(entry, "frames", whole=True)
+    for name in _DRIVEN:
+        _require(_is_number(entry[name]) or entry["expression_error"] is None, name)
+
+
+def _number(entry: Mapping[str, Any], name: str, *, whole: bool = False) -> None:
+    value = entry[name]
+    _require(_is_number(value) and value >= 0 and (isinstance(value, int) or not whole), name)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MOST
+
+
+def _require(holds: bool, what: str) -> None:
+    if not holds:
+        raise ValueError(f"{what} is not what it should be")

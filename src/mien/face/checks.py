@@ -1,0 +1,102 @@
+"""What must hold of a face model and of face parameters that were read, so that posing never fails or reads outside."""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from mien.errors import UserError
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.inside import is_one_line
+from mien.limits import LARGEST_NUMBER, skeleton_fault
+
+_AXES = {
+    "template": "v3", "faces": "f3", "uv": "u2", "uv_faces": "f3", "face_regions": "f", "identity_basis": "iv3",
+    "expression_basis": "ev3", "expression_bounds": "e2", "joint_template": "k3", "joint_identity_basis": "ik3",
+    "joint_rotation_basis": "ek3", "joint_translation_basis": "ek3", "skinning_weights": "vk", "pose_basis": "pv3",
+    "expression_sigmas": "e",
+}  # fmt: skip
+"""As in `FaceModel`."""
+_OPTIONAL = ("pose_basis", "expression_sigmas")
+_INDICES = {"faces": "v", "uv_faces": "u", "face_regions": "r"}
+"""What the whole numbers count."""
+
+
+def check_face_model(model: FaceModel, where: str, remedy: str) -> None:
+    """Find that a face model's arrays fit each other, its indices lie within them and its numbers are moderate.
+
+    Args:
+        model: without landmarks.
+        where: it was read from.
+        remedy: what to do if something does not hold.
+
+    Raises:
+        UserError: something does not hold.
+    """
+    for fault in _faults(model):
+        raise UserError(f"{where}: {fault}; {remedy}")
+
+
+def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: str) -> None:
+    """Find that face parameters are those of a face model, finite and moderate.
+
+    Args:
+        model: the face model.
+        face: at any number of timesteps.
+        where: they were read from.
+        remedy: what to do if they are not.
+
+    Raises:
+        UserError: they are not.
+    """
+    b, v = len(face), len(model.template)
+    shapes = {
+        "identity": (len(model.identity_basis),), "expression": (b, len(model.expression_basis)),
+        "joints": (b, len(model.free_joint_names), 3), "head_rotation": (b, 3), "head_translation": (b, 3),
+        "vertex_offsets": (v, 3),
+    }  # fmt: skip
+    for name, tensor in face.tensors().items():
+        if tuple(tensor.shape) != shapes[name]:
+            told = f"{name} is {list(tensor.shape)}, which the face model {model.name!r} has not"
+            raise UserError(f"{where}: {told} ({list(shapes[name])}); {remedy}")
+        if not tensor.is_floating_point() or not _is_moderate(tensor):
+            raise UserError(f"{where}: {name} holds NaN or numbers beyond {LARGEST_NUMBER:g}; {remedy}")
+
+
+def _faults(model: FaceModel) -> Iterator[str]:
+    texts = (model.name, *model.region_names, *model.expression_names, *model.joint_names)
+    if not all(isinstance(text, str) and is_one_line(text) for text in texts):
+        yield "a name in it is no text, or not in one line"
+    fault = skeleton_fault(model.joint_names, model.joint_parents, model.joint_free)
+    if fault is not None:
+        yield fault
+    free = sum(bool(mark) for mark in model.joint_free)
+    counted = {"e": len(model.expression_names), "k": len(model.joint_names), "p": 9 * free, "2": 2, "3": 3}
+    sizes = dict(counted)
+    for name, axes in _AXES.items():
+        tensor = getattr(model, name)
+        if tensor is None and name in _OPTIONAL:
+            continue
+        if not isinstance(tensor, Tensor) or tensor.dtype != (torch.int64 if name in _INDICES else torch.float32):
+            yield f"{name} is of another type"
+            return
+        shape = tuple(tensor.shape)
+        if len(shape) != len(axes) or any(
+            sizes.setdefault(axis, size) != size for axis, size in zip(axes, shape, strict=True)
+        ):
+            yield f"{name} has the shape {list(shape)}, which does not fit the others"
+            return
+        if name not in _INDICES and not _is_moderate(tensor):
+            yield f"{name} holds NaN or numbers beyond {LARGEST_NUMBER:g}"
+    sizes["r"] = len(model.region_names)
+    if not sizes["v"] or not sizes["f"]:
+        yield "it has no vertices or no triangles"
+    for name, counts in _INDICES.items():
+        tensor = getattr(model, name)
+        if tensor.numel() and not (int(tensor.min()) >= 0 and int(tensor.max()) < sizes[counts]):
+            yield f"{name} names what does not exist"
+
+
+def _is_moderate(tensor: Tensor) -> bool:
+    return tensor.numel() == 0 or bool(tensor.abs().max() <= LARGEST_NUMBER)

@@ -1,0 +1,99 @@
+"""Limits of what files may ask for: sizes of pictures, cameras that can see, joints in order. Without torch.
+
+A file from a stranger has right checksums, too. What it says is checked where it is read, so that nothing behind the
+reader meets a picture of 10^9 pixels, an index outside of its array, or a number that overflows.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+LARGEST_SIDE = 8192
+"""Pixels of a picture's width or height."""
+LARGEST_NUMBER = 1e6
+"""Of metres, radians, raw values and weights; what mien writes stays far below."""
+LARGEST_FOCAL = 1e7
+"""Pixels."""
+_RIGID = 1e-2
+"""How far a view's rotation may be from one."""
+
+
+def whole(value: object, low: int, high: int) -> int:
+    """`value`, if it is a whole number from `low` to `high`.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise ValueError(f"{value!r:.40} is no whole number from {low} to {high}")
+    return value
+
+
+def side(value: object) -> int:
+    """`value`, if it can be a picture's width or height in pixels.
+
+    Raises:
+        ValueError: it cannot.
+    """
+    return whole(value, 1, LARGEST_SIDE)
+
+
+def is_moderate(array: np.ndarray) -> bool:
+    """Whether all numbers are finite and none is beyond `LARGEST_NUMBER`."""
+    return array.size == 0 or bool(np.abs(array).max() <= LARGEST_NUMBER)
+
+
+def are_indices(array: np.ndarray, count: int) -> bool:
+    """Whether all are indices into `count` things."""
+    return array.size == 0 or bool(int(array.min()) >= 0 and int(array.max()) < count)
+
+
+def camera_fault(K: Any, viewmat: Any, width: object, height: object) -> str | None:
+    """Why these cannot be a camera (`mien.camera.Camera`); None where they can.
+
+    Args:
+        K: array [3, 3], pixels.
+        viewmat: array [4, 4], world to camera, metres.
+        width: pixels.
+        height: pixels.
+    """
+    for value in (width, height):
+        try:
+            side(value)
+        except ValueError:
+            return f"{width!r:.40}x{height!r:.40} pixels, not whole numbers from 1 to {LARGEST_SIDE}"
+    K, viewmat = (np.asarray(matrix, np.float64) for matrix in (K, viewmat))
+    if K.shape != (3, 3) or viewmat.shape != (4, 4):
+        return "K must be 3x3 and viewmat 4x4 numbers"
+    if not (np.isfinite(K).all() and np.isfinite(viewmat).all()):
+        return "K and viewmat must be finite numbers"
+    if np.abs(K).max() > LARGEST_FOCAL or min(K[0, 0], K[1, 1]) < 1 / LARGEST_FOCAL:
+        return f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}, not above 0 and to {LARGEST_FOCAL:g} pixels"
+    if np.abs(K[2] - (0, 0, 1)).max() > _RIGID:
+        return "the last row of K must be 0 0 1"
+    turned = viewmat[:3, :3]
+    rigid = np.abs(turned).max() <= 2 and np.abs(_product(turned) - np.eye(3)).max() <= _RIGID
+    if not rigid or np.linalg.det(turned) < 0 or np.abs(viewmat[3] - (0, 0, 0, 1)).max() > _RIGID:
+        return "viewmat is no rotation and translation (world to camera, OpenCV axes)"
+    if np.abs(viewmat[:3, 3]).max() > LARGEST_NUMBER:
+        return f"it is more than {LARGEST_NUMBER:g} metres away"
+    return None
+
+
+def _product(turned: np.ndarray) -> np.ndarray:
+    """`turned` times its transpose."""
+    return (turned[:, None] * turned[None]).sum(-1)
+
+
+def skeleton_fault(names: Sequence[Any], parents: Sequence[Any], free: Sequence[Any]) -> str | None:
+    """Why these cannot be the joints of a model (`joint_names`, `joint_parents`, `joint_free`); None where they can."""
+    if not (len(names) == len(parents) == len(free)) or not names:
+        return f"{len(names)} joint names, {len(parents)} parents and {len(free)} marks of free joints"
+    if not all(isinstance(name, str) for name in names) or not all(isinstance(mark, bool) for mark in free):
+        return "joint names that are no texts, or marks that are not true or false"
+    if not all(isinstance(parent, int) and not isinstance(parent, bool) for parent in parents):
+        return "parents of joints that are no whole numbers"
+    if any(not -1 <= parent < index for index, parent in enumerate(parents)):
+        return "a joint comes before its parent"
+    return None
