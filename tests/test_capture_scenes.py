@@ -123,6 +123,8 @@ def test_three_scenes_become_three_sequences(
 @pytest.mark.slow
 def test_a_clip_with_cuts_becomes_an_avatar(three_scenes: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     arguments = ["create", str(three_scenes[0]), "--out", str(tmp_path / "out"), "--capture.size", "128"]
+    # Scenes tracked together by their pixels lie in test_subject_commands.
+    arguments += ["--tracking.schedule", "landmarks", "--tracking.keyframes", "6"]
     assert main([*arguments, "--steps", "20", "--preset", "draft", "--hold-out", "scenes-2"]) == 0
     run = tmp_path / "out/runs/gaussian_avatars"
     trained = json.loads((run / "config.json").read_text())["data"]

@@ -11,7 +11,11 @@ from mien.cli import main
 from mien.synthetic import SyntheticRecipe, write_synthetic_video
 from mien.tracking import read_tracking
 
-SMALL = ("--capture.size", "128", "--steps", "20", "--preset", "draft")
+TRACKING = (
+    "--tracking.keyframes", "6", "--tracking.photometric.keyframes", "6", "--tracking.photometric.sizes", "64", "64",
+    "--tracking.photometric.texture-size", "128", "--tracking.photometric.shared-steps", "1",
+)  # fmt: skip
+SMALL = ("--capture.size", "128", "--steps", "20", "--preset", "draft", *TRACKING)
 PARTS = {"one": slice(0, 12), "two": slice(12, 24), "three": slice(24, 32)}
 
 
@@ -68,7 +72,7 @@ def test_the_same_command_does_nothing_again(
 def test_a_damaged_tracking_is_made_again(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = _identity(workspace, "two")
     (workspace / "sequences/two/tracking/tracking.safetensors").write_bytes(b"broken")
-    assert main(["track", str(workspace)]) == 0
+    assert main(["track", str(workspace), *TRACKING]) == 0
     assert "tracking again" in capsys.readouterr().err
     assert torch.equal(_identity(workspace, "two"), before)
 
@@ -79,7 +83,7 @@ def test_a_third_clip_gives_all_a_new_identity(
 ) -> None:
     before, arguments = _identity(workspace, "one"), ["--out", str(workspace), "--capture.size", "128"]
     assert main(["capture", str(clips["three"]), *arguments]) == 0
-    assert main(["track", str(workspace)]) == 0
+    assert main(["track", str(workspace), *TRACKING]) == 0
     shown = capsys.readouterr().err
     assert "three came new: all 3 sequences are tracked again" in shown
     assert "Trained on the tracking before this one: gaussian_avatars" in shown

@@ -78,6 +78,7 @@ def two_sequences():
     return captures, truth, track_subject(captures, make_small_face_model(), FEW)
 
 
+@pytest.mark.slow
 def test_sequences_of_a_subject_have_one_identity(two_sequences):
     captures, truth, together = two_sequences
     assert torch.equal(together[0].face.identity, together[1].face.identity)
@@ -94,6 +95,7 @@ def test_every_sequence_has_its_own_motion(two_sequences):
     assert aside.face.head_rotation[:, 1].min() > 0.4
 
 
+@pytest.mark.slow
 def test_the_order_of_sequences_does_not_matter(two_sequences):
     captures, _, (first, _) = two_sequences
     _, again = track_subject(captures[::-1], make_small_face_model(), FEW)
@@ -256,6 +258,7 @@ def test_report_of_several_cameras(ring):
     assert report["depth_m"]["median"] == pytest.approx(0.9, abs=0.05)
 
 
+@pytest.mark.slow
 def test_rings_and_videos_share_an_identity(ring):
     face, capture, _ = ring
     case = make_tracking_case(timesteps=20, noise=0)
