@@ -39,7 +39,7 @@ EXPECTED = {
     "picture too wide": (VALUE, "1048545 columns of pixels; at most 1048544"),
     "too many pixels": (VALUE, "2147549184 pixels; at most 2147483647"),
     "lengths beyond 32 bits": (VALUE, "4294967297 rows of pixels"),
-    "products beyond 64 bits": (VALUE, "one row of attributes a pixel"),
+    "products beyond 64 bits": (VALUE, "8796093022208 numbers a vertex; at most 2147483647"),
     "unaligned": (TYPE, "sigmoid()"),
     "copies are not written": (TYPE, "pose_face()"),
     "strided": (TYPE, "pose_face()"),
