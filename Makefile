@@ -49,6 +49,17 @@ test-312-part: setup
 sanitize:
 	$(MAKE) -C native/checks -j2
 
+# Every native function with random arguments under AddressSanitizer and UndefinedBehaviorSanitizer.
+CALLS ?= 50000
+SEED ?= 1
+SANITIZED := build/sanitize-native
+.PHONY: fuzz-native
+fuzz-native: setup
+	$(BIN)/cmake -S . -B $(SANITIZED) -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN)/ninja) -DCMAKE_BUILD_TYPE=Debug -DMIEN_SANITIZE=ON \
+	  -DPython_EXECUTABLE=$(abspath $(BIN)/python) -Dnanobind_DIR=$$($(BIN)/python -m nanobind --cmake_dir) > /dev/null
+	$(BIN)/ninja --quiet -C $(SANITIZED)
+	$(BIN)/python tests/fuzzing/native_calls.py $(SANITIZED)/native --calls $(CALLS) --seed $(SEED)
+
 lint: setup
 	$(BIN)/ruff check src tests examples benchmarks
 	$(BIN)/ruff format --check src tests examples benchmarks

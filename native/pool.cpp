@@ -64,6 +64,8 @@ class Pool {
     } catch (const std::bad_alloc&) {
     }
     threads_ = static_cast<int>(workers_.size()) + 1;  // workers read it within loops only, which come later
+    // A thread that finds no memory for its own variables ends the process: better now than when a loop has taken all.
+    for (int now; (now = started_.load(std::memory_order_acquire)) < threads_ - 1;) started_.wait(now);
   }
 
   // Ends the workers, after the loop that is running. Whoever still holds this pool runs loops on his own thread.
@@ -139,6 +141,8 @@ class Pool {
 
   void serve(int self) {
     t_in_loop = true;
+    started_.fetch_add(1, std::memory_order_release);
+    started_.notify_one();
     uint32_t seen = 0;
     std::chrono::microseconds spin = kMostSpin;
     while (!stop_) {
@@ -164,6 +168,7 @@ class Pool {
   std::vector<Share> shares_;
   std::vector<std::thread> workers_;
   int threads_ = 1;
+  std::atomic<int> started_{0};
   std::mutex busy_, error_mutex_;
   std::exception_ptr error_;                    // the first of a loop
   std::chrono::microseconds spin_ = kMostSpin;  // of whoever runs a loop

@@ -206,7 +206,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "too many pixels": large_picture,
     "lengths beyond 32 bits": lambda: _native.box_of_nonzero(np.zeros((2**32 + 1, 0), F32)),
     "products beyond 64 bits": lambda: _native.interpolate_mesh(
-        np.zeros((2**20, 2**4), I32) - I32(1), np.zeros((2**20, 2**4, 3), F32), np.zeros((0, 2**40), F32),
+        np.full((2**17, 2**4), -1, I32), np.zeros((2**17, 2**4, 3), F32), np.zeros((0, 2**43), F32),
         np.zeros((0, 3), I64), np.zeros((0, 1, 1), F32),
     ),
     "unaligned": unaligned,

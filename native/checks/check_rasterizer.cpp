@@ -1,4 +1,6 @@
 // Both passes of the rasterizer: any size, any shape of Gaussian, the same bits for any number of threads.
+#include <stdexcept>
+#include <string>
 #include <thread>
 
 #include "checks.h"
@@ -147,6 +149,30 @@ void check_what_is_not_finite() {
   }
 }
 
+// As many Gaussians as wide as the widest picture are refused, before they take memory.
+void check_too_many_pairs() {
+  Scene s = random_scene(3, mien::kMostPairs / (mien::kMostPictureSide / 32) + 1, 1, mien::kMostPictureSide, 1);
+  s.scales.assign(s.scales.size(), 3.0f);
+  s.opacities.assign(s.opacities.size(), 0.5f);
+  for (int64_t i = 0; i < s.count; ++i) {
+    s.means[3 * i] = s.means[3 * i + 1] = 0;
+    s.means[3 * i + 2] = 1.0f / static_cast<float>(i + 1);
+  }
+  const Scene small = random_scene(4, 200, 1, 61, 45);
+  const Result expected = draw(small, 4);
+  Floats image(3 * s.width), alpha(s.width);
+  std::vector<int32_t> radii(s.count);
+  bool refused = false;
+  try {
+    mien::rasterize_forward(s.arrays(), s.view, {image.data(), alpha.data(), radii.data()}, true);
+  } catch (const std::length_error& error) {
+    const std::string pairs = std::to_string(s.count * (mien::kMostPictureSide / 32));
+    refused = std::string(error.what()).find(pairs) != std::string::npos;
+  }
+  CHECK(refused);
+  CHECK(draw(small, 4) == expected);
+}
+
 // Several views at once, each on a thread of its caller, as evaluation draws frames.
 void check_views_side_by_side() {
   std::vector<Scene> scenes;
@@ -188,6 +214,7 @@ void check_rasterizer() {
     check_scene(scene, seed);
   }
   check_what_is_not_finite();
+  check_too_many_pairs();
   check_views_side_by_side();
 }
 
