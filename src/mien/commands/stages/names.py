@@ -14,10 +14,10 @@ def sequence_name(video: Path, name: str | None) -> str:
     """`name`, or the video's name without its ending (with "_" for control characters), if it can be a folder's.
 
     Raises:
-        UserError: it is empty or holds a path separator or a control character.
+        UserError: it is empty or holds a path separator.
     """
     name = plain_name(video.stem) if name is None else name
-    if not name or name in (".", "..") or "/" in name or name != plain_name(name):
+    if not name or name in (".", "..") or "/" in name:
         raise UserError(f"{name!r} cannot be the name of a folder; give another with --name or --run")
     return name
 
@@ -26,7 +26,7 @@ def run_name(name: str) -> str:
     """`name`, if it can be a folder's.
 
     Raises:
-        UserError: it is empty or holds a path separator or a control character.
+        UserError: it is empty or holds a path separator.
     """
     return sequence_name(Path(name), name)
 
