@@ -16,6 +16,12 @@ from mien.errors import UserError
 from mien.storage import read_arrays
 
 
+_FARTHEST = 1e6
+"""Pixels from a picture's corner at which no landmark is."""
+_SHOWN = 40
+"""Characters of a cell that a message shows."""
+
+
 def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]:
     """Landmarks in pixels of the source's pictures as they are shown, a row for each frame; NaN for no face.
 
@@ -32,7 +38,7 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
         if landmarks is None:
             raise UserError(f"{path}: has no array `landmarks`; write [{source_frames}, {LANDMARKS}, 2] pixels as that")
     elif path.suffix == ".csv":
-        landmarks = _read_csv(path)
+        landmarks = _read_csv(path, source_frames)
     else:
         raise UserError(f"--capture.landmarks {path}: cannot be read; give a .csv or .safetensors file")
     expected = (source_frames, LANDMARKS, 2)
@@ -41,15 +47,20 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
             f"{path}: has landmarks of shape {list(landmarks.shape)}, expected {list(expected)}: "
             "a row for each frame of the source"
         )
+    if landmarks.dtype.kind not in "iuf":
+        raise UserError(f"{path}: `landmarks` is {landmarks.dtype}; write numbers, pixels, as float32")
     landmarks = landmarks.astype(np.float64)
-    if np.isinf(landmarks).any():
-        raise UserError(f"{path}: has infinite numbers; write nan where there is no face")
+    if (np.abs(landmarks) > _FARTHEST).any():
+        raise UserError(
+            f"{path}: has numbers that are infinite or beyond {_FARTHEST:g} pixels; write nan where there is no face"
+        )
     landmarks[~np.isfinite(landmarks).all(axis=(1, 2))] = np.nan
     return landmarks
 
 
-def _read_csv(path: Path) -> np.ndarray:
-    rows: list[list[float]] = []
+def _read_csv(path: Path, most: int) -> np.ndarray:
+    """Its rows; of those beyond `most`, one, so that there are too many without all being held."""
+    rows: list[np.ndarray] = []
     try:
         with path.open(newline="", encoding="utf-8") as file:
             for number, line in enumerate(csv.reader(file), 1):
@@ -57,7 +68,10 @@ def _read_csv(path: Path) -> np.ndarray:
                     continue
                 if len(line) not in (0, 2 * LANDMARKS):
                     raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {2 * LANDMARKS}")
-                rows.append([_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS))
+                numbers = [_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS)
+                rows.append(np.array(numbers))
+                if len(rows) > most:
+                    break
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{path}: cannot be read as csv ({error}); write it again") from None
     return np.array(rows).reshape(len(rows), LANDMARKS, 2)
@@ -71,7 +85,8 @@ def _number(path: Path, line: int, cell: str) -> float:
     try:
         return float(cell) if cell.strip() else np.nan
     except ValueError:
-        raise UserError(f"{path}: line {line}: {cell!r} is no number; write pixels, or nan for no face") from None
+        shown = repr(cell if len(cell) <= _SHOWN else f"{cell[:_SHOWN]}...")
+        raise UserError(f"{path}: line {line}: {shown} is no number; write pixels, or nan for no face") from None
 
 
 class GivenMattes:

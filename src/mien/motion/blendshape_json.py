@@ -16,13 +16,19 @@ from typing import Any
 import numpy as np
 
 from mien.errors import UserError
-from mien.motion.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, evenly, gaze_of, held
+from mien.motion.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, check_size, check_times, evenly, gaze_of, held
 from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
 
 _INDEX = {name: index for index, name in enumerate(ARKIT_NAMES)}
 _NO_EXPRESSION = "_neutral"
 _DEFAULT_FPS = 30.0
 _CENTIMETRE = 0.01
+_FARTHEST = 1e6
+"""Centimetres."""
+_LATEST = 1e15
+"""Milliseconds: thirty thousand years, so that every clock's zero will do."""
+_SHOWN = 80
+"""Characters of a value that a message shows."""
 
 
 def read_blendshape_json(path: Path) -> Motion:
@@ -33,8 +39,9 @@ def read_blendshape_json(path: Path) -> Motion:
             range, or times do not increase (naming the frame).
     """
     try:
+        check_size(path)
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError, MemoryError) as error:
         raise UserError(f"{path}: cannot be read as json ({error}); give frames of blend shapes") from None
     frames = [content] if isinstance(content, dict) else content
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
@@ -54,7 +61,9 @@ def read_blendshape_json(path: Path) -> Motion:
             rows[index, 55:] = _CENTIMETRE * matrix[:3, 3]
     if not found.any():
         raise UserError(f"{path}: no frame has a face in it")
-    fps, rows = evenly(_seconds(frames, path), held(rows, found))
+    seconds = _seconds(frames, path)
+    check_times(seconds, lambda index: f"{path}, frame {index}")
+    fps, rows = evenly(seconds, held(rows, found))
     coefficients = rows[:, :52].astype(np.float32)
     head = rows[:, 52:].astype(np.float32)
     return Motion(fps, coefficients, gaze_of(coefficients), head[:, :3], head[:, 3:], int((~found).sum()))
@@ -70,10 +79,10 @@ def from_face_landmarker(frame: dict[str, Any], where: str) -> tuple[dict[str, A
         faces, poses = frame["faceBlendshapes"], frame.get("facialTransformationMatrixes") or []
         scores = {entry["categoryName"]: entry["score"] for entry in faces[0]["categories"]} if faces else None
         matrix = np.array(poses[0]["data"], dtype=np.float64).reshape(4, 4).T if poses else None
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise UserError(f"{where}: is not as FaceLandmarker gives its results ({error!r})") from None
-    if matrix is not None and not np.isfinite(matrix).all():
-        raise UserError(f"{where}: its facial transformation matrix is not finite")
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise UserError(f"{where}: is not as FaceLandmarker gives its results ({_short(error)})") from None
+    if matrix is not None and not (np.abs(matrix) < _FARTHEST).all():
+        raise UserError(f"{where}: its facial transformation matrix holds numbers that no face has (NaN or huge)")
     return scores, matrix
 
 
@@ -91,9 +100,9 @@ def _row(scores: dict[str, Any], where: str) -> np.ndarray:
             continue
         if name not in _INDEX:
             near = difflib.get_close_matches(str(name), ARKIT_NAMES, 1)
-            raise UserError(f"{where}: no blend shape {name!r}" + (f"; did you mean {near[0]}?" if near else ""))
+            raise UserError(f"{where}: no blend shape {_short(name)}" + (f"; did you mean {near[0]}?" if near else ""))
         if isinstance(score, bool) or not isinstance(score, (int, float)) or not SMALLEST <= score <= LARGEST:
-            raise UserError(f"{where}: {name} is {score!r}; scores go from 0 to 1")
+            raise UserError(f"{where}: {name} is {_short(score)}; scores go from 0 to 1")
         row[_INDEX[name]] = score
     return row
 
@@ -104,8 +113,17 @@ def _seconds(frames: list[dict[str, Any]], path: Path) -> np.ndarray:
     if all(stamp is None for stamp in stamps):
         return np.arange(len(frames)) / _DEFAULT_FPS
     for index, stamp in enumerate(stamps):
-        if isinstance(stamp, bool) or not isinstance(stamp, (int, float)) or not math.isfinite(stamp):
-            raise UserError(f"{path}, frame {index}: timestamp_ms is {stamp!r}; give every frame a number")
+        if isinstance(stamp, bool) or not isinstance(stamp, (int, float)) or not abs(stamp) < _LATEST:
+            raise UserError(f"{path}, frame {index}: timestamp_ms is {_short(stamp)}; give every frame a number")
         if index and stamp <= stamps[index - 1]:  # pyright: ignore[reportOperatorIssue]
             raise UserError(f"{path}, frame {index}: its timestamp_ms is not after the one before")
     return np.array(stamps, dtype=np.float64) / 1000
+
+
+def _short(value: object) -> str:
+    """A value as messages show it."""
+    try:
+        text = repr(value)
+    except ValueError:  # thousands of digits
+        text = f"a number of {type(value).__name__} with thousands of digits"
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."

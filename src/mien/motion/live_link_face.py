@@ -15,14 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from mien.errors import UserError
-from mien.motion.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, evenly, gaze_of, held
+from mien.motion.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, check_size, check_times, evenly, gaze_of, held
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 HEAD = ("HeadYaw", "HeadPitch", "HeadRoll")
 EYES = tuple(f"{side}Eye{angle}" for side in ("Left", "Right") for angle in ("Yaw", "Pitch", "Roll"))
-_TIMECODE = re.compile(r"(\d+):(\d+):(\d+)[:;](\d+)(?:\.(\d+))?")
+_TIMECODE = re.compile(r"([0-9]{1,4}):([0-9]{1,2}):([0-9]{1,2})[:;]([0-9]{1,4})(?:\.([0-9]{1,20}))?")
 _RATES = (24, 25, 30, 48, 50, 60, 90, 120, 240)
 _USUAL_RATE = 60
+_SHOWN = 40
+"""Characters of a cell that a message shows."""
 
 
 def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
@@ -58,6 +60,7 @@ def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
         values[row_index] = [_number(path, line, header[index], row[index]) for index in indices]
     stamp = columns["timecode"]
     seconds = _seconds(path, [(line, row[stamp] if stamp < len(row) else "") for line, row in lines], fps)
+    check_times(seconds, lambda row_index: f"{path}, line {lines[row_index][0]}")
     rate, values = evenly(seconds, held(values, found))
     coefficients = values[:, :52].astype(np.float32)
     turns = {name: values[:, 52 + index] for index, name in enumerate(angles)}
@@ -76,6 +79,7 @@ _SIDES = ("Left", "Right")
 def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The header, and the other rows that are not empty with their line numbers."""
     try:
+        check_size(path)
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file)
             rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
@@ -97,13 +101,19 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise UserError(f"{where} is {text!r}, not a number; mend or delete the line") from None
+        raise UserError(f"{where} is {_short(text)}, not a number; mend or delete the line") from None
     if name.strip().lower() in _ANGLES:
         if not abs(value) <= math.pi:
-            raise UserError(f"{where} is {text}; angles are radians, -3.14 to 3.14: convert it from degrees")
+            raise UserError(f"{where} is {_short(text, bare=True)}; angles are radians, -3.14 to 3.14: convert it from degrees")
     elif not SMALLEST <= value <= LARGEST:
-        raise UserError(f"{where} is {text}; coefficients go from 0 to 1: mend or delete the line")
+        raise UserError(f"{where} is {_short(text, bare=True)}; coefficients go from 0 to 1: mend or delete the line")
     return value
+
+
+def _short(text: str, *, bare: bool = False) -> str:
+    """A cell as messages show it."""
+    cut = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return cut if bare else repr(cut)
 
 
 _ANGLES = {name.lower() for name in (*HEAD, *EYES)}
@@ -114,7 +124,7 @@ def _seconds(path: Path, timecodes: list[tuple[int, str]], fps: float | None) ->
     for line, text in timecodes:
         match = _TIMECODE.fullmatch(text.strip())
         if match is None:
-            raise UserError(f"{path}, line {line}: Timecode {text!r}; expected HH:MM:SS:FF.fraction")
+            raise UserError(f"{path}, line {line}: Timecode {_short(text)}; expected HH:MM:SS:FF.fraction")
         hours, minutes, seconds, frame = (int(part) for part in match.groups()[:4])
         parsed.append((3600 * hours + 60 * minutes + seconds, frame + float(f"0.{match.group(5) or 0}")))
     whole, frames = np.array(parsed).T

@@ -1,10 +1,14 @@
 """Motion: what a driver's face does over time, in ARKit's terms, whatever recorded it."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
+
+from mien.errors import UserError
 
 ARKIT_NAMES = (
     "eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft", "eyeSquintLeft",
@@ -21,6 +25,12 @@ ARKIT_NAMES = (
 
 LOOK_ANGLE = math.radians(30)
 """How far an eye turns for an eyeLook coefficient of 1; Apple names no angle, and this is about as far as eyes go."""
+LONGEST_GAP = 60.0
+"""Seconds between two moments that are filled by a straight line; more is another recording."""
+MOST_MOMENTS = 500_000
+"""Two hours at 60 a second."""
+LARGEST_FILE = 128 << 20
+"""Bytes of a recording; an hour of Live Link Face has as many."""
 SMALLEST, LARGEST = -0.5, 1.5
 """Coefficients go from 0 to 1; programs that calibrate or exaggerate go a little beyond."""
 
@@ -70,6 +80,41 @@ def evenly(seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]) -> 
     if count == len(rows) and np.abs(even - seconds).max() < 0.5 * step:
         return (len(rows) - 1) / float(seconds[-1] - seconds[0]), rows
     return 1 / step, np.stack([np.interp(even, seconds, column) for column in rows.T], axis=1)
+
+
+def check_size(path: Path) -> None:
+    """Refuse a recording that would fill the memory, before it is read.
+
+    Raises:
+        UserError: it has more than `LARGEST_FILE` bytes.
+    """
+    if path.stat().st_size > LARGEST_FILE:
+        raise UserError(f"{path}: has more than {LARGEST_FILE:,} bytes; cut it into shorter recordings")
+
+
+def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -> None:
+    """Refuse times that `evenly` would fill with moments that nobody recorded.
+
+    Args:
+        seconds: increasing strictly.
+        where: names a row's place in its file.
+
+    Raises:
+        UserError: a gap is longer than `LONGEST_GAP`, or there would be more than `MOST_MOMENTS`.
+    """
+    steps = np.diff(seconds)
+    longest = int(np.argmax(steps)) if len(steps) else 0
+    if len(steps) and steps[longest] > LONGEST_GAP:
+        raise UserError(
+            f"{where(longest + 1)}: comes {steps[longest]:,.0f} s after the one before, and gaps of up to "
+            f"{LONGEST_GAP:g} s are filled; cut the file there"
+        )
+    moments = float(seconds[-1] - seconds[0]) / float(np.median(steps)) if len(steps) else 1.0
+    if max(moments, len(seconds)) > MOST_MOMENTS:
+        raise UserError(
+            f"{where(0)}: the times from here on make {moments:,.0f} moments, more than {MOST_MOMENTS:,}; cut the file "
+            "into shorter ones"
+        )
 
 
 def held(rows: Float[np.ndarray, "r c"], found: np.ndarray) -> Float[np.ndarray, "r c"]:
