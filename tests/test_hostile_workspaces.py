@@ -21,6 +21,7 @@ from damage import edit_json
 from mien.capture import read_capture
 from mien.capture.frame_files import CacheWriter, FrameLayout, FrameWriter
 from mien.cli import main
+from mien.commands.stages import tracking as stage
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, compare_runs, evaluate
 from mien.evaluation.experiment import Frame
@@ -28,9 +29,10 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.partial import PartialScores
 from mien.inside import check_tree, inside, is_plain_name, open_new, remove_tree
 from mien.storage import file_digest, read_arrays, read_json, read_tensors, write_arrays, write_json, write_tensors
-from mien.tracking import read_scoring, read_tracking
+from mien.tracking import TrackingSettings, read_scoring, read_tracking
 from mien.training import read_curves, read_run_config, read_sequence, read_training_summary, run_camera
 from mien.workspace import Workspace, check_new_workspace, open_workspace
+from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
 COMMANDS = (
@@ -546,3 +548,26 @@ def test_json_is_written_as_it_is_read(tmp_path: Path) -> None:
     content = {"a": (1, 2.5, [2**63 - 1]), "b": {"1": None}}
     write_json(tmp_path / "a.json", "x", 1, {**content, "b": {1: None}})
     assert read_json(tmp_path / "a.json", "x", 1)["a"] == [1, 2.5, [2**63 - 1]]
+
+
+def test_kept_pieces_of_a_tracking_that_are_of_no_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whole files of the right names that hold something else: tracking begins again, once."""
+    keep, seen = tmp_path / ".tracking-0123", []
+    keep.mkdir()
+
+    def fit(captures: object, face_model: object, settings: object, keep: Path, page: object) -> list[object]:
+        seen.append(keep.exists())
+        if keep.exists():
+            raise KeyError("rows")
+        return []
+
+    monkeypatch.setattr(stage, "track_subject", fit)
+    arguments: Any = ([], toy_face_model(), TrackingSettings(), keep, None)
+    assert stage._track_or_begin_again(*arguments) == []
+    assert seen == [True, False]
+    assert "begins again" in capsys.readouterr().err
+    monkeypatch.setattr(stage, "track_subject", lambda *_: {}["a bug of ours"])
+    with pytest.raises(KeyError):
+        stage._track_or_begin_again(*arguments)

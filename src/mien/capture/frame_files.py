@@ -173,4 +173,4 @@ def _write_png(path: Path, picture: np.ndarray) -> None:
     written, data = cv2.imencode(".png", stored, _PNG_OPTIONS)
     assert written
     with open_new(path) as file:
-        file.write(data)
+        file.write(data.tobytes())

@@ -234,7 +234,7 @@ def _checked(
         (isinstance(camera_ids, list) and camera_ids and all(map(is_file_name, camera_ids)))
         and (len(set(camera_ids)) == len(camera_ids) and _is_count(timesteps))
         and (isinstance(fps, int | float) and _SLOWEST <= fps <= _FASTEST)
-        and (is_one_line(name) and isinstance(source, dict))
+        and (isinstance(name, str) and is_one_line(name) and isinstance(source, dict))
     ):
         raise UserError(f"{path / JSON_NAME}: has missing or wrong entries; {REMEDY}")
     _check_arrays(path / ARRAYS_NAME, arrays, timesteps, len(camera_ids))

@@ -109,15 +109,18 @@ def read_cameras(path: Path) -> list[Camera]:
 def _camera_of(entry: Any, where: str) -> Camera:
     try:
         K, viewmat = torch.tensor(entry["K"], dtype=torch.float32), torch.tensor(entry["viewmat"], dtype=torch.float32)
-        # Other programs write 512.0.
-        width, height = (int(size) if isinstance(size, float) and size.is_integer() else size
-                         for size in (entry["width"], entry["height"]))  # fmt: skip
+        width, height = _whole(entry["width"]), _whole(entry["height"])
     except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise UserError(f"{where}: needs K [3][3], viewmat [4][4], width and height ({error!r})") from None
     fault = camera_fault(K.numpy(), viewmat.numpy(), width, height)
     if fault is not None:
         raise UserError(f"{where}: {fault}")
     return Camera(K, viewmat, width, height)
+
+
+def _whole(size: Any) -> Any:
+    """Other programs write 512.0."""
+    return int(size) if isinstance(size, float) and size.is_integer() else size
 
 
 def orbit(

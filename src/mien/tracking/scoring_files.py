@@ -123,7 +123,7 @@ def _write_into(folder: Path, scoring: Scoring, capture_hash: str | None) -> Non
         encoded, data = cv2.imencode(".png", mask)
         assert encoded
         with open_new(file) as opened:
-            opened.write(data)
+            opened.write(data.tobytes())
     crops = scoring.crops.astype(np.int32)
     write_arrays(folder / "crops.safetensors", {"crops": crops})
     size = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width}
