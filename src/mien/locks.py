@@ -31,8 +31,8 @@ from mien.progress import say
 
 Result = TypeVar("Result")
 
-WAIT = "wait until it is done, or end it"
-_AGAIN = "try again when it is done"
+WAIT, AGAIN = "wait until it is done, or end it", "try again when it is done"
+"""Remedies, for who writes and for who reads."""
 _LONGEST_NAME = 240
 """Bytes; file systems allow 255."""
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
@@ -77,11 +77,7 @@ def hold(*places: Path, remedy: str = WAIT) -> Iterator[None]:
 
 
 def check_free(place: Path, remedy: str = WAIT) -> None:
-    """Tell before any work that another process writes a place.
-
-    Raises:
-        BeingWrittenError: so it is.
-    """
+    """Tell before any work, by a BeingWrittenError, that another process writes a place."""
     holder = holder_of(place)
     if holder is not None:
         raise _being_written(place, holder, remedy)
@@ -129,7 +125,7 @@ def read_beside_writers(read: Callable[[], Result], folders: Sequence[Path], pla
             if writer is None and (pause is None or before == [_state(folder) for folder in folders]):
                 raise
             if writer is not None and pause is None:
-                raise _being_written(*writer, _AGAIN) from None
+                raise _being_written(*writer, AGAIN) from None
             time.sleep(pause or 0.0)
     raise AssertionError("the last try returns or raises")
 

@@ -102,10 +102,10 @@ def _check_first_captures(workspace: Workspace) -> None:
     Raises:
         BeingWrittenError: another process captures its first sequence.
     """
-    from mien.locks import check_free  # brings numpy
+    from mien.locks import AGAIN, check_free  # brings numpy
 
     for file in sorted(workspace.root.glob("sequences/.*.lock")):
-        check_free(workspace.sequence_dir(file.name[1:].removesuffix(".lock")), "try again when it is done")
+        check_free(workspace.sequence_dir(file.name[1:].removesuffix(".lock")), AGAIN)
 
 
 def check_new_workspace(root: Path) -> None:
