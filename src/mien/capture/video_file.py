@@ -138,7 +138,7 @@ def _moving_pictures(path: Path, container: InputContainer) -> VideoStream:
 
 
 def _codec_name(container: InputContainer, index: int) -> str:
-    """The codec's name or four-character code, from FFmpeg's own words: PyAV tells neither of a codec without decoder."""
+    """The codec's name or four-character code, from FFmpeg's own words: PyAV tells neither without a decoder."""
     level = av.logging.get_level()
     av.logging.set_level(av.logging.INFO)
     try:
