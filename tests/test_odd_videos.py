@@ -62,7 +62,7 @@ def test_folders_of_pictures_with_odd_names_and_sizes(tmp_path: Path) -> None:
 
 def test_a_title_in_another_encoding_is_no_obstacle(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
-    encode(path, title="Titel X")
+    encode(path, title="Title X")
     path.write_bytes(path.read_bytes().replace(b"Title X", b"Title \xfc"))
     with pytest.raises(UnicodeDecodeError):
         av.open(str(path))
