@@ -571,3 +571,9 @@ def test_kept_pieces_of_a_tracking_that_are_of_no_use(
     monkeypatch.setattr(stage, "track_subject", lambda *_: {}["a bug of ours"])
     with pytest.raises(KeyError):
         stage._track_or_begin_again(*arguments)
+
+
+def test_a_capture_named_like_our_scratch_folder_is_not_removed(workspace: Path) -> None:
+    folder = (workspace / "sequences/clip/capture").rename(workspace / "mien-capture-mine")
+    assert read_capture(folder).timesteps == 5
+    assert read_capture(folder).timesteps == 5

@@ -43,12 +43,11 @@ def map_frames(layout: FrameLayout, capture_hash: str, digests: dict[str, np.nda
         UserError: a frame or matte is missing or damaged.
     """
     _check_present(layout)
-    if not _is_valid(layout, capture_hash):
-        layout = _rebuild(layout, capture_hash, digests)
-    images, mattes = (map_pictures(layout.raw(kind), layout.shape(kind)) for kind in (FRAMES, MATTES))
-    if layout.folder.name.startswith(_SCRATCH_PREFIX):
-        # The maps keep the pages; nobody else needs the names.
-        shutil.rmtree(layout.folder, ignore_errors=True)
+    found = layout if _is_valid(layout, capture_hash) else _rebuild(layout, capture_hash, digests)
+    images, mattes = (map_pictures(found.raw(kind), found.shape(kind)) for kind in (FRAMES, MATTES))
+    if found is not layout:
+        # A scratch folder: the maps keep the pages; nobody else needs the names.
+        shutil.rmtree(found.folder, ignore_errors=True)
     return images, mattes
 
 
