@@ -97,7 +97,12 @@ def test_arrays_that_repeat_or_unpack_one_text_are_counted(tmp_path: Path, monke
         __module__, __qualname__ = "builtins", "dict"
 
         def __reduce__(self):
-            state = {"data": np.ones(1), "indices": np.zeros(1, int), "indptr": np.array([0, 1]), "_shape": (9**6, 9**6)}
+            state = {
+                "data": np.ones(1),
+                "indices": np.zeros(1, int),
+                "indptr": np.array([0, 1]),
+                "_shape": (9**6, 9**6),
+            }
             return (OrderedDict, (), state)
 
     path.write_bytes(pickle.dumps({"J_regressor": Sparse()}, protocol=2))
@@ -205,7 +210,7 @@ ODD = {
     "a chain without rows": ("kintree_table", np.zeros((0, 5), int), "gives the joints the parents"),
     "a chain of nothing": ("kintree_table", np.array(3), "gives the joints the parents"),
     "a chain of NaN": ("kintree_table", np.full((2, 5), np.nan), "gives the joints the parents"),
-    "huge numbers": ("shapedirs", None, "'shapedirs' holds 1e\\+30, and no number of a head"),
+    "huge numbers": ("shapedirs", None, "'shapedirs' holds 1e\\+30, and a head has no number"),
     "texture of complex numbers": ("vt", np.zeros((4, 2), bool), "no texture coordinates"),
 }
 

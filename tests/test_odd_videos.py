@@ -11,7 +11,6 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-
 from av.stream import Disposition
 
 from capture_helpers import write_gradient_video
@@ -63,8 +62,8 @@ def test_folders_of_pictures_with_odd_names_and_sizes(tmp_path: Path) -> None:
 
 def test_a_title_in_another_encoding_is_no_obstacle(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
-    encode(path, title="Titel X")
-    path.write_bytes(path.read_bytes().replace(b"Titel X", b"Titel \xfc"))
+    encode(path, title="Song X")
+    path.write_bytes(path.read_bytes().replace(b"Song X", b"Song \xfc"))
     with pytest.raises(UnicodeDecodeError):
         av.open(str(path))
     assert count_frames(path) == len(list(read_video_frames(path))) == 5
@@ -86,7 +85,10 @@ LISTS = {
     "a.m3u8": ("#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\n{segment}\n#EXT-X-ENDLIST\n", "is a playlist"),
     "a.mp4": ("ffconcat version 1.0\nfile {segment}\n", "is a list of files for FFmpeg"),
     "a.mpd": ("<?xml version='1.0'?>\n<MPD type='static'><BaseURL>{segment}</BaseURL></MPD>", "is a DASH manifest"),
-    "a.sdp": ("v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=x\r\nt=0 0\r\nm=video 5004 RTP/AVP 96\r\n", "description of a stream"),
+    "a.sdp": (
+        "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=x\r\nt=0 0\r\nm=video 5004 RTP/AVP 96\r\n",
+        "description of a stream",
+    ),
     "a.ass": ("[Script Info]\nTitle: x\n", "of a kind that mien does not open"),
     "a.asx": ("<asx version='3.0'><entry><ref href='{segment}'/></entry></asx>", "a link or a playlist"),
 }

@@ -15,7 +15,6 @@ from mien.capture.source import FrameSelection, FrameSource, list_images, open_s
 from mien.errors import UserError
 from mien.storage import read_arrays
 
-
 _FARTHEST = 1e6
 """Pixels from a picture's corner at which no landmark is."""
 _SHOWN = 40

@@ -101,8 +101,8 @@ class _Machine:
     def _argument(self, opcode: pickletools.OpcodeInfo) -> Any:
         if opcode.name != "STRING":
             return opcode.arg.reader(self._file)
-        # latin1 is how numpy's arrays in pickles of Python 2 are read, as their bytes were text there; pickletools would
-        # take this one kind of text for ASCII.
+        # latin1 is how numpy's arrays in pickles of Python 2 are read, as their bytes were text there; of this kind of
+        # text pickletools would take ASCII only.
         quoted = self._file.readline().strip()
         if len(quoted) < 2 or quoted[:1] not in b"'\"" or quoted[-1:] != quoted[:1]:
             raise ValueError("a text without quotes")

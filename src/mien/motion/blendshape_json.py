@@ -9,7 +9,6 @@ OpenGL axes. Only the first face counts. A frame without a face repeats the one 
 
 import difflib
 import json
-import math
 from pathlib import Path
 from typing import Any
 

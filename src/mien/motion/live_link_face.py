@@ -104,7 +104,9 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
         raise UserError(f"{where} is {_short(text)}, not a number; mend or delete the line") from None
     if name.strip().lower() in _ANGLES:
         if not abs(value) <= math.pi:
-            raise UserError(f"{where} is {_short(text, bare=True)}; angles are radians, -3.14 to 3.14: convert it from degrees")
+            raise UserError(
+                f"{where} is {_short(text, bare=True)}; angles are radians, -3.14 to 3.14: convert it from degrees"
+            )
     elif not SMALLEST <= value <= LARGEST:
         raise UserError(f"{where} is {_short(text, bare=True)}; coefficients go from 0 to 1: mend or delete the line")
     return value
