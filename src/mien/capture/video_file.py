@@ -142,7 +142,7 @@ def _codec_name(container: InputContainer, index: int) -> str:
     level = av.logging.get_level()
     av.logging.set_level(av.logging.INFO)
     try:
-        described = container.dumps_format()
+        described: str = container.dumps_format()  # pyright: ignore[reportAttributeAccessIssue]
     finally:
         av.logging.set_level(level)
     match = re.search(rf"Stream #\d+:{index}\b[^\n]*?: Video: (?:none \()?([^,\n]+?)(?: / 0x\w+\))?[,\n]", described)
