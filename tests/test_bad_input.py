@@ -21,6 +21,9 @@ from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import read_metrics
 from mien.export import in_world, read_ply, write_ply
+from mien.export.output import plan_output
+from mien.export.pictures import write_pictures
+from mien.gaussians import Gaussians
 from mien.storage import read_json, read_tensors, write_arrays, write_json, write_tensors
 from mien.tracking import Scoring, write_scoring, write_tracking
 from mien.training import read_run_config, read_training_summary
@@ -55,6 +58,16 @@ def write_toy_video(folder: Path) -> None:
     write_video(folder / "a.mp4", list(noise), 25.0)
 
 
+def write_toy_pictures(path: Path, count: int) -> None:
+    """As `mien render` and `mien drive` do."""
+    noise = np.random.default_rng(0).integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
+    write_pictures(plan_output(path, count), list(noise), 25.0)
+
+
+def toy_gaussians() -> Gaussians:
+    return Gaussians(torch.zeros(50, 3), torch.ones(50, 4), torch.ones(50, 3), torch.ones(50), torch.zeros(50, 1, 3))
+
+
 WRITERS: dict[str, Callable[[Path], object]] = {
     "json": lambda folder: write_json(folder / "a.json", "x", 1, {"text": "x" * 2000}),
     "tensors": lambda folder: write_tensors(folder / "a.safetensors", {"a": torch.zeros(1000)}),
@@ -62,6 +75,11 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "capture": lambda folder: write_capture(folder / "capture", toy_sequence(3, 64)[1].capture),
     "tracking": lambda folder: write_tracking(folder / "tracking", toy_sequence(30, 32)[1].tracking),
     "video": write_toy_video,
+    "webm": lambda folder: write_toy_pictures(folder / "a.webm", 8),
+    "picture": lambda folder: write_toy_pictures(folder / "a.png", 1),
+    "pictures": lambda folder: write_toy_pictures(folder / "a_%03d.png", 2),
+    "film": lambda folder: write_toy_pictures(folder / "a:b.mp4", 3),
+    "ply": lambda folder: write_ply(folder / "a.ply", toy_gaussians()),
 }
 
 

@@ -210,7 +210,7 @@ ODD = {
     "a chain without rows": ("kintree_table", np.zeros((0, 5), int), "gives the joints the parents"),
     "a chain of nothing": ("kintree_table", np.array(3), "gives the joints the parents"),
     "a chain of NaN": ("kintree_table", np.full((2, 5), np.nan), "gives the joints the parents"),
-    "huge numbers": ("shapedirs", None, "'shapedirs' holds 1e\\+30, and no number of a head"),
+    "huge numbers": ("shapedirs", None, "'shapedirs' holds 1e\\+30, and a head has no number"),
     "texture of complex numbers": ("vt", np.zeros((4, 2), bool), "no texture coordinates"),
 }
 

@@ -1,4 +1,4 @@
-"""Motion, landmarks and crops that users hand in: gaps, huge numbers and files are told before they take memory."""
+"""Motion, landmarks and crops that users hand in: gaps, huge numbers and huge files are told in time."""
 
 import json
 from pathlib import Path

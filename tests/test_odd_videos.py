@@ -62,8 +62,8 @@ def test_folders_of_pictures_with_odd_names_and_sizes(tmp_path: Path) -> None:
 
 def test_a_title_in_another_encoding_is_no_obstacle(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
-    encode(path, title="Title X")
-    path.write_bytes(path.read_bytes().replace(b"Title X", b"Title \xfc"))
+    encode(path, title="Song X")
+    path.write_bytes(path.read_bytes().replace(b"Song X", b"Song \xfc"))
     with pytest.raises(UnicodeDecodeError):
         av.open(str(path))
     assert count_frames(path) == len(list(read_video_frames(path))) == 5

@@ -74,10 +74,8 @@ class Display:
             self._matrix = _display_matrix(frame)
             self._size = _display_size(*stored, self._pixel_aspect, self._longest_side)
             if self._size[0] * self._size[1] > LARGEST_FRAME:
-                raise UserError(
-                    f"{self._name}: is shown with {self._size[0]}x{self._size[1]} pixels, {TOO_MANY_PIXELS}; "
-                    "make it smaller"
-                )
+                shown = f"{self._size[0]}x{self._size[1]}"
+                raise UserError(f"{self._name}: is shown with {shown} pixels, {TOO_MANY_PIXELS}; make it smaller")
         elif abs(stored[0] / stored[1] / (self._stored_size[0] / self._stored_size[1]) - 1) > _ASPECT_TOLERANCE:
             before = f"{self._stored_size[0]}x{self._stored_size[1]}"
             raise UserError(

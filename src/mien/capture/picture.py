@@ -36,7 +36,7 @@ def decode_picture(path: Path, flags: int) -> np.ndarray | None:
         size = path.stat().st_size
         if size > _LARGEST_FILE:
             raise UserError(
-                f"{path}: has {size:,} bytes, and mien reads no picture of more than {_LARGEST_FILE:,}; make it smaller"
+                f"{path}: has {size:,} bytes, more than a picture that mien reads ({_LARGEST_FILE:,}); make it smaller"
             )
         data = path.read_bytes() if path.is_file() else b""
     except OSError:

@@ -28,7 +28,7 @@ _CONTAINERS = (
     "mov", "matroska", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "flv", "live_flv", "asf", "ogg", "mxf", "gxf",
     "nut", "dv", "gif", "apng", "ivf", "obu", "av1", "h261", "h263", "h264", "hevc", "vvc", "vc1", "dirac", "dnxhd",
     "mjpeg", "yuv4mpegpipe", "wtv", "rm", "swf", "dhav", "cine", "webp_anim", "png_pipe", "jpeg_pipe", "webp_pipe",
-    "bmp_pipe", "tiff_pipe", "wav", "mp3", "flac", "aac", "aiff", "caf",
+    "bmp_pipe", "tiff_pipe", "wav", "mp3", "flac", "aac", "aiff",
 )  # fmt: skip
 """FFmpeg's names of the containers that are opened. None of them leads to other files. Sound alone is told as such."""
 _LISTS = (
@@ -68,7 +68,6 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         raise UserError(f"{path}: is no file; name a video file")
     if path.stat().st_size == 0:
         raise UserError(f"{path}: is empty; copy or record it again")
-    limit = {"max_pixels": str(LARGEST_FRAME)}
     try:
         file = path.open("rb")
     except OSError as error:
@@ -78,7 +77,8 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             container = av.open(
                 _Local(file),
                 "r",
-                options=limit,
+                # FFmpeg forgets a size that it refuses, and somewhat larger ones are to be named.
+                options={"max_pixels": str(4 * LARGEST_FRAME)},
                 container_options={"format_whitelist": ",".join(_CONTAINERS), "protocol_whitelist": "none"},
                 metadata_errors="replace",  # titles come in any encoding
                 buffer_size=_BUFFER,
@@ -88,7 +88,7 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         with container:
             stream = _moving_pictures(path, container)
             _check_size(path, stream.codec_context.width, stream.codec_context.height)
-            stream.codec_context.options = limit
+            stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}
             yield container, stream
 
 
@@ -138,11 +138,11 @@ def _moving_pictures(path: Path, container: InputContainer) -> VideoStream:
 
 
 def _codec_name(container: InputContainer, index: int) -> str:
-    """The codec's name or four-character code, from FFmpeg's own words: PyAV tells neither without a decoder."""
+    """The codec's name or four-character code, out of FFmpeg's own words: PyAV has neither where no decoder is."""
     level = av.logging.get_level()
     av.logging.set_level(av.logging.INFO)
     try:
-        described = container.dumps_format()
+        described: str = container.dumps_format()  # pyright: ignore[reportAttributeAccessIssue]
     finally:
         av.logging.set_level(level)
     match = re.search(rf"Stream #\d+:{index}\b[^\n]*?: Video: (?:none \()?([^,\n]+?)(?: / 0x\w+\))?[,\n]", described)

@@ -127,8 +127,8 @@ def read_crops(path: Path) -> dict[str, Box]:
         raise UserError(f"{str(error).split('; ')[0]}; write it again, or leave it out") from None
     boxes: dict[str, Box] = {}
     for name, box in crops.items() if isinstance(crops, dict) else [("", None)]:
-        whole = isinstance(box, list) and len(box) == 4 and all(type(v) is int and abs(v) <= _FARTHEST for v in box)
-        if not whole or min(box[2:]) < 1:
+        fits = isinstance(box, list) and len(box) == 4 and all(type(v) is int and abs(v) <= _FARTHEST for v in box)
+        if not isinstance(box, list) or not fits or min(box[2:]) < 1:
             raise UserError(f"{path}: {name!r} has no box of 4 numbers (left, top, width, height); write it again")
         boxes[name] = (box[0], box[1], box[2], box[3])
     return boxes

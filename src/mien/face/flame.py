@@ -219,8 +219,7 @@ def _check_values(path: Path, key: str, array: np.ndarray) -> None:
     largest = max(float(array.max(initial=0)), -float(array.min(initial=0)))
     if largest > _LARGEST_NUMBER:
         raise UserError(
-            f"{path}: {key!r} holds {largest:g}, but no number of a head is above {_LARGEST_NUMBER:g}; "
-            "download it again"
+            f"{path}: {key!r} holds {largest:g}, and a head has no number above {_LARGEST_NUMBER:g}; download it again"
         )
 
 

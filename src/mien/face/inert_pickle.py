@@ -91,18 +91,18 @@ class _Machine:
             opcode = _OPCODES[code[0]]
             if opcode.name == "STOP":
                 return self._stack.pop()
-            argument = None if opcode.arg is None else self._argument(opcode)
+            argument = None if opcode.arg is None else self._argument(opcode.name, opcode.arg)
             act = _ACTIONS.get(opcode.name)
             if act is None:
                 raise ValueError(f"it uses {opcode.name}, which no file of arrays does")
             act(self, argument)
         raise ValueError(f"it has more than {_MOST_OPCODES:,} opcodes")
 
-    def _argument(self, opcode: pickletools.OpcodeInfo) -> Any:
-        if opcode.name != "STRING":
-            return opcode.arg.reader(self._file)
-        # latin1 is how numpy's arrays in pickles of Python 2 are read, as their bytes were text there; pickletools
-        # would take this one kind of text for ASCII.
+    def _argument(self, name: str, described: pickletools.ArgumentDescriptor) -> Any:
+        if name != "STRING":
+            return described.reader(self._file)
+        # latin1 is how numpy's arrays in pickles of Python 2 are read, as their bytes were text there; of this kind of
+        # text pickletools would take ASCII only.
         quoted = self._file.readline().strip()
         if len(quoted) < 2 or quoted[:1] not in b"'\"" or quoted[-1:] != quoted[:1]:
             raise ValueError("a text without quotes")

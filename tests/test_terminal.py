@@ -1,0 +1,196 @@
+"""What reaches a terminal: names that would act are shown instead, and closed outputs end a command quietly."""
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from mien import progress, terminal
+from mien.cli import main
+from mien.commands.stages.names import sequence_name
+from mien.errors import UserError
+from mien.progress import progress_bar, say
+from mien.terminal import plain_name, printable, show
+from mien.threads import MOST_THREADS, asked_threads, thread_count
+
+NASTY = "\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\udcff.mp4"
+SHOWN = r"\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\xff.mp4"
+
+
+def test_what_acts_is_shown() -> None:
+    assert printable(NASTY) == SHOWN
+    assert printable("a\nb\t", lines=True) == "a\nb\\t"
+    for harmless in ("Köpfe und Leute", "頭.mp4", "👩\u200d💻 it's", r"C:\x1b", "a\xa0b"):
+        assert printable(harmless) == harmless
+    assert plain_name("a\x1b[2J\n\udcffb") == "a_[2J__b"
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_messages_and_bars_are_harmless(
+    is_terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = io.StringIO()
+    console = Console(file=written, force_terminal=is_terminal, width=300, highlight=False, markup=False, emoji=False)
+    monkeypatch.setattr(progress, "console", console)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal, raising=False)
+    say(f"warning: {NASTY}: odd")
+    with progress_bar(f"find the face in {NASTY}", 2) as advance:
+        advance(2, f"at {NASTY}")
+    show(f"name: {NASTY}")
+    out, err = capsys.readouterr()
+    told = written.getvalue() + err
+    assert f"warning: {SHOWN}: odd\n" in told
+    assert f"find the face in {SHOWN}" in told
+    assert f"at {SHOWN}" in told
+    assert "\x1b[2J" not in told + out
+    assert not {"\x07", "\x9b", "\u202e"} & set(told + out)
+    assert out == "name: " + SHOWN.replace(r"\n", "\n") + "\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["capture", NASTY, "--out", "out"],
+        [NASTY],
+        ["capture", "--out", NASTY, NASTY, "--bogus", NASTY],
+        ["capture", "a.mp4", "--out", "out", "--capture.turn", NASTY],
+        ["render", NASTY, "--out", NASTY],
+        ["face-models", "--bake", NASTY],
+    ],
+    ids=["missing", "command", "option", "choice", "workspace", "model"],
+)
+def test_complaints_are_one_harmless_line(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert told.strip().isprintable()
+
+
+def test_a_bug_with_an_odd_name_is_written_down(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: object) -> None:
+        raise RuntimeError(NASTY)
+
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["mien", NASTY])
+    monkeypatch.setattr("mien.workspace.Workspace.sequence_names", fail)
+    assert main(["track", str(tmp_path)]) == 1
+    assert "\x1b" not in capsys.readouterr().err
+    (log,) = tmp_path.glob("mien-crash-*.log")
+    assert "RuntimeError" in log.read_text()
+
+
+def test_names_of_videos_become_names_of_folders() -> None:
+    assert sequence_name(Path(NASTY.replace("/", "")), None) == "_[2J__[red]x[red][]:smile:___"
+    assert sequence_name(Path("take:1.mp4"), None) == "take:1"
+
+
+# Outputs that are closed ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "output", "code", "words"),
+    [
+        ("--version", ">&-", 0, ""),
+        ("--version", ">/dev/full", 2, "standard output: cannot be written (No space left on device)"),
+        ("capture none.mp4 --out none", "2>&-", 2, ""),
+    ],
+)
+def test_closed_outputs_end_quietly(arguments: str, output: str, code: int, words: str) -> None:
+    mien = f"'{sys.executable}' -c 'import sys; from mien.cli import main; sys.exit(main())'"
+    script = f"{mien} {arguments} {output}"
+    done = subprocess.run(["bash", "-c", script], stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == code
+    assert words in done.stderr
+    assert done.stderr.count("\n") == (1 if words else 0)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["bench", "--help"], ["face-models"]])
+def test_a_reader_that_is_gone_ends_the_command_quietly(arguments: list[str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    code = (
+        "import sys, mien.cli, mien.terminal\n"
+        "if 'face-models' in sys.argv: mien.cli._run = lambda *_: mien.terminal.show('[]')\n"
+        "sys.exit(mien.cli.main())"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *arguments], stdout=writing, stderr=subprocess.PIPE, check=False)
+    os.close(writing)
+    assert done.returncode == 141
+    assert done.stderr == b""
+
+
+def test_progress_that_nobody_reads_ends_the_command_quietly() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    code = (
+        "import sys, mien.cli\nfrom mien.progress import say\n"
+        "def run(name, rest): say('hello'); return 0\n"
+        "mien.cli._run = run\nsys.exit(mien.cli.main(['track', 'x']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], stderr=writing, stdout=subprocess.PIPE, check=False)
+    os.close(writing)
+    assert done.returncode == 141
+    assert done.stdout == b""
+
+
+def test_a_closed_output_is_not_taken_by_the_next_file(tmp_path: Path) -> None:
+    """Else what a library prints would land in a file of the user."""
+    code = (
+        "import sys, os; from mien.terminal import open_closed_streams; open_closed_streams();"
+        "file = open(sys.argv[1], 'wb'); os.write(1, b'chatter'); print('more'); sys.exit(file.fileno() < 3)"
+    )
+    path = tmp_path / "mine"
+    done = subprocess.run(["bash", "-c", f"'{sys.executable}' -c \"{code}\" '{path}' >&- 2>&- <&-"], check=False)
+    assert done.returncode == 0
+    assert path.read_bytes() == b""
+
+
+# Threads --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text", ["0", "-1", "abc", "100000", "1" + 30 * "0", "9" * 9000, "1.5", "\u0663", "\x1b[2J", "1 2"]
+)
+def test_threads_that_cannot_be_are_told(
+    text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MIEN_THREADS", text)
+    with pytest.raises(UserError, match="give a number from 1 to 1024, or unset it"):
+        thread_count()
+    assert main(["face-models"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"mien: MIEN_THREADS={printable(text)[:40]}")
+    assert told.count("\n") == 1
+    assert len(told) < 150
+
+
+def test_threads_that_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    for text in ("1", "7", str(MOST_THREADS), " 2 "):
+        monkeypatch.setenv("MIEN_THREADS", text)
+        assert asked_threads() == thread_count() == int(text)
+    monkeypatch.setenv("MIEN_THREADS", "")
+    assert asked_threads() is None
+    assert thread_count() == os.cpu_count()
+
+
+def test_the_runtime_tells_them_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from mien import runtime
+
+    monkeypatch.setenv("MIEN_THREADS", "100000")
+    with pytest.raises(UserError, match="MIEN_THREADS=100000"):
+        runtime.load(tmp_path / "none.mien")
+
+
+def test_the_door_needs_no_library(tmp_path: Path) -> None:
+    assert terminal.__doc__
+    code = "import sys, mien.terminal, mien.threads; sys.exit(bool({'torch', 'rich', 'numpy'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
