@@ -56,9 +56,11 @@ class Holder:
     @contextmanager
     def holding(self, *places: Path) -> Iterator[None]:
         self._ask(json.dumps([str(place) for place in places]), "held")
-        yield
-        if self.process.poll() is None:
-            self._ask("", "free")
+        try:
+            yield
+        finally:
+            if self.process.poll() is None:
+                self._ask("", "free")
 
     def _ask(self, line: str, answer: str) -> None:
         assert self.process.stdin is not None
@@ -132,11 +134,9 @@ def test_the_lock_of_a_killed_process_is_free_at_once(mortal: Holder, tmp_path: 
     with mortal.holding(place):
         mortal.kill()
         assert lock_file(place).is_file()
-        began = time.monotonic()
         assert holder_of(place) is None
         with hold(place):
             assert json.loads(lock_file(place).read_text())["pid"] == os.getpid()
-        assert time.monotonic() - began < 0.4
     assert not lock_file(place).exists()
 
 
@@ -311,10 +311,10 @@ def test_a_lock_whose_file_was_removed_is_not_taken_for_the_new_one(tmp_path: Pa
 
 
 def test_a_reader_of_damage_asks_who_writes(other: Holder, tmp_path: Path) -> None:
-    calls: list[float] = []
+    calls: list[int] = []
 
     def damaged() -> None:
-        calls.append(time.monotonic())
+        calls.append(len(calls))
         raise UserError("damaged; make it again")
 
     def read() -> None:
@@ -328,7 +328,7 @@ def test_a_reader_of_damage_asks_who_writes(other: Holder, tmp_path: Path) -> No
     with other.holding(tmp_path / "r"):
         with pytest.raises(BeingWrittenError, match=rf"process {other.pid} .*; try again when it is done$"):
             read()
-        assert calls[-1] - calls[2] < 1, "readers do not wait"
+        assert len(calls) == 2 + 5, "readers look again a few times, and do not wait"
 
 
 def test_a_reader_reads_again_what_was_replaced_meanwhile(tmp_path: Path) -> None:
@@ -478,10 +478,8 @@ def test_every_command_that_writes_tells_who_is_at_it(
     before = tree_bytes(studio.root)
     with other.holding(*{place for place, _ in commands.values()}):
         for name, (place, command) in commands.items():
-            began = time.monotonic()
             assert main(command) == 2, name
-            assert time.monotonic() - began < 5, f"{name} works before it looks"
-            (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
+            (line,) = capsys.readouterr().err.splitlines()  # and no bar of progress before it
             assert line.startswith(f"mien: {place}: is being written by another command (process {other.pid} on "), name
             assert ("--run NAME" in line) == (name in ("train", "create"))
             assert ("--out DIR" in line) == (name == "bench quality")

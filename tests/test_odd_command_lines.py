@@ -131,7 +131,7 @@ def test_a_current_tracking_is_said(
 ) -> None:
     monkeypatch.chdir(place)
     current = {"clip": read_tracking(place / "W/sequences/clip/tracking")}
-    monkeypatch.setattr("mien.commands.stages.tracking._current_trackings", lambda *_: current)
+    monkeypatch.setattr("mien.commands.stages.tracking._current_trackings", lambda *_, **__: current)
     monkeypatch.setattr("mien.commands.stages.tracking._show_tracking", lambda *_: None)
     assert main(["track", "W"]) == 0
     assert "clip: the tracking is current, nothing to do" in capsys.readouterr().err
