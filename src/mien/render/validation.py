@@ -7,6 +7,10 @@ from mien.camera import Camera
 from mien.gaussians import Gaussians
 
 
+class NotFiniteError(ValueError):
+    """What is to be drawn holds NaN or infinity."""
+
+
 def check_shapes(gaussians: Gaussians, background: Tensor) -> None:
     """Raise ValueError for shapes, dtypes and devices that do not fit together."""
     means, quats, scales, opacities, sh = _parts(gaussians)
@@ -37,7 +41,9 @@ def check_finite(gaussians: Gaussians, camera: Camera, background: Tensor) -> No
         bad = ~torch.isfinite(tensor)
         if bad.any():
             index = bad.nonzero()[0].tolist()
-            raise ValueError(f"rasterize: {name}{index} is {tensor[tuple(index)].item()}; every input must be finite")
+            raise NotFiniteError(
+                f"rasterize: {name}{index} is {tensor[tuple(index)].item()}; every input must be finite"
+            )
 
 
 def named_tensors(gaussians: Gaussians, background: Tensor) -> dict[str, Tensor]:
