@@ -371,6 +371,14 @@ def test_training_refuses_settings_out_of_range(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+def test_settings_that_make_training_diverge_are_told(tmp_path: Path) -> None:
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    config = replace(HeadGasConfig(points=50), log_scales_rate=Rate(100.0))
+    with pytest.raises(UserError, match=r"training diverged by step \d+ \(.*\); lower the learning rates"):
+        train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "run")
+    assert not (tmp_path / "run" / "avatar").exists()
+
+
 def test_a_rate_that_starts_at_nothing_stays_there() -> None:
     assert Rate(0.0, 1e-3).at(Progress(5, 10)) == 0
     assert Rate(1e-2, 1e-4).at(Progress(5, 10)) == pytest.approx(1e-3)

@@ -11,6 +11,10 @@ from mien.errors import UserError
 from mien.gaussians import Gaussians
 
 
+class NotFiniteError(ValueError):
+    """What is to be drawn holds NaN or infinity."""
+
+
 def check_shapes(gaussians: Gaussians, background: Tensor) -> None:
     """Raise ValueError for shapes, dtypes and devices that do not fit together."""
     means, quats, scales, opacities, sh = _parts(gaussians)
@@ -43,10 +47,6 @@ def check_finite(gaussians: Gaussians, camera: Camera, background: Tensor) -> No
             index = bad.nonzero()[0].tolist()
             told = f"rasterize: {name}{index} is {tensor[tuple(index)].item()}; every input must be finite"
             raise NotFiniteError(told)
-
-
-class NotFiniteError(ValueError):
-    """NaN or infinity where Gaussians, a camera or a background are to be drawn."""
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from mien.face.checks import check_face_params
 from mien.locks import hold
 from mien.progress import Advance, progress_bar
 from mien.render import rasterize
+from mien.render.validation import NotFiniteError
 from mien.training.adam import Adam
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.density import density_strategy
@@ -59,8 +60,9 @@ def train(
     bytes as if it had never stopped; if that run is finished, its avatar is loaded.
 
     Raises:
-        UserError: a setting is out of range; `run_dir` holds another run, or another process writes it; the face model
-            is not the one the sequences were tracked with; they were not tracked together; nothing is left to train on.
+        UserError: a setting is out of range, or training diverges; `run_dir` holds another run, or another process
+            writes it; the face model is not the one the sequences were tracked with; they were not tracked together;
+            nothing is left to train on.
         KeyboardInterrupt: after Ctrl-C, when a checkpoint is safe.
     """
     method_config.check()
@@ -89,13 +91,36 @@ def _train_to_the_end(
     with _one_torch_thread(), _native_threads(settings.threads), _deferred_interrupt() as interrupted:
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
-                status = step(state, data, settings)
+                try:
+                    status = step(state, data, settings)
+                except NotFiniteError as error:
+                    raise _diverged(state, str(error)) from None
                 advance(1, status)
                 if state.step % settings.checkpoint_every == 0 or interrupted():
+                    _check_finite(state)
                     write_checkpoint(run_dir / "checkpoints", state)
                 if interrupted():
                     raise KeyboardInterrupt
+        _check_finite(state)
         write_results(run_dir, state)
+
+
+def _check_finite(state: TrainingState) -> None:
+    """Find that training has not diverged, before anything of it is written.
+
+    Raises:
+        UserError: the avatar holds NaN or infinity.
+    """
+    for name, tensor in state.avatar.state_dict().items():
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            raise _diverged(state, f"{name} is not finite")
+
+
+def _diverged(state: TrainingState, what: str) -> UserError:
+    return UserError(
+        f"training diverged by step {state.step} ({what}); lower the learning rates and weights that differ from the "
+        "preset's, and train under another name (--run NAME)"
+    )
 
 
 def check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
