@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from mien import exact
 from mien.errors import UserError
 from mien.storage import read_arrays, read_json, write_arrays, write_json
 from mien.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy, measure
@@ -40,7 +41,7 @@ class Truth:
     def vertices_world(self) -> Float[np.ndarray, "t n 3"]:
         """The region in world space."""
         poses = self.tracking.face.T_world_head.numpy()
-        return np.einsum("tij,tnj->tni", poses[:, :3, :3], self.vertices) + poses[:, None, :3, 3]
+        return exact.product(self.vertices, np.swapaxes(poses[:, :3, :3], 1, 2)) + poses[:, None, :3, 3]
 
 
 def truth_of(scene: SyntheticScene) -> Truth:
