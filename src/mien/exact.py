@@ -18,12 +18,12 @@ def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     total = first[..., 0] * second[..., 0]
     for index in range(1, first.shape[-1]):
         total = total + first[..., index] * second[..., index]
-    return total
+    return np.asarray(total)
 
 
 def length(vectors: Float[np.ndarray, "*b c"]) -> np.ndarray:
     """Euclidean norms over the last axis."""
-    return np.sqrt(dot(vectors, vectors))
+    return np.asarray(np.sqrt(dot(vectors, vectors)))
 
 
 def product(first: Float[np.ndarray, "*b n k"], second: Float[np.ndarray, "*b k m"]) -> np.ndarray:

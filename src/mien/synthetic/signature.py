@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mien.synthetic.scene import SyntheticScene
-from mien.synthetic.truth import truth_of
+from mien.synthetic.truth import surface_of
 
 _BLOCKS = 4
 """Along each side of a picture."""
@@ -35,13 +35,13 @@ def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
     cameras = sorted({0, len(scene.cameras) - 1})
     frames = [frame for step in timesteps for frame in scene.timestep_frames(step, cameras)]
     images, mattes = (np.stack([getattr(frame, part) for frame in frames]) for part in ("image", "matte"))
-    truth = truth_of(scene)
-    vertices = truth.vertices[timesteps][:, np.linspace(0, len(truth.vertex_index) - 1, _VERTICES).astype(int)]
+    index, vertices, landmarks = surface_of(scene)
+    vertices = vertices[timesteps][:, np.linspace(0, len(index) - 1, _VERTICES).astype(int)]
     parts = {
         "means": _blocks(images).mean((2, 4)),
         "spreads": _blocks(images).std((2, 4)),
         "mattes": _blocks(mattes[..., None]).mean((2, 4)),
-        "landmarks": truth.landmarks[timesteps][:, cameras][:, :, list(_LANDMARKS)],
+        "landmarks": landmarks[timesteps][:, cameras][:, :, list(_LANDMARKS)],
         "vertices": 1000 * vertices,
     }
     return {name: np.round(values.astype(np.float64), 3).ravel().tolist() for name, values in parts.items()}

@@ -46,12 +46,18 @@ class Truth:
 
 def truth_of(scene: SyntheticScene) -> Truth:
     """The truth of a scene, rounded as it is stored."""
+    return Truth(scene.tracking(), *surface_of(scene))
+
+
+def surface_of(
+    scene: SyntheticScene,
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "t n 3"], Float[np.ndarray, "t c l 2"]]:
+    """`vertex_index`, `vertices` and `landmarks` of the truth."""
     index = face_region(measure(scene.model, scene.identity))
     chosen = torch.from_numpy(index)
     vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.recipe.timesteps)])
     landmarks = np.stack([scene.landmarks(camera) for camera in range(len(scene.cameras))], axis=1)
-    return Truth(scene.tracking(), index, _unpacked(_packed(vertices, _METRE), _METRE),
-                 _unpacked(_packed(landmarks, _PIXEL), _PIXEL))  # fmt: skip
+    return index, _unpacked(_packed(vertices, _METRE), _METRE), _unpacked(_packed(landmarks, _PIXEL), _PIXEL)
 
 
 def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
@@ -62,10 +68,11 @@ def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
     return skin[inside & (points[:, 2] > marks[_EAR, 2])].astype(np.int64)
 
 
-def hash_truth(digest: "hashlib._Hash", truth: Truth) -> None:
-    """Add the truth's numbers to a hash."""
-    digest.update(truth.vertex_index.astype(np.int32).tobytes())
-    digest.update(_packed(truth.vertices, _METRE).tobytes() + _packed(truth.landmarks, _PIXEL).tobytes())
+def hash_surface(digest: "hashlib._Hash", scene: SyntheticScene) -> None:
+    """Add the numbers of `surface_of` to a hash."""
+    index, vertices, landmarks = surface_of(scene)
+    digest.update(index.astype(np.int32).tobytes())
+    digest.update(_packed(vertices, _METRE).tobytes() + _packed(landmarks, _PIXEL).tobytes())
 
 
 def write_truth(folder: Path, truth: Truth) -> None:

@@ -19,7 +19,7 @@ from mien.progress import progress_bar, say
 from mien.storage import read_json, write_json
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.scene import SyntheticScene
-from mien.synthetic.truth import hash_truth, truth_of, write_truth
+from mien.synthetic.truth import hash_surface, truth_of, write_truth
 
 FORMAT, VERSION = "mien.synthetic_capture", 2
 _JSON, _WORK, _STATE = "synthetic.json", ".drawing", "state.json"
@@ -110,7 +110,7 @@ class _Hasher:
         self._digest.update(mattes.tobytes())
 
     def finish(self, scene: SyntheticScene) -> str:
-        hash_truth(self._digest, truth_of(scene))
+        hash_surface(self._digest, scene)
         return self._digest.hexdigest()[:16]
 
 
