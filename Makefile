@@ -1,10 +1,10 @@
-# make setup | demo | test | sanitize | lint | bench | gpu. The environment is .venv; everything else is in pyproject.toml.
+# make setup | demo | test | test-exact | sanitize | lint | bench | gpu. The environment is .venv; everything else is in pyproject.toml.
 PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || echo python3.11)
 BIN := .venv/bin
 NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UV_VERSION := 0.13.8
 
-.PHONY: setup build demo test sanitize lint format bench gpu lock clean
+.PHONY: setup build demo test test-exact sanitize lint format bench gpu lock clean
 setup: .venv/.built
 
 .venv/.packages: requirements/lock.txt
@@ -29,6 +29,12 @@ demo: setup
 
 test: setup
 	MIEN_THREADS=2 $(BIN)/pytest
+
+# What is promised to be equal, or close, on every processor, once more as two older processors compute (docs/reproducibility.md).
+test-exact: setup
+	MKL_CBWR=COMPATIBLE ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Nehalem $(BIN)/pytest -m exact -q
+	MKL_CBWR=AVX2 ATEN_CPU_CAPABILITY=avx2 OPENBLAS_CORETYPE=Haswell NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL" \
+	  $(BIN)/pytest -m exact -q
 
 # The native core's own checks under AddressSanitizer, UndefinedBehaviorSanitizer and ThreadSanitizer; needs no Python.
 sanitize:

@@ -4,7 +4,8 @@ What it sees, in the thread that enters it:
 
 - torch, by its dispatcher: matrix products (`@`, einsum and layers are lowered to them), decompositions, solvers,
   convolutions, and sums over more than `FEW` elements;
-- numpy: an `@` that is reached in a function of mien or of a test; `np.matmul`, `np.dot`, `np.inner`, `np.vdot` by name; the method `dot`; everything of `np.linalg` and `np.einsum`, also when numpy
+- numpy: an `@` that is reached in a function of mien or of a test; `np.matmul`, `np.dot`, `np.inner`, `np.vdot` by
+  name; the method `dot`; everything of `np.linalg` and `np.einsum`, also when numpy
   itself calls it (`np.polyfit`, ...); OpenCV's products and solvers.
 
 What it does not see: the inside of the native core and of OpenCV's filters; other threads; what runs when a module is
@@ -111,7 +112,8 @@ def _watch(frame: FrameType, event: str, called: Any) -> None:
 def _is_numeric(called: Any) -> bool:
     owner = getattr(called, "__self__", None)
     module = owner.__name__ if isinstance(owner, ModuleType) else getattr(called, "__module__", None)
-    return isinstance(owner, np.ndarray) or str(module).split(".")[0] in ("numpy", "cv2", "_operator")
+    is_of_opencv = owner is None and module is None  # its functions say neither
+    return is_of_opencv or isinstance(owner, np.ndarray) or str(module).split(".")[0] in ("numpy", "cv2", "_operator")
 
 
 def _trace(frame: FrameType, event: str, _: Any) -> Callable[..., Any] | None:

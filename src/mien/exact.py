@@ -26,7 +26,7 @@ def length(vectors: Float[np.ndarray, "*b c"]) -> np.ndarray:
     return np.asarray(np.sqrt(dot(vectors, vectors)))
 
 
-def product(first: Float[np.ndarray, "*b n k"], second: Float[np.ndarray, "*b k m"]) -> np.ndarray:
+def product(first: Float[np.ndarray, "*#b n k"], second: Float[np.ndarray, "*#b k m"]) -> np.ndarray:
     """`first @ second`, for few columns: one pass over the result for each of the k terms."""
     total = first[..., :, 0, None] * second[..., None, 0, :]
     for index in range(1, first.shape[-1]):
