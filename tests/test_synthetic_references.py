@@ -1,4 +1,4 @@
-"""Reference captures: named by their keys, drawn alike everywhere, true to the micrometre, drawn in pieces like in one go."""
+"""Reference captures: named by keys, drawn alike everywhere, true to the micrometre, in pieces like in one go."""
 
 from dataclasses import replace
 

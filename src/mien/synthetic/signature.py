@@ -18,7 +18,7 @@ _LANDMARKS = (1, 10, 33, 61, 133, 152, 234, 263, 291, 362, 454, 468, 473)
 """Nose, forehead, eyes, mouth, chin, sides, irises."""
 _VERTICES = 24
 """Of the face region, evenly spread over its indices."""
-TOLERANCES: Mapping[str, float] = {"means": 0.15, "spreads": 0.15, "mattes": 0.15, "landmarks": 0.07, "vertices": 0.015}
+TOLERANCES: Mapping[str, float] = {"means": 0.05, "spreads": 0.05, "mattes": 0.05, "landmarks": 0.07, "vertices": 0.015}
 """Largest difference of a number: grey levels (0..255) for pictures and mattes, pixels, millimetres.
 
 docs/reference_captures.md has the measurements they come from. The truth is rounded to a sixteenth of a pixel and to
