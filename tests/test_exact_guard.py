@@ -28,6 +28,7 @@ PLAIN = replace(
     glasses=False, brows_and_lashes=False,
 )  # fmt: skip
 T, A = torch.ones(5, 5), np.ones((5, 5))
+LEARNT = torch.ones(5, 5, requires_grad=True)
 
 
 @pytest.mark.parametrize(
@@ -38,7 +39,7 @@ T, A = torch.ones(5, 5), np.ones((5, 5))
         lambda: torch.linalg.svd(T),
         lambda: torch.linalg.eigh(T), lambda: torch.linalg.solve(T + torch.eye(5), T), lambda: torch.linalg.qr(T),
         lambda: T.sum(), lambda: T.mean(0), lambda: T.norm(), lambda: T.softmax(-1), lambda: torch.cdist(T, T),
-        lambda: torch.conv2d(T[None, None], T[None, None, :2, :2]), lambda: torch.ones(5, 5, requires_grad=True).matmul(T),
+        lambda: torch.conv2d(T[None, None], T[None, None, :2, :2]), lambda: LEARNT.matmul(T),
         lambda: np.matmul(A, A), lambda: np.dot(A, A), lambda: A.dot(A), lambda: np.einsum("ij,jk->ik", A, A),
         lambda: np.linalg.norm(A[0]), lambda: np.linalg.svd(A), lambda: np.linalg.lstsq(A, A, rcond=None),
         lambda: np.tensordot(A, A), lambda: np.polyfit(np.arange(5), A[0], 1), lambda: np.convolve(A[0], A[0]),

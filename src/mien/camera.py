@@ -96,4 +96,4 @@ def _cross(first: Float[Tensor, " 3"], second: Float[Tensor, " 3"]) -> Float[Ten
 
 def _unit(vector: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
     x, y, z = (vector * vector).unbind()
-    return vector / ((x + y) + z).sqrt()
+    return vector / ((x + y) + z).sqrt().clamp_min(1e-12)
