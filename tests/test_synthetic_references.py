@@ -74,7 +74,7 @@ def test_another_recipe_has_another_signature():
     scene = SyntheticScene(SMALL, 3)
     own = signature_of(scene)
     assert signature_distance(own, own) == dict.fromkeys(TOLERANCES, 0.0)
-    slightly = {"noise": 0.005, "focal": 2.36, "expression": 0.95}
+    slightly = {"noise": 0.005, "focal": 2.36, "rotation": (25.5, 12.0, 8.0)}
     for field, value in slightly.items():
         other = SyntheticScene(replace(SMALL, **{field: value}), 3)
         other.__dict__["subject"] = scene.subject  # the same person, not built again
