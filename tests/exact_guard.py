@@ -24,6 +24,7 @@ from types import CodeType, FrameType, ModuleType
 from typing import Any
 
 import numpy as np
+import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 FEW = 3
