@@ -1,4 +1,4 @@
-# make setup | demo | test | test-312 | sanitize | lint | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# make setup | demo | test | test-312 | test-exact | sanitize | lint | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 PYTHON312 ?= python3.12
@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UV_VERSION := 0.13.8
 
-.PHONY: setup build demo test test-312 test-312-part sanitize lint format bench gpu lock clean
+.PHONY: setup build demo test test-312 test-312-part test-exact sanitize lint format bench gpu lock clean
 setup: $(VENV)/.built
 
 $(VENV)/.packages: requirements/lock.txt
@@ -44,6 +44,14 @@ test-312:
 
 test-312-part: setup
 	MIEN_THREADS=1 $(BIN)/pytest -n auto $(PART:%=tests/test_%.py)
+
+# The tests of docs/reproducibility.md once more, as an old and a middle-aged processor of the x86-64 family compute.
+X86 := $(filter x86_64,$(shell uname -m))
+test-exact: setup
+	MKL_CBWR=COMPATIBLE ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=$(if $(X86),Nehalem) MIEN_ISA=$(if $(X86),sse4) \
+	  $(BIN)/pytest -m exact -q
+	MKL_CBWR=AVX2 ATEN_CPU_CAPABILITY=$(if $(X86),avx2) OPENBLAS_CORETYPE=$(if $(X86),Haswell) MIEN_ISA=$(if $(X86),avx2) \
+	  $(BIN)/pytest -m exact -q
 
 # The native core's own checks under AddressSanitizer, UndefinedBehaviorSanitizer and ThreadSanitizer; needs no Python.
 sanitize:

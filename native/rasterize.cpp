@@ -3,8 +3,11 @@
 
 #include <atomic>
 #include <cmath>
+#include <cstdlib>
 #include <cstring>
 #include <mutex>
+#include <stdexcept>
+#include <string>
 #include <vector>
 
 #include "pool.h"
@@ -42,15 +45,19 @@ const std::vector<Isa>& isas() {
 
 std::atomic<const Isa*> g_isa{nullptr};
 
-const Isa& isa() {
-  if (!g_isa) {
-    for (const Isa& one : isas()) {
-      if (one.here) {
-        g_isa = &one;
-        break;
-      }
-    }
+// The best one, or the one that MIEN_ISA names.
+const Isa& first_isa() {
+  const char* wanted = std::getenv("MIEN_ISA");
+  std::string here;
+  for (const Isa& one : isas()) {
+    if (one.here && (!wanted || !*wanted || std::strcmp(one.name, wanted) == 0)) return one;
+    if (one.here) here += (here.empty() ? "" : ", ") + std::string(one.name);
   }
+  throw std::invalid_argument("MIEN_ISA=" + std::string(wanted) + ": this machine has " + here);
+}
+
+const Isa& isa() {
+  if (!g_isa) g_isa = &first_isa();
   return *g_isa;
 }
 

@@ -1,19 +1,18 @@
 """The native sigmoid against torch's."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 
+from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.avatar.activation import sigmoid
-from needs import use_instructions
 
 
-@pytest.fixture(params=["avx512", "avx2", "sse4"])
-def isa(request: pytest.FixtureRequest):
-    before = _native.rasterize_isa()
-    use_instructions(request.param)
-    yield request.param
-    assert _native.set_rasterize_isa(before)
+@pytest.fixture(params=ISAS)
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    yield from each_isa(request)
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 17, 40_001])

@@ -108,7 +108,7 @@ def test_truth_follows_the_capture_s_crop(case):
     np.testing.assert_allclose(moved, (truth.landmarks - [32, 16]) * 2, rtol=1e-5)
 
 
-def test_the_table_names_hash_and_baselines():
+def test_the_table_names_key_and_baselines():
     figures = {"psnr": 30.0, "ssim": 0.9, "l1": 0.01, "perceptual": None}
     figures = {**figures, "head": dict(figures)}
     protocols = {"novel_view": {**figures, "baselines": {"mean_frame": figures, "mesh": figures}}}

@@ -1,13 +1,14 @@
 """The native way from face parameters to vertices against the plain PyTorch one."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
 import torch
 
+from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.face import FaceModel, FaceParams, head_poses, load_face_model
-from needs import use_instructions
 from small_face_model import make_small_face_model
 
 
@@ -37,12 +38,9 @@ def random_face(model: FaceModel, timesteps: int, joint_scale: float = 0.5) -> F
     )  # fmt: skip
 
 
-@pytest.fixture(params=["avx512", "avx2", "sse4"])
-def isa(request: pytest.FixtureRequest):
-    before = _native.rasterize_isa()
-    use_instructions(request.param)
-    yield request.param
-    assert _native.set_rasterize_isa(before)
+@pytest.fixture(params=ISAS)
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    yield from each_isa(request)
 
 
 @pytest.mark.parametrize("in_world", [True, False])

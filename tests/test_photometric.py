@@ -1,13 +1,15 @@
 """The fused L1 + SSIM loss against its plain PyTorch reference."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, interpolate
 
+from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.training.photometric import Box, photometric_loss, photometric_loss_reference, ssim, ssim_map
-from needs import use_instructions
 
 WHOLE_AND_PARTS = [
     (64, 48, None),
@@ -21,12 +23,9 @@ WHOLE_AND_PARTS = [
 ]
 
 
-@pytest.fixture(params=["avx512", "avx2", "sse4", "baseline"])
-def isa(request: pytest.FixtureRequest):
-    before = _native.rasterize_isa()
-    use_instructions(request.param)
-    yield request.param
-    assert _native.set_rasterize_isa(before)
+@pytest.fixture(params=ISAS)
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    yield from each_isa(request)
 
 
 def smooth_picture(height: int, width: int, seed: int) -> Tensor:

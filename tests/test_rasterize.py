@@ -1,12 +1,15 @@
 """The native rasterizer against the float64 reference, forward and backward; the reference against differences."""
 
-import platform
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
 import torch
 from torch import Tensor
 
+from instruction_sets import ISAS
 from mien import _native
 from mien.render.rasterize import Backend
 from needs import use_instructions
@@ -22,7 +25,6 @@ from rasterize_scenes import (
 )
 
 BACKENDS = ["native", GSPLAT]
-ISAS = ["avx512", "avx2", "sse4"] if platform.machine() in ("x86_64", "AMD64") else ["baseline"]
 
 
 @pytest.fixture(autouse=True)
@@ -92,6 +94,7 @@ def test_gradient_of_one_output_only(loss: str) -> None:
         assert relative_error(found[name], value) < 1e-3, name  # a pixel at a cutoff may be among them
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize("threads", [2, 3, 7])
 def test_threads_do_not_change_a_bit(threads: int) -> None:
     scene = random_scene(9, count=5000, coefficients=9, width=200, height=170)
@@ -130,3 +133,17 @@ def test_reference_gradients_match_finite_differences() -> None:
         return torch.cat([rendering.image, rendering.alpha[..., None]], -1)
 
     assert torch.autograd.gradcheck(rgba, tuple(tensors.values()), eps=1e-6, atol=1e-6, rtol=1e-4)
+
+
+def test_the_environment_chooses_the_level() -> None:
+    """`MIEN_ISA` names one; what is not there is told with those that are."""
+    ask = [sys.executable, "-c", "from mien import _native; print(_native.rasterize_isa())"]
+    for name in ISAS:
+        if _native.set_rasterize_isa(name):
+            chosen = subprocess.run(
+                ask, env={**os.environ, "MIEN_ISA": name}, capture_output=True, text=True, check=True
+            )
+            assert chosen.stdout.strip() == name
+    wrong = subprocess.run(ask, env={**os.environ, "MIEN_ISA": "mmx"}, capture_output=True, text=True, check=False)
+    assert "MIEN_ISA=mmx: this machine has " in wrong.stderr
+    assert wrong.returncode == 1

@@ -143,6 +143,7 @@ def test_depth_of_one_ball_and_its_gradient() -> None:
     torch.testing.assert_close(means.grad, torch.tensor([[0.0, 0.0, 1.0]]), atol=1e-3, rtol=0)
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_views_of_one_call_equal_single_calls_to_the_bit(threads: int) -> None:
     """Of several views each is drawn by one thread; gradients of what they share add up in their order."""

@@ -82,6 +82,7 @@ def rendered_without_torch(avatar: Avatar, face: FaceParams, camera: Camera, fol
         return dict(pictures)
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
     "config",
     [GaussianAvatarsConfig(), GaussianAvatarsConfig(sh_degree=2), GaussianAvatarsConfig(sh_degree=1, sh_frame="head")],

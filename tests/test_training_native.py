@@ -1,26 +1,24 @@
 """The native parts of a training step against their plain PyTorch twins."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 from torch import Tensor
 
+from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.avatar import Moments
 from mien.avatar.penalties import triangle_penalties, triangle_penalties_reference
 from mien.training.adam import Update, update_all, update_reference
 from mien.training.density import observe_reference
-from needs import use_instructions
 
 COUNTS = (0, 1, 15, 16, 4097)
-ISAS = ("avx512", "avx2", "sse4")
 
 
 @pytest.fixture(params=ISAS)
-def isa(request: pytest.FixtureRequest):
-    before = _native.rasterize_isa()
-    use_instructions(request.param)
-    yield request.param
-    assert _native.set_rasterize_isa(before)
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    yield from each_isa(request)
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

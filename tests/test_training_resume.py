@@ -94,6 +94,7 @@ def test_finished_run_is_loaded(undisturbed: Path, capsys: pytest.CaptureFixture
     assert set(summary) == {"steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"}
 
 
+@pytest.mark.exact
 def test_threads_do_not_change_a_bit() -> None:
     """Whole steps on a real face model, with enough Gaussians that every native loop is divided."""
     results = []

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.rotation import invert_rigid, rigid_transform
+from mien.rotation import compose_rigid, invert_rigid, rigid_transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Camera:
 
     def in_frame(self, T_world_local: Float[Tensor, "4 4"]) -> "Camera":
         """The camera as seen from a local frame: it views local points as `self` views them in world space."""
-        return replace(self, viewmat=self.viewmat @ T_world_local)
+        return replace(self, viewmat=compose_rigid(self.viewmat, T_world_local))
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same view with another number of pixels."""
@@ -83,7 +83,17 @@ def look_at(
     position: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]
 ) -> Float[Tensor, "4 4"]:
     """The viewmat of a camera at `position` that looks at `target`; `up` points upwards in the picture."""
-    forward = torch.nn.functional.normalize(target - position, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
-    down = torch.linalg.cross(forward, right)
+    forward = _unit(target - position)
+    right = _unit(_cross(forward, up))
+    down = _cross(forward, right)
     return invert_rigid(rigid_transform(torch.stack([right, down, forward], dim=-1), position))
+
+
+# Each product and sum by itself, so that the bits are the same on every processor.
+def _cross(first: Float[Tensor, " 3"], second: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
+    return first.roll(-1) * second.roll(1) - first.roll(1) * second.roll(-1)
+
+
+def _unit(vector: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
+    x, y, z = (vector * vector).unbind()
+    return vector / ((x + y) + z).sqrt().clamp_min(1e-12)

@@ -148,7 +148,8 @@ class QualityRow:
     """All figures of one reference capture."""
 
     capture: str
-    content_hash: str
+    key: str
+    """Of the reference capture: `ReferenceCapture.key`."""
     method: str
     steps: int
     gaussians: int
@@ -167,14 +168,14 @@ class QualityRow:
 def markdown_table(rows: list[QualityRow]) -> str:
     """Pictures and trackings, as docs/results.md shows them."""
     lines = [
-        "| capture (hash) | protocol | what | whole frame: PSNR / SSIM / L1 / ST-LPIPS | head crop |",
+        "| capture (key) | protocol | what | whole frame: PSNR / SSIM / L1 / ST-LPIPS | head crop |",
         "|---|---|---|---|---|",
     ]
     for row in rows:
         for protocol, entry in row.protocols.items():
             named = {"avatar": entry, **entry["baselines"]}
             for what, figures in named.items():
-                label = f"{row.capture} (`{row.content_hash}`)" if what == "avatar" else ""
+                label = f"{row.capture} (`{row.key}`)" if what == "avatar" else ""
                 lines.append(f"| {label} | {protocol if what == 'avatar' else ''} | {what.replace('_', ' ')} | "
                              f"{_figures(figures)} | {_figures(figures['head'])} |")  # fmt: skip
     lines += [

@@ -152,6 +152,11 @@ def read_face_model(stem: Path, remedy: str = "delete it and load the model agai
     return model
 
 
+def face_model_edition(model: FaceModel) -> str:
+    """Tells editions of a model apart, alike on every machine: recipe and source of a baked one, else its hash."""
+    return _SOURCES[model.name].tag() if model.name in _SOURCES else model.content_hash
+
+
 def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
     """The landmark sets of a face model: those that ship with mien, or that were placed when the user added it.
 

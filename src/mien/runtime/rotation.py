@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+from mien import exact
+
 _SMALL_ANGLE_SQUARED = 1e-8
 
 
@@ -18,7 +20,7 @@ def matrix_from_axis_angle(axis_angle: Float[np.ndarray, "*b 3"]) -> Float[np.nd
     x, y, z = np.moveaxis(axis_angle, -1, 0)
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*axis_angle.shape, 3)
-    return np.eye(3) + sine * cross + cosine * (cross @ cross)
+    return np.eye(3) + sine * cross + cosine * exact.product(cross, cross)
 
 
 def compose_rigid(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
@@ -40,8 +42,8 @@ def axis_angle_from_matrix(matrices: Float[np.ndarray, "*b 3 3"]) -> Float[np.nd
             [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 - m[0, 0] - m[1, 1] + m[2, 2]],
         ])  # fmt: skip
         quat = outer[np.argmax(np.diagonal(outer))]
-        quat = quat / np.linalg.norm(quat) * (1 if quat[0] >= 0 else -1)
-        length = np.linalg.norm(quat[1:])
+        quat = quat / exact.length(quat) * (1 if quat[0] >= 0 else -1)
+        length = exact.length(quat[1:])
         angle = 2 * np.arctan2(length, quat[0])
         vectors[index] = quat[1:] * (angle / length if length > 1e-9 else 2.0)
     return vectors.reshape(matrices.shape[:-1])

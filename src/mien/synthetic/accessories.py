@@ -74,7 +74,7 @@ def _temple(anatomy: Anatomy, rim: np.ndarray, side: float) -> Float[np.ndarray,
     x_skin = np.abs(anatomy.skull_centre[0] + around[:, 0] * anatomy.skull_radius(around))
     x = np.maximum(x_skin + 0.0025, np.abs(outer[0]) * (1 - share) + 0.06 * share)
     x[0] = np.abs(outer[0])
-    x = np.convolve(np.pad(x, 2, mode="edge"), np.ones(5) / 5, "valid")
+    x = np.lib.stride_tricks.sliding_window_view(np.pad(x, 2, mode="edge"), 5).mean(-1)
     x[0] = np.abs(outer[0])
     return np.stack([side * x, y, z], -1)
 

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
+from mien import exact
 from mien.face import FaceModel
-from mien.render.mesh import vertex_normals
+from mien.synthetic.posing import landmark_positions, rest_vertices
 
 # MediaPipe's indices; "right" is the subject's right.
 LIPS_OUTER = (61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185)
@@ -75,8 +76,8 @@ class Anatomy:
         faces = self.faces[self.skin & ~self.region("ears")]
         random = np.random.default_rng(0)
         weights = random.dirichlet((1, 1, 1), (len(faces), 24)).astype(np.float32)
-        points = np.einsum("fsk,fkc->fsc", weights, self.vertices[faces]).reshape(-1, 3) - self.skull_centre
-        radius = np.linalg.norm(points, axis=-1)
+        points = exact.product(weights, self.vertices[faces]).reshape(-1, 3) - self.skull_centre
+        radius = exact.length(points)
         row, column = _cells(points / radius[:, None])
         radii = np.zeros((_ELEVATIONS, _AZIMUTHS), np.float32)
         np.maximum.at(radii, (row.astype(int) % _ELEVATIONS, column.astype(int) % _AZIMUTHS), radius)
@@ -116,19 +117,19 @@ class Anatomy:
 
 def measure(model: FaceModel, identity: torch.Tensor) -> Anatomy:
     """The anatomy of a person at rest."""
-    rest = model.template + torch.einsum("i,ivc->vc", identity, model.identity_basis)
+    rest, faces = rest_vertices(model, identity), model.faces.numpy()
     return Anatomy(
         model=model,
-        vertices=rest.numpy(),
-        normals=vertex_normals(rest, model.faces).numpy(),
-        faces=model.faces.numpy(),
-        landmarks=model.landmark_positions(rest, "mediapipe").numpy(),
+        vertices=rest,
+        normals=exact.vertex_normals(rest, faces),
+        faces=faces,
+        landmarks=landmark_positions(model, rest),
     )
 
 
 def resample(corners: Float[np.ndarray, "c 3"], points: int) -> Float[np.ndarray, "p 3"]:
     """Points at equal distances along a chain."""
-    lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=-1))])
+    lengths = np.concatenate([[0], np.cumsum(exact.length(np.diff(corners, axis=0)))])
     places = np.linspace(0, lengths[-1], points)
     return np.stack([np.interp(places, lengths, corners[:, axis]) for axis in range(3)], -1).astype(np.float32)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from mien import exact
 from mien.synthetic import anatomy as places
 from mien.synthetic.anatomy import Anatomy, face_view
 from mien.synthetic.hair import Strands, unit
@@ -28,7 +29,7 @@ class RootedStrands:
     def posed(self, anatomy: Anatomy, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Strands:
         """The strands on a head in motion (head frame)."""
         roots, frames = _frames(anatomy, self.faces, self.barycentric, vertices, normals)
-        points = roots[:, None] + np.einsum("nij,nsj->nsi", frames, self.local)
+        points = roots[:, None] + exact.product(self.local, np.swapaxes(frames, 1, 2))
         outwards = np.repeat(frames[:, None, :, 2], points.shape[1], axis=1)
         return Strands(points.astype(np.float32), self.widths, self.colors, np.ascontiguousarray(outwards))
 
@@ -73,7 +74,7 @@ def full_beard(anatomy: Anatomy, color: Float[np.ndarray, " 3"], length: float, 
     return RootedStrands(
         faces=faces,
         barycentric=barycentric,
-        local=np.einsum("nji,nsj->nsi", frames, offsets).astype(np.float32),
+        local=exact.product(offsets, frames).astype(np.float32),
         widths=(0.00062 * np.linspace(1, 0.45, _STEPS) * random.uniform(0.8, 1.2, (_COUNT, 1))).astype(np.float32),
         colors=colors.astype(np.float32),
     )
@@ -83,7 +84,7 @@ def _roots(anatomy: Anatomy, random: np.random.Generator) -> tuple[np.ndarray, n
     """Triangles, barycentric coordinates and places of the roots: in the zone, not on the lips."""
     candidates = np.flatnonzero(anatomy.skin & ~anatomy.region("ears", "nose"))
     corners = anatomy.vertices[anatomy.faces[candidates]]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    areas = exact.length(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     weights = areas * (beard_zone(anatomy, corners.mean(1)) > 0.01)
     view = face_view(anatomy)
     lips = view.polygon(anatomy.landmarks[list(places.LIPS_OUTER)], 0.0012)
@@ -91,7 +92,7 @@ def _roots(anatomy: Anatomy, random: np.random.Generator) -> tuple[np.ndarray, n
     while sum(len(part[0]) for part in kept) < _COUNT:
         chosen = random.choice(len(candidates), size=_COUNT, p=weights / weights.sum())
         barycentric = random.dirichlet((1, 1, 1), _COUNT).astype(np.float32)
-        points = np.einsum("nk,nkc->nc", barycentric, corners[chosen]).astype(np.float32)
+        points = exact.mixed(barycentric, corners[chosen]).astype(np.float32)
         in_front = points[:, 2] > anatomy.landmarks[list(places.LIPS_OUTER), 2].min() - 0.008
         on_lips = view.look_up(lips, points) * in_front > 0.25
         above_neck = smoothstep(-0.026, -0.012, points[:, 1] - anatomy.landmarks[places.CHIN, 1])
@@ -106,8 +107,9 @@ def _frames(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
     """Roots, and frames whose columns are a tangent along the triangle's first edge, a second tangent, the normal."""
     index = anatomy.faces[faces]
-    corners, weights = vertices[index], barycentric[..., None]
-    normal = unit((normals[index] * weights).sum(1))
+    corners = vertices[index]
+    normal = unit(exact.mixed(barycentric, normals[index]))
     edge = corners[:, 1] - corners[:, 0]
-    tangent = unit(edge - (edge * normal).sum(-1, keepdims=True) * normal)
-    return (corners * weights).sum(1), np.stack([tangent, np.cross(normal, tangent), normal], -1).astype(np.float32)
+    tangent = unit(edge - exact.dot(edge, normal)[:, None] * normal)
+    frames = np.stack([tangent, np.cross(normal, tangent), normal], -1).astype(np.float32)
+    return exact.mixed(barycentric, corners), frames

@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
+from mien.exact import dot, length, mixed, product
 from mien.synthetic.anatomy import BROWS_LOWER, BROWS_UPPER, LOWER_LIDS, SIDES, UPPER_LIDS, Anatomy, resample
 from mien.synthetic.noise import SolidNoise, smoothstep
 
@@ -52,13 +53,8 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors * (1 / np.sqrt(dot(vectors, vectors) + 1e-20))[..., None]
 
 
-def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray | np.floating:
-    """Scalar products over the last axis; several times faster than multiplying and summing."""
-    return np.einsum("...i,...i->...", first, second)
-
-
 def along(vectors: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Scalar products with one direction, without the linear algebra library, whose threads would spin for it."""
+    """Scalar products with one direction, in the dtype of `vectors`."""
     x, y, z = direction.tolist()
     return vectors[..., 0] * x + vectors[..., 1] * y + vectors[..., 2] * z
 
@@ -76,7 +72,7 @@ def short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, coun
     direction = unit(roots - centre)
     top = smoothstep(0.45, 0.8, direction[:, 1])  # 1 on top of the head, 0 at its sides
     low = smoothstep(0.05, -0.25, direction[:, 1])
-    length = (0.024 - 0.012 * low + 0.055 * top) * random.uniform(0.75, 1.15, count) * (1 + 0.25 * noise(roots, 0.03))
+    reach = (0.024 - 0.012 * low + 0.055 * top) * random.uniform(0.75, 1.15, count) * (1 + 0.25 * noise(roots, 0.03))
     stray = random.uniform(size=count) < 0.025
     layer = random.uniform(0.12, 1.0, count) + np.where(stray, random.uniform(0, 0.5, count), 0)
     parting = 1 - 0.75 * np.exp(-(((roots[:, 0] - part) / 0.006) ** 2)) * (roots[:, 2] > centre[2] - 0.04)
@@ -87,13 +83,13 @@ def short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, coun
     outwards = np.empty_like(points)
     for step in range(steps):
         place = step / (steps - 1)
-        rise = height * (1 - np.exp(-place * length / (0.5 * height + 1e-4))) * (1 - 0.3 * place**2)
+        rise = height * (1 - np.exp(-place * reach / (0.5 * height + 1e-4))) * (1 - 0.3 * place**2)
         radius = anatomy.skull_radius(direction) + rise - 0.001 * (step == 0)
         points[:, step] = centre + direction * radius[:, None]
         outwards[:, step] = direction
         combed = _combed(points[:, step], centre, part, noise) + wobble
-        combed -= (combed * direction).sum(-1, keepdims=True) * direction
-        direction = unit(direction + unit(combed) * (length / (steps - 1) / radius)[:, None])
+        combed -= dot(combed, direction)[:, None] * direction
+        direction = unit(direction + unit(combed) * (reach / (steps - 1) / radius)[:, None])
     taper = np.linspace(1, 0.45, steps) * random.uniform(0.75, 1.25, count)[:, None]
     shade = 0.35 + 0.65 * np.clip(layer, 0, 1)[:, None] * smoothstep(-0.15, 0.5, np.linspace(0, 1, steps))
     tint = np.exp(0.16 * random.normal(size=(count, 1)) + 0.2 * noise(roots, 0.012)[:, None])
@@ -105,14 +101,14 @@ def scalp_points(anatomy: Anatomy, count: int, random: np.random.Generator) -> F
     """Places on the scalp where hair grows, evenly spread, thinning out at the hairline."""
     faces = anatomy.faces[anatomy.skin & ~anatomy.region("ears")]
     corners = anatomy.vertices[faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    areas = length(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     inside = anatomy.hair_share(corners.mean(1)) > 0.02
     weights = areas * inside
     found: list[np.ndarray] = []
     total = 0
     while total < count:
         chosen = random.choice(len(faces), size=count, p=weights / weights.sum())
-        points = np.einsum("nk,nkc->nc", random.dirichlet((1, 1, 1), count), corners[chosen]).astype(np.float32)
+        points = mixed(random.dirichlet((1, 1, 1), count), corners[chosen]).astype(np.float32)
         kept = points[anatomy.hair_share(points + random.normal(0, 0.0015, points.shape)) > random.uniform(size=count)]
         found.append(kept)
         total += len(kept)
@@ -124,10 +120,10 @@ def _combed(
 ) -> Float[np.ndarray, "n 3"]:
     """Away from the parting on top, down and back at the sides, down at the back; in locks."""
     relative = points - centre
-    top = smoothstep(0.2, 0.85, relative[:, 1] / np.linalg.norm(relative, axis=-1))
+    top = smoothstep(0.2, 0.85, relative[:, 1] / length(relative))
     front = smoothstep(0.0, 0.08, relative[:, 2])
     aside = np.tanh((points[:, 0] - part) / 0.006) * (0.3 + 0.7 * top)
-    high = smoothstep(-0.05, 0.35, relative[:, 1] / np.linalg.norm(relative, axis=-1))
+    high = smoothstep(-0.05, 0.35, relative[:, 1] / length(relative))
     sweep = front * high  # from the forehead the hair goes up, aside and back
     down = -0.15 - 1.1 * (1 - top) * (1 - sweep) + 0.35 * sweep
     combed = np.stack([aside * (1 + 0.2 * sweep), down, -0.5 - 0.25 * sweep], -1)
@@ -150,9 +146,8 @@ class SkinStrands:
     def posed(self, anatomy: Anatomy, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Strands:
         """The strands on a head in motion (head frame)."""
         corners = anatomy.faces[self.faces]
-        weights = self.barycentric[..., None]
-        outwards = unit((normals[corners] * weights).sum(2))
-        points = (vertices[corners] * weights).sum(2) + self.heights[..., None] * outwards
+        outwards = unit(mixed(self.barycentric, normals[corners]))
+        points = mixed(self.barycentric, vertices[corners]) + self.heights[..., None] * outwards
         return Strands(points, self.widths, self.colors, outwards)
 
 
@@ -204,16 +199,17 @@ def front_points(
     candidates = np.flatnonzero(anatomy.skin)
     corners = anatomy.vertices[anatomy.faces[candidates]]
     centres = corners.mean(1)
+    squares = dot(centres, centres)
     faces = np.empty(len(points), np.int64)
     weights = np.empty((len(points), 3), np.float32)
     for start in range(0, len(points), 512):
         part = points[start : start + 512]
-        away = (centres * centres).sum(-1) - 2 * part @ centres.T
+        away = squares - 2 * product(part, centres.T)
         near = np.argpartition(away, 12, axis=1)[:, :12]
         barycentric = _barycentric(part[:, None], corners[near])
         clamped = np.clip(barycentric, 0, 1)
         clamped /= clamped.sum(-1, keepdims=True)
-        distance = np.linalg.norm((clamped[..., None] * corners[near]).sum(2) - part[:, None], axis=-1)
+        distance = length(mixed(clamped, corners[near]) - part[:, None])
         best = distance.argmin(1)
         rows = np.arange(len(part))
         faces[start : start + 512] = candidates[near[rows, best]]
@@ -224,8 +220,8 @@ def front_points(
 def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
     e1, e2, d = b - a, c - a, points - a
-    d11, d12, d22 = (e1 * e1).sum(-1), (e1 * e2).sum(-1), (e2 * e2).sum(-1)
-    p1, p2 = (d * e1).sum(-1), (d * e2).sum(-1)
+    d11, d12, d22 = dot(e1, e1), dot(e1, e2), dot(e2, e2)
+    p1, p2 = dot(d, e1), dot(d, e2)
     determinant = np.maximum(d11 * d22 - d12 * d12, 1e-18)
     v, w = (d22 * p1 - d12 * p2) / determinant, (d11 * p2 - d12 * p1) / determinant
     return np.stack([1 - v - w, v, w], -1)
@@ -241,16 +237,16 @@ def lash_strands(
     points, outwards, widths = [], [], []
     on_lid = eye_radius + 0.0012
     for side, centre in zip(SIDES, eye_centres, strict=True):
-        for rims, length, curl, count in ((UPPER_LIDS, 0.0058, 0.62, 44), (LOWER_LIDS, 0.0030, -0.5, 24)):
+        for rims, longest, curl, count in ((UPPER_LIDS, 0.0058, 0.62, 44), (LOWER_LIDS, 0.0030, -0.5, 24)):
             roots = resample(landmarks[list(rims[side])], count + 6)[3:-3]
             radial = unit(roots - centre)
             # Where landmarks lie on the inner fold of a lid, lashes start on its outside.
-            roots = centre + np.maximum(np.linalg.norm(roots - centre, axis=-1, keepdims=True), on_lid) * radial
+            roots = centre + np.maximum(length(roots - centre)[:, None], on_lid) * radial
             aside = np.linspace(0.6, -0.25, count)[:, None] * np.array([1.0 if side == "left" else -1.0, 0, 0])
             vary = 1 + 0.25 * np.sin(np.arange(count) * 12.9898) * np.cos(np.arange(count) * 4.1)
             upward = np.array([0.0, 1.0, 0.0]) - radial[:, 1:2] * radial
             t = np.linspace(0, 1, steps)[None, :, None]
-            reach = (length * vary * (0.65 + 0.35 * np.sin(np.linspace(0.2, 2.6, count))))[:, None, None]
+            reach = (longest * vary * (0.65 + 0.35 * np.sin(np.linspace(0.2, 2.6, count))))[:, None, None]
             bend = t * (radial + 0.5 * aside)[:, None] + curl * t * t * upward[:, None]
             points.append(roots[:, None] + reach * bend)
             outwards.append(np.repeat(radial[:, None], steps, 1))

@@ -7,12 +7,19 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from mien import exact
 from mien.camera import Camera, look_at
 from mien.render.mesh import rasterize_mesh, sh_basis
+from mien.synthetic.posing import project
 
 # Clamped cosine in spherical harmonics, degrees 0, 1, 2 (Ramamoorthi and Hanrahan 2001, "An efficient representation
 # for irradiance environment maps").
 _CLAMPED_COSINE = np.array([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5, np.float32)
+# Those of `mien.render.mesh.sh_basis`.
+_SH_FACTORS = np.array([
+    0.28209479177387814, *[0.4886025119029199] * 3, *[1.0925484305920792] * 2, 0.31539156525252005,
+    1.0925484305920792, 0.5462742152960396,
+])  # fmt: skip
 _DIRECTIONS = 112
 _MAP_SIZE = 224
 _MAP_DISTANCE = 20.0  # metres: nearly parallel rays, and depths that float32 still tells apart
@@ -54,9 +61,19 @@ class Lighting:
         """How bright each direction of world space is, in arbitrary units: lobes over the room."""
         total = self.ambient * (1 + 0.5 * directions[:, 1:2]) / 4
         for lamp in self.lamps:
-            lobe = np.exp(lamp.spread * (directions @ lamp.direction - 1)) * lamp.spread / (2 * math.pi)
+            lobe = np.exp(lamp.spread * (exact.dot(directions, lamp.direction) - 1)) * lamp.spread / (2 * math.pi)
             total = total + lobe[:, None] * lamp.color
         return total.astype(np.float32)
+
+
+def polynomial(sh_light: Float[np.ndarray, "9 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`mien.render.mesh.shade` as a polynomial of the normal: `constant + linear @ n + n @ square @ n`.
+
+    Shapes are [3], [3, 3] and [3, 3, 3]; the first axis is the colour channel.
+    """
+    one, y, z, x, xy, yz, zz, xz, xx_yy = (sh_light * _SH_FACTORS[:, None])[..., None]
+    square = np.concatenate([xx_yy, 0.5 * xy, 0.5 * xz, 0.5 * xy, -xx_yy, 0.5 * yz, 0.5 * xz, 0.5 * yz, 3 * zz], -1)
+    return (one - zz)[:, 0], np.concatenate([x, y, z], -1), square.reshape(3, 3, 3)
 
 
 def studio_lighting(seed: int) -> Lighting:
@@ -80,19 +97,26 @@ class Visibility:
     """Which directions each vertex sees, past the whole scene at rest, in the head frame."""
 
     directions: Float[np.ndarray, "d 3"]
-    transfer: Float[np.ndarray, "v d"]
+    transfer: Float[np.ndarray, "d v"]
     """Visible share times the clamped cosine."""
-    unshadowed: Float[np.ndarray, "v d"]
+    unshadowed: Float[np.ndarray, "d v"]
     """The clamped cosine alone."""
 
     def shadow(self, lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "v 3"]:
         """The share of the light, per colour channel, that reaches each vertex when the head is turned."""
-        radiance = lighting.radiance(self.directions @ R_world_head.T)
-        # By torch, whose threads the caller has set; numpy's linear algebra would start its own in every frame.
-        lit, full = (
-            (torch.from_numpy(m) @ torch.from_numpy(radiance)).numpy() for m in (self.transfer, self.unshadowed)
-        )
+        radiance = lighting.radiance(exact.rotated(self.directions, R_world_head))
+        lit, full = (_weighed(radiance, cosines) for cosines in (self.transfer, self.unshadowed))
         return (lit + 1e-4) / (full + 1e-4)
+
+
+def _weighed(radiance: Float[np.ndarray, "d 3"], cosines: Float[np.ndarray, "d v"]) -> Float[np.ndarray, "v 3"]:
+    """Light of all directions at each vertex, added up direction by direction."""
+    total = np.zeros((3, cosines.shape[1]), np.float32)
+    part = np.empty(cosines.shape[1], np.float32)
+    for row, color in zip(cosines, radiance, strict=True):
+        for channel in range(3):
+            total[channel] += np.multiply(row, color[channel], out=part)
+    return np.ascontiguousarray(total.T)
 
 
 def compute_visibility(
@@ -108,10 +132,10 @@ def compute_visibility(
     polar, azimuth = np.arccos(1 - 2 * index / _DIRECTIONS), math.pi * (1 + 5**0.5) * index  # Fibonacci's spiral
     directions = np.stack([np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth)], -1)
     directions = directions.astype(np.float32)
-    unshadowed = np.clip(normals @ directions.T, 0, None)
+    unshadowed = np.clip(exact.product(directions, normals.T), 0, None)
     if occluders is None:
         return Visibility(directions, unshadowed, unshadowed)
-    visible = np.stack([_lit_share(points + 0.0015 * normals, direction, occluders) for direction in directions], -1)
+    visible = np.stack([_lit_share(points + 0.0015 * normals, direction, occluders) for direction in directions])
     return Visibility(directions, unshadowed * visible, unshadowed)
 
 
@@ -119,14 +143,14 @@ def _lit_share(
     points: np.ndarray, direction: np.ndarray, occluders: tuple[np.ndarray, np.ndarray]
 ) -> Float[np.ndarray, " v"]:
     centre = torch.from_numpy(occluders[0].mean(0))
-    radius = float(np.linalg.norm(occluders[0] - occluders[0].mean(0), axis=-1).max()) * 1.02
+    radius = float(exact.length(occluders[0] - occluders[0].mean(0)).max()) * 1.02
     up = torch.tensor([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else torch.tensor([0.0, 0.0, 1.0])
     focal = 0.5 * _MAP_SIZE * _MAP_DISTANCE / radius
     K = torch.tensor([[focal, 0, _MAP_SIZE / 2], [0, focal, _MAP_SIZE / 2], [0, 0, 1]])
     viewmat = look_at(centre + _MAP_DISTANCE * torch.from_numpy(direction), centre, up)
     camera = Camera(K, viewmat, _MAP_SIZE, _MAP_SIZE)
     depth_map = rasterize_mesh(torch.from_numpy(occluders[0]), torch.from_numpy(occluders[1]), camera).depth.numpy()
-    pixels, depth = (array.numpy() for array in camera.project(torch.from_numpy(points)))
+    pixels, depth = project(camera, points)
     lit = np.zeros(len(points), np.float32)
     for dx in (-1, 0, 1):
         for dy in (-1, 0, 1):
@@ -138,4 +162,4 @@ def _lit_share(
 
 def _unit(x: float, y: float, z: float) -> np.ndarray:
     vector = np.array([x, y, z], np.float32)
-    return vector / np.linalg.norm(vector)
+    return vector / exact.length(vector)

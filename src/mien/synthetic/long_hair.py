@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from mien import exact
 from mien.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy
 from mien.synthetic.hair import Strands, scalp_points, unit
 from mien.synthetic.noise import SolidNoise, smoothstep
@@ -24,7 +25,7 @@ class DrapedStrands:
     def posed(self, T_head_shoulders: Float[np.ndarray, "4 4"]) -> Strands:
         """The strands in the head frame when the shoulders are turned against the head."""
         points = self.rest.points
-        on_shoulders = np.einsum("ij,nsj->nsi", T_head_shoulders[:3, :3], points) + T_head_shoulders[:3, 3]
+        on_shoulders = exact.rotated(points, T_head_shoulders[:3, :3], T_head_shoulders[:3, 3])
         moved = points + self.follow[..., None] * (on_shoulders - points)
         return Strands(moved.astype(np.float32), self.rest.widths, self.rest.colors, self.rest.outwards)
 
@@ -90,7 +91,7 @@ class _Path:
         aside = self._side * (0.15 + 1.1 * top + 0.35 * front)
         combed = np.stack([aside, -1.0 + 0.6 * top + 0.35 * front, -0.35 * top - 0.5 * front], -1)
         on_skull = smoothstep(0.1, 0.5, outward[:, 1])[:, None]
-        inward = (combed * outward).sum(-1, keepdims=True) * outward
+        inward = exact.dot(combed, outward)[:, None] * outward
         down = np.stack([-0.04 * np.sign(points[:, 0]), -np.ones(len(points)), np.full(len(points), 0.02)], -1)
         return unit(on_skull * (combed - inward) + (1 - on_skull) * down)
 
@@ -98,7 +99,7 @@ class _Path:
         """The points moved out of the head by their layer's height, and off the face."""
         points = self._beside_the_face(points.astype(np.float32))
         relative = points - self._centre
-        radius = np.linalg.norm(relative, axis=-1)
+        radius = exact.length(relative)
         outward = relative / radius[:, None]
         top = smoothstep(0.3, 0.85, outward[:, 1])
         mirrored = points * np.array([1, 1, 1], np.float32)

@@ -4,10 +4,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from mien import exact
 from mien.face import FaceModel, FaceParams
-from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.synthetic.expressions import Tracks, expression_tracks
 from mien.synthetic.noise import smoothstep
+from mien.synthetic.posing import rest_joints
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.script import Span, moving_clock, share_of, spans_of, wide_turns
 
@@ -33,15 +35,16 @@ def head_motion(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRecip
     gaze = _gaze(random, times, spans) if recipe.blinks else np.zeros((len(times), 2))
     gaze -= np.clip(0.85 * pitch_yaw_roll[:, :2], -_MAX_GAZE, _MAX_GAZE)  # the eyes keep looking into the camera
     tracks = expression_tracks(random, times, recipe.expression, spans, blinks=recipe.blinks)
-    rotations = euler_matrices(torch.from_numpy(pitch_yaw_roll).float())
+    rotations = euler_matrices(pitch_yaw_roll)
     pivot = neck_pivot(model, identity)
-    anchor = torch.tensor([0.0, 0.0, -recipe.distance]) + pivot + torch.from_numpy(sway).float()
+    anchor = np.array([0.0, 0.0, -recipe.distance]) + pivot + sway
+    head_rotation = axis_angle_from_matrix(rotations)
     return FaceParams(
         identity=identity,
         expression=_expression(model, tracks, len(times)),
-        joints=_joints(model, rotations, torch.from_numpy(gaze).float()),
-        head_rotation=axis_angle_from_matrix(rotations),
-        head_translation=anchor - rotations @ pivot,
+        joints=_joints(model, rotations, head_rotation, gaze),
+        head_rotation=torch.from_numpy(head_rotation).float(),
+        head_translation=torch.from_numpy(anchor - exact.dot(rotations, pivot)).float(),
     )
 
 
@@ -49,24 +52,23 @@ SHOULDERS_FOLLOW = 0.25
 """The share of the head's rotation that the shoulders make too."""
 
 
-def shoulder_rotation(head_rotation: Float[torch.Tensor, "*b 3"]) -> Float[torch.Tensor, "*b 3 3"]:
+def shoulder_rotation(head_rotation: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
     """Rotations of the shoulders, from the head's as axis-angle."""
     return matrix_from_axis_angle(SHOULDERS_FOLLOW * head_rotation)
 
 
-def neck_pivot(model: FaceModel, identity: torch.Tensor) -> Float[torch.Tensor, " 3"]:
+def neck_pivot(model: FaceModel, identity: torch.Tensor) -> Float[np.ndarray, " 3"]:
     """The point of the head frame, at the neck joint, that nods and turns leave in place."""
-    rest = model.joint_template + torch.einsum("i,ikc->kc", identity, model.joint_identity_basis)
     if "neck" in model.joint_names:
-        return rest[model.joint_names.index("neck")]
-    return torch.tensor([0.0, -0.10, -0.02])
+        return rest_joints(model, identity)[model.joint_names.index("neck")]
+    return np.array([0.0, -0.10, -0.02])
 
 
-def euler_matrices(pitch_yaw_roll: Float[torch.Tensor, "*b 3"]) -> Float[torch.Tensor, "*b 3 3"]:
+def euler_matrices(pitch_yaw_roll: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
     """Roll, then pitch, then yaw, about the head's +z, +x and +y axes, radians; positive pitch looks down."""
-    axes = torch.eye(3)
+    axes = np.eye(3)
     pitch, yaw, roll = (matrix_from_axis_angle(pitch_yaw_roll[..., i, None] * axes[i]) for i in range(3))
-    return yaw @ pitch @ roll
+    return exact.product(exact.product(yaw, pitch), roll)
 
 
 def _drift(random: np.random.Generator, times: np.ndarray, amplitude: float) -> np.ndarray:
@@ -108,13 +110,16 @@ def _expression(model: FaceModel, tracks: Tracks, timesteps: int) -> Float[torch
 
 
 def _joints(
-    model: FaceModel, rotations: Float[torch.Tensor, "t 3 3"], gaze: Float[torch.Tensor, "t 2"]
+    model: FaceModel,
+    rotations: Float[np.ndarray, "t 3 3"],
+    head_rotation: Float[np.ndarray, "t 3"],
+    gaze: Float[np.ndarray, "t 2"],
 ) -> Float[torch.Tensor, "t j 3"]:
-    joints = torch.zeros(len(gaze), len(model.free_joint_names), 3)
-    shoulders = shoulder_rotation(axis_angle_from_matrix(rotations))
+    joints = np.zeros((len(gaze), len(model.free_joint_names), 3))
+    shoulders = shoulder_rotation(head_rotation)
     for column, name in enumerate(model.free_joint_names):
         if "eye" in name:
             joints[:, column, :2] = gaze
         elif name == "neck":
-            joints[:, column] = axis_angle_from_matrix(rotations.transpose(-1, -2) @ shoulders)
-    return joints
+            joints[:, column] = axis_angle_from_matrix(exact.product(np.swapaxes(rotations, 1, 2), shoulders))
+    return torch.from_numpy(joints).float()

@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien import exact
 from mien.face import FaceModel, FaceParams
 from mien.synthetic.noise import SolidNoise, smoothstep
+from mien.synthetic.posing import rest_vertices
 
 _EXTRA = (("jawOpen", "mouthSmileLeft"), ("mouthPucker", "mouthFunnel"), ("browInnerUp", "browDownLeft"))
 """Pairs of expressions whose product drives a field of its own: muscles that work together do not just add up."""
@@ -33,7 +35,8 @@ class OffModel:
         times = np.arange(len(face)) / fps
         extra = [face.expression[:, names.index(first)] * face.expression[:, names.index(second)]
                  for first, second in _EXTRA]  # fmt: skip
-        active = face.expression.abs().sum(-1).clamp(0, 1)  # a resting face rests
+        total = np.abs(face.expression.numpy()).sum(-1)
+        active = torch.from_numpy(np.clip(total, 0, 1))  # a resting face rests
         for _ in range(_WANDERING):
             wave = np.sin(2 * np.pi * (random.uniform(0.2, 0.45) * times + random.uniform())).astype(np.float32)
             extra.append(torch.from_numpy(wave).clamp_min(0) * active)
@@ -42,8 +45,7 @@ class OffModel:
 
 def bend_off_model(model: FaceModel, identity: Float[Tensor, " i"], strength: float, seed: int) -> OffModel:
     """A head beyond the face model, from a seed; `strength` 1 moves vertices by some 5 mm, and no eye."""
-    rest = model.template + torch.einsum("i,ivc->vc", identity, model.identity_basis)
-    points, noise = rest.numpy(), SolidNoise(seed + 101)
+    points, noise = rest_vertices(model, identity), SolidNoise(seed + 101)
     free = _away_from_eyes(model, points)
     offsets = torch.from_numpy(strength * free[:, None] * _warp(points, noise)).float()
     basis = _bent_expressions(model, points, strength * free, noise)
@@ -67,7 +69,7 @@ def _away_from_eyes(model: FaceModel, points: np.ndarray) -> Float[np.ndarray, "
     free = smoothstep(-0.13, -0.08, points[:, 1])
     for side in (-1.0, 1.0):
         centre = points[eyes[points[eyes, 0] * side > 0]].mean(0)
-        free = free * smoothstep(_EYE_INNER, _EYE_OUTER, np.linalg.norm(points - centre, axis=-1))
+        free = free * smoothstep(_EYE_INNER, _EYE_OUTER, exact.length(points - centre))
     return free.astype(np.float32)
 
 
@@ -94,7 +96,7 @@ def _bent_expressions(
     for index, field in enumerate(basis):
         gain = 1 + 0.45 * share * noise(points + 0.61 * index, 0.05)
         aside = 0.25 * share[:, None] * _field(points, noise, 0.06, 0.37 * index)
-        basis[index] = field * gain[:, None] + np.linalg.norm(field, axis=-1, keepdims=True) * aside
+        basis[index] = field * gain[:, None] + exact.length(field)[:, None] * aside
     return torch.from_numpy(basis)
 
 

@@ -7,12 +7,14 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 
+from mien import exact
 from mien.camera import Camera
 from mien.render.mesh import MeshFragments, interpolate, rasterize_mesh
 from mien.synthetic import shading
 from mien.synthetic.anatomy import LIPS_OUTER, SIDES, UPPER_LIDS
 from mien.synthetic.hair import unit
 from mien.synthetic.noise import SolidNoise
+from mien.synthetic.posing import project
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.subject import (
     EYE,
@@ -157,10 +159,9 @@ def _paint_mouth(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
     values = canvas.interpolate(rows, attributes, _model_faces(canvas))
     normals, points, rest = unit(values[:, :3]), values[:, 3:6], values[:, 6:]
     lips = posed.landmarks[list(LIPS_OUTER)]
-    bend = np.polyfit(lips[:, 0], lips[:, 2], 2)
-    depth = np.polyval(bend, points[:, 0]).astype(np.float32) - points[:, 2]
+    depth = exact.Parabola(lips[:, 0], lips[:, 2])(points[:, 0]).astype(np.float32) - points[:, 2]
     views = canvas.views(canvas.pixels[rows])
-    normals = np.where((normals * views).sum(-1, keepdims=True) < 0, -normals, normals)
+    normals = np.where(exact.dot(normals, views)[:, None] < 0, -normals, normals)
     if canvas.material[rows[0]] == TEETH:
         teeth = posed.head[np.unique(subject.anatomy.faces[subject.anatomy.region("teeth")]), 2]
         return shading.shade_teeth(rest, normals, teeth.max() - points[:, 2], views, canvas.light)
@@ -184,7 +185,7 @@ def _paint_shirt(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
     assert subject.shirt is not None
     R = canvas.posed.T_head_shoulders[:3, :3]
     attributes = np.zeros((len(canvas.vertices), 6), np.float32)
-    attributes[-len(subject.shirt.vertices) :, :3] = subject.shirt.normals @ R.T
+    attributes[-len(subject.shirt.vertices) :, :3] = exact.rotated(subject.shirt.normals, R)
     attributes[-len(subject.shirt.vertices) :, 3:] = subject.shirt.vertices
     values = canvas.interpolate(rows, attributes, subject.faces)
     noise = SolidNoise(5)
@@ -214,7 +215,7 @@ def _add_lenses(canvas: _Canvas, image: Float[np.ndarray, "p 3"]) -> None:
     glasses = canvas.subject.glasses
     assert glasses is not None
     lenses, camera = glasses.lenses, canvas.camera
-    projected = camera.project(torch.from_numpy(lenses.vertices))[0].numpy()
+    projected = project(camera, lenses.vertices)[0]
     size = (camera.width, camera.height)
     left, top = (int(v) for v in np.clip(np.floor(projected.min(0)), 0, size))
     right, bottom = (int(v) for v in np.clip(np.ceil(projected.max(0)), 0, size))

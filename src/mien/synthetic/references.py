@@ -7,7 +7,7 @@ from pathlib import Path
 from mien.errors import UserError
 from mien.synthetic.recipe import Segment, SyntheticRecipe
 from mien.synthetic.scene import SyntheticScene
-from mien.synthetic.writing import hash_scene, write_scene
+from mien.synthetic.writing import scene_key, write_scene
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class ReferenceCapture:
         return scenes
 
     def write(self, folder: Path) -> str:
-        """Draw every sequence into FOLDER/NAME, unless it is there; returns the hash of the whole reference."""
-        return combined_hash([write_scene(scene, folder / scene.recipe.name) for scene in self.scenes()])
+        """Draw every sequence into FOLDER/NAME, unless it is there; returns the key of the whole reference."""
+        return _combined([write_scene(scene, folder / scene.recipe.name) for scene in self.scenes()])
 
-    def hash_in_memory(self) -> str:
-        """The same hash, without writing anything: for tiny versions."""
-        return combined_hash([hash_scene(scene) for scene in self.scenes()])
+    def key(self) -> str:
+        """What figures on this reference are quoted with: the same on every machine, changed with recipe or drawing."""
+        return _combined([scene_key(scene) for scene in self.scenes()])
 
     def tiny(self) -> "ReferenceCapture":
         """The same people and motions in three frames of 64x64 pixels from at most three cameras: for tests."""
@@ -53,9 +53,9 @@ class ReferenceCapture:
         return replace(self, sequences=tuple(small))
 
 
-def combined_hash(hashes: list[str]) -> str:
-    """One sequence's own hash, or one over those of several."""
-    return hashes[0] if len(hashes) == 1 else hashlib.sha256(" ".join(hashes).encode()).hexdigest()[:16]
+def _combined(keys: list[str]) -> str:
+    """One sequence's own key, or one over those of several."""
+    return keys[0] if len(keys) == 1 else hashlib.sha256(" ".join(keys).encode()).hexdigest()[:16]
 
 
 def reference_named(name: str) -> ReferenceCapture:

@@ -11,11 +11,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from mien import exact
 from mien.camera import Camera
 from mien.face import FaceModel, load_face_model
 from mien.synthetic.motion import head_motion
 from mien.synthetic.off_model import bend_off_model
 from mien.synthetic.painter import develop, draw, to_uint8, wall
+from mien.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.rig import cameras_of
 from mien.synthetic.subject import Subject, build_subject, pose_subject
@@ -81,17 +83,23 @@ class SyntheticScene:
         return build_subject(self.drawn_model, self.identity, self.recipe, self.seed)
 
     @cached_property
+    def _poser(self) -> HeadPoser:
+        return HeadPoser(self.drawn_model, self.identity)
+
+    @cached_property
     def background(self) -> Float[np.ndarray, "h w 3"]:
         """The empty room, linear; it looks the same to every camera."""
         return wall(self.recipe, self.seed)
 
     def vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
         """True vertices of the head, in the face model's topology, world space, metres."""
-        return self.drawn_model.vertices_reference(self._drawn_face[timestep])[0]
+        face = self._drawn_face[timestep]
+        T = head_pose(face)
+        return torch.from_numpy(exact.rotated(self._poser(face), T[:3, :3], T[:3, 3]))
 
     def head_vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
         """True vertices of the head in the head frame, metres."""
-        return self.drawn_model.head_vertices_reference(self._drawn_face[timestep])[0]
+        return torch.from_numpy(self._poser(self._drawn_face[timestep]))
 
     def frame(self, timestep: int, camera: int = 0) -> SyntheticFrame:
         """One picture; the same bytes every time. Safe to call from several threads at once."""
@@ -103,7 +111,7 @@ class SyntheticScene:
         posed = pose_subject(self.subject, face, self.camera.position.numpy())
         frames = []
         for index in range(len(self.cameras)) if cameras is None else cameras:
-            camera = self.cameras[index].in_frame(face.T_world_head[0])
+            camera = self.cameras[index].in_frame(torch.from_numpy(head_pose(face)))
             seen = replace(posed, viewpoint=camera.position.numpy())
             colors, coverage = draw(self.subject, seen, camera, self.recipe.supersample)
             image = develop(colors, coverage, self.background)
@@ -143,9 +151,9 @@ class SyntheticScene:
         """MediaPipe's 478 points of every timestep in pixels, by the face model's embedding, hidden ones too."""
         projected = []
         for timestep in range(self.recipe.timesteps):
-            points = self.model.landmark_positions(self.vertices(timestep), "mediapipe")
-            projected.append(self.cameras[camera].project(points)[0])
-        return torch.stack(projected).numpy()
+            points = landmark_positions(self.model, self.vertices(timestep).numpy())
+            projected.append(project(self.cameras[camera], points)[0])
+        return np.stack(projected)
 
     def tracking(self) -> Tracking:
         """The truth. With `recipe.off_model` it is the truth only for head pose, cameras and the neutral shape."""

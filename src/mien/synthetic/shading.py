@@ -6,9 +6,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mien.render.mesh import sample_texture, sh_basis
-from mien.synthetic.hair import Strands, along, dot, unit
-from mien.synthetic.light import Lighting
+from mien import exact
+from mien.exact import dot
+from mien.render.mesh import sample_texture
+from mien.synthetic.hair import Strands, along, unit
+from mien.synthetic.light import Lighting, polynomial
 from mien.synthetic.noise import smoothstep
 
 _HIGHLIGHT = 0.2
@@ -39,15 +41,17 @@ class LocalLight:
 
 def turned(lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> LocalLight:
     """The light for one head pose."""
-    # Nine directions and more decide the ten factors, up to xx + yy + zz = 1, which least squares shares out.
-    directions = unit(np.random.default_rng(0).standard_normal((40, 3)))
-    world = torch.from_numpy((directions @ R_world_head.T).astype(np.float32))
-    values = sh_basis(world).numpy() @ lighting.sh_light
-    x, y, z = directions.T
-    monomials = np.stack([x * x, y * y, z * z, x * y, y * z, x * z, x, y, z, np.ones_like(x)], -1)
-    quadratic = np.linalg.lstsq(monomials, values.astype(np.float64), rcond=None)[0].astype(np.float32)
+    constant, linear, square = (part.astype(np.float64) for part in polynomial(lighting.sh_light))
+    R = R_world_head.astype(np.float64)
+    linear = exact.product(linear, R)
+    square = exact.product(exact.product(R.T, square), R)
+    # Since xx + yy + zz = 1, a part of the constant can be in the squares: the share that makes all factors small.
+    share = (constant - square[:, 0, 0] - square[:, 1, 1] - square[:, 2, 2]) / 4
+    rows = [square[:, axis, axis] + share for axis in range(3)]
+    rows += [2 * square[:, first, second] for first, second in ((0, 1), (1, 2), (0, 2))]
+    quadratic = np.stack([*rows, *linear.T, constant - share]).astype(np.float32)
     bright = [lamp for lamp in lighting.lamps if lamp.color.max() > _HIGHLIGHT]
-    lamps = tuple(((R_world_head.T @ lamp.direction).astype(np.float32), lamp.color) for lamp in bright)
+    lamps = tuple((exact.rotated(lamp.direction, R_world_head.T).astype(np.float32), lamp.color) for lamp in bright)
     return LocalLight(quadratic, lamps)
 
 
@@ -134,7 +138,7 @@ def shade_eye(
         iris: Its size (sine of the angle to its rim), its colour, and whether the eye is wet.
     """
     size, color, is_wet = iris
-    radius = np.linalg.norm(local[:, :2], axis=-1)
+    radius = exact.length(local[:, :2])
     q = radius / size
     turn = np.arctan2(local[:, 1], local[:, 0])
     fibres = _fibres(turn, q)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from mien import exact
 from mien.camera import Camera
 from mien.render.mesh import interpolate, rasterize_mesh
 from mien.synthetic import anatomy as places
@@ -114,7 +115,8 @@ def _vertex_share(anatomy: Anatomy, region: str) -> Float[np.ndarray, " v"]:
 
 def _near(points: np.ndarray, centre: np.ndarray, radius: float) -> Float[np.ndarray, " n"]:
     """A soft ball: 1 at its centre."""
-    return np.exp(-((points - centre) ** 2).sum(-1) / (2 * radius * radius))
+    away = points - centre
+    return np.exp(-exact.dot(away, away) / (2 * radius * radius))
 
 
 def _paint_zones(canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise) -> None:
@@ -147,7 +149,7 @@ def _paint_detail(
     canvas.albedo[:] *= np.exp(np.outer(spots, [-0.18, -0.34, -0.4]))
     for _ in range(random.integers(5, 10)):
         spot = points[random.integers(len(points))]
-        mole = smoothstep(1.0, 0.6, np.linalg.norm(points - spot, axis=-1) / random.uniform(0.0009, 0.0019))
+        mole = smoothstep(1.0, 0.6, exact.length(points - spot) / random.uniform(0.0009, 0.0019))
         canvas.albedo[:] *= np.exp(np.outer(mole, [-0.9, -1.3, -1.5]))
         canvas.height[:] += 0.0002 * mole
     oily = _near(points, marks[places.NOSE_TIP], 0.016) + 0.7 * _near(points, marks[9], 0.03)
@@ -206,7 +208,7 @@ def _paint_brows(canvas: _Canvas, anatomy: Anatomy, view: FrontView, noise: Soli
         outline = middle + (outline - middle) * np.array([1.02, 0.78, 1.0])
         in_front = smoothstep(middle[2] - 0.05, middle[2] - 0.03, points[:, 2])
         mask = view.look_up(view.polygon(outline, 0.0014), points) * in_front
-        hairs = noise(points @ np.array([[0.5, 0.5, 0], [0.35, 2.0, 0], [0.0, 0, 1]], np.float32), 0.0019)
+        hairs = noise(exact.product(points, np.array([[0.5, 0.5, 0], [0.35, 2.0, 0], [0.0, 0, 1]], np.float32)), 0.0019)
         share = np.clip(mask * (0.62 + 0.4 * hairs), 0, 0.9)[:, None]
         canvas.albedo[:] = canvas.albedo * (1 - share) + hair_color * share
         canvas.gloss[:] *= 1 - 0.7 * mask
@@ -238,11 +240,11 @@ def _surface_gradient(canvas: _Canvas, positions: Float[np.ndarray, "s s 3"]) ->
     inner = cv2.erode(canvas.covered.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)[canvas.covered]
     along = [central(positions, axis)[canvas.covered] for axis in (1, 0)]
     rise = [central(height, axis)[canvas.covered] for axis in (1, 0)]
-    a, b, c = (along[0] ** 2).sum(-1), (along[0] * along[1]).sum(-1), (along[1] ** 2).sum(-1)
+    a, b, c = (exact.dot(*pair) for pair in ((along[0], along[0]), (along[0], along[1]), (along[1], along[1])))
     determinant = np.maximum(a * c - b * b, 1e-16)
     u, v = (c * rise[0] - b * rise[1]) / determinant, (a * rise[1] - b * rise[0]) / determinant
     gradient = u[:, None] * along[0] + v[:, None] * along[1]
-    steep = np.linalg.norm(gradient, axis=-1, keepdims=True)
+    steep = exact.length(gradient)[:, None]
     return (gradient * np.minimum(1, 0.7 / np.maximum(steep, 1e-6)) * inner[:, None]).astype(np.float32)
 
 

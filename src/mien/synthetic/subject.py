@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from mien import exact
 from mien.face import FaceModel, FaceParams
-from mien.render.mesh import vertex_normals
 from mien.synthetic.accessories import Glasses, Part, build_glasses, build_shirt
 from mien.synthetic.anatomy import CHIN, SIDES, Anatomy, measure
 from mien.synthetic.beard import RootedStrands, full_beard
@@ -15,6 +15,7 @@ from mien.synthetic.hair import SkinStrands, Strands, brow_strands, lash_strands
 from mien.synthetic.light import Lighting, Visibility, compute_visibility, studio_lighting
 from mien.synthetic.long_hair import DrapedStrands, long_hair
 from mien.synthetic.motion import neck_pivot, shoulder_rotation
+from mien.synthetic.posing import HeadPoser, head_pose, landmark_positions
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.skin import SkinTextures, paint_skin
 
@@ -53,6 +54,7 @@ class Subject:
     """Everything of a person that does not move by itself; the head frame at rest."""
 
     model: FaceModel
+    poser: HeadPoser
     anatomy: Anatomy
     textures: SkinTextures
     lighting: Lighting
@@ -112,6 +114,7 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
     occluders = _occluders(anatomy, _at_rest(hair), glasses, shirt) if recipe.detail.shadows else None
     return Subject(
         model=model,
+        poser=HeadPoser(model, identity),
         anatomy=anatomy,
         textures=paint_skin(anatomy, recipe, seed, 0.75 * hair_color),
         lighting=studio_lighting(seed),
@@ -134,22 +137,22 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
 def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.ndarray, " 3"]) -> PosedSubject:
     """The subject at one timestep (`face` has a batch of one)."""
     model = subject.model
-    head = model.head_vertices_reference(face)[0]  # whose rounding stays, and with it the hash of pictures
-    landmarks = model.landmark_positions(head, "mediapipe").numpy()
-    normals = vertex_normals(head, model.faces).numpy()
-    T_world_head = face.T_world_head[0].numpy()
+    head = subject.poser(face)
+    landmarks = landmark_positions(model, head)
+    normals = exact.vertex_normals(head, subject.anatomy.faces)
+    T_world_head = head_pose(face)
     R = T_world_head[:3, :3]
-    centres = np.stack([head.numpy()[eye.vertices].mean(0) for eye in subject.eyes])
+    centres = np.stack([head[eye.vertices].mean(0) for eye in subject.eyes])
     T_head_shoulders = _shoulders(subject, face, R)
     return PosedSubject(
-        head=head.numpy(),
+        head=head,
         normals=normals,
         landmarks=landmarks,
         eye_centres=centres,
-        strands=_posed_strands(subject, head.numpy(), normals, landmarks, centres, T_head_shoulders),
+        strands=_posed_strands(subject, head, normals, landmarks, centres, T_head_shoulders),
         T_head_shoulders=T_head_shoulders,
         R_world_head=R,
-        viewpoint=R.T @ (camera_position - T_world_head[:3, 3]),
+        viewpoint=exact.rotated(camera_position - T_world_head[:3, 3], R.T),
     )
 
 
@@ -191,16 +194,16 @@ def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, 
         parts.append(subject.glasses.frame.vertices)
     if subject.shirt is not None:
         T = posed.T_head_shoulders
-        parts.append(subject.shirt.vertices @ T[:3, :3].T + T[:3, 3])
+        parts.append(exact.rotated(subject.shirt.vertices, T[:3, :3], T[:3, 3]))
     return np.concatenate(parts).astype(np.float32)
 
 
 def _shoulders(subject: Subject, face: FaceParams, R_world_head: np.ndarray) -> Float[np.ndarray, "4 4"]:
     """The shoulders turn less than the head, about the neck's joint."""
-    pivot = neck_pivot(subject.model, face.identity).numpy()
-    R = R_world_head.T @ shoulder_rotation(face.head_rotation)[0].numpy()
+    pivot = neck_pivot(subject.model, face.identity)
+    R = exact.product(R_world_head.T, shoulder_rotation(face.head_rotation[0].numpy()))
     T = np.eye(4, dtype=np.float32)
-    T[:3, :3], T[:3, 3] = R, pivot - R @ pivot
+    T[:3, :3], T[:3, 3] = R, pivot - exact.dot(R, pivot)
     return T
 
 
@@ -208,15 +211,15 @@ def _eye(anatomy: Anatomy, side: str) -> Eye:
     vertices = anatomy.eye_vertices(side)
     iris = np.intersect1d(vertices, np.unique(anatomy.faces[anatomy.region("irises")]))
     offsets = anatomy.vertices[vertices] - anatomy.vertices[vertices].mean(0)
-    directions = offsets / np.linalg.norm(offsets, axis=-1, keepdims=True)
+    directions = offsets / exact.length(offsets)[:, None]
     axis = directions[np.isin(vertices, iris)].mean(0) if len(iris) else np.array([0, 0, 1.0])
-    axis = axis / np.linalg.norm(axis)
+    axis = axis / exact.length(axis)
     right = np.cross([0, 1, 0], axis)
-    right /= np.linalg.norm(right)
+    right /= exact.length(right)
     basis = np.stack([right, np.cross(axis, right), axis]).T
-    rim = np.linalg.norm((directions @ basis)[np.isin(vertices, iris), :2], axis=-1).max() if len(iris) else 0.42
-    radius = float(np.linalg.norm(offsets, axis=-1).mean())
-    return Eye(vertices, (offsets @ basis).astype(np.float32), iris, radius, float(rim))
+    rim = exact.length(exact.product(directions, basis)[np.isin(vertices, iris), :2]).max() if len(iris) else 0.42
+    radius = float(exact.length(offsets).mean())
+    return Eye(vertices, exact.product(offsets, basis).astype(np.float32), iris, radius, float(rim))
 
 
 def _collar(anatomy: Anatomy) -> tuple[Float[np.ndarray, " 3"], tuple[float, float]]:
@@ -244,7 +247,7 @@ def _shoulder_points(
     beside = (centres[:, 1] < 0.02) & (centres[:, 1] > -0.06) & (np.abs(centres[:, 0]) > 1.02 * size[0])
     weights = np.random.default_rng(0).dirichlet((1, 1, 1), (beside.sum(), 40)).astype(np.float32)
     corners = anatomy.vertices[faces[beside]]
-    return np.concatenate([np.einsum("fsk,fkc->fsc", weights, corners).reshape(-1, 3), corners.reshape(-1, 3)])
+    return np.concatenate([exact.product(weights, corners).reshape(-1, 3), corners.reshape(-1, 3)])
 
 
 def _occluders(

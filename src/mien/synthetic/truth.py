@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from mien import exact
 from mien.errors import UserError
 from mien.storage import read_arrays, read_json, write_arrays, write_json
 from mien.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy, measure
@@ -40,17 +41,23 @@ class Truth:
     def vertices_world(self) -> Float[np.ndarray, "t n 3"]:
         """The region in world space."""
         poses = self.tracking.face.T_world_head.numpy()
-        return np.einsum("tij,tnj->tni", poses[:, :3, :3], self.vertices) + poses[:, None, :3, 3]
+        return exact.product(self.vertices, np.swapaxes(poses[:, :3, :3], 1, 2)) + poses[:, None, :3, 3]
 
 
 def truth_of(scene: SyntheticScene) -> Truth:
     """The truth of a scene, rounded as it is stored."""
+    return Truth(scene.tracking(), *surface_of(scene))
+
+
+def surface_of(
+    scene: SyntheticScene,
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "t n 3"], Float[np.ndarray, "t c l 2"]]:
+    """`vertex_index`, `vertices` and `landmarks` of the truth."""
     index = face_region(measure(scene.model, scene.identity))
     chosen = torch.from_numpy(index)
     vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.recipe.timesteps)])
     landmarks = np.stack([scene.landmarks(camera) for camera in range(len(scene.cameras))], axis=1)
-    return Truth(scene.tracking(), index, _unpacked(_packed(vertices, _METRE), _METRE),
-                 _unpacked(_packed(landmarks, _PIXEL), _PIXEL))  # fmt: skip
+    return index, _unpacked(_packed(vertices, _METRE), _METRE), _unpacked(_packed(landmarks, _PIXEL), _PIXEL)
 
 
 def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
@@ -61,10 +68,11 @@ def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
     return skin[inside & (points[:, 2] > marks[_EAR, 2])].astype(np.int64)
 
 
-def hash_truth(digest: "hashlib._Hash", truth: Truth) -> None:
-    """Add the truth's numbers to a hash."""
-    digest.update(truth.vertex_index.astype(np.int32).tobytes())
-    digest.update(_packed(truth.vertices, _METRE).tobytes() + _packed(truth.landmarks, _PIXEL).tobytes())
+def hash_surface(digest: "hashlib._Hash", scene: SyntheticScene) -> None:
+    """Add the numbers of `surface_of` to a hash."""
+    index, vertices, landmarks = surface_of(scene)
+    digest.update(index.astype(np.int32).tobytes())
+    digest.update(_packed(vertices, _METRE).tobytes() + _packed(landmarks, _PIXEL).tobytes())
 
 
 def write_truth(folder: Path, truth: Truth) -> None:

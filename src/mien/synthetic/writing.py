@@ -14,17 +14,18 @@ from mien.capture import Capture, write_capture
 from mien.capture.faces import LANDMARKS, LandmarkDetector
 from mien.capture.video import write_video
 from mien.errors import UserError
+from mien.face.loading import face_model_edition
 from mien.progress import progress_bar, say
 from mien.storage import read_json, write_json
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.scene import SyntheticScene
-from mien.synthetic.truth import hash_truth, truth_of, write_truth
+from mien.synthetic.truth import hash_surface, truth_of, write_truth
 
-FORMAT, VERSION = "mien.synthetic_capture", 1
+FORMAT, VERSION = "mien.synthetic_capture", 2
 _JSON, _WORK, _STATE = "synthetic.json", ".drawing", "state.json"
 VIDEO_NAME, CAPTURE_NAME, TRUTH_NAME = "video.mp4", "capture", "truth"
-_DRAWING = 2
-"""Raised whenever the same recipe would be drawn otherwise, so that old captures are not taken for current."""
+DRAWING = 3
+"""Raised whenever the same recipe would be drawn otherwise: with it changes every key that figures are quoted on."""
 _CHUNK = 16
 """Timesteps after which progress is kept."""
 
@@ -35,7 +36,7 @@ def write_synthetic_capture(recipe: SyntheticRecipe, seed: int, folder: Path) ->
 
 
 def write_scene(scene: SyntheticScene, folder: Path) -> str:
-    """Draw a capture into a folder and return its content hash: over all pictures, mattes and the truth.
+    """Draw a capture into a folder and return its key, which is the same on every machine (`scene_key`).
 
     With one camera FOLDER/video.mp4 is what a user would have filmed. With several FOLDER/capture is a Capture with
     calibration, exact mattes, and landmarks as a detector finds them in the drawn pictures (NaN where it finds none).
@@ -44,18 +45,20 @@ def write_scene(scene: SyntheticScene, folder: Path) -> str:
     Raises:
         UserError: the folder cannot be written.
     """
-    key = scene_key(scene)
-    if _finished_hash(folder, key) is None:
+    inputs = inputs_hash(scene)
+    if not _is_current(folder, inputs):
         try:
-            content_hash = _draw_all(scene, folder, key)
+            content_hash = _draw_all(scene, folder, inputs)
         except OSError as error:
             raise UserError(f"{folder}: cannot be written ({error.strerror or error}); choose another place") from None
-        say(f"{scene.recipe.name}: drawn, content hash {content_hash}")
-    return read_synthetic_hash(folder)
+        say(f"{scene.recipe.name}: drawn, key {scene_key(scene)}, hash of the bytes {content_hash}")
+    return scene_key(scene)
 
 
 def read_synthetic_hash(folder: Path) -> str:
-    """The content hash of a drawn capture.
+    """The hash over the bytes of a drawn capture: all pictures, mattes and the truth.
+
+    It is the same for the same key on the same machine; another processor may draw a pixel one grey level apart.
 
     Raises:
         UserError: there is none, or it is not complete.
@@ -64,13 +67,34 @@ def read_synthetic_hash(folder: Path) -> str:
 
 
 def scene_key(scene: SyntheticScene) -> str:
-    """A hash of all that decides the pictures, known before they are drawn."""
-    content = {"drawing": _DRAWING, "name": scene.recipe.name, "source": scene.source}
+    """What figures on a capture are quoted with: 16 hex digits over recipe, seeds, face model and drawing version.
+
+    It is known before anything is drawn, it is the same on every machine, and nothing that was computed is in it.
+    `mien.synthetic.signature` tells whether two machines draw the same under one key.
+    """
+    marks = scene.model.landmarks["mediapipe"]  # as they were read; paint and strands are placed by them
+    content = {
+        "drawing": DRAWING,
+        "recipe": asdict(scene.recipe),
+        "seed": scene.seed,
+        "motion_seed": scene.motion_seed,
+        "face_model": [scene.model.name, face_model_edition(scene.model)],
+        "landmarks": [
+            marks.faces.tolist(),
+            [[round(1e4 * weight) for weight in row] for row in marks.barycentric.tolist()],
+        ],
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def inputs_hash(scene: SyntheticScene) -> str:
+    """A hash of all that decides the bytes on this machine, with the face model's numbers: tells what is current."""
+    content = {"drawing": DRAWING, "name": scene.recipe.name, "source": scene.source}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def hash_scene(scene: SyntheticScene) -> str:
-    """The content hash of a scene, drawn in memory: for small ones."""
+    """The hash over the bytes of a scene, drawn in memory: for small ones."""
     pictures = _Hasher(scene)
     for frames in scene.all_frames(range(scene.recipe.timesteps)):
         pictures.add(np.stack([f.image for f in frames]), np.stack([f.matte for f in frames]))
@@ -86,23 +110,22 @@ class _Hasher:
         self._digest.update(mattes.tobytes())
 
     def finish(self, scene: SyntheticScene) -> str:
-        hash_truth(self._digest, truth_of(scene))
+        hash_surface(self._digest, scene)
         return self._digest.hexdigest()[:16]
 
 
-def _finished_hash(folder: Path, key: str) -> str | None:
+def _is_current(folder: Path, inputs: str) -> bool:
     try:
-        content = read_json(folder / _JSON, FORMAT, VERSION)
+        return read_json(folder / _JSON, FORMAT, VERSION).get("inputs") == inputs
     except UserError:
-        return None
-    return str(content["content_hash"]) if content.get("key") == key else None
+        return False
 
 
-def _draw_all(scene: SyntheticScene, folder: Path, key: str) -> str:
+def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
     (folder / _JSON).unlink(missing_ok=True)
     store = _Pictures(folder / _WORK, scene.recipe)
-    store.resume(key)
-    _draw_missing(scene, store, key)
+    store.resume(inputs)
+    _draw_missing(scene, store, inputs)
     images, mattes = store.maps()
     pictures = _Hasher(scene)
     for timestep in range(scene.recipe.timesteps):
@@ -116,8 +139,9 @@ def _draw_all(scene: SyntheticScene, folder: Path, key: str) -> str:
     truth = truth_of(scene)
     write_truth(folder / TRUTH_NAME, truth)
     content = {
+        "key": scene_key(scene),
         "content_hash": content_hash,
-        "key": key,
+        "inputs": inputs,
         "seed": scene.seed,
         "motion_seed": scene.motion_seed,
         "recipe": asdict(recipe),
@@ -140,10 +164,10 @@ class _Pictures:
         recipe = self.recipe
         return (recipe.timesteps, len(recipe.camera_ids), recipe.height, recipe.width)
 
-    def resume(self, key: str) -> None:
-        """Start anew unless what is there belongs to the same key."""
+    def resume(self, inputs: str) -> None:
+        """Start anew unless what is there belongs to the same inputs."""
         try:
-            kept = read_json(self.folder / _STATE, FORMAT, VERSION).get("key") == key
+            kept = read_json(self.folder / _STATE, FORMAT, VERSION).get("inputs") == inputs
         except UserError:
             kept = False
         if not kept:
@@ -151,11 +175,11 @@ class _Pictures:
             self.folder.mkdir(parents=True)
             for name in ("frames.u8", "mattes.u8"):
                 (self.folder / name).touch()
-            self.mark(key, 0)
+            self.mark(inputs, 0)
 
-    def mark(self, key: str, done: int) -> None:
+    def mark(self, inputs: str, done: int) -> None:
         """Note how many timesteps are complete."""
-        write_json(self.folder / _STATE, FORMAT, VERSION, {"key": key, "done": done})
+        write_json(self.folder / _STATE, FORMAT, VERSION, {"inputs": inputs, "done": done})
 
     def done(self) -> int:
         """Timesteps that are complete."""
@@ -174,14 +198,14 @@ class _Pictures:
         return images, np.memmap(self.folder / "mattes.u8", np.uint8, "r", shape=self._shape)
 
 
-def _draw_missing(scene: SyntheticScene, store: _Pictures, key: str) -> None:
+def _draw_missing(scene: SyntheticScene, store: _Pictures, inputs: str) -> None:
     total, done = scene.recipe.timesteps, store.done()
     with progress_bar(f"Drawing {scene.recipe.name}", total, done) as advance:
         drawn = scene.all_frames(range(done, total)) if done < total else iter(())
         for timestep, frames in enumerate(drawn, done):
             store.append(timestep, np.stack([f.image for f in frames]), np.stack([f.matte for f in frames]))
             if (timestep + 1) % _CHUNK == 0 or timestep + 1 == total:
-                store.mark(key, timestep + 1)
+                store.mark(inputs, timestep + 1)
             advance()
 
 
@@ -198,7 +222,7 @@ def _as_capture(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray, c
         landmarks=landmarks,
         valid=np.isfinite(landmarks[..., 0, 0]),
         principal_point=np.tile(np.array([recipe.width / 2, recipe.height / 2], np.float32), (len(scene.cameras), 1)),
-        source={**scene.source, "drawn_hash": content_hash},
+        source={**scene.source, "key": scene_key(scene), "drawn_hash": content_hash},
         calibration=scene.cameras,
     )
 

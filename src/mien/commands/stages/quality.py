@@ -74,7 +74,7 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
     times = _Times(workspace.root / _TIMES)
     say(f"== {reference.name}: {reference.what}")
     with times.measured("draw"):
-        content_hash = reference.write(drawn)
+        key = reference.write(drawn)
     with times.measured("capture"):
         for recipe in reference.sequences:
             _capture(workspace, drawn / recipe.name, recipe.name)
@@ -98,9 +98,7 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
         name: {key: value for key, value in entry.items() if key != "per_frame"}
         for name, entry in metrics["protocols"].items()
     }
-    row = QualityRow(
-        reference.name, content_hash, method, steps, summary["gaussians"], protocols, errors, times.seconds
-    )
+    row = QualityRow(reference.name, key, method, steps, summary["gaussians"], protocols, errors, times.seconds)
     return row, _strip(workspace, run)
 
 

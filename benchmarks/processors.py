@@ -1,0 +1,132 @@
+"""How much results differ between processors, emulated by environment: the table of docs/reproducibility.md.
+
+    python benchmarks/processors.py --out out/processors                  # some minutes
+    python benchmarks/processors.py --out out/processors --settings isa-avx2 old
+
+One synthetic clip is drawn once. Then a process for each setting tracks it, trains an avatar on it (with the true
+tracking, so that the two do not mix), and renders both its own avatar and that of the first setting. Differences are
+told against the first setting, which is this machine as it is: PSNR of renderings in dB, tracked vertices in
+millimetres, landmarks in pixels. For processors of another kind copy the output folder to another machine.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mien.avatar import Avatar, GaussianAvatarsConfig, load_avatar
+from mien.capture import read_capture, write_capture
+from mien.face import load_face_model
+from mien.render import rasterize
+from mien.synthetic import RECIPES, synthesize
+from mien.tracking import Tracking, read_tracking, track, write_tracking
+from mien.training import Sequence, TrainSettings, train
+
+FIRST = "here"
+OLD = {"MKL_CBWR": "COMPATIBLE", "ATEN_CPU_CAPABILITY": "default", "OPENBLAS_CORETYPE": "Nehalem", "MIEN_ISA": "sse4"}
+SETTINGS: dict[str, dict[str, str]] = {
+    FIRST: {},
+    "again, one more thread": {"MIEN_THREADS": "2"},
+    "mkl-compatible": {"MKL_CBWR": "COMPATIBLE"},
+    "aten-default": {"ATEN_CPU_CAPABILITY": "default"},
+    "openblas-nehalem": {"OPENBLAS_CORETYPE": "Nehalem"},
+    "isa-avx2": {"MIEN_ISA": "avx2"},
+    "isa-sse4": {"MIEN_ISA": "sse4"},
+    "old": OLD,
+}
+"""Environments by name; those that name an instruction set are of x86-64."""
+
+
+def main() -> None:
+    """Run what is not there yet, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder for clip, avatars and results")
+    parser.add_argument("--settings", nargs="*", default=[*SETTINGS], help=f"of {', '.join(SETTINGS)}")
+    parser.add_argument("--steps", type=int, default=400, help="of the optimiser")
+    parser.add_argument("--size", type=int, default=128, help="of the pictures, pixels")
+    parser.add_argument("--frames", type=int, default=16, help="of the clip")
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.worker:
+        work(given.out, given.worker, given.steps)
+        return
+    draw(given.out, given.size, given.frames)
+    names = [FIRST, *(name for name in given.settings if name != FIRST)]
+    for name in names:
+        if not (given.out / f"{name}.npz").is_file():
+            command = [sys.executable, __file__, "--out", given.out, "--steps", str(given.steps), "--worker", name]
+            subprocess.run(command, env={"MIEN_THREADS": "1", **os.environ, **SETTINGS[name]}, check=True)
+    print(table(given.out, names))
+
+
+def draw(out: Path, size: int, frames: int) -> None:
+    """The clip, once."""
+    if not (out / "truth").is_dir():
+        recipe = replace(RECIPES["plain"], width=size, height=size, fps=8.0, seconds=frames / 8, texture_size=512)
+        capture, truth = synthesize(recipe, 3)
+        write_capture(out / "capture", capture)
+        write_tracking(out / "truth", truth)
+
+
+def work(out: Path, name: str, steps: int) -> None:
+    """What one processor makes of it: OUT/NAME.npz and OUT/run-NAME."""
+    torch.set_num_threads(1)
+    capture, truth = read_capture(out / "capture"), read_tracking(out / "truth")
+    model = load_face_model(truth.face_model)
+    tracked = track(capture, model)
+    sequence = Sequence(capture.name, capture, truth, np.array(capture.mattes))
+    settings = TrainSettings(steps=steps, split="none", background="white")
+    own = train([sequence], model, GaussianAvatarsConfig(), settings, out / f"run-{name}")
+    points = model(tracked.face)
+    marks = model.landmark_positions(points, "mediapipe")
+    np.savez(
+        out / f"{name}.npz",
+        trained=render(own, truth),
+        rendered=render(load_avatar(out / f"run-{FIRST}"), truth),
+        vertices=points.numpy(),
+        landmarks=tracked.cameras[0].project(marks)[0].numpy(),
+    )
+
+
+@torch.no_grad()
+def render(avatar: Avatar, tracking: Tracking) -> np.ndarray:
+    """An avatar at every timestep, float32."""
+    pictures = []
+    for timestep in range(len(tracking.face)):
+        gaussians = avatar.pose(tracking.face[timestep]).gaussians.timestep(0)
+        pictures.append(rasterize(gaussians, tracking.cameras[0], background=torch.ones(3)).image.numpy())
+    return np.stack(pictures)
+
+
+def table(out: Path, names: list[str]) -> str:
+    """Markdown: every setting against the first."""
+    results = {name: dict(np.load(out / f"{name}.npz")) for name in names}
+    first = results[FIRST]
+    lines = [
+        "| setting | one avatar, rendered | avatar, trained | tracking: vertices | landmarks |",
+        "|---|---|---|---|---|",
+    ]
+    for name in names[1:]:
+        one = results[name]
+        settings = " ".join(f"{key}={value}" for key, value in SETTINGS[name].items())
+        cells = [decibels(one[part], first[part]) for part in ("rendered", "trained")]
+        for part, unit, factor in (("vertices", "mm", 1000), ("landmarks", "px", 1)):
+            away = factor * np.linalg.norm(one[part].astype(np.float64) - first[part], axis=-1)
+            cells.append("same bytes" if not away.any() else f"{away.mean():.2g} {unit} (most {away.max():.2g})")
+        lines.append(f"| `{settings}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def decibels(pictures: np.ndarray, expected: np.ndarray) -> str:
+    """PSNR over all pictures."""
+    squared = float(((pictures.astype(np.float64) - expected) ** 2).mean())
+    return "same bytes" if squared == 0 else f"{-10 * np.log10(squared):.1f} dB"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""A signature of a drawn scene: numbers that any processor draws nearly alike, and another recipe does not.
+
+Pixels differ between processors by a grey level here and there, since `exp`, `sin` and the filters of OpenCV may round
+their last bit otherwise. So a capture is told by its key, and that two machines draw the same is told by this.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from mien.synthetic.scene import SyntheticScene
+from mien.synthetic.truth import surface_of
+
+_BLOCKS = 4
+"""Along each side of a picture."""
+_LANDMARKS = (1, 10, 33, 61, 133, 152, 234, 263, 291, 362, 454, 468, 473)
+"""Nose, forehead, eyes, mouth, chin, sides, irises."""
+_VERTICES = 24
+"""Of the face region, evenly spread over its indices."""
+TOLERANCES: Mapping[str, float] = {"means": 0.05, "spreads": 0.05, "mattes": 0.05, "landmarks": 0.07, "vertices": 0.015}
+"""Largest difference of a number: grey levels (0..255) for pictures and mattes, pixels, millimetres.
+
+docs/reference_captures.md has the measurements they come from. The truth is rounded to a sixteenth of a pixel and to
+0.01 mm: one such step is allowed."""
+
+
+def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
+    """Means and standard deviations of blocks of some pictures, means of their mattes, landmarks, vertices.
+
+    The pictures are those of first, middle and last timestep by the first and the last camera. Each part is a flat
+    list: means and spreads of colours and means of mattes in grey levels, landmarks in pixels, vertices in millimetres.
+    """
+    timesteps = sorted({0, scene.recipe.timesteps // 2, scene.recipe.timesteps - 1})
+    cameras = sorted({0, len(scene.cameras) - 1})
+    frames = [frame for step in timesteps for frame in scene.timestep_frames(step, cameras)]
+    images, mattes = (np.stack([getattr(frame, part) for frame in frames]) for part in ("image", "matte"))
+    index, vertices, landmarks = surface_of(scene)
+    vertices = vertices[timesteps][:, np.linspace(0, len(index) - 1, _VERTICES).astype(int)]
+    parts = {
+        "means": _blocks(images).mean((2, 4)),
+        "spreads": _blocks(images).std((2, 4)),
+        "mattes": _blocks(mattes[..., None]).mean((2, 4)),
+        "landmarks": landmarks[timesteps][:, cameras][:, :, list(_LANDMARKS)],
+        "vertices": 1000 * vertices,
+    }
+    return {name: np.round(values.astype(np.float64), 3).ravel().tolist() for name, values in parts.items()}
+
+
+def signature_distance(first: Mapping[str, list[float]], second: Mapping[str, list[float]]) -> dict[str, float]:
+    """Largest difference of each part, in units of its tolerance: above 1 it is another drawing."""
+    if {name: len(values) for name, values in first.items()} != {name: len(values) for name, values in second.items()}:
+        return dict.fromkeys(TOLERANCES, float("inf"))
+    return {
+        name: float(np.abs(np.subtract(first[name], second[name])).max()) / tolerance
+        for name, tolerance in TOLERANCES.items()
+    }
+
+
+def _blocks(pictures: np.ndarray) -> Float[np.ndarray, "n b y d x c"]:
+    """Cut into blocks; rows and columns beyond the last whole one are left out."""
+    n, height, width, channels = pictures.shape
+    y, x = height // _BLOCKS, width // _BLOCKS
+    cut = pictures[:, : y * _BLOCKS, : x * _BLOCKS].astype(np.float64)
+    return cut.reshape(n, _BLOCKS, y, _BLOCKS, x, channels)

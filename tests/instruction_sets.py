@@ -1,0 +1,19 @@
+"""The native core's levels that a build for this kind of processor has; one that a machine lacks is skipped."""
+
+import platform
+from collections.abc import Iterator
+
+import pytest
+
+from mien import _native
+from needs import use_instructions
+
+ISAS = ("avx512", "avx2", "sse4") if platform.machine() in ("x86_64", "AMD64") else ("baseline",)
+
+
+def each_isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Body of a fixture with `params=ISAS`: one level during a test, then the one before."""
+    before = _native.rasterize_isa()
+    use_instructions(request.param)
+    yield request.param
+    assert _native.set_rasterize_isa(before)

@@ -1,0 +1,116 @@
+"""The guard sees what it is for, and what must be the same everywhere stands within it."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from exact_guard import InexactError, exact_guard
+from mien import exact
+from mien.avatar import GaussianAvatarsConfig
+from mien.files import file_digest, write_json
+from mien.gaussians import Gaussians
+from mien.render import rasterize
+from mien.synthetic import RECIPES, SyntheticScene
+from mien.synthetic.light import Visibility
+from mien.training import TrainSettings, trainer
+from mien.training.frames import FrameOrder, background_at, training_frames
+from mien.training.sequence import Targets
+from rasterize_scenes import random_scene
+from toy_scene import toy_sequence
+
+pytestmark = pytest.mark.exact
+
+PLAIN = replace(
+    RECIPES["demo"], width=48, height=48, fps=4.0, seconds=0.5, texture_size=64, supersample=1, hair="none",
+    glasses=False, brows_and_lashes=False,
+)  # fmt: skip
+T, A = torch.ones(5, 5), np.ones((5, 5))
+LEARNT = torch.ones(5, 5, requires_grad=True)
+
+
+@pytest.mark.parametrize(
+    "inexact",
+    [
+        lambda: torch.mm(T, T), lambda: torch.einsum("ij,jk->ik", T, T), lambda: T[None].bmm(T[None]),
+        lambda: T.mv(T[0]), lambda: T[0].dot(T[0]), lambda: torch.nn.functional.linear(T, T),
+        lambda: torch.linalg.svd(T),
+        lambda: torch.linalg.eigh(T), lambda: torch.linalg.solve(T + torch.eye(5), T), lambda: torch.linalg.qr(T),
+        lambda: T.sum(), lambda: T.mean(0), lambda: T.norm(), lambda: T.softmax(-1), lambda: torch.cdist(T, T),
+        lambda: torch.conv2d(T[None, None], T[None, None, :2, :2]), lambda: LEARNT.matmul(T),
+        lambda: np.matmul(A, A), lambda: np.dot(A, A), lambda: A.dot(A), lambda: np.einsum("ij,jk->ik", A, A),
+        lambda: np.linalg.norm(A[0]), lambda: np.linalg.svd(A), lambda: np.linalg.lstsq(A, A, rcond=None),
+        lambda: np.tensordot(A, A), lambda: np.polyfit(np.arange(5), A[0], 1), lambda: np.convolve(A[0], A[0]),
+        lambda: np.inner(A, A), lambda: A @ A, lambda: T @ T, lambda: cv2.gemm(A, A, 1.0, None, 0.0),
+    ],
+)  # fmt: skip
+def test_the_guard_refuses(inexact):
+    inexact()
+    with pytest.raises(InexactError), exact_guard():
+        inexact()
+
+
+def test_the_guard_lets_pass_what_has_one_order():
+    with exact_guard():
+        assert torch.equal(T * 2 + T, 3 * T)
+        assert float((T[:, :3] * T[:, :3]).sum(-1)[0]) == 3
+        assert exact.product(A, A)[0, 0] == 5
+        assert A.sum() == 25
+    assert np.matmul(A, A)[0, 0] == 5  # all is as before
+    assert float(torch.mm(T, T)[0, 0]) == 5
+
+
+def test_drawing_has_no_product_of_a_library(monkeypatch):
+    scene = SyntheticScene(PLAIN, 3)
+    with exact_guard():
+        scene.frame(1)
+    light = Visibility.shadow
+
+    def by_numpy(self: Visibility, lighting, R):
+        return light(self, lighting, R @ np.eye(3, dtype=np.float32))
+
+    def by_torch(self: Visibility, lighting, R):
+        return light(self, lighting, torch.mm(torch.from_numpy(R), torch.eye(3)).numpy())
+
+    for worse in (by_numpy, by_torch):
+        monkeypatch.setattr(Visibility, "shadow", worse)
+        with pytest.raises(InexactError), exact_guard():
+            scene.frame(1)
+
+
+def test_native_rasterizer_adds_up_by_itself():
+    scene = random_scene(0, coefficients=9)
+    given = replace(scene.gaussians, T_world_local=None)
+    means = given.means.clone().requires_grad_()
+    gaussians = Gaussians(means, given.quats, given.scales, given.opacities, given.sh)
+    gradient = torch.ones(scene.camera.height, scene.camera.width, 3)
+    with exact_guard():
+        rendering = rasterize(gaussians, scene.camera, scene.background, "native")
+        rendering.image.backward(gradient)
+    assert means.grad is not None
+    assert float(means.grad.abs().max()) > 0
+
+
+def test_a_step_of_training_adds_up_by_itself():
+    """One avatar's own step, from the pose to the optimiser; the first step makes what later ones keep."""
+    face_model, sequence = toy_sequence(timesteps=3, size=32)
+    settings = TrainSettings(steps=100, split="none", background="random", record_every=100)
+    state = trainer.start([sequence], face_model, GaussianAvatarsConfig(), settings, torch.zeros(()))
+    order = FrameOrder(training_frames([sequence], settings), settings.seed)
+    data = trainer.TrainingData(order, (Targets(sequence, 0),))
+    trainer.step(state, data, settings)
+    with exact_guard():
+        trainer.step(state, data, settings)
+
+
+def test_digests_and_splits_compute_with_integers(tmp_path):
+    _, sequence = toy_sequence(timesteps=12, size=32)
+    with exact_guard():
+        settings = TrainSettings(steps=100, split="blocks", background="random")
+        frames = training_frames([sequence], settings)
+        FrameOrder(frames, settings.seed)
+        background_at(settings, 7)
+        write_json(tmp_path / "a.json", "mien.test", 1, {"frames": len(frames)})
+        assert len(file_digest(tmp_path / "a.json")) == 64
