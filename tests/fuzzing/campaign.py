@@ -1,0 +1,140 @@
+"""Cases over all targets, in several workers; what was found, by its cause, and a table."""
+
+import contextlib
+import json
+import os
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fuzzing.judge import Result
+from fuzzing.material import make_material
+from fuzzing.targets import TARGETS, spread
+from fuzzing.workers import run_cases
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked for."""
+
+    seed: int
+    cases: int
+    only: list[str] | None = None
+    workers: int = 1
+    until: float | None = None
+    """Time of `time.monotonic` up to which further seeds follow; None for one seed."""
+
+
+@dataclass
+class Tally:
+    """Counts by format, and findings by cause."""
+
+    outcomes: Counter[tuple[str, str]] = field(default_factory=Counter)
+    findings: dict[str, list[Result]] = field(default_factory=dict)
+
+    def add(self, result: Result) -> None:
+        self.outcomes[result.format, result.outcome] += 1
+        if result.outcome == "finding":
+            self.findings.setdefault(result.cause, []).append(result)
+
+    def table(self) -> str:
+        """Figures by format, then causes with a case of each."""
+        rows = ["| format | cases | refused | accepted | findings |", "|---|---|---|---|---|"]
+        formats = list(dict.fromkeys(target.format for target in TARGETS.values()))
+        total = Counter[str]()
+        for name in formats:
+            counts = Counter({outcome: count for (other, outcome), count in self.outcomes.items() if other == name})
+            total += counts
+            rows.append(_row(name, counts))
+        rows += [_row("all", total), "", f"{len(self.findings)} causes:"]
+        for cause, results in sorted(self.findings.items(), key=lambda item: -len(item[1])):
+            rows.append(f"{len(results):6} x {cause}    --replay {results[0].case!r}")
+        return "\n".join(rows)
+
+
+def _row(name: str, counts: Counter[str]) -> str:
+    cells = (sum(counts.values()), *(counts[outcome] for outcome in ("refused", "accepted", "finding")))
+    return f"| {name} | {' | '.join(f'{cell:,}' for cell in cells)} |"
+
+
+def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
+    """Run a plan below a folder for everything that is made; findings are written as json lines as they come."""
+    material = folder / "material"
+    _make_material_aside(material)
+    tally, began = Tally(), time.monotonic()
+    with contextlib.ExitStack() as stack:
+        log = stack.enter_context(findings.open("a")) if findings else None
+        for result in _all_results(plan, folder, material):
+            tally.add(result)
+            count = sum(tally.outcomes.values())
+            if result.outcome == "finding" and log is not None:
+                log.write(json.dumps(result.as_json()) + "\n")
+                log.flush()
+            if count % 500 == 0:
+                print(f"{count} cases in {time.monotonic() - began:.0f} s, {len(tally.findings)} causes", file=sys.stderr, flush=True)
+    print(f"{sum(tally.outcomes.values())} cases in {time.monotonic() - began:.0f} s", file=sys.stderr)
+    return tally
+
+
+def replay(case: str, folder: Path) -> Result:
+    """One case again."""
+    _make_material_aside(folder / "material")
+    return next(run_cases([case], folder / "worker", folder / "material"))
+
+
+def _all_results(plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
+    seed = plan.seed
+    while True:
+        cases = [f"{name}:{seed}:{number}" for name, number in spread(plan.cases, plan.only)]
+        yield from _in_workers(cases, plan, folder, material)
+        seed += 1
+        if plan.until is None or time.monotonic() >= plan.until:
+            return
+
+
+def _in_workers(cases: list[str], plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
+    if plan.workers == 1:
+        yield from run_cases(cases, folder / "worker", material, plan.until)
+        return
+    pipes = []
+    for index in range(plan.workers):
+        reading, writing = os.pipe()
+        if os.fork() == 0:
+            os.close(reading)
+            with os.fdopen(writing, "w") as out:
+                for result in run_cases(cases[index :: plan.workers], folder / f"worker{index}", material, plan.until):
+                    out.write(json.dumps(result.as_json()) + "\n")
+                    out.flush()
+            os._exit(0)
+        os.close(writing)
+        pipes.append(os.fdopen(reading))
+    for pipe in pipes:
+        with pipe:
+            for line in pipe:
+                yield Result(**json.loads(line))
+        os.wait()
+
+
+def _make_material_aside(material: Path) -> None:
+    """In a process of its own: this one has to stay without threads, so that cases can be forked off it."""
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            quiet = os.open(os.devnull, os.O_WRONLY)
+            errors = os.dup(2)
+            os.dup2(quiet, 1)
+            os.dup2(quiet, 2)
+            make_material(material)
+            code = 0
+        except BaseException:
+            os.dup2(errors, 2)
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0:
+        raise RuntimeError("the whole files, of which faulty copies are to be made, could not be made")
