@@ -21,6 +21,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="fuzzing", description=__doc__)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cases", type=int, default=1500, help="mutated inputs over all targets")
+    parser.add_argument("--lines", type=int, default=0, help="odd command lines besides")
+    parser.add_argument("--heavy", type=int, default=0, help="odd command lines of what takes long: each is stopped after 40 s")
     parser.add_argument("--minutes", type=float, default=None, help="go on with further seeds for so long")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--only", nargs="*", default=None, help="names of targets")
@@ -29,14 +31,15 @@ def main() -> int:
     parser.add_argument("--keep", action="store_true", help="of a replay: leave the faulty files and say where")
     asked = parser.parse_args()
     os.nice(5)
-    folder = Path(tempfile.mkdtemp(prefix="mien-fuzz-"))
+    memory = Path("/dev/shm")  # a thousand small folders are made and removed
+    folder = Path(tempfile.mkdtemp(prefix="mien-fuzz-", dir=memory if memory.is_dir() else None))
     try:
         if asked.replay is not None:
             result = campaign.replay(asked.replay, folder)
             print(json.dumps(result.as_json(), indent=1, ensure_ascii=True))
             return int(result.outcome == "finding")
         until = None if asked.minutes is None else time.monotonic() + 60 * asked.minutes
-        plan = campaign.Plan(asked.seed, asked.cases, asked.only, asked.workers, until)
+        plan = campaign.Plan(asked.seed, asked.cases, asked.only, asked.workers, until, asked.lines, asked.heavy)
         tally = campaign.run(plan, folder, asked.findings)
         print(tally.table())
         return int(bool(tally.findings))

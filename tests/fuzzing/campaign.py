@@ -13,6 +13,7 @@ from pathlib import Path
 
 from fuzzing.judge import Result
 from fuzzing.material import make_material
+from fuzzing.run_lines import HEAVY, LIGHT, LINES, run_lines
 from fuzzing.targets import TARGETS, spread
 from fuzzing.workers import run_cases
 
@@ -27,6 +28,10 @@ class Plan:
     workers: int = 1
     until: float | None = None
     """Time of `time.monotonic` up to which further seeds follow; None for one seed."""
+    lines: int = 0
+    """Command lines, besides."""
+    heavy: int = 0
+    """Command lines that take long."""
 
 
 @dataclass
@@ -35,29 +40,35 @@ class Tally:
 
     outcomes: Counter[tuple[str, str]] = field(default_factory=Counter)
     findings: dict[str, list[Result]] = field(default_factory=dict)
+    seconds: float = 0.0
+    """Longest of a mutated input."""
+    megabytes: float = 0.0
+    """Most that one took."""
 
     def add(self, result: Result) -> None:
         self.outcomes[result.format, result.outcome] += 1
+        if result.format != LINES and result.outcome != "finding":
+            self.seconds, self.megabytes = max(self.seconds, result.seconds), max(self.megabytes, result.megabytes)
         if result.outcome == "finding":
             self.findings.setdefault(result.cause, []).append(result)
 
     def table(self) -> str:
         """Figures by format, then causes with a case of each."""
-        rows = ["| format | cases | refused | accepted | findings |", "|---|---|---|---|---|"]
-        formats = list(dict.fromkeys(target.format for target in TARGETS.values()))
+        rows = ["| format | cases | refused | accepted | stopped | findings |", "|---|---|---|---|---|---|"]
+        formats = [*dict.fromkeys(target.format for target in TARGETS.values()), LINES]
         total = Counter[str]()
         for name in formats:
             counts = Counter({outcome: count for (other, outcome), count in self.outcomes.items() if other == name})
             total += counts
             rows.append(_row(name, counts))
-        rows += [_row("all", total), "", f"{len(self.findings)} causes:"]
+        rows += [_row("all", total), "", f"longest {self.seconds:.1f} s, most memory {self.megabytes:.0f} MB", "", f"{len(self.findings)} causes:"]
         for cause, results in sorted(self.findings.items(), key=lambda item: -len(item[1])):
             rows.append(f"{len(results):6} x {cause}    --replay {results[0].case!r}")
         return "\n".join(rows)
 
 
 def _row(name: str, counts: Counter[str]) -> str:
-    cells = (sum(counts.values()), *(counts[outcome] for outcome in ("refused", "accepted", "finding")))
+    cells = (sum(counts.values()), *(counts[outcome] for outcome in ("refused", "accepted", "stopped", "finding")))
     return f"| {name} | {' | '.join(f'{cell:,}' for cell in cells)} |"
 
 
@@ -81,14 +92,18 @@ def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
 
 
 def replay(case: str, folder: Path) -> Result:
-    """One case again."""
+    """One case or command line again."""
     _make_material_aside(folder / "material")
+    if case.startswith((LIGHT, HEAVY)):
+        return next(run_lines([case], folder / "worker", folder / "material"))
     return next(run_cases([case], folder / "worker", folder / "material"))
 
 
 def _all_results(plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
     seed = plan.seed
-    while True:
+    lines = [f"{name}:{seed}:{number}" for name, count in ((LIGHT, plan.lines), (HEAVY, plan.heavy)) for number in range(count)]
+    yield from run_lines(lines, folder / "lines", material)
+    while plan.cases:
         cases = [f"{name}:{seed}:{number}" for name, number in spread(plan.cases, plan.only)]
         yield from _in_workers(cases, plan, folder, material)
         seed += 1
