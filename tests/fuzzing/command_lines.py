@@ -103,21 +103,21 @@ def make_line(place: Place, dice: Random, heavy: bool) -> Line:
     if dice.random() < 0.05:
         line.words = [dice.choice((*COMMANDS, "rendr", "", "--version", "-h", "\x1b[31m")), *line.words[1:]]
     options = list(options_of(line.words[0])) if line.words and line.words[0] in COMMANDS else []
-    for _ in range(dice.choice((0, 1, 1, 2, 3))):
+    for _ in range(dice.choice((0, 0, 1, 1, 2))):
         if options:
             line.words += _with_value(dice.choice(options), dice)
-    if dice.random() < 0.1:
+    if dice.random() < 0.07:
         line.words[dice.randrange(len(line.words))] = dice.choice((*TEXTS[:40], *_PATHS)).replace("\x00", "")
     if dice.random() < 0.05:
         line.words.append(dice.choice(("--help", "--help-all", "-h", "--", "--x", "--out", "--out=", "--OUT=a.png")))
     line.words = [word.replace(PORT, str(place.port)).replace("@CANARY@", str(place.canary)) for word in line.words]
     # What a shell cannot hand over is no command line: null bytes, and lone surrogates other than those of bytes.
     line.words = [word.replace("\x00", "").replace("\ud800", "\udcff") for word in line.words]
-    if dice.random() < 0.35:
+    if dice.random() < 0.4:
         name = dice.choice(list(_SURROUNDINGS))
         line.names.append(name)
         line.surroundings = _SURROUNDINGS[name]
-    if dice.random() < 0.3:
+    if dice.random() < 0.4:
         files = sorted((place.root / "W").rglob("*"))
         place.file = dice.choice(files)
         where = place.file.relative_to(place.root)
@@ -163,12 +163,12 @@ def _value(hint: Any, dice: Random) -> str:
     origin = get_origin(hint)
     if origin in (tuple, Union, types.UnionType):
         return _value(next(one for one in get_args(hint) if one is not type(None)), dice)
-    if dice.random() < 0.06:
+    if dice.random() < 0.04:
         return dice.choice((*TEXTS[:40], *_NUMBERS, *_PATHS))
     if origin is Literal:
-        return dice.choice((*map(str, get_args(hint)), "x"))
+        return dice.choice(list(map(str, get_args(hint))))
     if hint in (int, float):
-        return dice.choice(_NUMBERS)
+        return dice.choice(_NUMBERS if dice.random() < 0.5 else ("1", "2", "3", "16", "20"))
     if hint is Path:
         return dice.choice(_PATHS)
     return dice.choice((*TEXTS[:40], "clip", "toy", "anny", "drop=0.5", "drop=nan", "swell=1e400", "white", "#12345", "jawOpen=1"))

@@ -78,9 +78,6 @@ def _import_everything() -> None:
 
 
 if __name__ == "__main__":
-    if "--apart" in sys.argv:
-        prepare(json.loads(sys.argv[-1]))
-        os.execv(sys.executable, [sys.executable, "-m", "mien.cli", *sys.argv[1:]])
     _import_everything()
     if _serve():
         from mien.cli import main

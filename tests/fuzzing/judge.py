@@ -169,7 +169,7 @@ def judge_traces(
     if select.select([listener], [], [], 0)[0]:
         listener.accept()[0].close()
         result.findings.append("connection")
-    leftovers = sorted(path.name for path in (bench.folder / "tmp").iterdir())
+    leftovers = sorted(path.name for path in (bench.folder / "tmp").iterdir() if not path.name.startswith("mien-crash-"))
     if leftovers and result.outcome != "finding":
         result.findings.append("leftover")
         result.traceback.append(f"left in the folder for temporary files: {leftovers}")

@@ -24,6 +24,7 @@ PARTS = ("W", "given", "pictures", "videos", "flame", "head.mien", "head.ply", "
 LINES, LIGHT, HEAVY = "command lines", "line", "heavy line"
 """Their format in the table; what the names of their cases begin with."""
 FINE = frozenset({0, 2, 130, 141, 143})
+TESTS = str(Path(__file__).parent.parent)
 APART = 0.15
 """Of the lines, how many are started, not forked, whatever they need."""
 _SECONDS = 40.0
@@ -37,7 +38,11 @@ class Server:
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "fuzzing.command_server"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0
+            [sys.executable, "-m", "fuzzing.command_server"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+            env={**os.environ, "PYTHONPATH": TESTS},
         )
 
     def run(self, request: dict[str, Any], line: Line) -> tuple[int | None, int]:
@@ -102,17 +107,18 @@ def run_line(case: str, bench: Bench, server: Server, listener: socket.socket) -
     if megabytes > MEMORY / 2**20 + 700 and not line.heavy:  # beside what is imported
         result.findings.append("memory")
     # A line may write wherever it is told to, into its home's cache, and be stopped before its time is over.
-    judge_traces(result, bench, before, listener, outside=not line.names or "out" in line.names[0], slow=False)
+    cause = _cause(code, told, line)
+    judge_traces(result, bench, before, listener, outside=True, slow=False)
     if result.findings:
         result.outcome = "finding"
         result.traceback = [*result.traceback, f"exit code {code}, {megabytes} MB", *told.splitlines()[-12:]]
-        result.cause = f"line: {'+'.join(result.findings)}, {_cause(code, told, line, bench)}"
+        result.cause = f"line: {'+'.join(result.findings)}, {cause}"
     return result
 
 
 def _request(line: Line, bench: Bench) -> dict[str, Any]:
     around = line.surroundings
-    env = {name: value for name, value in os.environ.items() if name not in around.get("without", ())}
+    env = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", *around.get("without", ()))}
     env |= {"MIEN_CACHE": str(bench.root / "cache"), "MIEN_THREADS": "1", **around.get("env", {})}
     if "HOME" in around.get("without", ()) or "HOME" in around.get("env", {}):
         del env["MIEN_CACHE"]
@@ -126,9 +132,9 @@ def _request(line: Line, bench: Bench) -> dict[str, Any]:
 
 def _run_apart(request: dict[str, Any], line: Line) -> tuple[int | None, int]:
     """In a process that is started anew, as a shell does."""
-    source = "import json, os, sys; from fuzzing.command_server import prepare; prepare(json.loads(sys.argv[1])); "
-    source += "os.execve(sys.executable, [sys.executable, '-m', 'mien.cli', *json.loads(sys.argv[1])['words']], os.environ)"
-    process = subprocess.Popen([sys.executable, "-c", source, json.dumps(request)])
+    source = "import json, os, sys; from fuzzing.command_server import prepare; asked = json.loads(sys.argv[1]); prepare(asked); "
+    source += "os.execve(sys.executable, [sys.executable, '-m', 'mien.cli', *asked['words']], os.environ)"
+    process = subprocess.Popen([sys.executable, "-c", source, json.dumps(request)], env={**os.environ, "PYTHONPATH": TESTS})
 
     def ended(seconds: float) -> bool:
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -171,14 +177,15 @@ def _faults_of_end(code: int | None, told: str, line: Line) -> Iterator[str]:
         yield "signal"
     elif code >= 0 and code not in FINE:
         yield "exit code"
-    if "Traceback (most recent call last)" in told:
+    # Python itself says so where Ctrl-C meets it between two of its own steps.
+    if "Traceback (most recent call last)" in told and not (sent == signal.SIGINT and "Exception ignored in" in told):
         yield "traceback"
     lines = [text for text in told.splitlines() if text.startswith("mien: ")]
     if code == 2 and len(lines) != 1 and line.surroundings.get("stderr") != "closed" and "largest_file" not in line.surroundings:
         yield "lines"
 
 
-def _cause(code: int | None, told: str, line: Line, bench: Bench) -> str:
+def _cause(code: int | None, told: str, line: Line) -> str:
     """What findings of the same origin share: where the traceback ends, or else the command and its surroundings."""
     text = told
     for log in re.findall(r"the traceback is in (\S+);", told):
