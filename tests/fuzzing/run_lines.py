@@ -27,7 +27,7 @@ FINE = frozenset({0, 2, 130, 141, 143})
 TESTS = str(Path(__file__).parent.parent)
 APART = 0.15
 """Of the lines, how many are started, not forked, whatever they need."""
-_SECONDS = 40.0
+_SECONDS = 60.0
 """A busy machine needs as long for a command on small input; those that take longer are told to stop then."""
 _TO_END = 20.0
 """Seconds that a command gets to end after it was told to."""

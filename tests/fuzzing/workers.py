@@ -129,7 +129,7 @@ def _ended(case: str, bench: Bench, before: dict[str, Any], finding: str, status
     told = bench.told.read_text(errors="replace")[-4000:] if bench.told.exists() else ""
     result = Result(case, TARGETS[case.rsplit(":", 2)[0]].format, outcome="finding", findings=[finding])
     result.message = f"{signal.Signals(os.WTERMSIG(status)).name if os.WIFSIGNALED(status) else f'exit code {os.waitstatus_to_exitcode(status)}'}"
-    result.traceback = [line.strip() for line in told.splitlines() if line.strip()][-12:]
+    result.traceback = [line.strip() for line in told.splitlines() if line.strip()][:8]
     frames = [line for line in told.splitlines() if line.strip().startswith('File "') and "/mien/" in line]
     place = frames[0].strip().rpartition("/")[2] if frames else case.split(":")[0]
     place = place.replace('"', "")
