@@ -4,7 +4,7 @@ BIN := .venv/bin
 NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UV_VERSION := 0.13.8
 
-.PHONY: setup build demo test sanitize lint format bench gpu lock clean
+.PHONY: setup build demo test sanitize fuzz lint format bench gpu lock clean
 setup: .venv/.built
 
 .venv/.packages: requirements/lock.txt
@@ -33,6 +33,14 @@ test: setup
 # The native core's own checks under AddressSanitizer, UndefinedBehaviorSanitizer and ThreadSanitizer; needs no Python.
 sanitize:
 	$(MAKE) -C native/checks -j2
+
+# Mutated files of every format and odd command lines, for so long; findings go to out/fuzz/findings.jsonl.
+MINUTES ?= 10
+SEED ?= 1
+fuzz: setup
+	PYTHONPATH=tests $(BIN)/python -m fuzzing --self-check --seed $(SEED) --cases 5000 --minutes $(MINUTES) --workers 2 \
+	  --lines 300 --heavy 10 --findings out/fuzz/findings.jsonl
+	@if [ -f tests/fuzzing/native_calls.py ]; then $(MAKE) fuzz-native; fi
 
 lint: setup
 	$(BIN)/ruff check src tests examples benchmarks

@@ -3,17 +3,21 @@
 import contextlib
 import json
 import os
+import select
 import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from fuzzing.judge import Result
 from fuzzing.material import make_material
 from fuzzing.run_lines import HEAVY, LIGHT, LINES, run_lines
+from fuzzing.self_check import failures
 from fuzzing.targets import TARGETS, spread
 from fuzzing.workers import run_cases
 
@@ -32,6 +36,8 @@ class Plan:
     """Command lines, besides."""
     heavy: int = 0
     """Command lines that take long."""
+    self_check: bool = False
+    """Find first that the fuzzers can fail."""
 
 
 @dataclass
@@ -44,6 +50,8 @@ class Tally:
     """Longest of a mutated input."""
     megabytes: float = 0.0
     """Most that one took."""
+    missed: list[str] = field(default_factory=list)
+    """What the fuzzers would not have found."""
 
     def add(self, result: Result) -> None:
         self.outcomes[result.format, result.outcome] += 1
@@ -75,10 +83,11 @@ def _row(name: str, counts: Counter[str]) -> str:
 def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
     """Run a plan below a folder for everything that is made; findings are written as json lines as they come."""
     material = folder / "material"
-    _make_material_aside(material)
+    make_material_aside(material)
     tally, began = Tally(), time.monotonic()
     with contextlib.ExitStack() as stack:
-        log = stack.enter_context(findings.open("a")) if findings else None
+        tally.missed += list(failures(folder / "self", material)) if plan.self_check else []
+        log = stack.enter_context(_made(findings).open("a")) if findings else None
         for result in _all_results(plan, folder, material):
             tally.add(result)
             count = sum(tally.outcomes.values())
@@ -91,50 +100,74 @@ def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
     return tally
 
 
+def _made(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def replay(case: str, folder: Path) -> Result:
     """One case or command line again."""
-    _make_material_aside(folder / "material")
+    make_material_aside(folder / "material")
     if case.startswith((LIGHT, HEAVY)):
         return next(run_lines([case], folder / "worker", folder / "material"))
     return next(run_cases([case], folder / "worker", folder / "material"))
 
 
+Job = Callable[[], Iterator[Result]]
+"""Cases for a process of its own."""
+
+
 def _all_results(plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
+    """Command lines beside the cases of the first seed, then further seeds."""
+    lines = [f"{name}:{plan.seed}:{n}" for name, count in ((LIGHT, plan.lines), (HEAVY, plan.heavy)) for n in range(count)]
+    jobs: list[Job] = [partial(run_lines, lines, folder / "lines", material)]
     seed = plan.seed
-    lines = [f"{name}:{seed}:{number}" for name, count in ((LIGHT, plan.lines), (HEAVY, plan.heavy)) for number in range(count)]
-    yield from run_lines(lines, folder / "lines", material)
-    while plan.cases:
-        cases = [f"{name}:{seed}:{number}" for name, number in spread(plan.cases, plan.only)]
-        yield from _in_workers(cases, plan, folder, material)
-        seed += 1
+    while plan.cases or jobs:
+        cases = [f"{name}:{seed}:{number}" for name, number in spread(plan.cases, plan.only)] if plan.cases else []
+        shares = [cases[index :: plan.workers] for index in range(plan.workers)]
+        jobs += [
+            partial(run_cases, share, folder / f"worker{index}", material, plan.until) for index, share in enumerate(shares)
+        ]
+        yield from chain.from_iterable(job() for job in jobs) if plan.workers == 1 else _side_by_side(jobs)
+        jobs, seed = [], seed + 1
         if plan.until is None or time.monotonic() >= plan.until:
             return
 
 
-def _in_workers(cases: list[str], plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
-    if plan.workers == 1:
-        yield from run_cases(cases, folder / "worker", material, plan.until)
-        return
-    pipes = []
-    for index in range(plan.workers):
+def _side_by_side(jobs: list[Job]) -> Iterator[Result]:
+    """Results of jobs in a process each, as they come."""
+    pipes, children = [], []
+    for job in jobs:
         reading, writing = os.pipe()
-        if os.fork() == 0:
-            os.close(reading)
-            with os.fdopen(writing, "w") as out:
-                for result in run_cases(cases[index :: plan.workers], folder / f"worker{index}", material, plan.until):
-                    out.write(json.dumps(result.as_json()) + "\n")
-                    out.flush()
-            os._exit(0)
+        children.append(os.fork())
+        if children[-1] == 0:
+            code = 1
+            try:
+                with os.fdopen(writing, "w") as out:
+                    for result in job():
+                        out.write(json.dumps(result.as_json()) + "\n")
+                        out.flush()
+                code = 0
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                os._exit(code)
         os.close(writing)
         pipes.append(os.fdopen(reading))
-    for pipe in pipes:
-        with pipe:
-            for line in pipe:
+    waiting = list(pipes)
+    while waiting:
+        for pipe in select.select(waiting, [], [])[0]:
+            # A line comes as a whole: less than a pipe holds, or its rest follows at once.
+            if line := pipe.readline():
                 yield Result(**json.loads(line))
-        os.wait()
+            else:
+                waiting.remove(pipe)
+                pipe.close()
+    if any(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children):
+        raise RuntimeError("a worker of the fuzzer itself failed; what it said is above")
 
 
-def _make_material_aside(material: Path) -> None:
+def make_material_aside(material: Path) -> None:
     """In a process of its own: this one has to stay without threads, so that cases can be forked off it."""
     child = os.fork()
     if child == 0:

@@ -45,6 +45,8 @@ class Bench:
     folder: Path
     material: Path
     port: int
+    seconds: float = SECONDS
+    memory: int = MEMORY
 
     @property
     def root(self) -> Path:
@@ -162,9 +164,9 @@ def judge_traces(
         result.findings.append("outside")
         result.traceback.append(f"changed: {changed}")
         result.cause = result.cause or f"outside: {result.case.split(':')[0]}, {result.kind}"
-    if slow and result.seconds > SECONDS:
+    if slow and result.seconds > bench.seconds:
         result.findings.append("hang")
-    if result.megabytes > MEMORY / 2**20:
+    if result.megabytes > bench.memory / 2**20:
         result.findings.append("memory")
     if select.select([listener], [], [], 0)[0]:
         listener.accept()[0].close()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fuzzing.content import content_of
-from fuzzing.judge import SECONDS, Bench, Result, limit_this_process, run_case, snapshot
+from fuzzing.judge import Bench, Result, limit_this_process, run_case, snapshot
 from fuzzing.material import copy_of
 from fuzzing.targets import TARGETS, Target
 
@@ -25,12 +25,15 @@ _GROWN = 400.0
 """Megabytes after which a process is left to end."""
 
 
-def run_cases(cases: list[str], folder: Path, material: Path, until: float | None = None) -> Iterator[Result]:
-    """Results in order; `until` is the time of `time.monotonic` after which no case begins."""
+def run_cases(
+    cases: list[str], folder: Path, material: Path, until: float | None = None, **limits: float
+) -> Iterator[Result]:
+    """Results in order; `until` is the time of `time.monotonic` after which no case begins; limits are `Bench`'s."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen(64)
-        bench, other = (Bench(folder / name, material, listener.getsockname()[1]) for name in ("row", "alone"))
+        port = listener.getsockname()[1]
+        bench, other = (Bench(folder / name, material, port, **limits) for name in ("row", "alone"))  # type: ignore[arg-type]
         waiting = list(cases)
         while waiting and (until is None or time.monotonic() < until):
             done = 0
@@ -57,7 +60,7 @@ def _batch(cases: list[str], bench: Bench, listener: socket.socket) -> Iterator[
     os.close(writing)
     pending, done, status = b"", 0, None
     while done < len(cases):
-        ready, _, _ = select.select([reading], [], [], SECONDS + _SPARE)
+        ready, _, _ = select.select([reading], [], [], bench.seconds + _SPARE)
         data = os.read(reading, 1 << 20) if ready else None
         if data:
             *lines, pending = (pending + data).split(b"\n")
@@ -91,12 +94,12 @@ def _child(cases: list[str], bench: Bench, listener: socket.socket, writing: int
             os.ftruncate(told, 0)
             os.lseek(told, 0, os.SEEK_SET)
             (bench.folder / "case.txt").write_text(case)
-            faulthandler.dump_traceback_later(SECONDS, file=sys.__stderr__ or sys.stderr)
+            faulthandler.dump_traceback_later(bench.seconds, file=sys.__stderr__ or sys.stderr)
             result = run_case(case, bench, listener, expected)
             faulthandler.cancel_dump_traceback_later()
             os.write(writing, json.dumps(result.as_json()).encode() + b"\n")
-            if result.megabytes > _GROWN or "outside" in result.findings:
-                break
+            if result.megabytes > _GROWN or result.findings:
+                break  # what follows is not to suffer from it
         code = 0
     except BaseException as error:
         print(f"the fuzzer itself failed: {error!r}", file=sys.stderr, flush=True)
