@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from fuzzing.judge import Result
 from fuzzing.material import make_material
@@ -86,7 +87,8 @@ def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
     make_material_aside(material)
     tally, began = Tally(), time.monotonic()
     with contextlib.ExitStack() as stack:
-        tally.missed += list(failures(folder / "self", material)) if plan.self_check else []
+        if plan.self_check:
+            tally.missed += _aside(lambda: list(failures(folder / "self", material)))
         log = stack.enter_context(_made(findings).open("a")) if findings else None
         for result in _all_results(plan, folder, material):
             tally.add(result)
@@ -168,21 +170,31 @@ def _side_by_side(jobs: list[Job]) -> Iterator[Result]:
 
 
 def make_material_aside(material: Path) -> None:
-    """In a process of its own: this one has to stay without threads, so that cases can be forked off it."""
+    """Whole files of every kind."""
+    _aside(lambda: make_material(material))
+
+
+def _aside(work: Callable[[], Any]) -> Any:
+    """What `work` returns, as json, from a process of its own: this one stays without threads, to be forked safely."""
+    reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
-        code = 1
+        code, errors, quiet = 1, os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        os.close(reading)
         try:
-            quiet = os.open(os.devnull, os.O_WRONLY)
-            errors = os.dup(2)
             os.dup2(quiet, 1)
             os.dup2(quiet, 2)
-            make_material(material)
+            with os.fdopen(writing, "w") as out:
+                json.dump(work(), out)
             code = 0
         except BaseException:
             os.dup2(errors, 2)
             traceback.print_exc()
         finally:
             os._exit(code)
+    os.close(writing)
+    with os.fdopen(reading) as answer:
+        told = answer.read()
     if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0:
-        raise RuntimeError("the whole files, of which faulty copies are to be made, could not be made")
+        raise RuntimeError("the fuzzer itself failed; what it said is above")
+    return json.loads(told)

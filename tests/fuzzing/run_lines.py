@@ -25,7 +25,7 @@ LINES, LIGHT, HEAVY = "command lines", "line", "heavy line"
 """Their format in the table; what the names of their cases begin with."""
 FINE = frozenset({0, 2, 130, 141, 143})
 TESTS = str(Path(__file__).parent.parent)
-APART = 0.15
+APART = 0.08
 """Of the lines, how many are started, not forked, whatever they need."""
 _SECONDS = 60.0
 """A busy machine needs as long for a command on small input; those that take longer are told to stop then."""
