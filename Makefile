@@ -1,4 +1,4 @@
-# make setup | demo | test | test-312 | test-exact | sanitize | lint | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# make setup | demo | test | test-312 | test-exact | sanitize | fuzz | lint | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 PYTHON312 ?= python3.12
@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UV_VERSION := 0.13.8
 
-.PHONY: setup build demo test test-312 test-312-part test-exact sanitize lint format bench gpu lock clean
+.PHONY: setup build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native lint format bench gpu lock clean
 setup: $(VENV)/.built
 
 $(VENV)/.packages: requirements/lock.txt
@@ -61,12 +61,18 @@ sanitize:
 CALLS ?= 50000
 SEED ?= 1
 SANITIZED := build/sanitize-native
-.PHONY: fuzz-native
 fuzz-native: setup
 	$(BIN)/cmake -S . -B $(SANITIZED) -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN)/ninja) -DCMAKE_BUILD_TYPE=Debug -DMIEN_SANITIZE=ON \
 	  -DPython_EXECUTABLE=$(abspath $(BIN)/python) -Dnanobind_DIR=$$($(BIN)/python -m nanobind --cmake_dir) > /dev/null
 	$(BIN)/ninja --quiet -C $(SANITIZED)
 	$(BIN)/python tests/fuzzing/native_calls.py $(SANITIZED)/native --calls $(CALLS) --seed $(SEED)
+
+# Mutated files of every format and odd command lines, for MINUTES, then native calls; findings go to out/fuzz/findings.jsonl.
+MINUTES ?= 10
+fuzz: setup
+	PYTHONPATH=tests $(BIN)/python -m fuzzing --self-check --seed $(SEED) --cases 5000 --minutes $(MINUTES) --workers 2 \
+	  --lines 300 --heavy 10 --findings out/fuzz/findings.jsonl
+	$(MAKE) fuzz-native
 
 lint: setup
 	$(BIN)/ruff check src tests examples benchmarks

@@ -1,0 +1,33 @@
+"""A small tracking that was stopped: its finished pieces, and going on from them."""
+
+import pickle
+from pathlib import Path
+
+import torch
+
+from mien.tracking import TrackingSettings, track_subject
+from mien.tracking.photometric_settings import PhotometricSettings
+from mien.tracking.resume import Keeper
+from photometric_case import make_photometric_case, make_textured_model
+
+SETTINGS = TrackingSettings(photometric=PhotometricSettings(texture_size=128, keyframes=2, shared_steps=1))
+_TIMESTEPS = 4
+
+
+def write_pieces(folder: Path) -> None:
+    """Every piece of a tracking, none dropped, and the capture that it is of (for this process's children alone)."""
+    torch.set_num_threads(1)
+    capture = make_photometric_case(_TIMESTEPS).capture
+    drop, forget = Keeper.drop, Keeper.forget
+    Keeper.drop = Keeper.forget = lambda *_: None  # type: ignore[method-assign, assignment]
+    try:
+        track_subject([capture], make_textured_model(), SETTINGS, folder)
+    finally:
+        Keeper.drop, Keeper.forget = drop, forget  # type: ignore[method-assign]
+    (folder / "capture.pickle").write_bytes(pickle.dumps(capture))
+
+
+def go_on(folder: Path) -> None:
+    """Track on from the pieces in a folder."""
+    capture = pickle.loads((folder / "capture.pickle").read_bytes())
+    track_subject([capture], make_textured_model(), SETTINGS, folder)

@@ -1,0 +1,97 @@
+"""What is fuzzed: which file is made faulty, how it is read, and what is done with what was read."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from fuzzing import faults, uses
+from fuzzing.faults import Place
+from fuzzing.material import RUN, SEQUENCE
+
+Read = Callable[[Path, Path], Any]
+"""From the folder with the copies, and the faulty file, to what was read."""
+Use = Callable[[Path, Any, Random], None]
+"""With that folder, what was read, and dice for what is chosen."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kind of file."""
+
+    name: str
+    format: str
+    """As the table of results has it."""
+    files: str
+    """Pattern below the material."""
+    parts: tuple[str, ...]
+    """Of the material, that reading takes."""
+    read: Read
+    use: Use = uses.nothing
+    exact: bool = False
+    """Whether bytes that were damaged without repair have to be refused, or to give the very content."""
+    fault: Callable[[Place, Random], str] = faults.faulty_file
+    weight: float = 1.0
+    """How often, beside the others."""
+    named: bool = True
+    """Whether the message has to name a file of the folder."""
+
+
+def _all() -> tuple[Target, ...]:
+    run, clip, whole = RUN, SEQUENCE, ("W",)
+    return (
+        Target("capture.json", "capture", f"{clip}/capture/capture.json", whole, uses.read_capture, uses.use_capture, True, weight=2),
+        Target("landmarks.safetensors", "capture", f"{clip}/capture/landmarks.safetensors", whole, uses.read_capture, uses.use_capture, True, weight=2),
+        Target("frames", "capture", f"{clip}/capture/*/*/*.png", whole, uses.read_capture, uses.use_capture, True),
+        Target("cache", "capture", f"{clip}/capture/cache/*", whole, uses.read_capture, uses.use_capture, fault=faults.faulty_without_damage),
+        Target("tracking.json", "tracking", f"{clip}/tracking/tracking.json", whole, uses.read_tracking, uses.use_run, True, weight=2),
+        Target("tracking.safetensors", "tracking", f"{clip}/tracking/tracking.safetensors", whole, uses.read_tracking, uses.use_run, True, weight=3),
+        Target("scoring.json", "scoring", f"{clip}/scoring/scoring.json", whole, uses.read_scoring, uses.use_run, True, weight=1.5),
+        Target("crops.safetensors", "scoring", f"{clip}/scoring/crops.safetensors", whole, uses.read_scoring, uses.use_run, True, weight=1.5),
+        Target("masks", "scoring", f"{clip}/scoring/masks/*/*.png", whole, uses.read_scoring, uses.use_run, True),
+        Target("config.json", "run", f"{run}/config.json", whole, uses.read_config, uses.use_run, True, weight=2),
+        Target("training.json", "run", f"{run}/training.json", whole, uses.read_summary, uses.use_evaluation, True),
+        Target("curves.safetensors", "run", f"{run}/curves.safetensors", whole, uses.read_curves, uses.use_evaluation, True),
+        Target("face_track.safetensors", "run", f"{run}/face_track.safetensors", whole, uses.read_face_track, uses.use_evaluation, True),
+        Target("checkpoints", "run", f"{run}/checkpoints/*.safetensors", whole, uses.resume_run, uses.use_training, weight=2),
+        Target("metrics.json", "metrics", f"{run}/metrics.json", whole, uses.read_metrics, uses.use_comparison, True, weight=2),
+        Target("partial scores", "partial files", f"{run}/.*.partial", whole, uses.read_partial, uses.use_partial, fault=faults.faulty_lines),
+        Target("tracking pieces", "partial files", "pieces/*.safetensors", ("pieces",), uses.go_on_tracking, weight=0.3, named=False),
+        Target("avatar.json", "avatar", f"{run}/avatar/avatar.json", whole, uses.read_avatar, uses.use_avatar, True, weight=2),
+        Target("avatar.safetensors", "avatar", f"{run}/avatar/avatar.safetensors", whole, uses.read_avatar, uses.use_avatar, True, weight=2),
+        Target("avatar's face_model.json", "avatar", f"{run}/avatar/face_model.json", whole, uses.read_avatar, uses.use_avatar, True, weight=1.5),
+        Target("avatar's face_model.safetensors", "avatar", f"{run}/avatar/face_model.safetensors", whole, uses.read_avatar, uses.use_avatar, True, weight=2),
+        Target("added face models", "face model", "cache/face_models/added/*", ("cache",), uses.read_added, uses.use_face_model, weight=2, named=False),
+        Target("head.mien", ".mien", "head.mien", ("head.mien",), uses.read_portable, uses.use_portable, True, faults.faulty_portable, 4),
+        Target("head.ply", ".ply", "head.ply", ("head.ply",), uses.read_ply, uses.use_gaussians, weight=2),
+        Target("pictures", "pictures", "pictures/*", ("pictures",), uses.read_pictures, weight=5),
+        Target("mattes", "pictures", "given/mattes/*", ("given",), uses.read_mattes, uses.expect_finite),
+        Target("points", "landmarks", "given/points.*", ("given",), uses.read_points, uses.expect_rows, weight=2),
+        Target("crops.json", "crops, cameras", "given/crops.json", ("given",), uses.read_crops, uses.expect_finite),
+        Target("cameras.json", "crops, cameras", "given/cameras.json", ("given", "head.ply"), uses.read_cameras, uses.use_cameras, weight=1.5),
+        Target("take.csv", "motion", "given/take.csv", ("given",), uses.read_motion, uses.expect_motion, weight=2),
+        Target("take.json", "motion", "given/*take.json", ("given",), uses.read_motion, uses.expect_motion, weight=2),
+        Target("tiny.npz", "FLAME's schema", "flame/tiny.npz", ("flame",), uses.read_flame, uses.use_flame, weight=2),
+        Target("tiny.pkl", "FLAME's schema", "flame/tiny.pkl", ("flame",), uses.read_flame, uses.use_flame, weight=2),
+        Target("videos", "videos", "videos/*", ("videos",), uses.read_video, weight=3),
+        Target("playlists", "videos", "videos/clip.mp4", ("videos",), uses.read_no_playlist, fault=faults.write_playlist, weight=1),
+        Target("names", "names", "[gpv]*/*.*", ("given", "pictures", "videos"), uses.read_by_ending, fault=faults.rename, named=False),
+        Target("places", "workspace", "W/**/*", ("W",), uses.read_workspace, uses.use_run, fault=faults.faulty_place, weight=4),
+        Target("commands", "workspace", "W/**/*", ("W", "cache"), uses.nothing_read, uses.run_a_line, fault=faults.any_fault, weight=1, named=False),
+    )  # fmt: skip
+
+
+TARGETS = {target.name: target for target in _all()}
+
+
+def spread(total: int, names: list[str] | None = None) -> list[tuple[str, int]]:
+    """So many cases over the targets by their weights: names and numbers, mixed so that any part of them holds all."""
+    chosen = [TARGETS[name] for name in names] if names else list(TARGETS.values())
+    share = total / sum(target.weight for target in chosen)
+    places = []
+    for target in chosen:
+        amount = max(1, math.ceil(share * target.weight))
+        places += [((number + 0.5) / amount, target.name, number) for number in range(amount)]
+    return [(name, number) for _, name, number in sorted(places)]

@@ -1,0 +1,374 @@
+"""Reading faulty files, and doing with what was read what people do: a fault that is not refused must do no harm later."""
+
+import contextlib
+import io
+import itertools
+import os
+import tempfile
+from dataclasses import fields, replace
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import torch
+
+from fuzzing import content, pieces
+from fuzzing.material import CONFIG, QUICK, RUN, SEQUENCE, SETTINGS
+from mien import cli
+from mien.avatar import load_avatar
+from mien.avatar.portable import make_portable
+from mien.capture import read_capture as read_whole_capture
+from mien.capture.crop import whole_picture
+from mien.capture.given import GivenMattes, read_landmarks
+from mien.capture.source import FrameSelection, open_source, read_image
+from mien.capture.video import count_frames, probe_video, read_video_frames
+from mien.errors import UserError
+from mien.evaluation import evaluate, read_metrics as read_figures
+from mien.evaluation.cameras import fitted, read_cameras as read_camera_path
+from mien.evaluation.compare import compare_runs
+from mien.evaluation.compare_report import comparison_html
+from mien.evaluation.compare_text import comparison_text
+from mien.evaluation.driving import drive
+from mien.evaluation.image_folders import read_crops as read_boxes
+from mien.evaluation.image_source import open_pictures, read_picture
+from mien.evaluation.partial import PartialScores
+from mien.export import in_world, read_ply as read_gaussians, write_ply
+from mien.face import FaceModel, FaceParams, available_face_models, load_face_model
+from mien.face.flame import flame_face_model, read_flame as read_flame_file
+from mien.motion import Motion, read_blendshape_json, read_live_link_face
+from mien.render import rasterize
+from mien.runtime import Avatar, read_portable as read_mien, write_portable
+from mien.storage import read_tensors
+from mien.tracking import read_scoring as read_masks, read_tracking as read_track
+from mien.training import read_curves as read_all_curves, read_run_config, read_sequence, read_training_summary, train
+from mien.training.checkpoint import resume
+from mien.training.run import run_camera
+from mien.training.trainer import start
+from mien.workspace import open_workspace
+from toy_scene import toy_camera, toy_face_model, toy_sequence
+
+SEEN = 3
+"""Pictures of a video that are looked at."""
+
+
+class CommandError(Exception):
+    """A command ended otherwise than commands may."""
+
+
+# Reading: from the folder with the copies, and the faulty file. ------------------------------------------------------
+
+
+def read_capture(root: Path, file: Path) -> Any:
+    return read_whole_capture(root / SEQUENCE / "capture")
+
+
+def read_tracking(root: Path, file: Path) -> Any:
+    return read_track(root / SEQUENCE / "tracking")
+
+
+def read_scoring(root: Path, file: Path) -> Any:
+    return read_masks(root / SEQUENCE / "scoring")
+
+
+def read_config(root: Path, file: Path) -> Any:
+    return _known(read_run_config(root / RUN)), run_camera(root / RUN)
+
+
+def read_summary(root: Path, file: Path) -> Any:
+    return _known(read_training_summary(root / RUN))
+
+
+def read_curves(root: Path, file: Path) -> Any:
+    return read_all_curves(root / RUN)
+
+
+def read_face_track(root: Path, file: Path) -> Any:
+    tensors = read_tensors(file)
+    try:
+        return FaceParams(**tensors)
+    except TypeError as error:  # so does `mien.evaluation.load`
+        raise UserError(f"{file}: {error}") from None
+
+
+def read_metrics(root: Path, file: Path) -> Any:
+    return _known(read_figures(root / RUN))
+
+
+def read_partial(root: Path, file: Path) -> Any:
+    return PartialScores(file, "0").read()
+
+
+def resume_run(root: Path, file: Path) -> Any:
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    state = start([sequence], face_model, CONFIG, replace(SETTINGS, split="tail"))
+    resume(root / RUN / "checkpoints", state)
+    return state.avatar
+
+
+def go_on_tracking(root: Path, file: Path) -> Any:
+    pieces.go_on(root / "pieces")
+
+
+def read_avatar(root: Path, file: Path) -> Any:
+    return load_avatar(root / RUN)
+
+
+def read_added(root: Path, file: Path) -> Any:
+    os.environ["MIEN_CACHE"] = str(root / "cache")
+    available_face_models()
+    return load_face_model("mine")
+
+
+def read_portable(root: Path, file: Path) -> Any:
+    return read_mien(file)
+
+
+def read_ply(root: Path, file: Path) -> Any:
+    return read_gaussians(file)
+
+
+def read_pictures(root: Path, file: Path) -> Any:
+    for each in (read_image(file), read_picture(file)):
+        assert each.dtype == np.uint8, each.dtype
+        assert each.ndim == 3, each.shape
+        assert each.size > 0, each.shape
+    source = open_source(file.parent, FrameSelection(), 25.0)
+    assert source.expected_frames == len(list(source.frames(64)))
+    open_pictures(file.parent)
+
+
+def read_mattes(root: Path, file: Path) -> Any:
+    mattes, whole = GivenMattes(root / "given/mattes", (32, 32)), whole_picture(32, 32, 32)
+    return [mattes.matte(number, whole) for number in range(3)]
+
+
+def read_points(root: Path, file: Path) -> Any:
+    return read_landmarks(file, 3)
+
+
+def read_crops(root: Path, file: Path) -> Any:
+    return read_boxes(file)
+
+
+def read_cameras(root: Path, file: Path) -> Any:
+    return read_camera_path(file)
+
+
+def read_motion(root: Path, file: Path) -> Any:
+    return read_live_link_face(file) if file.suffix == ".csv" else read_blendshape_json(file)
+
+
+def read_flame(root: Path, file: Path) -> Any:
+    return read_flame_file(file)
+
+
+def read_video(root: Path, file: Path) -> Any:
+    probe_video(file)
+    count_frames(file)
+    for seconds, frame in itertools.islice(read_video_frames(file, 512), SEEN):
+        assert np.isfinite(seconds), seconds
+        assert frame.dtype == np.uint8, frame.dtype
+        assert frame.ndim == 3, frame.shape
+
+
+def read_no_playlist(root: Path, file: Path) -> Any:
+    shown = sum(1 for _ in itertools.islice(read_video_frames(file, 512), SEEN))
+    assert shown == 0, "a list made mien read other files"
+
+
+def read_by_ending(root: Path, file: Path) -> Any:
+    """As people type it: from the file's own folder."""
+    before = Path.cwd()
+    os.chdir(file.parent)
+    try:
+        _read_any(Path(file.name))
+    finally:
+        os.chdir(before)
+
+
+def read_workspace(root: Path, file: Path) -> Any:
+    workspace = open_workspace(root / "W")
+    folder = workspace.sequence_dir(workspace.pick_sequence(None))
+    read_sequence(folder)
+    return load_avatar(workspace.run_dir(workspace.pick_run(None)))
+
+
+def nothing_read(root: Path, file: Path) -> Any:
+    """Nothing: the command reads."""
+
+
+def _read_any(file: Path) -> None:
+    suffix = file.suffix
+    if suffix in (".mp4", ".mov", ".mkv", ".avi", ".ts", ".flv", ".webm"):
+        read_video(file.parent, file)
+        open_source(file, FrameSelection(), 25.0)
+    elif suffix in (".png", ".jpg", ".webp", ".tif", ".bmp"):
+        read_pictures(file.parent, file)
+    elif file.stem == "points" or suffix == ".safetensors":
+        read_landmarks(file, 3)
+    elif suffix in (".csv", ".json"):
+        read_motion(file.parent, file)
+
+
+def _known(found: dict[str, Any]) -> dict[str, Any]:
+    """Without the one entry that damage to the name `checksum` leaves."""
+    names = ("method", "settings", "data", "mien", "command_line", "protocols", "training", "fingerprints", "steps", "seconds")
+    return {name: value for name, value in found.items() if name in names}
+
+
+# Using: with the folder, what was read, and dice. ---------------------------------------------------------------------
+
+
+def nothing(root: Path, found: Any, dice: Random) -> None:
+    """Nothing more."""
+
+
+def expect_finite(root: Path, found: Any, dice: Random) -> None:
+    content.expect_finite(found)
+
+
+def expect_rows(root: Path, found: np.ndarray, dice: Random) -> None:
+    assert found.shape == (3, 478, 2), found.shape
+    assert not np.isinf(found).any()
+
+
+def expect_motion(root: Path, found: Motion, dice: Random) -> None:
+    assert all(np.isfinite(getattr(found, field.name)).all() for field in fields(found))
+    assert 0 < found.fps <= 1e6, found.fps
+
+
+def use_capture(root: Path, found: Any, dice: Random) -> None:
+    content.expect_finite(found.calibration)
+    assert found.images[0, 0].shape == (found.height, found.width, 3)
+    np.asarray(found.mattes[-1, -1]).sum()
+    found.usable  # noqa: B018
+    if dice.random() < 0.3:
+        use_run(root, None, dice)
+
+
+def use_run(root: Path, found: Any, dice: Random) -> None:
+    dice.choice((use_evaluation, use_training, use_rendering))(root, found, dice)
+
+
+def use_evaluation(root: Path, found: Any, dice: Random) -> None:
+    evaluate(root / RUN, [root / SEQUENCE], QUICK)
+    read_figures(root / RUN)
+
+
+def use_training(root: Path, found: Any, dice: Random) -> None:
+    run = root / (RUN if dice.random() < 0.7 else "W/runs/new")
+    if dice.random() < 0.7:
+        (run / "training.json").unlink(missing_ok=True)
+    settings = replace(SETTINGS, split="tail")
+    settings = settings if run.name == "toy" else replace(settings, steps=2)
+    train([read_sequence(root / SEQUENCE)], toy_face_model(), CONFIG, settings, run)
+
+
+def use_rendering(root: Path, found: Any, dice: Random) -> None:
+    avatar, sequence = load_avatar(root / RUN), read_sequence(root / SEQUENCE)
+    camera = fitted(run_camera(root / RUN), 32, 32)
+    face = sequence.tracking.face
+    driven = drive(face, face[0], avatar.subject, avatar.face_model.expression_bounds)
+    with torch.no_grad():
+        for each in (camera, fitted(sequence.tracking.cameras[0], 32, 32)):
+            image = rasterize(avatar.pose(driven[0]).gaussians.timestep(0), each, torch.ones(3)).image
+            assert image.isfinite().all(), "a picture that is not finite"
+
+
+def use_partial(root: Path, found: Any, dice: Random) -> None:
+    """Add, forget; and evaluate with the faulty lines behind the right first one."""
+    for file in (root / RUN).glob(".*.partial"):
+        kept = PartialScores(file, "0")
+        kept.read()
+    use_evaluation(root, found, dice)
+
+
+def use_comparison(root: Path, found: Any, dice: Random) -> None:
+    comparison = compare_runs({"a": root / RUN})
+    comparison_text(comparison, bold=False)
+    comparison.content()
+    comparison_html(comparison, [""] * len(comparison.tables))
+
+
+def use_avatar(root: Path, found: Any, dice: Random) -> None:
+    content.expect_finite(found)
+    with torch.no_grad():
+        gaussians = found.pose(found.subject).gaussians.timestep(0)
+        rasterize(gaussians, toy_camera(32), torch.ones(3))
+        if dice.random() < 0.3:
+            write_ply(root / "out.ply", in_world(gaussians))
+            write_portable(root / "out.mien", make_portable(found, toy_camera(32), "toy"))
+
+
+def use_face_model(root: Path, found: FaceModel, dice: Random) -> None:
+    content.expect_finite(found)
+    found(found.neutral(2))
+    vertices = found.vertices_reference(found.neutral(1))
+    for name in found.landmarks:
+        assert found.landmark_positions(vertices, name).isfinite().all()
+
+
+def use_portable(root: Path, found: Any, dice: Random) -> None:
+    content.expect_finite(found)
+    avatar = Avatar(found)
+    assert max(found.camera.width, found.camera.height) <= 1 << 15, "a camera of this size was let in"
+    posed = avatar.pose()
+    avatar.pose(dict.fromkeys(avatar.expression_names, 0.5))
+    image, _ = avatar.render(posed, found.camera.resized(32, 32))
+    assert np.isfinite(image).all(), "a picture that is not finite"
+
+
+def use_gaussians(root: Path, found: Any, dice: Random) -> None:
+    content.expect_finite(found)
+    if len(found) < 100_000:
+        image = rasterize(found, toy_camera(32), torch.ones(3)).image
+        assert image.isfinite().all(), "a picture that is not finite"
+
+
+def use_cameras(root: Path, found: Any, dice: Random) -> None:
+    content.expect_finite(found)
+    gaussians = read_gaussians(root / "head.ply")
+    for camera in found[:2]:
+        for each in (fitted(camera, 32, 32), replace(camera, width=min(camera.width, 64), height=min(camera.height, 64))):
+            assert rasterize(gaussians, each, torch.ones(3)).image.isfinite().all(), "a picture that is not finite"
+
+
+def use_flame(root: Path, found: Any, dice: Random) -> None:
+    content.expect_finite(found)
+    model = flame_face_model(found, "tiny")
+    content.expect_finite(model)
+    model(model.neutral(1))
+
+
+LINES = (
+    "render {W} --out {root}/o.png --width 16 --height 16", "render {W} --out {root}/o.png --size 16 --path captured", "render {W} --out {root}/o.png --size 16 --sequence clip",
+    "render {W} --out {root}/o_%03d.png --size 16 --frames 2", "drive {W} --by {W} --out {root}/o.mp4 --size 16", "export {W} --out {root}/o.ply",
+    "export {W} --out {root}/o.mien", "export {W} --out {root}/o.ply --series clip", "evaluate {W} --no-perceptual", "evaluate {W} --compare", "evaluate {W} --compare --json",
+    "train {W} --steps 1 --run other", "train {W} --steps 1 --run toy", "track {W} --again", "track {W}", "face-models", "face-models --json",
+)  # fmt: skip
+
+
+def run_a_line(root: Path, found: Any, dice: Random) -> None:
+    """One command on the faulty workspace, in this process."""
+    os.environ["MIEN_CACHE"] = str(root / "cache")
+    words = [word.format(W=root / "W", root=root) for word in dice.choice(LINES).split()]
+    told = io.StringIO()
+    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            code: Any = cli.main(words)
+        except SystemExit as stop:
+            code = stop.code
+    lines = [line for line in told.getvalue().splitlines() if line.startswith("mien: ")]
+    if code == cli.EXIT_USER_ERROR and len(lines) == 1:
+        raise UserError(lines[0])
+    if code != 0:
+        raise CommandError(f"{words[0]}: exit code {code}, {len(lines)} lines; {_crash()}")
+
+
+def _crash() -> str:
+    logs = sorted(Path(tempfile.gettempdir()).glob("mien-crash-*.log"))
+    text = logs[-1].read_text() if logs else ""
+    for log in logs:
+        log.unlink()
+    return text[-1500:]
