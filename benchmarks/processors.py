@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from mien.avatar import Avatar, GaussianAvatarsConfig, load_avatar
-from mien.capture import read_capture, write_capture
+from mien.capture import Capture, read_capture, write_capture
 from mien.face import load_face_model
 from mien.render import rasterize
 from mien.synthetic import RECIPES, synthesize
@@ -87,10 +87,17 @@ def work(out: Path, name: str, steps: int) -> None:
     np.savez(
         out / f"{name}.npz",
         trained=render(own, truth),
+        clip=over_white(capture),
         rendered=render(load_avatar(out / f"run-{FIRST}"), truth),
         vertices=points.numpy(),
         landmarks=tracked.cameras[0].project(marks)[0].numpy(),
     )
+
+
+def over_white(capture: Capture) -> np.ndarray:
+    """What was trained on, float32."""
+    alpha = capture.mattes[:, 0, ..., None] / np.float32(255)
+    return alpha * (capture.images[:, 0] / np.float32(255)) + 1 - alpha
 
 
 @torch.no_grad()
@@ -108,13 +115,15 @@ def table(out: Path, names: list[str]) -> str:
     results = {name: dict(np.load(out / f"{name}.npz")) for name in names}
     first = results[FIRST]
     lines = [
-        "| setting | one avatar, rendered | avatar, trained | tracking: vertices | landmarks |",
-        "|---|---|---|---|---|",
+        "| setting | one avatar, rendered | avatar, trained | against the clip | tracking: vertices | landmarks |",
+        "|---|---|---|---|---|---|",
+        f"| the machine as it is | | | {decibels(first['trained'], first['clip'])} | | |",
     ]
     for name in names[1:]:
         one = results[name]
         settings = " ".join(f"{key}={value}" for key, value in SETTINGS[name].items())
         cells = [decibels(one[part], first[part]) for part in ("rendered", "trained")]
+        cells.append(decibels(one["trained"], one["clip"]))
         for part, unit, factor in (("vertices", "mm", 1000), ("landmarks", "px", 1)):
             away = factor * np.linalg.norm(one[part].astype(np.float64) - first[part], axis=-1)
             cells.append("same bytes" if not away.any() else f"{away.mean():.2g} {unit} (most {away.max():.2g})")
