@@ -1,4 +1,4 @@
-"""Native functions refuse what does not belong together, and survive a want of memory (`native_cases.py` has the calls)."""
+"""Native functions refuse what does not belong together, and survive a want of memory; `native_cases.py` calls them."""
 
 import json
 import os

@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from native_baselines import BASELINES, Rng
+from native_baselines import BASELINES
+from native_mesh_baselines import Rng
 
 REFUSALS = (TypeError, ValueError, IndexError, OverflowError, MemoryError, BufferError)
 SECONDS_A_CALL = 20
@@ -121,7 +122,7 @@ def other_layout(rng: Rng, array: np.ndarray) -> Any:
         return np.broadcast_to(array.ravel()[:1].reshape([1] * array.ndim) if array.size else array, array.shape)
     if kind == 4:
         array = array.copy()
-        array.flags.writeable = False
+        array.setflags(write=False)
         return array
     if kind == 5:
         memory = np.zeros(array.nbytes + 1, np.uint8)
