@@ -101,11 +101,6 @@ void row_span(const Splat& s, int row, int columns, int* low, int* high) {
   *high = static_cast<int>(std::clamp(std::floor((right - 0.5f) / kTile), -1.0f, static_cast<float>(columns - 1)));
 }
 
-// Whether a splat touches at most two rows of tiles, and at most two tiles in each: most do.
-bool is_small(const TileSpan& span) {
-  return span.row_count <= 2 && span.high[0] - span.low[0] < 2 && span.high[1] - span.low[1] < 2;
-}
-
 // Calls body(first tile, number of tiles) for each row of tiles that a splat touches.
 template <typename Body>
 void for_rows(const Splat& splat, const TileSpan& span, int columns, Body&& body) {
@@ -138,12 +133,7 @@ void check_pair_count(Frame& frame) {
     int64_t own = 0;
     for (int64_t rank = frame.chunks[c].first; rank < frame.chunks[c].last; ++rank) {
       const uint32_t gaussian = frame.order[rank];
-      const TileSpan& span = frame.spans[gaussian];
-      if (is_small(span)) {
-        own += frame.slot_counts[gaussian];
-      } else {
-        for_rows(frame.splats[gaussian], span, frame.columns, [&](int, int count) { own += count; });
-      }
+      for_rows(frame.splats[gaussian], frame.spans[gaussian], frame.columns, [&](int, int count) { own += count; });
     }
     pairs += own;
   });
@@ -165,7 +155,7 @@ void find_pairs(BinChunk& chunk, Frame& frame) {
     __builtin_prefetch(&spans[order[std::min(i + kAhead, count - 1)]]);
     const TileSpan& span = spans[gaussian];
     const int above = std::max(span.high[0] - span.low[0] + 1, 0), below = std::max(span.high[1] - span.low[1] + 1, 0);
-    if (span.row_count <= 2 && above <= 2 && below <= 2) {  // is_small
+    if (span.row_count <= 2 && above <= 2 && below <= 2) {
       // Without a branch on the number of tiles, which is as good as random: both are written, those that count stay.
       const uint32_t first = static_cast<uint32_t>(span.first_row * frame.columns);
       const uint32_t upper = first + static_cast<uint32_t>(span.low[0]);

@@ -1,4 +1,4 @@
-"""Native functions refuse what does not belong together, and survive a lack of memory (calls: `native_cases.py`)."""
+"""Native functions refuse what does not belong together, and survive a want of memory; `native_cases.py` calls them."""
 
 import json
 import os

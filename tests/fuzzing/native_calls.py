@@ -23,15 +23,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from native_baselines import BASELINES, Rng
+from native_baselines import BASELINES
+from native_mesh_baselines import Rng
 
 REFUSALS = (TypeError, ValueError, IndexError, OverflowError, MemoryError, BufferError)
 SECONDS_A_CALL = 20
 MOST_FINDINGS = 20
 SETTINGS_FOR = 50
 """Calls that share a number of threads and an instruction set."""
-INTEGERS = [0, 1, -1, 2, 3, 15, 255, 2**15, 2**16, 2**24, 2**31 - 1, 2**31, -(2**31), 2**32, 2**40, 2**62, 2**63 - 1]
-INTEGERS += [-(2**63), 2**63, 2**64, 10**30]
+INTEGERS = [0, 1, -1, 2, 3, 15, 255, 2**15, 2**16, 2**24, 2**31 - 1, 2**31 - 2, 2**31, -(2**31), 2**32, 2**62]
+INTEGERS += [2**63 - 1, -(2**63), 2**63, 2**64, 10**30]
 FLOATS = [0.0, -0.0, 1.0, -1.0, 1e-45, 1e-30, 1e30, 3.4e38, 1e300, float("inf"), float("-inf"), float("nan")]
 DTYPES = ["f4", "f8", "f2", "i4", "i8", "u1", "u4", "?", "c8", ">f4", "O", "U3"]
 LENGTHS = [0, 1, 2, 3, 4, 7, 64]
@@ -121,7 +122,7 @@ def other_layout(rng: Rng, array: np.ndarray) -> Any:
         return np.broadcast_to(array.ravel()[:1].reshape([1] * array.ndim) if array.size else array, array.shape)
     if kind == 4:
         array = array.copy()
-        array.flags.writeable = False
+        array.setflags(write=False)
         return array
     if kind == 5:
         memory = np.zeros(array.nbytes + 1, np.uint8)
@@ -189,6 +190,10 @@ def changed(rng: Rng, value: Any) -> Any:
     return None
 
 
+def is_whole(value: Any) -> bool:
+    return isinstance(value, int) or (isinstance(value, np.ndarray) and value.dtype.kind in "iu")
+
+
 def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
     """One to three places changed; some get what belongs elsewhere, in this call or in another."""
     for _ in range(int(rng.integers(1, 4))):
@@ -196,6 +201,8 @@ def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
         if not paths or rng.random() < 0.03:
             arguments = changed(rng, arguments) if arguments else [None]
             continue
+        if rng.random() < 0.4:  # what indexes and counts
+            paths = [path for path in paths if is_whole(at(arguments, path))] or paths
         path, kind = paths[int(rng.integers(0, len(paths)))], rng.random()
         if kind < 0.75:
             new = changed(rng, at(arguments, path))
