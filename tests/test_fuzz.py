@@ -11,13 +11,14 @@ from pathlib import Path
 
 import pytest
 
+REPLAY = "one again: PYTHONPATH=tests .venv/bin/python -m fuzzing --replay CASE"
 SECONDS = 400
 """A busy machine needs as long; an idle one with two cores needs half a minute."""
 
 
 @pytest.mark.slow
 def test_random_damage_to_every_file(tmp_path: Path) -> None:
-    """In processes of their own: a decoder that crashes would take the tests with it, and types are not checked there."""
+    """In processes of their own: a decoder that crashes would take the tests with it."""
     asked = ("--self-check", "--seed", "0", "--cases", "1500", "--lines", "20", "--workers", "2")
     result = subprocess.run(
         [sys.executable, "-m", "fuzzing", *asked, "--findings", str(tmp_path / "findings.jsonl")],
@@ -27,5 +28,6 @@ def test_random_damage_to_every_file(tmp_path: Path) -> None:
         timeout=SECONDS,
         check=False,
     )
-    assert result.returncode == 0, f"{result.stdout}\n{result.stderr[-3000:]}\nreplay one: PYTHONPATH=tests python -m fuzzing --replay CASE"
-    assert "| all | 1,5" in result.stdout, result.stdout
+    told = f"{result.stdout}\n{result.stderr[-3000:]}\none again: PYTHONPATH=tests python -m fuzzing --replay CASE"
+    assert result.returncode == 0, told
+    assert "| all | 1,5" in result.stdout, told

@@ -22,12 +22,16 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cases", type=int, default=1500, help="mutated inputs over all targets")
     parser.add_argument("--lines", type=int, default=0, help="odd command lines besides")
-    parser.add_argument("--heavy", type=int, default=0, help="odd command lines of what takes long: each is stopped after 40 s")
+    parser.add_argument(
+        "--heavy", type=int, default=0, help="odd command lines of what takes long: each is stopped after 40 s"
+    )
     parser.add_argument("--minutes", type=float, default=None, help="go on with further seeds for so long")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--only", nargs="*", default=None, help="names of targets")
     parser.add_argument("--findings", type=Path, default=None, help="file of json lines for what is found")
-    parser.add_argument("--replay", default=None, metavar="TARGET:SEED:NUMBER", help="one case, with all that is known of it")
+    parser.add_argument(
+        "--replay", default=None, metavar="TARGET:SEED:NUMBER", help="one case, with all that is known of it"
+    )
     parser.add_argument("--self-check", action="store_true", help="first, find that whatever is wrong would be found")
     parser.add_argument("--keep", action="store_true", help="of a replay: leave the faulty files and say where")
     asked = parser.parse_args()
@@ -40,7 +44,9 @@ def main() -> int:
             print(json.dumps(result.as_json(), indent=1, ensure_ascii=True))
             return int(result.outcome == "finding")
         until = None if asked.minutes is None else time.monotonic() + 60 * asked.minutes
-        plan = campaign.Plan(asked.seed, asked.cases, asked.only, asked.workers, until, asked.lines, asked.heavy, asked.self_check)
+        plan = campaign.Plan(
+            asked.seed, asked.cases, asked.only, asked.workers, until, asked.lines, asked.heavy, asked.self_check
+        )
         tally = campaign.run(plan, folder, asked.findings)
         print(tally.table())
         return int(bool(tally.findings or tally.missed))

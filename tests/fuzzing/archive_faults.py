@@ -15,30 +15,70 @@ from fuzzing.edges import INTEGERS, edge_integer, packed_integer, put
 from fuzzing.picture_faults import zeros
 from fuzzing.tensor_faults import faulty_arrays, faulty_numbers
 
-_TYPES = ("'|O'", "'<f8'", "'>f4'", "'<U1000'", "'|S5'", "'<c16'", "[('a', '<f4')]", "'<M8[s]'", "'|V8'", "'x'", "None", "'|b1'", "'<f2'")
+_TYPES = (
+    "'|O'",
+    "'<f8'",
+    "'>f4'",
+    "'<U1000'",
+    "'|S5'",
+    "'<c16'",
+    "[('a', '<f4')]",
+    "'<M8[s]'",
+    "'|V8'",
+    "'x'",
+    "None",
+    "'|b1'",
+    "'<f2'",
+)
 
 
 def faulty_npz(data: bytes, dice: Random) -> tuple[str, bytes]:
     """One fault in a .npz."""
     members = members_of(data)
     name = dice.choice(list(members))
-    kind = dice.choice(("numbers",) * 4 + ("arrays",) * 4 + ("shape", "shape", "type", "member", "name", "zip", "bomb", "version"))
+    kind = dice.choice(
+        ("numbers",) * 4 + ("arrays",) * 4 + ("shape", "shape", "type", "member", "name", "zip", "bomb", "version")
+    )
     if kind in ("numbers", "arrays"):
         change = faulty_numbers if kind == "numbers" else faulty_arrays
         fault, arrays = change(dict(sorted(np.load(io.BytesIO(data)).items())), dice)
         return f"{kind} {fault}", npz_of({key: npy_of(array) for key, array in arrays.items()})
     if kind == "shape":
-        shape = dice.choice((str((edge_integer(dice),)), str((edge_integer(dice), 3)), "()", "(-1,)", "(1.5,)", "'x'", "(10**12,)", str((1,) * 40)))
-        members[name] = _with_header(members[name], re.sub(r"'shape': \(.*?\)", f"'shape': {shape}", _header(members[name])))
+        shape = dice.choice(
+            (
+                str((edge_integer(dice),)),
+                str((edge_integer(dice), 3)),
+                "()",
+                "(-1,)",
+                "(1.5,)",
+                "'x'",
+                "(10**12,)",
+                str((1,) * 40),
+            )
+        )
+        members[name] = _with_header(
+            members[name], re.sub(r"'shape': \(.*?\)", f"'shape': {shape}", _header(members[name]))
+        )
     elif kind == "type":
-        members[name] = _with_header(members[name], re.sub(r"'descr': '.*?'", f"'descr': {dice.choice(_TYPES)}", _header(members[name])))
+        members[name] = _with_header(
+            members[name], re.sub(r"'descr': '.*?'", f"'descr': {dice.choice(_TYPES)}", _header(members[name]))
+        )
     elif kind == "version":
         text = dice.choice(("", "{", "x" * 70_000, "__import__('os')", "(" * 5000, "{'descr': 1}", "{**1}", "1" * 5000))
-        members[name] = _with_header(members[name], text) if dice.random() < 0.7 else put(members[name], dice.randrange(10), dice.randbytes(1))
+        members[name] = (
+            _with_header(members[name], text)
+            if dice.random() < 0.7
+            else put(members[name], dice.randrange(10), dice.randbytes(1))
+        )
     elif kind == "member":
-        members[name] = dice.choice((b"", members[name][: dice.randrange(len(members[name]))], b"\x80\x04N.", members[name] * 3))
+        members[name] = dice.choice(
+            (b"", members[name][: dice.randrange(len(members[name]))], b"\x80\x04N.", members[name] * 3)
+        )
     elif kind == "name":
-        members = {dice.choice(("../x", "/x", f"{name}.npy.npy", "", "a\x1b[31m", "f" * 5000)) if key == name else key: value for key, value in members.items()}
+        members = {
+            dice.choice(("../x", "/x", f"{name}.npy.npy", "", "a\x1b[31m", "f" * 5000)) if key == name else key: value
+            for key, value in members.items()
+        }
     elif kind == "bomb":
         amount = dice.choice((1 << 30, 3 << 30, 6 << 30))
         head = _with_header(b"", f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({amount // 12}, 3), }}")
@@ -115,10 +155,42 @@ def faulty_pickle(data: bytes, dice: Random) -> tuple[str, bytes]:
             other = dice.randrange(len(operations) - 1)
             operations[index], operations[other] = operations[other], operations[index]
         elif kind == "insert":
-            operations.insert(index, dice.choice((b"(", b"]", b"}", b"N", b"t", b"R", b"b", b".", b"0", b"2", b"Q", b"\x93", b"\x81", b"o", b"e", b"u", b"a")))
+            operations.insert(
+                index,
+                dice.choice(
+                    (
+                        b"(",
+                        b"]",
+                        b"}",
+                        b"N",
+                        b"t",
+                        b"R",
+                        b"b",
+                        b".",
+                        b"0",
+                        b"2",
+                        b"Q",
+                        b"\x93",
+                        b"\x81",
+                        b"o",
+                        b"e",
+                        b"u",
+                        b"a",
+                    )
+                ),
+            )
         elif kind == "global":
             places = [at for at, operation in enumerate(operations) if operation[:1] == b"c"] or [index]
-            name = dice.choice((b"cos\nsystem\n", b"cbuiltins\neval\n", b"cmien.cli\nmain\n", b"c\n\n", b"cnumpy\nndarray\n", b"c" + b"x" * 9999 + b"\n\x1b[31m\n"))
+            name = dice.choice(
+                (
+                    b"cos\nsystem\n",
+                    b"cbuiltins\neval\n",
+                    b"cmien.cli\nmain\n",
+                    b"c\n\n",
+                    b"cnumpy\nndarray\n",
+                    b"c" + b"x" * 9999 + b"\n\x1b[31m\n",
+                )
+            )
             operations[dice.choice(places)] = name
         elif len(operations[index]) > 1:
             size = len(operations[index]) - 1

@@ -7,7 +7,20 @@ from fuzzing.edges import edge_integer, packed_integer, put
 
 _HOLDERS = frozenset({b"moov", b"trak", b"mdia", b"minf", b"stbl", b"udta", b"edts", b"dinf"})
 _TABLES = frozenset({b"stts", b"stsc", b"stsz", b"stco", b"co64", b"stss", b"ctts", b"elst", b"stsd"})
-_CODECS = (b"xxxx", b"hvc1", b"av01", b"mp4v", b"vp09", b"rle ", b"raw ", b"jpeg", b"\x00\x00\x00\x00", b"\xa9\x1b[m", b"apcn", b"dvh1")
+_CODECS = (
+    b"xxxx",
+    b"hvc1",
+    b"av01",
+    b"mp4v",
+    b"vp09",
+    b"rle ",
+    b"raw ",
+    b"jpeg",
+    b"\x00\x00\x00\x00",
+    b"\xa9\x1b[m",
+    b"apcn",
+    b"dvh1",
+)
 Box = tuple[bytes, int, int]
 """Type, where its size field stands, and its whole size."""
 
@@ -27,7 +40,24 @@ def boxes_of(data: bytes, start: int = 0, end: int | None = None) -> list[Box]:
 
 def faulty_mp4(data: bytes, dice: Random) -> tuple[str, bytes]:
     """One to three faults in the boxes of an mp4 or mov."""
-    kind = dice.choice(("field", "field", "field", "table", "table", "size", "type", "remove", "double", "codec", "extradata", "tag", "frames", "cut"))
+    kind = dice.choice(
+        (
+            "field",
+            "field",
+            "field",
+            "table",
+            "table",
+            "size",
+            "type",
+            "remove",
+            "double",
+            "codec",
+            "extradata",
+            "tag",
+            "frames",
+            "cut",
+        )
+    )
     for _ in range(dice.choice((1, 1, 2, 3))):
         found = [box for box in boxes_of(data) if box[0] != b"mdat"]
         if not found:
@@ -51,13 +81,21 @@ def _with_fault(data: bytes, kind: str, found: list[Box], dice: Random) -> bytes
     if kind == "size":
         return put(data, start, packed_integer(dice, 4, "big"))
     if kind == "type":
-        return put(data, start + 4, dice.choice((b"free", b"moov", b"mdat", b"meta", b"\x00\x00\x00\x00", dice.choice(found)[0])))
+        return put(
+            data,
+            start + 4,
+            dice.choice((b"free", b"moov", b"mdat", b"meta", b"\x00\x00\x00\x00", dice.choice(found)[0])),
+        )
     if kind == "remove":
         return data[:start] + data[start + size :]
     if kind == "double":
         return data[: start + size] + data[start : start + size] * dice.choice((1, 30)) + data[start + size :]
     if kind == "tag":
-        return with_tag(data, dice.choice((b"Caf\xe9 \xff", b"\x1b]0;own\x07", b"x" * 70_000, b"\x00" * 20, "größer".encode())), dice)
+        return with_tag(
+            data,
+            dice.choice((b"Caf\xe9 \xff", b"\x1b]0;own\x07", b"x" * 70_000, b"\x00" * 20, "größer".encode())),
+            dice,
+        )
     if kind == "frames":
         middle = [box for box in boxes_of(data) if box[0] == b"mdat"]
         if not middle:
@@ -88,7 +126,9 @@ def faulty_stream(data: bytes, dice: Random) -> tuple[str, bytes]:
         if kind == "head":
             data = put(data, at, bytes([edge_integer(dice) % 256]))[: len(data)]
         elif kind == "field":
-            data = put(data, at, packed_integer(dice, dice.choice((2, 4, 8)), dice.choice(("big", "little"))))[: len(data)]
+            data = put(data, at, packed_integer(dice, dice.choice((2, 4, 8)), dice.choice(("big", "little"))))[
+                : len(data)
+            ]
         elif kind == "middle":
             data = put(data, at, dice.randbytes(8))[: len(data)]
         elif kind == "double":

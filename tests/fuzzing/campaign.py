@@ -70,7 +70,13 @@ class Tally:
             counts = Counter({outcome: count for (other, outcome), count in self.outcomes.items() if other == name})
             total += counts
             rows.append(_row(name, counts))
-        rows += [_row("all", total), "", f"longest {self.seconds:.1f} s, most memory {self.megabytes:.0f} MB", "", f"{len(self.findings)} causes:"]
+        rows += [
+            _row("all", total),
+            "",
+            f"longest {self.seconds:.1f} s, most memory {self.megabytes:.0f} MB",
+            "",
+            f"{len(self.findings)} causes:",
+        ]
         for cause, results in sorted(self.findings.items(), key=lambda item: -len(item[1])):
             rows.append(f"{len(results):6} x {cause}    --replay {results[0].case!r}")
         return "\n".join(rows)
@@ -97,7 +103,11 @@ def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
                 log.write(json.dumps(result.as_json()) + "\n")
                 log.flush()
             if count % 500 == 0:
-                print(f"{count} cases in {time.monotonic() - began:.0f} s, {len(tally.findings)} causes", file=sys.stderr, flush=True)
+                print(
+                    f"{count} cases in {time.monotonic() - began:.0f} s, {len(tally.findings)} causes",
+                    file=sys.stderr,
+                    flush=True,
+                )
     print(f"{sum(tally.outcomes.values())} cases in {time.monotonic() - began:.0f} s", file=sys.stderr)
     return tally
 
@@ -121,14 +131,17 @@ Job = Callable[[], Iterator[Result]]
 
 def _all_results(plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
     """Command lines beside the cases of the first seed, then further seeds."""
-    lines = [f"{name}:{plan.seed}:{n}" for name, count in ((LIGHT, plan.lines), (HEAVY, plan.heavy)) for n in range(count)]
+    lines = [
+        f"{name}:{plan.seed}:{n}" for name, count in ((LIGHT, plan.lines), (HEAVY, plan.heavy)) for n in range(count)
+    ]
     jobs: list[Job] = [partial(run_lines, lines, folder / "lines", material)]
     seed = plan.seed
     while plan.cases or jobs:
         cases = [f"{name}:{seed}:{number}" for name, number in spread(plan.cases, plan.only)] if plan.cases else []
         shares = [cases[index :: plan.workers] for index in range(plan.workers)]
         jobs += [
-            partial(run_cases, share, folder / f"worker{index}", material, plan.until) for index, share in enumerate(shares)
+            partial(run_cases, share, folder / f"worker{index}", material, plan.until)
+            for index, share in enumerate(shares)
         ]
         yield from chain.from_iterable(job() for job in jobs) if plan.workers == 1 else _side_by_side(jobs)
         jobs, seed = [], seed + 1

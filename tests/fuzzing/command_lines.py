@@ -18,30 +18,44 @@ from fuzzing.faults import Place
 from mien.cli import COMMANDS
 
 BASES = (
-    "render W --out o.png --size 16", "render W --out o.mp4 --size 16 --frames 2", "render W --out o_%03d.png --size 16 --sequence clip",
-    "render W --out o.webm --size 16 --frames 2 --background transparent", "render W --cameras given/cameras.json --out o_%d.png",
-    "drive W --by W --out o.mp4 --size 16", "drive W --by given/take.csv --out o.mp4 --size 16", "drive W --by given/take.json --out o.mp4 --size 16",
-    "export W --out o.ply", "export W --out o.mien", "export W --out o.ply --series clip", "evaluate W --no-perceptual", "evaluate W --compare --json",
-    "evaluate --images pictures --truth pictures --no-perceptual", "evaluate --images given/mattes --truth given/mattes --no-perceptual --json --crops given/crops.json",
-    "train W --steps 1 --run r", "train W --run toy", "track W", "track W --again", "face-models", "face-models --json", "capture none.mp4 --out new",
+    "render W --out o.png --size 16", "render W --out o.mp4 --size 16 --frames 2",
+    "render W --out o_%03d.png --size 16 --sequence clip",
+    "render W --out o.webm --size 16 --frames 2 --background transparent",
+    "render W --cameras given/cameras.json --out o_%d.png",
+    "drive W --by W --out o.mp4 --size 16", "drive W --by given/take.csv --out o.mp4 --size 16",
+    "drive W --by given/take.json --out o.mp4 --size 16",
+    "export W --out o.ply", "export W --out o.mien", "export W --out o.ply --series clip",
+    "evaluate W --no-perceptual", "evaluate W --compare --json",
+    "evaluate --images pictures --truth pictures --no-perceptual",
+    "evaluate --images given/mattes --truth given/mattes --no-perceptual --json --crops given/crops.json",
+    "train W --steps 1 --run r", "train W --run toy", "track W", "track W --again", "face-models",
+    "face-models --json", "capture none.mp4 --out new",
     "bench", "bench quality --out o", "create none.mp4 --out new", "demo --out head.ply",
 )  # fmt: skip
 HEAVY = (
-    "capture videos/clip.mp4 --out new", "create videos/clip.mp4 --out new --steps 1", "capture pictures --out new", "demo --out new --seconds 0.1 --steps 1",
-    "face-models --add flame/tiny.npz --name tiny", "face-models --add flame/tiny.pkl", "bench render --seconds 0.001 --json", "bench scaling --seconds 0.001",
+    "capture videos/clip.mp4 --out new", "create videos/clip.mp4 --out new --steps 1", "capture pictures --out new",
+    "demo --out new --seconds 0.1 --steps 1",
+    "face-models --add flame/tiny.npz --name tiny", "face-models --add flame/tiny.pkl",
+    "bench render --seconds 0.001 --json", "bench scaling --seconds 0.001",
     "drive W --by videos/clip.mp4 --out o.mp4", "track W --face-model flame/tiny.npz",
 )  # fmt: skip
 """These take longer than a case may; they are stopped then, and have to end as a stopped command does."""
 _NUMBERS = (
-    "0", "1", "2", "3", "16", "0.5", "-1", "-0", "nan", "inf", "-inf", "1e400", "9" * 400, "9" * 5000, "2147483647", "2147483648", "4294967296", "9223372036854775808",
+    "0", "1", "2", "3", "16", "0.5", "-1", "-0", "nan", "inf", "-inf", "1e400", "9" * 400, "9" * 5000, "2147483647",
+    "2147483648", "4294967296", "9223372036854775808",
     "0x10", "1e3", "1_0", "٣", "1,5", "1.0", "3e38", "1e-320", " 1", "--1", "x",
 )  # fmt: skip
 _PATHS = (
-    "W", "W/", "./W/../W", "W/runs/toy", "W/runs", "W/sequences/clip", "W/sequences/clip/capture", "none", "none.png", "videos/clip.mp4", "videos/clip.mkv", "pictures", "pictures/a.png",
-    "pictures/a.jpg", "given/take.csv", "given/take.json", "given/points.csv", "given/points.safetensors", "given/mattes", "given/crops.json", "given/cameras.json", "head.mien", "head.ply",
-    "flame/tiny.npz", "flame/tiny.pkl", "/dev/null", "/dev/zero", "/proc/self/mem", "/proc/self/environ", "/nowhere/x", "pipe", ".", "..", "~", "-", "x" * 300, "a/" * 2000 + "x",
-    f"http://127.0.0.1:{PORT}/x.mp4", "a\x1b[31m.png", "a\nb.mp4", "empty", "größer.png", "\udcff.png", "%s.png", "%d%d.png", "%n.png", "o.png", "o.mp4", "o.webm", "o.ply", "o.mien", "o.json",
-    "o.html", "o", "o_%06d.png", "out/deep/o.png", "W/o.png", "head.ply/x.png", "/dev/full", "/proc/x.png", "outside_link/o.png",
+    "W", "W/", "./W/../W", "W/runs/toy", "W/runs", "W/sequences/clip", "W/sequences/clip/capture", "none", "none.png",
+    "videos/clip.mp4", "videos/clip.mkv", "pictures", "pictures/a.png",
+    "pictures/a.jpg", "given/take.csv", "given/take.json", "given/points.csv", "given/points.safetensors",
+    "given/mattes", "given/crops.json", "given/cameras.json", "head.mien", "head.ply",
+    "flame/tiny.npz", "flame/tiny.pkl", "/dev/null", "/dev/zero", "/proc/self/mem", "/proc/self/environ",
+    "/nowhere/x", "pipe", ".", "..", "~", "-", "x" * 300, "a/" * 2000 + "x",
+    f"http://127.0.0.1:{PORT}/x.mp4", "a\x1b[31m.png", "a\nb.mp4", "empty", "größer.png", "\udcff.png", "%s.png",
+    "%d%d.png", "%n.png", "o.png", "o.mp4", "o.webm", "o.ply", "o.mien", "o.json",
+    "o.html", "o", "o_%06d.png", "out/deep/o.png", "W/o.png", "head.ply/x.png", "/dev/full", "/proc/x.png",
+    "outside_link/o.png",
 )  # fmt: skip
 _SURROUNDINGS: dict[str, dict[str, Any]] = {
     "LANG=C": {"env": {"LANG": "C", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}},
@@ -171,4 +185,6 @@ def _value(hint: Any, dice: Random) -> str:
         return dice.choice(_NUMBERS if dice.random() < 0.5 else ("1", "2", "3", "16", "20"))
     if hint is Path:
         return dice.choice(_PATHS)
-    return dice.choice((*TEXTS[:40], "clip", "toy", "anny", "drop=0.5", "drop=nan", "swell=1e400", "white", "#12345", "jawOpen=1"))
+    return dice.choice(
+        (*TEXTS[:40], "clip", "toy", "anny", "drop=0.5", "drop=nan", "swell=1e400", "white", "#12345", "jawOpen=1")
+    )

@@ -11,6 +11,7 @@ os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS
 import json
 import resource
 import sys
+from pathlib import Path
 from typing import Any
 
 
@@ -23,14 +24,16 @@ def apply_limits(request: dict[str, Any]) -> None:
         if name in request:
             resource.setrlimit(limit, (request[name], request[name]))
     if "memory" in request:
-        size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()  # noqa: SIM115
+        size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (size + request["memory"], size + request["memory"]))
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         where = request[name]
         if where == "closed":
             os.close(number)
         else:
-            os.dup2(os.open(where, os.O_RDONLY if number == 0 else os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), number)
+            os.dup2(
+                os.open(where, os.O_RDONLY if number == 0 else os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), number
+            )
 
 
 def _broken_pipe() -> None:

@@ -45,5 +45,18 @@ def expect_finite(value: Any, path: str = "") -> None:
             expect_finite(item, path)
 
 
-_MAY_BE_NAN = frozenset({"landmarks", "residuals", "pixel_residuals", "sharpness", "brightness", "clipped", "quality", "timestamps", "source", "settings"})
+_MAY_BE_NAN = frozenset(
+    {
+        "landmarks",
+        "residuals",
+        "pixel_residuals",
+        "sharpness",
+        "brightness",
+        "clipped",
+        "quality",
+        "timestamps",
+        "source",
+        "settings",
+    }
+)
 """Of a face that was not found, or what is only shown."""

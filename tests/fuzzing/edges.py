@@ -5,7 +5,8 @@ from random import Random
 from typing import Any
 
 INTEGERS = (
-    0, 1, -1, 2, 7, 255, 256, 65535, 65536, 2**24 + 1, 4 * 10**8, 2**31 - 1, 2**31, -(2**31), 2**32 - 1, 2**32, 2**53 + 1,
+    0, 1, -1, 2, 7, 255, 256, 65535, 65536, 2**24 + 1, 4 * 10**8, 2**31 - 1, 2**31, -(2**31), 2**32 - 1, 2**32,
+    2**53 + 1,
     2**63 - 1, 2**63, -(2**63), 2**64 - 1, 2**64, 10**400, -(10**400),
 )  # fmt: skip
 FLOATS = (math.nan, math.inf, -math.inf, 3e38, -3e38, 3.5e38, 1e308, 1e-320, -0.0, 0.5, 1e16, 1e-9, 1e30, -1e30)
@@ -16,9 +17,12 @@ DEEP = "@DEEP"
 SCRIPT = "<script>mien_fuzz(1)</script>"
 """Has to be escaped in every report."""
 TEXTS = (
-    "", " ", "text", "0", "nan", "null", "x" * 300, "x" * 100_000, "a\nb", "\x1b]0;own\x07\x1b[31mred", "a\x00b", "\u202eabc",
-    "\ud800", "\x9b31m", "..", ".", "/", "../../x", "../" * 12 + "etc/passwd", f"{CANARY}/victim.json", f"../../../..{CANARY}/victim",
-    "C:\\x", "con", "-", "--help", "a:b", f"http://127.0.0.1:{PORT}/x", "%s%n", "{0}", SCRIPT, "größer", "\U0001f600", "é" * 200,
+    "", " ", "text", "0", "nan", "null", "x" * 300, "x" * 100_000, "a\nb", "\x1b]0;own\x07\x1b[31mred", "a\x00b",
+    "\u202eabc",
+    "\ud800", "\x9b31m", "..", ".", "/", "../../x", "../" * 12 + "etc/passwd", f"{CANARY}/victim.json",
+    f"../../../..{CANARY}/victim",
+    "C:\\x", "con", "-", "--help", "a:b", f"http://127.0.0.1:{PORT}/x", "%s%n", "{0}", SCRIPT, "größer", "\U0001f600",
+    "é" * 200,
 )  # fmt: skip
 _DEPTHS = (2, 100, 500, 990, 1000, 5000, 100_000)
 
@@ -42,7 +46,9 @@ def edge_value(dice: Random) -> Any:
         return dice.choice(TEXTS)
     if kind == 5:
         return f"{DEEP}{dice.choice(_DEPTHS)}"
-    return dice.choice((None, True, False, [], {}, [[]], [None], {"": 0}, [0] * 1000, [[0, 0], [0]], {"tensor": "x"}, {"kind": "x"}))
+    return dice.choice(
+        (None, True, False, [], {}, [[]], [None], {"": 0}, [0] * 1000, [[0, 0], [0]], {"tensor": "x"}, {"kind": "x"})
+    )
 
 
 def packed_integer(dice: Random, size: int, order: str = "little") -> bytes:

@@ -108,7 +108,9 @@ def _faulty_json_file(data: bytes, dice: Random) -> tuple[str, bytes]:
         kind, content = faulty_json(content, dice)
         return kind, written(content, dice)
     checksum = content.pop("checksum", None)
-    frame = {name: content.pop(name) for name in ("format", "version") if name in content} if dice.random() < 0.8 else {}
+    frame = (
+        {name: content.pop(name) for name in ("format", "version") if name in content} if dice.random() < 0.8 else {}
+    )
     kind, content = faulty_json(content, dice)
     if isinstance(content, dict):
         content = {**frame, **content}
@@ -155,6 +157,8 @@ def rename(place: Place, dice: Random) -> str:
 
 
 _BY_ENDING = {
-    ".png": faulty_picture, ".jpg": faulty_picture, ".webp": faulty_picture, ".tif": faulty_picture, ".bmp": faulty_picture,
-    ".mp4": faulty_mp4, ".mov": faulty_mp4, ".csv": faulty_table, ".ply": faulty_ply, ".npz": faulty_npz, ".pkl": faulty_pickle,
+    ".png": faulty_picture, ".jpg": faulty_picture, ".webp": faulty_picture, ".tif": faulty_picture,
+    ".bmp": faulty_picture,
+    ".mp4": faulty_mp4, ".mov": faulty_mp4, ".csv": faulty_table, ".ply": faulty_ply, ".npz": faulty_npz,
+    ".pkl": faulty_pickle,
 }  # fmt: skip

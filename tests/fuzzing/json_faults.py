@@ -36,7 +36,8 @@ def faulty_json(value: Any, dice: Random) -> tuple[str, Any]:
 
 
 _FAULTS = (
-    "edge", "edge", "edge", "edge", "edge", "number", "number", "remove", "rename", "swap", "wrap", "unwrap", "double", "add", "type",
+    "edge", "edge", "edge", "edge", "edge", "number", "number", "remove", "rename", "swap", "wrap", "unwrap",
+    "double", "add", "type",
 )  # fmt: skip
 
 
@@ -107,7 +108,22 @@ def faulty_text(data: bytes, dice: Random) -> tuple[str, bytes]:
     numbers = list(re.finditer(r"-?[0-9.]+(e-?[0-9]+)?", text))
     kind = dice.choice(("literal", "literal", "twice", "tail", "encoding", "deep", "quotes", "bytes", "comment"))
     if kind == "literal" and numbers:
-        literals = ("NaN", "-Infinity", "1e999", "-1e999", "9" * 400, "9" * 5000, "0x10", "01", "1.", ".5", "1e", "--1", "1_0", "٣")
+        literals = (
+            "NaN",
+            "-Infinity",
+            "1e999",
+            "-1e999",
+            "9" * 400,
+            "9" * 5000,
+            "0x10",
+            "01",
+            "1.",
+            ".5",
+            "1e",
+            "--1",
+            "1_0",
+            "٣",
+        )
         found = dice.choice(numbers)
         return kind, (text[: found.start()] + dice.choice(literals) + text[found.end() :]).encode()
     if kind == "twice":
@@ -123,4 +139,6 @@ def faulty_text(data: bytes, dice: Random) -> tuple[str, bytes]:
     if kind == "comment":
         return kind, b"// json\n" + data
     at = dice.randrange(len(data) + 1)
-    return "bytes", data[:at] + dice.choice((b"\xff", b"\xc3", b"\x00", b"\xed\xa0\x80", b"\x1b[31m", b'\\ud800"')) + data[at:]
+    return "bytes", data[:at] + dice.choice(
+        (b"\xff", b"\xc3", b"\x00", b"\xed\xa0\x80", b"\x1b[31m", b'\\ud800"')
+    ) + data[at:]

@@ -61,13 +61,19 @@ class Bench:
         """What the case prints."""
         return self.folder / "told.txt"
 
+    def patience(self) -> float:
+        """Seconds after which a case hangs: longer where others keep the machine busy."""
+        return self.seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1) - 1)
+
     def prepare(self) -> None:
         """Fresh folders, and an environment in which nothing of the user's is touched."""
         shutil.rmtree(self.folder, ignore_errors=True)
         for name in ("home", "here", "tmp"):
             (self.folder / name).mkdir(parents=True)
         outside_of(self.canary)
-        os.environ.update(HOME=str(self.folder / "home"), TMPDIR=str(self.folder / "tmp"), MIEN_CACHE=str(self.folder / "cache"))
+        os.environ.update(
+            HOME=str(self.folder / "home"), TMPDIR=str(self.folder / "tmp"), MIEN_CACHE=str(self.folder / "cache")
+        )
         tempfile.tempdir = None
         os.chdir(self.folder / "here")
 
@@ -150,13 +156,24 @@ def snapshot(bench: Bench) -> dict[str, Any]:
         for path in sorted([folder, *folder.rglob("*")]):
             status = path.lstat()
             whole = path.is_file() and not path.is_symlink()
-            digest = hashlib.sha256(path.read_bytes()).hexdigest() if whole and status.st_size < LARGEST_FILE / 64 else None
-            found[str(path.relative_to(bench.folder))] = (status.st_mode, digest, None if path.is_dir() else status.st_mtime_ns)
+            digest = (
+                hashlib.sha256(path.read_bytes()).hexdigest() if whole and status.st_size < LARGEST_FILE / 64 else None
+            )
+            found[str(path.relative_to(bench.folder))] = (
+                status.st_mode,
+                digest,
+                None if path.is_dir() else status.st_mtime_ns,
+            )
     return found
 
 
 def judge_traces(
-    result: Result, bench: Bench, before: dict[str, Any], listener: socket.socket, outside: bool = True, slow: bool = True
+    result: Result,
+    bench: Bench,
+    before: dict[str, Any],
+    listener: socket.socket,
+    outside: bool = True,
+    slow: bool = True,
 ) -> None:
     """Whether anything was left, written outside, called, printed."""
     if outside and (after := snapshot(bench)) != before:
@@ -164,14 +181,16 @@ def judge_traces(
         result.findings.append("outside")
         result.traceback.append(f"changed: {changed}")
         result.cause = result.cause or f"outside: {result.case.split(':')[0]}, {result.kind}"
-    if slow and result.seconds > bench.seconds:
+    if slow and result.seconds > bench.patience():
         result.findings.append("hang")
     if result.megabytes > bench.memory / 2**20:
         result.findings.append("memory")
     if select.select([listener], [], [], 0)[0]:
         listener.accept()[0].close()
         result.findings.append("connection")
-    leftovers = sorted(path.name for path in (bench.folder / "tmp").iterdir() if not path.name.startswith("mien-crash-"))
+    leftovers = sorted(
+        path.name for path in (bench.folder / "tmp").iterdir() if not path.name.startswith("mien-crash-")
+    )
     if leftovers and result.outcome != "finding":
         result.findings.append("leftover")
         result.traceback.append(f"left in the folder for temporary files: {leftovers}")
@@ -200,7 +219,10 @@ def _faults_of_message(message: str, root: str) -> list[str]:
 
 def _add_traceback(result: Result, error: BaseException) -> None:
     frames = traceback.extract_tb(error.__traceback__)
-    result.traceback = [f"{Path(frame.filename).name}:{frame.lineno} {frame.name}: {(frame.line or '').strip()[:120]}" for frame in frames][-6:]
+    result.traceback = [
+        f"{Path(frame.filename).name}:{frame.lineno} {frame.name}: {(frame.line or '').strip()[:120]}"
+        for frame in frames
+    ][-6:]
     ours = [frame for frame in frames if "/mien/" in frame.filename]
     last = ours[-1] if ours else frames[-1]
     result.cause = f"{'+'.join(result.findings)}: {type(error).__name__} in {Path(last.filename).name}:{last.name}"

@@ -64,7 +64,9 @@ def _evaluate_and_keep_the_partial_file(root: Path) -> None:
 def _write_pictures(folder: Path) -> None:
     folder.mkdir()
     across = np.linspace(0, 255, 32).astype(np.uint8)
-    picture = np.stack([np.tile(across, (32, 1)), np.tile(across[:, None], (1, 32)), np.full((32, 32), 90, np.uint8)], axis=-1)
+    picture = np.stack(
+        [np.tile(across, (32, 1)), np.tile(across[:, None], (1, 32)), np.full((32, 32), 90, np.uint8)], axis=-1
+    )
     for suffix in ("png", "jpg", "webp", "tif", "bmp"):
         assert cv2.imwrite(str(folder / f"a.{suffix}"), picture)
 
@@ -80,7 +82,7 @@ def _write_face_models(folder: Path) -> None:
 
 
 def tiny_flame() -> dict[str, np.ndarray]:
-    """A head of two hundred vertices in FLAME's schema: an egg, two eyeballs; four identity and three expression directions."""
+    """A head of two hundred vertices in FLAME's schema: an egg with two eyeballs, four identities, three expressions."""
     dice = np.random.default_rng(0)
     egg, egg_faces = _ball(14, 12)
     ball, ball_faces = _ball(6, 5)
@@ -98,18 +100,25 @@ def tiny_flame() -> dict[str, np.ndarray]:
     for joint, chosen in enumerate((low < -0.1, low < -0.06, low < 0, *(weights[:, side] > 0 for side in (3, 4)))):
         regressor[joint, : len(chosen)] = chosen / chosen.sum()
     return {
-        "v_template": template, "f": faces.astype(np.uint32), "shapedirs": dice.normal(0, 1e-3, (v, 3, 7)).astype(np.float32),
+        "v_template": template, "f": faces.astype(np.uint32),
+        "shapedirs": dice.normal(0, 1e-3, (v, 3, 7)).astype(np.float32),
         "posedirs": dice.normal(0, 1e-4, (v, 3, 36)).astype(np.float32), "J_regressor": regressor, "weights": weights,
         "kintree_table": np.array([[2**32 - 1, 0, 1, 1, 1], [0, 1, 2, 3, 4]], np.int64), "identities": np.array(4),
     }  # fmt: skip
 
 
 def _ball(around: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
-    polar, angle = np.meshgrid(np.linspace(0.1, np.pi - 0.1, rings), np.arange(around) * 2 * np.pi / around, indexing="ij")
-    points = np.stack([np.sin(polar) * np.sin(angle), np.cos(polar), np.sin(polar) * np.cos(angle)], axis=-1).reshape(-1, 3)
+    polar, angle = np.meshgrid(
+        np.linspace(0.1, np.pi - 0.1, rings), np.arange(around) * 2 * np.pi / around, indexing="ij"
+    )
+    points = np.stack([np.sin(polar) * np.sin(angle), np.cos(polar), np.sin(polar) * np.cos(angle)], axis=-1).reshape(
+        -1, 3
+    )
     ring, column = (axis.reshape(-1) for axis in np.meshgrid(np.arange(rings - 1), np.arange(around), indexing="ij"))
     first, second = ring * around + column, ring * around + (column + 1) % around
-    return points, np.concatenate([np.stack([first, first + around, second], 1), np.stack([second, first + around, second + around], 1)])
+    return points, np.concatenate(
+        [np.stack([first, first + around, second], 1), np.stack([second, first + around, second + around], 1)]
+    )
 
 
 def _write_videos(folder: Path) -> None:

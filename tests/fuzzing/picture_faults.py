@@ -31,7 +31,9 @@ def chunks_of(data: bytes) -> list[tuple[bytes, bytes]]:
 
 def png_of(chunks: list[tuple[bytes, bytes]]) -> bytes:
     """A PNG of any chunks, with their checksums right."""
-    parts = [struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body)) for name, body in chunks]
+    parts = [
+        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body)) for name, body in chunks
+    ]
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
@@ -43,15 +45,20 @@ def zeros(amount: int) -> bytes:
 
 
 _EXTRA = (
-    (b"tRNS", bytes(6)), (b"PLTE", bytes(range(255))), (b"gAMA", bytes(4)), (b"eXIf", b"MM\x00*\x00\x00\x00\x08" + b"\xff" * 40),
-    (b"acTL", struct.pack(">II", 2**31 - 1, 0)), (b"iCCP", b"x\x00\x00" + zlib.compress(b"x" * 200)), (b"pHYs", b"\xff" * 9),
-    (b"tEXt", b"Comment\x00\x1b]0;own\x07"), (b"zTXt", b"Comment\x00\x00" + zeros(64 << 20)), (b"sBIT", b"\xff" * 5), (b"IHDR", bytes(13)),
+    (b"tRNS", bytes(6)), (b"PLTE", bytes(range(255))), (b"gAMA", bytes(4)),
+    (b"eXIf", b"MM\x00*\x00\x00\x00\x08" + b"\xff" * 40),
+    (b"acTL", struct.pack(">II", 2**31 - 1, 0)), (b"iCCP", b"x\x00\x00" + zlib.compress(b"x" * 200)),
+    (b"pHYs", b"\xff" * 9),
+    (b"tEXt", b"Comment\x00\x1b]0;own\x07"), (b"zTXt", b"Comment\x00\x00" + zeros(64 << 20)), (b"sBIT", b"\xff" * 5),
+    (b"IHDR", bytes(13)),
 )  # fmt: skip
 
 
 def _faulty_png(data: bytes, dice: Random) -> tuple[str, bytes]:
     chunks = chunks_of(data)
-    kind = dice.choice(("size", "size", "header", "header", "pixels", "pixels", "extra", "order", "length", "crc") * 3 + ("bomb",))
+    kind = dice.choice(
+        ("size", "size", "header", "header", "pixels", "pixels", "extra", "order", "length", "crc") * 3 + ("bomb",)
+    )
     header = bytearray(chunks[0][1])
     if kind == "size":
         header[dice.choice((0, 4)) :][:4] = b""
@@ -95,7 +102,11 @@ def _faulty_jpeg(data: bytes, dice: Random) -> tuple[str, bytes]:
     if kind in ("size", "frame") and frames:
         frame = segments[frames[0]]
         at = dice.choice((5, 7)) if kind == "size" else dice.choice((1, 4, 9, 10, 11, 12))
-        field = struct.pack(">H", dice.choice(_SIDES) % 65536) if kind == "size" else bytes([dice.choice((0, 1, 3, 4, 8, 12, 0xC2, 255))])
+        field = (
+            struct.pack(">H", dice.choice(_SIDES) % 65536)
+            if kind == "size"
+            else bytes([dice.choice((0, 1, 3, 4, 8, 12, 0xC2, 255))])
+        )
         segments[frames[0]] = put(frame, at, field)
     elif kind == "length" and segments:
         index = dice.randrange(len(segments))
@@ -107,8 +118,15 @@ def _faulty_jpeg(data: bytes, dice: Random) -> tuple[str, bytes]:
     elif kind == "order":
         dice.shuffle(segments)
     elif kind == "exif":
-        entry = struct.pack(">HHI", 0x0112, dice.choice((3, 4, 2, 99)), dice.choice((1, 0, 2**32 - 1))) + packed_integer(dice, 4, "big")
-        body = b"Exif\x00\x00MM\x00*" + dice.choice((struct.pack(">I", 8), packed_integer(dice, 4, "big"))) + struct.pack(">H", 1) + entry
+        entry = struct.pack(
+            ">HHI", 0x0112, dice.choice((3, 4, 2, 99)), dice.choice((1, 0, 2**32 - 1))
+        ) + packed_integer(dice, 4, "big")
+        body = (
+            b"Exif\x00\x00MM\x00*"
+            + dice.choice((struct.pack(">I", 8), packed_integer(dice, 4, "big")))
+            + struct.pack(">H", 1)
+            + entry
+        )
         segments.insert(0, b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body)
     elif kind == "scan":
         rest = put(rest, dice.randrange(len(rest)), dice.randbytes(8))
@@ -126,7 +144,11 @@ def _faulty_fields(places: tuple[int, ...], sizes: tuple[int, ...]) -> Fault:
             for _ in range(dice.choice((1, 1, 2))):
                 at = dice.choice(places)
                 size = dice.choice(sizes)
-                field = packed_integer(dice, size) if dice.random() < 0.5 else (dice.choice(_SIDES) % (1 << 8 * size)).to_bytes(size, "little")
+                field = (
+                    packed_integer(dice, size)
+                    if dice.random() < 0.5
+                    else (dice.choice(_SIDES) % (1 << 8 * size)).to_bytes(size, "little")
+                )
                 data = put(data, at, field)
             return kind, data
         if kind == "body":
@@ -146,7 +168,9 @@ def _faulty_tiff(data: bytes, dice: Random) -> tuple[str, bytes]:
         offset, size = dice.choice(((2, 2), (4, 4), (8, 4), (8, 4), (8, 2)))
         return kind, put(data, at + offset, packed_integer(dice, size, order))
     if kind == "tag":
-        tag = dice.choice((256, 257, 258, 259, 262, 273, 277, 278, 279, 284, 320, 322, 323, 324, 325, 330, 339, 347, 34675, 65535))
+        tag = dice.choice(
+            (256, 257, 258, 259, 262, 273, 277, 278, 279, 284, 320, 322, 323, 324, 325, 330, 339, 347, 34675, 65535)
+        )
         return kind, put(data, at, tag.to_bytes(2, order))  # type: ignore[arg-type]
     if kind == "directory":
         return kind, put(data, dice.choice((2, 4, first, first + 2 + 12 * count)), packed_integer(dice, 4, order))

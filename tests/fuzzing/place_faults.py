@@ -11,9 +11,12 @@ from fuzzing.edges import DEEP, PORT
 SPARSE = 3 << 30
 """Bytes of a file that takes no room on the disk."""
 NAMES = (
-    "take:1", "http:x", f"http:127.0.0.1:{PORT}", "file:x", "concat:a|b", "pipe:1", "data:,x", "-", "--help", "-i", "a b", " ", "...", "%d", "%06d", "%s%n",
-    "a\nb", "a\x1b]0;own\x07\x1b[31m", "\x9b31m", "a\rb", "\x7f", "\u202eabc", "größer", "x" * 240, "con", "*", "?", "[a]", "{a,b}", "~", "$HOME", "`id`",
-    "a'b", 'a"b', "\\", "@x", "#x", "<script>mien_fuzz(1)</script>".replace("/", "∕"), "\udcff", "\u2028", "é", ".hidden", "capture.json",
+    "take:1", "http:x", f"http:127.0.0.1:{PORT}", "file:x", "concat:a|b", "pipe:1", "data:,x", "-", "--help", "-i",
+    "a b", " ", "...", "%d", "%06d", "%s%n",
+    "a\nb", "a\x1b]0;own\x07\x1b[31m", "\x9b31m", "a\rb", "\x7f", "\u202eabc", "größer", "x" * 240, "con", "*", "?",
+    "[a]", "{a,b}", "~", "$HOME", "`id`",
+    "a'b", 'a"b', "\\", "@x", "#x", "<script>mien_fuzz(1)</script>".replace("/", "∕"), "\udcff", "\u2028", "é",
+    ".hidden", "capture.json",
 )  # fmt: skip
 """Names of files without their ending; none has a slash."""
 
@@ -51,7 +54,15 @@ def faulty_place(path: Path, canary: Path, dice: Random) -> str:
 def outside_of(canary: Path) -> None:
     """Fill the folder that nothing may be written into, and that links lead to."""
     (canary / "folder").mkdir(parents=True)
-    for name in ("victim.json", "victim.safetensors", "victim.png", "victim.u8", "victim", "folder/victim.txt", "folder/000000.png"):
+    for name in (
+        "victim.json",
+        "victim.safetensors",
+        "victim.png",
+        "victim.u8",
+        "victim",
+        "folder/victim.txt",
+        "folder/000000.png",
+    ):
         (canary / name).write_bytes(b"precious " * 20)
 
 

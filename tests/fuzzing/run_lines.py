@@ -101,7 +101,9 @@ def run_line(case: str, bench: Bench, server: Server, listener: socket.socket) -
     apart = line.apart or dice.random() < APART
     code, megabytes = _run_apart(request, line) if apart else server.run(request, line)
     result.seconds, result.megabytes = round(time.monotonic() - began, 2), 0.0
-    told = (bench.folder / "told.txt").read_text(errors="surrogateescape") if (bench.folder / "told.txt").exists() else ""
+    told = (
+        (bench.folder / "told.txt").read_text(errors="surrogateescape") if (bench.folder / "told.txt").exists() else ""
+    )
     result.outcome = {0: "accepted", 2: "refused"}.get(code if code is not None else -999, "stopped")
     result.findings = list(_faults_of_end(code, told, line))
     if megabytes > MEMORY / 2**20 + 700 and not line.heavy:  # beside what is imported
@@ -132,9 +134,13 @@ def _request(line: Line, bench: Bench) -> dict[str, Any]:
 
 def _run_apart(request: dict[str, Any], line: Line) -> tuple[int | None, int]:
     """In a process that is started anew, as a shell does."""
-    source = "import json, os, sys; from fuzzing.command_server import prepare; asked = json.loads(sys.argv[1]); prepare(asked); "
-    source += "os.execve(sys.executable, [sys.executable, '-m', 'mien.cli', *asked['words']], os.environ)"
-    process = subprocess.Popen([sys.executable, "-c", source, json.dumps(request)], env={**os.environ, "PYTHONPATH": TESTS})
+    source = "import json, os, sys; from fuzzing.command_server import prepare; asked = json.loads(sys.argv[1]); "
+    source += (
+        "prepare(asked); os.execve(sys.executable, [sys.executable, '-m', 'mien.cli', *asked['words']], os.environ)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", source, json.dumps(request)], env={**os.environ, "PYTHONPATH": TESTS}
+    )
 
     def ended(seconds: float) -> bool:
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -148,7 +154,7 @@ def _run_apart(request: dict[str, Any], line: Line) -> tuple[int | None, int]:
 
 
 def _wait(child: int, line: Line, request: dict[str, Any], ended: Any) -> bool:
-    """Wait for the end of a process, signal it if the line asks for that, stop it where it is too long; false: it hung."""
+    """Wait for the end of a process; signal it if the line asks for that, or where it takes too long. False: it hung."""
     number = line.surroundings.get("signal")
     if number is not None and not ended(0.05 + (sum(map(len, line.words)) % 20) / 10):
         _tell(child, number)
@@ -181,7 +187,12 @@ def _faults_of_end(code: int | None, told: str, line: Line) -> Iterator[str]:
     if "Traceback (most recent call last)" in told and not (sent == signal.SIGINT and "Exception ignored in" in told):
         yield "traceback"
     lines = [text for text in told.splitlines() if text.startswith("mien: ")]
-    if code == 2 and len(lines) != 1 and line.surroundings.get("stderr") != "closed" and "largest_file" not in line.surroundings:
+    if (
+        code == 2
+        and len(lines) != 1
+        and line.surroundings.get("stderr") != "closed"
+        and "largest_file" not in line.surroundings
+    ):
         yield "lines"
 
 
@@ -193,5 +204,9 @@ def _cause(code: int | None, told: str, line: Line) -> str:
             text += Path(log).read_text(errors="replace")
     frames = re.findall(r'File "[^"]*/mien/([^"]+)", line \d+, in (\S+)', text)
     errors = [each for each in text.splitlines() if re.match(r"^[A-Za-z_.]+(Error|Exception|Interrupt)\b", each)]
-    where = f"{Path(frames[-1][0]).name}:{frames[-1][1]}" if frames else f"{line.words[0] if line.words else ''}, {line.names[:1]}"
+    where = (
+        f"{Path(frames[-1][0]).name}:{frames[-1][1]}"
+        if frames
+        else f"{line.words[0] if line.words else ''}, {line.names[:1]}"
+    )
     return f"exit {code}: {errors[-1].split(':')[0] if errors else ''} in {where}"

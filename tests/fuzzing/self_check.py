@@ -22,7 +22,7 @@ import safetensors.numpy
 from fuzzing import uses
 from fuzzing.edges import SCRIPT
 from fuzzing.faults import Place
-from fuzzing.material import RUN, SEQUENCE, copy_of
+from fuzzing.material import copy_of
 from fuzzing.repairs import repair_around, repair_portable, repair_tensors, with_checksum
 from fuzzing.targets import TARGETS, Target
 from fuzzing.tensor_faults import joined, split

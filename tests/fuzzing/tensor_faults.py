@@ -10,7 +10,26 @@ import safetensors.numpy
 from fuzzing.edges import FLOATS, INTEGERS, edge_integer, edge_value
 from fuzzing.json_faults import faulty_json, written
 
-_DTYPES = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "U16", "U32", "U64", "BOOL", "F8_E5M2", "C64", "X9", "", 3)
+_DTYPES = (
+    "F64",
+    "F32",
+    "F16",
+    "BF16",
+    "I64",
+    "I32",
+    "I16",
+    "I8",
+    "U8",
+    "U16",
+    "U32",
+    "U64",
+    "BOOL",
+    "F8_E5M2",
+    "C64",
+    "X9",
+    "",
+    3,
+)
 _KINDS = (np.float64, np.float32, np.float16, np.int64, np.int32, np.int8, np.uint8, np.uint64, np.bool_)
 
 
@@ -66,7 +85,10 @@ def faulty_tensors(data: bytes, dice: Random) -> tuple[str, bytes]:
 def faulty_arrays(arrays: dict[str, np.ndarray], dice: Random) -> tuple[str, dict[str, np.ndarray]]:
     """Arrays of other sizes, axes or types; some that are missing or too many."""
     name = dice.choice(list(arrays))
-    array, kind = arrays[name], dice.choice(("longer", "shorter", "none", "type", "type", "axis", "flat", "turned", "missing", "copy"))
+    array, kind = (
+        arrays[name],
+        dice.choice(("longer", "shorter", "none", "type", "type", "axis", "flat", "turned", "missing", "copy")),
+    )
     axis = dice.randrange(max(1, array.ndim))
     if kind == "missing":
         return kind, {other: value for other, value in arrays.items() if other != name}
@@ -105,7 +127,9 @@ def faulty_numbers(arrays: dict[str, np.ndarray], dice: Random) -> tuple[str, di
         places = [dice.randrange(len(flat)) for _ in range(dice.choice((1, 1, 3, 30)))]
     value: Any = edge_for(flat.dtype, dice)
     if dice.random() < 0.2:
-        flat[places] = flat[places] * np.array(dice.choice((-1, 2, 100)), flat.dtype) if flat.dtype.kind in "fi" else ~flat[places]
+        flat[places] = (
+            flat[places] * np.array(dice.choice((-1, 2, 100)), flat.dtype) if flat.dtype.kind in "fi" else ~flat[places]
+        )
         return "scaled", {**arrays, name: flat.reshape(arrays[name].shape)}
     flat[places] = value
     return f"{value:.3g}" if isinstance(value, float) else "integer", {**arrays, name: flat.reshape(arrays[name].shape)}

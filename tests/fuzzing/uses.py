@@ -1,4 +1,4 @@
-"""Reading faulty files, and doing with what was read what people do: a fault that is not refused must do no harm later."""
+"""Reading faulty files, and doing with what was read what people do: what is let in must do no harm later."""
 
 import contextlib
 import io
@@ -24,8 +24,10 @@ from mien.capture.given import GivenMattes, read_landmarks
 from mien.capture.source import FrameSelection, open_source, read_image
 from mien.capture.video import count_frames, probe_video, read_video_frames
 from mien.errors import UserError
-from mien.evaluation import evaluate, read_metrics as read_figures
-from mien.evaluation.cameras import fitted, read_cameras as read_camera_path
+from mien.evaluation import evaluate
+from mien.evaluation import read_metrics as read_figures
+from mien.evaluation.cameras import fitted
+from mien.evaluation.cameras import read_cameras as read_camera_path
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.compare_report import comparison_html
 from mien.evaluation.compare_text import comparison_text
@@ -33,15 +35,20 @@ from mien.evaluation.driving import drive
 from mien.evaluation.image_folders import read_crops as read_boxes
 from mien.evaluation.image_source import open_pictures, read_picture
 from mien.evaluation.partial import PartialScores
-from mien.export import in_world, read_ply as read_gaussians, write_ply
+from mien.export import in_world, write_ply
+from mien.export import read_ply as read_gaussians
 from mien.face import FaceModel, FaceParams, available_face_models, load_face_model
-from mien.face.flame import flame_face_model, read_flame as read_flame_file
+from mien.face.flame import flame_face_model
+from mien.face.flame import read_flame as read_flame_file
 from mien.motion import Motion, read_blendshape_json, read_live_link_face
 from mien.render import rasterize
-from mien.runtime import Avatar, read_portable as read_mien, write_portable
+from mien.runtime import Avatar, write_portable
+from mien.runtime import read_portable as read_mien
 from mien.storage import read_tensors
-from mien.tracking import read_scoring as read_masks, read_tracking as read_track
-from mien.training import read_curves as read_all_curves, read_run_config, read_sequence, read_training_summary, train
+from mien.tracking import read_scoring as read_masks
+from mien.tracking import read_tracking as read_track
+from mien.training import read_curves as read_all_curves
+from mien.training import read_run_config, read_sequence, read_training_summary, train
 from mien.training.checkpoint import resume
 from mien.training.run import run_camera
 from mien.training.trainer import start
@@ -213,7 +220,18 @@ def _read_any(file: Path) -> None:
 
 def _known(found: dict[str, Any]) -> dict[str, Any]:
     """Without the one entry that damage to the name `checksum` leaves."""
-    names = ("method", "settings", "data", "mien", "command_line", "protocols", "training", "fingerprints", "steps", "seconds")
+    names = (
+        "method",
+        "settings",
+        "data",
+        "mien",
+        "command_line",
+        "protocols",
+        "training",
+        "fingerprints",
+        "steps",
+        "seconds",
+    )
     return {name: value for name, value in found.items() if name in names}
 
 
@@ -330,7 +348,10 @@ def use_cameras(root: Path, found: Any, dice: Random) -> None:
     content.expect_finite(found)
     gaussians = read_gaussians(root / "head.ply")
     for camera in found[:2]:
-        for each in (fitted(camera, 32, 32), replace(camera, width=min(camera.width, 64), height=min(camera.height, 64))):
+        for each in (
+            fitted(camera, 32, 32),
+            replace(camera, width=min(camera.width, 64), height=min(camera.height, 64)),
+        ):
             assert rasterize(gaussians, each, torch.ones(3)).image.isfinite().all(), "a picture that is not finite"
 
 
@@ -342,10 +363,14 @@ def use_flame(root: Path, found: Any, dice: Random) -> None:
 
 
 LINES = (
-    "render {W} --out {root}/o.png --width 16 --height 16", "render {W} --out {root}/o.png --size 16 --path captured", "render {W} --out {root}/o.png --size 16 --sequence clip",
-    "render {W} --out {root}/o_%03d.png --size 16 --frames 2", "drive {W} --by {W} --out {root}/o.mp4 --size 16", "export {W} --out {root}/o.ply",
-    "export {W} --out {root}/o.mien", "export {W} --out {root}/o.ply --series clip", "evaluate {W} --no-perceptual", "evaluate {W} --compare", "evaluate {W} --compare --json",
-    "train {W} --steps 1 --run other", "train {W} --steps 1 --run toy", "track {W} --again", "track {W}", "face-models", "face-models --json",
+    "render {W} --out {root}/o.png --width 16 --height 16", "render {W} --out {root}/o.png --size 16 --path captured",
+    "render {W} --out {root}/o.png --size 16 --sequence clip",
+    "render {W} --out {root}/o_%03d.png --size 16 --frames 2", "drive {W} --by {W} --out {root}/o.mp4 --size 16",
+    "export {W} --out {root}/o.ply",
+    "export {W} --out {root}/o.mien", "export {W} --out {root}/o.ply --series clip", "evaluate {W} --no-perceptual",
+    "evaluate {W} --compare", "evaluate {W} --compare --json",
+    "train {W} --steps 1 --run other", "train {W} --steps 1 --run toy", "track {W} --again", "track {W}",
+    "face-models", "face-models --json",
 )  # fmt: skip
 
 

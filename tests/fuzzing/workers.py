@@ -33,7 +33,8 @@ def run_cases(
         listener.bind(("127.0.0.1", 0))
         listener.listen(64)
         port = listener.getsockname()[1]
-        bench, other = (Bench(folder / name, material, port, **limits) for name in ("row", "alone"))  # type: ignore[arg-type]
+        bench = Bench(folder / "row", material, port, **limits)  # type: ignore[arg-type]
+        other = Bench(folder / "alone", material, port, **limits)  # type: ignore[arg-type]
         waiting = list(cases)
         while waiting and (until is None or time.monotonic() < until):
             done = 0
@@ -60,7 +61,7 @@ def _batch(cases: list[str], bench: Bench, listener: socket.socket) -> Iterator[
     os.close(writing)
     pending, done, status = b"", 0, None
     while done < len(cases):
-        ready, _, _ = select.select([reading], [], [], bench.seconds + _SPARE)
+        ready, _, _ = select.select([reading], [], [], bench.patience() + _SPARE)
         data = os.read(reading, 1 << 20) if ready else None
         if data:
             *lines, pending = (pending + data).split(b"\n")
@@ -94,7 +95,7 @@ def _child(cases: list[str], bench: Bench, listener: socket.socket, writing: int
             os.ftruncate(told, 0)
             os.lseek(told, 0, os.SEEK_SET)
             (bench.folder / "case.txt").write_text(case)
-            faulthandler.dump_traceback_later(bench.seconds, file=sys.__stderr__ or sys.stderr)
+            faulthandler.dump_traceback_later(bench.patience(), file=sys.__stderr__ or sys.stderr)
             result = run_case(case, bench, listener, expected)
             faulthandler.cancel_dump_traceback_later()
             os.write(writing, json.dumps(result.as_json()).encode() + b"\n")
@@ -131,7 +132,10 @@ def _ended(case: str, bench: Bench, before: dict[str, Any], finding: str, status
     """The result of a case that ended its process."""
     told = bench.told.read_text(errors="replace")[-4000:] if bench.told.exists() else ""
     result = Result(case, TARGETS[case.rsplit(":", 2)[0]].format, outcome="finding", findings=[finding])
-    result.message = f"{signal.Signals(os.WTERMSIG(status)).name if os.WIFSIGNALED(status) else f'exit code {os.waitstatus_to_exitcode(status)}'}"
+    by_signal = os.WIFSIGNALED(status)
+    result.message = (
+        signal.Signals(os.WTERMSIG(status)).name if by_signal else f"exit code {os.waitstatus_to_exitcode(status)}"
+    )
     result.traceback = [line.strip() for line in told.splitlines() if line.strip()][:8]
     frames = [line for line in told.splitlines() if line.strip().startswith('File "') and "/mien/" in line]
     place = frames[0].strip().rpartition("/")[2] if frames else case.split(":")[0]
