@@ -163,7 +163,7 @@ def changed_array(rng: Rng, array: np.ndarray) -> Any:
             same_size = array.itemsize == np.dtype(name).itemsize != 8
             return array.view(name) if same_size else np.zeros(array.shape, name)
         return other_values(rng, array)
-    except (MemoryError, BufferError, ValueError):  # numpy's own refusal: nothing of ours
+    except (MemoryError, BufferError, TypeError, ValueError):  # numpy's own refusal: nothing of ours
         return array
 
 
