@@ -93,7 +93,7 @@ def _with_fault(data: bytes, kind: str, found: list[Box], dice: Random) -> bytes
     if kind == "tag":
         return with_tag(
             data,
-            dice.choice((b"Caf\xe9 \xff", b"\x1b]0;own\x07", b"x" * 70_000, b"\x00" * 20, "größer".encode())),
+            dice.choice((b"gr\xf6\xdfer \xff", b"\x1b]0;own\x07", b"x" * 70_000, b"\x00" * 20, "größer".encode())),
             dice,
         )
     if kind == "frames":

@@ -82,7 +82,7 @@ def _write_face_models(folder: Path) -> None:
 
 
 def tiny_flame() -> dict[str, np.ndarray]:
-    """A head of two hundred vertices in FLAME's schema: an egg, two eyeballs, four identities, three expressions."""
+    """A head of two hundred vertices in FLAME's schema: an egg, two eyeballs; four identities, three expressions."""
     dice = np.random.default_rng(0)
     egg, egg_faces = _ball(14, 12)
     ball, ball_faces = _ball(6, 5)

@@ -154,7 +154,7 @@ def _run_apart(request: dict[str, Any], line: Line) -> tuple[int | None, int]:
 
 
 def _wait(child: int, line: Line, request: dict[str, Any], ended: Any) -> bool:
-    """Wait for the end of a process; signal it if the line asks for it or it takes too long. False: it hung."""
+    """Wait for the end of a process; signal it if the line asks for that, or where it takes too long; false: hung."""
     number = line.surroundings.get("signal")
     if number is not None and not ended(0.05 + (sum(map(len, line.words)) % 20) / 10):
         _tell(child, number)
