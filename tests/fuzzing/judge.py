@@ -149,10 +149,10 @@ def run_case(case: str, bench: Bench, listener: socket.socket, expected: Callabl
     return result
 
 
-def snapshot(bench: Bench) -> dict[str, Any]:
-    """All that lies outside of the copies."""
+def snapshot(bench: Bench, home: bool = True) -> dict[str, Any]:
+    """All that lies outside of the copies, with the home folder or without."""
     found: dict[str, Any] = {}
-    for folder in (bench.canary, bench.folder / "home", bench.folder / "here"):
+    for folder in (bench.canary, bench.folder / "here", *([bench.folder / "home"] if home else [])):
         for path in sorted([folder, *folder.rglob("*")]):
             status = path.lstat()
             whole = path.is_file() and not path.is_symlink()
@@ -172,11 +172,11 @@ def judge_traces(
     bench: Bench,
     before: dict[str, Any],
     listener: socket.socket,
-    outside: bool = True,
+    home: bool = True,
     slow: bool = True,
 ) -> None:
     """Whether anything was left, written outside, called, printed."""
-    if outside and (after := snapshot(bench)) != before:
+    if (after := snapshot(bench, home)) != before:
         changed = sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path))
         result.findings.append("outside")
         result.traceback.append(f"changed: {changed}")

@@ -96,7 +96,7 @@ def run_line(case: str, bench: Bench, server: Server, listener: socket.socket) -
     place = Place(bench.root, bench.root / "W", bench.canary, bench.port)
     line = make_line(place, dice, case.startswith(HEAVY))
     result.kind, result.message = " ".join([*line.words[:1], *(["(heavy)"] if line.heavy else [])]), line.text()
-    before, began = snapshot(bench), time.monotonic()
+    before, began = snapshot(bench, home=False), time.monotonic()
     request = _request(line, bench)
     apart = line.apart or dice.random() < APART
     code, megabytes = _run_apart(request, line) if apart else server.run(request, line)
@@ -108,9 +108,9 @@ def run_line(case: str, bench: Bench, server: Server, listener: socket.socket) -
     result.findings = list(_faults_of_end(code, told, line))
     if megabytes > MEMORY / 2**20 + 700 and not line.heavy:  # beside what is imported
         result.findings.append("memory")
-    # A line may write wherever it is told to, into its home's cache, and be stopped before its time is over.
+    # The libraries of a command may keep caches in the home folder, and a line is stopped before it is slow.
     cause = _cause(code, told, line)
-    judge_traces(result, bench, before, listener, outside=True, slow=False)
+    judge_traces(result, bench, before, listener, home=False, slow=False)
     if result.findings:
         result.outcome = "finding"
         result.traceback = [*result.traceback, f"exit code {code}, {megabytes} MB", *told.splitlines()[-12:]]
