@@ -13,6 +13,7 @@ from mien.errors import UserError
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render import rasterize as rasterize_in_place
 from mien.render.rasterize import Backend, choose_backend
+from mien.render.validation import drawable
 from rasterize_scenes import GSPLAT, Scene, random_scene, relative_error
 from rasterize_scenes import rasterize_anywhere as rasterize
 
@@ -273,3 +274,18 @@ def test_gsplat_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(UserError, match="pip install 'gsplat"):
         rasterize_in_place(one_gaussian(), front_camera(), torch.zeros(3), "gsplat")
+
+
+def test_more_pairs_than_can_be_counted_are_refused():
+    count, width = 70_000, 1_048_544  # each Gaussian touches all of 32,767 tiles
+    one = one_gaussian(scale=3.0)
+    means = one.means.repeat(count, 1)
+    means[:, 2] += torch.linspace(0, 1, count)
+    repeated = {name: getattr(one, name).repeat_interleave(count, 0) for name in ("quats", "scales", "opacities", "sh")}
+    K = torch.tensor([[float(width), 0, width / 2], [0, float(width), 0.5], [0, 0, 1]])
+    gaussians, camera = Gaussians(means=means, **repeated), Camera(K, torch.eye(4), width, 1)
+    with (
+        pytest.raises(UserError, match=r"^it: cannot be drawn \(too many pairs .*\); do something else$"),
+        drawable("it", "do something else"),
+    ):
+        rasterize_in_place(gaussians, camera, torch.ones(3), backend="native")

@@ -194,3 +194,14 @@ def test_the_door_needs_no_library(tmp_path: Path) -> None:
     assert terminal.__doc__
     code = "import sys, mien.terminal, mien.threads; sys.exit(bool({'torch', 'rich', 'numpy'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_instructions_that_the_machine_lacks_are_told(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mien.cli", "demo", "--out", str(tmp_path / "demo")]
+    ended = subprocess.run(
+        command, env={**os.environ, "MIEN_ISA": "mmx"}, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert ended.returncode == 2
+    assert ended.stderr.startswith("mien: MIEN_ISA=mmx: this machine has ")
+    assert len(ended.stderr.splitlines()) == 1
+    assert not (tmp_path / "demo").exists()

@@ -169,6 +169,7 @@ def _run(name: str, rest: list[str]) -> int:
     with contextlib.suppress(ValueError):  # signals are for the main thread
         signal.signal(signal.SIGTERM, _terminated)
     _use_one_torch_thread()
+    _check_instruction_set()
     command.run()
     return 0
 
@@ -195,6 +196,20 @@ def _in_one_line(box: str) -> str:
             comma = inner.startswith(" ") and parts[-1] and not parts[-1].endswith(":")
             parts[-1] = f"{parts[-1]}{',' if comma else ''} {text}".strip()
     return "; ".join(part.rstrip(".") for part in parts if part and not part.startswith(_USELESS))
+
+
+def _check_instruction_set() -> None:
+    """Find that this machine has what MIEN_ISA asks for.
+
+    Raises:
+        UserError: it has not.
+    """
+    from mien import _native
+
+    try:
+        _native.rasterize_isa()
+    except ValueError as error:
+        raise UserError(f"{error}; give one of these, or unset it") from None
 
 
 def _use_one_torch_thread() -> None:

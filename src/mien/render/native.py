@@ -11,8 +11,10 @@ from torch.autograd.function import once_differentiable
 from mien import _native
 from mien.arrays import recycled, unpacked
 from mien.render.rendering import Rendering, View
-from mien.render.validation import check_finite
+from mien.render.validation import TooManyPairsError, check_finite
 
+_TOO_MANY_PAIRS = "too many pairs"
+"""How the native core begins its complaint (`native/rasterize_bin.cpp`)."""
 _INPUTS = 9
 """Tensors a view: offset of the centres, means, quats, scales, opacities, sh, background, viewmat, K."""
 
@@ -70,7 +72,12 @@ class _Rasterize(torch.autograd.Function):
             view = (recycled(*size, 3), recycled(*size), torch.empty(count, dtype=torch.int32))
             tasks.append(tuple(unpacked(*own, *view)))
             outputs += view
-        ctx.frames = _native.rasterize_views(tasks, any(ctx.needs_input_grad))
+        try:
+            ctx.frames = _native.rasterize_views(tasks, any(ctx.needs_input_grad))
+        except ValueError as error:
+            if str(error).startswith(_TOO_MANY_PAIRS):
+                raise TooManyPairsError(str(error)) from None
+            raise
         if None in ctx.frames:
             raise _NotFiniteError(ctx.frames.index(None))
         ctx.set_materialize_grads(False)

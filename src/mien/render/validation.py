@@ -11,8 +11,16 @@ from mien.errors import UserError
 from mien.gaussians import Gaussians
 
 
-class NotFiniteError(ValueError):
+class CannotDrawError(ValueError):
+    """Gaussians that no rasterizer can draw."""
+
+
+class NotFiniteError(CannotDrawError):
     """What is to be drawn holds NaN or infinity."""
+
+
+class TooManyPairsError(CannotDrawError):
+    """The Gaussians touch more tiles, all together, than the native rasterizer can count."""
 
 
 def check_shapes(gaussians: Gaussians, background: Tensor) -> None:
@@ -54,11 +62,11 @@ def drawable(what: str, remedy: str) -> Iterator[None]:
     """Tell the user where an avatar that was read, posed as asked, cannot be drawn.
 
     Raises:
-        UserError: inside, a rasterizer met NaN or infinity.
+        UserError: inside, a rasterizer met NaN or infinity, or more Gaussians on more tiles than it can count.
     """
     try:
         yield
-    except NotFiniteError as error:
+    except CannotDrawError as error:
         raise UserError(f"{what}: cannot be drawn ({error}); {remedy}") from None
 
 

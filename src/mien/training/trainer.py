@@ -22,7 +22,7 @@ from mien.face.checks import check_face_params
 from mien.locks import hold
 from mien.progress import Advance, progress_bar
 from mien.render import rasterize
-from mien.render.validation import NotFiniteError
+from mien.render.validation import CannotDrawError
 from mien.training.adam import Adam
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.density import density_strategy
@@ -93,7 +93,7 @@ def _train_to_the_end(
             while state.step < settings.steps:
                 try:
                     status = step(state, data, settings)
-                except NotFiniteError as error:
+                except CannotDrawError as error:
                     raise _diverged(state, str(error)) from None
                 advance(1, status)
                 if state.step % settings.checkpoint_every == 0 or interrupted():
