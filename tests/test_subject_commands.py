@@ -127,7 +127,9 @@ def test_mistakes_are_told_before_any_work(
         "version": 1,
         "method": {"kind": "other"},
         "settings": {"split": "none"},
-        "data": [],
+        "data": [{"sequence": "clip"}],
+        "mien": "0",
+        "command_line": [],
     }
     (out / "runs" / "other" / "config.json").write_text(json.dumps(content))
     arguments = [part.format(clip=clip, gone=tmp_path / "gone.mp4") for part in arguments]

@@ -140,7 +140,7 @@ def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndar
         raise UserError(f"{path}: truncated; {remedy}")
     picture = None
     # Its width and height stand at the beginning; what they promise would be allocated.
-    if data[:8] == _PNG_SIGNATURE and struct.unpack(">II", data[16:24]) == (shape[1], shape[0]):
+    if data[:8] == _PNG_SIGNATURE and data[16:24] == struct.pack(">II", shape[1], shape[0]):
         with contextlib.suppress(cv2.error):
             flags = cv2.IMREAD_COLOR_RGB if len(shape) == 3 else cv2.IMREAD_GRAYSCALE
             picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

@@ -22,6 +22,7 @@ from mien.runtime.checks import baked_fault
 from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
+_LARGEST_INDEX = 2**31 - 1
 _REMEDY = "delete the run's training.json, if it is there, and train it again with `mien train`"
 
 
@@ -132,6 +133,9 @@ def _misfit(own: dict[str, Tensor], state: dict[str, Tensor], gaussians: int) ->
             return f"{name!r} is {found.dtype} {list(found.shape)}"
         if found.is_floating_point() and not (found.numel() == 0 or bool(found.abs().max() <= LARGEST_NUMBER)):
             return f"{name!r} holds NaN or numbers beyond {LARGEST_NUMBER:g}"
+        # Baking narrows indices to 32 bits: what is larger would come round to one that exists.
+        if found.dtype == torch.int64 and not (found.numel() == 0 or bool(found.abs().max() <= _LARGEST_INDEX)):
+            return f"{name!r} holds numbers beyond {_LARGEST_INDEX}"
     known = {len(tensor) for tensor in state.values() if tensor.ndim > 0 and tensor[:1].numel() > 0}
     return None if gaussians == 0 or gaussians in known else f"{gaussians} Gaussians, by no tensor"
 

@@ -113,6 +113,8 @@ class GivenMattes:
             UserError: it is missing, damaged or of another size than the picture.
         """
         if self._files:
+            if number >= len(self._files):
+                raise UserError(f"{self._path}: ends before its frame {number}; give a matte for each frame")
             name, matte = self._files[number], _read_matte(self._files[number])
         else:
             frame = next(itertools.dropwhile(lambda frame: frame.number < number, self._stream), None)

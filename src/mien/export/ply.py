@@ -1,12 +1,15 @@
 """The standard 3D Gaussian .ply that viewers, editors and game engines read."""
 
+import os
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from mien.bounded import open_ordinary
 from mien.errors import UserError
 from mien.gaussians import Gaussians
 from mien.storage import write_atomically
@@ -15,6 +18,8 @@ _HEADER_LIMIT = 65536
 _REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
 """SH coefficients (1, 4, 9, 16) by the number of f_rest_* properties."""
 _DIGITS_OF_COUNT = 12
+_MOST_GAUSSIANS = 2_000_000
+"""Largest number of Gaussians that is read: a head has tens of thousands, and memory grows with it."""
 _LOCAL_COMMENT = "mien frame: local"
 _WORLD_COMMENT = "mien frame: world"
 
@@ -65,20 +70,34 @@ def read_ply(path: Path) -> Gaussians:
         UserError: the file is missing, truncated, no ply, ASCII or big-endian, holds no 3D Gaussians, or NaN.
     """
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); give the path of a 3D Gaussian .ply") from None
-    end = content[:_HEADER_LIMIT].find(b"end_header\n")
-    if not content.startswith(b"ply") or end < 0:
-        raise UserError(f"{path}: no .ply file; give one with 3D Gaussians, as `mien export` writes")
-    lines = content[:end].decode("ascii", errors="replace").splitlines()
-    count, names = _parse_header(path, lines)
-    body = content[end + len(b"end_header\n") :]
-    expected = count * len(names) * 4
-    if len(body) < expected:
-        raise UserError(f"{path}: truncated, {len(body)} of {expected} bytes of vertices; copy or export it again")
+        with open_ordinary(path) as file:
+            lines = _read_header(path, file)
+            count, names = _parse_header(path, lines)
+            expected, left = count * len(names) * 4, os.fstat(file.fileno()).st_size - file.tell()
+            if left < expected:
+                raise UserError(f"{path}: truncated, {left} of {expected} bytes of vertices; copy or export it again")
+            if count > _MOST_GAUSSIANS:
+                raise UserError(f"{path}: {count:,} Gaussians, more than {_MOST_GAUSSIANS:,}; take fewer of them")
+            body = file.read(expected)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{path}: cannot be read ({reason}); give the path of a 3D Gaussian .ply") from None
     values = np.frombuffer(body, dtype="<f4", count=count * len(names)).reshape(count, len(names))
     return _activated({name: values[:, i] for i, name in enumerate(names)}, _pose_of(path, lines), path)
+
+
+def _read_header(path: Path, file: IO[bytes]) -> list[str]:
+    """The lines before the vertices; the file is left at the first vertex.
+
+    Raises:
+        UserError: it is no .ply.
+    """
+    content = file.read(_HEADER_LIMIT)
+    end = content.find(b"end_header\n")
+    if not content.startswith(b"ply") or end < 0:
+        raise UserError(f"{path}: no .ply file; give one with 3D Gaussians, as `mien export` writes")
+    file.seek(end + len(b"end_header\n"))
+    return content[:end].decode("ascii", errors="replace").splitlines()
 
 
 def _raw_rows(gaussians: Gaussians) -> Float32[np.ndarray, "n p"]:

@@ -60,7 +60,9 @@ def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: st
         if tuple(tensor.shape) != shapes[name]:
             told = f"{name} is {list(tensor.shape)}, which the face model {model.name!r} has not"
             raise UserError(f"{where}: {told} ({list(shapes[name])}); {remedy}")
-        if not tensor.is_floating_point() or not _is_moderate(tensor):
+        if tensor.dtype != torch.float32:
+            raise UserError(f"{where}: {name} is {tensor.dtype}, not torch.float32; {remedy}")
+        if not _is_moderate(tensor):
             raise UserError(f"{where}: {name} holds NaN or numbers beyond {LARGEST_NUMBER:g}; {remedy}")
 
 

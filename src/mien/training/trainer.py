@@ -94,18 +94,18 @@ def _train_to_the_end(
                 try:
                     status = step(state, data, settings)
                 except CannotDrawError as error:
-                    raise _diverged(state, str(error)) from None
+                    raise _diverged(run_dir, state, str(error)) from None
                 advance(1, status)
                 if state.step % settings.checkpoint_every == 0 or interrupted():
-                    _check_finite(state)
+                    _check_finite(run_dir, state)
                     write_checkpoint(run_dir / "checkpoints", state)
                 if interrupted():
                     raise KeyboardInterrupt
-        _check_finite(state)
+        _check_finite(run_dir, state)
         write_results(run_dir, state)
 
 
-def _check_finite(state: TrainingState) -> None:
+def _check_finite(run_dir: Path, state: TrainingState) -> None:
     """Find that training has not diverged, before anything of it is written.
 
     Raises:
@@ -113,12 +113,12 @@ def _check_finite(state: TrainingState) -> None:
     """
     for name, tensor in state.avatar.state_dict().items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            raise _diverged(state, f"{name} is not finite")
+            raise _diverged(run_dir, state, f"{name} is not finite")
 
 
-def _diverged(state: TrainingState, what: str) -> UserError:
+def _diverged(run_dir: Path, state: TrainingState, what: str) -> UserError:
     return UserError(
-        f"training diverged by step {state.step} ({what}); lower the learning rates and weights that differ from the "
+        f"{run_dir}: training diverged by step {state.step} ({what}); lower the learning rates and weights that differ from the "
         "preset's, and train under another name (--run NAME)"
     )
 
