@@ -91,7 +91,7 @@ def use_rendering(root: Path, found: Any, dice: Random) -> None:
     avatar, sequence = load_avatar(root / RUN), read_sequence(root / SEQUENCE)
     camera = fitted(run_camera(root / RUN), 32, 32)
     face = sequence.tracking.face
-    driven = drive(face, face[0], avatar.subject, avatar.face_model.expression_bounds)
+    driven = drive(face, face[0], avatar.subject, avatar.face_model.expression_bounds, who=str(root / SEQUENCE))
     with torch.no_grad():
         for each in (camera, fitted(sequence.tracking.cameras[0], 32, 32)):
             image = rasterize(avatar.pose(driven[0]).gaussians.timestep(0), each, torch.ones(3)).image

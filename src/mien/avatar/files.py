@@ -84,7 +84,10 @@ def _load_avatar(folder: Path) -> Avatar:
     content: _Content = decode(_Content, named, where, _REMEDY)
     if content.gaussians < 0:
         raise UserError(f"{where}: {content.gaussians} Gaussians; {_REMEDY}")
-    method = method_named(content.kind)
+    try:
+        method = method_named(content.kind)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
     tensors = read_tensors(folder / "avatar.safetensors", remedy=_REMEDY)
     if file_digest(folder / "avatar.safetensors") != content.tensors_sha256:
         raise UserError(f"{folder / 'avatar.safetensors'}: is not what was written; {_REMEDY}")
@@ -134,8 +137,12 @@ def _misfit(own: dict[str, Tensor], state: dict[str, Tensor], gaussians: int) ->
         if found.is_floating_point() and not (found.numel() == 0 or bool(found.abs().max() <= LARGEST_NUMBER)):
             return f"{name!r} holds NaN or numbers beyond {LARGEST_NUMBER:g}"
         # Baking narrows indices to 32 bits: what is larger would come round to one that exists.
-        if found.dtype == torch.int64 and not (found.numel() == 0 or bool(found.abs().max() <= _LARGEST_INDEX)):
-            return f"{name!r} holds numbers beyond {_LARGEST_INDEX}"
+        if (
+            found.dtype == torch.int64
+            and found.numel() > 0
+            and not (found.min() >= 0 and found.max() <= _LARGEST_INDEX)
+        ):
+            return f"{name!r} holds numbers that are no indices"
     known = {len(tensor) for tensor in state.values() if tensor.ndim > 0 and tensor[:1].numel() > 0}
     return None if gaussians == 0 or gaussians in known else f"{gaussians} Gaussians, by no tensor"
 

@@ -87,7 +87,7 @@ class Command:
         own = series in workspace.sequence_names()
         driver = open_driver(workspace.root if own else Path(series), series if own else None, avatar.face_model)
         bounds = avatar.face_model.expression_bounds
-        driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, with_head_pose=False)
+        driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, False, series)
         driven = with_expression(driven[:: self.every], avatar.face_model, self.set)
         for index in track_progress(range(len(driven)), "Exporting", len(driven)):
             _write_ply(self._numbered(index), avatar, driven[index])

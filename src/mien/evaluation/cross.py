@@ -81,7 +81,8 @@ def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
     if not valid:
         raise UserError(f"{driver_dir}: no frame of it was tracked; choose another driver")
     at_rest = neutral_of(tracking.face[tracking.valid])
-    faces = drive(tracking.face, at_rest, avatar.subject, avatar.face_model.expression_bounds)
+    bounds = avatar.face_model.expression_bounds
+    faces = drive(tracking.face, at_rest, avatar.subject, bounds, who=str(driver_dir))
     cameras = read_tracking(sequence_dir / "tracking").cameras
     return Driven(
         avatar=avatar,

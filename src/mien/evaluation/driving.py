@@ -18,6 +18,7 @@ def drive(
     avatar_neutral: FaceParams,
     expression_bounds: Float[Tensor, "e 2"] | None = None,
     with_head_pose: bool = True,
+    who: str = "the driver",
 ) -> FaceParams:
     """Face parameters that make an avatar do what the driver does; its own identity and offsets stay.
 
@@ -31,6 +32,7 @@ def drive(
         avatar_neutral: One timestep of the avatar's person at rest.
         expression_bounds: `FaceModel.expression_bounds`; results are clamped there.
         with_head_pose: Whether the head follows the driver's; else it stays at the avatar's neutral.
+        who: What messages call the driver, such as its file.
 
     Raises:
         UserError: the two were tracked with different face models.
@@ -39,7 +41,7 @@ def drive(
         theirs, ours = getattr(driver, name).shape[1:], getattr(avatar_neutral, name).shape[1:]
         if theirs != ours:
             raise UserError(
-                f"the driver has {_times(theirs)} {name} parameters, the avatar {_times(ours)}: "
+                f"{who} has {_times(theirs)} {name} parameters, the avatar {_times(ours)}: "
                 "they were tracked with different face models; track the driver with the avatar's"
             )
     expression = avatar_neutral.expression + driver.expression - driver_neutral.expression

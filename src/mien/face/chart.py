@@ -56,6 +56,8 @@ def _outside(
     names, counts = np.unique(pieces, return_counts=True)
     seen = (pieces == names[counts.argmax()]) & (facing > _FLAT) & (np.ptp(flat[faces, 0], axis=1) < 1.0)
     # Inner layers (a mouth's back wall) face outwards as well, but turned triangles part them from the outside.
+    if not seen.any():
+        return seen
     together = edge_connected(faces, seen)
     names, counts = np.unique(together[seen], return_counts=True)
     return together == names[counts.argmax()]

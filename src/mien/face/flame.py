@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Int
 
 from mien.errors import UserError
-from mien.face.chart import unwrap
+from mien.face.chart import outside_of, unwrap
 from mien.face.inert_pickle import read_inert_pickle
 from mien.face.model import FaceModel
 from mien.face.npz import read_npz
@@ -109,9 +109,8 @@ def read_flame(path: Path) -> FlameFile:
 def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> FaceModel:
     """A file in FLAME's schema as a face model without landmarks; `shareable` as in `FaceModel`."""
     joints = flame.regressor @ flame.template
-    eyes = [flame.weights[:, joint] > 0.5 for joint in (3, 4)]
-    centres = np.stack([flame.template[eye].mean(0) for eye in eyes])
-    origin = centres.mean(0) - np.array([0.0, 0.0, _EYE_BACK])
+    eyes, centres = _eyeballs(flame)
+    origin = _origin(centres)
     # FLAME's root segment is mien's neck, its neck segment mien's head; each turns about FLAME's neck joint.
     order = [1, 0, 2, 3, 4]
     pivots = joints[[1, 1, 2, 3, 4]] - origin
@@ -280,3 +279,16 @@ def _check_sense(path: Path, flame: FlameFile) -> None:
         raise UserError(
             f"{path}: the eyes are not where FLAME's are; 'v_template' needs +x to the subject's left, +y up, +z ahead"
         )
+    if not outside_of(flame.template - _origin(_eyeballs(flame)[1]), flame.faces).any():
+        raise UserError(f"{path}: 'f' has no triangle that faces outwards; give FLAME's triangles")
+
+
+def _eyeballs(flame: FlameFile) -> tuple[list[np.ndarray], Float[np.ndarray, "2 3"]]:
+    """Masks [v] of the vertices of the left and the right eyeball, and their centres in metres."""
+    eyes = [flame.weights[:, joint] > 0.5 for joint in (3, 4)]
+    return eyes, np.stack([flame.template[eye].mean(0) for eye in eyes])
+
+
+def _origin(centres: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, " 3"]:
+    """The head frame's origin in FLAME's coordinates, in metres: behind the midpoint of the eyeballs' centres."""
+    return centres.mean(0) - np.array([0.0, 0.0, _EYE_BACK])

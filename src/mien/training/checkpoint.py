@@ -16,7 +16,7 @@ from mien.training.density import DensityStrategy
 from mien.training.face_track import FaceTrack
 
 _KEPT = 2
-_CURVES = {"step", "loss", "psnr", "gaussians", "step_ms"}
+CURVES = {"step", "loss", "psnr", "gaussians", "step_ms"}
 """That every run has."""
 
 
@@ -111,7 +111,7 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
     curves = part("curves.")
     if state.step < 0 or state.seconds < 0 or any(curve.ndim != 1 for curve in curves.values()):
         raise ValueError("its step or curves cannot be")
-    if len({len(curve) for curve in curves.values()}) > 1 or not (curves.keys() >= _CURVES or state.step == 0):
+    if len({len(curve) for curve in curves.values()}) > 1 or not (curves.keys() >= CURVES or state.step == 0):
         raise ValueError("its curves are incomplete")
     state.curves = {name: curve.tolist() for name, curve in curves.items()}
 

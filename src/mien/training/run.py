@@ -22,7 +22,7 @@ from mien.limits import camera_fault
 from mien.locks import WAIT, check_free
 from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
 from mien.tracking import Tracking
-from mien.training.checkpoint import TrainingState
+from mien.training.checkpoint import CURVES, TrainingState
 from mien.training.sequence import Sequence
 from mien.training.settings import TrainSettings
 
@@ -189,6 +189,8 @@ def read_curves(run_dir: Path) -> dict[str, np.ndarray]:
     shapes = {curve.shape for curve in curves.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1 or any(curve.dtype != np.float64 for curve in curves.values()):
         raise UserError(f"{path}: holds no curves of one length; {_AGAIN}")
+    if not curves.keys() >= CURVES:
+        raise UserError(f"{path}: lacks {', '.join(sorted(CURVES - curves.keys()))}; {_AGAIN}")
     return curves
 
 

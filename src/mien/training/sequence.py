@@ -29,6 +29,8 @@ class Sequence:
     tracking: Tracking
     scoring: UInt8[np.ndarray, "t c h w"]
     """Opacity of what counts (the matte above the neck line), 255 = all."""
+    folder: Path | None = None
+    """Where it was read from, for messages."""
 
     def usable(self) -> np.ndarray:
         """Bool [t, c]: the face was tracked, and found in this very picture or in another camera's.
@@ -171,4 +173,4 @@ def sequence_of(folder: Path, scoring: Scoring) -> Sequence:
     check_tracking_of(capture, tracking, folder / "tracking")
     if scoring.masks.shape != capture.mattes.shape:
         raise UserError(f"{folder / 'scoring'}: is not of the capture beside it; delete it and run `mien track` again")
-    return Sequence(folder.name, capture, tracking, scoring.masks)
+    return Sequence(folder.name, capture, tracking, scoring.masks, folder)

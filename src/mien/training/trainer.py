@@ -118,8 +118,8 @@ def _check_finite(run_dir: Path, state: TrainingState) -> None:
 
 def _diverged(run_dir: Path, state: TrainingState, what: str) -> UserError:
     return UserError(
-        f"{run_dir}: training diverged by step {state.step} ({what}); lower the learning rates and weights that differ from the "
-        "preset's, and train under another name (--run NAME)"
+        f"{run_dir}: training diverged by step {state.step} ({what}); lower the learning rates and weights that "
+        "differ from the preset's, and train under another name (--run NAME)"
     )
 
 
@@ -135,7 +135,7 @@ def check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
                 f"{sequence.name}: tracked with face model {sequence.tracking.face_model!r} "
                 f"{sequence.tracking.face_model_hash}, not {face_model.name!r} {face_model.content_hash}; track again"
             )
-        check_face_params(face_model, sequence.tracking.face, sequence.name, "track again")
+        check_face_params(face_model, sequence.tracking.face, str(sequence.folder or sequence.name), "track again")
         if not sequence.tracking.face.identity.equal(sequences[0].tracking.face.identity):
             raise UserError(
                 f"{sequences[0].name} and {sequence.name}: tracked apart, with two identities; "

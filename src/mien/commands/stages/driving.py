@@ -123,7 +123,7 @@ def drive_stage(
     avatar = load_avatar(run_dir)
     driver = open_driver(by, options.sequence, avatar.face_model, options.fps)
     bounds = avatar.face_model.expression_bounds
-    driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, with_head_pose=options.head_pose)
+    driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, options.head_pose, str(by))
     if output.kind == "sequence":
         plan_output(out, len(driven), output.transparent)
     camera = view(look, run_camera(run_dir))
