@@ -21,7 +21,6 @@ from damage import edit_json
 from mien.capture import read_capture
 from mien.capture.frame_files import CacheWriter, FrameLayout, FrameWriter
 from mien.cli import main
-from mien.commands.stages import tracking as stage
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, compare_runs, evaluate
 from mien.evaluation.experiment import Frame
@@ -29,7 +28,7 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.partial import PartialScores
 from mien.inside import check_tree, inside, is_plain_name, open_new, remove_tree
 from mien.storage import file_digest, read_arrays, read_json, read_tensors, write_arrays, write_json, write_tensors
-from mien.tracking import TrackingSettings, read_scoring, read_tracking
+from mien.tracking import TrackingSettings, pipeline, read_scoring, read_tracking, track_subject
 from mien.training import read_curves, read_run_config, read_sequence, read_training_summary, run_camera
 from mien.workspace import Workspace, check_new_workspace, open_workspace
 from toy_scene import toy_face_model
@@ -551,9 +550,9 @@ def test_json_is_written_as_it_is_read(tmp_path: Path) -> None:
 
 
 def test_kept_pieces_of_a_tracking_that_are_of_no_use(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whole files of the right names that hold something else: tracking begins again, once."""
+    """Whole files of the right names that hold something else: tracking starts again, once."""
     keep, seen = tmp_path / ".tracking-0123", []
     keep.mkdir()
 
@@ -563,14 +562,21 @@ def test_kept_pieces_of_a_tracking_that_are_of_no_use(
             raise KeyError("rows")
         return []
 
-    monkeypatch.setattr(stage, "track_subject", fit)
-    arguments: Any = ([], toy_face_model(), TrackingSettings(), keep, None)
-    assert stage._track_or_begin_again(*arguments) == []
+    monkeypatch.setattr(pipeline, "_track_subject", fit)
+    capture = read_capture(workspace / "sequences" / "clip" / "capture")
+    arguments: Any = ([capture], toy_face_model(), TrackingSettings(), keep, None)
+        [read_capture(workspace / "sequences" / "clip" / "capture")],
+        toy_face_model(),
+        TrackingSettings(),
+        keep,
+        None,
+    )
+    assert track_subject(*arguments) == []
     assert seen == [True, False]
-    assert "begins again" in capsys.readouterr().err
-    monkeypatch.setattr(stage, "track_subject", lambda *_: {}["a bug of ours"])
+    assert "starts again" in capsys.readouterr().err
+    monkeypatch.setattr(pipeline, "_track_subject", lambda *_: {}["a bug of ours"])
     with pytest.raises(KeyError):
-        stage._track_or_begin_again(*arguments)
+        track_subject(*arguments)
 
 
 def test_a_capture_named_like_our_scratch_folder_is_not_removed(workspace: Path) -> None:

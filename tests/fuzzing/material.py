@@ -19,7 +19,8 @@ from mien.evaluation import EvaluationSettings, evaluate
 from mien.evaluation.partial import PartialScores
 from mien.export import in_world, write_ply
 from mien.face import Landmarks
-from mien.face.loading import write_face_model, write_landmarks
+from mien.face.cache import cache_folder
+from mien.face.loading import load_face_model, write_face_model, write_landmarks
 from mien.runtime import write_portable
 from mien.storage import write_json
 from toy_scene import toy_camera, toy_face_model
@@ -42,6 +43,9 @@ def make_material(root: Path) -> None:
     _write_pictures(root / "pictures")
     write_what_users_give(root / "given", cv2.imread(str(root / "pictures/a.png")))  # type: ignore[arg-type]
     _write_face_models(root / "cache" / "face_models" / "added")
+    load_face_model("anny")  # baked once: a command that had to do so would look like one that hangs
+    for file in (cache_folder() / "face_models").glob("*.*"):
+        shutil.copy(file, root / "cache" / "face_models")
     (root / "flame").mkdir()
     (root / "flame/tiny.npz").write_bytes(npz_of({name: npy_of(array) for name, array in tiny_flame().items()}))
     from flame_like import write_pickle

@@ -120,7 +120,7 @@ def use_avatar(root: Path, found: Any, dice: Random) -> None:
         rasterize(gaussians, toy_camera(32), torch.ones(3))
         if dice.random() < 0.3:
             write_ply(root / "out.ply", in_world(gaussians))
-            write_portable(root / "out.mien", make_portable(found, toy_camera(32), "toy"))
+            write_portable(root / "out.mien", make_portable(found, toy_camera(32), str(root)))
 
 
 def use_face_model(root: Path, found: FaceModel, dice: Random) -> None:

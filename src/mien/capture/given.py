@@ -1,6 +1,7 @@
 """Mattes and landmarks that were made elsewhere, checked against the source they belong to."""
 
 import csv
+import io
 import itertools
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mien.bounded import open_ordinary
 from mien.capture.crop import Crop, whole_picture
 from mien.capture.faces import LANDMARKS
 from mien.capture.picture import decode_picture
@@ -61,7 +63,7 @@ def _read_csv(path: Path, most: int) -> np.ndarray:
     """Its rows; of those beyond `most`, one, so that there are too many without all being held."""
     rows: list[np.ndarray] = []
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with io.TextIOWrapper(open_ordinary(path), encoding="utf-8", newline="") as file:
             for number, line in enumerate(csv.reader(file), 1):
                 if number == 1 and any(_is_name(cell) for cell in line):
                     continue
@@ -71,7 +73,7 @@ def _read_csv(path: Path, most: int) -> np.ndarray:
                 rows.append(np.array(numbers))
                 if len(rows) > most:
                     break
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise UserError(f"{path}: cannot be read as csv ({error}); write it again") from None
     return np.array(rows).reshape(len(rows), LANDMARKS, 2)
 

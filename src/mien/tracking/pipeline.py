@@ -11,7 +11,8 @@ from torch import Tensor
 from mien.capture.capture import Capture
 from mien.errors import UserError
 from mien.face import FaceModel
-from mien.progress import progress_bar
+from mien.inside import remove_tree
+from mien.progress import progress_bar, say
 from mien.tracking.detector_response import DetectorResponse, read_response
 from mien.tracking.head_pose import fit_head_pose
 from mien.tracking.landmark_model import LandmarkModel, reduce_face_model
@@ -70,7 +71,8 @@ def track_subject(
     adds nothing to it. With one uncalibrated camera, metric scale comes from the identity prior.
 
     `keep` is a folder of its own for finished parts, from which interrupted tracking of the same captures with the
-    same settings goes on, to the same numbers. It is removed at the end.
+    same settings goes on, to the same numbers. It is removed at the end. If its parts, whole as their files are, do not
+    fit, tracking starts again.
 
     `preview` is an .html (with a .png beside it) that shows how far the fit has come, written anew every few seconds.
 
@@ -80,6 +82,24 @@ def track_subject(
     """
     assert captures, "nothing to track"
     settings.check()
+    begun = keep is not None and keep.is_dir()
+    try:
+        return _track_subject(captures, face_model, settings, keep, preview)
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError):
+        if keep is None or not begun:
+            raise
+    say("What was kept of an interrupted tracking is of no use; tracking starts again")
+    remove_tree(keep)
+    return _track_subject(captures, face_model, settings, keep, preview)
+
+
+def _track_subject(
+    captures: Sequence[Capture],
+    face_model: FaceModel,
+    settings: TrackingSettings,
+    keep: Path | None,
+    preview: Path | None,
+) -> list[Tracking]:
     if "mediapipe" not in face_model.landmarks:
         raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; calibrate them for it first")
     shots, keeper = [shot_of(capture, settings) for capture in captures], Keeper(keep)

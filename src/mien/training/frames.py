@@ -51,8 +51,9 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
             frames += [Frame(index, int(t), int(c), start + int(t)) for t, c in np.argwhere(usable & np.array(cameras))]
         start += sequence.capture.timesteps
     if not frames:
+        places = [str(sequence.folder or sequence.name) for sequence in sequences]
         raise UserError(
-            f"{', '.join(names)}: no frame to train on with split {settings.split!r} and what is held out; "
+            f"{', '.join(places)}: no frame to train on with split {settings.split!r} and what is held out; "
             "a longer clip, --split none, or hold out less"
         )
     return frames

@@ -175,7 +175,7 @@ def _track(
     page = workspace.root / "tracking_preview.html" if preview else None
     if page is not None:
         say(f"Open {page} in a browser: it is renewed while the fit goes on")
-    tracked = _track_or_begin_again(list(usable.values()), face_model, settings, keep, page)
+    tracked = track_subject(list(usable.values()), face_model, settings, keep, page)
     trackings = {}
     for name, tracking in zip(usable, tracked, strict=True):
         made_from = {"fingerprint": fingerprint, "tracked_together": list(usable)}
@@ -184,21 +184,6 @@ def _track(
         say(f"{name}: tracked with a median landmark residual of {tracking.residuals.nanmedian():.2f} pixels")
     _tell_outdated_runs(workspace, trackings)
     return trackings
-
-
-def _track_or_begin_again(
-    captures: list[Capture], face_model: FaceModel, settings: TrackingSettings, keep: Path, page: Path | None
-) -> list[Tracking]:
-    """`track_subject`; from the start where what was kept of an earlier one, whole as its files are, is of no use."""
-    begun = keep.is_dir()
-    try:
-        return track_subject(captures, face_model, settings, keep, page)
-    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError):
-        if not begun:
-            raise
-    say("What was kept of an interrupted tracking is of no use; tracking begins again")
-    remove_tree(keep)
-    return track_subject(captures, face_model, settings, keep, page)
 
 
 def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking]) -> None:
