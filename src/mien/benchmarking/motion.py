@@ -142,7 +142,7 @@ def mean_rotation(rotations: Float[torch.Tensor, "n 3 3"]) -> Float[torch.Tensor
 
 
 def still_timesteps(true: Float[np.ndarray, "t c l 2"]) -> Bool[np.ndarray, " t2"]:
-    """Return whether true landmarks stand still before and after each timestep but the first and the last."""
+    """Return, for all timesteps but the first and the last, whether true landmarks stand still around them."""
     moving = np.linalg.norm(np.diff(true[:, 0], axis=0), axis=-1).max(-1)
     return (moving[1:] < _STILL) & (moving[:-1] < _STILL)
 

@@ -133,7 +133,7 @@ def _visible(truth: Truth, face_model: FaceModel, timestep: int) -> Bool[np.ndar
 
 
 def _rotation_errors(tracking: Tracking, truth: Truth) -> tuple[float, float]:
-    """Return mean angles in degrees: of the whole difference, and without the mean difference."""
+    """Return mean rotation errors in degrees: of the whole difference, and without the mean difference."""
     kept = tracking.valid
     tracked, true = (matrix_from_axis_angle(t.face.head_rotation)[kept].double() for t in (tracking, truth.tracking))
     difference = tracked.transpose(-1, -2) @ true

@@ -48,7 +48,7 @@ class Crop:
 
 
 def whole_picture(width: int, height: int, size: int) -> Crop:
-    """The whole picture, shrunk so that its longer side has at most `size` pixels."""
+    """Return a crop of the whole picture, shrunk so that its longer side has at most `size` pixels."""
     width_out, height_out = shrunk_size(width, height, size)
     return Crop(0, 0, width, height, width_out, height_out)
 

@@ -6,7 +6,7 @@ from jaxtyping import Float, UInt8
 _REACH = 3
 """Frames on either side of a cut that must all differ. After a flash, the picture from before it comes back."""
 _NEIGHBOURS = 4
-"""Frames on either side of a cut in which the picture may change only a little. A moving picture moves for longer."""
+"""Frames on either side of a cut in which the picture may change only a little: motion lasts longer than a cut."""
 _SMALLEST = 0.05
 """Smallest change at a cut, as a fraction of the mean brightness."""
 _CONTRAST = 3.0
@@ -35,7 +35,7 @@ def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"]) -> list[int]:
 
 
 def _parted(pictures: Float[np.ndarray, "t h w 3"], start: int) -> float:
-    """The smallest difference between a frame shortly before `start` and one shortly after it."""
+    """Return the smallest difference between a frame shortly before `start` and one shortly after it."""
     before, after = pictures[max(start - _REACH, 0) : start], pictures[start : start + _REACH]
     return min(_difference(one, other) for one in before for other in after)
 

@@ -50,7 +50,7 @@ class FaceFinder:
         return np.zeros((0, 4))
 
     def surest(self, image: UInt8[np.ndarray, "h w 3"]) -> float:
-        """The highest confidence of both detectors that there is a face, 0..1; 0 if none finds one."""
+        """Return the higher of the two detectors' confidences that there is a face, 0..1; 0 if neither finds one."""
         found = [detection for detector in self._detectors for detection in detector.process(image).detections or ()]
         return max((float(detection.score[0]) for detection in found), default=0.0)
 

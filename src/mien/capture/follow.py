@@ -40,7 +40,7 @@ class LandmarkFollower:
         return chosen
 
     def _expected(self, timestep: int) -> Float[np.ndarray, " 4"] | None:
-        """The box where the face should be: the survey's, or else that of the last landmarks if they are recent."""
+        """Return the box where the face should be: the survey's, or else that of the last landmarks if recent."""
         if np.isfinite(self._boxes[timestep, 0]):
             return self._boxes[timestep]
         if self._last is None or abs(timestep - self._last[0]) > _MEMORY:
@@ -57,7 +57,7 @@ class LandmarkFollower:
         if distances[best] > _ASTRAY * (expected[2:] - expected[:2]).max():
             return None
         to_others = np.linalg.norm(centres[best] - (others[:, :2] + others[:, 2:]) / 2, axis=1)
-        # A missing face is NaN, and no distance to it is smaller.
+        # Missing faces are NaN, which never compares as smaller.
         return None if (to_others < distances[best]).any() else faces[best]
 
 

@@ -29,7 +29,7 @@ _PNG_OPTIONS = (
 )
 """These options take half the time of OpenCV's default for level 1 and make smaller files."""
 _IN_FLIGHT = 8
-"""Most timesteps that wait to be written, which bounds the memory."""
+"""Largest number of timesteps that wait to be written. It bounds the memory."""
 
 MakeFrames = Callable[[], tuple[np.ndarray, np.ndarray]]
 """Computes the images [c, h, w, 3] and mattes [c, h, w] of one timestep."""

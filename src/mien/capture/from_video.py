@@ -191,7 +191,7 @@ def _read_finished_parts(sequences: Path, job: _Job, tell: bool = True) -> list[
 
 
 def _check_place(out: Path, job: _Job) -> None:
-    """Refuse to replace anything but a capture of the same source.
+    """Refuse to replace anything but a capture of the same source, or of any source if the user allows it.
 
     Raises:
         UserError: the folder holds something else, or a capture of another source.

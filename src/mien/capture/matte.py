@@ -75,11 +75,8 @@ def guided_filter(
 ) -> Float[np.ndarray, "h w"]:
     """Return `values` as a locally affine function of the guide's colour.
 
-    This is eq. 19 of He, Sun, Tang: Guided Image Filtering.
-
-    19).
-
-    It is solved on every second pixel and interpolated (He, Sun: Fast Guided Filter, arXiv:1505.00996).
+    This is eq. 19 of He, Sun, Tang: Guided Image Filtering. It is solved on every second pixel and interpolated (He,
+    Sun: Fast Guided Filter, arXiv:1505.00996).
     """
     height, width = values.shape
     half = (max(1, width // 2), max(1, height // 2))

@@ -19,9 +19,9 @@ _SIZE_RANGE = 2.5
 _LOOK_RANGE = 0.12
 """...and its mean colours (0..1) differ by at most this."""
 _CANDIDATES = 8
-"""Number of tracks, of those that fill the picture most, that may become the person."""
+"""Number of tracks that are considered: those that fill the picture most."""
 _PASSING = 3
-"""A track of fewer frames counts as a false detection if the clip is longer than this."""
+"""Frames below which a track counts as a false detection, in clips of at least as many frames."""
 
 
 @dataclass(frozen=True, eq=False)

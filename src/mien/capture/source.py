@@ -182,7 +182,7 @@ def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[LazyFr
 
 
 def shrink_to(image: UInt8[np.ndarray, "h w 3"], longest_side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Return the picture shrunk to at most `longest_side` pixels a side, area-averaged. It is never enlarged."""
+    """Return the picture shrunk to at most `longest_side` pixels per side, area-averaged. It is never enlarged."""
     height, width = image.shape[:2]
     width_out, height_out = shrunk_size(width, height, longest_side)
     if (width_out, height_out) == (width, height):

@@ -24,7 +24,7 @@ _CHUNK = 1000
 _THUMBNAIL = (32, 18)
 """Width and height of thumbnails in pixels, whatever the picture's shape."""
 _LOOK = 3
-"""Cells a side of the grid on which a face's mean colours, its look, are computed."""
+"""Cells along each side of the grid on which a face's mean colours, its look, are computed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 The curve is the same for every frame and every clip, so a face keeps its colours when the scene around it changes:
 
 1. Signal to light: PQ by SMPTE ST 2084 (cd/m2); HLG by BT.2100 with its OOTF for a screen of 1,000 cd/m2 (gamma 1.2).
-2. Diffuse white, 203 cd/m2 (BT.2408), becomes 1.0. BT.2020 primaries become BT.709's; colours outside are clipped.
+2. Diffuse white, 203 cd/m2 (BT.2408), becomes 1.0. BT.2020 is converted to BT.709; colours outside are clipped.
 3. Light up to 0.75 of diffuse white stays as it is. Above, the brightest channel follows the extended Reinhard curve,
    which continues the line without a kink and reaches 1.0 at 1,000 cd/m2. All three channels are scaled alike, so hues
    stay.

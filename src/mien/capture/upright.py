@@ -42,7 +42,7 @@ def check_upright(frames: FrameSource, survey: Survey, turned: int) -> None:
 
 
 def _best_turn(frames: FrameSource, survey: Survey) -> int:
-    """Return the degrees clockwise after which faces are found with most confidence."""
+    """Return the degrees clockwise after which faces are found with the most confidence."""
     seen = np.flatnonzero(np.isfinite(survey.boxes[:_BEGINNING, 0, 0]))
     numbers = seen if len(seen) else np.arange(min(_BEGINNING, len(survey.boxes)))
     chosen = set(numbers[:: -(-len(numbers) // _LOOKED_AT)].tolist())

@@ -1,8 +1,8 @@
 """The only module that opens and creates video files.
 
-FFmpeg does not treat every name as a file: `take:1.mp4` is an address to it, `%03d.png` a row of files, and a playlist
-makes it open what it lists. So it never gets a name here. It reads and writes a file that Python has opened, may open
-nothing else, and accepts only containers that hold their own pictures.
+FFmpeg does not treat every name as a file: `take:1.mp4` is an address to it, `%03d.png` is a series of files, and a
+playlist makes it open the files in the list. So it never gets a name here. It reads and writes a file that Python has
+opened, may open nothing else, and accepts only containers that hold their own pictures.
 """
 
 import re

@@ -77,7 +77,7 @@ class FaceModel:
     expression_sigmas: Float[Tensor, " e"] | None = None
     """Standard deviations of the coefficients over time, for trackers' priors. If None, the names decide (ARKit's)."""
     shareable: bool = True
-    """Whether the licence lets an avatar contain a copy of the model. If not, an avatar only names it: no export."""
+    """Whether the licence lets an avatar contain a copy. If not, an avatar only names the model and is not exported."""
 
     @cached_property
     def content_hash(self) -> str:
@@ -100,7 +100,7 @@ class FaceModel:
 
     @cached_property
     def topology_hash(self) -> str:
-        """SHA-256 over the triangles, as 16 hex digits. Points on the mesh's surface are valid for one such hash."""
+        """SHA-256 over the triangles, as 16 hex digits. Landmarks belong to meshes with one such hash."""
         return hashlib.sha256(self.faces.to(torch.int64).cpu().contiguous().numpy().tobytes()).hexdigest()[:16]
 
     @property
@@ -127,14 +127,17 @@ class FaceModel:
     def __call__(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
         """Return vertices in world space, in metres.
 
-        Differentiable in every field of `face`. It runs natively for float32 on a CPU.
+        They are differentiable in every field of `face`, and computed natively for float32 on a CPU.
         """
         if has_native_posing(self, face):
             return pose_vertices(self, face, in_world=True)
         return self.vertices_reference(face)
 
     def head_vertices(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
-        """Return vertices in the head frame, in metres. Differentiable in every field of `face` but the head pose."""
+        """Return vertices in the head frame, in metres.
+
+        They are differentiable in every field of `face` but the head pose.
+        """
         if has_native_posing(self, face):
             return pose_vertices(self, face, in_world=False)
         return self.head_vertices_reference(face)

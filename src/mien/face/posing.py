@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 _MOST_SHAPES = 256
-"""Most expressions plus nine per free joint: kMostFaceShapes of native/face.h."""
+"""Largest number of expressions plus nine per free joint: kMostFaceShapes of native/face.h."""
 
 
 def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:
@@ -40,7 +40,7 @@ def pose_vertices(model: "FaceModel", face: FaceParams, in_world: bool) -> Float
 def head_poses(face: FaceParams) -> Float[Tensor, "b 4 4"]:
     """Return `FaceParams.T_world_head` with the rounding of `mien.runtime`.
 
-    Differentiable, and native for float32 on a CPU.
+    They are differentiable, and computed natively for float32 on a CPU.
 
     The two agree to 1e-6. Avatars pass this one to renderers, so that pictures are the same as those without torch.
     """

@@ -94,7 +94,7 @@ def studio_lighting(seed: int) -> Lighting:
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """Light that each vertex receives by direction, past the whole scene at rest, in the head frame."""
+    """Visibility of directions from each vertex, past the whole scene at rest, in the head frame."""
 
     directions: Float[np.ndarray, "d 3"]
     transfer: Float[np.ndarray, "d v"]

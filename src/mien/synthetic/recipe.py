@@ -40,9 +40,9 @@ class SyntheticRecipe:
     face_model: str = "anny"
     """Name of the face model, for `mien.face.load_face_model`."""
     width: int = 512
-    """Pixels."""
+    """Width of the frames in pixels."""
     height: int = 512
-    """Pixels."""
+    """Height of the frames in pixels."""
     seconds: float = 9.0
     """Length of the clip in seconds."""
     fps: float = 25.0
@@ -54,7 +54,7 @@ class SyntheticRecipe:
     identity_scale: float = 0.8
     """Standard deviation of the identity coefficients; 0 is the mean person."""
     hair: Literal["none", "short", "long"] = "short"
-    """Length of the strands on the scalp, which are not part of the face model."""
+    """Hair on the scalp as strands, which are not part of the face model."""
     glasses: bool = True
     """Whether the person wears glasses, which are not part of the face model."""
     brows_and_lashes: bool = True

@@ -1,4 +1,4 @@
-"""Reference captures: fixed, named recipes on which everybody can reproduce figures."""
+"""Reference captures: fixed, named recipes for figures that everybody can reproduce."""
 
 import hashlib
 from dataclasses import dataclass, replace

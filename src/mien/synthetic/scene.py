@@ -150,7 +150,7 @@ class SyntheticScene:
     def landmarks(self, camera: int = 0) -> Float[np.ndarray, "t l 2"]:
         """Return MediaPipe's 478 points of every timestep in pixels, from the face model's embedding.
 
-        Hidden ones count.
+        Hidden points are included.
         """
         projected = []
         for timestep in range(self.recipe.timesteps):

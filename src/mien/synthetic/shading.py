@@ -187,7 +187,7 @@ def shade_teeth(
     along = rest[:, 0] / 0.0082
     place = along - np.round(along - 0.5) - 0.5
     gap = smoothstep(0.42, 0.5, np.abs(place))
-    # Normals point out of the arch, since the coarse mesh's own are too rough, and are rounded over each tooth.
+    # Normals point out of the arch and are rounded over each tooth. The coarse mesh's own normals are too rough.
     across = rest[:, 0] / 0.032 + 2.0 * np.sign(place) * place**2
     rounded = 0.3 * normals + np.stack([across, np.full_like(place, 0.1), np.ones_like(place)], -1)
     rounded = unit(rounded).astype(np.float32)

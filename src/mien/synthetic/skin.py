@@ -120,7 +120,7 @@ def _near(points: np.ndarray, centre: np.ndarray, radius: float) -> Float[np.nda
 
 
 def _paint_zones(canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise) -> None:
-    """Paint redder cheeks, nose, ears and chin, a yellower forehead, and blotches of blood."""
+    """Paint redder cheeks, nose, ears and chin, a yellower forehead, and reddish blotches."""
     points, marks = canvas.points, anatomy.landmarks
     red = 0.75 * canvas.ears
     for index, radius, strength in (

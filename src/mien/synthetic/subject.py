@@ -74,7 +74,7 @@ class Subject:
     """Triangles of everything that is opaque."""
     materials: Int[np.ndarray, " f"]
     model_faces: Int[np.ndarray, " m"]
-    """Indices of the face model's triangles that are the first ones in `faces`, in this order."""
+    """Indices of the face model's triangles that come first in `faces`, in this order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class PosedSubject:
     landmarks: Float[np.ndarray, "l 3"]
     eye_centres: Float[np.ndarray, "2 3"]
     strands: tuple[Strands, ...]
-    """Hair, brows, beard and lashes that exist, in the order of the subject's `faces`."""
+    """Hair, brows, beard and lashes, if present, in the order of the subject's `faces`."""
     T_head_shoulders: Float[np.ndarray, "4 4"]
     R_world_head: Float[np.ndarray, "3 3"]
     viewpoint: Float[np.ndarray, " 3"]

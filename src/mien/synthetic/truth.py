@@ -35,7 +35,8 @@ class Truth:
     vertices: Float[np.ndarray, "t n 3"]
     """Their positions in the head frame, in metres, to 10 micrometres. They are exact for every recipe."""
     landmarks: Float[np.ndarray, "t c l 2"]
-    """MediaPipe's 478 points on the true surface, projected to pixels of the drawn pictures, with hidden ones."""
+    """MediaPipe's 478 points on the true surface, projected to pixels of the drawn pictures. Hidden ones are
+    included."""
 
     @property
     def vertices_world(self) -> Float[np.ndarray, "t n 3"]:
@@ -61,7 +62,7 @@ def surface_of(
 
 
 def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
-    """Return the vertices of the face's skin, without ears, neck, and anything behind the ears or above it."""
+    """Return the vertices of the face's skin: no ears, no neck, nothing behind the ears or above the forehead."""
     skin = np.unique(anatomy.faces[anatomy.skin & ~anatomy.region("ears", "neck", "scalp")])
     points, marks = anatomy.vertices[skin], anatomy.landmarks
     inside = (points[:, 1] > marks[CHIN, 1] - 0.005) & (points[:, 1] < marks[FOREHEAD_TOP, 1])

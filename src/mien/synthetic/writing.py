@@ -25,7 +25,7 @@ FORMAT, VERSION = "mien.synthetic_capture", 2
 _JSON, _WORK, _STATE = "synthetic.json", ".drawing", "state.json"
 VIDEO_NAME, CAPTURE_NAME, TRUTH_NAME = "video.mp4", "capture", "truth"
 DRAWING = 3
-"""Drawing version. It is raised whenever a recipe would be drawn differently, and changes every key of a reference."""
+"""Drawing version, raised whenever a recipe would be drawn differently. Every key depends on it."""
 _CHUNK = 16
 """Timesteps after which progress is saved."""
 
@@ -74,7 +74,7 @@ def scene_key(scene: SyntheticScene) -> str:
     It is known before anything is drawn, and is the same on every machine, since it depends on no computed numbers.
     `mien.synthetic.signature` checks whether two machines draw the same under one key.
     """
-    marks = scene.model.landmarks["mediapipe"]  # as they were read; they place paint and strands
+    marks = scene.model.landmarks["mediapipe"]  # as read from disk; they place paint and strands
     content = {
         "drawing": DRAWING,
         "recipe": asdict(scene.recipe),
