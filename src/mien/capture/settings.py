@@ -33,7 +33,7 @@ class CaptureSettings:
     cuts: bool = True
     """Split the video at cuts to another shot, into NAME-1, NAME-2, ... With --capture.no-cuts it stays one capture."""
     shortest_part: float = 1.0
-    """Shortest shot to keep, in seconds. Shorter ones between two cuts are left out."""
+    """Shortest shot to keep in a video with cuts, in seconds. Shorter shots are left out."""
     clean_plate: Path | None = None
     """A picture of the scene without the person, from the same camera in the same place. It gives better mattes."""
     mattes: Path | None = None
