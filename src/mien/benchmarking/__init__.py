@@ -1,1 +1,1 @@
-"""What `mien bench` runs: timings on this machine, as rows that a machine may read."""
+"""Benchmarks of `mien bench`: timings on this machine, as machine-readable rows."""

@@ -1,4 +1,4 @@
-"""Where a chart goes, checked without the libraries that measure."""
+"""Check a chart's path without loading the libraries that measure."""
 
 from pathlib import Path
 
@@ -9,10 +9,10 @@ KINDS = (".png", ".svg", ".pdf")
 
 
 def check_chart_path(path: Path) -> None:
-    """Find out before any measuring whether a chart can be written there.
+    """Check, before anything is measured, that a chart can be written at this path.
 
     Raises:
-        UserError: it is no kind of picture that we draw, or its place cannot be written to.
+        UserError: the ending is no supported kind of picture, or the path cannot be written.
     """
     if path.suffix not in KINDS:
         raise UserError(f"{path}: charts are written as {', '.join(KINDS)}; give a name with one of these endings")

@@ -8,9 +8,9 @@ from mien.files import write_atomically
 
 
 def write_scaling_chart(path: Path, rows: Sequence[BenchmarkRow], machine: Machine) -> None:
-    """Milliseconds over the number of Gaussians, both logarithmic: one line a size, one panel a kind of row.
+    """Write a log-log chart of milliseconds over the number of Gaussians: a line per size, a panel per kind of row.
 
-    The file's ending (.png, .svg, .pdf) says its kind.
+    The file's ending (.png, .svg, .pdf) decides its format.
     """
     from matplotlib.figure import Figure
 

@@ -1,4 +1,7 @@
-"""How fast a GPU draws and trains, at the sizes that papers report: `mien bench render|train-step --device cuda`."""
+"""Measure how fast a GPU renders and trains at the sizes that papers report.
+
+Run as `mien bench render|train-step --device cuda`.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -15,11 +18,11 @@ from mien.training.trainer import step
 
 COUNTS = (30_000, 100_000)
 SIZES = ((512, 512), (550, 802))
-"""Width and height: HeadGaS's figure, and GaussianAvatars' table (802x550 there is height x width)."""
+"""Width and height of HeadGaS's figure and of GaussianAvatars' table (802x550 there is height x width)."""
 
 
 def render_rows(like: Tensor, seconds: float) -> Iterator[BenchmarkRow]:
-    """Forward alone, and forward with backward, on the device of `like`."""
+    """Measure forward alone, and forward with backward, on the device of `like`."""
     for count in COUNTS:
         for size in SIZES:
             scene = _scene_on(head_scene(count, *size), like)
@@ -29,7 +32,7 @@ def render_rows(like: Tensor, seconds: float) -> Iterator[BenchmarkRow]:
 
 
 def train_step_rows(like: Tensor, seconds: float) -> Iterator[BenchmarkRow]:
-    """Whole `gaussian_avatars` steps as `mien train` runs them, and posing with drawing."""
+    """Measure whole `gaussian_avatars` steps as `mien train` runs them, and posing with rendering."""
     face_model = load_face_model()
     for count in COUNTS:
         for size in SIZES:
@@ -42,7 +45,7 @@ def train_step_rows(like: Tensor, seconds: float) -> Iterator[BenchmarkRow]:
 
 
 def _timed(like: Tensor, work: Callable[[], object], seconds: float) -> Timing:
-    """Each run until the device is done with it."""
+    """Time each run until the device has finished it."""
 
     def run() -> None:
         work()

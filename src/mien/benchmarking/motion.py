@@ -1,4 +1,4 @@
-"""Does a tracking keep up? Lag and lost amplitude of blinks and fast head turns, and jitter where nothing moves."""
+"""Measure whether a tracking keeps up: lag and lost amplitude of blinks and fast turns, and jitter at rest."""
 
 from dataclasses import dataclass
 
@@ -12,40 +12,40 @@ from mien.tracking import Tracking, frontal_camera
 from mien.tracking.landmark_groups import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
 
 LIDS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS)
-"""Pairs of landmarks across the eyes' openings, and of their corners (`_CORNERS`): MediaPipe's numbers."""
+"""MediaPipe's pairs of landmarks across the eyes' openings (`LIDS`), and of the eyes' corners (`_CORNERS`)."""
 _CORNERS = ((33, 133), (362, 263))
 _LEAST_BLINK = 0.25
-"""By which part of its median an eye's opening has to shrink to be a blink; half of that is its beginning."""
+"""Smallest decrease of an eye's opening in a blink, as a part of the median. A blink begins at half of it."""
 _FAST = np.radians(15.0)
-"""Radians a second from which a head turns fast."""
+"""Angular speed in radians per second from which a head turns fast."""
 _AROUND_SECONDS = 0.3
-"""Before and after an event that belong to it."""
+"""Seconds before and after an event that belong to it."""
 _MOST_LAG, _LAG_STEP = 4.0, 0.05
-"""Frames."""
+"""Largest lag and step of the search, in frames."""
 _STILL = 0.02
-"""Pixels a frame: below, true landmarks stand still."""
+"""Speed in pixels per frame below which true landmarks stand still."""
 
 
 @dataclass(frozen=True)
 class Following:
-    """How a tracked signal follows the true one, over all events of a kind together."""
+    """How a tracked signal follows the true one, over all events of one kind."""
 
     lag_frames: float
-    """By which the true signal has to be delayed to look most like the tracked one (largest correlation)."""
+    """Delay of the true signal at which it correlates most with the tracked one."""
     loss_percent: float
-    """Of the amplitude: 100 (1 - g), where the tracked signal is about g times the delayed true one."""
+    """Lost amplitude: 100 (1 - g), where the tracked signal is about g times the delayed true one."""
     events: int
 
 
 def following(
     tracked: Float[np.ndarray, "t k"], true: Float[np.ndarray, "t k"], busy: Bool[np.ndarray, " t"], around: int
 ) -> Following | None:
-    """Lag and lost amplitude of k signals where something happens; None where nothing does.
+    """Return lag and lost amplitude of k signals around events; None if there is no event.
 
     Args:
-        tracked: Finite where it is to count.
-        true: The same in truth.
-        busy: Timesteps of events; runs of them are one event each.
+        tracked: Tracked signals. Events with values that are not finite are skipped.
+        true: True signals.
+        busy: Timesteps of events; each run of them is one event.
         around: Timesteps before and after an event that belong to it.
     """
     windows = _windows(busy, around)
@@ -59,7 +59,7 @@ def following(
 
 
 def _windows(busy: Bool[np.ndarray, " t"], around: int) -> list[slice]:
-    """One an event, longer by `around` at both ends; events that then overlap are one."""
+    """Return one window per event, longer by `around` at both ends. Overlapping windows are merged."""
     wide = np.convolve(busy, np.ones(2 * around + 1), mode="same") > 0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], wide.astype(int), [0]])))
     return [slice(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
@@ -68,7 +68,10 @@ def _windows(busy: Bool[np.ndarray, " t"], around: int) -> list[slice]:
 def _products(
     tracked: Float[np.ndarray, "t k"], true: Float[np.ndarray, "t k"], parts: list[slice], lag: float
 ) -> tuple[float, float, float]:
-    """Sums of tracked x true, tracked squared and true squared, beside each part's means; the true signal delayed."""
+    """Return sums of tracked x true, tracked squared and true squared.
+
+    The true signal is delayed, and each part's means are subtracted.
+    """
     time, sums = np.arange(len(true)), np.zeros(3)
     for part in parts:
         for x, y in zip(tracked.T, true.T, strict=True):
@@ -79,7 +82,10 @@ def _products(
 
 
 def _between(values: Float[np.ndarray, " t"], at: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Values at fractional timesteps by cubic convolution (Keys 1981): straight lines would flatten a blink."""
+    """Interpolate values at fractional timesteps by cubic convolution (Keys 1981).
+
+    Linear interpolation would flatten a blink.
+    """
     at = np.clip(at, 0, len(values) - 1)
     first = np.floor(at).astype(int)
     x = at - first
@@ -94,7 +100,7 @@ def _between(values: Float[np.ndarray, " t"], at: Float[np.ndarray, " n"]) -> Fl
 
 
 def eye_opening(landmarks: Float[np.ndarray, "t l 2"]) -> Float[np.ndarray, " t"]:
-    """The mean distance of the lids over the mean width of the eyes: closed is about 0."""
+    """Return the mean distance of the lids over the mean width of the eyes; about 0 when closed."""
     gaps = [np.linalg.norm(landmarks[:, upper] - landmarks[:, lower], axis=-1) for upper, lower in LIDS]
     widths = [np.linalg.norm(landmarks[:, one] - landmarks[:, other], axis=-1) for one, other in _CORNERS]
     return np.mean(gaps, axis=0) / np.mean(widths, axis=0)
@@ -103,7 +109,7 @@ def eye_opening(landmarks: Float[np.ndarray, "t l 2"]) -> Float[np.ndarray, " t"
 def blink_following(
     projected: Float[np.ndarray, "t c l 2"], true: Float[np.ndarray, "t c l 2"], truth: Truth, fps: float
 ) -> Following | None:
-    """How blinks are followed, as the camera that the face looks at sees them."""
+    """Measure how blinks are followed, in the frontal camera's pictures."""
     camera = frontal_camera(truth.tracking)
     tracked, opening = (eye_opening(points[:, camera].astype(np.float64)) for points in (projected, true))
     middle = float(np.median(opening))
@@ -115,7 +121,7 @@ def blink_following(
 
 
 def turn_following(tracking: Tracking, truth: Truth, fps: float) -> Following | None:
-    """How fast head turns are followed; a constant difference of pose does not count."""
+    """Measure how fast head turns are followed. A constant difference of pose does not count."""
     tracked, true = (
         matrix_from_axis_angle(one.face.head_rotation.double()) for one in (tracking, truth.tracking)
     )  # fmt: skip
@@ -128,7 +134,7 @@ def turn_following(tracking: Tracking, truth: Truth, fps: float) -> Following | 
 
 
 def mean_rotation(rotations: Float[torch.Tensor, "n 3 3"]) -> Float[torch.Tensor, "3 3"]:
-    """The rotation nearest to the mean of matrices."""
+    """Return the rotation nearest to the mean of the matrices."""
     u, _, vh = torch.linalg.svd(rotations.double().mean(0))
     sign = torch.ones(3, dtype=torch.float64)
     sign[2] = torch.det(u @ vh)
@@ -136,13 +142,13 @@ def mean_rotation(rotations: Float[torch.Tensor, "n 3 3"]) -> Float[torch.Tensor
 
 
 def still_timesteps(true: Float[np.ndarray, "t c l 2"]) -> Bool[np.ndarray, " t2"]:
-    """Of all timesteps but the first and the last, those before and after which true landmarks stand still."""
+    """Return, for all timesteps but the first and the last, whether true landmarks stand still around them."""
     moving = np.linalg.norm(np.diff(true[:, 0], axis=0), axis=-1).max(-1)
     return (moving[1:] < _STILL) & (moving[:-1] < _STILL)
 
 
 def jitter(points: Float[np.ndarray, "t *l d"], still: Bool[np.ndarray, " t2"]) -> float | None:
-    """Median length of second differences over time where nothing moves, in the points' unit."""
+    """Return the median length of second differences over time where nothing moves, in the points' unit."""
     second = np.linalg.norm(points[2:] - 2 * points[1:-1] + points[:-2], axis=-1)[still]
     second = second[np.isfinite(second)]
     return float(np.median(second)) if len(second) else None

@@ -1,4 +1,4 @@
-"""How far a tracking is from the truth of a synthetic capture, and the rows and tables of `mien bench quality`."""
+"""Errors of a tracking against the truth of a synthetic capture, and rows and tables of `mien bench quality`."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -22,39 +22,41 @@ from mien.synthetic import Truth
 from mien.tracking import Tracking, residual_report
 
 _FACING = 0.2
-"""Least cosine between a visible vertex's normal and the direction to the camera."""
+"""Smallest cosine between a visible vertex's normal and the direction to the camera."""
 
 
 @dataclass(frozen=True)
 class TrackingErrors:
-    """Means over the tracked timesteps of one sequence; None where there is nothing to measure."""
+    """Means over the tracked timesteps of one sequence; None if there is nothing to measure."""
 
     vertex_mm: float
-    """Distance of the face region's visible vertices after an alignment of each frame, millimetres: a rigid one where
-    calibrated cameras tell scale, else a similarity."""
+    """Distance of the face region's visible vertices after an alignment of each frame, in millimetres. The alignment is
+    rigid if there are several (calibrated) cameras, which fix the scale, and a similarity otherwise."""
     landmark_px: float
-    """Distance of the tracked model's landmarks, projected, from the true ones, capture pixels; visible cameras."""
+    """Distance of the tracked model's projected landmarks from the true ones, in capture pixels, where a face was
+    found."""
     rotation_deg: float
-    """Of the head, degrees."""
+    """Error of the head's rotation, in degrees."""
     rotation_steady_deg: float
-    """The same without its constant part, in which shape and pose stand in for each other."""
+    """The same without the constant part, in which shape and pose can compensate for each other."""
     jitter_px: float | None
-    """Median second difference of the tracked landmarks where the true ones stand still, capture pixels."""
+    """Median second difference of the tracked landmarks while the true ones stand still, in capture pixels."""
     jitter_mm: float | None = None
-    """The same in world space, millimetres."""
+    """The same in world space, in millimetres."""
     blinks: Following | None = None
     """How the eyes' openings follow the true ones around blinks."""
     turns: Following | None = None
     """How head rotation follows the true one around fast turns."""
     iris_deviation_percent: float | None = None
-    """Standard deviation of the irises' distance x depth / focal length over near-frontal frames, of its mean."""
+    """Standard deviation of the irises' distance x depth / focal length over near-frontal frames, in percent of the
+    mean."""
 
 
 @torch.no_grad()
 def tracking_errors(tracking: Tracking, capture: Capture, truth: Truth, face_model: FaceModel) -> TrackingErrors:
-    """Compare a tracking with the truth; both must be of the same face model's topology.
+    """Compare a tracking with the truth. Both must have the same face model topology.
 
-    Cameras are compared in the pixels of the capture, which may be a crop of the drawn pictures.
+    Errors in pixels refer to the capture, which may be a crop of the drawn pictures.
     """
     timesteps = tracking.valid.nonzero()[:, 0].tolist()
     index = torch.from_numpy(truth.vertex_index)
@@ -89,7 +91,7 @@ def tracking_errors(tracking: Tracking, capture: Capture, truth: Truth, face_mod
 
 
 def crop_landmarks(landmarks: Float[np.ndarray, "t c l 2"], capture: Capture) -> Float[np.ndarray, "t c l 2"]:
-    """Pixels of the drawn pictures as pixels of the capture, which may be cropped and shrunk."""
+    """Convert pixels of the drawn pictures to pixels of the capture, which may be cropped and shrunk."""
     crop = capture.source.get("crop")
     if crop is None:
         return landmarks
@@ -98,7 +100,7 @@ def crop_landmarks(landmarks: Float[np.ndarray, "t c l 2"], capture: Capture) ->
 
 
 def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], rigid: bool = False) -> float:
-    """Mean distance after the best rotation, shift and, unless `rigid`, scale of `points` (Umeyama 1991)."""
+    """Return the mean distance after the best rotation, shift and, unless `rigid`, scale of `points` (Umeyama 1991)."""
     a, b = points.astype(np.float64), target.astype(np.float64)
     a, b = a - a.mean(0), b - b.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
@@ -108,7 +110,7 @@ def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray,
 
 
 def _visible(truth: Truth, face_model: FaceModel, timestep: int) -> Bool[np.ndarray, " n"]:
-    """Vertices of the region that face any camera."""
+    """Mark the region's vertices that face any camera."""
     index, faces = truth.vertex_index, face_model.faces.numpy()
     place = np.full(len(face_model.template), -1)
     place[index] = np.arange(len(index))
@@ -131,7 +133,7 @@ def _visible(truth: Truth, face_model: FaceModel, timestep: int) -> Bool[np.ndar
 
 
 def _rotation_errors(tracking: Tracking, truth: Truth) -> tuple[float, float]:
-    """Mean angles in degrees: as it is, and beside the mean difference."""
+    """Return mean rotation errors in degrees: of the whole difference, and without the mean difference."""
     kept = tracking.valid
     tracked, true = (matrix_from_axis_angle(t.face.head_rotation)[kept].double() for t in (tracking, truth.tracking))
     difference = tracked.transpose(-1, -2) @ true
@@ -149,24 +151,24 @@ class QualityRow:
 
     capture: str
     key: str
-    """Of the reference capture: `ReferenceCapture.key`."""
+    """Key of the reference capture: `ReferenceCapture.key`."""
     method: str
     steps: int
     gaussians: int
     protocols: dict[str, Any]
-    """As in metrics.json, without the figures of single frames."""
+    """Protocols as in metrics.json, without the figures of single frames."""
     tracking: dict[str, TrackingErrors]
-    """By sequence."""
+    """Tracking errors by sequence."""
     seconds: dict[str, float]
-    """Of each stage when it was last run."""
+    """Seconds of each stage when it last ran."""
 
     def as_json(self) -> dict[str, Any]:
-        """For json."""
+        """Return the row as a json object."""
         return asdict(self)
 
 
 def markdown_table(rows: list[QualityRow]) -> str:
-    """Pictures and trackings, as docs/results.md shows them."""
+    """Return tables of pictures and trackings, in the form of docs/results.md."""
     lines = [
         "| capture (key) | protocol | what | whole frame: PSNR / SSIM / L1 / ST-LPIPS | head crop |",
         "|---|---|---|---|---|",
@@ -194,7 +196,7 @@ def markdown_table(rows: list[QualityRow]) -> str:
 
 
 def tracking_cells(errors: TrackingErrors) -> str:
-    """The measures of one sequence as cells of a table."""
+    """Return the figures of one sequence as cells of a table."""
     pixels, world = _known(errors.jitter_px, "{:.3f} px"), _known(errors.jitter_mm, "{:.3f} mm")
     return " | ".join([
         f"{errors.vertex_mm:.2f} mm", f"{errors.landmark_px:.2f} px",

@@ -1,6 +1,6 @@
-"""How fast the native rasterizer draws a synthetic head that fills half of the picture.
+"""Measure how fast the native rasterizer renders a synthetic head that fills half of the picture.
 
-Run as `mien bench render` (three sizes, every instruction set) and `mien bench scaling` (sizes of the papers).
+Run as `mien bench render` (two sizes, every instruction set) and `mien bench scaling` (sizes of the papers).
 """
 
 from collections.abc import Iterator
@@ -20,24 +20,24 @@ SIZES = {
     "": (1024, 1024),
     "large": (2048, 2048),
 }
-"""Width and height in pixels (the papers' 802x550 is height x width), and who reports that size."""
+"""Width and height in pixels (the papers' 802x550 is height x width), by where that size is reported."""
 INSTRUCTION_SETS = ("avx512", "avx2", "sse4", "baseline")
 
 
 def draw(scene: Scene, backend: Backend = "native") -> None:
-    """One picture without gradients."""
+    """Render one picture without gradients."""
     with torch.no_grad():
         rasterize(scene.gaussians, scene.camera, scene.background, backend)
 
 
 def draw_and_differentiate(scene: Scene, backend: Backend = "native") -> None:
-    """One picture, and the gradients of all parameters."""
+    """Render one picture and compute the gradients of all parameters."""
     picture = rasterize(scene.gaussians, scene.camera, scene.background, backend).image
     torch.autograd.grad(picture, scene.parameters, scene.gradient)
 
 
 def benchmark_render(count: int, size: tuple[int, int], threads: int, seconds: float = 0.8) -> list[BenchmarkRow]:
-    """Forward alone, and forward with backward, of one picture. Changes the number of native threads."""
+    """Measure forward alone, and forward with backward, of one picture. This changes the number of native threads."""
     _native.set_thread_count(threads)
     scene = head_scene(count, *size)
     forward = time_function(lambda: draw(scene), seconds)
@@ -49,7 +49,7 @@ def benchmark_render(count: int, size: tuple[int, int], threads: int, seconds: f
 
 
 def render_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
-    """10,000 to 100,000 Gaussians at two sizes by threads, then 30,000 at 512x512 by instruction set."""
+    """Measure 10,000 to 100,000 Gaussians at two sizes by threads, then 30,000 at 512x512 by instruction set."""
     for count in COUNTS[:3]:
         for size in ((512, 512), (1024, 1024)):
             for threads in thread_counts():
@@ -64,7 +64,7 @@ def render_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
 
 
 def scaling_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
-    """10,000 to 300,000 Gaussians at the papers' sizes and up to 2048x2048, by threads."""
+    """Measure 10,000 to 300,000 Gaussians at the papers' sizes and up to 2048x2048, by threads."""
     for size in SIZES.values():
         for count in COUNTS:
             for threads in thread_counts():
@@ -72,6 +72,6 @@ def scaling_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
 
 
 def thread_counts() -> list[int]:
-    """One, and all that `MIEN_THREADS` or the machine gives."""
+    """Return one thread, and all threads that `MIEN_THREADS` or the machine allows."""
     _native.set_thread_count(0)
     return sorted({1, _native.thread_count()})

@@ -1,4 +1,4 @@
-"""What benchmarks draw: a head of any number of Gaussians that fills half of a picture."""
+"""Scenes for benchmarks: a head of any number of Gaussians that fills half of a picture."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from mien.gaussians import Gaussians
 
 
 def synthetic_head(count: int, coefficients: int = 1) -> Gaussians:
-    """An ellipsoid's surface in small, mostly opaque splats whose total area does not depend on their number."""
+    """Cover an ellipsoid with small, mostly opaque splats. Their total area does not depend on their number."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     spread = torch.exp(0.35 * torch.randn(count, 3, generator=generator))
@@ -25,7 +25,10 @@ def synthetic_head(count: int, coefficients: int = 1) -> Gaussians:
 
 
 def head_camera(width: int, height: int) -> Camera:
-    """60 cm in front of the head; the head's height is about three quarters of the picture's shorter side."""
+    """Return a camera 60 cm in front of the head.
+
+    The head's height is about three quarters of the picture's shorter side.
+    """
     viewmat = torch.eye(4)
     viewmat[2, 3] = 0.6
     focal = 2.35 * min(width, height)
@@ -43,13 +46,13 @@ class Scene:
 
     @property
     def parameters(self) -> list[Tensor]:
-        """What gradients are taken of."""
+        """The tensors whose gradients are computed."""
         own = self.gaussians
         return [own.means, own.quats, own.scales, own.opacities, own.sh]
 
 
 def head_scene(count: int, width: int, height: int) -> Scene:
-    """The head over white; its tensors are leaves."""
+    """Return the head over white. Its tensors are leaves."""
     head = synthetic_head(count)
     names = ("means", "quats", "scales", "opacities", "sh")
     head = replace(head, **{name: getattr(head, name).requires_grad_() for name in names})

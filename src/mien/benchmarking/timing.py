@@ -1,4 +1,4 @@
-"""How benchmarks measure, and what they say about the machine."""
+"""Timing of benchmarks, and a description of the machine."""
 
 import os
 import platform
@@ -16,19 +16,19 @@ from mien import _native
 
 @dataclass(frozen=True)
 class Timing:
-    """Of one function, in milliseconds."""
+    """Times of one function, in milliseconds."""
 
     min_ms: float
-    """Least wall-clock time."""
+    """Smallest wall-clock time."""
     median_ms: float
     """Median wall-clock time."""
     cpu_ms: float
-    """Least processor time, all threads added: what other work on the machine disturbs least."""
+    """Smallest processor time, summed over threads. Other work on the machine disturbs it least."""
 
 
 @dataclass(frozen=True)
 class BenchmarkRow(Timing):
-    """One line of a table."""
+    """One row of a table."""
 
     name: str
     gaussians: int
@@ -36,27 +36,27 @@ class BenchmarkRow(Timing):
     height: int
     threads: int
     isa: str
-    """Instruction set of the native kernels; `cuda` on a GPU, where threads are 0."""
+    """Instruction set of the native kernels; `cuda` on a GPU, where `threads` is 0."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What the figures were measured on."""
+    """The machine on which figures were measured."""
 
     processor: str
     cores: int
     isa: str
-    """The best instruction set that the native kernels have here."""
+    """The best instruction set of the native kernels on this machine."""
     gflops: float
-    """Float32 operations of one thread in 1e9 a second, measured: a matrix product of 512x512 by torch."""
+    """Measured float32 operations of one thread in 1e9 per second: a 512x512 matrix product in torch."""
     load: float
-    """Of the last minute, before the benchmark: above 0 others were working."""
+    """Load average of the minute before the benchmark. Above 0, other work was running."""
     gpu: str = ""
-    """Its name, torch's CUDA version and gsplat's version, where it is measured."""
+    """Name of the GPU, torch's CUDA version and gsplat's version, if the GPU is measured."""
 
 
 def time_function(function: Callable[[], object], seconds: float = 0.8, least: int = 7) -> Timing:
-    """Run it for about so many seconds, but at least `least` times, after two runs that do not count."""
+    """Time a function for about `seconds` and at least `least` runs, after two warm-up runs."""
     for _ in range(2):
         function()
     walls: list[float] = []
@@ -71,7 +71,7 @@ def time_function(function: Callable[[], object], seconds: float = 0.8, least: i
 
 
 def benchmark_row(name: str, gaussians: int, size: tuple[int, int], timing: Timing) -> BenchmarkRow:
-    """A row with the threads and the instruction set in use; `size` is (width, height)."""
+    """Return a row with the threads and the instruction set in use; `size` is (width, height)."""
     width, height = size
     return BenchmarkRow(
         **asdict(timing), name=name, gaussians=gaussians, width=width, height=height,
@@ -80,13 +80,13 @@ def benchmark_row(name: str, gaussians: int, size: tuple[int, int], timing: Timi
 
 
 def device_row(name: str, gaussians: int, size: tuple[int, int], timing: Timing, like: Tensor) -> BenchmarkRow:
-    """A row of what ran on the device of `like`; `size` is (width, height)."""
+    """Return a row of a run on the device of `like`; `size` is (width, height)."""
     row = benchmark_row(name, gaussians, size, timing)
     return replace(row, threads=0, isa=like.device.type) if like.is_cuda else row
 
 
 def measure_machine(gpu: bool = False) -> Machine:
-    """Takes a fifth of a second."""
+    """Describe this machine. This takes a fifth of a second."""
     load = os.getloadavg()[0]
     matrix = torch.randn(512, 512)
     threads = torch.get_num_threads()
@@ -101,7 +101,7 @@ def measure_machine(gpu: bool = False) -> Machine:
 
 
 def format_machine(machine: Machine) -> str:
-    """One line."""
+    """Return the machine's description in one line."""
     processor = (
         f"{machine.processor}, {machine.cores} cores, {machine.isa}, {machine.gflops:.0f} GFLOP/s a thread "
         f"(matrix product), load {machine.load:.1f}"
@@ -110,7 +110,7 @@ def format_machine(machine: Machine) -> str:
 
 
 def format_row(row: BenchmarkRow) -> str:
-    """One line of the table."""
+    """Return one line of the table."""
     return (
         f"{row.name:28} {row.gaussians:7} {row.width:5}x{row.height:<5} {row.threads:2} threads {row.isa:8} "
         f"{row.min_ms:8.2f} min {row.median_ms:8.2f} median {row.cpu_ms:8.2f} processor ms"

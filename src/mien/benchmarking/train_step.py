@@ -1,4 +1,4 @@
-"""How long a `gaussian_avatars` training step takes, as `mien train` runs it, on a sequence that needs no footage.
+"""Measure a `gaussian_avatars` training step, as `mien train` runs it, on a sequence that needs no footage.
 
 Run as `mien bench train-step`.
 """
@@ -26,12 +26,12 @@ from mien.training.trainer import TrainingData, start, step
 
 TIMESTEPS = 20
 SETTINGS = TrainSettings(steps=1_000_000_000, split="none")
-"""So many that no round of density control comes while we measure."""
+"""So many steps that no density control happens during the measurement."""
 _ON_CPU = torch.zeros(())
 
 
 def train_step_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
-    """Whole steps at 512x512 by the number of Gaussians and threads; pose and render at the papers' sizes."""
+    """Measure whole steps at 512x512 by Gaussians and threads, and posing with rendering at the papers' sizes."""
     for count in (10_000, 30_000, 100_000):
         state, data = training_case(load_face_model(), count, 512, 512)
         for threads in thread_counts():
@@ -49,7 +49,7 @@ def train_step_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
 
 
 def pose_and_render(avatar: Avatar, face: FaceParams, camera: Camera) -> None:
-    """From face parameters to a picture."""
+    """Pose the avatar and render one picture."""
     with torch.no_grad():
         gaussians = avatar.pose(face[0]).gaussians.timestep(0)
         rasterize(gaussians, camera, gaussians.means.new_ones(3))
@@ -58,9 +58,11 @@ def pose_and_render(avatar: Avatar, face: FaceParams, camera: Camera) -> None:
 def training_case(
     face_model: FaceModel, count: int, width: int, height: int, like: Tensor = _ON_CPU
 ) -> tuple[TrainingState, TrainingData]:
-    """The state in the middle of a run of so many Gaussians, and pictures to train on; head over half the picture.
+    """Return a state in the middle of a run with `count` Gaussians, and its pictures.
 
-    Both with the float dtype and on the device of `like`.
+    The head covers half of each picture.
+
+    Both have the float dtype and the device of `like`.
     """
     sequence = _sequence(face_model, width, height)
     state = start([sequence], face_model, GaussianAvatarsConfig(), SETTINGS, like)
@@ -80,7 +82,7 @@ def training_case(
 
 
 def _grow(avatar: Avatar, count: int) -> None:
-    """As density control leaves an avatar: several Gaussians on every triangle, small and mostly opaque."""
+    """Grow an avatar as density control would: several Gaussians per triangle, small and mostly opaque."""
     store, generator = avatar.gaussian_store(), torch.Generator().manual_seed(0)
     faces = len(store)
     store.select(torch.arange(count) % faces)
@@ -93,7 +95,7 @@ def _grow(avatar: Avatar, count: int) -> None:
 
 
 def _sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
-    """A head that turns and opens its mouth a little, with pictures that are still black."""
+    """Return a head that turns and opens its mouth a little, with pictures that are still black."""
     time = torch.linspace(0, 2 * torch.pi, TIMESTEPS + 1)[:-1]
     neutral = face_model.neutral(TIMESTEPS)
     turn = torch.stack([0.1 * time.sin(), 0.2 * time.cos(), 0 * time], -1)
@@ -121,7 +123,7 @@ def _sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
 
 
 def _paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor) -> None:
-    """Pictures of the same head in noisy colours, so that every loss has something to do."""
+    """Paint pictures of the same head in noisy colours, so that every loss has a gradient."""
     noise = np.random.default_rng(0)
     for timestep in range(TIMESTEPS):
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Capture: a video of a head becomes frames, mattes and landmarks."""
+"""Capture: turn a video of a head into frames, mattes and landmarks."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The decoded cache of a capture: valid while neither it nor the PNGs beside it change; rebuilt otherwise."""
+"""The decoded cache of a capture. It is rebuilt when the capture or one of its PNGs has changed."""
 
 import hashlib
 import itertools
@@ -27,7 +27,7 @@ _SCRATCH_PREFIX, _ASIDE_PREFIX = "mien-capture-", ".making-"
 
 
 def stamp_cache(layout: FrameLayout, capture_hash: str) -> None:
-    """Declare the cache complete and in step with the PNGs."""
+    """Record that the cache is complete and matches the PNGs."""
     write_json(
         layout.folder / CACHE / "stamp.json",
         _FORMAT,
@@ -37,7 +37,7 @@ def stamp_cache(layout: FrameLayout, capture_hash: str) -> None:
 
 
 def map_frames(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Memory maps of all frames [t, c, h, w, 3] and mattes [t, c, h, w]; decodes them first where the cache is stale.
+    """Return memory maps of all frames [t, c, h, w, 3] and mattes [t, c, h, w]. A stale cache is rebuilt first.
 
     Raises:
         UserError: a frame or matte is missing or damaged.
@@ -46,7 +46,7 @@ def map_frames(layout: FrameLayout, capture_hash: str, digests: dict[str, np.nda
     found = layout if _is_valid(layout, capture_hash) else _rebuild(layout, capture_hash, digests)
     images, mattes = (map_pictures(found.raw(kind), found.shape(kind)) for kind in (FRAMES, MATTES))
     if found is not layout:
-        # A scratch folder: the maps keep the pages; nobody else needs the names.
+        # The maps keep the pages of a scratch folder alive. Nothing else needs its file names.
         shutil.rmtree(found.folder, ignore_errors=True)
     return images, mattes
 
@@ -75,7 +75,7 @@ def _is_valid(layout: FrameLayout, capture_hash: str) -> bool:
 
 
 def _fingerprint(layout: FrameLayout) -> str:
-    """Of sizes and times of change of the cache and of all PNGs: cheap, and changes when a file does."""
+    """Hash of the sizes and modification times of the cache and of all PNGs, which is cheap to compute."""
     digest = hashlib.sha256()
     for kind in (FRAMES, MATTES):
         paths: list[Path] = [layout.raw(kind)]
@@ -89,9 +89,10 @@ def _fingerprint(layout: FrameLayout) -> str:
 
 
 def _rebuild(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarray]) -> FrameLayout:
-    """Decode everything into the cache, or into a scratch folder where the capture's own cannot be written now.
+    """Decode everything into the cache, or into a scratch folder if the capture's own cache cannot be written now.
 
-    Others may map the cache meanwhile: it is made aside and put in their place. One process at a time makes it.
+    Other processes may have the old cache mapped, so new files are made aside and then renamed. A lock lets only one
+    process write at a time.
     """
     _read_first(layout, digests)
     try:
@@ -117,9 +118,9 @@ def _rebuild(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarr
 
 def _replace_cache(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
     cache = layout.folder / CACHE
-    for left in cache.glob(f"{_ASIDE_PREFIX}*"):  # by a process that was killed
+    for left in cache.glob(f"{_ASIDE_PREFIX}*"):  # left by a process that was killed
         shutil.rmtree(left, ignore_errors=True)
-    for old in (cache / "stamp.json", layout.raw(FRAMES), layout.raw(MATTES)):  # there may be no room for both
+    for old in (cache / "stamp.json", layout.raw(FRAMES), layout.raw(MATTES)):  # the disk may have no room for both
         old.unlink(missing_ok=True)
     aside = replace(layout, folder=Path(tempfile.mkdtemp(dir=cache, prefix=_ASIDE_PREFIX)))
     try:
@@ -131,7 +132,7 @@ def _replace_cache(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
 
 
 def _read_first(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
-    """Find a size that no picture has before room is made for all of them.
+    """Check the first frame and matte, so that a wrong size in `capture.json` fails before disk space is allocated.
 
     Raises:
         UserError: the first frame or matte is damaged or of another size.

@@ -11,35 +11,35 @@ from mien.capture.quality import FrameQuality
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """t timesteps seen by c cameras. Read from disk, `images` and `mattes` are memory maps."""
+    """A sequence of t timesteps seen by c cameras. If it was read from disk, `images` and `mattes` are memory maps."""
 
     name: str
-    """Of the sequence."""
+    """Name of the sequence."""
     camera_ids: tuple[str, ...]
     fps: float
-    """Frames a second."""
+    """Frames per second."""
     timestamps: Float[np.ndarray, " t"]
-    """Seconds from the start."""
+    """Time of each frame in seconds from the start."""
     images: UInt8[np.ndarray, "t c h w 3"]
-    """sRGB as decoded."""
+    """Decoded sRGB pixels."""
     mattes: UInt8[np.ndarray, "t c h w"]
     """Foreground opacity, 255 = person."""
     landmarks: Float[np.ndarray, "t c l 2"]
-    """MediaPipe's 478 points in pixels; NaN where no face was found."""
+    """MediaPipe's 478 points in pixels. NaN where no face was found."""
     valid: Bool[np.ndarray, "t c"]
-    """False: no face was found; trackers and trainers leave the frame out."""
+    """Whether a face was found. Trackers and trainers skip the other frames."""
     principal_point: Float[np.ndarray, "c 2"]
-    """Where the source picture's centre lies, in pixels (a crop may move it off the centre)."""
+    """Position of the source picture's centre in pixels. A crop may move it away from the frame's centre."""
     source: dict
-    """Where it came from: file name, content hash, crop box, original size."""
+    """Origin of the capture: file name, content hash, crop box, original size."""
     calibration: tuple[Camera, ...] | None = None
-    """One calibrated camera a camera_id, in one world frame, for pictures of this size; None where it is unknown."""
+    """One calibrated camera per camera_id, in one world frame, for frames of this size. None if unknown."""
     quality: FrameQuality | None = None
-    """How sharp and how well lit the face is; None where it was not measured."""
+    """Sharpness and lighting of the face. None if they were not measured."""
 
     @property
     def usable(self) -> Bool[np.ndarray, "t c"]:
-        """Frames fit to learn from: a face was found, and it is not blurred."""
+        """Frames to learn from: a face was found in them, and it is not blurred."""
         return self.valid if self.quality is None else self.valid & ~self.quality.blurred
 
     @property
@@ -49,10 +49,10 @@ class Capture:
 
     @property
     def width(self) -> int:
-        """Pixels."""
+        """Width of the frames in pixels."""
         return self.images.shape[3]
 
     @property
     def height(self) -> int:
-        """Pixels."""
+        """Height of the frames in pixels."""
         return self.images.shape[2]

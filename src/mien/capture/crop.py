@@ -1,4 +1,4 @@
-"""One crop for a whole clip, so that the camera stays a camera: a head that moves, moves in the picture."""
+"""One crop for a whole clip. The crop does not follow the head, so the frames still come from one fixed camera."""
 
 from dataclasses import dataclass
 
@@ -9,18 +9,18 @@ from jaxtyping import Float, UInt8
 from mien.capture.source import shrunk_size
 
 _MARGIN = 1.5
-"""Face boxes (eyebrows to chin) of room around all positions of the face, for hair, neck and shoulders."""
+"""Room around all positions of the face for hair, neck and shoulders, in face boxes (eyebrows to chin)."""
 _OUTLIERS = 1.0
-"""Percent of the frames at either end that may lie outside: a false detection must not decide."""
+"""Percent of the frames at either end that may lie outside, so that a false detection does not decide the crop."""
 _SQUARISH = 1.25
-"""A picture of up to this aspect..."""
+"""A picture counts as a head crop already, and is kept whole, if its aspect ratio is at most this..."""
 _MOSTLY_HEAD = 0.7
-"""...of which the head crop would take at least this part is a head crop already, and kept whole."""
+"""...and the chosen crop would take at least this part of its shorter side."""
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A part of the source picture and the size it is shrunk to, all in pixels."""
+    """A part of the source picture and the size to which it is shrunk, all in pixels."""
 
     left: int
     top: int
@@ -31,15 +31,15 @@ class Crop:
 
     @property
     def scale(self) -> Float[np.ndarray, " 2"]:
-        """Output pixels a source pixel, along x and y."""
+        """Output pixels per source pixel, along x and y."""
         return np.array([self.width / self.crop_width, self.height / self.crop_height])
 
     def to_output(self, source_pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
-        """Source pixels as pixels of the output."""
+        """Convert positions in the source picture to positions in the output."""
         return (source_pixels - np.array([self.left, self.top])) * self.scale
 
     def apply(self, image: UInt8[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h2 w2 *channels"]:
-        """Cut out and shrink (area-averaged)."""
+        """Cut the part out and shrink it (area-averaged)."""
         part = image[self.top : self.top + self.crop_height, self.left : self.left + self.crop_width]
         if (self.crop_width, self.crop_height) == (self.width, self.height):
             return np.ascontiguousarray(part)
@@ -48,19 +48,19 @@ class Crop:
 
 
 def whole_picture(width: int, height: int, size: int) -> Crop:
-    """No crop, only shrunk so that the longer side has at most `size` pixels."""
+    """Return a crop of the whole picture, shrunk so that its longer side has at most `size` pixels."""
     width_out, height_out = shrunk_size(width, height, size)
     return Crop(0, 0, width, height, width_out, height_out)
 
 
 def choose_crop(boxes: Float[np.ndarray, "t 4"], width: int, height: int, size: int) -> Crop:
-    """A square that holds the head over the whole clip, inside the picture; or the picture, if it is a head crop.
+    """Return a square inside the picture that holds the head over the whole clip, or the picture if it is a head crop.
 
     Args:
-        boxes: left, top, right, bottom of the face as fractions of the picture; NaN where there is none.
-        width: of the source picture, pixels.
-        height: of the source picture, pixels.
-        size: pixels a side of the result; smaller crops are not enlarged.
+        boxes: left, top, right, bottom of the face as fractions of the picture. NaN where there is no face.
+        width: width of the source picture in pixels.
+        height: height of the source picture in pixels.
+        size: largest side of the result in pixels. Smaller crops are not enlarged.
     """
     pixels = boxes[np.isfinite(boxes).all(axis=1)] * np.array([width, height, width, height])
     assert len(pixels) > 0

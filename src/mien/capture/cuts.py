@@ -1,25 +1,25 @@
-"""Where a video cuts to another shot, seen in thumbnails."""
+"""Find where a video cuts to another shot, from its thumbnails."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 _REACH = 3
-"""Frames on either side that a cut keeps apart: a flash does not, for the picture before it comes back."""
+"""Frames on either side of a cut that must all differ. After a flash, the picture from before it comes back."""
 _NEIGHBOURS = 4
-"""Frames on either side in which the picture may change only a little: where it moves, it moves for a while."""
+"""Frames on either side of a cut in which the picture may change only a little: motion lasts longer than a cut."""
 _SMALLEST = 0.05
-"""Change at a cut at least, as a fraction of the mean brightness."""
+"""Smallest change at a cut, as a fraction of the mean brightness."""
 _CONTRAST = 3.0
-"""How much more the picture changes at a cut than beside it."""
+"""Factor by which the change at a cut exceeds the changes beside it."""
 _BLOCKS = (3, 4)
-"""Rows and columns of blocks; the change is that of the quarter of them that changes most, as the head may be small."""
+"""Rows and columns of blocks. The change is that of the quarter that changes most, as the head may be small."""
 
 
 def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"]) -> list[int]:
-    """Numbers of the frames that begin a new shot; 0 is not among them.
+    """Return the numbers of the frames that begin a new shot; 0 is not among them.
 
-    A cut is a change that stands out from the changes beside it and that the next frames do not take back. Thumbnails
-    are compared after division by their mean, so that a light that is switched on makes no cut.
+    A cut is a change that is much larger than the changes beside it, and that the next frames do not undo. Thumbnails
+    are divided by their mean before they are compared, so that switching on a light is no cut.
     """
     pictures = thumbnails.astype(np.float32)
     pictures /= np.maximum(pictures.mean(axis=(1, 2, 3), keepdims=True), 1.0)
@@ -27,7 +27,7 @@ def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"]) -> list[int]:
     cuts = []
     for index in np.flatnonzero(changes > _SMALLEST).tolist():
         beside = np.concatenate([changes[max(index - _NEIGHBOURS, 0) : index], changes[index + 1 :][:_NEIGHBOURS]])
-        # The largest neighbour may be the other half of a cut over a blended frame.
+        # The largest neighbour may be the other half of a cut that passes through a blended frame.
         loudest = np.sort(beside)[-2] if len(beside) > 1 else 0.0
         if changes[index] > _CONTRAST * loudest and _parted(pictures, index + 1) > 0.5 * changes[index]:
             cuts.append(index + 1)
@@ -35,7 +35,7 @@ def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"]) -> list[int]:
 
 
 def _parted(pictures: Float[np.ndarray, "t h w 3"], start: int) -> float:
-    """The smallest difference between a picture shortly before `start` and one shortly after."""
+    """Return the smallest difference between a frame shortly before `start` and one shortly after it."""
     before, after = pictures[max(start - _REACH, 0) : start], pictures[start : start + _REACH]
     return min(_difference(one, other) for one in before for other in after)
 

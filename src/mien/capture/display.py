@@ -1,4 +1,4 @@
-"""A decoded video frame as an sRGB screen shows it: matrix and range, HDR, pixel aspect, rotation."""
+"""Convert decoded video frames to what an sRGB screen shows: matrix and range, HDR, pixel aspect, rotation."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from mien.capture.video_file import LARGEST_FRAME, TOO_MANY_PIXELS
 from mien.errors import UserError
 
 ACCURATE = Interpolation.BICUBIC | Interpolation.FULL_CHR_H_INT | Interpolation.ACCURATE_RND
-"""Without accurate rounding swscale is five times faster, but darkens pictures by a whole level."""
+"""Without accurate rounding swscale is five times faster, but it darkens pictures by a whole level."""
 _SHRINKING = Interpolation.AREA | Interpolation.ACCURATE_RND
 _UNSPECIFIED_COLORSPACE = 2
 _HIGH_DEFINITION_HEIGHT = 720
@@ -21,15 +21,15 @@ _ASPECT_TOLERANCE = 0.01
 
 
 class Display:
-    """Converts the frames of one clip, which all get the size of the first."""
+    """Converts the frames of one clip to one size, which the first frame decides."""
 
     def __init__(self, name: str, pixel_aspect: float = 1.0, longest_side: int = 0) -> None:
-        """For one clip.
+        """Create the converter of one clip.
 
         Args:
-            name: of the clip, for messages.
-            pixel_aspect: width of a pixel over its height; frames are stretched, never shrunk, to square pixels.
-            longest_side: shrink larger pictures to this many pixels, area-averaged; 0 keeps the size.
+            name: name of the clip, for messages.
+            pixel_aspect: width of a pixel over its height. Frames are stretched, never shrunk, to square pixels.
+            longest_side: side in pixels to which larger pictures are shrunk (area-averaged). 0 keeps the size.
         """
         self._name = name
         self._pixel_aspect = pixel_aspect
@@ -41,10 +41,10 @@ class Display:
         self._size = (0, 0)
 
     def show(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
-        """The frame's sRGB picture.
+        """Return the frame as an sRGB picture.
 
         Raises:
-            UserError: the frame's shape differs from that of the frames before, or it is shown with too many pixels.
+            UserError: the aspect ratio differs from that of earlier frames, or the converted frame has too many pixels.
         """
         self._fit(frame)
         is_hdr = frame.color_trc in (PQ, HLG)
@@ -65,7 +65,7 @@ class Display:
         return _turn(converted, self._matrix) if self._matrix else converted
 
     def _fit(self, frame: av.VideoFrame) -> None:
-        """Choose the size at the first frame; later ones may have another resolution, but no other shape."""
+        """Choose the size at the first frame. Later frames may have another resolution, but no other aspect ratio."""
         stored = (frame.width, frame.height)
         if stored == self._stored_size:
             return
@@ -95,15 +95,15 @@ def _colorspace(frame: av.VideoFrame, is_hdr: bool) -> int:
         return frame.colorspace
     if is_hdr:
         return Colorspace.BT2020
-    # Files that do not say follow the custom of players: BT.709 from 720 lines up, BT.601 below.
+    # Players assume BT.709 from 720 lines up and BT.601 below if a file does not name its matrix.
     return Colorspace.ITU709 if frame.height >= _HIGH_DEFINITION_HEIGHT else Colorspace.ITU601
 
 
 def _display_matrix(frame: av.VideoFrame) -> list[int]:
-    """The upper two rows of the display matrix; empty where there is none.
+    """The upper two rows of the display matrix; empty if the frame has none.
 
-    To be asked once a clip: whoever touches a frame's side data makes a reference cycle, and whole frames then wait
-    for the garbage collector.
+    Call it once per clip: access to a frame's side data makes a reference cycle, and the whole frame then waits for the
+    garbage collector.
     """
     side_data: Any = frame.side_data  # PyAV's stub types its keys as strings
     data = side_data.get(SideDataType.DISPLAYMATRIX)
@@ -111,7 +111,7 @@ def _display_matrix(frame: av.VideoFrame) -> list[int]:
 
 
 def _turn(image: np.ndarray, matrix: list[int]) -> np.ndarray:
-    """Rotate and mirror by the display matrix: x' = a x + c y, y' = b x + d y with entries of -1, 0, 1."""
+    """Rotate and mirror by the display matrix: x' = a x + c y, y' = b x + d y with entries -1, 0 and 1."""
     a, b, _, c, d = matrix
     if abs(b) > abs(a):
         image = image.swapaxes(0, 1)

@@ -1,4 +1,4 @@
-"""Faces in pictures: boxes of all faces (to choose the crop), then the landmarks of the one that is followed."""
+"""Faces in pictures: boxes of all faces, to choose the crop, and landmarks, to follow one of them."""
 
 from types import TracebackType
 from typing import Any
@@ -9,13 +9,15 @@ from jaxtyping import Float, UInt8
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
 
 LANDMARKS = 478
-"""MediaPipe's face mesh with irises."""
+"""Points of MediaPipe's face mesh with irises."""
 _MOST_FACES = 4
 _DETECTION_CONFIDENCE = 0.5
 
 
 class FaceFinder:
-    """Boxes of all faces in a picture: MediaPipe's detector for near faces, where it fails the one for far faces.
+    """Finds the boxes of all faces in a picture.
+
+    It uses MediaPipe's detector for near faces and, if that finds none, the one for far faces.
 
     Use as a context manager.
     """
@@ -39,7 +41,7 @@ class FaceFinder:
             detector.close()
 
     def find(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n 4"]:
-        """Left, top, right, bottom of each face, eyebrows to chin, as fractions of the picture's width and height."""
+        """Return left, top, right, bottom of each face (eyebrows to chin) as fractions of the picture's size."""
         for detector in self._detectors:
             found = detector.process(image).detections
             if found:
@@ -48,16 +50,16 @@ class FaceFinder:
         return np.zeros((0, 4))
 
     def surest(self, image: UInt8[np.ndarray, "h w 3"]) -> float:
-        """How sure the surer detector is of a face, 0..1; 0 for none."""
+        """Return the higher of the two detectors' confidences that there is a face, 0..1; 0 if neither finds one."""
         found = [detection for detector in self._detectors for detection in detector.process(image).detections or ()]
         return max((float(detection.score[0]) for detection in found), default=0.0)
 
 
 class LandmarkDetector:
-    """Face-mesh landmarks over consecutive pictures of one clip. Use as a context manager, one for each clip.
+    """Finds face-mesh landmarks in consecutive pictures of one clip. Use as a context manager, one for each clip.
 
-    MediaPipe places its region of interest by the landmarks of the picture before, which is steadier than detecting
-    anew, but makes a result depend on some four pictures before it: show those first.
+    MediaPipe places its region of interest by the landmarks of the previous picture. That is steadier than a new
+    detection, but a result then depends on about four earlier pictures: pass those first.
     """
 
     def __init__(self, several_faces: bool) -> None:
@@ -67,7 +69,7 @@ class LandmarkDetector:
         module = load_solution("face_mesh")
         with quiet_mediapipe():
             self._mesh = module.FaceMesh(max_num_faces=_MOST_FACES if self._several_faces else 1, refine_landmarks=True)
-            # The graph starts in threads of its own, with warnings; when it has seen a picture it has started.
+            # The graph starts in its own threads and prints warnings. It has started when it has processed a picture.
             self._mesh.process(np.zeros((64, 64, 3), np.uint8))
         self._has_seen_face = False
         return self
@@ -78,7 +80,7 @@ class LandmarkDetector:
         self._mesh.close()
 
     def detect(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n l 2"]:
-        """The landmarks of all faces in the next picture of the clip, pixels."""
+        """Return the landmarks of all faces in the next picture of the clip, in pixels."""
         faces = self._process(image)
         if not faces:
             return np.zeros((0, LANDMARKS, 2))
@@ -88,7 +90,7 @@ class LandmarkDetector:
     def _process(self, image: np.ndarray) -> Any:
         if self._has_seen_face:
             return self._mesh.process(image).multi_face_landmarks
-        # Its last warning comes with the first face.
+        # MediaPipe prints its last warning at the first face.
         with quiet_mediapipe():
             faces = self._mesh.process(image).multi_face_landmarks
         self._has_seen_face = bool(faces)
@@ -96,7 +98,7 @@ class LandmarkDetector:
 
 
 def second_difference_jitter(landmarks: Float[np.ndarray, "t l 2"]) -> float:
-    """Median length in pixels of the landmarks' second difference over time; NaN for less than three frames."""
+    """Return the median length in pixels of the landmarks' second difference; NaN for fewer than three frames."""
     differences = landmarks[2:] - 2 * landmarks[1:-1] + landmarks[:-2]
     lengths = np.linalg.norm(differences, axis=-1)
     return float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else float("nan")

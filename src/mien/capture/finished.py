@@ -1,4 +1,4 @@
-"""What is at a capture's place already, and whether it is what would be made there."""
+"""Check whether a folder already holds the capture that would be made there."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from mien.storage import read_json
 
 
 def read_source(out: Path) -> dict[str, Any] | None:
-    """Where the capture in a folder came from; none where there is none, or none that can be read."""
+    """Return the `source` entry of the capture in a folder, or None if there is no readable capture."""
     try:
         source = read_json(out / JSON_NAME, FORMAT, VERSION).get("source")
     except UserError:
@@ -20,7 +20,7 @@ def read_source(out: Path) -> dict[str, Any] | None:
 
 
 def read_finished(out: Path, key: str, tell: bool = True) -> Capture | None:
-    """The capture in a folder, if it was made as `key` says and is whole; `tell` says where it is damaged."""
+    """Return the capture in a folder if it has this `key` and is intact. `tell` reports a damaged one."""
     source = read_source(out)
     if source is None or source.get("key") != key:
         return None

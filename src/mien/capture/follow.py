@@ -1,4 +1,4 @@
-"""Landmarks of the followed person, and of nobody else."""
+"""Pick the landmarks of the followed person among all faces in a frame."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -9,13 +9,13 @@ from mien.capture.people import Person
 from mien.capture.survey import Survey
 
 _ASTRAY = 0.6
-"""Landmarks whose middle is further from the followed face than this part of its longer side are another's."""
+"""Largest distance between the centres of landmarks and of the followed face, as a part of the face's longer side."""
 _MEMORY = 12
-"""Frames for which the last landmarks tell where the face is, when the survey did not see it."""
+"""Frames for which the last landmarks predict the face's position if the survey did not find it."""
 
 
 class LandmarkFollower:
-    """Picks, frame after frame, the landmarks of the person whom the survey follows."""
+    """Picks the landmarks of the person that the survey follows, frame by frame."""
 
     def __init__(self, detector: LandmarkDetector, survey: Survey, person: Person, crop: Crop) -> None:
         self._detector = detector
@@ -26,11 +26,12 @@ class LandmarkFollower:
         self._last: tuple[int, np.ndarray] | None = None
 
     def find(self, timestep: int, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "l 2"] | None:
-        """The landmarks in the next picture, pixels; none where the person's face is not found."""
+        """Return the person's landmarks in the next picture, in pixels, or None if the face is not found."""
         faces = self._detector.detect(image)
         expected = self._expected(timestep)
         if expected is None:
-            # Detectors differ: in a clip where nobody else is ever seen, whatever the finer one sees is the person.
+            # The two detectors differ. If the clip never shows anybody else, any face that is detected here is the
+            # person.
             chosen = faces[0] if self._is_alone and len(faces) else None
         else:
             chosen = self._nearest(faces, expected, self._others[timestep])
@@ -39,7 +40,7 @@ class LandmarkFollower:
         return chosen
 
     def _expected(self, timestep: int) -> Float[np.ndarray, " 4"] | None:
-        """Where the face should be: seen by the survey, or else where it was just now."""
+        """Return the box where the face should be: the survey's, or else that of the last landmarks if recent."""
         if np.isfinite(self._boxes[timestep, 0]):
             return self._boxes[timestep]
         if self._last is None or abs(timestep - self._last[0]) > _MEMORY:
@@ -56,7 +57,7 @@ class LandmarkFollower:
         if distances[best] > _ASTRAY * (expected[2:] - expected[:2]).max():
             return None
         to_others = np.linalg.norm(centres[best] - (others[:, :2] + others[:, 2:]) / 2, axis=1)
-        # NaN, for no other face, is not nearer.
+        # Missing faces are NaN, which never compares as smaller.
         return None if (to_others < distances[best]).any() else faces[best]
 
 

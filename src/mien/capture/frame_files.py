@@ -1,4 +1,4 @@
-"""Frames on disk: lossless PNGs, and beside them the decoded pixels as raw files that are read as memory maps."""
+"""Frames on disk: lossless PNGs, and beside them the decoded pixels as raw files for memory maps."""
 
 import hashlib
 import math
@@ -21,23 +21,23 @@ from mien.picture_files import decode_png, write_at
 FRAMES, MATTES, CACHE = "frames", "mattes", "cache"
 STAGE = "`mien capture`"
 REMEDY = "run `mien capture` on its video again, which mends it"
-"""For damaged captures."""
+"""What to do about a damaged capture."""
 _PNG_OPTIONS = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
 )
-"""Half the time of OpenCV's default for level 1, and smaller files."""
+"""These options take half the time of OpenCV's default for level 1 and make smaller files."""
 _IN_FLIGHT = 8
-"""Timesteps that wait for the disk at most: bounds the memory."""
+"""Largest number of timesteps that wait to be written. It bounds the memory."""
 
 MakeFrames = Callable[[], tuple[np.ndarray, np.ndarray]]
-"""Computes the images [c, h, w, 3] and mattes [c, h, w] of a timestep."""
+"""Computes the images [c, h, w, 3] and mattes [c, h, w] of one timestep."""
 
 
 @dataclass(frozen=True)
 class FrameLayout:
-    """Where the frames of a capture lie, and how many there are."""
+    """Paths of the frames of a capture, and their number and size."""
 
     folder: Path
     camera_ids: tuple[str, ...]
@@ -46,31 +46,31 @@ class FrameLayout:
     width: int
 
     def png(self, kind: str, timestep: int, camera: int) -> Path:
-        """The file of one frame (`kind` is FRAMES) or matte (MATTES)."""
+        """Path of one frame (`kind` is FRAMES) or matte (MATTES)."""
         return self.folder / kind / self.camera_ids[camera] / f"{timestep:06d}.png"
 
     def raw(self, kind: str) -> Path:
-        """The cache file of all frames or mattes."""
+        """Path of the cache file of all frames or mattes."""
         return self.folder / CACHE / f"{kind}.u8"
 
     def shape(self, kind: str) -> tuple[int, ...]:
-        """Of all frames, [t, c, h, w, 3], or mattes, [t, c, h, w]."""
+        """Shape of all frames, [t, c, h, w, 3], or mattes, [t, c, h, w]."""
         shape = (self.timesteps, len(self.camera_ids), self.height, self.width)
         return (*shape, 3) if kind == FRAMES else shape
 
     def raw_size(self, kind: str) -> int:
-        """Bytes of the cache file."""
+        """Size of the cache file in bytes."""
         return math.prod(self.shape(kind))
 
 
 class CacheWriter:
-    """Fills the raw files picture by picture, by plain writes: a full disk is an error then, not a crash."""
+    """Fills the raw files picture by picture, with plain writes: a full disk raises an error instead of crashing."""
 
     def __init__(self, layout: FrameLayout) -> None:
-        """What the files hold already is kept.
+        """Open the raw files. Their content is kept.
 
         Raises:
-            UserError: something there is a link, no file, or has a second name.
+            UserError: a link, a special file or a file with a second name is in the way.
             OSError: the files cannot be written.
         """
         self._layout = layout
@@ -85,7 +85,7 @@ class CacheWriter:
             raise
 
     def write(self, kind: str, timestep: int, camera: int, picture: np.ndarray) -> None:
-        """Put one picture in its place."""
+        """Write one picture at its position."""
         index = timestep * len(self._layout.camera_ids) + camera
         write_at(self._files[kind], picture, index * picture.nbytes)
 
@@ -96,7 +96,7 @@ class CacheWriter:
 
 
 class FrameWriter:
-    """Writes frames and mattes as PNGs and into the cache, on one thread beside the caller's. A context manager.
+    """Writes frames and mattes as PNGs and into the cache, on one thread beside the caller's. Use as a context manager.
 
     Files of an earlier, interrupted run are overwritten frame by frame.
     """
@@ -105,7 +105,7 @@ class FrameWriter:
         self.layout = layout
         shape = (layout.timesteps, len(layout.camera_ids))
         self.digests = {kind: np.zeros(shape, np.uint64) for kind in (FRAMES, MATTES)}
-        """Of each picture written so far."""
+        """Digest of each picture written so far."""
         self._pending: deque[Future[None]] = deque()
 
     def __enter__(self) -> "FrameWriter":
@@ -123,10 +123,10 @@ class FrameWriter:
         self._cache.close()
 
     def submit(self, timestep: int, make: MakeFrames) -> None:
-        """Queue one timestep, whose pictures `make` computes on the writing thread; waits while too many are queued.
+        """Queue one timestep, whose pictures `make` computes on the writing thread. Waits if too many are queued.
 
         Raises:
-            OSError: something queued before could not be written.
+            OSError: an earlier timestep could not be written.
         """
         while len(self._pending) >= _IN_FLIGHT:
             self._pending.popleft().result()
@@ -136,7 +136,7 @@ class FrameWriter:
         """Wait until everything queued is written.
 
         Raises:
-            OSError: something could not be written.
+            OSError: a timestep could not be written.
         """
         while self._pending:
             self._pending.popleft().result()
@@ -152,12 +152,12 @@ class FrameWriter:
 
 
 def picture_digest(picture: UInt8[np.ndarray, "..."]) -> int:
-    """64 bits of a hash over the pixels."""
+    """Return 64 bits of a hash over the pixels."""
     return int.from_bytes(hashlib.sha256(picture.data.cast("B")).digest()[:8], "little")
 
 
 def read_png(path: Path, shape: tuple[int, ...], expected_digest: int) -> UInt8[np.ndarray, "..."]:
-    """One picture, checked.
+    """Read one picture and check its pixels.
 
     Raises:
         UserError: it is missing, damaged, or not what was written.

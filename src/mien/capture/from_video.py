@@ -1,4 +1,7 @@
-"""Video in, captures out: the head cut out of every frame, landmarks, mattes; a few frames in memory at a time."""
+"""Turn a video into captures: crop the head out of every frame, find its landmarks and make its matte.
+
+Only a few frames are in memory at a time.
+"""
 
 import hashlib
 import json
@@ -29,13 +32,13 @@ from mien.storage import cannot_write, file_digest, read_json, write_json
 from mien.terminal import plain_name
 
 _RECIPE = 4
-"""Raised whenever the same video would give another capture, so that old ones are not taken for current."""
+"""Recipe version, raised whenever the same video would give another capture, so that old ones are made again."""
 _STATE, _CHUNKS = "state.json", "chunks"
 
 
 @dataclass(frozen=True)
 class _Job:
-    """What is asked for."""
+    """What the user asked for."""
 
     frames: FrameSource
     settings: CaptureSettings
@@ -47,20 +50,21 @@ class _Job:
 def capture_video(
     source: Path, out: Path, settings: CaptureSettings | None = None, name: str | None = None, replace: bool = False
 ) -> Capture:
-    """Capture the head in a video, or in a folder of images, into the folder `out`: one capture, cuts or not.
+    """Capture the head in a video or in a folder of images into the folder `out`, as one capture even if it has cuts.
 
-    An `out` made earlier from the same source with the same settings is read back. What an interrupted run has done is
-    kept beside `out` and continued; the result does not depend on interruptions. Memory does not grow with the length.
+    An `out` that was made earlier from the same source with the same settings is read back. Unfinished work of an
+    interrupted run is kept beside `out` and continued; the result does not depend on interruptions. Memory use does not
+    grow with the length of the video.
 
     Args:
         source: video file or folder of images.
-        out: the capture's folder; a capture of the same source in it is replaced, anything else is refused.
-        settings: how; the defaults by default.
-        name: of the sequence; by default the source's name without its ending.
-        replace: whether a capture of another source may be replaced, too.
+        out: the capture's folder. A capture of the same source in it is replaced; anything else is refused.
+        settings: settings of the capture; the defaults if None.
+        name: name of the sequence; by default the source's name without its ending.
+        replace: whether a capture of another source may be replaced too.
 
     Raises:
-        UserError: the source is no video or shows no face, or `out` cannot be written, is damaged or being written.
+        UserError: the source is no video or shows no face, or a folder cannot be written, is damaged or being written.
     """
     job = _job(source, settings or CaptureSettings(), name, replace)
     capture = read_finished(out, _part_key(job, 1, 1), tell=False)
@@ -92,19 +96,19 @@ def capture_video_parts(
     name: str | None = None,
     replace: bool = False,
 ) -> list[Capture]:
-    """Capture a video into `sequences`/NAME/capture, or, where it has cuts, each shot into NAME-1, NAME-2, ...
+    """Capture a video into `sequences`/NAME/capture, or, if it has cuts, each shot into NAME-1, NAME-2, ...
 
-    As `capture_video`, for each part. The source is read twice in all, however many parts there are.
+    Each part is captured as by `capture_video`. The source is read only twice, however many parts there are.
 
     Args:
         source: video file or folder of images.
         sequences: folder of the subject's sequences.
-        settings: how; `cuts` tells whether to look for them.
+        settings: settings of the capture; `cuts` decides whether cuts are searched.
         name: NAME; by default the source's name without its ending.
-        replace: whether captures of another source may be replaced, too.
+        replace: whether captures of another source may be replaced too.
 
     Returns:
-        The captures in the video's order; their `name` is their folder's.
+        The captures in the video's order. The `name` of each is the name of its folder.
 
     Raises:
         UserError: the source is no video or shows no face, or a folder cannot be written, is damaged or being written.
@@ -143,7 +147,7 @@ def _job(source: Path, settings: CaptureSettings, name: str | None, replace_othe
     selection = FrameSelection(settings.start, settings.end, settings.stride, settings.max_frames)
     frames = open_source(source, selection, settings.fps, settings.turn // 90)
     name = name or plain_name(source.resolve().stem)
-    # Files count by what is in them.
+    # Files enter the key by their content, not by their path.
     contents = {
         "clean_plate": file_digest(settings.clean_plate) if settings.clean_plate else None,
         "landmarks": file_digest(settings.landmarks) if settings.landmarks else None,
@@ -168,7 +172,7 @@ def _place(sequences: Path, name: str) -> Path:
 
 
 def _read_finished_parts(sequences: Path, job: _Job, tell: bool = True) -> list[Capture]:
-    """All parts, if all are finished; none otherwise."""
+    """Return all parts if all of them are finished, else an empty list."""
     whole = read_finished(_place(sequences, job.name), _part_key(job, 1, 1), tell)
     if whole is not None:
         return [whole]
@@ -187,10 +191,10 @@ def _read_finished_parts(sequences: Path, job: _Job, tell: bool = True) -> list[
 
 
 def _check_place(out: Path, job: _Job) -> None:
-    """Refuse what must not be replaced.
+    """Refuse to replace anything but a capture of the same source, or of any source if the user allows it.
 
     Raises:
-        UserError: there is something else, or a capture of another source.
+        UserError: the folder holds something else, or a capture of another source.
     """
     try:
         check_replaceable(out)
@@ -210,10 +214,10 @@ def _check_place(out: Path, job: _Job) -> None:
 
 @contextmanager
 def _tidy(out: Path, survey_folder: Path) -> Iterator[Path]:
-    """The folder for the survey; it goes at the end, and after bad input no empty folders stay."""
+    """Yield the folder for the survey and remove it at the end. After a UserError, remove new empty folders too."""
     missing = [folder for folder in (out.parent, *out.parent.parents) if not folder.exists()]
     threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # one thread detects, another refines and writes; more would stand in their way
+    cv2.setNumThreads(1)  # one thread detects and another refines and writes; more would slow them down
     try:
         yield survey_folder
     except OSError as error:
@@ -230,7 +234,7 @@ def _tidy(out: Path, survey_folder: Path) -> Iterator[Path]:
 
 
 def _prepare(work: Path, key: str) -> Path:
-    """A folder for unfinished work; what is in it is kept only if it belongs to the same key."""
+    """Prepare a folder for unfinished work. Its content is kept only if it belongs to the same key."""
     try:
         kept = read_json(work / _STATE, "mien.capture_state", 1).get("key") == key
     except UserError:
@@ -243,7 +247,7 @@ def _prepare(work: Path, key: str) -> Path:
 
 
 def _leads_out(work: Path) -> bool:
-    """Whether unfinished work could make us write somewhere else; then it is not ours."""
+    """Whether links in the unfinished work could make mien write somewhere else. Such a folder is not mien's own."""
     try:
         check_tree(work)
         return work.is_symlink() or has_other_names(work)
@@ -285,7 +289,7 @@ def _survey(job: _Job, folder: Path, means: Means) -> Survey:
 
 
 def _process(job: _Job, reel: Reel, part: Part, place: tuple[int, int], means: Means, out: Path) -> None:
-    """Capture one part, unless that is done."""
+    """Capture one part, unless that has been done."""
     key = _part_key(job, *place)
     if read_finished(out, key) is not None:
         return
@@ -296,7 +300,7 @@ def _process(job: _Job, reel: Reel, part: Part, place: tuple[int, int], means: M
 
 
 def _tell_leftovers(sequences: Path, job: _Job, names: set[str]) -> None:
-    """Name sequences that an earlier capture of the same video left under other numbers."""
+    """Warn about sequences that an earlier capture of the same video left under other names."""
     for path in sorted(sequences.glob(f"*/capture/{JSON_NAME}")):
         source = read_source(path.parent) or {}
         part = source.get("part")

@@ -1,4 +1,4 @@
-"""Mattes and landmarks that were made elsewhere, checked against the source they belong to."""
+"""Read mattes and landmarks that were made elsewhere, and check them against their source."""
 
 import csv
 import io
@@ -18,21 +18,21 @@ from mien.errors import UserError
 from mien.storage import read_arrays
 
 _FARTHEST = 1e6
-"""Pixels from a picture's corner at which no landmark is."""
+"""Largest coordinate of a landmark, in pixels."""
 _SHOWN = 40
-"""Characters of a cell that a message shows."""
+"""Characters of a csv cell that a message shows."""
 
 
 def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]:
-    """Landmarks in pixels of the source's pictures as they are shown, a row for each frame; NaN for no face.
+    """Read landmarks in pixels of the source's pictures as displayed, a row for each frame; NaN for no face.
 
     Args:
-        path: a .safetensors file with `landmarks` [n, 478, 2], or a .csv file with n lines of x0, y0, x1, y1, ...
-            (956 numbers; a line of names before them is passed over; empty or nan: no face).
-        source_frames: n.
+        path: a .safetensors file with `landmarks` [n, 478, 2], or a .csv file with n lines of x0, y0, x1, y1, ... (956
+            numbers; empty or nan means no face; a first line of column names is skipped).
+        source_frames: the number of frames in the source, n.
 
     Raises:
-        UserError: the file is missing, damaged, or has other sizes.
+        UserError: the file is missing, damaged or of another shape.
     """
     if path.suffix == ".safetensors":
         landmarks = read_arrays(path).get("landmarks")
@@ -60,7 +60,10 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
 
 
 def _read_csv(path: Path, most: int) -> np.ndarray:
-    """Its rows; of those beyond `most`, one, so that there are too many without all being held."""
+    """Read the rows of the file.
+
+    At most one row beyond `most` is read, which is enough to see that there are too many.
+    """
     rows: list[np.ndarray] = []
     try:
         with io.TextIOWrapper(open_ordinary(path), encoding="utf-8", newline="") as file:
@@ -91,7 +94,7 @@ def _number(path: Path, line: int, cell: str) -> float:
 
 
 class GivenMattes:
-    """Mattes of a source's frames, read once, forwards."""
+    """Mattes of a source's frames, read once and in order."""
 
     def __init__(self, path: Path, picture_size: tuple[int, int]) -> None:
         self._path = path
@@ -101,7 +104,9 @@ class GivenMattes:
         self._stream = iter(()) if self._files else open_source(path, whole, 25.0).frames()
 
     def check(self, number: int) -> None:
-        """Look at one matte, to find mistakes before anything that takes long; nothing can be read afterwards.
+        """Read one matte, to find mistakes before anything that takes long.
+
+        Nothing can be read from this object afterwards.
 
         Raises:
             UserError: it is missing, damaged or of another size than the picture.
@@ -109,7 +114,7 @@ class GivenMattes:
         self.matte(number, whole_picture(*self._size, max(self._size)))
 
     def matte(self, number: int, crop: Crop) -> UInt8[np.ndarray, "h w"]:
-        """The matte of the source's frame `number`, cropped as its picture is; numbers must grow.
+        """Return the matte of the source's frame `number`, cropped like its picture. Numbers must increase.
 
         Raises:
             UserError: it is missing, damaged or of another size than the picture.
@@ -132,7 +137,7 @@ class GivenMattes:
 
 
 def check_mattes(path: Path, source: FrameSource) -> None:
-    """Refuse mattes that are not as many as the source's frames.
+    """Refuse mattes whose number differs from that of the source's frames.
 
     Raises:
         UserError: there are more or fewer.
@@ -144,7 +149,7 @@ def check_mattes(path: Path, source: FrameSource) -> None:
 
 
 def _read_matte(path: Path) -> UInt8[np.ndarray, "h w"]:
-    """A grey picture, or the alpha channel of one that has it, 8 bit."""
+    """Read a grey picture, or the alpha channel of a picture that has one, as 8 bit."""
     matte = decode_picture(path, cv2.IMREAD_UNCHANGED)
     if matte is None or matte.dtype not in (np.uint8, np.uint16):
         raise UserError(f"{path}: cannot be read as a matte; write a grey picture of 8 or 16 bit")

@@ -1,4 +1,4 @@
-"""Mattes: MediaPipe's selfie segmentation at 256x256, steadied over time, refined on the picture at full size."""
+"""Mattes: MediaPipe's selfie segmentation at 256x256, stabilised over time and refined at the picture's full size."""
 
 from types import TracebackType
 
@@ -10,21 +10,21 @@ from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
 
 _MODEL_SIZE = 256
 _STEADY = 0.7
-"""Weight of the mask before, where the picture has not changed at all."""
+"""Weight of the previous mask where the picture has not changed at all."""
 _CHANGE = 0.03
 """Colour difference (0..1) at which that weight has dropped to 1 / e."""
 _GUIDE_RADIUS = 1 / 48
-"""Of the guided filter's window, as a fraction of the picture's longer side."""
+"""Radius of the guided filter's window, as a fraction of the picture's longer side."""
 _GUIDE_EPSILON = 1e-4
 """Variance of colour (0..1) below which the guided filter smooths instead of following edges."""
 _MASK_LEVELS = (0.2, 0.8)
-"""Mask values taken as sure background and sure person. The filter smooths enough; a soft mask would leave a halo."""
+"""Mask values that are background and person for certain. The filter smooths; a soft mask would leave a halo."""
 _ALPHA_LEVELS = (0.08, 0.92)
-"""Filtered values that become 0 and 1: the filter's overshoot would leave a veil and holes."""
+"""Filtered values that become 0 and 1. Without this the filter's overshoot would leave a veil and holes."""
 
 
 class Segmenter:
-    """Soft person masks of consecutive pictures of one clip. Use as a context manager."""
+    """Computes soft person masks of consecutive pictures of one clip. Use as a context manager."""
 
     def __enter__(self) -> "Segmenter":
         module = load_solution("selfie_segmentation")
@@ -40,13 +40,13 @@ class Segmenter:
         self._model.close()
 
     def segment(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "256 256"]:
-        """How surely each part of the picture is a person, 0..1, steadied by the picture before."""
+        """Return the probability of a person in each part of the picture, 0..1, stabilised by the previous one."""
         small = cv2.resize(image, (_MODEL_SIZE, _MODEL_SIZE), interpolation=cv2.INTER_AREA)
         mask = self._model.process(small).segmentation_mask.copy()
         colours = cv2.blur(small, (5, 5)).astype(np.float32) / 255
         if self._last is not None:
             last_mask, last_colours = self._last
-            # Only where nothing moved: elsewhere the mask before would leave a ghost.
+            # Blend only where nothing moved: elsewhere the previous mask would leave a ghost.
             change = np.abs(colours - last_colours).max(axis=-1)
             weight = _STEADY * np.exp(-np.square(change / _CHANGE))
             mask = mask + weight * (last_mask - mask)
@@ -55,27 +55,28 @@ class Segmenter:
 
 
 def refine_matte(image: UInt8[np.ndarray, "h w 3"], mask: Float[np.ndarray, "256 256"]) -> UInt8[np.ndarray, "h w"]:
-    """The mask at the picture's size with its border moved onto the picture's edges, 255 = person."""
+    """Return the mask at the picture's size, its border moved onto the picture's edges; 255 = person."""
     height, width = image.shape[:2]
     coarse = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     ramp = _stretch(coarse, _MASK_LEVELS)
     radius = max(2, round(_GUIDE_RADIUS * max(width, height)))
-    # A smooth step keeps the border in its place.
+    # A smooth step does not shift the border.
     alpha = guided_filter(image.astype(np.float32) / 255, ramp * ramp * (3 - 2 * ramp), radius, _GUIDE_EPSILON)
     return np.rint(_stretch(alpha, _ALPHA_LEVELS) * 255).astype(np.uint8)
 
 
 def _stretch(values: Float[np.ndarray, "h w"], levels: tuple[float, float]) -> Float[np.ndarray, "h w"]:
-    """Map the levels to 0 and 1, and clip."""
+    """Map the two levels to 0 and 1, and clip."""
     return np.clip((values - levels[0]) / (levels[1] - levels[0]), 0, 1)
 
 
 def guided_filter(
     guide: Float[np.ndarray, "h w 3"], values: Float[np.ndarray, "h w"], radius: int, epsilon: float
 ) -> Float[np.ndarray, "h w"]:
-    """`values` as a locally affine function of the guide's colour (He, Sun, Tang: Guided Image Filtering, eq. 19).
+    """Return `values` as a locally affine function of the guide's colour.
 
-    Solved on every second pixel and interpolated (He, Sun: Fast Guided Filter, arXiv:1505.00996).
+    This is eq. 19 of He, Sun, Tang: Guided Image Filtering. It is solved on every second pixel and interpolated (He,
+    Sun: Fast Guided Filter, arXiv:1505.00996).
     """
     height, width = values.shape
     half = (max(1, width // 2), max(1, height // 2))
@@ -104,7 +105,7 @@ def _affine_fit(
     mixed -= mean_guide[..., [1, 0, 0]] * mean_guide[..., [2, 2, 1]]
     rr, gg, bb = squares[..., 0], squares[..., 1], squares[..., 2]
     gb, rb, rg = mixed[..., 0], mixed[..., 1], mixed[..., 2]
-    # The inverse of the symmetric 3x3 matrix by its cofactors.
+    # Inverse of the symmetric 3x3 matrix by its cofactors.
     c_rr, c_rg, c_rb = gg * bb - gb * gb, rb * gb - rg * bb, rg * gb - rb * gg
     c_gg, c_gb, c_bb = rr * bb - rb * rb, rg * rb - rr * gb, rr * gg - rg * rg
     determinant = rr * c_rr + rg * c_rg + rb * c_rb

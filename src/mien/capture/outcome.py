@@ -1,4 +1,4 @@
-"""The end of a capture: what was found in all frames, written down beside them."""
+"""Finish a capture: write the results of all frames beside them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,25 +20,25 @@ from mien.progress import say
 CAMERA_ID = "0"
 _RATE_TOLERANCE = 0.01
 _VARIABLE_RATE = 1.5
-"""Longest over usual time between frames from which a clip's rate is called variable."""
+"""Ratio of the longest to the median time between frames from which a clip's rate is called variable."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a part came from."""
+    """The source of a part."""
 
     frames: FrameSource
     key: str
     name: str
-    """Of the whole, of which there may be several parts."""
+    """Name of the whole, which may have several parts."""
     place: tuple[int, int]
-    """The part's number, from 1, and how many there are."""
+    """The part's number, from 1, and the number of parts."""
 
 
 def finish_part(
     layout: FrameLayout, out: Path, chunks: list[Chunk], part: Part, origin: Origin, scaffolding: tuple[str, ...]
 ) -> None:
-    """Write what belongs beside the frames, remove the scaffolding (names in the folder), rename the folder to `out`.
+    """Write the files beside the frames, remove `scaffolding` (names in the folder) and rename the folder to `out`.
 
     Raises:
         UserError: no face was found in any frame.
@@ -93,7 +93,7 @@ def finish_part(
 
 
 def _pace(name: str, timestamps: Float[np.ndarray, " t"]) -> dict[str, Any]:
-    """The time between frames, for the report; says when it varies."""
+    """Return the time between frames for the report, and tell the user if it varies."""
     if len(timestamps) < 3:
         return {"frame_interval_ms": None, "variable_frame_rate": False}
     intervals = 1000 * np.diff(timestamps)
@@ -108,7 +108,7 @@ def _pace(name: str, timestamps: Float[np.ndarray, " t"]) -> dict[str, Any]:
 
 
 def _frame_rate(timestamps: Float[np.ndarray, " t"], nominal: float) -> float:
-    """The rate that the file names, unless its times tell otherwise (variable frame rate, dropped frames)."""
+    """Return the file's nominal rate, unless its timestamps differ from it (variable rate, dropped frames)."""
     if len(timestamps) < 2:
         return nominal
     measured = float((len(timestamps) - 1) / timestamps[-1])

@@ -1,4 +1,4 @@
-"""Which parts of a video become captures: one a shot, each with its person and its crop."""
+"""Choose the parts of a video that become captures: one for each shot, with its own person and crop."""
 
 from pathlib import Path
 
@@ -15,10 +15,10 @@ from mien.progress import say
 
 
 def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str) -> Part:
-    """Everything as one part; says where the video has cuts, unless the settings tell not to look for them.
+    """Return the whole video as one part. Report its cuts, unless the settings turn that off.
 
     Raises:
-        UserError: no face is seen.
+        UserError: no face was found.
     """
     cuts = find_cuts(survey.thumbnails) if settings.cuts else []
     if cuts:
@@ -31,7 +31,9 @@ def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str)
 
 
 def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str) -> list[Part]:
-    """A part for each shot that is long enough and shows a face: `name` if there is one, else `name`-1, `name`-2, ...
+    """Return a part for each shot that is long enough and shows a face.
+
+    A single part is called `name`, several are called `name`-1, `name`-2, ...
 
     Raises:
         UserError: there is no such shot.
@@ -42,7 +44,7 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     short, faceless, found = [], [], []
     for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
         seconds = float(survey.timestamps[stop - 1] - survey.timestamps[start]) + interval
-        # Half a frame of tolerance: 25 frames at 25 a second are a second.
+        # Tolerate half a frame: 25 frames at 25 per second last a second.
         if cuts and seconds < settings.shortest_part - interval / 2:
             short.append(start)
             continue
@@ -69,7 +71,7 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
 
 
 def no_face(path: Path, frames: int) -> UserError:
-    """What to tell when nobody is seen."""
+    """Return the error for a video in which no face was found."""
     return UserError(f"{path}: no face found in any of its {frames} frames; give a video in which one is seen clearly")
 
 
@@ -109,6 +111,6 @@ def _tell_people(path: Path, part: Part) -> None:
 
 
 def _times(survey: Survey, frames: list[int]) -> str:
-    """Up to five times of frames, for messages."""
+    """List the times of up to five frames, for messages."""
     listed = ", ".join(f"{survey.timestamps[frame]:.1f}" for frame in frames[:5])
     return f"{listed}{', ...' if len(frames) > 5 else ''} s"

@@ -1,4 +1,4 @@
-"""Who is captured: of all faces in a part of a video, those of one person."""
+"""Choose the person to capture: of all faces in a part of a video, the faces of one person."""
 
 import math
 from dataclasses import dataclass
@@ -9,38 +9,38 @@ from jaxtyping import Bool, Float
 from mien.capture.survey import Survey
 
 _REACH = 0.6
-"""A face moves by at most so many of its sides from one frame to the next..."""
+"""A face moves by at most this many of its sides from one frame to the next..."""
 _GROWTH = 1.6
-"""...and grows or shrinks by this factor at most."""
+"""...and grows or shrinks by at most this factor."""
 _PATIENCE = 1.0
-"""Seconds after which a face that comes back counts as newly come."""
+"""Seconds without detection after which a face that comes back starts a new track."""
 _SIZE_RANGE = 2.5
-"""The same person's face is at most so much larger or smaller when it comes back..."""
+"""The same person's face is larger or smaller by at most this factor when it comes back..."""
 _LOOK_RANGE = 0.12
 """...and its mean colours (0..1) differ by at most this."""
 _CANDIDATES = 8
-"""So many of the faces that fill the picture most are considered."""
+"""Number of tracks that are considered: those that fill the picture most."""
 _PASSING = 3
-"""A face seen in fewer frames than this is taken for a false detection, where the clip has more."""
+"""Frames below which a track counts as a false detection, in clips of at least as many frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """The followed face of a part of a video."""
+    """The followed face in a part of a video, and the other faces."""
 
     boxes: Float[np.ndarray, "t 4"]
-    """Left, top, right, bottom as fractions of the picture; NaN where the face is not seen."""
+    """Left, top, right, bottom as fractions of the picture. NaN where the face was not found."""
     others: Float[np.ndarray, "t f 4"]
-    """The faces of other people."""
+    """Boxes of other people's faces."""
 
     @property
     def crowded(self) -> Bool[np.ndarray, " t"]:
-        """Where somebody else is seen."""
+        """Frames in which somebody else is seen."""
         return np.asarray(np.isfinite(self.others[..., 0]).any(axis=1))
 
     @property
     def seen(self) -> Bool[np.ndarray, " t"]:
-        """Where the followed face is seen."""
+        """Frames in which the followed face is seen."""
         return np.isfinite(self.boxes[:, 0])
 
 
@@ -49,17 +49,17 @@ class _Track:
     """One face over consecutive frames."""
 
     entries: list[tuple[int, int]]
-    """Frame and place among the frame's faces."""
+    """Frame number, and index among the faces of that frame."""
 
     def frames(self) -> set[int]:
         return {frame for frame, _ in self.entries}
 
 
 def choose_person(survey: Survey) -> Person:
-    """The person whose face fills the picture most: its area, summed over the frames.
+    """Return the person whose face fills the picture most: its area, summed over the frames.
 
-    A face that leaves and comes back is followed again if its size and colours are the same and it was never seen
-    beside itself; a face that takes its place is not.
+    A face that leaves and comes back is followed again if its size and colours are similar and the two were never seen
+    together. Another face that takes its place is not followed.
     """
     tracks = _link(survey)
     boxes, others = np.full((len(survey.boxes), 4), np.nan), survey.boxes.copy()
@@ -82,12 +82,16 @@ def choose_person(survey: Survey) -> Person:
 
 
 def _sizes(boxes: Float[np.ndarray, "t f 4"]) -> Float[np.ndarray, "t f"]:
-    """Mean side, as a fraction of the picture."""
+    """Mean side of each face, as a fraction of the picture."""
     return np.sqrt(np.maximum((boxes[..., 2] - boxes[..., 0]) * (boxes[..., 3] - boxes[..., 1]), 1e-12))
 
 
 def _link(survey: Survey) -> list[_Track]:
-    """Faces joined over time: to the ones seen last, the nearest first; so nobody takes over who has just gone."""
+    """Join faces over time into tracks.
+
+    The most recently seen tracks choose first, and each the nearest face. So a track that has just ended does not take
+    over another person's face.
+    """
     tracks: list[_Track] = []
     open_tracks: list[_Track] = []
     for frame, (seconds, boxes) in enumerate(zip(survey.timestamps, survey.boxes, strict=True)):
@@ -114,7 +118,7 @@ def _link(survey: Survey) -> list[_Track]:
 
 
 def _distance(before: Float[np.ndarray, " 4"], now: Float[np.ndarray, " 4"]) -> float:
-    """Between two faces, in sides; infinite where their sizes differ too much."""
+    """Distance between two faces in units of their side; infinite if their sizes differ too much."""
     size_before, size_now = (max(math.sqrt(max((b[2] - b[0]) * (b[3] - b[1]), 0)), 1e-6) for b in (before, now))
     if not 1 / _GROWTH <= size_now / size_before <= _GROWTH:
         return float("inf")
@@ -123,12 +127,12 @@ def _distance(before: Float[np.ndarray, " 4"], now: Float[np.ndarray, " 4"]) -> 
 
 
 def _weight(tracks: list[_Track], areas: Float[np.ndarray, "t f"]) -> float:
-    """How much of the video a person's face fills."""
+    """Area of the person's face, summed over the frames."""
     return float(sum(areas[entry] for track in tracks for entry in track.entries))
 
 
 def _gather(first: _Track, tracks: list[_Track], areas: np.ndarray, looks: np.ndarray) -> list[_Track]:
-    """All tracks that can be of the person of the first one, the weightiest first."""
+    """Return all tracks that can be of the same person as the first one, the heaviest first."""
     accepted = [first]
     for track in tracks:
         if track is not first and _is_same_person(accepted, track, areas, looks):

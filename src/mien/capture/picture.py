@@ -1,7 +1,7 @@
-"""The one door through which pictures that users hand in are read: their size is looked at before memory is taken.
+"""The only module that reads pictures from users: it checks their size before memory is allocated.
 
-A picture of 0.9 MB may unpack to 8.5 GB. What it announces lies in its first bytes, and only the five kinds whose first
-bytes are read here are decoded at all, whatever a file's name says.
+A picture of 0.9 MB may unpack to 8.5 GB. Its first bytes announce its size. Only the five formats whose headers are
+read here are decoded at all, whatever the file's name says.
 """
 
 import struct
@@ -14,23 +14,23 @@ import numpy as np
 from mien.errors import UserError
 
 LARGEST_PICTURE = 8192 * 8192
-"""Pixels: as many as mien itself draws at most."""
+"""Largest number of pixels of a picture, which is also the most that mien renders."""
 _LARGEST_FILE = 8 * LARGEST_PICTURE + (64 << 20)
-"""Bytes: such a picture of four channels and 16 bits, not compressed, and what cameras write beside it."""
+"""Largest file in bytes: an uncompressed picture of that size with four 16-bit channels, and metadata."""
 _MOST_SCANS = 200
-"""Of a JPEG; cameras and editors write one to fourteen, and each costs a walk over the whole picture."""
+"""Most scans of a JPEG. Cameras and editors write one to fourteen, and each costs a pass over the whole picture."""
 _NO_FRAMES = (0xC4, 0xC8, 0xCC)
-"""Markers between 0xC0 and 0xCF that announce no JPEG frame."""
+"""Markers between 0xC0 and 0xCF that start no JPEG frame."""
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _TIFF_WIDTHS, _TIFF_HEIGHTS = (256, 322), (257, 323)
-"""Of the picture, and of its tiles."""
+"""TIFF tags of the picture's size and of its tiles' size."""
 
 
 def decode_picture(path: Path, flags: int) -> np.ndarray | None:
-    """The picture in a file as OpenCV decodes it under these flags; None where it is none, or damaged.
+    """Decode a picture file with OpenCV's `flags`. None if it is no picture, or a damaged one.
 
     Raises:
-        UserError: it has more pixels than `LARGEST_PICTURE`, or its file is larger than any such picture.
+        UserError: it has more pixels than `LARGEST_PICTURE`, or its file is larger than that of any such picture.
     """
     try:
         size = path.stat().st_size
@@ -57,7 +57,10 @@ def decode_picture(path: Path, flags: int) -> np.ndarray | None:
 
 
 def announced_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height that a PNG, JPEG, BMP, WebP or TIFF announces; None for anything else, or a cut header."""
+    """Return the width and height that a PNG, JPEG, BMP, WebP or TIFF announces.
+
+    None for anything else or a cut header.
+    """
     for start, read in _READERS:
         if data.startswith(start):
             try:
@@ -75,7 +78,7 @@ def _png(data: bytes) -> tuple[int, int] | None:
 def _bmp(data: bytes) -> tuple[int, int] | None:
     (header,) = struct.unpack_from("<I", data, 14)
     width, height = struct.unpack_from("<HH" if header == 12 else "<ii", data, 18)
-    return abs(width), abs(height)  # a negative height: rows from the top
+    return abs(width), abs(height)  # a negative height means rows from the top
 
 
 def _webp(data: bytes) -> tuple[int, int] | None:
@@ -108,7 +111,7 @@ def _jpeg(data: bytes) -> tuple[int, int] | None:
 
 
 def _tiff(data: bytes) -> tuple[int, int] | None:
-    """The first page; of an entry that stands twice, the larger."""
+    """Read the first page. If a tag occurs twice, the larger value counts."""
     order = "<" if data[:2] == b"II" else ">"
     big = data[2:4] in (b"\x2b\x00", b"\x00\x2b")
     (place,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)

@@ -1,43 +1,43 @@
-"""Mattes with a clean plate: what differs from the scene without the person, where a person can be."""
+"""Mattes with a clean plate: the person is what differs from the empty scene, near the segmentation mask."""
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 _SURE_PERSON, _SURE_BACKGROUND = 0.9, 0.05
-"""Values of the person mask from which, and up to which, its word is taken, away from its border."""
+"""Values of the person mask from which, and up to which, it is trusted away from its border."""
 _CORE = 1 / 40
-"""Width of the border inside the sure person in which the plate is asked, as a fraction of the longer side."""
+"""Width of the border inside the certain person in which the plate decides, as a fraction of the longer side."""
 _HALO = 1 / 12
-"""...and outside it: hair that the mask misses."""
+"""...and outside it, for hair that the mask misses."""
 _LEVELS = (2.5, 7.0)
-"""Colour differences, in standard deviations of the background's, that become 0 and 1..."""
+"""Colour differences that become 0 and 1, in standard deviations of the background's noise..."""
 _LEAST_NOISE = 0.008
-"""...which are at least this (0..1)."""
+"""...which is at least this (colours are 0..1)."""
 _SHADOW, _DARKEST_SHADOW = 0.35, 0.5
-"""A difference that only darkens, down to half, counts this much: it may be the person's shadow on the wall."""
+"""Weight of a difference that only darkens, down to half: it may be the person's shadow on the wall."""
 _SHIFT_SIZE = 256
 _MOST_SHIFT = 8.0
-"""Pixels at that size, by which the camera may have been moved."""
+"""Largest shift of the camera in pixels at that size."""
 _SHIFT_GAIN = 0.9
-"""A shift is believed if it brings the background's difference below this part of what it was."""
+"""A shift is accepted if it brings the background's difference below this part of its former value."""
 _DOUBT = (2.0, 0.25)
-"""By how much those levels are raised where the mask says background, and lowered where it says person."""
+"""Factors on the two levels where the mask says background (raised) and where it says person (lowered)."""
 _GAINS = (0.7, 1.4)
-"""Exposures between which the plate may be brought to the picture's."""
+"""Range of the gain that matches the plate's exposure to the picture's."""
 
 
 def plate_matte(
     image: UInt8[np.ndarray, "h w 3"], mask: Float[np.ndarray, "m m"], plate: UInt8[np.ndarray, "h w 3"]
 ) -> UInt8[np.ndarray, "h w"]:
-    """The opacity of the person, 255 = person.
+    """Return the opacity of the person, 255 = person.
 
-    The mask decides inside the person and far away; between, the difference to the plate does, after the plate was
-    shifted and brought to the picture's exposure by what is sure background.
+    The mask decides well inside the person and far away from it. In between, the difference to the plate decides. The
+    plate is first shifted and matched to the picture's exposure by the certain background.
 
     Args:
         image: the picture.
-        mask: how surely each part of it is a person, 0..1, of any size.
+        mask: probability that each part of the picture is a person, 0..1, of any size.
         plate: the same scene without the person.
     """
     height, width = image.shape[:2]
@@ -51,7 +51,7 @@ def plate_matte(
     if background.any():
         scene = _match(picture, scene, background)
         noise = max(noise, float(np.sqrt(np.mean(np.square(_difference(picture, scene)[background])))))
-    # Where the mask says person, little difference is enough; where it says background, it takes more.
+    # Where the mask says person, a small difference is enough; where it says background, a larger one is needed.
     levels = noise * (_DOUBT[0] + (_DOUBT[1] - _DOUBT[0]) * np.clip(soft, 0, 1))
     low, high = _LEVELS
     alpha = np.clip((_difference(picture, scene) / levels - low) / (high - low), 0, 1)
@@ -60,14 +60,14 @@ def plate_matte(
 
 
 def _grow(mask: Bool[np.ndarray, "h w"], distance: float) -> Bool[np.ndarray, "h w"]:
-    """Everything within so many pixels of the mask."""
+    """Return the pixels within `distance` of the mask."""
     if not mask.any():
         return mask
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3) <= distance
 
 
 def _match(picture: np.ndarray, scene: np.ndarray, background: np.ndarray) -> Float[np.ndarray, "h w 3"]:
-    """The scene, moved and brightened to the picture as far as the background tells."""
+    """Return the scene, shifted and brightened to match the picture's background."""
     scene = _expose(picture, scene, background)
     shift = _shift(picture, scene, background)
     if np.abs(shift).max() < 0.05:
@@ -85,12 +85,12 @@ def _expose(picture: np.ndarray, scene: np.ndarray, background: np.ndarray) -> n
 
 
 def _shift(picture: np.ndarray, scene: np.ndarray, background: np.ndarray) -> Float[np.ndarray, " 2"]:
-    """By how many pixels along x and y the picture's background is moved against the scene."""
+    """Return the shift in pixels along x and y from the scene to the picture's background."""
     height, width = background.shape
     scale = min(1.0, _SHIFT_SIZE / max(height, width))
     size = (max(8, round(width * scale)), max(8, round(height * scale)))
     known = cv2.resize(background.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    # Both get the same hole where the person is, filled with grey: nothing in it speaks for any shift.
+    # Both get the same grey hole where the person is, so that nothing in it favours any shift.
     prepared = []
     for image in (scene, picture):
         grey = cv2.resize(image.mean(axis=-1), size, interpolation=cv2.INTER_AREA)
@@ -104,7 +104,7 @@ def _shift(picture: np.ndarray, scene: np.ndarray, background: np.ndarray) -> Fl
 
 
 def _difference(picture: np.ndarray, scene: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """Of colours, slightly smoothed; what a shadow would do counts less."""
+    """Return the slightly smoothed colour difference. Darkening, as by a shadow, counts less."""
     shade = (picture * scene).sum(axis=-1) / np.maximum(np.square(scene).sum(axis=-1), 1e-4)
     shade = np.clip(shade, _DARKEST_SHADOW, 1)[..., None]
     other = np.abs(picture - shade * scene).max(axis=-1)

@@ -1,4 +1,4 @@
-"""The second pass over a source: crop every frame of a part, find its landmarks, cut its matte, write it."""
+"""The second pass over a source: crop every frame of a part, find its landmarks, make its matte, write both."""
 
 import itertools
 from collections import deque
@@ -26,25 +26,25 @@ from mien.progress import Advance, progress_bar
 from mien.storage import expect_whole, read_arrays, write_arrays
 
 _CHUNK = 256
-"""Frames after which progress is kept. Detectors start anew at each chunk, also when nothing is interrupted."""
+"""Frames after which progress is saved. Detectors start again at each chunk, even if nothing is interrupted."""
 _LEAD_IN = 8
-"""Frames before a chunk from which the detectors gather their state; after four they differ by 0.05 px."""
+"""Frames before a chunk that set up the detectors' state. After four of them, results differ by 0.05 px."""
 
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """What was found in some consecutive frames, whose pictures are written."""
+    """The results of some consecutive frames, whose pictures have been written."""
 
     landmarks: Float[np.ndarray, "t l 2"]
-    """Pixels of the cropped frames; NaN where there is no face."""
+    """Positions in pixels of the cropped frames; NaN where there is no face."""
     quality: Float[np.ndarray, "t m"]
-    """What `measure_face` gave; NaN where there is no face."""
+    """Results of `measure_face`; NaN where there is no face."""
     frame_digests: UInt64[np.ndarray, "t 1"]
     matte_digests: UInt64[np.ndarray, "t 1"]
 
     @property
     def valid(self) -> Bool[np.ndarray, " t"]:
-        """Where a face was found."""
+        """Frames in which a face was found."""
         return np.isfinite(self.landmarks[:, 0, 0])
 
 
@@ -53,11 +53,11 @@ class Part:
     """Consecutive frames of a source that become one capture."""
 
     name: str
-    """Of the sequence."""
+    """Name of the sequence."""
     start: int
-    """Of its first frame, among the frames taken."""
+    """Index of its first frame, among the frames taken."""
     survey: Survey
-    """Of its frames only."""
+    """Survey of the part's frames only."""
     person: Person
     crop: Crop
 
@@ -69,16 +69,16 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """What the user gave besides the source."""
+    """What the user gave besides the source video."""
 
     plate: UInt8[np.ndarray, "h w 3"] | None = None
     mattes: GivenMattes | None = None
     landmarks: Float[np.ndarray, "n l 2"] | None = None
-    """Pixels of the source's pictures, a row for each frame of the source."""
+    """Positions in pixels of the source's pictures, a row for each frame of the source."""
 
 
 class Reel:
-    """The frames of a source, read once and forwards."""
+    """The frames of a source, read once and in order."""
 
     def __init__(self, frames: FrameSource) -> None:
         self.path = frames.path
@@ -86,7 +86,7 @@ class Reel:
         self._position = 0
 
     def from_frame(self, start: int) -> Iterator[SourceFrame]:
-        """The frames from number `start` (of those taken) on, which must not have been read yet."""
+        """Yield the frames from index `start` (among those taken) on. They must not have been read yet."""
         assert start >= self._position, (start, self._position)
         for _ in itertools.islice(self._stream, start - self._position):
             self._position += 1
@@ -99,13 +99,13 @@ class PartProcessor:
     """Processes the frames of one part in order, a chunk at a time."""
 
     def __init__(self, reel: Reel, part: Part, means: Means, done: int) -> None:
-        """Pass over the first `done` frames of the part."""
+        """Prepare to process the part, skipping its first `done` frames."""
         self._path, self._part, self._means = reel.path, part, means
         begin = done - _LEAD_IN if done >= _LEAD_IN else 0
         left = part.timesteps - begin
         self._stream = itertools.islice(reel.from_frame(part.start + begin), left)
         self._recent: deque[tuple[int, np.ndarray]] = deque(maxlen=_LEAD_IN)
-        """Timestep and picture of what came before; before the first frame, the next ones backwards."""
+        """Timesteps and pictures of the latest frames; before the first frame, of the next ones in reverse order."""
         if begin == 0:
             ahead = [self._cropped(frame) for frame in itertools.islice(self._stream, _LEAD_IN + 1)]
             self._recent.extend((index, image) for index, (_, image) in reversed(list(enumerate(ahead))[1:]))
@@ -116,7 +116,7 @@ class PartProcessor:
         self._recent.extend((begin + index, image) for index, (_, image) in enumerate(before))
 
     def process(self, start: int, count: int, writer: FrameWriter, advance: Advance) -> Chunk:
-        """The next `count` frames, the first of which is the part's timestep `start`."""
+        """Process the next `count` frames, the first of which is the part's timestep `start`."""
         part = self._part
         landmarks = np.full((count, LANDMARKS, 2), np.nan, np.float32)
         quality = np.full((count, MEASURES), np.nan, np.float32)
@@ -151,13 +151,13 @@ class PartProcessor:
         return frame.number, self._part.crop.apply(frame.picture())
 
     def _given(self, timestep: int, number: int) -> Float[np.ndarray, "l 2"] | None:
-        """The landmarks that the user gave, where the followed person is seen."""
+        """Return the user's landmarks, or None if the followed person is not seen."""
         assert self._means.landmarks is not None
         return self._part.crop.to_output(self._means.landmarks[number]) if self._part.person.seen[timestep] else None
 
 
 def _read(path: Path) -> Chunk:
-    """What an interrupted call kept.
+    """Read a chunk that an interrupted call saved.
 
     Raises:
         UserError: it is damaged, or no chunk.
@@ -179,7 +179,7 @@ def _read(path: Path) -> Chunk:
 
 
 def process_part(reel: Reel, part: Part, means: Means, layout: FrameLayout, memory: Path) -> list[Chunk]:
-    """Process all frames of a part; chunks that an earlier, interrupted call left in the folder `memory` are kept.
+    """Process all frames of a part. Chunks that an interrupted call left in the folder `memory` are kept.
 
     Raises:
         UserError: the source cannot be decoded.
@@ -203,7 +203,7 @@ def process_part(reel: Reel, part: Part, means: Means, layout: FrameLayout, memo
 def _finish(
     image: np.ndarray, make_matte: MakeMatte, landmarks: np.ndarray, quality: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Picture and matte for the disk; writes into `quality` what the picture is worth."""
+    """Return picture and matte for the disk, and write the picture's quality into `quality`."""
     if np.isfinite(landmarks[0, 0]):
         quality[:] = measure_face(image, landmarks)
     return image[None], make_matte()[None]

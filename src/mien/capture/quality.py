@@ -1,4 +1,4 @@
-"""How sharp and how well lit the face is, frame by frame."""
+"""Measure how sharp and how well lit the face is in every frame."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,42 +10,44 @@ from jaxtyping import Bool, Float, UInt8
 from mien.progress import say
 
 _SIDE = 192
-"""Pixels to which the face is brought, so that its distance hardly counts."""
+"""Side in pixels to which the face is scaled, so that its distance hardly matters."""
 _BLURRED = 0.65
-"""Frames of less than this part of the clip's usual sharpness count as blurred: such as a motion by 4 % of the face's
-width gives, or by 5 pixels in a face of 130. Turned heads and closed eyes stay above it (docs/log.md)."""
+"""Part of the clip's median sharpness below which a frame counts as blurred. A motion by 4 % of the face's width causes
+that, or by 5 pixels in a face of 130. Turned heads and closed eyes stay above it (docs/log.md)."""
 _DIRECTIONS = 4
-"""Detail is measured across, down and along both diagonals: motion takes it away in its own direction only."""
+"""Directions in which detail is measured: across, down and both diagonals. Motion removes it only along itself."""
 MEASURES = _DIRECTIONS + 2
-"""Numbers that `measure_face` gives."""
+"""Number of values that `measure_face` returns."""
 _WHITE_LEVEL = 250
-"""A channel from this level on (of 255) has lost its colour."""
+"""Level (of 255) from which a channel counts as clipped."""
 _DARK = 0.18
 """Mean level of the face (0..1, sRGB) below which a clip counts as dark."""
 _CLIPPED = 0.1
-"""Part of the face without colour above which a clip counts as over-exposed."""
+"""Clipped part of the face above which a clip counts as over-exposed."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameQuality:
-    """Of the face in every frame of a capture; NaN where there is none."""
+    """Quality of the face in every frame of a capture; NaN where there is none."""
 
     sharpness: Float[np.ndarray, "t c"]
-    """Of the face's fine detail in the direction that lacks it most, relative to the median over the clip: 1 as usual,
-    0 nothing left."""
+    """Fine detail of the face in the direction with the least, relative to the clip's median: 1 is usual, 0 is none."""
     brightness: Float[np.ndarray, "t c"]
     """Mean level of the face, 0..1, sRGB."""
     clipped: Float[np.ndarray, "t c"]
-    """Part of the face, 0..1, in which a channel is at its end."""
+    """Part of the face, 0..1, in which a channel is clipped."""
 
     @property
     def blurred(self) -> Bool[np.ndarray, "t c"]:
-        """Frames to leave out where sharp ones matter, as in training."""
-        return self.sharpness < _BLURRED  # NaN is not
+        """Frames to leave out of training and of everything else that needs sharp ones."""
+        return self.sharpness < _BLURRED  # NaN compares as not blurred
 
 
 def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " m"]:
-    """Detail in each direction (in units of its own), brightness and clipped part of a face; NaN if it is outside."""
+    """Return detail in each direction (arbitrary units), brightness and clipped part.
+
+    They are NaN if the face lies outside the picture.
+    """
     height, width = image.shape[:2]
     left, top = np.clip(np.floor(landmarks.min(axis=0)), 0, [width, height]).astype(int)
     right, bottom = np.clip(np.ceil(landmarks.max(axis=0)), 0, [width, height]).astype(int)
@@ -57,11 +59,11 @@ def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray,
 
 
 def _detail(face: UInt8[np.ndarray, "h w 3"]) -> list[float]:
-    """Mean second derivative along each direction, relative to the contrast."""
+    """Return the mean second derivative along each direction, relative to the contrast."""
     grey = cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)
     scale = _SIDE / min(grey.shape)
     grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_LINEAR if scale > 1 else cv2.INTER_AREA)
-    # Noise is finer than a face's detail, and would pass for sharpness; where the face is small, it is enlarged, too.
+    # Noise is finer than a face's detail and would count as sharpness, the more so in a small face that is enlarged.
     grey = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), max(1.0, scale))
     across, down, mixed = (cv2.Sobel(grey, cv2.CV_32F, x, y, ksize=3) for x, y in ((2, 0), (0, 2), (1, 1)))
     diagonal = (across + down) / 2
@@ -70,7 +72,7 @@ def _detail(face: UInt8[np.ndarray, "h w 3"]) -> list[float]:
 
 
 def relative_quality(measured: Float[np.ndarray, "t m"]) -> FrameQuality:
-    """The quality of a clip's frames, with what `measure_face` gave for each."""
+    """Return the quality of a clip's frames from the results of `measure_face`."""
     values = measured.astype(np.float32)
     detail, others = values[:, :_DIRECTIONS], values[:, _DIRECTIONS:]
     seen = np.isfinite(detail[:, 0])
@@ -80,7 +82,7 @@ def relative_quality(measured: Float[np.ndarray, "t m"]) -> FrameQuality:
 
 
 def quality_report(name: str, quality: FrameQuality) -> dict[str, Any]:
-    """Figures for the capture's report; says aloud what is wrong with the clip."""
+    """Return figures for the capture's report, and tell the user what is wrong with the clip."""
     seen = np.isfinite(quality.brightness)
     brightness, clipped = (
         float(np.median(values[seen])) if seen.any() else 0.0 for values in (quality.brightness, quality.clipped)

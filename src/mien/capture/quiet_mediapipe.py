@@ -1,4 +1,4 @@
-"""mediapipe, kept quiet: its native libraries write to standard error, and its Python part warns."""
+"""Keep mediapipe quiet: its native libraries write to standard error, and its Python part warns."""
 
 import os
 import re
@@ -16,9 +16,9 @@ _NOISE = re.compile(
 
 @contextmanager
 def quiet_mediapipe() -> Iterator[None]:
-    """Drop mediapipe's chatter from standard error; lines of any other kind are passed on at the end.
+    """Drop mediapipe's messages from standard error. All other lines are passed on at the end.
 
-    Needed where graphs are built and see their first picture: their native code writes to the file descriptor.
+    Use it when graphs are built and process their first picture. Their native code writes to the file descriptor.
     """
     sys.stderr.flush()
     saved = os.dup(2)
@@ -39,7 +39,7 @@ def quiet_mediapipe() -> Iterator[None]:
 
 
 def load_solution(name: str) -> Any:
-    """One of mediapipe's `solutions` modules; imported late because that takes over a second."""
+    """Return one of mediapipe's `solutions` modules. The import is late because it takes over a second."""
     with quiet_mediapipe():
         from mediapipe.python import solutions
 

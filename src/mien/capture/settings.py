@@ -1,4 +1,4 @@
-"""What a user can ask of a capture."""
+"""Settings of a capture."""
 
 import math
 from dataclasses import dataclass
@@ -12,37 +12,37 @@ _SMALLEST_SIZE, _LARGEST_SIZE = 32, 8192
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """How a video becomes a capture."""
+    """Settings that control how a video becomes a capture."""
 
     size: int = 512
-    """Longest side of the captured frames in pixels; smaller sources are not enlarged."""
+    """Longest side of the captured frames in pixels. Smaller sources are not enlarged."""
     crop: Literal["auto", "none"] = "auto"
-    """auto: a square around the head, the same for the whole clip; none: the whole picture."""
+    """auto: a square around the head, the same for the whole clip. none: the whole picture."""
     start: float = 0.0
     """Seconds to skip at the beginning."""
     end: float = 0.0
-    """Second of the video at which to stop; 0 takes it to its end."""
+    """Time in the video at which to stop, in seconds. 0 captures to the end."""
     turn: Literal[0, 90, 180, 270] = 0
-    """Degrees to turn the pictures clockwise, for a video that lies on its side because its rotation flag was lost."""
+    """Degrees to turn the pictures clockwise, for a video whose rotation flag was lost."""
     stride: int = 1
-    """Take every n-th frame: 2 for half of them."""
+    """Take every n-th frame: 2 takes half of them."""
     max_frames: int = 0
-    """Stop after so many frames; 0 takes all."""
+    """Stop after this many frames. 0 takes all."""
     fps: float = 25.0
-    """Frames a second of a folder of pictures; videos know their own."""
+    """Frame rate of a folder of pictures, in frames per second. Videos have their own."""
     cuts: bool = True
-    """Parts the video where it cuts to another shot, into NAME-1, NAME-2, ...; with --capture.no-cuts it stays one."""
+    """Split the video at cuts to another shot, into NAME-1, NAME-2, ... With --capture.no-cuts it stays one capture."""
     shortest_part: float = 1.0
-    """Seconds; parts between two cuts that are shorter are left out."""
+    """Shortest shot to keep in a video with cuts, in seconds. Shorter shots are left out."""
     clean_plate: Path | None = None
-    """A picture of the scene without the person, from the same, still camera: gives better mattes."""
+    """A picture of the scene without the person, from the same camera in the same place. It gives better mattes."""
     mattes: Path | None = None
     """Mattes made elsewhere: a video or a folder of pictures, white = person, one for each frame of the source."""
     landmarks: Path | None = None
     """Landmarks made elsewhere, a row for each frame of the source: .csv or .safetensors (docs/conventions.md)."""
 
     def check(self) -> None:
-        """Raise a UserError that names the first value that makes no sense."""
+        """Raise a UserError for the first value that is not allowed."""
         _require(
             self.size >= _SMALLEST_SIZE, "size", self.size, f"too small; give {_SMALLEST_SIZE} or more, better 512"
         )

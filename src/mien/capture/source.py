@@ -1,4 +1,4 @@
-"""Where frames come from: a video file or a folder of images, and which of its frames are taken."""
+"""Sources of frames, video files and folders of images, and the selection of frames from them."""
 
 import hashlib
 import os
@@ -22,51 +22,51 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".
 
 @dataclass(frozen=True)
 class FrameSelection:
-    """Which frames of a source are taken."""
+    """Selection of frames from a source."""
 
     start: float = 0.0
     """Seconds to skip at the beginning."""
     end: float = 0.0
-    """Second at which to stop; 0 takes all."""
+    """Time at which to stop, in seconds. 0 takes all."""
     stride: int = 1
     """Take every n-th frame."""
     max_frames: int = 0
-    """Stop after so many frames; 0 takes all."""
+    """Stop after this many frames. 0 takes all."""
 
 
 class SourceFrame(NamedTuple):
-    """A frame that was taken."""
+    """A frame that was taken from a source."""
 
     number: int
-    """Of the frame in the source, from 0, with those that the selection leaves out."""
+    """Index of the frame in the source, from 0, counting also the frames that the selection leaves out."""
     seconds: float
-    """From the first frame taken."""
+    """Time since the first frame taken, in seconds."""
     picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
-    """Makes the sRGB picture; the costly part, so ask only for what is needed."""
+    """Makes the sRGB picture. This is the costly part, so call it only if the picture is needed."""
 
 
 @dataclass(frozen=True)
 class FrameSource:
-    """A video file or a folder of images that can be read as often as needed, a frame at a time."""
+    """A video file or a folder of images that can be read any number of times, a frame at a time."""
 
     path: Path
     selection: FrameSelection
     fps: float
-    """Of the frames taken, so after `stride`."""
+    """Frame rate of the frames taken, so after `stride`."""
     expected_frames: int
-    """For progress bars; only reading tells the true number."""
+    """Expected number of frames, for progress bars. Only reading the source gives the true number."""
     content_hash: str
-    """Of the file, or of the names and contents of all images."""
+    """Hash of the file, or of the names and contents of all images."""
     hdr: str = ""
-    """PQ, HLG, or empty for ordinary pictures."""
+    """HDR transfer function: PQ, HLG, or empty for ordinary pictures."""
     quarter_turns: int = 0
-    """By which pictures are turned clockwise, besides the file's own rotation flag."""
+    """Number of quarter turns clockwise, besides the file's own rotation flag."""
 
     def frames(self, longest_side: int = 0) -> Iterator[SourceFrame]:
-        """The frames taken; pictures are shrunk to `longest_side` pixels unless that is 0.
+        """Yield the frames taken. Pictures are shrunk to `longest_side` pixels unless that is 0.
 
         Raises:
-            UserError: something cannot be decoded, or the selection leaves no frame.
+            UserError: a frame cannot be decoded, or the selection leaves no frame.
         """
         if self.path.is_dir():
             everything = _read_images(self.path, self.fps * self.selection.stride, longest_side)
@@ -93,7 +93,7 @@ class FrameSource:
             )
 
     def count(self) -> int:
-        """The number of frames in the source, with those that the selection leaves out.
+        """Count the frames in the source, with those that the selection leaves out.
 
         Raises:
             UserError: the source is damaged.
@@ -102,13 +102,13 @@ class FrameSource:
 
 
 def open_source(path: Path, selection: FrameSelection, fps: float, quarter_turns: int = 0) -> FrameSource:
-    """Look at a source without reading its frames.
+    """Open a source without reading its frames.
 
     Args:
-        path: a video file, or a folder with images, which are taken in the natural order of their names.
+        path: a video file, or a folder of images, which are read in the natural order of their names.
         selection: which frames to take.
-        fps: frames a second of a folder of images; a video knows its own.
-        quarter_turns: by which to turn pictures clockwise.
+        fps: frame rate of a folder of images, in frames per second. A video has its own.
+        quarter_turns: number of quarter turns clockwise.
 
     Raises:
         UserError: the source is missing, is no video, or holds no images.
@@ -135,10 +135,10 @@ def _turned(picture: Callable[[], np.ndarray], quarter_turns: int) -> UInt8[np.n
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The images in a folder, `2.png` before `10.png`.
+    """List the images in a folder, `2.png` before `10.png`.
 
     Raises:
-        UserError: there are none.
+        UserError: there are no images.
     """
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
     if not images:
@@ -147,12 +147,12 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def _parts(name: str) -> list[str]:
-    # Digits always land at odd places, so that numbers are only ever compared with numbers.
+    # Digits are always at odd positions, so that numbers are only compared with numbers.
     return re.split(r"([0-9]+)", name)
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """An 8-bit sRGB picture, turned by its EXIF orientation.
+    """Read an 8-bit sRGB picture, turned by its EXIF orientation.
 
     Raises:
         UserError: it is missing, damaged or too large.
@@ -182,7 +182,7 @@ def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[LazyFr
 
 
 def shrink_to(image: UInt8[np.ndarray, "h w 3"], longest_side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """The picture with at most `longest_side` pixels a side, area-averaged; never enlarged."""
+    """Return the picture shrunk to at most `longest_side` pixels per side, area-averaged. It is never enlarged."""
     height, width = image.shape[:2]
     width_out, height_out = shrunk_size(width, height, longest_side)
     if (width_out, height_out) == (width, height):
@@ -191,7 +191,7 @@ def shrink_to(image: UInt8[np.ndarray, "h w 3"], longest_side: int) -> UInt8[np.
 
 
 def shrunk_size(width: int, height: int, longest_side: int) -> tuple[int, int]:
-    """Width and height after shrinking to `longest_side` with the same aspect; never enlarged."""
+    """Return width and height after shrinking to `longest_side` with the same aspect ratio. They never grow."""
     scale = min(1.0, longest_side / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 

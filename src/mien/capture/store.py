@@ -1,4 +1,4 @@
-"""Captures on disk: `capture.json`, `landmarks.safetensors`, `frames/`, `mattes/`, and a `cache/` that may go."""
+"""Captures on disk: `capture.json`, `landmarks.safetensors`, `frames/`, `mattes/` and a `cache/`."""
 
 import hashlib
 from dataclasses import dataclass
@@ -43,19 +43,19 @@ _ARRAYS = {
 }
 """Axes and type of every array in the safetensors file."""
 _CALIBRATION_ARRAYS = {"K": ("c33", np.float64), "viewmat": ("c44", np.float64)}
-"""Also there where the cameras are calibrated."""
+"""Additional arrays if the cameras are calibrated."""
 _QUALITY_ARRAYS = {"sharpness": ("tc", np.float32), "brightness": ("tc", np.float32), "clipped": ("tc", np.float32)}
-"""Also there where the faces were measured."""
+"""Additional arrays if the faces were measured."""
 _SLOWEST, _FASTEST = 1e-3, 1e5
-"""Frames a second."""
+"""Range of frame rates, in frames per second."""
 _LONGEST = 1e7
-"""Seconds from the first frame to the last."""
+"""Longest time from the first frame to the last, in seconds."""
 _OPTIONAL_ARRAYS = (_CALIBRATION_ARRAYS, _QUALITY_ARRAYS)
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureData:
-    """A capture without its pictures, and where it came from."""
+    """A capture without its pictures."""
 
     name: str
     camera_ids: tuple[str, ...]
@@ -70,7 +70,7 @@ class CaptureData:
 
 
 def write_capture(path: Path, capture: Capture) -> str:
-    """Write a capture to a folder, atomically, and return its hash. What was a capture there before is replaced.
+    """Write a capture to a folder, atomically, and return its hash. A capture that is there already is replaced.
 
     Raises:
         UserError: the folder holds something else, or cannot be written.
@@ -104,7 +104,9 @@ def write_capture(path: Path, capture: Capture) -> str:
 
 
 def read_capture(path: Path) -> Capture:
-    """Read a capture; its images and mattes are memory maps of the decoded cache, which is rebuilt where it is stale.
+    """Read a capture.
+
+    Its images and mattes are memory maps of the decoded cache. A stale cache is rebuilt first.
 
     Raises:
         UserError: the folder is missing, damaged, incomplete, of another version, or being written, or holds a link.
@@ -122,7 +124,7 @@ def _read_capture(path: Path) -> Capture:
         raise UserError(f"{path / ARRAYS_NAME}: does not belong to the {JSON_NAME} beside it; {REMEDY}")
     images, mattes = map_frames(layout, content["capture_hash"], digests)
     if read_capture_hash(path) != content["capture_hash"]:
-        # The maps may be of the one and the other: the folder was exchanged between them.
+        # The folder was replaced while it was mapped, so the maps may be of two captures.
         raise UserError(f"{path}: was replaced while it was read; run the same command again")
     return Capture(
         name=data.name,
@@ -141,7 +143,7 @@ def _read_capture(path: Path) -> Capture:
 
 
 def read_capture_hash(path: Path) -> str:
-    """The hash over pixels, mattes, landmarks, times and cameras of a capture on disk, without reading them.
+    """Return the hash over pixels, mattes, landmarks, times and cameras of a capture, without reading them.
 
     Raises:
         UserError: there is no capture, or one of another version.
@@ -150,12 +152,15 @@ def read_capture_hash(path: Path) -> str:
 
 
 def partial_folder(path: Path) -> Path:
-    """Where a capture is written before it is complete: beside its place, so that a rename finishes it."""
+    """Return the folder for an unfinished capture.
+
+    It is beside the final place, so that a rename finishes the capture.
+    """
     return path.parent / f".{path.name}.partial"
 
 
 def check_replaceable(path: Path) -> None:
-    """Refuse to write over anything but an empty folder or a capture.
+    """Refuse to overwrite anything but an empty folder or a capture.
 
     Raises:
         UserError: something else is there.
@@ -174,7 +179,7 @@ def finish_capture(
     digests: dict[str, np.ndarray],
     report: dict[str, Any] | None = None,
 ) -> str:
-    """Add what belongs beside the frames, and rename the finished folder to `path`. Returns the capture's hash."""
+    """Write the files beside the frames, rename the finished folder to `path` and return the capture's hash."""
     folder = layout.folder
     capture_hash = _hash(data, layout, digests)
     write_arrays(folder / ARRAYS_NAME, _arrays(data, digests))
@@ -225,7 +230,7 @@ def _hash(data: CaptureData, layout: FrameLayout, digests: dict[str, np.ndarray]
 def _checked(
     path: Path, content: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> tuple[FrameLayout, CaptureData, dict[str, np.ndarray]]:
-    """Everything but the pictures, after checks of every field's type, range and size."""
+    """Return everything but the pictures, after checks of every field's type, range and size."""
     camera_ids: Any = content.get("camera_ids")
     name, fps, source = content.get("name"), content.get("fps"), content.get("source")
     with expect_whole(path / JSON_NAME, REMEDY):
@@ -271,12 +276,15 @@ def _is_count(value: object) -> bool:
 
 
 def is_file_name(name: object) -> bool:
-    """Whether a camera's name can be a folder's, on any system."""
+    """Whether a camera's name can be the name of a folder on any system."""
     return is_plain_name(name) and not set(str(name)) & set(':*?"<>|')
 
 
 def _check_numbers(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Times go on, and nothing is infinite or far outside of any picture; landmarks are NaN where there is no face."""
+    """Check that times do not decrease, and that no number is infinite or far outside of any picture.
+
+    Landmarks may be NaN only where there is no face.
+    """
     times, valid = arrays["timestamps"], arrays["valid"]
     with np.errstate(invalid="ignore"):
         near = {

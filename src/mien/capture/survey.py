@@ -1,4 +1,4 @@
-"""The first pass over a source: all faces in every frame, and a thumbnail in which cuts are found."""
+"""The first pass over a source: find all faces in every frame, and make thumbnails in which cuts are found."""
 
 import itertools
 from collections.abc import Callable, Iterator
@@ -16,41 +16,42 @@ from mien.progress import Advance, progress_bar
 from mien.storage import expect_whole, read_arrays, write_arrays
 
 MOST_FACES = 4
-"""The largest so many faces of a frame are looked at."""
+"""Number of faces in a frame that are kept, the largest first."""
 SURVEY_SIZE = 512
-"""Longest side, pixels, of the pictures in which faces are searched: the detectors see 192 pixels at most."""
+"""Longest side in pixels of the pictures in which faces are searched. The detectors see at most 192 pixels."""
 _CHUNK = 1000
-"""Frames after which progress is kept."""
+"""Frames after which progress is saved."""
 _THUMBNAIL = (32, 18)
-"""Width and height, pixels, whatever the picture's shape."""
+"""Width and height of thumbnails in pixels, whatever the picture's shape."""
 _LOOK = 3
-"""A face's look is its mean colours on a grid of so many cells a side."""
+"""Cells along each side of the grid on which a face's mean colours, its look, are computed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What the first pass found, in some or all frames."""
+    """The results of the first pass for some or all frames."""
 
     numbers: Int64[np.ndarray, " t"]
-    """Of the frames in the source."""
+    """Indices of the frames in the source."""
     timestamps: Float[np.ndarray, " t"]
-    """Seconds from the first frame taken."""
+    """Time since the first frame taken, in seconds."""
     boxes: Float[np.ndarray, "t f 4"]
-    """Left, top, right, bottom of the faces as fractions of the picture, largest first; NaN where there are fewer."""
+    """Left, top, right, bottom of the faces as fractions of the picture, largest first. NaN where there are fewer."""
     looks: Float[np.ndarray, "t f p"]
     """Mean colours of each face, 0..1."""
     thumbnails: UInt8[np.ndarray, "t h w 3"]
     picture_size: Int64[np.ndarray, " 2"]
-    """Width and height of the source, pixels."""
+    """Width and height of the source in pixels."""
 
 
 def survey_source(frames: FrameSource, memory: Path, landmarks: Float[np.ndarray, "n l 2"] | None = None) -> Survey:
-    """Look at all frames; what an earlier call left in the folder `memory` is kept.
+    """Survey all frames. Results that an earlier call left in the folder `memory` are kept.
 
     Args:
         frames: the source.
-        memory: a folder for the results.
-        landmarks: where they are known for every frame of the source, faces are not searched; pixels, NaN for no face.
+        memory: the folder for the results.
+        landmarks: landmarks for every frame of the source in pixels, NaN for no face. If they are given, faces are not
+            searched.
 
     Raises:
         UserError: the source cannot be decoded.
@@ -79,7 +80,7 @@ def survey_source(frames: FrameSource, memory: Path, landmarks: Float[np.ndarray
 
 
 def _read(path: Path) -> Survey:
-    """What was kept of an earlier call.
+    """Read the saved results of an earlier call.
 
     Raises:
         UserError: it is damaged, or no survey.
@@ -99,13 +100,13 @@ def _read(path: Path) -> Survey:
 
 
 def slice_survey(survey: Survey, span: slice) -> Survey:
-    """Some consecutive frames; times stay those of the whole."""
+    """Return some consecutive frames. Their times still count from the start of the whole."""
     parts = {field.name: getattr(survey, field.name)[span] for field in fields(survey) if field.name != "picture_size"}
     return Survey(**parts, picture_size=survey.picture_size)
 
 
 _Find = Callable[[int, np.ndarray], np.ndarray]
-"""The boxes [n, 4] of the faces in a frame, by its number and its picture."""
+"""Returns the boxes [n, 4] of the faces in a frame, given its index and its picture."""
 
 
 def _search(finder: FaceFinder) -> _Find:
@@ -113,7 +114,7 @@ def _search(finder: FaceFinder) -> _Find:
 
 
 def _look_up(landmarks: Float[np.ndarray, "n l 2"]) -> _Find:
-    """Boxes around landmarks that are given as fractions of the picture."""
+    """Return boxes around landmarks that are given as fractions of the picture."""
 
     def find(number: int, image: np.ndarray) -> np.ndarray:
         face = landmarks[number]
@@ -125,7 +126,7 @@ def _look_up(landmarks: Float[np.ndarray, "n l 2"]) -> _Find:
 
 
 def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advance: Advance) -> Survey | None:
-    """What is seen in the frames of a stream; none if it is at its end."""
+    """Survey the frames of a stream; None if it is at its end."""
     rows: list[tuple[int, float, np.ndarray, np.ndarray, np.ndarray]] = []
     for frame in stream:
         image = frame.picture()
@@ -144,12 +145,12 @@ def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advan
 
 
 def _look(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:
-    """Mean colours of a face, NaN for none."""
+    """Return the mean colours of a face; NaN for no face."""
     if not np.isfinite(box).all():
         return np.full(3 * _LOOK**2, np.nan)
     height, width = image.shape[:2]
     left, top, right, bottom = np.clip(box * [width, height, width, height], 0, [width, height, width, height])
-    # A box at the border, or a false one, may have no pixel inside.
+    # A box at the border, or a false one, may contain no pixel.
     left, top = min(int(left), width - 1), min(int(top), height - 1)
     part = image[top : max(int(bottom), top + 1), left : max(int(right), left + 1)]
     return cv2.resize(part, (_LOOK, _LOOK), interpolation=cv2.INTER_AREA).ravel() / 255.0

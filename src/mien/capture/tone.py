@@ -1,11 +1,12 @@
-"""HDR video on an sRGB screen: PQ or HLG light, BT.2020 colours, brought into 0..255 by one fixed curve.
+"""Convert HDR video to sRGB: PQ or HLG light and BT.2020 colours are mapped to 0..255 by one fixed curve.
 
 The curve is the same for every frame and every clip, so a face keeps its colours when the scene around it changes:
 
 1. Signal to light: PQ by SMPTE ST 2084 (cd/m2); HLG by BT.2100 with its OOTF for a screen of 1,000 cd/m2 (gamma 1.2).
-2. Diffuse white, 203 cd/m2 (BT.2408), becomes 1.0. BT.2020 primaries become BT.709's; what lies outside is cut.
-3. Light up to 0.75 of diffuse white stays as it is; above, the brightest channel follows the extended Reinhard curve,
-   which leaves the line without a kink and reaches 1.0 at 1,000 cd/m2. All three channels shrink alike: hues stay.
+2. Diffuse white, 203 cd/m2 (BT.2408), becomes 1.0. BT.2020 is converted to BT.709; colours outside are clipped.
+3. Light up to 0.75 of diffuse white stays as it is. Above, the brightest channel follows the extended Reinhard curve,
+   which continues the line without a kink and reaches 1.0 at 1,000 cd/m2. All three channels are scaled alike, so hues
+   stay.
 4. sRGB's transfer function, 8 bit.
 """
 
@@ -18,11 +19,11 @@ PQ, HLG = 16, 18
 _WHITE, _PEAK = 203.0, 1000.0
 _KNEE = 0.75
 _SIXTEEN_BIT_WHITE = 65280
-"""swscale's 16-bit pictures hold 255 * 256 for white."""
+"""White in swscale's 16-bit pictures: 255 * 256."""
 _SIGNAL_BITS = 12
-"""Of the 16, those looked at: sources have ten or twelve."""
+"""Bits of the 16 that are used: sources have ten or twelve."""
 _LIGHT_STEPS = 16384
-"""Table entries of the sRGB curve; where it is steepest, an entry is a fifth of a level."""
+"""Table entries of the sRGB curve. Where it is steepest, an entry is a fifth of a level."""
 _BT2020_TO_BT709 = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]], np.float32
 )
@@ -31,7 +32,7 @@ _BT2020_LUMA = np.array([[0.2627, 0.6780, 0.0593]], np.float32)
 
 
 class ToneMapper:
-    """HDR pictures of one transfer function as sRGB."""
+    """Converts HDR pictures of one transfer function to sRGB."""
 
     def __init__(self, transfer: int) -> None:
         assert transfer in (PQ, HLG), transfer
@@ -43,7 +44,7 @@ class ToneMapper:
         self._levels = np.rint(255 * srgb_signal(np.arange(_LIGHT_STEPS) / (_LIGHT_STEPS - 1))).astype(np.uint8)
 
     def to_srgb(self, picture: UInt16[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """A picture of 16-bit non-linear R'G'B' in BT.2020."""
+        """Convert a picture of 16-bit non-linear R'G'B' in BT.2020."""
         light = self._light[picture >> (16 - _SIGNAL_BITS)]
         if self._is_hlg:
             luminance = cv2.transform(light, _BT2020_LUMA)
@@ -60,19 +61,19 @@ class ToneMapper:
 
 
 def pq_light(signal: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """Light in cd/m2 of a PQ signal in 0..1 (SMPTE ST 2084, EOTF)."""
+    """Return the light in cd/m2 of a PQ signal in 0..1 (SMPTE ST 2084, EOTF)."""
     powered = np.power(signal, 32 / 2523)
     return 10000 * np.power(np.maximum(powered - 107 / 128, 0) / (2413 / 128 - 2392 / 128 * powered), 8192 / 1305)
 
 
 def hlg_scene_light(signal: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """Scene light 0..1 of an HLG signal in 0..1 (BT.2100, inverse OETF)."""
+    """Return the scene light 0..1 of an HLG signal in 0..1 (BT.2100, inverse OETF)."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     return np.where(signal <= 0.5, np.square(signal) / 3, (np.exp((signal - c) / a) + b) / 12)
 
 
 def roll_off(light: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """Light above the knee (1 = diffuse white), pressed into what is left below 1."""
+    """Compress light above the knee (1 = diffuse white) into the range between the knee and 1."""
     room = 1 - _KNEE
     above = (np.minimum(light, _PEAK / _WHITE) - _KNEE) / room
     most = (_PEAK / _WHITE - _KNEE) / room
@@ -80,5 +81,5 @@ def roll_off(light: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
 
 
 def srgb_signal(light: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """The sRGB signal 0..1 of linear light 0..1 (IEC 61966-2-1)."""
+    """Return the sRGB signal 0..1 of linear light 0..1 (IEC 61966-2-1)."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(np.maximum(light, 1e-9), 1 / 2.4) - 0.055)

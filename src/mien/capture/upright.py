@@ -1,4 +1,4 @@
-"""Does a video lie on its side? And where no face was found, why?"""
+"""Check whether a video lies on its side, and why no face was found in it."""
 
 import itertools
 
@@ -11,26 +11,26 @@ from mien.errors import UserError
 from mien.progress import say
 
 _LOOKED_AT = 8
-"""Pictures that are turned each way..."""
+"""Number of pictures that are turned each way..."""
 _BEGINNING = 500
-"""...among so many at the beginning, with a face if there are any."""
+"""...from this many at the beginning, preferably with a face."""
 _CLEARER = 0.06
-"""By how much (of 0..1) faces must be surer in turned pictures. Of four clips, upright faces had 0.10 to 0.13 more than
-the same ones lying on their side, and 0.15 or more than upside down."""
+"""Smallest mean gain in confidence (0..1) by turning the pictures. In four clips, upright faces had 0.10 to 0.13 more
+than the same faces lying on their side, and at least 0.15 more than upside down."""
 _DARK, _BRIGHT = 0.12, 0.93
 """Mean levels (0..1) beyond which a video is too dark or too bright."""
 
 
 def check_upright(frames: FrameSource, survey: Survey, turned: int) -> None:
-    """Warn where faces lie on their side, and refuse a video in which there is none.
+    """Warn if faces lie on their side, and refuse a video without a face.
 
     Args:
         frames: the source.
-        survey: of it.
-        turned: degrees by which its pictures are turned already.
+        survey: the source's survey.
+        turned: degrees by which the pictures have been turned already.
 
     Raises:
-        UserError: there is no face; with the remedy that fits.
+        UserError: no face was found. The message names the remedy that fits.
     """
     turn = _best_turn(frames, survey)
     option = f"--capture.turn {(turned + turn) % 360}"
@@ -42,7 +42,7 @@ def check_upright(frames: FrameSource, survey: Survey, turned: int) -> None:
 
 
 def _best_turn(frames: FrameSource, survey: Survey) -> int:
-    """Degrees clockwise after which faces are found most surely."""
+    """Return the degrees clockwise after which faces are found with the most confidence."""
     seen = np.flatnonzero(np.isfinite(survey.boxes[:_BEGINNING, 0, 0]))
     numbers = seen if len(seen) else np.arange(min(_BEGINNING, len(survey.boxes)))
     chosen = set(numbers[:: -(-len(numbers) // _LOOKED_AT)].tolist())

@@ -1,4 +1,4 @@
-"""Video files in and out, one frame at a time (PyAV; no system ffmpeg)."""
+"""Read and write video files one frame at a time (PyAV; no system ffmpeg)."""
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
@@ -29,27 +29,27 @@ _DEFAULT_FPS = 25.0
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video file says about itself; only decoding tells the truth."""
+    """What a video file states about itself. Only decoding shows the truth."""
 
     fps: float
-    """Average frames a second."""
+    """Average frames per second."""
     frames: int
-    """How many frames to expect; 0 where the file does not say."""
+    """Expected number of frames; 0 if the file does not state it."""
     hdr: str
-    """PQ, HLG, or empty for ordinary video."""
+    """HDR transfer function: PQ, HLG, or empty for ordinary video."""
 
 
 class LazyFrame(NamedTuple):
-    """A frame that was read; its picture is made only when asked for."""
+    """A frame that was read. Its picture is made only on request."""
 
     seconds: float
-    """From the first frame."""
+    """Time since the first frame, in seconds."""
     picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
     """Makes the sRGB picture."""
 
 
 def probe_video(path: Path) -> VideoInfo:
-    """The frame rate, the expected number of frames, and whether it is HDR.
+    """Return the frame rate, the expected number of frames, and the HDR transfer function.
 
     Raises:
         UserError: the file is missing or is no video.
@@ -65,28 +65,28 @@ def probe_video(path: Path) -> VideoInfo:
 
 
 def count_frames(path: Path) -> int:
-    """The number of frames in a video, by reading its packets without decoding them.
+    """Count the frames in a video by reading its packets without decoding them.
 
     Raises:
         UserError: the file is missing or is no video.
     """
     with open_video(path) as (container, stream):
         try:
-            # An edit list leaves frames out that others need to be decoded.
+            # An edit list discards frames that others need for decoding.
             return sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
         except av.error.FFmpegError as error:
             raise UserError(f"{path}: is damaged ({error.strerror or error}); copy or record it again") from None
 
 
 def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
-    """Every frame in the order of display: its time in seconds from the first frame, and its sRGB picture.
+    """Yield every frame in display order: its time in seconds from the first frame, and its sRGB picture.
 
     The file's rotation and mirror flags and its pixel aspect are applied; HDR is tone-mapped (`mien.capture.tone`).
     Damaged parts are skipped with a warning.
 
     Args:
-        path: of the video.
-        longest_side: shrink larger pictures to this many pixels, area-averaged; 0 keeps the size.
+        path: path of the video.
+        longest_side: side in pixels to which larger pictures are shrunk (area-averaged). 0 keeps the size.
 
     Raises:
         UserError: the file is missing, is no video, or no frame of it can be decoded.
@@ -96,7 +96,10 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
 
 
 def read_lazily(path: Path, longest_side: int = 0) -> Iterator[LazyFrame]:
-    """As `read_video_frames`, but pictures that nobody asks for are not converted, which is most of the work."""
+    """Yield frames as `read_video_frames` does, but convert only pictures that are requested.
+
+    The conversion is most of the work.
+    """
     with open_video(path) as (container, stream):
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = _THREADS
@@ -112,7 +115,7 @@ def read_lazily(path: Path, longest_side: int = 0) -> Iterator[LazyFrame]:
                 absolute = float(frame.pts * frame.time_base)
                 first = absolute if first is None else first
                 seconds = absolute - first
-            # Times must increase for everything that differentiates over time; broken files repeat them.
+            # Times must increase for everything that differentiates over time, but broken files repeat them.
             latest = seconds if seconds > latest else latest + interval
             yield LazyFrame(latest, partial(display.show, frame))
 
@@ -124,14 +127,14 @@ def write_video(
     crf: int = 18,
     preset: str = "medium",
 ) -> None:
-    """Write sRGB frames as H.264 (yuv420p, BT.709), atomically; odd sizes get a repeated last row or column.
+    """Write sRGB frames as H.264 (yuv420p, BT.709), atomically. Odd sizes get a repeated last row or column.
 
     Args:
-        path: usually ends in .mp4; the ending chooses the container.
-        frames: all of one size; may be a generator, is read once.
-        fps: frames a second.
-        crf: x264's constant rate factor: 0 is lossless, 18 looks so, 51 is worst.
-        preset: x264's preset: `veryfast` takes a third of the time, for a file somewhat worse.
+        path: path of the video. Its ending, usually .mp4, chooses the container.
+        frames: frames of one size. They are read once, so a generator will do.
+        fps: frames per second.
+        crf: x264's constant rate factor: 0 is lossless, 18 looks lossless, 51 is worst.
+        preset: x264's preset. `veryfast` takes a third of the time and compresses somewhat worse.
 
     Raises:
         UserError: `frames` is empty, or the file cannot be written.
@@ -153,7 +156,7 @@ def _encode(
         stream.width, stream.height, stream.pix_fmt = width + width % 2, height + height % 2, "yuv420p"
         context = stream.codec_context
         context.thread_count = _THREADS
-        # BT.709 for matrix, primaries and transfer, studio range: what players assume, and written down.
+        # Players assume BT.709 for matrix, primaries and transfer, and studio range. The file also says so.
         context.colorspace = context.color_primaries = context.color_trc = 1
         context.color_range = ColorRange.MPEG
         reformatter = VideoReformatter()
@@ -173,7 +176,7 @@ def _encode(
 
 
 def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
-    """All frames; what cannot be decoded is skipped, counted, and reported at the end."""
+    """Yield all frames. Parts that cannot be decoded are skipped, counted, and reported at the end."""
     damaged, decoded = 0, 0
     packets = container.demux(stream)
     while True:

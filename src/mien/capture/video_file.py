@@ -1,8 +1,8 @@
-"""The one door through which video files are opened and made.
+"""The only module that opens and creates video files.
 
-FFmpeg takes names for more than names: `take:1.mp4` for an address, `%03d.png` for a row of files, a playlist for leave
-to open what it lists. So it never sees a name here. It reads and writes through a file that Python opened, may open
-nothing else, and takes only containers that hold their own pictures.
+FFmpeg does not treat every name as a file: `take:1.mp4` is an address to it, `%03d.png` is a series of files, and a
+playlist makes it open the files in the list. So it never gets a name here. It reads and writes a file that Python has
+opened, may open nothing else, and accepts only containers that hold their own pictures.
 """
 
 import re
@@ -21,7 +21,7 @@ from av.video.stream import VideoStream
 from mien.errors import UserError
 
 LARGEST_FRAME = 8192 * 4608
-"""Pixels of a video's pictures: 8K of every kind. A decoder holds up to 17 pictures at a time."""
+"""Largest number of pixels of a video's pictures: 8K of every kind. A decoder holds up to 17 pictures at a time."""
 TOO_MANY_PIXELS = f"more than the {LARGEST_FRAME:,} pixels (8192x4608) that mien takes of a video"
 _VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 _CONTAINERS = (
@@ -30,7 +30,8 @@ _CONTAINERS = (
     "mjpeg", "yuv4mpegpipe", "wtv", "rm", "swf", "dhav", "cine", "webp_anim", "png_pipe", "jpeg_pipe", "webp_pipe",
     "bmp_pipe", "tiff_pipe", "wav", "mp3", "flac", "aac", "aiff",
 )  # fmt: skip
-"""FFmpeg's names of the containers that are opened. None of them leads to other files. Sound alone is told as such."""
+"""FFmpeg's names of the containers that are accepted. None of them refers to other files. Files with only sound are
+accepted too, so that the message can say that they have no video."""
 _LISTS = (
     (rb"\A(\xef\xbb\xbf)?\s*#EXTM3U", "a playlist (.m3u8)"),
     (rb"\Affconcat version", "a list of files for FFmpeg (concat)"),
@@ -39,14 +40,14 @@ _LISTS = (
     (rb"\Av=0\r?\n(?s:.*)\nm=", "the description of a stream (.sdp)"),
     (rb"\A\[InternetShortcut\]|\A\[playlist\]|\A<asx", "a link or a playlist"),
 )
-"""What begins so names other files or addresses instead of holding pictures."""
+"""Beginnings of files that name other files or addresses instead of holding pictures, and their descriptions."""
 _SNIFFED = 4096
 _BUFFER = 1 << 16
-"""Bytes that FFmpeg asks for at a time."""
+"""Bytes that FFmpeg requests at a time."""
 
 
 class _Local:
-    """A file as FFmpeg sees it: without a name, apart from an ending that chooses the container that is written."""
+    """A file as FFmpeg sees it. Its name is a placeholder, whose ending chooses the container when writing."""
 
     def __init__(self, file: IO[bytes], name: str = "video") -> None:
         self.read, self.write, self.seek, self.tell = file.read, file.write, file.seek, file.tell
@@ -56,10 +57,10 @@ class _Local:
 
 @contextmanager
 def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """A video file and its first stream of moving pictures (a cover picture is none), ready to be decoded.
+    """Open a video file and its first stream of moving pictures, ready to be decoded. A cover picture does not count.
 
     Raises:
-        UserError: the file is missing, is no video, is of a container or codec that is not read, or has pictures of
+        UserError: the file is missing, is no video, has a container or codec that is not supported, or has pictures of
             more than `LARGEST_FRAME` pixels.
     """
     if not path.exists():
@@ -77,10 +78,11 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             container = av.open(
                 _Local(file),
                 "r",
-                # FFmpeg forgets a size that it refuses, and somewhat larger ones are to be named.
+                # FFmpeg does not report a size that it refuses. Somewhat larger sizes are let through here, so that the
+                # message can name them.
                 options={"max_pixels": str(4 * LARGEST_FRAME)},
                 container_options={"format_whitelist": ",".join(_CONTAINERS), "protocol_whitelist": "none"},
-                metadata_errors="replace",  # titles come in any encoding
+                metadata_errors="replace",  # titles may have any encoding
                 buffer_size=_BUFFER,
             )
         except (av.error.FFmpegError, OSError) as error:
@@ -94,10 +96,10 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 
 @contextmanager
 def create_video(path: Path) -> Iterator[OutputContainer]:
-    """A new video file; the ending of `path` chooses the container.
+    """Create a video file. The ending of `path` chooses the container.
 
     Raises:
-        OSError: the file cannot be written, with the system's own reason.
+        OSError: the file cannot be written; it carries the system's reason.
     """
     with path.open("wb") as file, av.open(_Local(file, f"video{path.suffix}"), "w") as container:
         yield container
@@ -109,7 +111,7 @@ def _check_size(path: Path, width: int, height: int) -> None:
 
 
 def _why_not(path: Path, error: av.error.FFmpegError | OSError) -> str:
-    """What a file that FFmpeg refused is, as far as its beginning tells, and what to do."""
+    """Return what a file that FFmpeg refused is, as far as its beginning shows, and what to do."""
     with path.open("rb") as file:
         start = file.read(_SNIFFED)
     for pattern, kind in _LISTS:
@@ -129,7 +131,7 @@ def _moving_pictures(path: Path, container: InputContainer) -> VideoStream:
     moving = [stream for stream in streams if not stream.disposition & Disposition.attached_pic]
     if not moving:
         raise UserError(f"{path}: has a cover picture, but no video stream; give a file with moving pictures in it")
-    # PyAV has no codec context for a codec that FFmpeg lacks.
+    # PyAV has no codec context for a codec that FFmpeg does not have.
     known = [stream for stream in moving if stream.codec_context is not None]
     if not known:
         codec = _codec_name(container, moving[0].index)
@@ -138,7 +140,10 @@ def _moving_pictures(path: Path, container: InputContainer) -> VideoStream:
 
 
 def _codec_name(container: InputContainer, index: int) -> str:
-    """The codec's name or four-character code, out of FFmpeg's own words: PyAV has neither where no decoder is."""
+    """Return the codec's name or four-character code, taken from FFmpeg's description.
+
+    PyAV gives neither if there is no decoder.
+    """
     level = av.logging.get_level()
     av.logging.set_level(av.logging.INFO)
     try:

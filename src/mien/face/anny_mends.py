@@ -1,24 +1,25 @@
-"""What the source's mesh does badly where a head is cut from it, mended: collar, tongue and lids."""
+"""Repairs of the source's mesh where it does not suit a head that is cut from it: collar, mouth and lids."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 BLINK = 0.8
-"""The source's eyeBlink closes an eye at this much (nothing of the eyeball is seen) and then runs the upper lid through
-the lower one, by up to 2.3 mm. ARKit's 1 means closed."""
+"""Factor on the source's eyeBlink. It closes the eye at this value (the eyeball is hidden); beyond it the upper lid
+runs through the lower one, by up to 2.3 mm. ARKit's 1 means closed."""
 
-# The helper geometry's lower teeth and tongue are as wide as the upper teeth and run through lip and cheeks: a little
-# narrower and further back they bite behind the upper ones (metres).
+# The helper geometry's lower teeth and tongue are as wide as the upper teeth and run through lip and cheeks. Slightly
+# narrower and further back (in metres), they close behind the upper teeth.
 _LOWER_TEETH_WIDTH, _LOWER_TEETH_BACK = 0.93, 0.002
-# Its tongue fills the closed mouth up to the palate, and stands like a slab in an open one.
+# Its tongue fills the closed mouth up to the palate and looks like a slab in an open one.
 _TONGUE_HEIGHT, _TONGUE_BACK = 0.6, 0.003
 
 _COLLAR_STEPS, _COLLAR_RINGS = 24, 5
-"""The cut's staircase over the shoulders is smoothed by so many steps along its edge; so many rings above follow."""
+"""Smoothing steps along the jagged edge of the cut over the shoulders, and number of vertex rings above it that
+follow."""
 
 
 def mend_mouth(people: Float[np.ndarray, "s v 3"], parts: dict[str, Bool[np.ndarray, " v"]]) -> None:
-    """Lower teeth that bite behind the upper ones, and a tongue that lies between them; in place."""
+    """Move the lower teeth behind the upper ones and the tongue between them, in place."""
     bite = parts["lower_teeth"] | parts["tongue"]
     people[:, bite] *= np.array([_LOWER_TEETH_WIDTH, 1.0, 1.0])
     people[:, bite] -= np.array([0.0, 0.0, _LOWER_TEETH_BACK])
@@ -30,7 +31,10 @@ def mend_mouth(people: Float[np.ndarray, "s v 3"], parts: dict[str, Bool[np.ndar
 
 
 def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
-    """A smooth lower edge of the neck; what lies above follows as a membrane would. Linear, so identity stays so."""
+    """Smooth the lower edge of the neck in place; the rings above follow like a membrane.
+
+    The change is linear, so identity stays linear.
+    """
     edges, times = np.unique(np.sort(_edges(faces), axis=1), axis=0, return_counts=True)
     loop = _lowest_loop(edges[times == 1], people[..., 1].mean(0))
     step = 0.5 * np.eye(len(loop)) + 0.25 * (np.roll(np.eye(len(loop)), 1, 1) + np.roll(np.eye(len(loop)), -1, 1))
@@ -56,7 +60,7 @@ def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
 
 
 def _lowest_loop(border: Int[np.ndarray, "b 2"], height: Float[np.ndarray, " v"]) -> Int[np.ndarray, " n"]:
-    """The vertices of the open border that holds the lowest vertex, in order."""
+    """Return the vertices, in order, of the open border that holds the lowest vertex."""
     neighbours: dict[int, list[int]] = {}
     for first, second in border.tolist():
         neighbours.setdefault(first, []).append(second)

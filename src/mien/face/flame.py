@@ -1,14 +1,13 @@
-"""Reads a head model in FLAME's schema (Li et al. 2017, "Learning a model of facial shape and expression ...").
+"""Read a head model in FLAME's schema (Li et al. 2017, "Learning a model of facial shape and expression ...").
 
-The schema is that of SMPL: a template, one linear basis whose first columns are identity and whose last are expression,
-joints regressed from vertices, correctives linear in the joints' rotation matrices, linear blend skinning. FLAME's own
-files are its users' to fetch (flame.is.tue.mpg.de) and their licence's to obey; mien ships none of them, and any model
-in this schema will do.
+The schema is that of SMPL: a template; one linear basis whose first columns are identity and whose last are expression;
+joints regressed from vertices; correctives linear in the joints' rotation matrices; linear blend skinning. Users have
+to fetch FLAME's own files themselves (flame.is.tue.mpg.de) and follow their licence. Mien ships none of them, and
+accepts any model in this schema.
 
 FLAME's chain starts at the shoulders: root, neck (which turns the whole head), then jaw and eyes. A mien head starts at
-the head, so that its pose is the head's pose. The same motions are reached from the other end: FLAME's neck joint
-turned by R is a mien head turned by R (after FLAME's root) whose neck is turned by the inverse of R, about the same
-point.
+the head, so that its pose is the head's pose. The same motions result from the other end. A FLAME neck joint turned by
+R becomes a mien head turned by R (after FLAME's root), with a neck turned by the inverse of R about the same point.
 """
 
 from dataclasses import dataclass
@@ -26,56 +25,56 @@ from mien.face.npz import read_npz
 
 JOINTS = ("head", "neck", "jaw", "left_eye", "right_eye")
 REGIONS = ("skin", "neck", "eyes", "irises")
-"""Those that skinning weights tell apart; `mien.tracking.regions` tells more, by landmarks."""
+"""Regions that follow from skinning weights. `mien.tracking.regions` finds more, by landmarks."""
 
 _CHAIN = (-1, 0, 1, 1, 1)
-"""FLAME's: the root, the neck on it, jaw and eyes on the neck."""
+"""Parents in FLAME's chain: the root, the neck on it, jaw and eyes on the neck."""
 _SPLITS = {400: 300}
-"""Identity directions of a basis with so many columns: FLAME 2020 and 2023."""
+"""Number of identity directions, by the number of columns of the basis: FLAME 2020 and 2023."""
 _LARGEST_COEFFICIENT = 3.0
-"""FLAME's coefficients are in standard deviations."""
+"""Bound of an expression coefficient. FLAME's coefficients are in standard deviations."""
 _EYE_BACK = 0.08
-"""Metres from the midpoint of the eyeballs' centres back to the origin of the head frame, as in the anny model."""
+"""Distance from the midpoint of the eyeballs' centres back to the origin, in metres, as in the anny model."""
 _IRIS_RADIUS = 0.0061
-"""Metres; people hardly differ."""
+"""Radius of the iris in metres. It hardly differs between people."""
 _QUANTUM = 1e-7
 _SIZES = (0.1, 0.6)
-"""Metres that a head with its neck may be high."""
+"""Range of the height of a head with its neck, in metres."""
 _SHAPES = {
     "v_template": "v 3", "f": "f 3", "shapedirs": "v 3 n", "posedirs": "v 3 36", "J_regressor": "5 v", "weights": "v 5",
 }  # fmt: skip
 
 _KEYS = frozenset({*_SHAPES, "kintree_table", "identities", "vt", "ft"})
 _OTHERS = frozenset({"lmk_face_idx", "lmk_bary_coords", "mean"})
-"""Keys of FLAME's other files, by which they are told."""
+"""Keys by which FLAME's other files are recognised."""
 _NAMED = 20
 _LARGEST_NUMBER = 1e6
-"""Metres, weights and indices are all below."""
+"""Bound of all numbers in the file: metres, weights and indices."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlameFile:
-    """The arrays of a file in FLAME's schema, checked."""
+    """The checked arrays of a file in FLAME's schema."""
 
     template: Float[np.ndarray, "v 3"]
-    """Metres, +x to the subject's left, +y up, +z ahead."""
+    """Positions in metres, +x to the subject's left, +y up, +z ahead."""
     faces: Int[np.ndarray, "f 3"]
     identity: Float[np.ndarray, "i v 3"]
     expression: Float[np.ndarray, "e v 3"]
     correctives: Float[np.ndarray, "36 v 3"]
-    """Times R - I, row by row, of neck, jaw, left eye, right eye."""
+    """Factors of R - I, row by row, of neck, jaw, left eye, right eye."""
     regressor: Float[np.ndarray, "5 v"]
     weights: Float[np.ndarray, "v 5"]
     uv: Float[np.ndarray, "u 2"] | None
-    """v upwards."""
+    """Texture coordinates, v upwards."""
     uv_faces: Int[np.ndarray, "f 3"] | None
 
 
 def read_flame(path: Path) -> FlameFile:
-    """Read a .npz or .pkl in FLAME's schema; a pickle is read without running anything in it.
+    """Read a .npz or .pkl in FLAME's schema. Reading a pickle runs none of its code.
 
     Raises:
-        UserError: the file is missing, damaged, or lacks something; the message names the key and what to do.
+        UserError: the file is missing, damaged or incomplete. The message names the key and what to do.
     """
     names, arrays = _arrays_of(path)
     for key in _SHAPES:
@@ -107,18 +106,18 @@ def read_flame(path: Path) -> FlameFile:
 
 
 def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> FaceModel:
-    """A file in FLAME's schema as a face model without landmarks; `shareable` as in `FaceModel`."""
+    """Convert a file in FLAME's schema to a face model without landmarks; `shareable` as in `FaceModel`."""
     joints = flame.regressor @ flame.template
     eyes, centres = _eyeballs(flame)
     origin = _origin(centres)
-    # FLAME's root segment is mien's neck, its neck segment mien's head; each turns about FLAME's neck joint.
+    # FLAME's root segment is mien's neck and its neck segment is mien's head. Both turn about FLAME's neck joint.
     order = [1, 0, 2, 3, 4]
     pivots = joints[[1, 1, 2, 3, 4]] - origin
     pivots[0] = 0
     basis = np.einsum("kv,ivc->ikc", flame.regressor, flame.identity)[:, [1, 1, 2, 3, 4]]
     basis[:, 0] = 0
     correctives = flame.correctives.reshape(4, 3, 3, -1, 3).copy()
-    correctives[0] = correctives[0].swapaxes(0, 1)  # of the inverse of the neck's rotation
+    correctives[0] = correctives[0].swapaxes(0, 1)  # for the inverse of the neck's rotation
     if flame.uv is None or flame.uv_faces is None:
         uv, uv_faces = unwrap(flame.template - origin, flame.faces)
     else:
@@ -157,7 +156,10 @@ def _tensor(values: np.ndarray) -> torch.Tensor:
 
 
 def _rounded(values: np.ndarray) -> torch.Tensor:
-    """What was worked out, to 0.1 micrometres: the last digits depend on the machine, and would change the hash."""
+    """Round computed values to 0.1 micrometres.
+
+    Their last digits depend on the machine and would change the hash.
+    """
     return _tensor(np.round(values / _QUANTUM) * _QUANTUM + 0.0)
 
 
@@ -174,7 +176,7 @@ def _regions(flame: FlameFile, eyes: list[np.ndarray], centres: Float[np.ndarray
 
 
 def _arrays_of(path: Path) -> tuple[list[str], dict[str, np.ndarray]]:
-    """The names of all that the file holds, and those of its arrays that the schema knows."""
+    """Return the names of all entries of the file, and those of its arrays that the schema has."""
     if not path.is_file():
         raise UserError(f"{path}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz")
     if path.suffix.lower() == ".npz":
@@ -225,7 +227,7 @@ def _check_values(path: Path, key: str, array: np.ndarray) -> None:
 def _check_chain(path: Path, table: np.ndarray | None) -> None:
     if table is None:
         raise UserError(f"{path}: has no 'kintree_table', which says how its joints hang together; add FLAME's")
-    # The root's parent is -1, or 2**32 - 1 where it was written without a sign.
+    # The root's parent is -1, or 2**32 - 1 if it was written as unsigned.
     fits = table.ndim == 2 and len(table) > 0 and table.dtype.kind in "iuf" and bool((np.abs(table) < 2**33).all())
     parents = table[0].astype(np.int64) if fits else np.zeros(0)
     parents = np.where(parents == 2**32 - 1, -1, parents)
@@ -262,7 +264,7 @@ def _indices(path: Path, key: str, values: np.ndarray, count: int) -> Int[np.nda
 
 
 def _check_sense(path: Path, flame: FlameFile) -> None:
-    """Units, axes and joints, which shapes do not show."""
+    """Check units, axes and joints, which shapes do not show."""
     height = float(np.ptp(flame.template[:, 1]))
     if not _SIZES[0] < height < _SIZES[1]:
         raise UserError(

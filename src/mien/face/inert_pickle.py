@@ -1,11 +1,10 @@
-"""Numbers out of a pickle without running anything that it names: some face models come as nothing else.
+"""Read numbers from a pickle without running any of its code: some face models exist only as pickles.
 
-A pickle is a program for a machine with a stack: it names functions, and reading it calls them. Here the program is
-followed by a machine of our own, in which every name leads to a stand-in that only remembers what it was given. So the
-worst that a hostile file can do is to be refused. Nor can it take more memory than its own size explains: the opcodes
-are counted, and strings are as long as what lies in the file. Of what the stand-ins hold, numpy's arrays, scipy's
-compressed matrices and the values of chumpy's variables are turned into arrays (none of the three has to be installed,
-numpy apart); everything else is dropped.
+A pickle is a program for a stack machine: it names functions, and reading it calls them. This module follows the
+program with a machine of its own, in which every name is a stand-in that only records its arguments. So the worst
+outcome of a hostile file is that it is refused. Memory is bounded as well: opcodes are counted, and strings are as long
+as their bytes in the file. Numpy's arrays, scipy's compressed matrices and the values of chumpy's variables are then
+converted to arrays (of the three, only numpy has to be installed). Everything else is dropped.
 """
 
 import codecs
@@ -23,36 +22,36 @@ from mien.errors import UserError
 from mien.face.npz import LARGEST_MODEL
 
 _LARGEST_FILE = LARGEST_MODEL + (16 << 20)
-"""Bytes."""
+"""Largest file in bytes."""
 _MOST_OPCODES = 400_000
-"""FLAME's files have some hundreds; each costs up to some hundred bytes of memory."""
+"""Most opcodes of a pickle. FLAME's files have some hundreds; each costs up to about a hundred bytes of memory."""
 _NUMBERS = re.compile(r"[biuf][1248]")
-"""Type codes of numpy for arrays of plain numbers."""
+"""Numpy's type codes for arrays of plain numbers."""
 _OPCODES = {ord(opcode.code): opcode for opcode in pickletools.opcodes}
 
 
 class _StandIn:
-    """Whatever a pickle names or builds: remembers the arguments, the state and the entries, does nothing."""
+    """Anything that a pickle names or builds. It records arguments, state and entries, and does nothing."""
 
     __slots__ = ("arguments", "entries", "name", "state")
 
     def __init__(self, name: str = "", arguments: Any = (), entries: dict[str, Any] | None = None) -> None:
         self.name = name
-        """Module and name in the pickle."""
+        """Module and name in the pickle, joined by a dot."""
         self.arguments: tuple[Any, ...] = arguments if isinstance(arguments, tuple) else ()
         self.state: Any = None
         self.entries = entries
 
 
 def read_inert_pickle(path: Path, wanted: Collection[str] | None = None) -> dict[str, Any]:
-    """The named arrays (and numbers and texts) of a pickled dictionary; what is none of these is left out.
+    """Return the named arrays, numbers and texts of a pickled dictionary. Other entries are left out.
 
     Args:
-        path: Of the pickle.
-        wanted: Names that are looked at; by default all of them.
+        path: Path of the pickle.
+        wanted: Names to read; all by default.
 
     Raises:
-        UserError: the file is missing, is no pickle or a damaged one, is too large, or holds no dictionary.
+        UserError: the file is missing, is no pickle, is damaged or too large, or holds no dictionary.
     """
     try:
         if path.stat().st_size > _LARGEST_FILE:
@@ -73,7 +72,7 @@ def read_inert_pickle(path: Path, wanted: Collection[str] | None = None) -> dict
 
 
 class _Machine:
-    """Follows the opcodes of a pickle."""
+    """Executes the opcodes of a pickle."""
 
     def __init__(self, data: bytes) -> None:
         self._file = io.BytesIO(data)
@@ -83,7 +82,7 @@ class _Machine:
         self._memo: dict[int, Any] = {}
 
     def run(self) -> Any:
-        """What the pickle makes."""
+        """Execute the pickle and return the object that it builds."""
         for _ in range(_MOST_OPCODES):
             code = self._file.read(1)
             if not code or code[0] not in _OPCODES:
@@ -101,67 +100,67 @@ class _Machine:
     def _argument(self, name: str, described: pickletools.ArgumentDescriptor) -> Any:
         if name != "STRING":
             return described.reader(self._file)
-        # latin1 is how numpy's arrays in pickles of Python 2 are read, as their bytes were text there; of this kind of
-        # text pickletools would take ASCII only.
+        # Numpy reads the bytes of its arrays in Python 2 pickles as latin1. For this opcode pickletools accepts only
+        # ASCII.
         quoted = self._file.readline().strip()
         if len(quoted) < 2 or quoted[:1] not in b"'\"" or quoted[-1:] != quoted[:1]:
             raise ValueError("a text without quotes")
         return codecs.escape_decode(quoted[1:-1])[0].decode("latin1")
 
     def push(self, value: Any) -> None:
-        """A value."""
+        """Push a value."""
         self._stack.append(value)
 
     def pop(self) -> Any:
-        """The value on top."""
+        """Remove and return the value on top."""
         return self._stack.pop()
 
     def top(self) -> Any:
-        """The value on top, which stays."""
+        """Return the value on top, which stays."""
         return self._stack[-1]
 
     def mark(self) -> None:
-        """Begin a group of values."""
+        """Start a group of values."""
         self._outer.append(self._stack)
         self._stack = []
 
     def group(self) -> list[Any]:
-        """The values since the last mark, which goes."""
+        """Return the values since the last mark, and remove the mark."""
         values, self._stack = self._stack, self._outer.pop()
         return values
 
     def drop(self) -> None:
-        """A value, or a mark that nothing follows."""
+        """Drop the value on top, or a mark that nothing follows."""
         if self._stack:
             self._stack.pop()
         else:
             self.group()
 
     def keep(self, number: int | None) -> None:
-        """Remember the value on top."""
+        """Store the value on top in the memo."""
         self._memo[len(self._memo) if number is None else number] = self._stack[-1]
 
     def recall(self, number: int) -> None:
-        """Push what was remembered."""
+        """Push a value from the memo."""
         self._stack.append(self._memo[number])
 
     def call(self, arguments: Any) -> None:
-        """What calling the name on top would make: a stand-in."""
+        """Push a stand-in for the result of calling the name on top."""
         called = self.pop()
         name = called.name if isinstance(called, _StandIn) else ""
         if name.endswith("._reconstructor") and isinstance(arguments, tuple) and arguments:
-            # copyreg's, with the class as its first argument.
+            # copyreg's `_reconstructor` has the class as its first argument.
             name = arguments[0].name if isinstance(arguments[0], _StandIn) else ""
         self.push(_StandIn(name, arguments))
 
     def set_state(self) -> None:
-        """Give the value below a state."""
+        """Pop a state and give it to the value below."""
         state = self.pop()
         if isinstance(self.top(), _StandIn):
             self.top().state = state
 
     def set_entries(self, values: list[Any]) -> None:
-        """Keys and values in turn, into the dictionary on top; keys that are no text are dropped."""
+        """Add alternating keys and values to the dictionary on top. Keys that are not text are dropped."""
         target = self.top()
         if isinstance(target, _StandIn):
             target.entries = target.entries if target.entries is not None else {}
@@ -170,7 +169,7 @@ class _Machine:
             target.update((key, value) for key, value in _pairs(values) if isinstance(key, str))
 
     def append(self, values: list[Any]) -> None:
-        """Values at the end of the list on top."""
+        """Append values to the list on top."""
         if isinstance(self.top(), list):
             self.top().extend(values)
 
@@ -252,7 +251,7 @@ _ACTIONS: dict[str, Callable[[_Machine, Any], None]] = {
     "INST": lambda machine, name: machine.push(_StandIn(".".join(name.split(" ", 1)), tuple(machine.group()))),
     "NEWOBJ_EX": _new_object_with_names,
 }
-"""What each opcode does, by its name in `pickletools`."""
+"""The action of each opcode, by its name in `pickletools`."""
 
 
 def _arrays(named: dict[str, Any], wanted: Collection[str] | None) -> dict[str, Any]:
@@ -289,7 +288,7 @@ def _plain(value: Any) -> Any:
 
 
 def _raw(value: Any) -> bytes | None:
-    """Bytes, or text that stands for bytes as it did in Python 2, or what `_codecs.encode` would make of text."""
+    """Return the bytes in a value: bytes, text that holds bytes as in Python 2, or a `_codecs.encode` call."""
     if isinstance(value, _StandIn) and value.name == "_codecs.encode" and value.arguments:
         value = value.arguments[0]
     if isinstance(value, str):
@@ -298,7 +297,7 @@ def _raw(value: Any) -> bytes | None:
 
 
 def _array(state: Any) -> np.ndarray | None:
-    """Numpy's state of an array: version, shape, type, whether columns come first, bytes."""
+    """Build an array from numpy's state of it: version, shape, type, column-major flag, bytes."""
     if not isinstance(state, tuple) or len(state) != 5:
         return None
     _, shape, kind, by_column, content = state
@@ -312,7 +311,7 @@ def _array(state: Any) -> np.ndarray | None:
 
 
 def _dense(state: dict[str, Any], by_column: bool) -> np.ndarray | None:
-    """Scipy's state of a compressed matrix."""
+    """Build a dense array from scipy's state of a compressed matrix."""
     data, indices, starts = (_plain(state[name]) for name in ("data", "indices", "indptr"))
     shape = state.get("_shape", state.get("shape"))
     if data is None or indices is None or starts is None or shape is None:

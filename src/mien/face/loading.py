@@ -1,4 +1,4 @@
-"""Face models by name: baked once into the user's cache, then read in a moment."""
+"""Load face models by name. Each is baked once into the user's cache, and then loads at once."""
 
 import json
 from collections.abc import Callable
@@ -31,7 +31,7 @@ _TENSORS = (
 )  # fmt: skip
 _SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
 ADDED_RECIPE = 1
-"""Raised whenever adding a user's file gives something else."""
+"""Recipe version, raised whenever adding a user's file gives a different result."""
 _PLACE_AGAIN = "delete it and add the face model again (`mien face-models --add FILE`)"
 """What to do about landmarks that cannot be read."""
 _LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
@@ -39,14 +39,14 @@ _LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "j
 
 @dataclass(frozen=True)
 class FaceModelInfo:
-    """What is known of a face model without loading it."""
+    """Facts about a face model that are known without loading it."""
 
     name: str
     licence: str
-    """Of its data."""
+    """Licence of its data."""
     description: str
     baked: bool
-    """Whether the cache has it, so that loading takes no time."""
+    """Whether the model is in the cache, so that it loads at once."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ class _Source:
     description: str
     bake: Callable[[], FaceModel]
     tag: Callable[[], str]
-    """Recipe and source version, as part of a file's name."""
+    """Returns recipe and source version, as part of a file's name."""
 
 
 def load_face_model(name: str = "anny") -> FaceModel:
-    """The face model of that name, ready to use; its first load bakes it (about half a minute, with a progress bar).
+    """Load the face model of that name. Its first load bakes it (about half a minute, with a progress bar).
 
-    Baked models are kept in `mien.face.cache.cache_folder()`, and so are those that the user added (`mien face-models
+    Baked models are kept in `mien.face.cache.cache_folder()`, like those that the user added (`mien face-models
     --add`).
 
     Raises:
@@ -72,7 +72,7 @@ def load_face_model(name: str = "anny") -> FaceModel:
 
 
 def load_face_model_without_landmarks(name: str) -> FaceModel:
-    """`load_face_model` for who makes the landmarks."""
+    """Load a face model without landmarks, for the code that makes them."""
     if name not in _SOURCES:
         return _read_added(name)
     source = _SOURCES[name]
@@ -85,7 +85,7 @@ def load_face_model_without_landmarks(name: str) -> FaceModel:
 
 
 def available_face_models() -> list[FaceModelInfo]:
-    """Every face model there is, those that the user added last."""
+    """List every face model; those that the user added come last."""
     ours = [
         FaceModelInfo(name, source.licence, source.description, _is_baked(name, source))
         for name, source in _SOURCES.items()
@@ -98,17 +98,17 @@ def available_face_models() -> list[FaceModelInfo]:
 
 
 def is_built_in(name: str) -> bool:
-    """Whether mien brings a face model of that name."""
+    """Whether a face model of that name comes with mien."""
     return name in _SOURCES
 
 
 def add_face_model(model: FaceModel, source: Path, source_sha256: str) -> None:
-    """Keep a finished face model, landmarks and all, in the user's cache, to be loaded by its name from now on.
+    """Add a complete face model, with landmarks, to the user's cache. It can then be loaded by its name.
 
     Args:
-        model: Its name takes the place of one added before under the same name.
-        source: The user's file, to be named in messages.
-        source_sha256: Of its content.
+        model: The model. It replaces one that was added under the same name.
+        source: The user's file, for messages.
+        source_sha256: Hash of the file's content.
     """
     stem = _added_file(model.name)
     write_face_model(stem, model)
@@ -118,7 +118,7 @@ def add_face_model(model: FaceModel, source: Path, source_sha256: str) -> None:
 
 
 def added_from(name: str) -> dict[str, Any] | None:
-    """What a face model was added from (`path`, `sha256`), if the user added one of that name in today's way."""
+    """Return what the user added a model from (`path`, `sha256`), or None if it was not added by the current recipe."""
     try:
         content = read_json(_source_file(_added_file(name)), _SOURCE_FORMAT, 1)
     except UserError:
@@ -127,7 +127,10 @@ def added_from(name: str) -> dict[str, Any] | None:
 
 
 def write_face_model(stem: Path, model: FaceModel) -> None:
-    """Write STEM.safetensors and STEM.json; landmarks are left out. The json comes last and says that all is there."""
+    """Write STEM.safetensors and STEM.json, without landmarks.
+
+    The json comes last and shows that the files are complete.
+    """
     tensors = {name: value for name in _TENSORS if (value := getattr(model, name)) is not None}
     integers = {name: value.to(torch.int32) for name, value in tensors.items() if not value.is_floating_point()}
     write_tensors(_tensor_file(stem), {**tensors, **integers})
@@ -136,7 +139,7 @@ def write_face_model(stem: Path, model: FaceModel) -> None:
 
 
 def read_face_model(stem: Path, remedy: str = "delete it and load the model again") -> FaceModel:
-    """Read what `write_face_model` wrote, without landmarks; `remedy` is what to say where that fails.
+    """Read what `write_face_model` wrote, without landmarks. Messages of errors end with `remedy`.
 
     Raises:
         UserError: a file is missing, damaged or of another version, or its arrays do not fit each other.
@@ -157,15 +160,18 @@ def read_face_model(stem: Path, remedy: str = "delete it and load the model agai
 
 
 def face_model_edition(model: FaceModel) -> str:
-    """Tells editions of a model apart, alike on every machine: recipe and source of a baked one, else its hash."""
+    """Return an identifier of the model's edition, the same on every machine.
+
+    It is recipe and source version for a built-in model, else the content hash.
+    """
     return _SOURCES[model.name].tag() if model.name in _SOURCES else model.content_hash
 
 
 def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
-    """The landmark sets of a face model: those that ship with mien, or that were placed when the user added it.
+    """Return the landmark sets of a face model: those that ship with mien, or those placed when the user added it.
 
     Raises:
-        UserError: they were made for another mesh, or the name leads to other folders.
+        UserError: the landmarks were made for another mesh, or the name contains a path.
     """
     if not is_plain_name(name):
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
@@ -200,7 +206,7 @@ def _landmarks(marks: dict[str, Any], model: FaceModel) -> Landmarks:
 
 
 def write_landmarks(path: Path, model: FaceModel, command: str, error: float | None = None) -> None:
-    """Write a model's landmark sets as `read_landmarks` reads them; `error` is their median, pixels."""
+    """Write a model's landmark sets as `read_landmarks` reads them; `error` is their median error in pixels."""
     content = {
         "format": LANDMARK_FORMAT,
         "version": LANDMARK_VERSION,
@@ -253,7 +259,7 @@ def _widened(tensor: Tensor) -> Tensor:
     return tensor if tensor.is_floating_point() else tensor.to(torch.int64)
 
 
-# Not `with_suffix`: a version in the name has dots of its own.
+# Not `with_suffix`, since a version in the name contains dots.
 def _json_file(stem: Path) -> Path:
     return stem.with_name(f"{stem.name}.json")
 

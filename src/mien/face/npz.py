@@ -1,6 +1,6 @@
-"""Arrays of an .npz that somebody hands in: what a member announces is looked at before memory is taken for it.
+"""Read arrays of a user's .npz file. The announced size of a member is checked before memory is allocated.
 
-`numpy.load` believes the headers, and a member of 6 MB may unpack to gigabytes.
+`numpy.load` trusts the headers, and a member of 6 MB may unpack to gigabytes.
 """
 
 import math
@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 LARGEST_MODEL = 256 << 20
-"""Bytes of all arrays of a face model together; FLAME 2023 has 60 MB."""
+"""Largest size of all arrays of a face model together, in bytes. FLAME 2023 has 60 MB."""
 _LARGEST_DIRECTORY = 1 << 20
-"""Bytes of the list of members at the end of the archive; each member takes 50 or so."""
+"""Largest list of members at the end of the archive, in bytes. Each member takes about 50."""
 _END, _END_SIZE = b"PK\x05\x06", 22
 _END_OF_LARGE = b"PK\x06\x07"
-"""Of archives with more than 65,534 members, or of 4 GB and more."""
+"""Marker of archives with more than 65,534 members, or of 4 GB and more."""
 _LONGEST_COMMENT = 65535
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -26,12 +26,12 @@ _ENDING = ".npy"
 
 
 def read_npz(path: Path, wanted: Collection[str]) -> tuple[list[str], dict[str, np.ndarray]]:
-    """The names of all members of an .npz, and those arrays of plain numbers that are wanted and there.
+    """Return the names of all members of an .npz, and its wanted arrays of plain numbers.
 
     Raises:
-        ValueError: a wanted member is no array of plain numbers, stands there twice, or is damaged; or the arrays are
-            larger than `LARGEST_MODEL`.
-        Exception: what Python's `zipfile` raises for an archive that is none or is damaged.
+        ValueError: a wanted member is no array of plain numbers, occurs twice, or is damaged; or the arrays are larger
+            than `LARGEST_MODEL`.
+        Exception: whatever Python's `zipfile` raises for a file that is no archive or a damaged one.
     """
     _check_directory(path)
     with zipfile.ZipFile(path) as archive:
@@ -53,7 +53,7 @@ def read_npz(path: Path, wanted: Collection[str]) -> tuple[list[str], dict[str, 
 
 
 def _check_directory(path: Path) -> None:
-    """Refuse archives whose list of members alone would fill the memory."""
+    """Refuse archives with a list of members that would fill the memory."""
     with path.open("rb") as file:
         size = path.stat().st_size
         file.seek(max(0, size - _LONGEST_COMMENT - _END_SIZE))
@@ -82,7 +82,7 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, limit: int) 
         if size > limit:
             raise ValueError(f"has {size:,} bytes; the arrays of a face model have at most {LARGEST_MODEL:,} together")
         data = file.read(size)
-        # Reading on to the end has the checksum compared.
+        # Reading to the end makes zipfile compare the checksum.
         if len(data) != size or file.read(1):
             raise ValueError("is not as long as it says")
     values = np.frombuffer(data, kind).reshape(shape, order="F" if by_column else "C")

@@ -1,4 +1,4 @@
-"""FaceParams: what a face does at each timestep, in a face model's own parameters."""
+"""FaceParams: pose and expression of a face at each timestep, in a face model's own parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -19,20 +19,20 @@ class FaceParams:
     expression: Float[Tensor, "b e"]
     """Coefficients of the expression basis, mostly 0..1."""
     joints: Float[Tensor, "b j 3"]
-    """Axis-angle, radians, of the model's free joints (`FaceModel.free_joint_names`), zero at rest."""
+    """Axis-angle in radians of the model's free joints (`FaceModel.free_joint_names`), zero at rest."""
     head_rotation: Float[Tensor, "b 3"]
-    """Axis-angle of the head frame (+x to the subject's left, +y up, +z ahead) in world space, radians."""
+    """Axis-angle of the head frame (+x to the subject's left, +y up, +z ahead) in world space, in radians."""
     head_translation: Float[Tensor, "b 3"]
-    """Origin of the head frame in world space, metres."""
+    """Origin of the head frame in world space, in metres."""
     vertex_offsets: Float[Tensor, "v 3"] | None = None
-    """Static offsets of this subject's vertices in the head frame, metres."""
+    """Static offsets of this subject's vertices in the head frame, in metres."""
 
     def __len__(self) -> int:
         """The number of timesteps, b."""
         return self.expression.shape[0]
 
     def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> "FaceParams":
-        """Some timesteps; the batch axis stays, also for a single one."""
+        """Return some timesteps. The batch axis is kept, also for a single timestep."""
         if isinstance(index, int):
             index = slice(index, index + 1) if index != -1 else slice(-1, None)
         return replace(
@@ -45,24 +45,24 @@ class FaceParams:
 
     @property
     def T_world_head(self) -> Float[Tensor, "b 4 4"]:
-        """The pose of the head frame."""
+        """Pose of the head frame in world space."""
         return rigid_transform(matrix_from_axis_angle(self.head_rotation), self.head_translation)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Every tensor that is there, by the name of its field."""
+        """Return every tensor that is not None, by the name of its field."""
         return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None}
 
     def to(self, like: Tensor) -> "FaceParams":
-        """The same parameters with the dtype and device of `like`."""
+        """Return the same parameters with the dtype and device of `like`."""
         return FaceParams(**{name: tensor.to(like) for name, tensor in self.tensors().items()})
 
     def detach(self) -> "FaceParams":
-        """The same values, cut from the autograd graph."""
+        """Return the same values, detached from the autograd graph."""
         return FaceParams(**{name: tensor.detach() for name, tensor in self.tensors().items()})
 
 
 def concatenate(parts: Sequence[FaceParams]) -> FaceParams:
-    """The timesteps of all parts in a row; identity and offsets are the first part's."""
+    """Concatenate the timesteps of all parts. Identity and offsets are the first part's."""
     return replace(
         parts[0],
         expression=torch.cat([p.expression for p in parts]),

@@ -1,4 +1,4 @@
-"""The native way from face parameters to vertices and head poses: autograd around the C++ core; float32 on a CPU."""
+"""Native computation of vertices and head poses: autograd around the C++ core, for float32 on a CPU."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 _MOST_SHAPES = 256
-"""Expressions, and nine of each free joint: kMostFaceShapes of native/face.h."""
+"""Largest number of expressions plus nine per free joint: kMostFaceShapes of native/face.h."""
 
 
 def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:
-    """Whether `pose_vertices` takes this model and these parameters."""
+    """Whether `pose_vertices` supports this model and these parameters."""
     if model.expression_basis.shape[0] + 9 * len(model.free_joint_names) > _MOST_SHAPES:
         return False
     tensors = (model.template, *face.tensors().values())
@@ -30,7 +30,7 @@ def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:
 
 
 def pose_vertices(model: "FaceModel", face: FaceParams, in_world: bool) -> Float[Tensor, "b v 3"]:
-    """What `FaceModel.__call__` (in world space) or `FaceModel.head_vertices` returns; differentiable in all fields."""
+    """Compute `FaceModel.__call__` (in world space) or `FaceModel.head_vertices`, differentiable in all fields."""
     compiled = compiled_model(model)
     rest, joint_rest = compiled.rest_shape(model, face)
     head = (face.head_rotation, face.head_translation) if in_world else (None, None)
@@ -38,9 +38,11 @@ def pose_vertices(model: "FaceModel", face: FaceParams, in_world: bool) -> Float
 
 
 def head_poses(face: FaceParams) -> Float[Tensor, "b 4 4"]:
-    """`FaceParams.T_world_head` with the rounding of `mien.runtime`; differentiable, native for float32 on a CPU.
+    """Return `FaceParams.T_world_head` with the rounding of `mien.runtime`.
 
-    The two agree to 1e-6. What avatars give to renderers is this one, so that pictures without torch are the same.
+    They are differentiable, and computed natively for float32 on a CPU.
+
+    The two agree to 1e-6. Avatars pass this one to renderers, so that pictures are the same as those without torch.
     """
     rotation, translation = face.head_rotation, face.head_translation
     if any(tensor.dtype != torch.float32 or tensor.device.type != "cpu" for tensor in (rotation, translation)):
@@ -67,7 +69,7 @@ class _HeadPoses(torch.autograd.Function):
 
 
 class CompiledModel:
-    """A model's constants as the core keeps them, and the last person's shape: training asks for it in every step."""
+    """A model's constants in the core's layout, and the last person's shape, which training needs in every step."""
 
     def __init__(self, model: "FaceModel"):
         pose_basis = model.pose_basis
@@ -83,15 +85,15 @@ class CompiledModel:
         self._last: _Person | None = None
 
     def rest_shape(self, model: "FaceModel", face: FaceParams) -> tuple[Tensor, Tensor]:
-        """Vertices and joints of this person without expression."""
+        """Return vertices and joints of this person without expression."""
         identity, offsets = face.identity, face.vertex_offsets
         versions = (identity._version, None if offsets is None else offsets._version)
         last = self._last
-        # The tensors kept here are alive, so the same object with the same version is the same person.
+        # The stored tensors stay alive, so the same object with the same version is the same person.
         if last and last.identity is identity and last.offsets is offsets and last.versions == versions:
             return last.shape
         shape = model.rest_vertices(face), model.rest_joints(face)
-        # What is kept has to do for gradients as well, though it may have been asked for without them.
+        # A stored shape has to serve gradients too, although it may have been computed without them.
         if not (identity.requires_grad or (offsets is not None and offsets.requires_grad)):
             self._last = _Person(identity, offsets, versions, shape)
         return shape
@@ -106,7 +108,7 @@ class _Person:
 
 
 def compiled_model(model: "FaceModel") -> CompiledModel:
-    """A model as the core takes it, made once."""
+    """Return the model in the core's layout, which is made once."""
     compiled = _compiled.get(model)
     if compiled is None:
         compiled = _compiled[model] = CompiledModel(model)

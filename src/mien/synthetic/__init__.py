@@ -1,4 +1,4 @@
-"""Synthetic captures with exact ground truth: heads that are drawn, not filmed."""
+"""Synthetic captures with exact ground truth: heads that are drawn instead of filmed."""
 
 from mien.synthetic.recipe import RECIPES, Detail, Segment, SyntheticRecipe
 from mien.synthetic.references import REFERENCES, ReferenceCapture, reference_named

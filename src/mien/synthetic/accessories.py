@@ -1,4 +1,4 @@
-"""What a person wears: glasses, and a shirt on shoulders. Nothing here is known to the face model."""
+"""Build what a person wears: glasses, and a shirt over shoulders. The face model has none of it."""
 
 from dataclasses import dataclass
 
@@ -22,14 +22,14 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Glasses:
-    """In the head frame."""
+    """A pair of glasses in the head frame."""
 
     frame: Part
     lenses: Part
 
 
 def build_glasses(anatomy: Anatomy) -> Glasses:
-    """Rims around both eyes, a bridge over the nose, temples to the ears."""
+    """Build rims around both eyes, a bridge over the nose, and temples to the ears."""
     pupils = np.stack([anatomy.landmarks[468], anatomy.landmarks[473]])
     middle = pupils.mean(0)
     front = float(anatomy.landmarks[[33, 133, 362, 263, 159, 386], 2].max()) + 0.010
@@ -42,7 +42,7 @@ def build_glasses(anatomy: Anatomy) -> Glasses:
         turn = np.linspace(0, 2 * np.pi, 56, endpoint=False)
         shape = np.stack([_power(np.cos(turn), 0.62) * half_width, _power(np.sin(turn), 0.62) * half_height], -1)
         shape[:, 0] += 0.003 * side * np.abs(np.sin(turn))  # leaves room for the nose
-        # Wraps around the face, and leans forward at the top.
+        # The rims wrap around the face and lean forward at the top.
         depth = -0.25 * (centre[0] + shape[:, 0]) ** 2 / 0.06 + 0.12 * shape[:, 1]
         rim = np.stack([centre[0] + shape[:, 0], centre[1] + shape[:, 1], front + depth + 0.004], -1)
         tubes.append(_tube(rim, 0.00165, closed=True))
@@ -107,18 +107,19 @@ def build_shirt(
     shoulder_points: Float[np.ndarray, "p 3"],
     seed: int,
 ) -> Part:
-    """Shoulders in a shirt with a round collar.
+    """Build shoulders in a shirt with a round collar.
 
     Args:
-        neck: Middle of the neck where the collar lies.
-        neck_size: Its half width and half depth there.
-        shoulder_points: Skin beside the neck that the shirt covers.
-        seed: Of the folds.
+        neck: Middle of the neck at the height of the collar.
+        neck_size: Half width and half depth of the neck there.
+        shoulder_points: Points of the skin beside the neck, which the shirt covers.
+        seed: Seed of the folds.
     """
     wide_neck, deep_neck = neck_size
     noise = SolidNoise(seed + 77)
     turn = np.linspace(0, 2 * np.pi, 96, endpoint=False)
-    # Height below the collar, half width, half depth, shift ahead, exponent of the superellipse: metres.
+    # One ring per row: height above the collar, half width, half depth, shift forward (metres), exponent of the
+    # superellipse.
     rings = np.array([
         [-0.012, 0.90 * wide_neck, 0.90 * deep_neck, 0.0, 1.0],
         [0.006, 1.05 * wide_neck, 1.05 * deep_neck, 0.0, 1.0],
@@ -158,7 +159,7 @@ def build_shirt(
 
 
 def _laid_over(grid: Float[np.ndarray, "r c 3"], points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "r c 3"]:
-    """The cloth lifted, smoothly, to where it is 5 mm above all points under it."""
+    """Lift the cloth smoothly until it is 5 mm above all points under it."""
     flat = grid.reshape(-1, 3)
     lift = np.zeros(len(flat))
     for start in range(0, len(flat), 256):
@@ -174,7 +175,7 @@ def _laid_over(grid: Float[np.ndarray, "r c 3"], points: Float[np.ndarray, "p 3"
 
 
 def _grid_faces(rows: int, columns: int, *, closed_rows: bool) -> Int[np.ndarray, "f 3"]:
-    """Triangles of a grid whose rows are rings; with `closed_rows` the last row meets the first."""
+    """Return the triangles of a grid whose rows are rings. With `closed_rows` the last row joins the first."""
     row = np.arange(rows if closed_rows else rows - 1)[:, None]
     column = np.arange(columns)[None]
     after, beside = (row + 1) % rows, (column + 1) % columns

@@ -1,4 +1,4 @@
-"""Where things are on one subject's head at rest: what painters, hairdressers and opticians need to know."""
+"""Places on one subject's head at rest, for the code that paints skin and adds hair and glasses."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +12,7 @@ from mien import exact
 from mien.face import FaceModel
 from mien.synthetic.posing import landmark_positions, rest_vertices
 
-# MediaPipe's indices; "right" is the subject's right.
+# MediaPipe's landmark indices. "right" is the subject's right.
 LIPS_OUTER = (61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185)
 LIPS_INNER = (78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308, 415, 310, 311, 312, 13, 82, 81, 80, 191)
 UPPER_LIDS = {
@@ -34,7 +34,7 @@ _ELEVATIONS, _AZIMUTHS = 64, 128
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """A subject at rest, in the head frame, metres."""
+    """A subject at rest, in the head frame, in metres."""
 
     model: FaceModel
     vertices: Float[np.ndarray, "v 3"]
@@ -45,26 +45,26 @@ class Anatomy:
 
     @cached_property
     def skin(self) -> Bool[np.ndarray, " f"]:
-        """Triangles of the outer skin, lips and lids included."""
+        """Mask of the triangles of the outer skin, lips and lids included."""
         return ~self.region("eyes", "irises", "eye_sockets", "teeth", "tongue", "mouth")
 
     def region(self, *names: str) -> Bool[np.ndarray, " f"]:
-        """Triangles of the named regions."""
+        """Return the mask of the triangles of the named regions."""
         return self.model.region_mask(*names).numpy()
 
     def eye_vertices(self, side: str) -> Int[np.ndarray, " e"]:
-        """Vertices of one eyeball."""
+        """Return the vertices of one eyeball."""
         members = np.unique(self.faces[self.region("eyes", "irises")])
         return members[(self.vertices[members, 0] > 0) == (side == "left")]
 
     def curve(self, indices: tuple[int, ...], points: int) -> Float[np.ndarray, "p 3"]:
-        """Points at equal distances along a chain of landmarks."""
+        """Return points at equal distances along a chain of landmarks."""
         corners = self.landmarks[list(indices)]
         return resample(corners, points)
 
     @cached_property
     def skull_centre(self) -> Float[np.ndarray, " 3"]:
-        """About the middle of the skull: hair grows away from it."""
+        """Approximate centre of the skull. Hair grows away from it."""
         top = self.vertices[:, 1].max()
         forehead = self.landmarks[FOREHEAD_TOP]
         back = self.vertices[np.abs(self.vertices[:, 1] - forehead[1]) < 0.03, 2].min()
@@ -72,7 +72,7 @@ class Anatomy:
 
     @cached_property
     def _radii(self) -> Float[np.ndarray, "e a"]:
-        """Distance of the skull's skin from its centre by direction, without the ears."""
+        """Distance of the skin from the skull's centre by direction, without the ears."""
         faces = self.faces[self.skin & ~self.region("ears")]
         random = np.random.default_rng(0)
         weights = random.dirichlet((1, 1, 1), (len(faces), 24)).astype(np.float32)
@@ -90,7 +90,7 @@ class Anatomy:
         return smooth[:, _AZIMUTHS : 2 * _AZIMUTHS]
 
     def skull_radius(self, directions: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
-        """Distance of the skin from `skull_centre` in unit directions, ears left out, smoothed."""
+        """Return the smoothed distance of the skin, without ears, from `skull_centre` in unit directions."""
         row, column = _cells(directions)
         wrapped = np.concatenate([self._radii, self._radii[:, :1]], axis=1)
         row = np.clip(row - 0.5, 0, _ELEVATIONS - 1.001)
@@ -102,7 +102,7 @@ class Anatomy:
         return above * (1 - fr) + below * fr
 
     def hair_share(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """1 well inside the hairline, 0 well outside; 4 mm between."""
+        """Return 1 inside the hairline and 0 outside, with a ramp of 4 mm between."""
         around = np.degrees(np.abs(np.arctan2(points[:, 0], points[:, 2] - self.skull_centre[2])))
         eye = self.landmarks[[33, 263], 1].mean()
         nose, mouth, top = (self.landmarks[i, 1] for i in (NOSE_BASE, MOUTH_TOP, FOREHEAD_TOP))
@@ -116,7 +116,7 @@ class Anatomy:
 
 
 def measure(model: FaceModel, identity: torch.Tensor) -> Anatomy:
-    """The anatomy of a person at rest."""
+    """Return the anatomy of a person at rest."""
     rest, faces = rest_vertices(model, identity), model.faces.numpy()
     return Anatomy(
         model=model,
@@ -128,21 +128,21 @@ def measure(model: FaceModel, identity: torch.Tensor) -> Anatomy:
 
 
 def resample(corners: Float[np.ndarray, "c 3"], points: int) -> Float[np.ndarray, "p 3"]:
-    """Points at equal distances along a chain."""
+    """Return points at equal distances along a chain of points."""
     lengths = np.concatenate([[0], np.cumsum(exact.length(np.diff(corners, axis=0)))])
     places = np.linspace(0, lengths[-1], points)
     return np.stack([np.interp(places, lengths, corners[:, axis]) for axis in range(3)], -1).astype(np.float32)
 
 
 def _cells(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row (by elevation) and column (by azimuth) of the map of radii, as fractions."""
+    """Return fractional row (elevation) and column (azimuth) in the map of radii."""
     elevation = np.arcsin(np.clip(directions[..., 1], -1, 1)) / np.pi + 0.5
     azimuth = np.arctan2(directions[..., 0], directions[..., 2]) / (2 * np.pi) + 0.5
     return np.clip(elevation * _ELEVATIONS, 0, _ELEVATIONS - 1e-3), azimuth * _AZIMUTHS
 
 
 class FrontView:
-    """A parallel view of the face from the front, to paint on and to find skin points by (x, y)."""
+    """An orthographic view of the face from the front, to paint on and to sample at points of the skin by (x, y)."""
 
     def __init__(
         self, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"], texels_per_metre: float = 5000.0
@@ -153,17 +153,17 @@ class FrontView:
         self.shape = (round(height * texels_per_metre), round(width * texels_per_metre))
 
     def pixels(self, points: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n 2"]:
-        """Columns and rows; rows go up."""
+        """Return columns and rows of points; rows go up."""
         return (points[:, :2] - self._origin) * self._scale
 
     def polygon(self, corners: Float[np.ndarray, "c 3"], blur: float) -> Float[np.ndarray, "h w"]:
-        """A filled outline with edges softened over `blur` metres."""
+        """Return a filled outline with edges softened over `blur` metres."""
         image = np.zeros(self.shape, np.uint8)
         cv2.fillPoly(image, [np.round(self.pixels(corners) * 16).astype(np.int32)], 255, cv2.LINE_AA, 4)
         return self._soften(image, blur)
 
     def line(self, corners: Float[np.ndarray, "c 3"], width: float, blur: float) -> Float[np.ndarray, "h w"]:
-        """A line of `width` metres, softened."""
+        """Return a softened line of `width` metres."""
         image = np.zeros(self.shape, np.uint8)
         points = np.round(self.pixels(corners) * 16).astype(np.int32)
         cv2.polylines(image, [points], False, 255, max(round(width * self._scale), 1), cv2.LINE_AA, 4)
@@ -173,9 +173,9 @@ class FrontView:
         return cv2.GaussianBlur(image.astype(np.float32) / 255, (0, 0), max(blur * self._scale, 0.3))
 
     def look_up(self, image: Float[np.ndarray, "h w"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """The painting at points of space; 0 outside."""
+        """Sample the painting at points in space; 0 outside."""
         place = self.pixels(points).astype(np.float32)
-        # remap takes pictures of at most 32767 texels a side
+        # remap supports at most 32767 texels a side
         rows = -(-len(place) // 4096)
         padded = np.full((rows * 4096, 2), -1e4, np.float32)
         padded[: len(place)] = place - 0.5
@@ -184,6 +184,6 @@ class FrontView:
 
 
 def face_view(anatomy: Anatomy) -> FrontView:
-    """A front view that holds the whole face."""
+    """Return a front view that contains the whole face."""
     low, high = anatomy.landmarks.min(0) - 0.01, anatomy.landmarks.max(0) + 0.02
     return FrontView(low[:2], high[:2])

@@ -1,4 +1,4 @@
-"""A full beard: moustache, chin and jaw in strands that grow on the skin and move with it."""
+"""A full beard: moustache, chin and jaw, made of strands that grow on the skin and move with it."""
 
 from dataclasses import dataclass
 
@@ -16,18 +16,18 @@ _COUNT, _STEPS = 5200, 7
 
 @dataclass(frozen=True, eq=False)
 class RootedStrands:
-    """Strands of which each keeps its shape in the frame of the skin that it grows from."""
+    """Strands that each keep their shape in the frame of the skin where they grow."""
 
     faces: Int[np.ndarray, " n"]
-    """Triangles of the face model."""
+    """Index of each root's triangle in the face model."""
     barycentric: Float[np.ndarray, "n 3"]
     local: Float[np.ndarray, "n s 3"]
-    """Offsets from the root in the frame of `_frames`, metres."""
+    """Offsets from the root in the frame of `_frames`, in metres."""
     widths: Float[np.ndarray, "n s"]
     colors: Float[np.ndarray, "n s 3"]
 
     def posed(self, anatomy: Anatomy, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Strands:
-        """The strands on a head in motion (head frame)."""
+        """Return the strands on a posed head, in the head frame."""
         roots, frames = _frames(anatomy, self.faces, self.barycentric, vertices, normals)
         points = roots[:, None] + exact.product(self.local, np.swapaxes(frames, 1, 2))
         outwards = np.repeat(frames[:, None, :, 2], points.shape[1], axis=1)
@@ -35,7 +35,7 @@ class RootedStrands:
 
 
 def beard_zone(anatomy: Anatomy, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """1 where a beard grows, 0 elsewhere, soft between; the lips are not left out."""
+    """Return 1 where a beard grows and 0 elsewhere, with soft borders. The lips are not excluded."""
     marks = anatomy.landmarks
     nose, mouth = marks[places.NOSE_BASE], marks[places.MOUTH_TOP]
     width = 0.5 * abs(marks[454, 0] - marks[234, 0])
@@ -46,7 +46,7 @@ def beard_zone(anatomy: Anatomy, points: Float[np.ndarray, "n 3"]) -> Float[np.n
 
 
 def full_beard(anatomy: Anatomy, color: Float[np.ndarray, " 3"], length: float, seed: int) -> RootedStrands:
-    """Hairs that leave the skin at a slant, down and aside, and curl; `length` in metres at the chin."""
+    """Grow hairs that leave the skin at a slant, down and sideways, and curl; `length` at the chin is in metres."""
     random, noise = np.random.default_rng([seed, 10]), SolidNoise(seed + 53)
     faces, barycentric, roots = _roots(anatomy, random)
     _, frames = _frames(anatomy, faces, barycentric, anatomy.vertices, anatomy.normals)
@@ -81,7 +81,7 @@ def full_beard(anatomy: Anatomy, color: Float[np.ndarray, " 3"], length: float, 
 
 
 def _roots(anatomy: Anatomy, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles, barycentric coordinates and places of the roots: in the zone, not on the lips."""
+    """Choose triangles, barycentric coordinates and positions of the roots in the beard zone, but not on the lips."""
     candidates = np.flatnonzero(anatomy.skin & ~anatomy.region("ears", "nose"))
     corners = anatomy.vertices[anatomy.faces[candidates]]
     areas = exact.length(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
@@ -105,7 +105,7 @@ def _roots(anatomy: Anatomy, random: np.random.Generator) -> tuple[np.ndarray, n
 def _frames(
     anatomy: Anatomy, faces: np.ndarray, barycentric: np.ndarray, vertices: np.ndarray, normals: np.ndarray
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
-    """Roots, and frames whose columns are a tangent along the triangle's first edge, a second tangent, the normal."""
+    """Return roots, and frames with these columns: tangent along the triangle's first edge, second tangent, normal."""
     index = anatomy.faces[faces]
     corners = vertices[index]
     normal = unit(exact.mixed(barycentric, normals[index]))

@@ -1,8 +1,10 @@
-"""How a landmark detector sees a face model's points on people: `python -m mien.synthetic.detector_calibration anny`.
+"""Measure where a landmark detector finds a face model's points on people.
 
-Draws synthetic people with skin, hair, glasses and beards through lenses of all kinds, lets the detector look at them,
-and fits what `mien.tracking.detector_response` describes. The result ships with mien (src/mien/tracking/data), so that
-only who changes a face model, its landmarks or the painter has to run this: 200 people take half an hour.
+Run as `python -m mien.synthetic.detector_calibration anny`.
+
+It draws synthetic people with skin, hair, glasses and beards through many kinds of lenses, runs the detector on them,
+and fits the model of `mien.tracking.detector_response`. The result ships with mien (src/mien/tracking/data). Run this
+only after a change of a face model, its landmarks or the painter: 200 people take half an hour.
 """
 
 from collections.abc import Sequence
@@ -24,39 +26,39 @@ from mien.synthetic.scene import SyntheticScene
 from mien.tracking.detector_response import DetectorResponse, response_path, write_response
 
 _FIRST_SEED = 500
-"""Far from those of the reference captures: nobody is measured on people that were calibrated on."""
+"""First seed, far from those of the reference captures, so that nobody is both calibrated on and measured on."""
 _LOOKS = 2
-"""Times that each picture is shown: the detector follows a face from picture to picture."""
+"""Times that each picture is shown to the detector, which follows a face from picture to picture."""
 _FOCALS = (1.2, 1.7, 2.4, 3.2)
-"""Of the picture's width."""
+"""Focal lengths in picture widths."""
 _WRONG = 0.008
-"""Metres of median offset beyond which the detector found something else."""
+"""Median offset in metres above which the detector has found something else."""
 _LEAST_PICTURES = 5
-"""Of a person."""
+"""Fewest pictures of a person."""
 _DEPTH_RIDGE = 0.05
-"""Pull of a person's offsets towards zero, in pictures: depth is seen in turned heads only."""
+"""Regularisation of a person's offsets towards zero, in pictures. Only turned heads show depth."""
 _HABIT_RIDGE = 2.0
-"""Pull of what follows turns and expressions towards zero, in pictures."""
+"""Regularisation of the response to turns and expressions towards zero, in pictures."""
 _ROUNDS = 6
-"""Of habits and people in turn."""
+"""Rounds that alternate between habits and people."""
 _COMPONENTS = 40
 _FOLDS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """What the detector made of n pictures of one person, beside what was there."""
+    """Detections in n pictures of one person, and the truth beside them."""
 
     R_seen: Float[Tensor, "n 2 3"]
-    """From the head frame onto the picture's axes."""
+    """Rotation from the head frame onto the picture's axes."""
     across: Float[Tensor, "n l 2"]
-    """From the model's points to the detector's, metres at the points' depth."""
+    """Offsets from the model's points to the detector's, in metres at the points' depth."""
     habits: Float[Tensor, "n h"]
-    """What offsets may follow: two turns, then the expression."""
+    """Regressors that offsets may depend on: two turns, then the expression."""
 
 
 def sight_person(seed: int, face_model: FaceModel) -> Sightings:
-    """Draw one person, who turns the head and pulls faces, and ask the detector."""
+    """Draw one person who turns the head and makes faces, and run the detector."""
     scene = SyntheticScene(_recipe(seed, face_model), seed)
     found = []
     with LandmarkDetector(several_faces=False) as detector:
@@ -80,10 +82,10 @@ def sight_person(seed: int, face_model: FaceModel) -> Sightings:
 
 
 def fit_response(people: Sequence[Sightings], components: int = _COMPONENTS) -> DetectorResponse:
-    """The linear model that explains what the detector made of these people, by least squares.
+    """Fit the linear model that explains the detections of these people by least squares.
 
     Raises:
-        UserError: the detector found too few of them.
+        UserError: the detector found too few people.
     """
     people = [person for person in people if len(person.R_seen) >= _LEAST_PICTURES]
     if len(people) < 2 * _FOLDS:
@@ -120,7 +122,7 @@ def _recipe(seed: int, face_model: FaceModel) -> SyntheticRecipe:
 
 
 def _offsets(person: Sightings, across: Float[Tensor, "n l 2"]) -> Float[Tensor, "l 3"]:
-    """In the head frame, of what was seen across the line of sight."""
+    """Fit offsets in the head frame to offsets across the line of sight."""
     n = len(across)
     hessian = torch.einsum("nxc,nxd->cd", person.R_seen, person.R_seen) / n + _DEPTH_RIDGE * torch.eye(3)
     return torch.linalg.solve(hessian, torch.einsum("nxc,nlx->cl", person.R_seen, across) / n).T
@@ -142,29 +144,29 @@ def _explained(person: Sightings, habits: Float[Tensor, "h l 3"]) -> Float[Tenso
 
 
 def _principal_components(of_people: Float[Tensor, "n f"], count: int) -> Float[Tensor, "k f"]:
-    """Each as long as its standard deviation."""
+    """Return principal components, each as long as its standard deviation."""
     _, lengths, directions = torch.linalg.svd(of_people, full_matrices=False)
     count = min(count, len(of_people) - 1)
     return directions[:count] * lengths[:count, None] / (len(of_people) - 1) ** 0.5
 
 
 def _unexplained(of_people: Float[Tensor, "n f"], count: int) -> float:
-    """Root mean square along each axis of what components of the others leave of a person, in a fit of unit noise."""
+    """Return the RMS per axis of what the components of other people leave of a person, in a fit with unit noise."""
     squares, fold = [], torch.arange(len(of_people)) % _FOLDS
     for left_out in range(_FOLDS):
         basis, others = _principal_components(of_people[fold != left_out], count), of_people[fold == left_out]
-        # Lengths are metres here; a millimetre is the noise that a tracker expects of a landmark.
+        # Lengths are in metres here. A tracker expects noise of a millimetre in a landmark.
         hessian = basis @ basis.T + 1e-6 * torch.eye(len(basis))
         squares.append((others - torch.linalg.solve(hessian, basis @ others.T).T @ basis).square().flatten())
     return float(torch.cat(squares).mean().sqrt())
 
 
 def main(name: tyro.conf.Positional[str] = "anny", people: int = 200) -> None:
-    """Measure how the landmark detector sees a face model on people, and write it into the package's data.
+    """Measure where the landmark detector finds a face model's points, and write the result into the package's data.
 
     Args:
         name: The face model.
-        people: How many to draw; each takes some 8 seconds.
+        people: Number of people to draw; each takes about 8 seconds.
     """
     face_model = load_face_model(name)
     seeds = range(_FIRST_SEED, _FIRST_SEED + people)

@@ -1,4 +1,4 @@
-"""What a face does over time: talk, smiles and frowns, posed expressions, blinks; coefficients by ARKit's names."""
+"""A face's expressions over time: speech, smiles and frowns, posed expressions, blinks. Names are ARKit's."""
 
 from collections.abc import Callable, Mapping
 
@@ -8,7 +8,7 @@ from mien.synthetic.noise import smoothstep
 from mien.synthetic.script import Span
 
 Tracks = dict[str, np.ndarray]
-"""Coefficients over time. A name without its side means both."""
+"""Coefficients over time by name. A name without a side means both sides."""
 
 _VISEMES: dict[str, Mapping[str, float]] = {
     "rest": {},
@@ -51,14 +51,14 @@ _POSED: dict[str, Mapping[str, float]] = {
 def expression_tracks(
     random: np.random.Generator, times: np.ndarray, scale: float, spans: tuple[Span, ...], *, blinks: bool
 ) -> Tracks:
-    """Every coefficient that is not always 0, over time.
+    """Return every coefficient over time that is not always 0.
 
     Args:
         random: Decides timing and order.
-        times: Seconds.
-        scale: Of all but blinks.
-        spans: The script.
-        blinks: Whether there are any.
+        times: Times in seconds.
+        scale: Scale of everything but blinks.
+        spans: Spans of the script.
+        blinks: Whether to add blinks.
     """
     tracks: Tracks = {}
     for span in spans:
@@ -78,7 +78,7 @@ def _add(tracks: Tracks, shape: Mapping[str, float], weight: np.ndarray, factors
 
 
 def _add_speech(random: np.random.Generator, times: np.ndarray, span: Span, tracks: Tracks) -> None:
-    """Phrases of one to two seconds: visemes every 0.12 to 0.24 s that flow into each other, then a pause."""
+    """Add phrases of one to two seconds: visemes every 0.12 to 0.24 s that blend into each other, then a pause."""
     names = [name for name in _VISEMES if name != "rest"]
     keys, shapes, loudness = [span.start], ["rest"], [1.0]
     clock = span.start + random.uniform(0.1, 0.4)
@@ -101,7 +101,7 @@ def _add_speech(random: np.random.Generator, times: np.ndarray, span: Span, trac
 
 
 def _add_gestures(random: np.random.Generator, times: np.ndarray, span: Span, tracks: Tracks) -> None:
-    """Smiles, raised and lowered brows that come, stay and go; every kind returns."""
+    """Add smiles, raised and lowered brows that rise, hold and fall. Every kind recurs."""
     order: list[str] = []
     clock = span.start + random.uniform(0.2, 0.8)
     while clock < span.end:
@@ -116,7 +116,7 @@ def _add_gestures(random: np.random.Generator, times: np.ndarray, span: Span, tr
 
 
 def _add_posed(random: np.random.Generator, times: np.ndarray, span: Span, tracks: Tracks) -> None:
-    """One posed expression after the other: in, held, out; every kind before one returns."""
+    """Add one posed expression after the other: rise, hold, fall. All kinds occur before one recurs."""
     order: list[str] = []
     clock = span.start + 0.2
     while clock < span.end - 1.0:
@@ -129,7 +129,7 @@ def _add_posed(random: np.random.Generator, times: np.ndarray, span: Span, track
 
 
 def _add_blinks(random: np.random.Generator, times: np.ndarray, spans: tuple[Span, ...], tracks: Tracks) -> None:
-    """Closed in a third of a blink of 0.18 to 0.3 s, opened in the rest, every 1.2 to 3.5 s."""
+    """Add blinks every 1.2 to 3.5 s. They last 0.18 to 0.3 s and close in a third of that."""
     clock = random.uniform(0.5, 1.5)
     closed = np.zeros_like(times)
     while clock < times[-1]:

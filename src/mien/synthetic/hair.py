@@ -1,4 +1,4 @@
-"""Strands: hair on the scalp, brows and lashes. Curves with a width, drawn as ribbons that face the camera."""
+"""Strands of hair: scalp, brows and lashes. They are curves with a width, drawn as ribbons that face the camera."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,13 +16,13 @@ class Strands:
     """n strands of s points that move rigidly with the head."""
 
     points: Float[np.ndarray, "n s 3"]
-    """Head frame, metres."""
+    """Positions in the head frame, in metres."""
     widths: Float[np.ndarray, "n s"]
-    """Metres."""
+    """Widths in metres."""
     colors: Float[np.ndarray, "n s 3"]
-    """Linear albedo, darker where the hair shades itself."""
+    """Linear albedo, darker where hair shades itself."""
     outwards: Float[np.ndarray, "n s 3"]
-    """Unit directions away from what the hair lies on."""
+    """Unit directions away from the surface under the hair."""
 
     @cached_property
     def tangents(self) -> Float[np.ndarray, "n s 3"]:
@@ -30,40 +30,40 @@ class Strands:
         return unit(np.gradient(self.points, axis=1).astype(np.float32))
 
     def ribbon_vertices(self, viewpoint: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "v 3"]:
-        """Two vertices a point, apart by its width, across the view from `viewpoint` (head frame)."""
+        """Return two vertices per point, one width apart, across the view from `viewpoint` (head frame)."""
         across = np.cross(self.tangents, viewpoint - self.points)
         return ribbon(self.points, unit(across), self.widths)
 
 
 def ribbon_faces(strands: int, points: int) -> Int[np.ndarray, "f 3"]:
-    """Triangles over the `ribbon_vertices` of so many strands with so many points each."""
+    """Return the triangles over `ribbon_vertices`, given the numbers of strands and of points per strand."""
     start = 2 * (np.arange(strands)[:, None] * points + np.arange(points - 1))
     quads = np.stack([start, start + 1, start + 3, start, start + 3, start + 2], -1)
     return quads.reshape(-1, 3).astype(np.int64)
 
 
 def ribbon(points: np.ndarray, across: np.ndarray, widths: np.ndarray) -> Float[np.ndarray, "v 3"]:
-    """Left and right edge of every point."""
+    """Return the left and right edges of every point."""
     half = 0.5 * widths[..., None] * across
     return np.stack([points - half, points + half], axis=2).reshape(-1, 3).astype(np.float32)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Scaled to length 1."""
+    """Return the vectors scaled to length 1."""
     return vectors * (1 / np.sqrt(dot(vectors, vectors) + 1e-20))[..., None]
 
 
 def along(vectors: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Scalar products with one direction, in the dtype of `vectors`."""
+    """Return scalar products with one direction, in the dtype of `vectors`."""
     x, y, z = direction.tolist()
     return vectors[..., 0] * x + vectors[..., 1] * y + vectors[..., 2] * z
 
 
 def short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, count: int = 9000) -> Strands:
-    """A side parting: long on top, short at the sides and the nape.
+    """Grow short hair with a side parting: long on top, short at the sides and the nape.
 
-    A strand walks over the skull in the direction it is combed to, at a height that its layer gives, so it never
-    enters the head.
+    A strand follows the skull in the direction in which it is combed, at the height of its layer, so it never enters
+    the head.
     """
     random, noise = np.random.default_rng([seed, 3]), SolidNoise(seed + 31)
     roots = scalp_points(anatomy, count, random)
@@ -98,7 +98,7 @@ def short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, coun
 
 
 def scalp_points(anatomy: Anatomy, count: int, random: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-    """Places on the scalp where hair grows, evenly spread, thinning out at the hairline."""
+    """Sample roots on the scalp, evenly spread and sparser towards the hairline."""
     faces = anatomy.faces[anatomy.skin & ~anatomy.region("ears")]
     corners = anatomy.vertices[faces]
     areas = length(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
@@ -118,7 +118,7 @@ def scalp_points(anatomy: Anatomy, count: int, random: np.random.Generator) -> F
 def _combed(
     points: Float[np.ndarray, "n 3"], centre: np.ndarray, part: float, noise: SolidNoise
 ) -> Float[np.ndarray, "n 3"]:
-    """Away from the parting on top, down and back at the sides, down at the back; in locks."""
+    """Return the combing direction in locks: away from the parting on top, down and back at the sides and behind."""
     relative = points - centre
     top = smoothstep(0.2, 0.85, relative[:, 1] / length(relative))
     front = smoothstep(0.0, 0.08, relative[:, 2])
@@ -133,18 +133,18 @@ def _combed(
 
 @dataclass(frozen=True, eq=False)
 class SkinStrands:
-    """Brow hairs: every point lies over a triangle of the skin and moves with it."""
+    """Brow hairs. Every point lies over a triangle of the skin and moves with it."""
 
     faces: Int[np.ndarray, "n s"]
-    """Triangles of the face model."""
+    """Index of each point's triangle in the face model."""
     barycentric: Float[np.ndarray, "n s 3"]
     heights: Float[np.ndarray, "n s"]
-    """Above the skin, metres."""
+    """Heights above the skin, in metres."""
     widths: Float[np.ndarray, "n s"]
     colors: Float[np.ndarray, "n s 3"]
 
     def posed(self, anatomy: Anatomy, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Strands:
-        """The strands on a head in motion (head frame)."""
+        """Return the strands on a posed head, in the head frame."""
         corners = anatomy.faces[self.faces]
         outwards = unit(mixed(self.barycentric, normals[corners]))
         points = mixed(self.barycentric, vertices[corners]) + self.heights[..., None] * outwards
@@ -154,7 +154,7 @@ class SkinStrands:
 def brow_strands(
     anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, per_side: int = 620, steps: int = 4
 ) -> SkinStrands:
-    """Hairs that rise at the inner end of the brow and lie along it towards the temple."""
+    """Grow hairs that rise at the inner end of the brow and lie along it towards the temple."""
     random = np.random.default_rng([seed, 4])
     curves = []
     for side in SIDES:
@@ -183,7 +183,7 @@ def brow_strands(
 
 
 def _between(lower: np.ndarray, upper: np.ndarray, u: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "n s 3"]:
-    """Bilinear points of the band between two chains; `u` along (it may pass the end), `v` across."""
+    """Interpolate bilinearly in the band between two chains; `u` runs along it (and may exceed 1), `v` across."""
     place = u * (len(lower) - 1)
     index = np.clip(place.astype(int), 0, len(lower) - 2)
     fraction = (place - index)[..., None]
@@ -195,7 +195,7 @@ def _between(lower: np.ndarray, upper: np.ndarray, u: np.ndarray, v: np.ndarray)
 def front_points(
     anatomy: Anatomy, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """The skin triangle and the barycentric coordinates nearest to each point, by the triangles' planes."""
+    """Return the skin triangle and the barycentric coordinates nearest to each point, by the triangles' planes."""
     candidates = np.flatnonzero(anatomy.skin)
     corners = anatomy.vertices[anatomy.faces[candidates]]
     centres = corners.mean(1)
@@ -233,14 +233,14 @@ def lash_strands(
     eye_radius: float,
     steps: int = 4,
 ) -> Strands:
-    """Lashes along the posed rims of the lids: outwards from the eyeball, the upper ones curling up."""
+    """Grow lashes along the posed rims of the lids, outwards from the eyeball. Upper ones curl up."""
     points, outwards, widths = [], [], []
     on_lid = eye_radius + 0.0012
     for side, centre in zip(SIDES, eye_centres, strict=True):
         for rims, longest, curl, count in ((UPPER_LIDS, 0.0058, 0.62, 44), (LOWER_LIDS, 0.0030, -0.5, 24)):
             roots = resample(landmarks[list(rims[side])], count + 6)[3:-3]
             radial = unit(roots - centre)
-            # Where landmarks lie on the inner fold of a lid, lashes start on its outside.
+            # If landmarks lie on the inner fold of a lid, lashes still start on its outside.
             roots = centre + np.maximum(length(roots - centre)[:, None], on_lid) * radial
             aside = np.linspace(0.6, -0.25, count)[:, None] * np.array([1.0 if side == "left" else -1.0, 0, 0])
             vary = 1 + 0.25 * np.sin(np.arange(count) * 12.9898) * np.cos(np.arange(count) * 4.1)

@@ -1,4 +1,4 @@
-"""Light: a soft key from one side, a fill, a rim and the room, as 9 spherical-harmonic coefficients; and shadows."""
+"""Light as 9 spherical-harmonic coefficients (a soft key from one side, a fill, a rim and the room), and shadows."""
 
 import math
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from mien.camera import Camera, look_at
 from mien.render.mesh import rasterize_mesh, sh_basis
 from mien.synthetic.posing import project
 
-# Clamped cosine in spherical harmonics, degrees 0, 1, 2 (Ramamoorthi and Hanrahan 2001, "An efficient representation
+# Clamped cosine in spherical harmonics of degrees 0, 1, 2 (Ramamoorthi and Hanrahan 2001, "An efficient representation
 # for irradiance environment maps").
 _CLAMPED_COSINE = np.array([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5, np.float32)
-# Those of `mien.render.mesh.sh_basis`.
+# Factors of `mien.render.mesh.sh_basis`.
 _SH_FACTORS = np.array([
     0.28209479177387814, *[0.4886025119029199] * 3, *[1.0925484305920792] * 2, 0.31539156525252005,
     1.0925484305920792, 0.5462742152960396,
 ])  # fmt: skip
 _DIRECTIONS = 112
 _MAP_SIZE = 224
-_MAP_DISTANCE = 20.0  # metres: nearly parallel rays, and depths that float32 still tells apart
+_MAP_DISTANCE = 20.0  # metres: nearly parallel rays, and depths that float32 can still separate
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,24 +30,24 @@ class Lamp:
     """A distant soft light."""
 
     direction: Float[np.ndarray, " 3"]
-    """Towards the lamp, unit, world space."""
+    """Unit direction towards the lamp, in world space."""
     color: Float[np.ndarray, " 3"]
-    """What a white surface that faces the lamp returns, linear."""
+    """Linear colour that a white surface facing the lamp reflects."""
     spread: float
-    """Concentration of the lobe it appears as in shadows and highlights; larger is smaller and harder."""
+    """Concentration of the lamp's lobe in shadows and highlights. A larger value is smaller and harder."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """All light of a scene; fixed in world space."""
+    """All light of a scene, fixed in world space."""
 
     lamps: tuple[Lamp, ...]
     ambient: Float[np.ndarray, " 3"]
-    """What a white surface returns from the room's light, linear."""
+    """Linear colour that a white surface reflects from the room's light."""
 
     @property
     def sh_light(self) -> Float[np.ndarray, "9 3"]:
-        """For `mien.render.mesh.shade` over world-space normals."""
+        """Coefficients for `mien.render.mesh.shade` with world-space normals."""
         coefficients = np.zeros((9, 3), np.float32)
         coefficients[0] = self.ambient * math.sqrt(4 * math.pi)
         # The room is brighter above than below.
@@ -58,7 +58,7 @@ class Lighting:
         return coefficients
 
     def radiance(self, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """How bright each direction of world space is, in arbitrary units: lobes over the room."""
+        """Return the brightness of each direction of world space, in arbitrary units: the lamps' lobes and the room."""
         total = self.ambient * (1 + 0.5 * directions[:, 1:2]) / 4
         for lamp in self.lamps:
             lobe = np.exp(lamp.spread * (exact.dot(directions, lamp.direction) - 1)) * lamp.spread / (2 * math.pi)
@@ -67,9 +67,9 @@ class Lighting:
 
 
 def polynomial(sh_light: Float[np.ndarray, "9 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`mien.render.mesh.shade` as a polynomial of the normal: `constant + linear @ n + n @ square @ n`.
+    """Return `mien.render.mesh.shade` as a polynomial of the normal: `constant + linear @ n + n @ square @ n`.
 
-    Shapes are [3], [3, 3] and [3, 3, 3]; the first axis is the colour channel.
+    The shapes are [3], [3, 3] and [3, 3, 3]. The first axis is the colour channel.
     """
     one, y, z, x, xy, yz, zz, xz, xx_yy = (sh_light * _SH_FACTORS[:, None])[..., None]
     square = np.concatenate([xx_yy, 0.5 * xy, 0.5 * xz, 0.5 * xy, -xx_yy, 0.5 * yz, 0.5 * xz, 0.5 * yz, 3 * zz], -1)
@@ -77,7 +77,7 @@ def polynomial(sh_light: Float[np.ndarray, "9 3"]) -> tuple[np.ndarray, np.ndarr
 
 
 def studio_lighting(seed: int) -> Lighting:
-    """A key from above one side, a weak fill, a rim from behind the other side."""
+    """Return a key from above one side, a weak fill, and a rim from behind the other side."""
     random = np.random.default_rng([seed, 2])
     side = random.choice([-1.0, 1.0])
     warm = random.uniform(-0.04, 0.06)
@@ -94,7 +94,7 @@ def studio_lighting(seed: int) -> Lighting:
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """Which directions each vertex sees, past the whole scene at rest, in the head frame."""
+    """Visibility of directions from each vertex, past the whole scene at rest, in the head frame."""
 
     directions: Float[np.ndarray, "d 3"]
     transfer: Float[np.ndarray, "d v"]
@@ -103,14 +103,14 @@ class Visibility:
     """The clamped cosine alone."""
 
     def shadow(self, lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "v 3"]:
-        """The share of the light, per colour channel, that reaches each vertex when the head is turned."""
+        """Return the share of the light, per colour channel, that reaches each vertex in this head pose."""
         radiance = lighting.radiance(exact.rotated(self.directions, R_world_head))
         lit, full = (_weighed(radiance, cosines) for cosines in (self.transfer, self.unshadowed))
         return (lit + 1e-4) / (full + 1e-4)
 
 
 def _weighed(radiance: Float[np.ndarray, "d 3"], cosines: Float[np.ndarray, "d v"]) -> Float[np.ndarray, "v 3"]:
-    """Light of all directions at each vertex, added up direction by direction."""
+    """Sum the light of all directions at each vertex, one direction at a time."""
     total = np.zeros((3, cosines.shape[1]), np.float32)
     part = np.empty(cosines.shape[1], np.float32)
     for row, color in zip(cosines, radiance, strict=True):
@@ -124,7 +124,7 @@ def compute_visibility(
     normals: Float[np.ndarray, "v 3"],
     occluders: tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]] | None,
 ) -> Visibility:
-    """Shadow maps from all around: a point is lit from where its depth is (within 2 mm) the first.
+    """Compute shadow maps from all directions. A point is lit if its depth is the nearest one, within 2 mm.
 
     Without occluders nothing is in shadow.
     """

@@ -1,4 +1,4 @@
-"""Hair to the shoulders: a parting, locks that fall beside the face and over the ears, ends on the shoulders."""
+"""Shoulder-length hair: a parting, and locks that fall beside the face and over the ears onto the shoulders."""
 
 from dataclasses import dataclass
 
@@ -16,14 +16,14 @@ _COUNT = 7500
 
 @dataclass(frozen=True, eq=False)
 class DrapedStrands:
-    """Strands that move with the head where they grow and partly with the shoulders where they end."""
+    """Strands that move with the head at their roots, and partly with the shoulders at their ends."""
 
     rest: Strands
     follow: Float[np.ndarray, "n s"]
-    """Share of the shoulders' motion, 0..1."""
+    """Share of the shoulders' motion that each point follows, 0..1."""
 
     def posed(self, T_head_shoulders: Float[np.ndarray, "4 4"]) -> Strands:
-        """The strands in the head frame when the shoulders are turned against the head."""
+        """Return the strands in the head frame when the shoulders are turned relative to the head."""
         points = self.rest.points
         on_shoulders = exact.rotated(points, T_head_shoulders[:3, :3], T_head_shoulders[:3, 3])
         moved = points + self.follow[..., None] * (on_shoulders - points)
@@ -31,13 +31,13 @@ class DrapedStrands:
 
 
 def long_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], collar: float, seed: int) -> DrapedStrands:
-    """Strands that are combed away from a parting, then hang; they stay outside of skull, ears and face.
+    """Grow strands that are combed away from a parting and then hang. They stay outside of skull, ears and face.
 
     Args:
-        anatomy: Of the head.
+        anatomy: Anatomy of the head.
         color: Linear albedo.
-        collar: Height of the collar in the head frame, metres; the hair ends about there.
-        seed: Of this hair.
+        collar: Height of the collar in the head frame, in metres. The hair ends near it.
+        seed: Seed of this hair.
     """
     random, noise = np.random.default_rng([seed, 3]), SolidNoise(seed + 31)
     roots = scalp_points(anatomy, _COUNT, random)
@@ -63,7 +63,7 @@ def long_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], collar: float, s
     along = np.linspace(0, 1, _STEPS)
     taper = (1 - 0.45 * along**3) * random.uniform(0.8, 1.2, (_COUNT, 1))
     inner = 0.3 + 0.7 * layer[:, None] * smoothstep(-0.2, 0.3, along)
-    lighter = 1 + 0.25 * smoothstep(0.4, 1.0, along)  # ends have seen more sun
+    lighter = 1 + 0.25 * smoothstep(0.4, 1.0, along)  # the sun has bleached the ends
     tint = np.exp(0.14 * random.normal(size=(_COUNT, 1)) + 0.2 * noise(roots, 0.010)[:, None])
     colors = color * (inner * tint * lighter)[..., None]
     strands = Strands(points, (0.00125 * taper).astype(np.float32), colors.astype(np.float32), outwards)
@@ -72,7 +72,7 @@ def long_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], collar: float, s
 
 
 class _Path:
-    """Where a strand may be, and where it goes next."""
+    """Constrains where a strand may be, and directs where it goes next."""
 
     def __init__(self, anatomy: Anatomy, centre: np.ndarray, side: np.ndarray, layer: np.ndarray) -> None:
         self._anatomy, self._centre, self._side, self._layer = anatomy, centre, side, layer
@@ -83,7 +83,7 @@ class _Path:
         self._chin = float(anatomy.landmarks[CHIN, 1])
 
     def heading(self, points: Float[np.ndarray, "n 3"], part: float) -> Float[np.ndarray, "n 3"]:
-        """Aside and back on top of the head, along it at its sides, then straight down."""
+        """Return the direction: sideways and back on top of the head, along it at its sides, then straight down."""
         relative = points - self._centre
         outward = unit(relative)
         top = smoothstep(0.25, 0.9, outward[:, 1])
@@ -96,7 +96,7 @@ class _Path:
         return unit(on_skull * (combed - inward) + (1 - on_skull) * down)
 
     def lifted(self, points: Float[np.ndarray, "n 3"], along: float) -> Float[np.ndarray, "n 3"]:
-        """The points moved out of the head by their layer's height, and off the face."""
+        """Return the points moved off the head by their layer's height, and off the face."""
         points = self._beside_the_face(points.astype(np.float32))
         relative = points - self._centre
         radius = exact.length(relative)
@@ -109,13 +109,13 @@ class _Path:
         height = height + 0.003 + 0.016 * at_ear * (along > 0.05)
         least = self._anatomy.skull_radius(outward.astype(np.float32)) + height
         upper = smoothstep(self._chin - 0.06, self._chin - 0.02, points[:, 1])
-        # On the skull a strand lies; where the skull recedes it hangs free.
+        # A strand lies on the skull. Where the skull recedes, it hangs free.
         slack = np.where(outward[:, 1] > -0.1, 0.002 + 0.25 * smoothstep(0.25, -0.1, outward[:, 1]), 1.0)
         held = np.clip(radius, least, least + slack)
         return (self._centre + outward * (radius + upper * (held - radius))[:, None]).astype(np.float32)
 
     def _beside_the_face(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Turned about the skull's upright axis until the face is free."""
+        """Turn points about the skull's vertical axis until they leave the face free."""
         x, z = points[:, 0] - self._centre[0], points[:, 2] - self._centre[2]
         around = np.arctan2(np.abs(x), z)
         side = np.where(np.abs(x) > 0.03, np.sign(x), self._side)

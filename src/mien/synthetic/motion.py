@@ -1,4 +1,4 @@
-"""Motion of a head: pose, speech, smiles, brows, blinks and gaze, from a seed, with natural timing."""
+"""Generate a head's motion from a seed, with natural timing: pose, speech, smiles, brows, blinks and gaze."""
 
 import numpy as np
 import torch
@@ -13,14 +13,14 @@ from mien.synthetic.posing import rest_joints
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.script import Span, moving_clock, share_of, spans_of, wide_turns
 
-_MAX_GAZE = 0.42  # radians; further, the head turns
+_MAX_GAZE = 0.42  # radians; beyond this the head turns
 
 
 def head_motion(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRecipe, seed: int) -> FaceParams:
-    """Face parameters of every timestep; the camera stands at the world's origin and looks along -z.
+    """Return face parameters of every timestep. The camera is at the world's origin and looks along -z.
 
-    The head turns about the neck's base, which sways; the neck joint, where the model has one, bends so that the
-    base of the neck stays with the shoulders, which follow the head's turns by `SHOULDERS_FOLLOW`.
+    The head turns about the base of the neck, which sways. The neck joint, if the model has one, bends so that the base
+    of the neck stays with the shoulders. The shoulders follow the head's turns by `SHOULDERS_FOLLOW`.
     """
     random = np.random.default_rng([seed, 1])
     times, spans = np.arange(recipe.timesteps) / recipe.fps, spans_of(recipe)
@@ -49,30 +49,33 @@ def head_motion(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRecip
 
 
 SHOULDERS_FOLLOW = 0.25
-"""The share of the head's rotation that the shoulders make too."""
+"""Share of the head's rotation that the shoulders follow."""
 
 
 def shoulder_rotation(head_rotation: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Rotations of the shoulders, from the head's as axis-angle."""
+    """Return the shoulders' rotations, given the head's as axis-angle."""
     return matrix_from_axis_angle(SHOULDERS_FOLLOW * head_rotation)
 
 
 def neck_pivot(model: FaceModel, identity: torch.Tensor) -> Float[np.ndarray, " 3"]:
-    """The point of the head frame, at the neck joint, that nods and turns leave in place."""
+    """Return the point at the neck joint, in the head frame, that stays in place when the head nods and turns."""
     if "neck" in model.joint_names:
         return rest_joints(model, identity)[model.joint_names.index("neck")]
     return np.array([0.0, -0.10, -0.02])
 
 
 def euler_matrices(pitch_yaw_roll: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Roll, then pitch, then yaw, about the head's +z, +x and +y axes, radians; positive pitch looks down."""
+    """Return rotations by roll, then pitch, then yaw, about the head's +z, +x and +y axes.
+
+    Angles are in radians. Positive pitch looks down.
+    """
     axes = np.eye(3)
     pitch, yaw, roll = (matrix_from_axis_angle(pitch_yaw_roll[..., i, None] * axes[i]) for i in range(3))
     return exact.product(exact.product(yaw, pitch), roll)
 
 
 def _drift(random: np.random.Generator, times: np.ndarray, amplitude: float) -> np.ndarray:
-    """Slow aimless motion that just reaches the amplitude."""
+    """Return slow, aimless motion whose maximum is the amplitude."""
     total = np.zeros_like(times)
     for frequency, strength in ((0.11, 1.0), (0.19, 0.7), (0.33, 0.35), (0.62, 0.12)):
         frequency *= random.uniform(0.85, 1.15)
@@ -81,7 +84,7 @@ def _drift(random: np.random.Generator, times: np.ndarray, amplitude: float) -> 
 
 
 def _gaze(random: np.random.Generator, times: np.ndarray, spans: tuple[Span, ...]) -> np.ndarray:
-    """Where the eyes look beside the camera: (down, left) angles in radians, held, with jumps of 40 ms between."""
+    """Return the gaze beside the camera as (down, left) angles in radians: fixations with jumps of 40 ms between."""
     gaze = np.zeros((len(times), 2))
     clock, current = 0.0, np.zeros(2)
     while clock < times[-1]:
@@ -95,7 +98,7 @@ def _gaze(random: np.random.Generator, times: np.ndarray, spans: tuple[Span, ...
 
 
 def _expression(model: FaceModel, tracks: Tracks, timesteps: int) -> Float[torch.Tensor, "t e"]:
-    """Tracks as rows of the model's expression; `eyeBlink` drives `eyeBlinkLeft` and `eyeBlinkRight`."""
+    """Convert tracks to rows of the model's expression. `eyeBlink` drives `eyeBlinkLeft` and `eyeBlinkRight`."""
     expression = np.zeros((timesteps, len(model.expression_names)))
     closed = tracks.get("eyeBlink", np.zeros(timesteps))
     for column, name in enumerate(model.expression_names):
@@ -104,7 +107,7 @@ def _expression(model: FaceModel, tracks: Tracks, timesteps: int) -> Float[torch
             continue
         values = tracks.get(name, 0.0) + (tracks.get(side, 0.0) if side != name else 0.0)
         if side in ("eyeSquint", "eyeWide"):
-            values = values * (1 - closed)  # a closed eye has no further to go
+            values = values * (1 - closed)  # a closed eye cannot close further
         expression[:, column] = np.clip(values, *model.expression_bounds[column].tolist())
     return torch.from_numpy(expression).float()
 

@@ -1,4 +1,4 @@
-"""Solid noise: random functions of a point in space, the same for the same seed."""
+"""Solid noise: random functions of a point in space. The same seed gives the same noise."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,13 +7,13 @@ _PERIOD = 32  # lattice cells after which the noise repeats; a power of two
 
 
 class SolidNoise:
-    """Smooth random functions of space with about zero mean and values in -1..1."""
+    """Smooth random functions of space with a mean near zero and values in -1..1."""
 
     def __init__(self, seed: int) -> None:
         self._lattice = np.random.default_rng(seed).uniform(-1, 1, (_PERIOD,) * 3).astype(np.float32)
 
     def __call__(self, points: Float[np.ndarray, "n 3"], wavelength: float) -> Float[np.ndarray, " n"]:
-        """Value noise whose lattice has this spacing, in the points' unit."""
+        """Return value noise with this lattice spacing, in the points' unit."""
         scaled = points.astype(np.float64) / wavelength
         cell = np.floor(scaled)
         fraction = (scaled - cell).astype(np.float32)
@@ -35,15 +35,15 @@ class SolidNoise:
         return planes[0] + fx * (planes[1] - planes[0])
 
     def octaves(self, points: Float[np.ndarray, "n 3"], wavelength: float, count: int) -> Float[np.ndarray, " n"]:
-        """Sum of `count` noises, each with half the wavelength and half the strength of the one before."""
+        """Return the sum of `count` noises, each with half the wavelength and half the strength of the previous one."""
         total = np.zeros(len(points), np.float32)
         for octave in range(count):
-            shifted = points + 17.31 * wavelength * octave  # so that lattices of two octaves do not coincide
+            shifted = points + 17.31 * wavelength * octave  # so that the lattices of two octaves do not coincide
             total += 0.5**octave * self(shifted, wavelength / 2**octave)
         return total
 
 
 def smoothstep(low: float | np.floating, high: float | np.floating, value: np.ndarray) -> np.ndarray:
-    """0 below `low`, 1 above `high`, smooth between; falls where `low` > `high`."""
+    """Return 0 below `low`, 1 above `high`, and a smooth ramp between. It falls if `low` > `high`."""
     t = np.clip((value - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)

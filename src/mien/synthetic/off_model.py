@@ -1,4 +1,4 @@
-"""A head that the face model cannot represent: bent out of its space of shapes, with a face that moves otherwise."""
+"""A head that the face model cannot represent: its shape leaves the model's space, and its face moves differently."""
 
 from dataclasses import dataclass, replace
 
@@ -13,30 +13,31 @@ from mien.synthetic.noise import SolidNoise, smoothstep
 from mien.synthetic.posing import rest_vertices
 
 _EXTRA = (("jawOpen", "mouthSmileLeft"), ("mouthPucker", "mouthFunnel"), ("browInnerUp", "browDownLeft"))
-"""Pairs of expressions whose product drives a field of its own: muscles that work together do not just add up."""
+"""Pairs of expressions whose product drives an additional field: muscles that work together do not just add up."""
 _WANDERING = 2
-"""Further fields that come and go by themselves."""
+"""Number of additional fields that come and go by themselves."""
 _EYE_INNER, _EYE_OUTER = 0.018, 0.045
-"""Metres from an eyeball's centre: nearer, nothing is bent, so that lids close; farther, all is."""
+"""Distances from an eyeball's centre in metres. Closer vertices are not bent, so that lids close; farther ones are bent
+fully."""
 
 
 @dataclass(frozen=True, eq=False)
 class OffModel:
-    """The head that is drawn."""
+    """The head that is drawn instead of the face model's."""
 
     model: FaceModel
-    """As the face model, but with the bent head for its template, bent expressions, and further ones at the end."""
+    """The face model with a bent template, bent expressions, and additional expressions at the end."""
     offsets: Float[Tensor, "v 3"]
-    """Of the drawn neutral head from the face model's, head frame, metres."""
+    """Offsets of the drawn neutral head from the face model's, in the head frame, in metres."""
 
     def face(self, face: FaceParams, fps: float, seed: int) -> FaceParams:
-        """The parameters that `model` takes for what the face model's own parameters say."""
+        """Convert the face model's parameters to parameters of `model`."""
         random, names = np.random.default_rng([seed, 12]), self.model.expression_names
         times = np.arange(len(face)) / fps
         extra = [face.expression[:, names.index(first)] * face.expression[:, names.index(second)]
                  for first, second in _EXTRA]  # fmt: skip
         total = np.abs(face.expression.numpy()).sum(-1)
-        active = torch.from_numpy(np.clip(total, 0, 1))  # a resting face rests
+        active = torch.from_numpy(np.clip(total, 0, 1))  # nothing moves in a resting face
         for _ in range(_WANDERING):
             wave = np.sin(2 * np.pi * (random.uniform(0.2, 0.45) * times + random.uniform())).astype(np.float32)
             extra.append(torch.from_numpy(wave).clamp_min(0) * active)
@@ -44,7 +45,7 @@ class OffModel:
 
 
 def bend_off_model(model: FaceModel, identity: Float[Tensor, " i"], strength: float, seed: int) -> OffModel:
-    """A head beyond the face model, from a seed; `strength` 1 moves vertices by some 5 mm, and no eye."""
+    """Make a head beyond the face model from a seed. `strength` 1 moves vertices by about 5 mm, and no eye."""
     points, noise = rest_vertices(model, identity), SolidNoise(seed + 101)
     free = _away_from_eyes(model, points)
     offsets = torch.from_numpy(strength * free[:, None] * _warp(points, noise)).float()
@@ -64,7 +65,7 @@ def bend_off_model(model: FaceModel, identity: Float[Tensor, " i"], strength: fl
 
 
 def _away_from_eyes(model: FaceModel, points: np.ndarray) -> Float[np.ndarray, " v"]:
-    """0 at the eyes, 1 far from them, and 0 again at the neck's base, which wears the shirt."""
+    """Return 0 at the eyes, 1 far from them, and 0 again at the base of the neck, where the shirt begins."""
     eyes = model.faces[model.region_mask("eyes", "irises")].unique().numpy()
     free = smoothstep(-0.13, -0.08, points[:, 1])
     for side in (-1.0, 1.0):
@@ -74,12 +75,12 @@ def _away_from_eyes(model: FaceModel, points: np.ndarray) -> Float[np.ndarray, "
 
 
 def _field(points: np.ndarray, noise: SolidNoise, wavelength: float, shift: float) -> Float[np.ndarray, "v 3"]:
-    """A smooth random vector field."""
+    """Return a smooth random vector field."""
     return np.stack([noise(points + shift + 3.7 * axis * wavelength, wavelength) for axis in range(3)], -1)
 
 
 def _warp(points: np.ndarray, noise: SolidNoise) -> Float[np.ndarray, "v 3"]:
-    """A nose bent aside, a jaw that widens downwards, and bulges of two sizes."""
+    """Return the offsets of a nose bent sideways, a jaw that widens downwards, and bulges of two sizes."""
     x, y, z = points.T
     front = smoothstep(0.02, 0.09, z)
     nose = np.exp(-((x / 0.016) ** 2) - (((y + 0.02) / 0.03) ** 2)) * front
@@ -91,7 +92,7 @@ def _warp(points: np.ndarray, noise: SolidNoise) -> Float[np.ndarray, "v 3"]:
 def _bent_expressions(
     model: FaceModel, points: np.ndarray, share: np.ndarray, noise: SolidNoise
 ) -> Float[Tensor, "e v 3"]:
-    """Each expression stronger here and weaker there, and a little aside, each in its own way."""
+    """Make each expression stronger in some places, weaker in others and slightly sideways, each in its own way."""
     basis = model.expression_basis.numpy().copy()
     for index, field in enumerate(basis):
         gain = 1 + 0.45 * share * noise(points + 0.61 * index, 0.05)
@@ -101,7 +102,7 @@ def _bent_expressions(
 
 
 def _extra_fields(points: np.ndarray, free: np.ndarray, noise: SolidNoise) -> Float[np.ndarray, "k v 3"]:
-    """Displacements of 3 to 5 mm over cheeks, chin and forehead that no expression of the model makes."""
+    """Return displacements of 3 to 5 mm on cheeks, chin and forehead that no expression of the model makes."""
     front = smoothstep(0.0, 0.05, points[:, 2]) * free
     places = (
         ((-0.04, -0.04, 0.07), 0.024), ((0.0, -0.085, 0.08), 0.022), ((0.0, 0.055, 0.09), 0.026),

@@ -1,4 +1,4 @@
-"""Draws a posed subject as a camera sees it: picture and coverage."""
+"""Draw a posed subject as a camera sees it: picture and coverage."""
 
 from collections.abc import Callable
 
@@ -35,7 +35,7 @@ _BLOCK = 32768  # samples
 def draw(
     subject: Subject, posed: PosedSubject, camera_in_head: Camera, supersample: int
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """Linear colour, premultiplied by coverage, and coverage; `camera_in_head` views points of the head frame."""
+    """Return linear colour, premultiplied by coverage, and coverage; `camera_in_head` views the head frame."""
     width, height = camera_in_head.width * supersample, camera_in_head.height * supersample
     camera = camera_in_head.resized(width, height)
     vertices = opaque_vertices(subject, posed)
@@ -60,7 +60,7 @@ def draw(
 
 
 class _Canvas:
-    """The samples of a picture that see something."""
+    """The samples of a picture that hit something."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class _Canvas:
         self.light = shading.turned(subject.lighting, posed.R_world_head)
 
     def part(self, rows: Int[np.ndarray, " n"]) -> MeshFragments:
-        """Some samples as a picture one pixel high."""
+        """Return some samples as a picture one pixel high."""
         pixels = torch.from_numpy(self.pixels[rows])
         return MeshFragments(
             torch.from_numpy(self.face_index[rows])[None],
@@ -89,12 +89,12 @@ class _Canvas:
         )
 
     def interpolate(self, rows: Int[np.ndarray, " n"], attributes: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """Attributes of vertices at some samples."""
+        """Interpolate attributes of vertices at some samples."""
         tensor = torch.from_numpy(np.ascontiguousarray(attributes, np.float32))
         return interpolate(self.part(rows), tensor, torch.from_numpy(faces))[0].numpy()
 
     def views(self, pixels: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-        """Unit directions from the surface towards the camera."""
+        """Return unit directions from the surface towards the camera."""
         K, R = self.camera.K.numpy(), self.camera.viewmat[:3, :3].numpy()
         small = pixels.astype(np.int32)
         row = small // np.int32(self.camera.width)
@@ -124,7 +124,7 @@ def _paint_skin(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
 
 
 def _in_blocks(rows: np.ndarray, paint: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Paints so few samples at a time that all intermediate arrays stay in a core's cache."""
+    """Paint in blocks so small that all intermediate arrays fit into a core's cache."""
     return np.concatenate([paint(rows[start : start + _BLOCK]) for start in range(0, len(rows), _BLOCK)])
 
 
@@ -153,7 +153,7 @@ def _paint_eyes(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
 
 
 def _paint_mouth(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
-    """Teeth and all that is inside the mouth."""
+    """Paint teeth, and everything else inside the mouth."""
     subject, posed = canvas.subject, canvas.posed
     attributes = np.concatenate([posed.normals, posed.head, subject.anatomy.vertices], -1)
     values = canvas.interpolate(rows, attributes, _model_faces(canvas))
@@ -169,7 +169,7 @@ def _paint_mouth(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
 
 
 def _paint_hair(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
-    """Shaded at the strands' points; the ribbons' two edges share a point's colour."""
+    """Shade hair at the strands' points. Both edges of a ribbon have the colour of its point."""
     subject, posed = canvas.subject, canvas.posed
     colors = np.zeros_like(canvas.vertices)
     start = len(posed.head)
@@ -211,7 +211,7 @@ def _paint_frame(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
 
 
 def _add_lenses(canvas: _Canvas, image: Float[np.ndarray, "p 3"]) -> None:
-    """Lenses over what is behind them; only samples that already see the person."""
+    """Draw lenses over what is behind them, only for samples that already hit the person."""
     glasses = canvas.subject.glasses
     assert glasses is not None
     lenses, camera = glasses.lenses, canvas.camera
@@ -242,9 +242,9 @@ def _add_lenses(canvas: _Canvas, image: Float[np.ndarray, "p 3"]) -> None:
 def develop(
     linear: Float[np.ndarray, "h w 3"], coverage: Float[np.ndarray, "h w"], background: Float[np.ndarray, "h w 3"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Over a linear background, with a soft shoulder for what is too bright, encoded as sRGB 0..1."""
+    """Composite over a linear background, compress highlights softly and encode as sRGB 0..1."""
     full = linear + (1 - coverage)[..., None] * background
-    # Straight up to 0.6, then bent so that 1.6 still is below white.
+    # Linear up to 0.6, then compressed so that 1.6 is still below white.
     bright = np.maximum(full - 0.6, 0)
     full = np.minimum(full, 0.6) + 0.4 * (1 - np.exp(-bright / 0.4))
     index = np.clip(full * (_TABLE_SIZE - 1), 0, _TABLE_SIZE - 1).astype(np.int32)
@@ -260,7 +260,7 @@ _SRGB_TABLE = _srgb((np.arange(_TABLE_SIZE) + 0.5) / _TABLE_SIZE).astype(np.floa
 
 
 def wall(recipe: SyntheticRecipe, seed: int) -> Float[np.ndarray, "h w 3"]:
-    """A plain wall, brighter on one side, linear."""
+    """Return a plain wall in linear colour, brighter on one side."""
     random = np.random.default_rng([seed, 7])
     y, x = np.mgrid[0 : recipe.height, 0 : recipe.width].astype(np.float32)
     x, y = x / recipe.width - 0.5, y / recipe.height - 0.5
@@ -275,7 +275,7 @@ def wall(recipe: SyntheticRecipe, seed: int) -> Float[np.ndarray, "h w 3"]:
 def to_uint8(
     image: Float[np.ndarray, "h w 3"], noise: float, random: np.random.Generator
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Rounded, with the camera's noise."""
+    """Add the camera's noise and round to 8 bit."""
     if noise > 0:
         image = image + noise * random.standard_normal(image.shape, dtype=np.float32)
     return np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)

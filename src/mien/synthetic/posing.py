@@ -1,7 +1,7 @@
-"""A face model's vertices and landmarks for drawing: `mien.face`'s own, in arithmetic that is the same everywhere.
+"""Vertices and landmarks of a face model for drawing, in arithmetic that gives the same result on every machine.
 
-`FaceModel.head_vertices_reference` goes through matrix products, the native core through kernels that differ between
-instruction sets; this is neither. It agrees with both to a micrometre, and takes one timestep at a time.
+`FaceModel.head_vertices_reference` uses matrix products, and the native core has kernels that differ between
+instruction sets. This module uses neither. It agrees with both to a micrometre, and handles one timestep at a time.
 """
 
 import numpy as np
@@ -15,17 +15,17 @@ from mien.runtime.rotation import matrix_from_axis_angle
 
 
 def rest_vertices(model: FaceModel, identity: Float[torch.Tensor, " i"]) -> Float[np.ndarray, "v 3"]:
-    """A person without expression, head frame, metres, float32."""
+    """Return a person's vertices without expression, in the head frame, in metres, float32."""
     return (model.template.numpy() + exact.combined(identity.numpy(), model.identity_basis.numpy())).astype(np.float32)
 
 
 def rest_joints(model: FaceModel, identity: Float[torch.Tensor, " i"]) -> Float[np.ndarray, "k 3"]:
-    """Joints of a person without expression, head frame, metres, float64."""
+    """Return a person's joints without expression, in the head frame, in metres, float64."""
     return model.joint_template.numpy() + exact.combined(identity.numpy(), model.joint_identity_basis.numpy())
 
 
 def head_pose(face: FaceParams) -> Float[np.ndarray, "4 4"]:
-    """`FaceParams.T_world_head` of one timestep, float32."""
+    """Return `FaceParams.T_world_head` of one timestep, float32."""
     T = np.eye(4, dtype=np.float32)
     T[:3, :3] = matrix_from_axis_angle(face.head_rotation[0].numpy())
     T[:3, 3] = face.head_translation[0].numpy()
@@ -33,7 +33,7 @@ def head_pose(face: FaceParams) -> Float[np.ndarray, "4 4"]:
 
 
 def landmark_positions(model: FaceModel, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "l 3"]:
-    """MediaPipe's 478 points on a mesh of the model."""
+    """Return MediaPipe's 478 points on a mesh of the model."""
     marks = model.landmarks["mediapipe"]
     return exact.mixed(marks.barycentric.numpy(), vertices[model.faces.numpy()[marks.faces.numpy()]])
 
@@ -41,24 +41,24 @@ def landmark_positions(model: FaceModel, vertices: Float[np.ndarray, "v 3"]) -> 
 def project(
     camera: Camera, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """`Camera.project`: pixels and depths, metres."""
+    """Project points like `Camera.project`: pixels, and depths in metres."""
     K, viewmat = camera.K.numpy(), camera.viewmat.numpy()
     seen = exact.rotated(exact.rotated(points, viewmat[:3, :3], viewmat[:3, 3]), K)
     return seen[:, :2] / seen[:, 2:], seen[:, 2]
 
 
 class HeadPoser:
-    """One person's head, ready to be posed."""
+    """Poses one person's head."""
 
     def __init__(self, model: FaceModel, identity: Float[torch.Tensor, " i"]) -> None:
         self._model = model
         self._rest = rest_vertices(model, identity)
         self._rest_joints = rest_joints(model, identity)
-        # Joint by joint, since a column of an array is slow to read.
+        # One row per joint, since a column of an array is slow to read.
         self._weights = np.ascontiguousarray(model.skinning_weights.numpy().T)
 
     def __call__(self, face: FaceParams) -> Float[np.ndarray, "v 3"]:
-        """`FaceModel.head_vertices` of one timestep (`face` has a batch of one, of this person), float32."""
+        """Return `FaceModel.head_vertices` of one timestep (`face` has a batch of one, of this person), float32."""
         model = self._model
         expression, joints = face.expression[0].numpy(), face.joints[0].numpy().astype(np.float64)
         shaped = self._rest + exact.combined(expression, model.expression_basis.numpy())
@@ -73,7 +73,7 @@ class HeadPoser:
         return posed.T.astype(np.float32, order="C")
 
     def _joint_transforms(self, expression: np.ndarray, joints: np.ndarray) -> list[Float[np.ndarray, "4 4"]]:
-        """`FaceModel.joint_transforms`, float64."""
+        """Return `FaceModel.joint_transforms`, float64."""
         model, rest = self._model, self._rest_joints
         turns = exact.combined(expression, model.joint_rotation_basis.numpy())
         shifts = exact.combined(expression, model.joint_translation_basis.numpy())

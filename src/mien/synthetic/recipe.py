@@ -1,4 +1,4 @@
-"""What a synthetic capture shows, and the recipes that have a name."""
+"""Recipes of synthetic captures: what a capture shows, and the recipes with names."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -11,81 +11,82 @@ class Segment:
     """One part of a clip's script."""
 
     kind: SegmentKind
-    """still: nothing moves, not even an eye; speech: talk; expressions: posed ones, each held; turns: wide turns of
-    the head to all sides; free: talk, smiles and frowns as they come. Blinks come in all but `still`."""
+    """still: nothing moves, not even an eye. speech: talking. expressions: posed expressions, each held. turns: wide
+    turns of the head to all sides. free: talking, smiles and frowns in any order. All but `still` have blinks."""
     seconds: float
-    """Length."""
+    """Length in seconds."""
 
 
 @dataclass(frozen=True)
 class Detail:
-    """What photographs have and plain drawings have not."""
+    """Details that photographs have and plain drawings lack."""
 
     pores: float = 1.0
-    """Strength of pores, fine lines and mottling of the skin; 0 for wax."""
+    """Strength of pores, fine lines and mottling of the skin; 0 looks like wax."""
     wet_eyes: bool = True
-    """Highlights of the lamps on cornea and lid rims."""
+    """Whether lamps have highlights on cornea and lid rims."""
     shadows: bool = True
-    """Soft shadows and ambient occlusion from hair, nose, brow, chin."""
+    """Whether hair, nose, brow and chin cast soft shadows and ambient occlusion."""
     compression: int = 18
-    """x264's constant rate factor where the clip becomes a video (0 lossless, 51 worst)."""
+    """x264's constant rate factor when the clip is written as a video (0 is lossless, 51 worst)."""
 
 
 @dataclass(frozen=True)
 class SyntheticRecipe:
-    """Everything that decides a synthetic capture, besides the seed."""
+    """Everything besides the seed that decides a synthetic capture."""
 
     name: str = "demo"
-    """Of the sequence."""
+    """Name of the sequence."""
     face_model: str = "anny"
-    """For `mien.face.load_face_model`."""
+    """Name of the face model, for `mien.face.load_face_model`."""
     width: int = 512
-    """Pixels."""
+    """Width of the frames in pixels."""
     height: int = 512
-    """Pixels."""
+    """Height of the frames in pixels."""
     seconds: float = 9.0
-    """Length of the clip."""
+    """Length of the clip in seconds."""
     fps: float = 25.0
-    """Frames a second."""
+    """Frames per second."""
     focal: float = 2.35
     """Focal length in picture widths."""
     distance: float = 1.0
-    """From the camera to the head, metres."""
+    """Distance from the camera to the head, in metres."""
     identity_scale: float = 0.8
     """Standard deviation of the identity coefficients; 0 is the mean person."""
     hair: Literal["none", "short", "long"] = "short"
-    """Strands on the scalp, which the face model does not know."""
+    """Hair on the scalp as strands, which are not part of the face model."""
     glasses: bool = True
-    """Frame and lenses, which the face model does not know."""
+    """Whether the person wears glasses, which are not part of the face model."""
     brows_and_lashes: bool = True
-    """As strands of hair, on top of the painted ones."""
+    """Whether brows and lashes have strands of hair on top of the painted ones."""
     clothes: bool = True
-    """Shoulders and a shirt below the neck."""
+    """Whether there are shoulders and a shirt below the neck."""
     stubble: float = 0.0
-    """Of a beard, painted on the skin, 0..1."""
+    """Strength of stubble that is painted on the skin, 0..1."""
     beard: float = 0.0
-    """Length of a full beard of strands, metres; 0 for none. The face model does not know it."""
+    """Length of a full beard of strands in metres; 0 for none. It is not part of the face model."""
     off_model: float = 0.0
-    """How far head shape and expressions leave what the face model can represent; 1 is far, 0 not at all."""
+    """How far head shape and expressions leave the face model's space; 1 is far, 0 not at all."""
     cameras: Literal["front", "ring"] = "front"
-    """front: one camera before the face; ring: `ring_size` calibrated ones on half a sphere, the first in front."""
+    """front: one camera in front of the face. ring: `ring_size` calibrated cameras on half a sphere, the first in
+    front."""
     ring_size: int = 16
-    """Number of cameras of a ring."""
+    """Number of cameras in a ring."""
     script: tuple[Segment, ...] = ()
-    """What happens, part by part; `seconds` is then not used. Empty: one `free` part."""
+    """The script, part by part; it replaces `seconds`. If empty, there is one `free` part."""
     detail: Detail = field(default_factory=Detail)
     rotation: tuple[float, float, float] = (25.0, 12.0, 8.0)
-    """Largest yaw, pitch and roll of the head, degrees, but in turns."""
+    """Largest yaw, pitch and roll of the head outside of turns, in degrees."""
     turns: tuple[float, float] = (60.0, 26.0)
-    """Largest yaw and pitch in the script's turns, degrees."""
+    """Largest yaw and pitch in the script's turns, in degrees."""
     translation: tuple[float, float, float] = (0.02, 0.012, 0.04)
-    """Largest shift to the side, upwards and in depth, metres."""
+    """Largest shift sideways, upwards and in depth, in metres."""
     expression: float = 1.0
-    """Scale of speech, smiles and brow raises; 0 keeps the face neutral but for blinks."""
+    """Scale of speech, smiles and brow raises; 0 keeps the face neutral except for blinks."""
     blinks: bool = True
-    """Blinks and saccades of the eyes."""
+    """Whether the eyes blink and make saccades."""
     noise: float = 0.004
-    """Standard deviation of the camera's noise, of 0..1."""
+    """Standard deviation of the camera's noise, with pixels in 0..1."""
     supersample: int = 2
     """Samples along each side of a pixel."""
     texture_size: int = 1536
@@ -107,4 +108,4 @@ RECIPES: dict[str, SyntheticRecipe] = {
     "demo": SyntheticRecipe(),
     "plain": SyntheticRecipe(name="plain", seconds=4.0, hair="none", glasses=False, noise=0.0),
 }
-"""By name."""
+"""Named recipes."""

@@ -1,4 +1,4 @@
-"""Reference captures: fixed recipes by name, the same for everybody, that figures are quoted on."""
+"""Reference captures: fixed, named recipes for figures that everybody can reproduce."""
 
 import hashlib
 from dataclasses import dataclass, replace
@@ -12,37 +12,40 @@ from mien.synthetic.writing import scene_key, write_scene
 
 @dataclass(frozen=True)
 class ReferenceCapture:
-    """One synthetic person in one or several sequences, and how it is trained on for comparison."""
+    """One synthetic person in one or several sequences, and how methods are trained on it for comparison."""
 
     name: str
     what: str
-    """One line for tables."""
+    """Description in one line, for tables."""
     seed: int
-    """Of the person."""
+    """Seed of the person."""
     sequences: tuple[SyntheticRecipe, ...]
-    """Their names are the sequences'."""
+    """Recipes of the sequences; their names are the sequences' names."""
     held_out_sequences: tuple[str, ...] = ()
     held_out_cameras: tuple[str, ...] = ()
     steps: int = 2_000
     """Optimiser steps of `mien bench quality`."""
 
     def scenes(self) -> list[SyntheticScene]:
-        """The sequences, not yet drawn; the person is shared, what happens differs."""
+        """Return the sequences, not yet drawn. They share the person but not the motion."""
         scenes: list[SyntheticScene] = []
         for index, recipe in enumerate(self.sequences):
             scenes.append(SyntheticScene(recipe, self.seed, 1000 * self.seed + index, scenes[0] if scenes else None))
         return scenes
 
     def write(self, folder: Path) -> str:
-        """Draw every sequence into FOLDER/NAME, unless it is there; returns the key of the whole reference."""
+        """Draw every sequence into FOLDER/NAME, unless it exists already, and return the key of the whole reference."""
         return _combined([write_scene(scene, folder / scene.recipe.name) for scene in self.scenes()])
 
     def key(self) -> str:
-        """What figures on this reference are quoted with: the same on every machine, changed with recipe or drawing."""
+        """Return the key that is quoted with figures on this reference.
+
+        It is the same on every machine and changes with the recipe or the drawing version.
+        """
         return _combined([scene_key(scene) for scene in self.scenes()])
 
     def tiny(self) -> "ReferenceCapture":
-        """The same people and motions in three frames of 64x64 pixels from at most three cameras: for tests."""
+        """Return the same people and motions in three frames of 64x64 pixels from at most three cameras, for tests."""
         small = [
             replace(
                 recipe, width=64, height=64, texture_size=128, supersample=1, ring_size=3,
@@ -54,15 +57,15 @@ class ReferenceCapture:
 
 
 def _combined(keys: list[str]) -> str:
-    """One sequence's own key, or one over those of several."""
+    """Return the key of a single sequence, or a hash of several keys."""
     return keys[0] if len(keys) == 1 else hashlib.sha256(" ".join(keys).encode()).hexdigest()[:16]
 
 
 def reference_named(name: str) -> ReferenceCapture:
-    """A reference capture by its name.
+    """Return a reference capture by its name.
 
     Raises:
-        UserError: there is none.
+        UserError: there is none of that name.
     """
     if name not in REFERENCES:
         raise UserError(f"there is no reference capture {name!r}; choose of: {', '.join(REFERENCES)}")
@@ -120,4 +123,4 @@ REFERENCES = {
         _one("off-model", "shape and expressions beyond the face model, 384x384", 7, replace(_BRIEF, off_model=1.0)),
     )
 }  # fmt: skip
-"""By name."""
+"""Reference captures by name."""

@@ -1,4 +1,4 @@
-"""Where the cameras stand."""
+"""Positions of the cameras."""
 
 import math
 
@@ -8,16 +8,16 @@ from mien.camera import Camera, look_at
 from mien.synthetic.recipe import SyntheticRecipe
 
 _LARGEST_AZIMUTH = 72.0
-"""Degrees to either side."""
+"""Largest angle to either side of a ring, in degrees."""
 _ELEVATIONS = (0.0, 24.0, -16.0)
-"""Degrees above the face, of the rows that take turns."""
+"""Elevations of the three rows in degrees above the face; cameras alternate between them."""
 
 
 def cameras_of(recipe: SyntheticRecipe) -> tuple[Camera, ...]:
-    """One camera a camera_id, all in one world frame.
+    """Return one camera per camera_id, all in one world frame.
 
-    The first stands at the world's origin and looks along -z at the head, `recipe.distance` away; those of a ring
-    look at the same point from the same distance, spread evenly from one side to the other in three rows.
+    The first is at the world's origin and looks along -z at the head, `recipe.distance` away. The others of a ring look
+    at the same point from the same distance. They are spread evenly from one side to the other, in three rows.
     """
     focal = recipe.focal * recipe.width
     K = torch.tensor([[focal, 0, recipe.width / 2], [0, focal, recipe.height / 2], [0, 0, 1.0]])

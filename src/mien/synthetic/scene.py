@@ -1,4 +1,4 @@
-"""A synthetic clip that can be drawn timestep by timestep, with its exact truth."""
+"""A synthetic clip that can be drawn timestep by timestep, with exact ground truth."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ from mien.threads import thread_count
 from mien.tracking import Tracking
 from mien.tracking.neck_line import fit_neck_lines
 
-_AHEAD = 2  # frames drawn beyond those that are asked for, a thread
+_AHEAD = 2  # frames per thread that are drawn ahead of the requested one
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +33,13 @@ class SyntheticFrame:
     """One picture with its coverage."""
 
     image: UInt8[np.ndarray, "h w 3"]
-    """sRGB."""
+    """sRGB pixels."""
     matte: UInt8[np.ndarray, "h w"]
-    """255 where only the person is seen: the share of samples that hit the person."""
+    """Share of samples that hit the person; 255 where only the person is seen."""
 
 
 class SyntheticScene:
-    """A person in motion before a camera; everything follows from the recipe and the seed."""
+    """A person in motion in front of a camera. Recipe and seeds decide everything."""
 
     def __init__(
         self,
@@ -48,13 +48,13 @@ class SyntheticScene:
         motion_seed: int | None = None,
         same_person: "SyntheticScene | None" = None,
     ) -> None:
-        """Lay out a scene; nothing is drawn yet.
+        """Prepare a scene; nothing is drawn yet.
 
         Args:
-            recipe: What it shows.
+            recipe: Recipe of the scene.
             seed: Decides the person, the light and the room.
-            motion_seed: Decides what the person does; None for `seed`. Sequences of one subject share only `seed`.
-            same_person: Another scene with the same person, who then is built only once.
+            motion_seed: Decides the motion; None for `seed`. Sequences of one subject share only `seed`.
+            same_person: Another scene with the same person, so that the person is built only once.
         """
         self.recipe, self.seed, self.motion_seed = recipe, seed, seed if motion_seed is None else motion_seed
         self._same_person = same_person
@@ -72,12 +72,12 @@ class SyntheticScene:
 
     @property
     def camera(self) -> Camera:
-        """The camera in front."""
+        """The front camera."""
         return self.cameras[0]
 
     @cached_property
     def subject(self) -> Subject:
-        """The person; takes some seconds when first asked for."""
+        """The person. Building takes some seconds at first access."""
         if self._same_person is not None:
             return self._same_person.subject
         return build_subject(self.drawn_model, self.identity, self.recipe, self.seed)
@@ -88,25 +88,25 @@ class SyntheticScene:
 
     @cached_property
     def background(self) -> Float[np.ndarray, "h w 3"]:
-        """The empty room, linear; it looks the same to every camera."""
+        """The empty room in linear colour. It looks the same to every camera."""
         return wall(self.recipe, self.seed)
 
     def vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
-        """True vertices of the head, in the face model's topology, world space, metres."""
+        """Return the true vertices of the head in the face model's topology, in world space, in metres."""
         face = self._drawn_face[timestep]
         T = head_pose(face)
         return torch.from_numpy(exact.rotated(self._poser(face), T[:3, :3], T[:3, 3]))
 
     def head_vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
-        """True vertices of the head in the head frame, metres."""
+        """Return the true vertices of the head in the head frame, in metres."""
         return torch.from_numpy(self._poser(self._drawn_face[timestep]))
 
     def frame(self, timestep: int, camera: int = 0) -> SyntheticFrame:
-        """One picture; the same bytes every time. Safe to call from several threads at once."""
+        """Draw one picture, with the same bytes every time. Threads may call this at the same time."""
         return self.timestep_frames(timestep, (camera,))[0]
 
     def timestep_frames(self, timestep: int, cameras: Sequence[int] | None = None) -> list[SyntheticFrame]:
-        """The pictures of some cameras (default: all) at one timestep; posing is shared."""
+        """Draw the pictures of some cameras (default: all) at one timestep. The pose is computed once."""
         face = self._drawn_face[timestep]
         posed = pose_subject(self.subject, face, self.camera.position.numpy())
         frames = []
@@ -122,14 +122,14 @@ class SyntheticScene:
         return frames
 
     def frames(self) -> Iterator[SyntheticFrame]:
-        """The front camera's pictures in order."""
+        """Yield the front camera's pictures in order."""
         for frames in self.all_frames(range(self.recipe.timesteps), (0,)):
             yield frames[0]
 
     def all_frames(
         self, timesteps: Sequence[int], cameras: Sequence[int] | None = None
     ) -> Iterator[list[SyntheticFrame]]:
-        """Pictures of some timesteps in order, by up to MIEN_THREADS threads, a few ahead of what was asked for."""
+        """Yield the pictures of some timesteps in order, drawn ahead by up to MIEN_THREADS threads."""
         assert self.subject is not None
         assert self.background is not None
         threads = thread_count()
@@ -148,7 +148,10 @@ class SyntheticScene:
             torch.set_num_threads(before)
 
     def landmarks(self, camera: int = 0) -> Float[np.ndarray, "t l 2"]:
-        """MediaPipe's 478 points of every timestep in pixels, by the face model's embedding, hidden ones too."""
+        """Return MediaPipe's 478 points of every timestep in pixels, from the face model's embedding.
+
+        Hidden points are included.
+        """
         projected = []
         for timestep in range(self.recipe.timesteps):
             points = landmark_positions(self.model, self.vertices(timestep).numpy())
@@ -156,7 +159,7 @@ class SyntheticScene:
         return np.stack(projected)
 
     def tracking(self) -> Tracking:
-        """The truth. With `recipe.off_model` it is the truth only for head pose, cameras and the neutral shape."""
+        """Return the true tracking. With `recipe.off_model` only head pose, cameras and the neutral shape are true."""
         timesteps = self.recipe.timesteps
         return Tracking(
             face_model=self.model.name,
@@ -176,8 +179,8 @@ class SyntheticScene:
 
     @property
     def source(self) -> dict:
-        """For `Capture.source`: names recipe and seed, and a hash of all that decides the pictures but the code."""
-        marks = self.model.landmarks["mediapipe"]  # paint and strands are placed by them
+        """For `Capture.source`: recipe, seeds, and a hash of everything that decides the pictures except the code."""
+        marks = self.model.landmarks["mediapipe"]  # they place paint and strands
         embedding = marks.faces.numpy().tobytes() + marks.barycentric.numpy().tobytes()
         content = {
             "recipe": asdict(self.recipe),

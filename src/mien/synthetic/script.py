@@ -1,4 +1,4 @@
-"""A clip's script laid out in time, and the head's wide turns."""
+"""Lay out a clip's script in time, with the head's wide turns."""
 
 from dataclasses import dataclass
 from itertools import accumulate
@@ -9,16 +9,16 @@ from mien.synthetic.noise import smoothstep
 from mien.synthetic.recipe import Segment, SegmentKind, SyntheticRecipe
 
 _RAMP = 0.5
-"""Seconds in which a part comes and goes."""
+"""Seconds in which a part fades in and out."""
 _TURNS = ((0.0, 1.0), (0.0, -1.0), (0.7, 0.0), (-0.8, 0.0), (0.4, 0.7), (-0.4, -0.7), (0.4, -0.7), (-0.4, 0.7))
-"""Shares of the largest pitch (positive looks down) and yaw that a turn goes to, one after the other."""
+"""Goals of successive turns, as shares of the largest pitch (positive looks down) and yaw."""
 _TURN_SECONDS = 2.2
-"""From one to the next."""
+"""Seconds from one goal to the next."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A segment with its place in the clip, seconds."""
+    """A segment with its start and end in the clip, in seconds."""
 
     kind: SegmentKind
     start: float
@@ -27,7 +27,7 @@ class Span:
     last: bool
 
     def window(self, times: np.ndarray) -> np.ndarray:
-        """1 inside, 0 outside, with soft ends inside; no ends at the beginning and the end of the clip."""
+        """Return 1 inside and 0 outside, with soft ends inside, except at the beginning and the end of the clip."""
         ramp = min(_RAMP, 0.25 * (self.end - self.start))
         rise = 1.0 if self.first else smoothstep(self.start, self.start + ramp, times)
         fall = 0.0 if self.last else smoothstep(self.end - ramp, self.end, times)
@@ -35,7 +35,7 @@ class Span:
 
 
 def spans_of(recipe: SyntheticRecipe) -> tuple[Span, ...]:
-    """The recipe's script in time."""
+    """Return the recipe's script as spans in time."""
     segments = recipe.script or (Segment("free", recipe.seconds),)
     ends = list(accumulate(segment.seconds for segment in segments))
     last = len(segments) - 1
@@ -46,19 +46,19 @@ def spans_of(recipe: SyntheticRecipe) -> tuple[Span, ...]:
 
 
 def moving_clock(times: np.ndarray, spans: tuple[Span, ...]) -> np.ndarray:
-    """Seconds of motion so far: the clock that stops where the script is still."""
+    """Return the seconds of motion so far: a clock that stops while the script is still."""
     speed = 1 - sum((span.window(times) for span in spans if span.kind == "still"), np.zeros_like(times))
     step = float(times[1] - times[0]) if len(times) > 1 else 0.0
     return np.concatenate([[0.0], np.cumsum(speed[:-1]) * step])
 
 
 def share_of(kind: SegmentKind, times: np.ndarray, spans: tuple[Span, ...]) -> np.ndarray:
-    """How much of this kind there is at each time, 0..1."""
+    """Return the share of this kind at each time, 0..1."""
     return sum((span.window(times) for span in spans if span.kind == kind), np.zeros_like(times))
 
 
 def wide_turns(times: np.ndarray, spans: tuple[Span, ...], pitch: float, yaw: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pitch and yaw of the turns, up to these angles: aside, up, down, along the diagonals, and back."""
+    """Return pitch and yaw of the turns, up to these angles: sideways, up, down, diagonally, and back."""
     down, left = np.zeros_like(times), np.zeros_like(times)
     for span in spans:
         if span.kind != "turns":

@@ -1,4 +1,4 @@
-"""What light does to each material of a synthetic person. Everything is in the head frame and in linear colour."""
+"""Shade each material of a synthetic person, in the head frame and in linear colour."""
 
 from dataclasses import dataclass
 
@@ -14,20 +14,20 @@ from mien.synthetic.light import Lighting, polynomial
 from mien.synthetic.noise import smoothstep
 
 _HIGHLIGHT = 0.2
-"""Lamps that are weaker show in diffuse light only."""
+"""Weaker lamps contribute only diffuse light."""
 
 
 @dataclass(frozen=True, eq=False)
 class LocalLight:
-    """A scene's light as the turned head sees it."""
+    """A scene's light relative to the turned head."""
 
     quadratic: Float[np.ndarray, "10 3"]
     """Irradiance as a polynomial of the normal: factors of xx, yy, zz, xy, yz, xz, x, y, z, 1."""
     lamps: tuple[tuple[np.ndarray, np.ndarray], ...]
-    """Direction (head frame) and colour of each that is bright enough for highlights."""
+    """Direction (head frame) and colour of each lamp that is bright enough for highlights."""
 
     def irradiance(self, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """What a white surface returns."""
+        """Return the light that a white surface reflects."""
         x, y, z = np.ascontiguousarray(normals.T)
         out = np.empty((len(x), 3), np.float32)
         for channel, (xx, yy, zz, xy, yz, xz, fx, fy, fz, one) in enumerate(self.quadratic.T):
@@ -40,12 +40,12 @@ class LocalLight:
 
 
 def turned(lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> LocalLight:
-    """The light for one head pose."""
+    """Return the light for one head pose."""
     constant, linear, square = (part.astype(np.float64) for part in polynomial(lighting.sh_light))
     R = R_world_head.astype(np.float64)
     linear = exact.product(linear, R)
     square = exact.product(exact.product(R.T, square), R)
-    # Since xx + yy + zz = 1, a part of the constant can be in the squares: the share that makes all factors small.
+    # Since xx + yy + zz = 1, part of the constant can move into the squares. This share makes all factors small.
     share = (constant - square[:, 0, 0] - square[:, 1, 1] - square[:, 2, 2]) / 4
     rows = [square[:, axis, axis] + share for axis in range(3)]
     rows += [2 * square[:, first, second] for first, second in ((0, 1), (1, 2), (0, 2))]
@@ -61,9 +61,9 @@ def highlight(
     light: LocalLight,
     lobes: tuple[tuple[float, float], ...],
 ) -> Float[np.ndarray, "n 3"]:
-    """Mirror-like part of the lamps' light.
+    """Return the specular part of the lamps' light.
 
-    Each lobe has a weight and a sharpness; it is normalised so that a sharper one is brighter and smaller.
+    Each lobe has a weight and a sharpness. It is normalised, so that a sharper lobe is brighter and smaller.
     """
     total = np.zeros_like(normals)
     for direction, color in light.lamps:
@@ -84,7 +84,7 @@ def shade_skin(
     views: Float[np.ndarray, "n 3"],
     light: LocalLight,
 ) -> Float[np.ndarray, "n 3"]:
-    """Diffuse light that bleeds red into shadows, and an oily sheen."""
+    """Shade skin: diffuse light that bleeds red into shadows, and an oily sheen."""
     albedo, gradient, gloss = channels[:, :3], channels[:, 3:6], channels[:, 6:7]
     normals = unit(unit(normals) - gradient)
     diffuse = albedo * light.irradiance(normals) * shadow
@@ -94,7 +94,7 @@ def shade_skin(
 
 
 def shade_hair(strands: Strands, light: LocalLight, viewpoint: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "n s 3"]:
-    """Cylinders under lamps: bright where the light comes across them (Kajiya and Kay 1989), with two highlights."""
+    """Shade hair as cylinders, bright where light comes across them (Kajiya and Kay 1989), with two highlights."""
     tangents, outwards = strands.tangents, strands.outwards
     n, s = strands.widths.shape
     room = light.irradiance(np.ascontiguousarray(outwards.reshape(-1, 3))).reshape(n, s, 3)
@@ -103,7 +103,7 @@ def shade_hair(strands: Strands, light: LocalLight, viewpoint: Float[np.ndarray,
     along_view = dot(tangents, views)
     across_view = np.sqrt(np.maximum(1 - along_view**2, 0))
     relative = strands.colors / (strands.colors.max(-1, keepdims=True) + 1e-6)
-    depth = np.clip(strands.colors.max(-1) / strands.colors.max(), 0, 1)  # hair below others is darker
+    depth = np.clip(strands.colors.max(-1) / strands.colors.max(), 0, 1)  # hair under other hair is darker
     for direction, color in light.lamps:
         lengthwise = along(tangents, direction)
         across = np.sqrt(np.maximum(1 - lengthwise**2, 0))
@@ -126,16 +126,16 @@ def shade_eye(
     light: LocalLight,
     iris: tuple[float, np.ndarray, bool],
 ) -> Float[np.ndarray, "n 3"]:
-    """White with veins towards the corners; iris with fibres, limbal ring and pupil; a wet cornea.
+    """Shade an eye: white with veins towards the corners; iris with fibres, limbal ring and pupil; a wet cornea.
 
     Args:
         local: Directions from the eyeball's centre, +z along the line of sight.
-        normals: The same in the head frame.
+        normals: The same directions in the head frame.
         axis: The line of sight.
-        under_lid: Metres below the upper lid's rim.
-        views: Towards the camera.
-        light: The scene's.
-        iris: Its size (sine of the angle to its rim), its colour, and whether the eye is wet.
+        under_lid: Distance below the upper lid's rim, in metres.
+        views: Directions towards the camera.
+        light: The scene's light.
+        iris: Size (sine of the angle to its rim) and colour of the iris, and whether the eye is wet.
     """
     size, color, is_wet = iris
     radius = exact.length(local[:, :2])
@@ -153,9 +153,9 @@ def shade_eye(
     )
     share = smoothstep(1.04, 0.94, q)[:, None]
     albedo = white * (1 - share) + iris_albedo * share
-    # The lid's shadow, and that of the orbit: eyes are darker than a white ball.
+    # The shadows of the lid and of the orbit: eyes are darker than a white ball.
     shadow = (0.30 + 0.70 * smoothstep(-0.0005, 0.0045, under_lid))[:, None]
-    # Light that enters the cornea falls on the far side of the iris: its diffuse light is as of a bowl.
+    # Light through the cornea reaches the far side of the iris, so its diffuse light is like that of a bowl.
     outward = normals - along(normals, axis)[:, None] * axis
     bowl = unit(normals - 1.2 * share * outward)
     diffuse = albedo * light.irradiance(bowl.astype(np.float32)) * shadow
@@ -167,7 +167,7 @@ def shade_eye(
 
 
 def _fibres(turn: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Radial streaks, the same in every eye, -1..1."""
+    """Return radial streaks in -1..1, the same in every eye."""
     bend = turn + 0.15 * np.sin(5 * q)
     waves = np.sin(23 * bend + 2 * np.sin(7 * turn)) + 0.7 * np.sin(41 * bend + 3 * np.cos(3 * turn) + 5 * q)
     return 0.6 * waves + 0.3 * np.sin(71 * turn - 9 * q)
@@ -180,11 +180,14 @@ def shade_teeth(
     views: Float[np.ndarray, "n 3"],
     light: LocalLight,
 ) -> Float[np.ndarray, "n 3"]:
-    """Off-white, with gaps every 8 mm along the arch; `depth` is metres behind the first of them: light gets scarce."""
+    """Shade teeth: off-white, with a gap every 8 mm along the arch.
+
+    `depth` is the distance behind the foremost tooth in metres; deeper teeth get less light.
+    """
     along = rest[:, 0] / 0.0082
     place = along - np.round(along - 0.5) - 0.5
     gap = smoothstep(0.42, 0.5, np.abs(place))
-    # Out of the arch rather than the coarse mesh's own direction, and rounded over each tooth.
+    # Normals point out of the arch and are rounded over each tooth. The coarse mesh's own normals are too rough.
     across = rest[:, 0] / 0.032 + 2.0 * np.sign(place) * place**2
     rounded = 0.3 * normals + np.stack([across, np.full_like(place, 0.1), np.ones_like(place)], -1)
     rounded = unit(rounded).astype(np.float32)
@@ -199,10 +202,11 @@ def shade_mouth(
     views: Float[np.ndarray, "n 3"],
     light: LocalLight,
 ) -> Float[np.ndarray, "n 3"]:
-    """Wet dark flesh: gums, tongue, the inside of the cheeks."""
+    """Shade the mouth as wet dark flesh: gums, tongue, the inside of the cheeks."""
     scarce = np.exp(-np.clip(depth - 0.006, 0, None) / 0.012)[:, None]
     albedo = np.array([0.34, 0.085, 0.075], np.float32)
-    # Lit from the opening alone: by the room's light on what faces it, whatever the surface's own direction.
+    # All light comes from the opening: use the room's light for a surface that faces it, not for the surface's own
+    # normal.
     opening = light.irradiance(np.array([[0.0, 0.1, 0.995]], np.float32))
     return (albedo * opening * 0.8 + 0.5 * scarce * highlight(normals, views, light, ((0.2, 40.0),))) * scarce + 0.002
 
@@ -210,7 +214,7 @@ def shade_mouth(
 def shade_frame(
     normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], light: LocalLight
 ) -> Float[np.ndarray, "n 3"]:
-    """Dark polished plastic."""
+    """Shade the frame as dark polished plastic."""
     albedo = np.array([0.016, 0.011, 0.009], np.float32)
     return albedo * light.irradiance(normals) + highlight(normals, views, light, ((0.9, 90.0),))
 
@@ -218,12 +222,12 @@ def shade_frame(
 def lens_reflection(
     normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], light: LocalLight
 ) -> Float[np.ndarray, "n 3"]:
-    """What a coated lens adds to what is behind it."""
+    """Return the light that a coated lens adds to what is behind it."""
     grazing = 1 - np.abs(dot(normals, views))[:, None]
     room = np.array([0.010, 0.013, 0.014], np.float32) * (1 + 8 * grazing**3)
     return room + highlight(normals, views, light, ((0.2, 60.0),))
 
 
 def look_up(channels: Float[np.ndarray, "s s c"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n c"]:
-    """Bilinear texture look-up."""
+    """Sample a texture bilinearly."""
     return sample_texture(torch.from_numpy(channels), torch.from_numpy(uv)[None])[0].numpy()

@@ -1,7 +1,7 @@
-"""A signature of a drawn scene: numbers that any processor draws nearly alike, and another recipe does not.
+"""Signatures of drawn scenes: numbers that are nearly the same on every processor, and differ between recipes.
 
-Pixels differ between processors by a grey level here and there, since `exp`, `sin` and the filters of OpenCV may round
-their last bit otherwise. So a capture is told by its key, and that two machines draw the same is told by this.
+Pixels differ between processors by a grey level here and there, since `exp`, `sin` and OpenCV's filters may round their
+last bit differently. So a capture is identified by its key, and the signature checks that two machines draw the same.
 """
 
 from collections.abc import Mapping
@@ -13,23 +13,24 @@ from mien.synthetic.scene import SyntheticScene
 from mien.synthetic.truth import surface_of
 
 _BLOCKS = 4
-"""Along each side of a picture."""
+"""Blocks along each side of a picture."""
 _LANDMARKS = (1, 10, 33, 61, 133, 152, 234, 263, 291, 362, 454, 468, 473)
-"""Nose, forehead, eyes, mouth, chin, sides, irises."""
+"""Landmarks in the signature: nose, forehead, eyes, mouth, chin, sides, irises."""
 _VERTICES = 24
-"""Of the face region, evenly spread over its indices."""
+"""Number of vertices in the signature, evenly spread over the indices of the face region."""
 TOLERANCES: Mapping[str, float] = {"means": 0.05, "spreads": 0.05, "mattes": 0.05, "landmarks": 0.07, "vertices": 0.015}
-"""Largest difference of a number: grey levels (0..255) for pictures and mattes, pixels, millimetres.
+"""Largest allowed difference of a number: grey levels (0..255) for pictures and mattes, pixels, millimetres.
 
-docs/reference_captures.md has the measurements they come from. The truth is rounded to a sixteenth of a pixel and to
-0.01 mm: one such step is allowed."""
+docs/reference_captures.md has the measurements behind them. The truth is rounded to a sixteenth of a pixel and to 0.01
+mm; one such step is allowed."""
 
 
 def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
-    """Means and standard deviations of blocks of some pictures, means of their mattes, landmarks, vertices.
+    """Return the means and standard deviations of picture blocks, the means of matte blocks, landmarks and vertices.
 
-    The pictures are those of first, middle and last timestep by the first and the last camera. Each part is a flat
-    list: means and spreads of colours and means of mattes in grey levels, landmarks in pixels, vertices in millimetres.
+    The pictures are those of the first, middle and last timestep from the first and the last camera. Each part is a
+    flat list: means and spreads of colours and means of mattes in grey levels, landmarks in pixels, vertices in
+    millimetres.
     """
     timesteps = sorted({0, scene.recipe.timesteps // 2, scene.recipe.timesteps - 1})
     cameras = sorted({0, len(scene.cameras) - 1})
@@ -48,7 +49,7 @@ def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
 
 
 def signature_distance(first: Mapping[str, list[float]], second: Mapping[str, list[float]]) -> dict[str, float]:
-    """Largest difference of each part, in units of its tolerance: above 1 it is another drawing."""
+    """Return the largest difference of each part in units of its tolerance. Above 1, the drawings differ."""
     if {name: len(values) for name, values in first.items()} != {name: len(values) for name, values in second.items()}:
         return dict.fromkeys(TOLERANCES, float("inf"))
     return {
@@ -58,7 +59,7 @@ def signature_distance(first: Mapping[str, list[float]], second: Mapping[str, li
 
 
 def _blocks(pictures: np.ndarray) -> Float[np.ndarray, "n b y d x c"]:
-    """Cut into blocks; rows and columns beyond the last whole one are left out."""
+    """Cut pictures into blocks. Rows and columns beyond the last whole block are dropped."""
     n, height, width, channels = pictures.shape
     y, x = height // _BLOCKS, width // _BLOCKS
     cut = pictures[:, : y * _BLOCKS, : x * _BLOCKS].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Paints a subject's skin: albedo, bumps and gloss as textures, from solid noise and from where things are."""
+"""Paint a subject's skin: albedo, bumps and gloss as textures, from solid noise and the anatomy."""
 
 from dataclasses import dataclass
 
@@ -24,24 +24,24 @@ _TONES = np.array(
 
 @dataclass(frozen=True, eq=False)
 class SkinTextures:
-    """Of one subject; look up with `mien.render.mesh.sample_texture`'s conventions."""
+    """Skin textures of one subject, in the conventions of `mien.render.mesh.sample_texture`."""
 
     channels: Float[np.ndarray, "s s 7"]
-    """Linear albedo (3), gradient of the height over the skin in the head frame at rest (3), gloss (1)."""
+    """Linear albedo (3), gradient of the bumps' height along the skin in the head frame at rest (3), gloss (1)."""
     uv: Float[np.ndarray, "u 2"]
     """The model's texture coordinates, scaled so that the skin fills the texture."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Canvas:
-    """Covered texels as points of the head at rest."""
+    """Covered texels as points on the head at rest."""
 
     covered: Bool[np.ndarray, "s s"]
     points: Float[np.ndarray, "n 3"]
     ears: Float[np.ndarray, " n"]
     neck: Float[np.ndarray, " n"]
     height: Float[np.ndarray, " n"]
-    """Of bumps, metres."""
+    """Height of bumps in metres."""
     albedo: Float[np.ndarray, "n 3"]
     gloss: Float[np.ndarray, " n"]
 
@@ -49,7 +49,7 @@ class _Canvas:
 def paint_skin(
     anatomy: Anatomy, recipe: SyntheticRecipe, seed: int, hair_color: Float[np.ndarray, " 3"]
 ) -> SkinTextures:
-    """Textures of a subject's skin."""
+    """Paint the textures of a subject's skin."""
     random, noise = np.random.default_rng([seed, 5]), SolidNoise(seed + 5)
     uv = _fitted_uv(anatomy)
     canvas, positions = _canvas(anatomy, uv, recipe.texture_size)
@@ -64,7 +64,7 @@ def paint_skin(
     _paint_lips(canvas, anatomy, view, noise, tone)
     _paint_brows(canvas, anatomy, view, noise, hair_color)
     if recipe.hair != "none":
-        # Long hair is combed away from the hairline, which shows skin.
+        # Long hair is combed away from the hairline, where skin shows.
         lowered = np.array([0, 0.022 if recipe.hair == "long" else 0.0, 0], np.float32)
         share = 0.85 * anatomy.hair_share(canvas.points - lowered)[:, None]
         canvas.albedo[:] = canvas.albedo * (1 - share) + 0.5 * hair_color * share
@@ -82,7 +82,7 @@ def _fitted_uv(anatomy: Anatomy) -> Float[np.ndarray, "u 2"]:
 
 
 def _canvas(anatomy: Anatomy, uv: np.ndarray, size: int) -> tuple[_Canvas, np.ndarray]:
-    """Draws the skin's triangles where they lie in the texture."""
+    """Rasterize the skin's triangles at their places in the texture."""
     flat = np.concatenate([uv * size, np.ones((len(uv), 1), np.float32)], -1)
     flat[:, 1] = size - flat[:, 1]
     camera = Camera(torch.eye(3), torch.eye(4), size, size)
@@ -114,13 +114,13 @@ def _vertex_share(anatomy: Anatomy, region: str) -> Float[np.ndarray, " v"]:
 
 
 def _near(points: np.ndarray, centre: np.ndarray, radius: float) -> Float[np.ndarray, " n"]:
-    """A soft ball: 1 at its centre."""
+    """Return a Gaussian of the distance from the centre, 1 at the centre."""
     away = points - centre
     return np.exp(-exact.dot(away, away) / (2 * radius * radius))
 
 
 def _paint_zones(canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise) -> None:
-    """Redder cheeks, nose, ears and chin, a yellower forehead, blood that shows in blotches."""
+    """Paint redder cheeks, nose, ears and chin, a yellower forehead, and reddish blotches."""
     points, marks = canvas.points, anatomy.landmarks
     red = 0.75 * canvas.ears
     for index, radius, strength in (
@@ -139,7 +139,7 @@ def _paint_zones(canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise) -> None:
 def _paint_detail(
     canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise, random: np.random.Generator, pores: float
 ) -> None:
-    """Mottling, freckles, moles; pores and fine lines as bumps; oil on forehead and nose."""
+    """Paint mottling, freckles and moles, pores and fine lines as bumps, and oil on forehead and nose."""
     points, marks = canvas.points, anatomy.landmarks
     fine, tiny = pores * noise(points, 0.0022), pores * noise(points + 0.5, 0.0011)
     canvas.albedo[:] *= np.exp(0.05 * fine + 0.05 * tiny + 0.05 * noise.octaves(points, 0.03, 2))[:, None]
@@ -162,7 +162,7 @@ def _paint_detail(
 
 
 def _paint_eyes(canvas: _Canvas, anatomy: Anatomy, view: FrontView) -> None:
-    """Dark rims of the lids, pink corners, shadows under the eyes."""
+    """Paint dark rims of the lids, pink corners, and shadows under the eyes."""
     points = canvas.points
     in_front = smoothstep(anatomy.landmarks[33, 2] - 0.02, anatomy.landmarks[33, 2] - 0.01, points[:, 2])
     for side in SIDES:
@@ -179,7 +179,7 @@ def _paint_eyes(canvas: _Canvas, anatomy: Anatomy, view: FrontView) -> None:
 
 
 def _paint_lips(canvas: _Canvas, anatomy: Anatomy, view: FrontView, noise: SolidNoise, tone: np.ndarray) -> None:
-    """Redder and darker than the skin, with fine upright lines, and moist."""
+    """Paint lips: redder and darker than the skin, moist, with fine vertical lines."""
     points = canvas.points
     corner = anatomy.landmarks[list(places.LIPS_OUTER), 2].min()
     in_front = smoothstep(corner - 0.016, corner - 0.008, points[:, 2])
@@ -188,7 +188,7 @@ def _paint_lips(canvas: _Canvas, anatomy: Anatomy, view: FrontView, noise: Solid
     lines = noise(points * np.array([1.0, 0.16, 0.5], np.float32) + 9.0, 0.0013)
     color = tone * np.array([0.78, 0.40, 0.45], np.float32)
     painted = color * np.exp(0.12 * lines + 0.10 * noise(points, 0.004))[:, None]
-    # The vermilion border: a slightly lighter line around.
+    # The vermilion border is a slightly lighter line around the lips.
     canvas.albedo[:] *= 1 + 0.25 * (soft * (1 - mask))[:, None]
     share = 0.88 * mask[:, None]
     canvas.albedo[:] = canvas.albedo * (1 - share) + painted * share
@@ -199,7 +199,7 @@ def _paint_lips(canvas: _Canvas, anatomy: Anatomy, view: FrontView, noise: Solid
 
 
 def _paint_brows(canvas: _Canvas, anatomy: Anatomy, view: FrontView, noise: SolidNoise, hair_color: np.ndarray) -> None:
-    """The shadow under the brows' hairs, and hairs where no strands will lie."""
+    """Paint the shadow under the brows, and hairs where no strands will be."""
     points = canvas.points
     for side in SIDES:
         upper, lower = (anatomy.landmarks[list(c[side])] for c in (places.BROWS_UPPER, places.BROWS_LOWER))
@@ -217,7 +217,7 @@ def _paint_brows(canvas: _Canvas, anatomy: Anatomy, view: FrontView, noise: Soli
 def _paint_stubble(
     canvas: _Canvas, anatomy: Anatomy, noise: SolidNoise, strength: float, hair_color: np.ndarray
 ) -> None:
-    """Dots of cut hair over upper lip, chin and jaw."""
+    """Paint dots of cut hair over upper lip, chin and jaw."""
     if strength <= 0:
         return
     points = canvas.points
@@ -230,7 +230,7 @@ def _paint_stubble(
 
 
 def _surface_gradient(canvas: _Canvas, positions: Float[np.ndarray, "s s 3"]) -> Float[np.ndarray, "n 3"]:
-    """Gradient of the height along the surface, a tangent vector of space; 0 at the borders of charts."""
+    """Return the gradient of the height along the surface as a tangent vector in space; 0 at the borders of charts."""
     height = np.zeros(canvas.covered.shape, np.float32)
     height[canvas.covered] = canvas.height
 
@@ -249,7 +249,7 @@ def _surface_gradient(canvas: _Canvas, positions: Float[np.ndarray, "s s 3"]) ->
 
 
 def _spread_over_borders(channels: Float[np.ndarray, "s s c"], covered: Bool[np.ndarray, "s s"]) -> np.ndarray:
-    """Repeats the borders of charts outwards, so that looking up between texels does not bleed."""
+    """Extend the borders of charts outwards, so that interpolation between texels does not bleed."""
     known = covered.astype(np.float32)
     for _ in range(4):
         weight = cv2.blur(known, (3, 3))

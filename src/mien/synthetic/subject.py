@@ -1,4 +1,4 @@
-"""A synthetic person: the face model's head, and all that it does not know, ready to be posed and drawn."""
+"""A synthetic person: the face model's head and everything beyond the face model, ready to be posed and drawn."""
 
 from dataclasses import dataclass
 
@@ -40,18 +40,19 @@ class Eye:
 
     vertices: Int[np.ndarray, " e"]
     local: Float[np.ndarray, "e 3"]
-    """Metres from the centre, +z along the line of sight; interpolated, then scaled to length 1, exact directions."""
+    """Offsets from the centre in metres, +z along the line of sight. Interpolated and normalised, they give exact
+    directions."""
     front: Int[np.ndarray, " i"]
     """Vertices of the iris."""
     radius: float
-    """Metres."""
+    """Radius in metres."""
     iris_size: float
     """Sine of the angle between the line of sight and the iris's rim."""
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """Everything of a person that does not move by itself; the head frame at rest."""
+    """Everything about a person that does not move by itself, in the head frame at rest."""
 
     model: FaceModel
     poser: HeadPoser
@@ -70,10 +71,10 @@ class Subject:
     glasses: Glasses | None
     shirt: Part | None
     faces: Int[np.ndarray, "f 3"]
-    """Of everything that is opaque."""
+    """Triangles of everything that is opaque."""
     materials: Int[np.ndarray, " f"]
     model_faces: Int[np.ndarray, " m"]
-    """The face model's triangles among `faces`: the first ones, in this order."""
+    """Indices of the face model's triangles that come first in `faces`, in this order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +87,15 @@ class PosedSubject:
     landmarks: Float[np.ndarray, "l 3"]
     eye_centres: Float[np.ndarray, "2 3"]
     strands: tuple[Strands, ...]
-    """Hair, brows, beard, lashes: what there is, in the order of the subject's `faces`."""
+    """Hair, brows, beard and lashes, if present, in the order of the subject's `faces`."""
     T_head_shoulders: Float[np.ndarray, "4 4"]
     R_world_head: Float[np.ndarray, "3 3"]
     viewpoint: Float[np.ndarray, " 3"]
-    """The camera."""
+    """Position of the camera."""
 
 
 def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRecipe, seed: int) -> Subject:
-    """A person from a seed: paints, grows hair, dresses, and finds what shades what."""
+    """Build a person from a seed: paint the skin, add hair and clothes, and compute what shades what."""
     random = np.random.default_rng([seed, 6])
     anatomy = measure(model, identity)
     hair_color = _HAIR_COLORS[random.integers(len(_HAIR_COLORS))]
@@ -135,7 +136,7 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
 
 
 def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.ndarray, " 3"]) -> PosedSubject:
-    """The subject at one timestep (`face` has a batch of one)."""
+    """Return the subject at one timestep (`face` has a batch of one)."""
     model = subject.model
     head = subject.poser(face)
     landmarks = landmark_positions(model, head)
@@ -187,7 +188,7 @@ def _posed_strands(
 
 
 def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, "w 3"]:
-    """Vertices of `subject.faces`, head frame."""
+    """Return the vertices of `subject.faces` in the head frame."""
     parts = [posed.head]
     parts += [strands.ribbon_vertices(posed.viewpoint) for strands in posed.strands]
     if subject.glasses is not None:
@@ -199,7 +200,7 @@ def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, 
 
 
 def _shoulders(subject: Subject, face: FaceParams, R_world_head: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    """The shoulders turn less than the head, about the neck's joint."""
+    """Return the shoulders' pose in the head frame. They turn less than the head, about the neck joint."""
     pivot = neck_pivot(subject.model, face.identity)
     R = exact.product(R_world_head.T, shoulder_rotation(face.head_rotation[0].numpy()))
     T = np.eye(4, dtype=np.float32)
@@ -223,7 +224,7 @@ def _eye(anatomy: Anatomy, side: str) -> Eye:
 
 
 def _collar(anatomy: Anatomy) -> tuple[Float[np.ndarray, " 3"], tuple[float, float]]:
-    """Middle, half width and half depth of the neck where a collar lies."""
+    """Return the middle, half width and half depth of the neck at the collar's height."""
     y = float(anatomy.landmarks[CHIN, 1]) - 0.052
     neck = anatomy.vertices[np.unique(anatomy.faces[anatomy.skin])]
     ring = neck[np.abs(neck[:, 1] - y) < 0.012]
@@ -234,14 +235,14 @@ def _collar(anatomy: Anatomy) -> tuple[Float[np.ndarray, " 3"], tuple[float, flo
 
 
 def _uncovered_faces(anatomy: Anatomy, collar: Float[np.ndarray, " 3"]) -> Int[np.ndarray, " m"]:
-    """Triangles that are not deep under the shirt."""
+    """Return the triangles that are not deep under the shirt."""
     return np.flatnonzero(anatomy.vertices[anatomy.faces].mean(1)[:, 1] > collar[1] - 0.065)
 
 
 def _shoulder_points(
     anatomy: Anatomy, collar: Float[np.ndarray, " 3"], size: tuple[float, float]
 ) -> Float[np.ndarray, "p 3"]:
-    """Dense points of the model's skin that a shirt has to cover: low and beside the neck."""
+    """Return dense points of the model's skin that a shirt has to cover: low and beside the neck."""
     faces = anatomy.faces[anatomy.skin]
     centres = anatomy.vertices[faces].mean(1) - collar
     beside = (centres[:, 1] < 0.02) & (centres[:, 1] > -0.06) & (np.abs(centres[:, 0]) > 1.02 * size[0])
@@ -253,12 +254,12 @@ def _shoulder_points(
 def _occluders(
     anatomy: Anatomy, hair: Strands | None, glasses: Glasses | None, shirt: Part | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What throws shadows: the head at rest, every fourth strand three times as wide, the rims, the shoulders."""
+    """Return what casts shadows: the head at rest, every fourth strand three times as wide, the rims, the shoulders."""
     closed = ~anatomy.region("eyes", "irises", "teeth", "tongue", "mouth", "eye_sockets")
     meshes = [(anatomy.vertices, anatomy.faces[closed])]
     if hair is not None:
         wide = Strands(hair.points[::4], 3.0 * hair.widths[::4], hair.colors[::4], hair.outwards[::4])
-        # Seen from far above its lie, a strand is as wide as it is on the skin.
+        # Ribbons that face the skull's centre lie flat on the skin.
         meshes.append((wide.ribbon_vertices(anatomy.skull_centre), ribbon_faces(*wide.widths.shape)))
     meshes += [
         (part.vertices, part.faces) for part in ([glasses.frame] if glasses else []) + ([shirt] if shirt else [])
@@ -278,7 +279,7 @@ def _strand_sizes(
     lashes: bool,
     anatomy: Anatomy,
 ) -> list[tuple[int, int]]:
-    """Strands and points a strand of everything that grows, in drawing order."""
+    """Return the numbers of strands and of points per strand of all hair, in drawing order."""
     rest = _at_rest(hair)
     sizes = [] if rest is None else [rest.widths.shape]
     sizes += [strands.widths.shape for strands in on_skin]
@@ -294,7 +295,7 @@ def _all_faces(
     glasses: Glasses | None,
     shirt: Part | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of `opaque_vertices` and their materials."""
+    """Return the triangles over `opaque_vertices` and their materials."""
     of_model = np.full(len(anatomy.faces), SKIN)
     of_model[anatomy.region("eyes", "irises")] = EYE
     of_model[anatomy.region("teeth")] = TEETH

@@ -1,4 +1,4 @@
-"""Whole synthetic captures: in memory with their truth, or as a video file."""
+"""Draw whole synthetic captures: in memory with their truth, or as a video file."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,10 +15,10 @@ from mien.tracking import Tracking
 
 
 def synthesize(recipe: SyntheticRecipe, seed: int) -> tuple[Capture, Tracking]:
-    """A capture with its exact tracking (ground truth), from a seed; with a progress bar.
+    """Draw a capture and return it with its exact tracking (ground truth), with a progress bar.
 
-    The same recipe and seed give the same bytes on the same machine. Landmarks are the face model's own, projected;
-    mattes are exact.
+    The same recipe and seed give the same bytes on the same machine. Landmarks are the face model's own, projected.
+    Mattes are exact.
 
     Example:
         >>> capture, truth = synthesize(RECIPES["plain"], seed=3)
@@ -48,7 +48,7 @@ def synthesize(recipe: SyntheticRecipe, seed: int) -> tuple[Capture, Tracking]:
 
 
 def write_synthetic_video(recipe: SyntheticRecipe, path: Path, seed: int) -> None:
-    """Draw a clip straight into a video file, a few frames in memory at a time; with a progress bar."""
+    """Draw a clip into a video file with a few frames in memory at a time, with a progress bar."""
     scene = SyntheticScene(recipe, seed)
 
     def images() -> Iterator[UInt8[np.ndarray, "h w 3"]]:

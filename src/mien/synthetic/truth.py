@@ -1,4 +1,4 @@
-"""What is exactly known of a synthetic capture: for measuring trackers in millimetres and pixels."""
+"""The exact truth of a synthetic capture, for measuring trackers in millimetres and pixels."""
 
 import hashlib
 from dataclasses import dataclass
@@ -26,33 +26,34 @@ _EAR = 234
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Of one sequence of t timesteps and c cameras."""
+    """The truth of one sequence of t timesteps and c cameras."""
 
     tracking: Tracking
-    """Head poses, cameras and identity; exact vertices too, unless the head leaves the face model (`off_model`)."""
+    """Head poses, cameras and identity. Vertices are exact too, unless the head leaves the face model (`off_model`)."""
     vertex_index: Int[np.ndarray, " n"]
-    """The face region: vertices of the face model on the skin between chin and hairline, in front of the ears."""
+    """Vertices of the face region: the face model's skin between chin and hairline, in front of the ears."""
     vertices: Float[np.ndarray, "t n 3"]
-    """Where those are in the head frame, metres, to 10 micrometres; exact for every recipe."""
+    """Their positions in the head frame, in metres, to 10 micrometres. They are exact for every recipe."""
     landmarks: Float[np.ndarray, "t c l 2"]
-    """MediaPipe's 478 points on the true surface, projected: pixels of the drawn pictures, hidden ones too."""
+    """MediaPipe's 478 points on the true surface, projected to pixels of the drawn pictures. Hidden ones are
+    included."""
 
     @property
     def vertices_world(self) -> Float[np.ndarray, "t n 3"]:
-        """The region in world space."""
+        """The region's vertices in world space."""
         poses = self.tracking.face.T_world_head.numpy()
         return exact.product(self.vertices, np.swapaxes(poses[:, :3, :3], 1, 2)) + poses[:, None, :3, 3]
 
 
 def truth_of(scene: SyntheticScene) -> Truth:
-    """The truth of a scene, rounded as it is stored."""
+    """Return the truth of a scene, rounded as it is stored."""
     return Truth(scene.tracking(), *surface_of(scene))
 
 
 def surface_of(
     scene: SyntheticScene,
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "t n 3"], Float[np.ndarray, "t c l 2"]]:
-    """`vertex_index`, `vertices` and `landmarks` of the truth."""
+    """Return `vertex_index`, `vertices` and `landmarks` of the truth."""
     index = face_region(measure(scene.model, scene.identity))
     chosen = torch.from_numpy(index)
     vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.recipe.timesteps)])
@@ -61,7 +62,7 @@ def surface_of(
 
 
 def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
-    """Vertices of the skin of the face: no ears, no neck, nothing behind the ears or above the forehead."""
+    """Return the vertices of the face's skin: no ears, no neck, nothing behind the ears or above the forehead."""
     skin = np.unique(anatomy.faces[anatomy.skin & ~anatomy.region("ears", "neck", "scalp")])
     points, marks = anatomy.vertices[skin], anatomy.landmarks
     inside = (points[:, 1] > marks[CHIN, 1] - 0.005) & (points[:, 1] < marks[FOREHEAD_TOP, 1])
@@ -76,7 +77,7 @@ def hash_surface(digest: "hashlib._Hash", scene: SyntheticScene) -> None:
 
 
 def write_truth(folder: Path, truth: Truth) -> None:
-    """Write FOLDER/truth.json, truth.safetensors and tracking/; the json comes last."""
+    """Write FOLDER/truth.json, truth.safetensors and tracking/. The json comes last."""
     write_tracking(folder / _TRACKING, truth.tracking)
     arrays = {
         "vertex_index": truth.vertex_index.astype(np.int32),
@@ -92,7 +93,7 @@ def read_truth(folder: Path) -> Truth:
     """Read what `write_truth` wrote.
 
     Raises:
-        UserError: something is missing, damaged or of another version.
+        UserError: a file is missing, damaged or of another version.
     """
     content = read_json(folder / _JSON, FORMAT, VERSION)
     arrays = read_arrays(folder / _ARRAYS)

@@ -1,4 +1,4 @@
-"""Synthetic captures on disk: drawn frame by frame in bounded memory, resumed where they stopped, with their truth."""
+"""Synthetic captures on disk, with their truth: drawn frame by frame in bounded memory, resumable."""
 
 import hashlib
 import json
@@ -25,22 +25,22 @@ FORMAT, VERSION = "mien.synthetic_capture", 2
 _JSON, _WORK, _STATE = "synthetic.json", ".drawing", "state.json"
 VIDEO_NAME, CAPTURE_NAME, TRUTH_NAME = "video.mp4", "capture", "truth"
 DRAWING = 3
-"""Raised whenever the same recipe would be drawn otherwise: with it changes every key that figures are quoted on."""
+"""Drawing version, raised whenever a recipe would be drawn differently. Every key depends on it."""
 _CHUNK = 16
-"""Timesteps after which progress is kept."""
+"""Timesteps after which progress is saved."""
 
 
 def write_synthetic_capture(recipe: SyntheticRecipe, seed: int, folder: Path) -> str:
-    """`write_scene` of a recipe and a seed."""
+    """Draw a recipe and a seed with `write_scene`."""
     return write_scene(SyntheticScene(recipe, seed), folder)
 
 
 def write_scene(scene: SyntheticScene, folder: Path) -> str:
     """Draw a capture into a folder and return its key, which is the same on every machine (`scene_key`).
 
-    With one camera FOLDER/video.mp4 is what a user would have filmed. With several FOLDER/capture is a Capture with
-    calibration, exact mattes, and landmarks as a detector finds them in the drawn pictures (NaN where it finds none).
-    FOLDER/truth holds what `read_truth` reads. A folder that is complete is left as it is; an interrupted one goes on.
+    With one camera, FOLDER/video.mp4 is what a user would have filmed. With several, FOLDER/capture is a Capture with
+    calibration, exact mattes, and landmarks that a detector finds in the drawn pictures (NaN where it finds none).
+    FOLDER/truth is for `read_truth`. A complete folder is left as it is; an interrupted one is continued.
 
     Raises:
         UserError: the folder cannot be written.
@@ -56,23 +56,25 @@ def write_scene(scene: SyntheticScene, folder: Path) -> str:
 
 
 def read_synthetic_hash(folder: Path) -> str:
-    """The hash over the bytes of a drawn capture: all pictures, mattes and the truth.
+    """Return the hash over the bytes of a drawn capture: all pictures, mattes and the truth.
 
-    It is the same for the same key on the same machine; another processor may draw a pixel one grey level apart.
+    It is the same for the same key on the same machine. Another processor may draw a pixel one grey level differently.
 
     Raises:
-        UserError: there is none, or it is not complete.
+        UserError: there is no drawn capture, or it is not complete.
     """
     return str(read_json(folder / _JSON, FORMAT, VERSION).get("content_hash"))
 
 
 def scene_key(scene: SyntheticScene) -> str:
-    """What figures on a capture are quoted with: 16 hex digits over recipe, seeds, face model and drawing version.
+    """Return the key that is quoted with figures on a capture.
 
-    It is known before anything is drawn, it is the same on every machine, and nothing that was computed is in it.
-    `mien.synthetic.signature` tells whether two machines draw the same under one key.
+    It is 16 hex digits over recipe, seeds, face model and drawing version.
+
+    It is known before anything is drawn, and is the same on every machine, since it depends on no computed numbers.
+    `mien.synthetic.signature` checks whether two machines draw the same under one key.
     """
-    marks = scene.model.landmarks["mediapipe"]  # as they were read; paint and strands are placed by them
+    marks = scene.model.landmarks["mediapipe"]  # as read from disk; they place paint and strands
     content = {
         "drawing": DRAWING,
         "recipe": asdict(scene.recipe),
@@ -88,13 +90,16 @@ def scene_key(scene: SyntheticScene) -> str:
 
 
 def inputs_hash(scene: SyntheticScene) -> str:
-    """A hash of all that decides the bytes on this machine, with the face model's numbers: tells what is current."""
+    """Return a hash of all that decides the bytes on this machine, with the face model's numbers.
+
+    It shows whether a folder is up to date.
+    """
     content = {"drawing": DRAWING, "name": scene.recipe.name, "source": scene.source}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def hash_scene(scene: SyntheticScene) -> str:
-    """The hash over the bytes of a scene, drawn in memory: for small ones."""
+    """Return the hash over the bytes of a scene, drawn in memory; for small scenes."""
     pictures = _Hasher(scene)
     for frames in scene.all_frames(range(scene.recipe.timesteps)):
         pictures.add(np.stack([f.image for f in frames]), np.stack([f.matte for f in frames]))
@@ -154,7 +159,7 @@ def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
 
 @dataclass(frozen=True)
 class _Pictures:
-    """Raw frames and mattes of a drawing that is not complete."""
+    """Raw frames and mattes of an unfinished drawing."""
 
     folder: Path
     recipe: SyntheticRecipe
@@ -165,7 +170,7 @@ class _Pictures:
         return (recipe.timesteps, len(recipe.camera_ids), recipe.height, recipe.width)
 
     def resume(self, inputs: str) -> None:
-        """Start anew unless what is there belongs to the same inputs."""
+        """Continue a drawing of the same inputs, else start again."""
         try:
             kept = read_json(self.folder / _STATE, FORMAT, VERSION).get("inputs") == inputs
         except UserError:
@@ -178,22 +183,25 @@ class _Pictures:
             self.mark(inputs, 0)
 
     def mark(self, inputs: str, done: int) -> None:
-        """Note how many timesteps are complete."""
+        """Record how many timesteps are complete."""
         write_json(self.folder / _STATE, FORMAT, VERSION, {"inputs": inputs, "done": done})
 
     def done(self) -> int:
-        """Timesteps that are complete."""
+        """Return the number of complete timesteps."""
         return int(read_json(self.folder / _STATE, FORMAT, VERSION)["done"])
 
     def append(self, timestep: int, images: np.ndarray, mattes: np.ndarray) -> None:
-        """Put one timestep in its place; by plain writes, so that a full disk is an error and no crash."""
+        """Write one timestep at its position.
+
+        It uses plain writes, so that a full disk raises an error instead of crashing.
+        """
         for name, array in (("frames.u8", images), ("mattes.u8", mattes)):
             with (self.folder / name).open("r+b") as file:
                 file.seek(timestep * array.nbytes)
                 file.write(array.tobytes())
 
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """All frames [t, c, h, w, 3] and mattes [t, c, h, w] as memory maps."""
+        """Return all frames [t, c, h, w, 3] and mattes [t, c, h, w] as memory maps."""
         images = np.memmap(self.folder / "frames.u8", np.uint8, "r", shape=(*self._shape, 3))
         return images, np.memmap(self.folder / "mattes.u8", np.uint8, "r", shape=self._shape)
 
@@ -228,7 +236,7 @@ def _as_capture(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray, c
 
 
 def _detected(scene: SyntheticScene, images: np.ndarray) -> Iterator[Float[np.ndarray, "t l 2"]]:
-    """Landmarks that a detector finds in each camera's pictures."""
+    """Yield the landmarks that a detector finds in each camera's pictures."""
     with progress_bar(f"Landmarks of {scene.recipe.name}", len(scene.cameras)) as advance:
         for camera in range(len(scene.cameras)):
             found = np.full((len(images), LANDMARKS, 2), np.nan, np.float32)
