@@ -214,8 +214,7 @@ def _check_instruction_set() -> None:
 
 
 def _use_one_torch_thread() -> None:
-    """Limit torch to one thread and leave the cores to native code: the thread pools of torch and mien stall each
-    other."""
+    """Limit torch to one thread and leave the cores to native code. Their two thread pools stall each other."""
     import torch
 
     torch.set_num_threads(1)
