@@ -34,33 +34,31 @@ class TrainOptions:
     """The main options of training. All other settings come from the preset, the file and the method."""
 
     method: MethodName = "gaussian_avatars"
-    """Method that makes the avatar (docs/results.md compares the methods)."""
+    """Method that makes the avatar (docs/results.md)."""
     config: Path | None = None
     """A .json with settings, for example the config.json of a run to repeat (docs/settings.md). Options override the
     file, and the file overrides the preset."""
     preset: PresetName = "standard"
-    """How thorough the training is. draft takes minutes; standard gives the figures of docs/results.md."""
+    """draft takes minutes; standard gives the figures of docs/results.md."""
     split: Split = "blocks"
-    """What is held out for scoring: every fifth block of 10 frames (blocks), the last 20 % (tail), or nothing
-    (none)."""
+    """What is held out for scoring: every fifth block of 10 frames, the last 20 % (tail), or nothing (none)."""
     background: Literal["white", "random"] = "white"
-    """Background of the training pictures. Use random for transparent renderings: it keeps white out of skin and
-    outlines, and costs 0.1 to 0.4 dB compared with white."""
+    """Background of the training pictures. random suits transparent renderings (no white in skin and outlines) and
+    costs 0.1 to 0.4 dB."""
     steps: int = 0
     """Number of optimiser steps, over which all schedules stretch. 0 means the preset's number."""
     seed: int = 0
-    """Seed of all random numbers. The same seed, data and settings give the same bytes on a CPU."""
+    """Equal seed, data and settings give equal bytes."""
     hold_out: tuple[str, ...] = ()
-    """Names of whole sequences that are scored but not trained on."""
+    """Whole sequences that are scored but not trained on."""
     hold_out_cameras: tuple[str, ...] = ()
     """Ids of cameras that are scored but not trained on, for captures with several cameras."""
     device: DeviceName = "cpu"
-    """Device that training runs on. cpu gives the same bytes every time; cuda is an NVIDIA GPU, through gsplat
-    (docs/using.md explains how to install it); auto is a GPU if there is one. A run may be resumed on another
-    device."""
+    """Device for training. cpu: always the same bytes; cuda: an NVIDIA GPU, through gsplat (docs/using.md says how to
+    install it); auto: a GPU if there is one. A run may resume on another device."""
     face_tuning: bool = True
-    """Let training correct the tracking of the frames that it uses. Held-out frames get corrections interpolated from
-    neighbouring frames. --no-face-tuning keeps the tracking as it is."""
+    """Let training correct the tracking. Held-out frames get interpolated corrections. --no-face-tuning keeps the
+    tracking as it is."""
     training: _IN_DETAIL = None
     """The other settings of the run."""
     method_settings: _IN_DETAIL = None
