@@ -10,8 +10,8 @@ from torch.utils.dlpack import to_dlpack
 from mien import _native
 
 _LARGE = 1 << 18
-"""Smallest number of elements for which memory is recycled. Smaller blocks come back from the allocator without
-fresh pages."""
+"""Smallest number of elements for which memory is recycled. Smaller blocks come back from the allocator without fresh
+pages."""
 
 
 def recycled(*shape: int) -> Tensor:

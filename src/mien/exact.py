@@ -3,8 +3,8 @@
 Matrix products of a library (BLAS), its decompositions, and sums that use the width of the processor's vectors add in
 an order that differs between machines. Here each product is rounded by itself and added in the order of its index.
 Sums, products, quotients and square roots of two numbers are the same everywhere (IEEE 754). So are numpy's `sum`,
-`mean` and `cumsum`, because their order comes from one source for all processors. Functions such as `exp` and `sin`
-may differ in their last bit: code that needs equal results computes them in float64 and then rounds to float32.
+`mean` and `cumsum`, because their order comes from one source for all processors. Functions such as `exp` and `sin` may
+differ in their last bit: code that needs equal results computes them in float64 and then rounds to float32.
 
 Results have the dtype that numpy gives to products of the arguments.
 """

@@ -141,7 +141,7 @@ def cannot_write(path: Path, error: OSError) -> CannotWriteError:
 
 @contextmanager
 def expect_whole(path: Path, remedy: str) -> Iterator[None]:
-    """Turn errors while content read from `path` is unpacked into one line: missing entries, wrong types or sizes.
+    """Report errors in the content read from `path` in one line: missing entries, wrong types or sizes.
 
     Raises:
         UserError: such an error occurred inside the context.

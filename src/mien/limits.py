@@ -12,7 +12,7 @@ import numpy as np
 LARGEST_SIDE = 8192
 """Largest width or height of a picture, in pixels."""
 LARGEST_NUMBER = 1e6
-"""Largest metre, radian, raw value or weight. The numbers that mien writes stay far below."""
+"""Largest magnitude of lengths in metres, angles in radians, raw values and weights. Numbers of mien stay far below."""
 LARGEST_FOCAL = 1e7
 """Largest focal length, in pixels."""
 _RIGID = 1e-2

@@ -62,9 +62,9 @@ class LinearBases:
 class AttributeNetwork:
     """A small network, the same for all Gaussians. Its outputs are added to the raw values.
 
-    Its input is a row of `base`, combined with what `input` names. `features` adds to the first f columns of `base` the
-    combination of `basis` by the expression, and that of `joint_basis` by the free joints. `displacement` appends the
-    centre's motion from the rig's template, in metres.
+    Its input is a row of `base` with an addition. With `features`, two sums are added to the first f columns: `basis`
+    weighted by the expression, and `joint_basis` weighted by the free joints. With `displacement`, the centre's motion
+    from the rig's template is appended, in metres.
     """
 
     input: Literal["features", "displacement"]

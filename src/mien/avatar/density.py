@@ -43,7 +43,7 @@ def split_along_axes(
 
 @dataclass(frozen=True)
 class GradientDensity:
-    """Duplicates, splits and prunes Gaussians and resets opacities, by the screen-space gradients of the centres."""
+    """Grows Gaussians by the screen-space gradients of their centres, prunes them, and resets opacities."""
 
     settings: GradientSettings
     opacity_logits: str | None

@@ -93,10 +93,10 @@ class MonoGaussianAvatar(Avatar):
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Distance of skinning weights and blend directions from those of the nearest canonical vertex.
 
-        Each step uses the next `face_points` points; on average, that is the paper's mean over all points. Expression
-        directions are weighted by the variance of their coefficients over the training frames, relative to the mean
-        variance.
-        The term then does not depend on how a face model scales its coefficients (the paper's weights are for FLAME).
+        Each step uses the next `face_points` points; on average, that is the paper's mean over all points. The squared
+        difference of an expression direction is multiplied by the squared mean variance of all coefficients over the
+        training frames, and divided by the variance of its own coefficient. The term then does not depend on how a face
+        model scales its coefficients (the paper's weights are for FLAME).
         """
         n = len(self.store)
         chosen = torch.arange(progress.step * self.config.face_points, (progress.step + 1) * self.config.face_points)
@@ -152,9 +152,8 @@ class MonoGaussianAvatar(Avatar):
             pose_basis=points["pose"].permute(2, 0, 1).contiguous(),
         )
         # The network takes the motion from the canonical position, but the runtime gives the motion from the rest
-        # position.
-        # They differ by a constant for each point. Both enter linearly, so the constant uses the same columns of
-        # weights again.
+        # position. They differ by a constant for each point. Both enter linearly, so the constant uses the same columns
+        # of weights again.
         first = weights[0] / LENGTH_UNIT
         network = AttributeNetwork(
             input="displacement",

@@ -30,8 +30,7 @@ class GaussianStore(nn.Module):
     """n Gaussians as a dict of equally long tensors. Some are trained; others, such as triangle indices, are fixed.
 
     `select` and `append` replace the tensors: across density control, hold names and not tensors. The moments of
-    trained
-    tensors are here too and follow every change. New Gaussians start with zero moments.
+    trained tensors are here too and follow every change. New Gaussians start with zero moments.
     """
 
     def __init__(self, trained: Mapping[str, Tensor], fixed: Mapping[str, Tensor] | None = None):

@@ -29,7 +29,7 @@ class Render:
     """Measure how fast the native core draws Gaussians, forward and backward, by size, threads and instruction set."""
 
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the machine and a list of rows for programs."""
+    """Print the machine and all rows as json, for programs."""
     seconds: float = 0.8
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     device: DeviceName = "cpu"
@@ -58,7 +58,7 @@ class Scaling:
     """Measure how drawing scales: 10,000 to 300,000 Gaussians, at the sizes that papers report and up to 2048x2048."""
 
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the machine and a list of rows for programs."""
+    """Print the machine and all rows as json, for programs."""
     seconds: float = 0.8
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     plot: Path | None = None
@@ -87,7 +87,7 @@ class TrainStep:
     """Measure a training step of `gaussian_avatars` (no footage is needed), and posing together with drawing."""
 
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the machine and a list of rows for programs."""
+    """Print the machine and all rows as json, for programs."""
     seconds: float = 3.0
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     device: DeviceName = "cpu"
@@ -127,7 +127,7 @@ class Quality:
     out: Path = Path("out/bench-quality")
     """Folder for the drawn captures, the workspaces and the tables."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print a list of rows for programs."""
+    """Print all rows as json, for programs."""
 
     def check(self) -> None:
         """Check that the number of steps is not negative."""

@@ -38,7 +38,7 @@ def read_config_file(path: Path) -> ConfigFile:
     """Read the config.json of a run, which may be edited (its checksum is not checked), or one written by hand.
 
     Raises:
-        UserError: the file is missing, is not json, holds something else than settings, or names an unknown method.
+        UserError: the file is missing, is not json, holds something other than settings, or names an unknown method.
     """
     content = _read(path)
     for name in content:

@@ -19,8 +19,7 @@ class Command:
     """Make an avatar, metrics and a report from videos of one person. A stopped command continues if you run it again.
 
     Each video is captured separately. All sequences of the workspace are tracked together, with one identity. The
-    avatar is
-    trained on the videos given here.
+    avatar is trained on the videos given here.
     """
 
     videos: Annotated[tuple[Path, ...], tyro.conf.Positional]

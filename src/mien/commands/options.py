@@ -34,7 +34,7 @@ class TrainOptions:
     """The main options of training. All other settings come from the preset, the file and the method."""
 
     method: MethodName = "gaussian_avatars"
-    """Method that makes the avatar (docs/results.md)."""
+    """Method that makes the avatar (compared in docs/results.md)."""
     config: Path | None = None
     """A .json with settings, for example the config.json of a run to repeat (docs/settings.md). Options override the
     file, and the file overrides the preset."""

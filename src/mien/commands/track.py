@@ -15,8 +15,7 @@ class Command:
     """Fit the face model to all sequences of a workspace. Writes DIR/sequences/NAME/tracking, an overlay and a report.
 
     A workspace is one person, so its sequences are tracked together, with one identity. If a sequence is added, all of
-    them
-    are tracked again.
+    them are tracked again.
     """
 
     workspace: Annotated[Path, tyro.conf.Positional]

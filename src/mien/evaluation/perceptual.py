@@ -31,9 +31,8 @@ class PerceptualDistance(nn.Module):
     """Distance between pictures by the features of a trained, anti-aliased AlexNet. 0 for equal ones, often below 1.
 
     Five feature maps are normalised to unit length at each pixel. Their squared differences are weighted by trained
-    factors
-    per channel, averaged over the picture, and summed, as in LPIPS. ST-LPIPS has stride 1 in the first convolution and
-    replaces every stride by a blur and a subsampling, so that a shift of a few pixels costs little.
+    factors per channel, averaged over the picture, and summed, as in LPIPS. ST-LPIPS has stride 1 in the first
+    convolution and replaces every stride by a blur and a subsampling, so that a shift of a few pixels costs little.
     """
 
     shift: Tensor

@@ -1,4 +1,4 @@
-"""The content of a .mien file as numpy arrays, with the classes and fields of `mien.avatar.baked`, which has tensors.
+"""The content of a .mien file as numpy arrays. `mien.avatar.baked` has the same classes and fields with tensors.
 
 Letters in shapes mean the same in the whole file: n Gaussians, m points of the rig, f triangles, e expressions, k
 joints, j free joints, p pose correctives (9 per free joint), s SH coefficients per channel.

@@ -32,9 +32,9 @@ def photometric_loss(
     """`l1_weight` * mean |image - target| + `ssim_weight` * (1 - mean SSIM), fused and native on a CPU.
 
     Differentiable in `image`. A uint8 `target` has colours 0..255. With a `box`, pixels outside count as equal in both
-    pictures, although the windows of pixels inside still see them, and the means stay over the whole picture. If the
-    pictures are equal everywhere except at least 5 pixels inside the box's edges, the value and the gradient are the
-    same in a fraction of the time. `drawn` promises that the pictures are equal where it is 0 and outside the box; the
+    pictures, although the windows of pixels inside still see them, and the means stay over the whole picture. Value and
+    gradient are the same as without the box, in a fraction of the time, if the pictures differ only where they are at
+    least 5 pixels inside the box. `drawn` promises that the pictures are equal where it is 0 and outside the box; the
     native loss skips these pixels.
     """
     assert image.shape == target.shape, (image.shape, target.shape)

@@ -34,7 +34,7 @@ ANOTHER_RUN = f"{WAIT}, or give this run another name (--run NAME)"
 """Remedy if another process is training the run."""
 _SUMMARIES, _MOST = ("steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"), 1 << 62
 _FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
-"""Settings that do not change the result of a run. They may differ when it continues."""
+"""Settings that say how a run is computed, not what it is. They may change when the run continues."""
 
 
 def claim_run(run_dir: Path, sequences: Items[Sequence], method_config: MethodConfig, settings: TrainSettings) -> None:

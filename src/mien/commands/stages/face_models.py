@@ -15,7 +15,8 @@ from mien.tracking.regions import with_regions_by_landmarks
 
 _SUFFIXES = (".npz", ".pkl", ".pickle")
 _FIRST_PICTURES = 80
-"""Number of pictures for a model with unknown lips and brows. `EmbeddingSettings` sets it once these are painted."""
+"""Number of pictures in the first round, when lips and brows are not known. The second round paints these, and uses the
+number in `EmbeddingSettings`."""
 
 
 def face_model_of(choice: str) -> FaceModel:
@@ -38,8 +39,8 @@ def face_model_of(choice: str) -> FaceModel:
 def add_face_model_stage(path: Path, name: str | None = None, shareable: bool = False) -> FaceModel:
     """Add a file in FLAME's schema to this user's face models, unless it is already there.
 
-    The default name is the file's. Landmarks are placed by running the landmark detector on pictures of the model
-    (some minutes, once).
+    The default name is the file's. Landmarks are placed by running the landmark detector on pictures of the model (some
+    minutes, once).
 
     Raises:
         UserError: the file is missing, damaged or in another schema, or the name is taken.
