@@ -45,7 +45,7 @@ def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
     Args:
         base: A dataclass.
         changes: Field name -> value. As in the output of `encode`, a `kind` is allowed.
-        where: Start of the place in messages, followed by the field: "config.json: method".
+        where: The place that messages name, followed by the field: "config.json: method".
         owner: Whose settings these are, for a message about an unknown setting.
 
     Raises:

@@ -12,7 +12,8 @@ import numpy as np
 LARGEST_SIDE = 8192
 """Largest width or height of a picture, in pixels."""
 LARGEST_NUMBER = 1e6
-"""Largest magnitude of lengths in metres, angles in radians, raw values and weights. Numbers of mien stay far below."""
+"""Largest magnitude of lengths in metres, angles in radians, raw values and weights. Mien writes far smaller
+numbers."""
 LARGEST_FOCAL = 1e7
 """Largest focal length, in pixels."""
 _RIGID = 1e-2

@@ -1,4 +1,4 @@
-"""The process that holds a lock: it signs the lock file, and later processes read that. `mien.locks` has the locks."""
+"""The process that holds a lock signs the lock file, and later processes read that. `mien.locks` has the locks."""
 
 import json
 import os

@@ -72,7 +72,7 @@ def map_pictures(file: Any, shape: tuple[int, ...]) -> PictureMap:
 
 
 class PictureStack:
-    """Pictures that are written in any order and read as one array. Few pictures are in memory, many on disk.
+    """Pictures that are written in any order and read as one array. A small array is in memory, a large one on disk.
 
     The file on disk has no name, and is removed together with the array.
     """

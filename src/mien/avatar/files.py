@@ -63,8 +63,8 @@ def load_avatar(folder: Path) -> Avatar:
     """Load the avatar of a run folder, or of an avatar folder itself.
 
     Raises:
-        UserError: the folder holds no avatar, or the avatar is damaged, cannot be posed, is being written, needs a face
-            model that is missing, or contains a link.
+        UserError: the folder holds no avatar, or holds a link; or the avatar is damaged, cannot be posed, is being
+            written, or needs a face model that is missing.
     """
     return read_beside_writers(lambda: _load_avatar(folder), [folder, folder / "avatar"], [folder, folder.parent])
 

@@ -56,7 +56,7 @@ class HeadGas(Avatar):
             self._last_layer.bias[-1] = torch.logit(torch.tensor(0.1))
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
-        """The Gaussians in the head frame, one batch entry per timestep. Only colours and opacities depend on it."""
+        """The Gaussians in the head frame, one batch entry per timestep. Only their colours and opacities differ."""
         store = self.store
         features = blend_features(store["feature_bases"], store["neutral_features"], face)
         encoding = self._encoding().expand(len(face), -1, -1)
@@ -122,7 +122,8 @@ class HeadGas(Avatar):
         return last
 
     def _encoding(self) -> Float[Tensor, "n c"]:
-        # Detached: the picture moves the centres, and the network's dependence on their position does not.
+        # Detached, so that centres move only by their effect on the picture, not through the encoding of their
+        # position.
         points = self.store["means"].detach() / self.config.encoding_length
         return positional_encoding(points, self.config.encoding_bands)
 

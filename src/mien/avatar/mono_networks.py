@@ -93,7 +93,8 @@ class AttributeChangeNet(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        # There is no activation after the third layer, as in the published code: it forms one linear map with the next.
+        # There is no activation after the third layer, as in the published code: this layer and the next form one
+        # linear map.
         first, second, third = (weight_norm(nn.Linear(size, width)) for size in (3, width, width))
         self.trunk = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), third)
         self.heads = nn.ModuleList(

@@ -68,8 +68,8 @@ class GradientSettings:
     prune_size: Annotated[float, NOT_NEGATIVE] = 0.1
     """Gaussians larger than this, in metres, are removed. This begins with the first opacity reset after `start`."""
     prune_radius: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Gaussians with a larger radius on screen than this, in pixels, are removed, from the same time on. 0 removes
-    none."""
+    """Gaussians with a larger radius on screen than this, in pixels, are removed. This begins with the first opacity
+    reset after `start`. 0 removes none."""
     opacity_resets: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = (0.1, 0.4)
     """Times at which opacities are lowered to `reset_opacity`, as fractions of the run."""
     reset_opacity: Annotated[float, Range(1e-6, 1)] = 0.01

@@ -14,9 +14,8 @@ from mien.workspace import Workspace, check_new_workspace
 class Command:
     """Turn a video of one person into frames, mattes and landmarks, in OUT/sequences/NAME/capture.
 
-    Any video from a camera or telephone works: upright or turned, HDR, with a variable frame rate, of any length. A
-    video with cuts becomes the sequences NAME-1, NAME-2, ... A stopped command continues where it was if you run it
-    again.
+    Any video from a camera or phone works: upright or turned, HDR, with a variable frame rate, of any length. A video
+    with cuts becomes the sequences NAME-1, NAME-2, ... A stopped command continues where it was if you run it again.
 
     Film half a minute or more, in even light, with the whole head in the picture: look around, talk, make faces.
 

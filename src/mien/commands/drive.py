@@ -38,8 +38,7 @@ class Command:
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         open_workspace(self.workspace).pick_run(self.run_name)
-        # The number of frames is known only after tracking. A video or numbered pictures take any number, so any will
-        # do.
+        # The number of frames is known only after tracking, but a video or numbered pictures take any number.
         self.picture.plan(self.out, 2)
         check_driver(self.by, self.sequence, self.fps)
 

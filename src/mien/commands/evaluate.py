@@ -69,7 +69,7 @@ class Command:
                 workspace.pick_run(self.run_name)
 
     def run(self) -> None:
-        """Do the one of the three tasks that is asked for."""
+        """Run the task that is asked for."""
         if self.images is not None and self.truth is not None:
             self._score_images(self.images, self.truth)
         elif self.compare:

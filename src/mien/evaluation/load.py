@@ -22,7 +22,7 @@ from mien.training.split import held_out
 
 
 def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Experiment]:
-    """The experiments of a run, by protocol. There is none if nothing was held out.
+    """The experiments of a run, by protocol. The result is empty if nothing was held out.
 
     - `self_reenactment` (`self_reenactment_tail` for that split): held-out timesteps of the training sequences.
     - `self_reenactment_sequence`: whole held-out sequences, posed as tracked.

@@ -29,7 +29,7 @@ class PartialScores:
     """Identity of the evaluation. Figures of any other evaluation are dropped."""
 
     def read(self) -> dict[Frame, Scored]:
-        """The frames that were scored before. None if the file belongs to another run or other settings, or is damaged.
+        """The frames that were scored before. Empty if the file is of another run or other settings, or is damaged.
 
         Cuts the file back to its good lines, because a killed process may leave half a line. Creates the file if
         needed.

@@ -8,7 +8,7 @@ from mien.training.settings import TrainSettings
 
 @dataclass(frozen=True)
 class Preset:
-    """The settings of a run, here, and of each method, in the file of the method's settings."""
+    """The settings of a run, which are given here, and of each method, which are in the file of its settings."""
 
     name: str
     settings: TrainSettings

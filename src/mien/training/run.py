@@ -34,7 +34,7 @@ ANOTHER_RUN = f"{WAIT}, or give this run another name (--run NAME)"
 """Remedy if another process is training the run."""
 _SUMMARIES, _MOST = ("steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"), 1 << 62
 _FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
-"""Settings that say how a run is computed, not what it is. They may change when the run continues."""
+"""Settings that say how a run is computed, not what it computes. They may change when the run continues."""
 
 
 def claim_run(run_dir: Path, sequences: Items[Sequence], method_config: MethodConfig, settings: TrainSettings) -> None:
@@ -200,7 +200,7 @@ def _choices(method_config: MethodConfig, settings: TrainSettings) -> dict[str, 
 
 
 def _fingerprint(sequence: Sequence) -> dict[str, Any]:
-    """A description that differs between different sequences: their source and tracking."""
+    """The source and the tracking of a sequence, which distinguish it from others."""
     first = sequence.tracking.cameras[0]
     return {
         "sequence": sequence.name,

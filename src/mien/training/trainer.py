@@ -224,7 +224,7 @@ def _native_threads(count: int) -> Iterator[None]:
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Replace Ctrl-C by a function to call between steps, so that no step is interrupted."""
+    """Turn Ctrl-C into a function that reports it between steps, so that no step is left half done."""
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield asked.is_set

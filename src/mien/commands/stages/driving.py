@@ -118,7 +118,7 @@ def drive_stage(
 ) -> None:
     """Render a run's avatar as it follows a driver. Pictures of the driver are beside it, unless `alone` is set."""
     options, look = options or DriveOptions(), picture or PictureOptions()
-    # The number of frames is known only after tracking. A video or numbered pictures take any number, so any will do.
+    # The number of frames is known only after tracking, but a video or numbered pictures take any number.
     output = look.plan(out, 2)
     avatar = load_avatar(run_dir)
     driver = open_driver(by, options.sequence, avatar.face_model, options.fps)

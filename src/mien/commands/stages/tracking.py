@@ -243,7 +243,7 @@ def _is_shown(folder: Path, tracking: Tracking, overlay: Overlay) -> tuple[bool,
 
 
 def _stride(tracking: Tracking, overlay: Overlay) -> int:
-    """The overlay shows every n-th frame; this is n."""
+    """The n for which the overlay shows every n-th frame."""
     return overlay_stride(len(tracking.valid)) if overlay == "auto" else 1
 
 
