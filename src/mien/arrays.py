@@ -1,4 +1,4 @@
-"""Tensors on their way into the native core."""
+"""Conversion of tensors for the native core."""
 
 import math
 from typing import Any
@@ -10,13 +10,14 @@ from torch.utils.dlpack import to_dlpack
 from mien import _native
 
 _LARGE = 1 << 18
-"""Numbers. Memory for fewer comes back from the allocator without fresh pages."""
+"""Smallest number of elements for which memory is recycled. Smaller blocks come back from the allocator without fresh
+pages."""
 
 
 def recycled(*shape: int) -> Tensor:
-    """An uninitialised float32 tensor on the CPU; if it is large, its memory has been in use before.
+    """An uninitialised float32 tensor on the CPU. A large one gets memory that was in use before.
 
-    The kernel clears fresh pages, which at 2048x2048 takes longer than drawing the picture.
+    The kernel clears fresh pages, and at 2048x2048 that takes longer than drawing the picture.
     """
     if math.prod(shape) < _LARGE:
         return torch.empty(shape)
@@ -24,9 +25,10 @@ def recycled(*shape: int) -> Tensor:
 
 
 def unpacked(*tensors: Tensor | None) -> list[Any]:
-    """What the core takes in place of CPU tensors that need no gradient; None stays None.
+    """CPU tensors that need no gradient, in the form in which the core takes them; None stays None.
 
-    The core would ask each tensor itself, by `__dlpack__`, which takes ten times as long: 2 us, a hundred times a
-    training step. Only for functions of one signature: a second try finds what the first has taken.
+    The core would otherwise call `__dlpack__` of each tensor itself. That takes ten times as long, 2 us, and happens a
+    hundred times per training step. Use it only for functions with a single signature: each capsule can be consumed
+    only once, so a second overload could not read it.
     """
     return [None if tensor is None else to_dlpack(tensor) for tensor in tensors]

@@ -1,4 +1,4 @@
-"""Reading with limits: files that are ordinary and not too large, json whose numbers can be counted with."""
+"""Reading with limits: only ordinary files of limited size, and json with numbers of limited size."""
 
 import json
 import math
@@ -10,16 +10,19 @@ from typing import IO, Any
 
 _WHOLE_NUMBERS = range(-(1 << 63), 1 << 64)
 _MOST_DIGITS = 20
-"""Of such a number, with its sign. Python takes long for very many, and float() and numpy refuse what does not fit."""
+"""Most characters of a whole number, with its sign. Python takes long to parse very many digits, and float() and numpy
+refuse numbers that do not fit."""
 _DEEPEST = 50
-"""Lists and objects in each other; Python's own limit is met later, wherever the content is shown or compared."""
+"""Most levels of nested lists and objects. Python has a limit of its own, but reaches it only later, when the content
+is shown or compared."""
 
 
 def parse_json(text: str) -> Any:
-    """What json says, with numbers that fit into 64 bits.
+    """The content of a json text, in which all numbers fit into 64 bits.
 
     Raises:
-        ValueError: it is no json, or holds NaN, infinity, a number too large, or lists too deep in each other.
+        ValueError: the text is not json, or it holds NaN, infinity, a number that is too large, or lists that are
+            nested too deep.
     """
     try:
         content = json.loads(text, parse_constant=_refuse_constant, parse_int=_whole_number, parse_float=_finite_number)
@@ -37,19 +40,19 @@ def read_bytes(path: Path, most: int) -> bytes:
     """The bytes of an ordinary file.
 
     Raises:
-        ValueError: it has more than `most`, or is a pipe or device.
-        OSError: it is missing or cannot be read.
+        ValueError: the file has more than `most` bytes, or is a pipe or device.
+        OSError: the file is missing or cannot be read.
     """
     with open_ordinary(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
             raise ValueError(f"{size} bytes are too many")
-        # Not to the end of the file: it may grow meanwhile.
+        # Do not read to the end of the file, because the file may grow meanwhile.
         return file.read(size)
 
 
 def open_ordinary(path: Path) -> IO[bytes]:
-    """A file, open for reading; a pipe is not waited for.
+    """Open a file for reading, without waiting for a pipe.
 
     Raises:
         ValueError: it is a pipe or device.
@@ -66,7 +69,7 @@ _TOO_DEEP = "lists or objects too deep in each other"
 
 
 def _children(node: Any) -> Iterator[Any]:
-    """The lists and objects right inside of one."""
+    """The lists and objects directly inside a node."""
     inner = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
     return (child for child in inner if isinstance(child, (dict, list)))
 

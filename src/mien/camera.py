@@ -22,17 +22,17 @@ class Camera:
     viewmat: Float[Tensor, "4 4"]
     """T_camera_world, in metres."""
     width: int
-    """Pixels."""
+    """Width in pixels."""
     height: int
-    """Pixels."""
+    """Height in pixels."""
 
     @property
     def position(self) -> Float[Tensor, " 3"]:
-        """The camera's centre in world space, metres."""
+        """The camera's centre in world space, in metres."""
         return invert_rigid(self.viewmat)[:3, 3]
 
     def to(self, like: Tensor) -> "Camera":
-        """The same camera with the dtype and device of `like`."""
+        """This camera with the dtype and device of `like`."""
         if all(tensor.dtype == like.dtype and tensor.device == like.device for tensor in (self.K, self.viewmat)):
             return self
         return replace(self, K=self.K.to(like), viewmat=self.viewmat.to(like))
@@ -42,19 +42,19 @@ class Camera:
         return replace(self, viewmat=compose_rigid(self.viewmat, T_world_local))
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same view with another number of pixels."""
+        """The same view with another resolution."""
         scale = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
         return replace(self, K=self.K * scale[:, None], width=width, height=height)
 
     def cropped(self, left: float, top: float, width: int, height: int) -> "Camera":
-        """The part of the view whose top left corner is at (left, top) pixels; it may reach outside."""
+        """The part of the view whose top left corner is at pixel (left, top). The part may reach outside the view."""
         K = self.K.clone()
         K[0, 2] -= left
         K[1, 2] -= top
         return replace(self, K=K, width=width, height=height)
 
     def project(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 2"], Float[Tensor, "*b"]]:
-        """Pixel positions and depths (camera z, metres; not positive behind the camera) of world-space points.
+        """Pixel positions and depths of world-space points. Depth is the camera's z in metres, not positive behind it.
 
         Differentiable in `points`, `K` and `viewmat`.
         """
@@ -89,7 +89,7 @@ def look_at(
     return invert_rigid(rigid_transform(torch.stack([right, down, forward], dim=-1), position))
 
 
-# Each product and sum by itself, so that the bits are the same on every processor.
+# Each product and sum is computed by itself, so that the bits are the same on every processor.
 def _cross(first: Float[Tensor, " 3"], second: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
     return first.roll(-1) * second.roll(1) - first.roll(1) * second.roll(-1)
 

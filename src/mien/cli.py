@@ -1,4 +1,4 @@
-"""The command line: picks the sub-command, loads only what it needs, turns errors into one line."""
+"""The command line: picks the sub-command, loads only what it needs, and turns errors into one line."""
 
 import contextlib
 import difflib
@@ -34,31 +34,32 @@ COMMANDS = {
     "bench": "timings of this machine; quality over reference captures with known truth",
     "demo": "the whole path on a synthetic head, in minutes: start here",
 }
-"""Name -> summary; `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command`.
+"""Name -> summary. `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command`.
 
-Its `check()` tells what can be told of options and paths without heavy libraries; `run()` does the work after it.
+`check()` checks options and paths as far as that is possible without heavy libraries; `run()` then does the work.
 """
 
 EXIT_USER_ERROR = 2
 EXIT_INTERRUPTED = 130
 EXIT_CLOSED_PIPE = 141
-"""As of a program that the system ends because nobody reads its output any more (`mien ... | head -1`)."""
+"""Exit code of a program that the system ends because nobody reads its output any more (`mien ... | head -1`)."""
 EXIT_TERMINATED = 143
 _OPENCVS_LIMIT, _MOST_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS", 8192 * 8192
-"""`mien.capture.picture.LARGEST_PICTURE` once more, for OpenCV itself, which reads it when it is imported."""
+"""Same number as `mien.capture.picture.LARGEST_PICTURE`. OpenCV reads this variable when it is imported."""
 _USERS_ERRNOS = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG}
 )
-"""The disk is full, read-only, protected or broken: nothing that mien could do better."""
+"""Errors that mien cannot prevent: the disk is full, read-only, protected or broken."""
 _USELESS = ("For full helptext", "Argument helptext")
 _INDENT_OF_DESCRIPTION = 8
-"""Spaces before an option's description in tyro's messages; names of options have fewer."""
+"""Number of spaces before an option's description in tyro's messages. Option names have fewer."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one sub-command; returns the exit code.
+    """Run one sub-command and return the exit code.
 
-    0, 2 for the user's mistakes, 1 for ours, 130 after Ctrl-C, 141 when nobody reads the output any more.
+    The code is 0 on success, 2 after a user's mistake, 1 after a bug in mien, 130 after Ctrl-C, and 141 if nobody reads
+    the output any more.
     """
     open_closed_streams()
     _print_what_can_be_printed()
@@ -98,7 +99,7 @@ def _main(arguments: list[str]) -> int:
 
 
 def _print_what_can_be_printed() -> None:
-    """A character that standard output's encoding lacks becomes a question mark: help and names of files have some."""
+    """Replace characters that standard output's encoding lacks with question marks. Help and file names have some."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
 
@@ -116,13 +117,13 @@ def _dispatch(arguments: list[str]) -> int:
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(COMMANDS)}"
         raise UserError(f"no sub-command {name!r}; {hint}")
     if "" in rest:
-        # As a path, nothing is the current folder: an unset variable of a shell must not fill that with pictures.
+        # As a path, an empty text is the current folder: an unset shell variable must not fill it with pictures.
         raise UserError(f"argument {rest.index('') + 1} after {name} is empty (an unset variable?); give it a value")
     return _run(name, rest)
 
 
 def _crash() -> int:
-    """Say that it is a bug; its traceback goes to a file."""
+    """Report that it is a bug, and write the traceback to a file."""
     log = _write_crash_log()
     tell(f"mien: this is a bug in mien, not your mistake: {traceback.format_exc().splitlines()[-1]}")
     tell(f"mien: the traceback is in {log}; please report it with the command")
@@ -166,7 +167,7 @@ def _run(name: str, rest: list[str]) -> int:
     sys.stderr.write(printable(complaints.getvalue(), lines=True))
     asked_threads()
     command.check()
-    with contextlib.suppress(ValueError):  # signals are for the main thread
+    with contextlib.suppress(ValueError):  # signal handlers work only in the main thread
         signal.signal(signal.SIGTERM, _terminated)
     _use_one_torch_thread()
     _check_instruction_set()
@@ -175,14 +176,14 @@ def _run(name: str, rest: list[str]) -> int:
 
 
 def _terminated(number: int, frame: object) -> None:
-    """Stop as Ctrl-C does, so that unfinished files go; the exit code is that of a process that was terminated."""
+    """Stop as Ctrl-C does, so that unfinished files are removed. The exit code is that of a terminated process."""
     raise SystemExit(EXIT_TERMINATED)
 
 
 def _in_one_line(box: str) -> str:
-    """What tyro says about wrong arguments in a box of several parts, without the descriptions of options."""
+    """One line from the box in which tyro reports wrong arguments, without the descriptions of options."""
     lines = box.splitlines()
-    # Where the terminal has no Unicode, the box is a title, a line of dashes, and everything two spaces to the right.
+    # If the terminal has no Unicode, the box is a title, a line of dashes, and the content indented by two spaces.
     lines = lines[1:] if "╭" in box else lines[2:]
     parts: list[str] = [""]
     for line in lines:
@@ -199,10 +200,10 @@ def _in_one_line(box: str) -> str:
 
 
 def _check_instruction_set() -> None:
-    """Find that this machine has what MIEN_ISA asks for.
+    """Check that this machine has the instruction set that MIEN_ISA asks for.
 
     Raises:
-        UserError: it has not.
+        UserError: it does not.
     """
     from mien import _native
 
@@ -213,7 +214,7 @@ def _check_instruction_set() -> None:
 
 
 def _use_one_torch_thread() -> None:
-    """Torch's thread pool and mien's native one stall each other: torch keeps one thread, native ops take the cores."""
+    """Limit torch to one thread and leave the cores to native code. Their two thread pools stall each other."""
     import torch
 
     torch.set_num_threads(1)
@@ -236,7 +237,7 @@ def _complain(message: str) -> int:
 
 def _write_crash_log() -> Path:
     handle, name = tempfile.mkstemp(prefix="mien-crash-", suffix=".log")
-    # Names of files may hold bytes that are no text.
+    # File names may hold bytes that are not text.
     with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as log:
         log.write(f"mien {mien.__version__}\n{shlex.join(sys.argv)}\n\n{traceback.format_exc()}")
     return Path(name)

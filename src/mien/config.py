@@ -13,7 +13,7 @@ from mien.ranges import ToLoad, check_range, marks_of, range_of
 
 
 def encode(value: Any) -> Any:
-    """Settings as what json can hold; every dataclass becomes an object with its class name as `kind`."""
+    """Settings as values that json can hold. Every dataclass becomes an object with its class name as `kind`."""
     if is_dataclass(value) and not isinstance(value, type):
         return {"kind": type(value).__name__, **{f.name: encode(getattr(value, f.name)) for f in fields(value)}}
     if isinstance(value, (tuple, list)):
@@ -27,11 +27,11 @@ def encode(value: Any) -> Any:
 
 
 def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make it again") -> Any:
-    """What `encode` encoded, as the type `hint`; fields that are missing get their defaults.
+    """Decode what `encode` encoded into the type `hint`. Missing fields get their defaults.
 
     Raises:
-        UserError: a field is unknown, is missing without a default, or has a value of another type or out of its range;
-            ends in `remedy`.
+        UserError: a field is unknown, is missing and has no default, has a value of another type, or is out of its
+            range. The message ends with `remedy`.
     """
     try:
         return _decode(hint, value, where)
@@ -40,13 +40,13 @@ def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make i
 
 
 def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
-    """Settings with some fields changed, as json holds them; what is not named stays, also in settings within settings.
+    """Settings with some fields changed to values from json. All other fields stay, also in nested settings.
 
     Args:
         base: A dataclass.
-        changes: Field name -> value. A `kind` may stand there too, as `encode` writes it.
-        where: What to name in messages, followed by the field: "config.json: method".
-        owner: Whose settings these are, for a message about one that there is not.
+        changes: Field name -> value. As in the output of `encode`, a `kind` is allowed.
+        where: The place that messages name, followed by the field: "config.json: method".
+        owner: Whose settings these are, for a message about an unknown setting.
 
     Raises:
         UserError: a field is unknown, of another type, or out of its range.
@@ -79,20 +79,20 @@ def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
 
 
 def for_loading(settings: Any) -> Any:
-    """The same settings with the least of what counts only when an avatar is begun (`ToLoad`)."""
+    """The same settings, with the smallest values of those that matter only for a new avatar (`ToLoad`)."""
     hints = get_type_hints(type(settings), include_extras=True)
     marks = {name: mark for name, hint in hints.items() for mark in marks_of(hint) if isinstance(mark, ToLoad)}
     return replace(settings, **{name: mark.value for name, mark in marks.items()})
 
 
 def no_such_setting(given: str, owner: str, near: Sequence[str], known: Sequence[str]) -> str:
-    """What to tell about a setting that there is not: the nearest name, if one is near, and all that there are."""
+    """The message about an unknown setting: the nearest name, if one is near, and all names."""
     hint = f"did you mean {near[0]}? " if near else ""
     return f"{given}: {owner} has no such setting; {hint}there are: {', '.join(known)}"
 
 
 def _in_words(hint: Any) -> str:
-    """What to give for a setting of some type, in a json file."""
+    """What to give for a setting of some type in a json file, in words."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Literal:
         return "one of " + ", ".join(str(part) for part in parts)
@@ -125,15 +125,15 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
         return tuple(_decode(kind, item, where) for kind, item in zip(kinds, value, strict=True))
     if origin is dict and isinstance(value, dict):
         return {key: _decode(get_args(hint)[1], item, where) for key, item in value.items()}
-    # Not asked of arrays, which compare by their items.
+    # Do not compare arrays, which compare entry by entry.
     if origin is Literal and isinstance(value, (str, int)) and value in get_args(hint):
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        with contextlib.suppress(OverflowError):  # a whole number of hundreds of digits
+        with contextlib.suppress(OverflowError):  # a whole number with hundreds of digits
             return float(value)
     if hint is Path and isinstance(value, str):
         return Path(value)
-    # True is an int to Python, not to people.
+    # True is an int in Python, but not for people.
     alike = isinstance(value, bool) == (hint is bool)
     if origin is None and isinstance(hint, type) and isinstance(value, hint) and alike:
         return value
@@ -171,7 +171,7 @@ def _decode_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
 
 
 def _in_short(value: Any) -> str:
-    """One line, whatever it is."""
+    """A value as one short line."""
     shape = getattr(value, "shape", None)
     if shape is not None:
         return f"{value.dtype} {tuple(shape)}"

@@ -1,4 +1,4 @@
-"""Where tensors of training and rendering live: the processor, or a CUDA GPU through gsplat."""
+"""The device that holds the tensors of training and rendering: the CPU, or a CUDA GPU through gsplat."""
 
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Literal
@@ -10,16 +10,16 @@ if TYPE_CHECKING:
     import torch
 
 DeviceName = Literal["cpu", "cuda", "auto"]
-"""`auto`: a CUDA GPU where torch finds one and gsplat is installed, else the processor."""
+"""`auto` chooses a CUDA GPU if torch finds one and gsplat is installed, and the CPU otherwise."""
 
 _OR_CPU = "or leave --device cuda out to use the processor"
 
 
 def check_device(name: DeviceName) -> None:
-    """Tell what can be told without torch.
+    """Check a device name as far as that is possible without torch.
 
     Raises:
-        UserError: CUDA is asked for and gsplat is not installed.
+        UserError: CUDA is asked for but gsplat is not installed.
     """
     if name == "cuda" and find_spec("gsplat") is None:
         raise UserError(
@@ -30,10 +30,10 @@ def check_device(name: DeviceName) -> None:
 
 
 def choose_device(name: DeviceName) -> "torch.device":
-    """The device for a name; says so where it is a GPU, or where `auto` found none.
+    """The device for a name. Prints a message if it is a GPU, or if `auto` finds none.
 
     Raises:
-        UserError: CUDA is asked for, and torch finds no GPU or gsplat is not installed.
+        UserError: CUDA is asked for, but torch finds no GPU or gsplat is not installed.
     """
     import torch
 
@@ -54,7 +54,7 @@ def choose_device(name: DeviceName) -> "torch.device":
 
 
 def like_on(device: "torch.device | str") -> "torch.Tensor":
-    """A float32 scalar there: what `.to(like)` of the value objects takes."""
+    """A float32 scalar on a device, to pass to the method `to(like)` of the value objects."""
     import torch
 
     return torch.zeros((), device=device)

@@ -1,4 +1,4 @@
-"""The errors that are the user's to mend."""
+"""Errors that the user can fix."""
 
 
 class UserError(Exception):
@@ -9,7 +9,7 @@ class UserError(Exception):
 
 
 class CannotWriteError(UserError, OSError):
-    """A file could not be written: the user's to mend, and still an OSError for who writes elsewhere instead."""
+    """A file could not be written. The user can fix that; code that can write elsewhere catches it as an OSError."""
 
     def __init__(self, message: str, cause: OSError):
         super().__init__(message)
@@ -17,5 +17,5 @@ class CannotWriteError(UserError, OSError):
         self.errno, self.strerror = cause.errno, cause.strerror
 
     def __str__(self) -> str:
-        """The line alone, without OSError's number."""
+        """The message alone, without OSError's number."""
         return self.message

@@ -1,6 +1,6 @@
-"""Files without torch: atomic writes, json with format and version, numpy arrays, and whether a path can be written.
+"""Files without torch: atomic writes, json with format and version, numpy arrays, and checks that a path is writable.
 
-`mien.storage` adds torch tensors. Nothing here knows what is stored.
+`mien.storage` adds torch tensors. Nothing here depends on what is stored.
 """
 
 import ctypes
@@ -24,31 +24,32 @@ from mien.errors import CannotWriteError, UserError
 from mien.inside import remove_tree
 
 _KEPT_OF_NAME = 100
-"""Characters of a file's name that its temporary name keeps: file systems allow 255 bytes in all."""
+"""Number of characters of a file's name that its temporary name keeps. File systems allow 255 bytes in all."""
 _CHECKSUM = "checksum"
-"""Of everything else in a json file, or in the header and data of a safetensors file."""
+"""Key of the checksum, which covers everything else in a json file, or the header and data of a safetensors file."""
 _ANY_STAGE = "the stage that writes it"
 _AT_CURRENT_FOLDER, _EXCHANGE = -100, 2
 """AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
 _LARGEST_JSON = 32 << 20
-"""Bytes; the largest that mien writes has some megabytes, and empty lists take twenty times their text in memory."""
+"""Largest json file that is read, in bytes. The largest that mien writes has some megabytes. Empty lists take twenty
+times the size of their text in memory."""
 _LARGEST_HEADER = 8 << 20
-"""Bytes of a safetensors header; what mien writes has some kilobytes."""
+"""Largest header of a safetensors file, in bytes. Headers that mien writes have some kilobytes."""
 _LARGEST_TENSORS = 1 << 30
-"""Bytes of a safetensors file; the largest that mien writes has some hundred megabytes."""
+"""Largest safetensors file that is read, in bytes. The largest that mien writes has some hundred megabytes."""
 _PIECE = 1 << 20
-"""Bytes that are hashed at a time."""
+"""Number of bytes that are hashed at a time."""
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 def check_writable(path: Path, *, folder: bool = False) -> None:
-    """Find out before any long work whether `path` can be written as a file (or, with `folder`, as a folder).
+    """Check before any long work that `path` can be written as a file (or, with `folder`, as a folder).
 
-    Missing parent folders are fine, since `write_atomically` makes them. Leaves nothing behind.
+    Missing parent folders are fine, because `write_atomically` makes them. The check leaves nothing behind.
 
     Raises:
-        UserError: it is a folder where a file is asked (or a file where a folder is), a device or pipe; a parent is a
-            file; or its place cannot be written to.
+        UserError: `path` is a folder instead of a file (or a file instead of a folder), a device or a pipe; a parent is
+            a file; or the folder that would hold it is not writable.
     """
     try:
         there = path.exists()
@@ -68,7 +69,8 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
     if not nearest.is_dir():
         raise UserError(f"{path}: {nearest} is a file, not a folder; choose another place")
     try:
-        # Tried, not asked: root may write everywhere by permission, yet not to /proc or a read-only disk.
+        # Test by writing instead of asking for permissions: root has every permission, yet cannot write to /proc or to
+        # a read-only disk.
         with tempfile.NamedTemporaryFile(dir=nearest, prefix=".mien-"):
             pass
     except OSError as error:
@@ -76,10 +78,10 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Call `write` with a temporary path beside `path`, then rename it into place: readers see all or nothing.
+    """Call `write` with a temporary path beside `path`, then rename it to `path`. Readers see either all or nothing.
 
     Raises:
-        CannotWriteError: the disk is full or read-only, or the place is not to be written to.
+        CannotWriteError: the disk is full or read-only, or the folder is not writable.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -100,12 +102,12 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def replace_folder(path: Path, finished: Path) -> None:
-    """Put the folder `finished`, which lies on the same disk, in the place `path`; a folder that is there goes.
+    """Move the folder `finished`, which is on the same disk, to `path`, and remove the folder that was there.
 
-    In one step where the system can exchange two names, so that readers find the one or the other.
+    This is a single step if the system can exchange two names. Readers then find either the old folder or the new one.
 
     Raises:
-        OSError: it cannot be done.
+        OSError: the folder cannot be moved.
     """
     if not path.exists():
         finished.rename(path)
@@ -120,7 +122,7 @@ def replace_folder(path: Path, finished: Path) -> None:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Let two paths change places (Linux); False where the system or the file system cannot."""
+    """Exchange two paths (Linux); False if the system or the file system cannot."""
     try:
         rename = ctypes.CDLL(None).renameat2
     except (OSError, AttributeError):
@@ -129,7 +131,7 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 def cannot_write(path: Path, error: OSError) -> CannotWriteError:
-    """What to tell when writing `path` failed: the remedy depends on why."""
+    """The error for a failed write of `path`, with a remedy that fits the cause."""
     if isinstance(error, CannotWriteError):
         return error
     full = error.errno in _FULL
@@ -139,10 +141,10 @@ def cannot_write(path: Path, error: OSError) -> CannotWriteError:
 
 @contextmanager
 def expect_whole(path: Path, remedy: str) -> Iterator[None]:
-    """Turn the errors of taking apart what was read from `path` into one line: entries missing, of another type, size.
+    """Report errors in the content read from `path` in one line: missing entries, wrong types or sizes.
 
     Raises:
-        UserError: such an error happened inside.
+        UserError: such an error occurred inside the context.
     """
     try:
         yield
@@ -152,7 +154,7 @@ def expect_whole(path: Path, remedy: str) -> Iterator[None]:
 
 
 def write_json(path: Path, format_name: str, version: int, content: Mapping[str, Any]) -> None:
-    """Write `content` as json behind its `format` and `version`, with a checksum that `read_json` takes off again."""
+    """Write `content` as json after its `format` and `version`, with a checksum that `read_json` removes again."""
     whole = {"format": format_name, "version": version, **content}
     text = json.dumps({**whole, _CHECKSUM: _json_checksum(whole)}, indent=1, allow_nan=False)
     write_atomically(path, lambda temporary: temporary.write_text(text + "\n", encoding="utf-8"))
@@ -161,13 +163,13 @@ def write_json(path: Path, format_name: str, version: int, content: Mapping[str,
 def read_json(
     path: Path, format_name: str, version: int, stage: str = _ANY_STAGE, remedy: str | None = None
 ) -> dict[str, Any]:
-    """Read what `write_json` wrote; `stage` is the command to name where that fails.
+    """Read what `write_json` wrote; error messages name the command `stage` as the remedy.
 
-    `remedy` says what to do instead, where the file's folder holds more than that stage makes in a moment; a file that
-    is missing still asks for its stage, if there is one.
+    `remedy` replaces that advice if the file's folder holds more than the stage can make again in a moment. A missing
+    file still asks for its stage, if there is one.
 
     Raises:
-        UserError: the file is missing, is no json, has another format or version, or was changed since.
+        UserError: the file is missing, is not json, has another format or version, or was changed after it was written.
     """
     try:
         content = parse_json(read_bytes(path, _LARGEST_JSON).decode("utf-8"))
@@ -198,7 +200,7 @@ def _json_checksum(content: Mapping[str, Any]) -> str:
 
 
 def _canonical_checksum(content: Any) -> str:
-    """Of what was parsed from json: tuples are lists, and keys are texts."""
+    """The checksum of content parsed from json, in which tuples are lists and keys are strings."""
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:32]
 
@@ -233,7 +235,7 @@ def write_safetensors(path: Path, data: bytes, metadata: Mapping[str, str] | Non
 
 
 def read_arrays(path: Path, stage: str = _ANY_STAGE) -> dict[str, np.ndarray]:
-    """Read safetensors as numpy arrays; `stage` is the command to name where that fails.
+    """Read safetensors as numpy arrays; error messages name the command `stage` as the remedy.
 
     Raises:
         UserError: the file is missing or damaged.
@@ -244,9 +246,9 @@ def read_arrays(path: Path, stage: str = _ANY_STAGE) -> dict[str, np.ndarray]:
 def read_safetensors(
     path: Path, load: Callable[[Path], Any], stage: str = _ANY_STAGE, remedy: str | None = None
 ) -> Any:
-    """What `load` reads from a safetensors file, with the errors of a missing or damaged one in words.
+    """What `load` reads from a safetensors file; a missing or damaged file is reported in one line.
 
-    `remedy` replaces "run `stage` again".
+    `remedy` replaces "run `stage` again" in the message.
 
     Raises:
         UserError: the file is missing or damaged.
@@ -263,7 +265,7 @@ def read_safetensors(
 
 
 def _check_safetensors(path: Path) -> None:
-    """Compare with the checksum that `write_safetensors` left; files of other programs have none."""
+    """Check a file against the checksum that `write_safetensors` stored. Files of other programs have none."""
     with open_ordinary(path) as file:
         whole = os.fstat(file.fileno()).st_size
         if whole > _LARGEST_TENSORS:

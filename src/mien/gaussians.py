@@ -9,16 +9,16 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """n activated Gaussians, with a leading batch axis where timesteps differ (an axis that is absent is shared)."""
+    """n activated Gaussians. A tensor that differs between timesteps has a leading batch axis; others are shared."""
 
     means: Float[Tensor, "... n 3"]
-    """Centres in the local frame, metres."""
+    """Centres in the local frame, in metres."""
     quats: Float[Tensor, "... n 4"]
-    """Rotations, wxyz; renderers normalise them."""
+    """Rotations as wxyz quaternions. Renderers normalise them."""
     scales: Float[Tensor, "... n 3"]
-    """Standard deviations along the rotated axes, metres, positive."""
+    """Standard deviations along the rotated axes, in metres, positive."""
     opacities: Float[Tensor, "... n"]
-    """0..1."""
+    """Opacities, 0 to 1."""
     sh: Float[Tensor, "... n k 3"]
     """Real spherical-harmonics coefficients of the colour (k = 1, 4, 9 or 16) in the local frame."""
     T_world_local: Float[Tensor, "... 4 4"] | None = None
@@ -34,7 +34,7 @@ class Gaussians:
         return any(t.ndim > ndim for t, ndim in self._tensors_with_ndim())
 
     def timestep(self, index: int) -> "Gaussians":
-        """One entry of the batch axis (entries without that axis are shared); unbatched Gaussians return themselves."""
+        """One entry of the batch axis; tensors without that axis are shared. Unbatched Gaussians return themselves."""
         if not self.batched:
             return self
         names = ("means", "quats", "scales", "opacities", "sh", "T_world_local")
@@ -45,7 +45,7 @@ class Gaussians:
         return Gaussians(**picked)
 
     def select(self, mask: Tensor) -> "Gaussians":
-        """The Gaussians where a bool mask [n] holds, or at the given indices."""
+        """The Gaussians that a bool mask [n] selects, or those at the given indices."""
         return replace(
             self,
             means=self.means[..., mask, :],
@@ -56,7 +56,7 @@ class Gaussians:
         )
 
     def to(self, like: Tensor) -> "Gaussians":
-        """The same Gaussians with the dtype and device of `like`."""
+        """These Gaussians with the dtype and device of `like`."""
         pose = None if self.T_world_local is None else self.T_world_local.to(like)
         moved = (t.to(like) for t in (self.means, self.quats, self.scales, self.opacities, self.sh))
         return Gaussians(*moved, T_world_local=pose)
@@ -68,18 +68,18 @@ class Gaussians:
         return Gaussians(*cut, T_world_local=pose)
 
     def _tensors_with_ndim(self) -> list[tuple[Tensor, int]]:
-        """Each tensor that is there with its number of axes when unbatched, in the order of the fields."""
+        """Each tensor that is not None, with its number of axes when unbatched, in the order of the fields."""
         entries = [(self.means, 2), (self.quats, 2), (self.scales, 2), (self.opacities, 1), (self.sh, 3)]
         return entries if self.T_world_local is None else [*entries, (self.T_world_local, 2)]
 
 
 def _entry(tensor: Tensor, index: int) -> Tensor:
-    # The only entry as a view: the gradient of an index would be written into zeros of the whole batch.
+    # A single entry is taken as a view: the backward pass of an index writes into zeros of the whole batch's size.
     return tensor.squeeze(0) if len(tensor) == 1 and index in (0, -1) else tensor[index]
 
 
 def world_means(gaussians: Gaussians) -> Float[Tensor, "... n 3"]:
-    """Centres in world space, metres."""
+    """Centres in world space, in metres."""
     if gaussians.T_world_local is None:
         return gaussians.means
     rotation = gaussians.T_world_local[..., :3, :3]
@@ -91,10 +91,10 @@ SH_C0 = 0.28209479177387814
 
 
 def sh_from_rgb(rgb: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """Constant SH coefficients whose colour is `rgb` (0..1)."""
+    """Constant SH coefficients for the colour `rgb` (0..1)."""
     return (rgb - 0.5) / SH_C0
 
 
 def rgb_from_sh(dc: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """Colours of constant SH coefficients, clamped at 0 from below as renderers do."""
+    """Colours of constant SH coefficients, clamped to 0 from below as in the renderers."""
     return torch.clamp_min(dc * SH_C0 + 0.5, 0)

@@ -1,4 +1,4 @@
-"""What `mien COMMAND --help` shows: the options that people ask for; `--help-all` shows every one."""
+"""The options that `mien COMMAND --help` shows: the common ones. `--help-all` shows every option."""
 
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
@@ -7,15 +7,15 @@ _COMMON = {
     "capture": ("size", "crop", "start", "end", "turn", "stride", "fps", "cuts", "clean_plate", "mattes"),
     "tracking": ("focal", "same_camera", "schedule"),
 }
-"""Of each group of settings, by the prefix of its options."""
+"""Common fields of each group of settings, by the prefix of the group's options."""
 
 
 def without_details(command: type) -> tuple[type, list[str]]:
-    """The options of a command without the rarely needed ones, and the groups that lack some.
+    """The options of a command without the rarely needed ones, and the groups that lack some of their options.
 
     Args:
-        command: A dataclass as tyro reads it. A field that is a dataclass is a group of settings, by the field's name
-            or that of its `tyro.conf.arg`.
+        command: A dataclass as tyro reads it. A field that is a dataclass is a group of settings, named by the field or
+            by its `tyro.conf.arg`.
     """
     shown: dict[str, Any] = {}
     groups = []
@@ -32,7 +32,7 @@ def without_details(command: type) -> tuple[type, list[str]]:
 
 
 def _hiding(settings: type, kept: tuple[str, ...]) -> type:
-    """The same dataclass, whose other fields are no options."""
+    """The same dataclass with all fields but `kept` removed from the options."""
     import tyro
 
     hints = get_type_hints(settings, include_extras=True)
@@ -46,6 +46,6 @@ def _hiding(settings: type, kept: tuple[str, ...]) -> type:
 
 def subclass_with(parent: type, annotations: dict[str, Any], defaults: dict[str, Any]) -> type:
     """The same dataclass with other types and defaults of some fields."""
-    # A subclass: tyro finds the descriptions of the fields in the parent's source.
+    # It is a subclass, because tyro finds the descriptions of the fields in the parent's source.
     namespace = {"__annotations__": annotations, "__doc__": parent.__doc__, "__module__": parent.__module__, **defaults}
     return dataclass(frozen=True)(type(parent.__name__, (parent,), namespace))

@@ -1,9 +1,9 @@
-"""Paths inside a folder that a stranger may have filled: names that stay in it, and nothing in it that leads out.
+"""Safe paths inside a folder that a stranger may have filled: names stay in the folder, and nothing leads out of it.
 
-A workspace, a run, a capture or an avatar can come from somebody else, who chose every name in it. The folder that the
-user names may be reached through links. Below it there are only files and folders: `check_tree` refuses links, pipes
-and devices before anything is read or written there. What is written in place is opened here as well, so that a link
-or a second name of a file outside is never written through.
+A workspace, a run, a capture or an avatar can come from somebody else, who chose every name in it. The path to the
+folder that the user names may contain links. Below that folder, only files and folders are allowed: `check_tree`
+refuses links, pipes and devices before anything is read or written. Files that are changed in place are opened here as
+well, so that nothing is ever written through a link or through a second name of a file outside.
 """
 
 import os
@@ -18,19 +18,19 @@ from mien.errors import UserError
 
 _MOST_BYTES_OF_NAME = 255
 _NOT_IN_NAMES = frozenset({"Cc", "Cs", "Zl", "Zp"})
-"""Categories of characters: control characters, halves of surrogates, ends of lines and paragraphs."""
+"""Unicode categories: control characters, halves of surrogate pairs, line and paragraph separators."""
 _NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
-"""Without it, opening a pipe waits for who writes into it."""
+"""Without this flag, opening a pipe waits for a process that writes into it."""
 
 
 def is_one_line(text: object) -> bool:
-    """Whether it is a text without control characters and ends of lines, safe to show."""
+    """Whether it is a text without control characters and line breaks, which is safe to show."""
     return isinstance(text, str) and not any(unicodedata.category(letter) in _NOT_IN_NAMES for letter in text)
 
 
 def is_plain_name(name: object) -> bool:
-    """Whether it can be the name of one file or folder and leads nowhere else."""
+    """Whether it is a name that a file or folder can have, and that does not lead to another folder."""
     if not (isinstance(name, str) and is_one_line(name)):
         return False
     return name not in ("", ".", "..") and not set(name) & {"/", "\\"} and len(name.encode()) <= _MOST_BYTES_OF_NAME
@@ -40,7 +40,7 @@ def inside(folder: Path, name: object) -> Path:
     """The path of `name` in a folder.
 
     Raises:
-        UserError: `name` is no plain name, so it may lead out of the folder.
+        UserError: `name` is not a plain name, so it may lead out of the folder.
     """
     if not is_plain_name(name):
         raise UserError(f"{folder}: {name!r:.100} cannot be the name of a file or folder in it; give a plain name")
@@ -48,10 +48,10 @@ def inside(folder: Path, name: object) -> Path:
 
 
 def check_tree(folder: Path) -> None:
-    """Find that below a folder there are only files and folders. The folder itself may be a link, or missing.
+    """Check that only files and folders are below a folder. The folder itself may be a link, or missing.
 
     Raises:
-        UserError: something below is a link, a pipe, a device or a socket, or cannot be looked at.
+        UserError: something below is a link, a pipe, a device or a socket, or cannot be checked.
     """
     for entry in _entries(folder):
         if not entry.is_file(follow_symlinks=False):
@@ -59,10 +59,10 @@ def check_tree(folder: Path) -> None:
 
 
 def check_subtrees(folder: Path, *names: str) -> None:
-    """`check_tree` of some entries of a folder, which must not be links themselves; they may be missing.
+    """Run `check_tree` on some entries of a folder. The entries may be missing, but must not be links themselves.
 
     Raises:
-        UserError: one of them, or something below, is no file or folder.
+        UserError: an entry is not a folder, or something below it is not a file or folder.
     """
     for name in names:
         path = folder / name
@@ -72,7 +72,7 @@ def check_subtrees(folder: Path, *names: str) -> None:
 
 
 def open_to_read(path: Path) -> IO[bytes]:
-    """A file inside, open for reading.
+    """Open a file inside the folder for reading.
 
     Raises:
         UserError: it is a link, a folder, a pipe or a device.
@@ -82,27 +82,27 @@ def open_to_read(path: Path) -> IO[bytes]:
 
 
 def open_to_change(path: Path) -> int:
-    """The descriptor of a file inside whose content is kept and changed; it is made where it is missing.
+    """The descriptor of a file inside the folder, opened to change its content. A missing file is created.
 
     Raises:
-        UserError: it is a link, no file, or has a second name, which may lie outside.
+        UserError: it is a link, is not a file, or has a second name, which may be outside the folder.
         OSError: it cannot be written.
     """
     return _opened(path, os.O_RDWR | os.O_CREAT, alone=True)
 
 
 def open_to_append(path: Path) -> IO[str]:
-    """A text file inside, open at its end.
+    """Open a text file inside the folder to append to it.
 
     Raises:
-        UserError: as `open_to_change`.
+        UserError: as for `open_to_change`.
         OSError: it cannot be written.
     """
     return os.fdopen(_opened(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, alone=True), "a", encoding="utf-8")
 
 
 def open_new(path: Path) -> IO[bytes]:
-    """A new, empty file in the place of whatever file or link is there; what a link leads to stays as it is.
+    """Create a new, empty file in place of an existing file or link. The target of a link stays as it is.
 
     Raises:
         OSError: it cannot be written.
@@ -112,7 +112,7 @@ def open_new(path: Path) -> IO[bytes]:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a folder with all that is in it, or a file or link; never what a link leads to. Missing is fine."""
+    """Remove a folder with everything in it, or a file or link, but never the target of a link. It may be missing."""
     if path.is_symlink() or not path.is_dir():
         path.unlink(missing_ok=True)
     else:
@@ -120,7 +120,7 @@ def remove_tree(path: Path) -> None:
 
 
 def drop_if_shared(path: Path) -> None:
-    """Make room where a link lies, or a file that also lies elsewhere: what else is there may be written in place.
+    """Remove a link, or a file with a second name, so that a write in place cannot change what is elsewhere.
 
     Raises:
         OSError: it cannot be removed.
@@ -130,12 +130,12 @@ def drop_if_shared(path: Path) -> None:
 
 
 def has_other_names(folder: Path) -> bool:
-    """Whether a file below has a second name, through which writing in place would reach another folder."""
+    """Whether a file below has a second name, so that writing in place would change another folder."""
     return any(entry.stat(follow_symlinks=False).st_nlink != 1 for entry in _entries(folder))
 
 
 def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
-    """All below a folder that are no folders themselves; no link is followed."""
+    """Everything below a folder except folders. Links are not followed."""
     pending = [str(folder)]
     while pending:
         try:

@@ -1,4 +1,4 @@
-"""Names of a room that are imported at their first use (PEP 562): its settings load without its libraries."""
+"""Imports names of a package at their first use (PEP 562), so that its settings load without its libraries."""
 
 import importlib
 import sys
@@ -7,11 +7,11 @@ from typing import Any
 
 
 def lazy_names(room: str, homes: Mapping[str, Sequence[str]]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` of a room's `__init__`.
+    """`__getattr__` and `__dir__` for the `__init__` of a package.
 
     Args:
-        room: The room's `__name__`.
-        homes: Module of the room -> names that it gives to the room; none may be a module's name.
+        room: The package's `__name__`.
+        homes: Module of the package -> names that the package exports from it. No name may be the name of a module.
     """
     modules = {name: f"{room}.{home}" for home, names in homes.items() for name in names}
 

@@ -1,7 +1,7 @@
-"""Limits of what files may ask for: sizes of pictures, cameras that can see, joints in order. Without torch.
+"""Limits on the content of files: sizes of pictures, valid cameras, order of joints. Needs no torch.
 
-A file from a stranger has right checksums, too. What it says is checked where it is read, so that nothing behind the
-reader meets a picture of 10^9 pixels, an index outside of its array, or a number that overflows.
+A stranger's file can have correct checksums, too. Its content is checked when it is read, so that no later code meets a
+picture of 10^9 pixels, an index outside its array, or a number that overflows.
 """
 
 from collections.abc import Sequence
@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 LARGEST_SIDE = 8192
-"""Pixels of a picture's width or height."""
+"""Largest width or height of a picture, in pixels."""
 LARGEST_NUMBER = 1e6
-"""Of metres, radians, raw values and weights; what mien writes stays far below."""
+"""Largest magnitude of lengths in metres, angles in radians, raw values and weights. Mien writes far smaller
+numbers."""
 LARGEST_FOCAL = 1e7
-"""Pixels."""
+"""Largest focal length, in pixels."""
 _RIGID = 1e-2
-"""How far a view's rotation may be from one."""
+"""Tolerance for the last rows of K and viewmat, and for the deviation of R R^T from the identity."""
 
 
 def whole(value: object, low: int, high: int) -> int:
@@ -40,17 +41,17 @@ def side(value: object) -> int:
 
 
 def is_moderate(array: np.ndarray) -> bool:
-    """Whether all numbers are finite and none is beyond `LARGEST_NUMBER`."""
+    """Whether all numbers are finite and at most `LARGEST_NUMBER` in magnitude."""
     return array.size == 0 or bool(np.abs(array).max() <= LARGEST_NUMBER)
 
 
 def are_indices(array: np.ndarray, count: int) -> bool:
-    """Whether all are indices into `count` things."""
+    """Whether all values are indices into an array of `count` entries."""
     return array.size == 0 or bool(int(array.min()) >= 0 and int(array.max()) < count)
 
 
 def camera_fault(K: Any, viewmat: Any, width: object, height: object) -> str | None:
-    """Why these cannot be a camera (`mien.camera.Camera`); None where they can.
+    """The reason why these cannot be a camera (`mien.camera.Camera`), or None if they can.
 
     Args:
         K: array [3, 3], pixels.
@@ -87,7 +88,7 @@ def _product(turned: np.ndarray) -> np.ndarray:
 
 
 def skeleton_fault(names: Sequence[Any], parents: Sequence[Any], free: Sequence[Any]) -> str | None:
-    """Why these cannot be the joints of a model (`joint_names`, `joint_parents`, `joint_free`); None where they can."""
+    """The reason why these cannot be a model's `joint_names`, `joint_parents`, `joint_free`, or None if they can."""
     if not (len(names) == len(parents) == len(free)) or not names:
         return f"{len(names)} joint names, {len(parents)} parents and {len(free)} marks of free joints"
     if not all(isinstance(name, str) for name in names) or not all(isinstance(mark, bool) for mark in free):

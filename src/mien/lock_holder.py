@@ -1,4 +1,4 @@
-"""Who holds a lock: signed into the lock file, read by those who come too late. `mien.locks` has the locks."""
+"""The process that holds a lock signs the lock file, and later processes read that. `mien.locks` has the locks."""
 
 import json
 import os
@@ -13,17 +13,17 @@ from typing import Any
 from mien.errors import UserError
 
 _BEGINNING = b'{"format": "mien.lock"'
-"""Every lock file of ours begins so."""
+"""Every lock file of mien begins with this."""
 _MOST_BYTES = 4096
 _SHOWN = {"host": 60, "since": 30, "command": 200}
-"""Characters of what a holder says about itself that are shown."""
+"""Number of characters that are shown of each entry about a holder."""
 
 
 def sign(handle: int, file: Path) -> None:
-    """Write into an open lock file that this process holds it: pid, host, time and command line.
+    """Write into an open lock file that this process holds it, with pid, host, time and command line.
 
     Raises:
-        UserError: the file is not one of ours, and is left as it is.
+        UserError: the file is not a lock file of mien. It stays as it is.
     """
     found = os.pread(handle, len(_BEGINNING), 0)
     if found != _BEGINNING[: len(found)]:
@@ -37,15 +37,15 @@ def sign(handle: int, file: Path) -> None:
         "command": command[: _SHOWN["command"] + 1],
     }
     text = json.dumps(about).encode()
-    with suppress(OSError):  # a full disk, or another user's file: the lock holds without a name in it
+    with suppress(OSError):  # a full disk, or another user's file: the lock holds even without a signature
         os.ftruncate(handle, 0)
         os.pwrite(handle, text, 0)
 
 
 def read_holder(handle: int) -> str | None:
-    """Who holds the lock of an open lock file, in words on one line; what the file says is not trusted.
+    """The holder of an open lock file, described in one line. The content of the file is not trusted.
 
-    None where it does not say, or names a process that has ended: the holder has not signed yet.
+    The result is None if the file names no process, or one that has ended: the holder has not signed yet.
     """
     about = _parsed(os.pread(handle, _MOST_BYTES, 0))
     if about is None or not _may_live(about):
@@ -64,19 +64,19 @@ def _parsed(text: bytes) -> dict[str, Any] | None:
 
 
 def _may_live(about: dict[str, Any]) -> bool:
-    """False where it is a process of this machine that has ended."""
+    """False if the holder is a process of this machine that has ended."""
     if about.get("host") != socket.gethostname()[: _SHOWN["host"]]:
         return True
     try:
         os.kill(about["pid"], 0)
     except ProcessLookupError:
         return False
-    except OSError:  # another user's
+    except OSError:  # the process belongs to another user
         return True
     return True
 
 
 def _shown(text: object, longest: int) -> str:
-    """Untrusted text for a terminal: on one line, without control characters, cut."""
+    """Untrusted text for a terminal: one line, without control characters, of limited length."""
     plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text)[: longest + 1])
     return plain if len(plain) <= longest else plain[:longest] + "..."

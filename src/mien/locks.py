@@ -1,16 +1,18 @@
-"""Two commands on one workspace: who writes holds a lock, who reads never waits.
+"""Two commands on one workspace: writers hold a lock, and readers never wait.
 
-`hold` takes the lock of a place (a folder or a file, there or not): the hidden file `.NAME.lock` beside it, under
-flock(2). The system releases it when the process ends, however it ends, so a lock is never left over. A place that
-another process holds is told at once (`BeingWrittenError`), with what that process wrote into the file about itself.
+`hold` takes the lock of a place (a folder or a file, which may be missing). The lock is the hidden file `.NAME.lock`
+beside the place, locked with flock(2). The system releases it when the process ends, however it ends, so no lock is
+ever left over. If another process holds a place, `hold` raises `BeingWrittenError` at once and quotes what that process
+wrote about itself into the file.
 
-The file goes with the lock. That is safe, because it is removed only under its lock, and because whoever gets a lock
-looks whether the file still has its name, and else starts again. After a kill it stays, unlocked, for the next one.
+The file is removed with the lock. That is safe, because it is removed only while it is locked, and because each process
+that gets a lock checks that the file still has its name, and starts again if not. After a kill the file stays,
+unlocked, and the next process uses it.
 
-The file may come from a stranger with the workspace: no link is followed, and what it says is not trusted
+The file may come from a stranger together with the workspace: no link is followed, and its content is not trusted
 (`mien.lock_holder`).
 
-Which command holds which locks is in docs/conventions.md, "Two commands at once". Readers use `read_beside_writers`.
+docs/conventions.md, "Two commands at once", lists which command holds which locks. Readers use `read_beside_writers`.
 """
 
 import errno
@@ -32,43 +34,45 @@ from mien.progress import say
 Result = TypeVar("Result")
 
 WAIT, AGAIN = "wait until it is done, or end it", "try again when it is done"
-"""Remedies, for who writes and for who reads."""
+"""Remedies for writers and for readers."""
 _LONGEST_NAME = 240
-"""Bytes; file systems allow 255."""
+"""Longest name of a lock file, in bytes. File systems allow 255."""
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
 _REMOVED = frozenset({errno.ENOENT, errno.ESTALE})
-"""By who released it (ESTALE: on another machine), with folders that stayed empty."""
+"""Errors if the process that released the lock has removed the file and the folders that stayed empty (ESTALE: on
+another machine)."""
 _PATIENCE_SECONDS, _STEP_SECONDS = 0.5, 0.01
-"""How long a lock is asked for again whose holder does not say its name: it may be a reader that looks at it for a
-moment, a process that was killed and is about to end, or one that signs in a moment."""
+"""How long to try again for a lock without a readable holder. The holder may be a reader that checks the lock for a
+moment, a process that was killed and is about to end, or a process that is about to sign."""
 _NAMELESS = "which has not left its name"
 _PAUSES_SECONDS = (0.0, 0.02, 0.05, 0.1)
-"""Before a reader reads again what a writer has changed under its hands."""
+"""Pauses before a reader reads again files that a writer changed in the meantime."""
 
 _ours: dict[int, tuple[int, int]] = {}
 """Open lock files of this process -> their device and number."""
 _once: set[str] = set()
-"""What was done or said in this process and is not to be repeated."""
+"""Actions and messages that happen only once per process."""
 
 
 class BeingWrittenError(UserError):
-    """Another process writes this place now."""
+    """Another process is writing this place."""
 
 
 @contextmanager
 def hold(*places: Path, remedy: str = WAIT) -> Iterator[None]:
-    """Be the only one that writes these places (folders or files, there or not) while the context lasts.
+    """Be the only writer of these places (folders or files, which may be missing) while the context lasts.
 
-    Folders above them are made, and go again if they stay empty. In a file system without locks it warns, once, and
-    goes on.
+    Missing parent folders are created, and removed again if they stay empty. If the file system has no locks, this
+    warns once and continues.
 
     Args:
-        places: taken in their order by name, so that of two processes that want the same ones the first gets all.
-        remedy: what to tell if another process has one.
+        places: locked in the order of their names, so that of two processes that want the same places the first gets
+            all.
+        remedy: advice for the message if another process holds a place.
 
     Raises:
-        BeingWrittenError: another process, or another thread of this one, holds one of them.
-        CannotWriteError: nothing can be written beside a place.
+        BeingWrittenError: another process, or another thread of this one, holds a place.
+        CannotWriteError: no lock file can be written beside a place.
     """
     with ExitStack() as stack:
         for place in sorted(set(places)):
@@ -77,14 +81,14 @@ def hold(*places: Path, remedy: str = WAIT) -> Iterator[None]:
 
 
 def check_free(place: Path, remedy: str = WAIT) -> None:
-    """Tell before any work, by a BeingWrittenError, that another process writes a place."""
+    """Raise a BeingWrittenError before any work if another process is writing a place."""
     holder = holder_of(place)
     if holder is not None:
         raise _being_written(place, holder, remedy)
 
 
 def holder_of(place: Path) -> str | None:
-    """Which other process writes a place, in words; None where nobody does, or only this process."""
+    """A description of the other process that is writing a place, or None if there is none."""
     try:
         handle = _open(lock_file(place), os.O_RDONLY)
     except (OSError, UserError):
@@ -103,16 +107,16 @@ def holder_of(place: Path) -> str | None:
 
 
 def read_beside_writers(read: Callable[[], Result], folders: Sequence[Path], places: Sequence[Path]) -> Result:
-    """What `read` returns. Where it fails because a writer replaced files while it read, it is called again.
+    """What `read` returns. If it fails because a writer replaced files meanwhile, it is called again.
 
     Args:
-        read: raises a UserError where what it finds is missing or damaged.
-        folders: whose files it reads.
-        places: whose locks the writers of these folders hold.
+        read: raises a UserError if files are missing or damaged.
+        folders: the folders that it reads.
+        places: the places that writers of these folders lock.
 
     Raises:
-        BeingWrittenError: it fails, and another process is at work there.
-        UserError: it fails otherwise.
+        BeingWrittenError: it fails while another process is writing there.
+        UserError: it fails for another reason.
     """
     for pause in (*_PAUSES_SECONDS, None):
         before = [_state(folder) for folder in folders]
@@ -131,7 +135,7 @@ def read_beside_writers(read: Callable[[], Result], folders: Sequence[Path], pla
 
 
 def lock_file(place: Path) -> Path:
-    """The hidden file beside a place whose lock is the place's."""
+    """The path of a place's lock file, a hidden file beside the place."""
     place = Path(os.path.abspath(place))  # noqa: PTH100 (`resolve` would follow a link in the place of a folder)
     name = f".{place.name}.lock"
     if len(os.fsencode(name)) > _LONGEST_NAME:
@@ -158,7 +162,7 @@ def _hold_one(place: Path, remedy: str) -> Iterator[None]:
 
 
 def _acquire(place: Path, file: Path, remedy: str) -> int | None:
-    """An open and locked file; None where the file system has no locks."""
+    """The descriptor of the open and locked file, or None if the file system has no locks."""
     _let_children_forget()
     patience = time.monotonic() + _PATIENCE_SECONDS
     while True:
@@ -209,7 +213,7 @@ def _wait_for_name(handle: int) -> str:
 def _release(file: Path, handle: int | None) -> None:
     if handle is None:
         return
-    # Under its lock: who waits for this very file finds that it has lost its name.
+    # Remove it while it is locked: a process that waits for this file then finds that it has lost its name.
     with suppress(OSError):
         if _is_named(handle, file):
             file.unlink()
@@ -218,20 +222,20 @@ def _release(file: Path, handle: int | None) -> None:
 
 
 def _open_own(file: Path) -> int:
-    """The lock file, made unless it is there."""
+    """Open the lock file, and create it if it is missing."""
     try:
         return _open(file, os.O_RDWR | os.O_CREAT)
     except PermissionError:
         if not file.is_file():
             raise
-        return _open(file, os.O_RDONLY)  # another user's: it can be locked all the same
+        return _open(file, os.O_RDONLY)  # another user's file, which can still be locked
 
 
 def _open(file: Path, flags: int) -> int:
-    """Open a lock file: no link, no pipe that would be waited for, nothing that has another name besides.
+    """Open a lock file. Links, pipes and files with a second name are refused.
 
     Raises:
-        UserError: it is none.
+        UserError: the path is not a plain file with a single name.
         OSError: it cannot be opened.
     """
     remedy = "it takes the place of a lock file; remove it"
@@ -249,7 +253,7 @@ def _open(file: Path, flags: int) -> int:
 
 
 def _is_named(handle: int, file: Path) -> bool:
-    """Whether the open file is still the one of that name."""
+    """Whether the open file is still the file of that name."""
     opened = os.fstat(handle)
     try:
         named = file.lstat()
@@ -267,7 +271,7 @@ def _being_written(place: Path, holder: str, remedy: str) -> BeingWrittenError:
 
 
 def _state(folder: Path) -> object:
-    """Changes whenever a folder or one of the files right in it is replaced."""
+    """A state that changes if the folder or a file directly in it is replaced."""
     try:
         own = folder.stat()
         files = [(entry.name, entry.stat(follow_symlinks=False)) for entry in os.scandir(folder) if not entry.is_dir()]
@@ -283,7 +287,7 @@ def _warn_of_no_locks(file: Path) -> None:
 
 
 def _let_children_forget() -> None:
-    """A child made by fork shares its parent's locks and must not keep them when the parent has died."""
+    """Close the locks in children made by fork, which would otherwise keep them after their parent has died."""
     if "fork" not in _once:
         _once.add("fork")
         os.register_at_fork(after_in_child=_forget)

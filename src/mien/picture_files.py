@@ -1,4 +1,4 @@
-"""Many pictures of one size: written one after the other, read as an array that does not fill the memory."""
+"""Many pictures of one size: written one by one, and read as an array that does not fill the memory."""
 
 import contextlib
 import math
@@ -19,16 +19,16 @@ from mien.files import cannot_write
 from mien.inside import open_to_read
 
 _KEPT = 256 << 20
-"""Bytes of a map that are handed out before its pages are given back, and of a stack that are held in memory."""
+"""Number of bytes that a map hands out before it gives its pages back, and largest stack that is held in memory."""
 _PNG_SIGNATURE, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _PNG_HEADERS = 1 << 16
-"""Bytes of a file beside those of its pixels, at most."""
+"""Most bytes of a PNG file besides those of its pixels."""
 _DONT_NEED = getattr(mmap, "MADV_DONTNEED", None)
-"""None where the system cannot be told (Windows)."""
+"""None if the system has no such call (Windows)."""
 
 
 class _Tally:
-    """Bytes handed out by a map and all of its views."""
+    """Counts the bytes handed out by a map and all of its views."""
 
     def __init__(self) -> None:
         self.handed_out = 0
@@ -37,19 +37,19 @@ class _Tally:
 class PictureMap(np.memmap):
     """A read-only memory map that gives its pages back to the system now and then.
 
-    What was looked at once stays in a plain map's share of the process's memory, up to the whole file. Pages that are
-    given back are read again when they are looked at again, mostly from the system's cache of files.
+    In a plain map, every page that was read once stays in the process's memory, up to the whole file. Pages that were
+    given back are read again when they are needed, mostly from the system's file cache.
     """
 
     _tally: _Tally | None = None
 
     def __array_finalize__(self, obj: Any) -> None:
-        """Views count with what they are views of."""
+        """Let views share the count of the array that they view."""
         super().__array_finalize__(obj)
         self._tally = getattr(obj, "_tally", None)
 
     def __getitem__(self, index: Any) -> Any:
-        """As of any array."""
+        """Index the map, and count the bytes that are handed out."""
         found = super().__getitem__(index)
         if isinstance(found, np.ndarray) and self._tally is not None:
             self._tally.handed_out += found.nbytes
@@ -65,20 +65,22 @@ class PictureMap(np.memmap):
 
 
 def map_pictures(file: Any, shape: tuple[int, ...]) -> PictureMap:
-    """The pictures [..., h, w] or [..., h, w, 3] in a raw file (a path, or an open file)."""
+    """Map the pictures [..., h, w] or [..., h, w, 3] in a raw file, given as a path or an open file."""
     pictures = cast(PictureMap, PictureMap(file, np.uint8, "r", shape=shape))
     pictures._tally = _Tally()
     return pictures
 
 
 class PictureStack:
-    """Pictures that are written in any order and read as one array: in memory while they are few, else on disk.
+    """Pictures that are written in any order and read as one array. A small array is in memory, a large one on disk.
 
-    The file has no name, and goes with the array.
+    The file on disk has no name, and is removed together with the array.
     """
 
     def __init__(self, shape: tuple[int, ...], folder: Path | None = None) -> None:
-        """`shape` is that of the array, [t, c, h, w]; `folder` is where there is room for it, by default the system's.
+        """Make room for an array of the given `shape`, [t, c, h, w].
+
+        A large array is in `folder`, by default in the system's folder for temporary files.
 
         Raises:
             CannotWriteError: the folder cannot be written to.
@@ -89,14 +91,14 @@ class PictureStack:
             self._array = np.zeros(shape, np.uint8)
             return
         try:
-            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (it lives as long as this)
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (open as long as this object lives)
             weakref.finalize(self, self._file.close)
             os.truncate(self._file.fileno(), math.prod(shape))
         except OSError as error:
             raise cannot_write(self._folder, error) from None
 
     def write(self, timestep: int, camera: int, picture: UInt8[np.ndarray, "h w"]) -> None:
-        """Put one picture in its place.
+        """Write one picture to its place.
 
         Raises:
             CannotWriteError: the disk is full.
@@ -105,30 +107,30 @@ class PictureStack:
             self._array[timestep, camera] = picture
             return
         try:
-            # Through a memory map a full disk would be a crash, not an error.
+            # A write through a memory map would crash on a full disk, not raise an error.
             write_at(self._file.fileno(), picture, (timestep * self._shape[1] + camera) * picture.nbytes)
         except OSError as error:
             raise cannot_write(self._folder, error) from None
 
     def array(self) -> UInt8[np.ndarray, "t c h w"]:
-        """All pictures; zero where none was written."""
+        """All pictures. Pictures that were not written are zero."""
         return self._array if self._file is None else map_pictures(self._file, self._shape)
 
 
 def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndarray, "..."]:
-    """A picture that mien wrote inside a workspace, [h, w] or [h, w, 3] (RGB); its header's size is looked at first.
+    """Read a picture that mien wrote inside a workspace, [h, w] or [h, w, 3] (RGB). Its header is checked first.
 
     Args:
-        path: of the file, no link.
-        shape: that it has to have.
-        remedy: what to do where it has not.
+        path: the file, which must not be a link.
+        shape: the shape that the picture must have.
+        remedy: advice for the message if the picture is missing or damaged.
 
     Raises:
         UserError: it is missing, damaged, or of another shape.
     """
     try:
         with open_to_read(path) as file:
-            # Noise takes a little more than its pixels; what is longer than that counts as damaged.
+            # A PNG of noise is a little larger than its pixels; a file that is much longer counts as damaged.
             most = 2 * math.prod(shape) + _PNG_HEADERS
             data = file.read(min(most, os.fstat(file.fileno()).st_size))
     except FileNotFoundError:
@@ -136,10 +138,10 @@ def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndar
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
     if not data.endswith(_PNG_END):
-        # Checked here, because libpng would print its complaint and return half a picture.
+        # Check the end here, because libpng would only print a complaint and return half a picture.
         raise UserError(f"{path}: truncated; {remedy}")
     picture = None
-    # Its width and height stand at the beginning; what they promise would be allocated.
+    # Check the width and height in the header first, because the decoder would allocate them.
     if data[:8] == _PNG_SIGNATURE and data[16:24] == struct.pack(">II", shape[1], shape[0]):
         with contextlib.suppress(cv2.error):
             flags = cv2.IMREAD_COLOR_RGB if len(shape) == 3 else cv2.IMREAD_GRAYSCALE
@@ -150,7 +152,7 @@ def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndar
 
 
 def write_at(file: int, picture: UInt8[np.ndarray, "..."], offset: int) -> None:
-    """Write a picture's bytes at a place in an open file.
+    """Write a picture's bytes at an offset in an open file.
 
     Raises:
         OSError: the disk is full.

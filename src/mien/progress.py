@@ -1,4 +1,4 @@
-"""Progress bars with an ETA for long work; quiet where the output is no terminal, but never silent."""
+"""Progress bars with an ETA for long work. If the output is no terminal, they print a line now and then."""
 
 import sys
 import time
@@ -16,12 +16,12 @@ Item = TypeVar("Item")
 
 class _Console(Console):
     def on_broken_pipe(self) -> None:
-        """Leave it to the command line, as everything else that nobody reads any more; rich would end the process."""
+        """Let the command line handle a closed pipe, as in all other output. Rich would end the process."""
         raise BrokenPipeError
 
 
 console = _Console(stderr=True, highlight=False, markup=False, emoji=False)
-"""Where people read: standard error, so that standard output stays for results."""
+"""The console for people, on standard error, so that standard output stays for results."""
 
 _PLAIN_INTERVAL_SECONDS = 10.0
 _CALLS_BEFORE_ETA = 3
@@ -29,7 +29,7 @@ _CALLS_BEFORE_ETA = 3
 
 @runtime_checkable  # for beartype, which checks annotations during tests
 class Advance(Protocol):
-    """Moves a progress bar on."""
+    """A function that moves a progress bar on."""
 
     def __call__(self, amount: int = 1, status: str = "") -> None:
         """Advance by `amount` and show `status` behind the bar."""
@@ -38,7 +38,7 @@ class Advance(Protocol):
 
 @contextmanager
 def progress_bar(title: str, total: int, completed: int = 0) -> Iterator[Advance]:
-    """A bar from `completed` to `total`; into a log file it prints a line every ten seconds instead."""
+    """A bar from `completed` to `total`. If the output is no terminal, it prints a line every ten seconds instead."""
     title = printable(title)
     if not sys.stderr.isatty():
         with _plain_progress(title, total, completed) as advance:
@@ -73,7 +73,7 @@ def _plain_progress(title: str, total: int, completed: int) -> Iterator[Advance]
     def report() -> None:
         nonlocal told
         elapsed, since_first = time.monotonic() - start, time.monotonic() - first
-        # The first item also loads and warms up what the others use.
+        # The first item takes longer, because it also loads and warms up what the others use.
         rate = (done - at_first) / since_first if calls >= _CALLS_BEFORE_ETA and since_first > 0 else 0.0
         eta = f", ETA {(total - done) / rate:.0f} s" if rate > 0 and done < total else ""
         line = f"{title}: {done}/{total} in {elapsed:.0f} s{eta} {latest}".rstrip()
@@ -95,7 +95,7 @@ def _plain_progress(title: str, total: int, completed: int) -> Iterator[Advance]
 
 
 def track_progress(items: Iterable[Item], title: str, total: int) -> Iterator[Item]:
-    """Iterate with a progress bar."""
+    """Iterate over items with a progress bar."""
     with progress_bar(title, total) as advance:
         for item in items:
             yield item
@@ -103,5 +103,5 @@ def track_progress(items: Iterable[Item], title: str, total: int) -> Iterator[It
 
 
 def say(message: str) -> None:
-    """One line for people, on standard error; what would act on the terminal is shown instead (`mien.terminal`)."""
+    """Print one line for people on standard error, with control characters made harmless (`mien.terminal`)."""
     console.print(printable(message), soft_wrap=True)

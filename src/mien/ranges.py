@@ -1,4 +1,4 @@
-"""Which numbers a setting may have: bounds stand beside the field and are checked in one place.
+"""Ranges of the numbers in settings. Each range is written beside its field, and all are checked in one place.
 
     rounds: Annotated[int, Range(0, 100_000)] = 16
 
@@ -12,12 +12,12 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 from mien.errors import UserError
 
 _LONGEST_SHOWN = 60
-"""Characters of a value in a message."""
+"""Number of characters of a value that a message shows."""
 
 
 @dataclass(frozen=True)
 class Range:
-    """The numbers from `least` to `most`, both included; NaN is never one of them.
+    """The numbers from `least` to `most`, both included, but never NaN.
 
     A tuple is in range if each of its entries is.
     """
@@ -25,16 +25,16 @@ class Range:
     least: float | int
     most: float | int
     or_zero: bool = False
-    """Whether 0 is allowed besides, to switch something off."""
+    """Whether 0 is allowed as well, to switch something off."""
     ascending: bool = False
-    """Whether the entries of a tuple have to grow from one to the next."""
+    """Whether each entry of a tuple must be larger than the one before it."""
     filled: bool = False
-    """Whether a tuple needs an entry at least."""
+    """Whether a tuple needs at least one entry."""
     words: str = ""
-    """What to ask for; without words, the bounds say it."""
+    """Description of the range in messages. If it is empty, the bounds are shown."""
 
     def holds(self, value: Any) -> bool:
-        """Whether a number, or every number of a tuple, is in range. None, which stands for no number, always is."""
+        """Whether a number, or every number of a tuple, is in range. None, which means no number, always is."""
         if value is None:
             return True
         numbers = value if isinstance(value, tuple) else (value,)
@@ -45,51 +45,52 @@ class Range:
         return all(self.least <= number <= self.most or (self.or_zero and number == 0) for number in numbers)
 
     def __str__(self) -> str:
-        """The range for people: "from 0 to 3"."""
+        """The range as text: "from 0 to 3"."""
         return self.asked("")
 
     def asked(self, numbers: str) -> str:
-        """What to ask for, where `numbers` says what kind: "a number from 0 to 3"."""
+        """The range with the kind of number that `numbers` names: "a number from 0 to 3"."""
         bounds = self.words or f"{numbers} from {_short(self.least)} to {_short(self.most)}".strip()
         return ("0, or " if self.or_zero else "") + bounds + (", ascending" if self.ascending else "")
 
 
 @dataclass(frozen=True)
 class NotBelow:
-    """A mark beside a field: its number is never smaller than that of another field of the same settings."""
+    """A mark beside a field: its number must not be smaller than that of another field of the same settings."""
 
     other: str
 
 
 @dataclass(frozen=True)
 class ToLoad:
-    """A mark beside a field that counts only when an avatar is begun.
+    """A mark beside a field that matters only when a new avatar is made.
 
-    An avatar whose tensors are about to be loaded is made with this value, so that no more is made than is read.
+    An avatar whose tensors will be loaded from a file is built with this value, so that no unneeded tensors are made.
     """
 
     value: int
 
 
 FRACTION = Range(0, 1)
-"""A share, an opacity, or a time as a fraction of the run."""
+"""Range of a share, an opacity, or a time as a fraction of the run."""
 POSITIVE = Range(1e-9, 1e9, words=f"a number above 0, {1e9:g} at most")
-"""A length, a scale."""
+"""Range of a length or a scale."""
 NOT_NEGATIVE = Range(0, 1e9, words=f"0 or a number above it, {1e9:g} at most")
-"""A weight that may be switched off."""
+"""Range of a weight that may be switched off."""
 COUNT = Range(1, 100_000)
 COUNT_OR_NONE = Range(0, 100_000)
 
 
 def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
-    """Check every number of some settings, and of the settings in them, against the range beside its field.
+    """Check every number of some settings, and of nested settings, against the range beside its field.
 
     Args:
         settings: A dataclass.
-        option: What people type to set the field of a dotted name: `density.rounds` -> "--method.density.rounds".
+        option: Turns the dotted name of a field into the option that sets it: `density.rounds` ->
+            "--method.density.rounds".
 
     Raises:
-        UserError: names the first option and value that is out of range, and the range.
+        UserError: a value is out of range. The message names the first such option, its value and the range.
     """
     hints = get_type_hints(type(settings), include_extras=True)
     for field in fields(settings):
@@ -110,7 +111,7 @@ def check_range(value: Any, allowed: Range, option: str) -> None:
     """Check one value.
 
     Raises:
-        UserError: it is out of range; names `option`, the value and the range.
+        UserError: it is out of range. The message names `option`, the value and the range.
     """
     if not allowed.holds(value):
         asked = allowed.asked("numbers" if isinstance(value, tuple) else "a number")
@@ -123,7 +124,7 @@ def range_of(hint: Any) -> Range | None:
 
 
 def shown(value: Any) -> str:
-    """A value of a setting in few characters."""
+    """A setting's value as a short text."""
     if isinstance(value, (tuple, list)):
         text = " ".join(shown(item) for item in value) or "(nothing)"
     else:
@@ -132,7 +133,7 @@ def shown(value: Any) -> str:
 
 
 def marks_of(hint: Any) -> tuple[Any, ...]:
-    """What stands in a field's type hint besides its type."""
+    """The marks in a field's type hint, besides its type."""
     return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
 
 

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 from mien import _native
 from mien.arrays import unpacked
 
-# Below this angle (radians, squared) the closed forms lose digits and their Taylor series take over.
+# Below this squared angle (radians), the closed forms lose digits and their Taylor series take over.
 _SMALL_ANGLE_SQUARED = 1e-8
 
 
@@ -65,12 +65,12 @@ def matrix_from_quaternion(quats: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 
 def quaternion_from_matrix(matrices: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
     """Unit wxyz quaternions of rotation matrices.
 
-    Of the four equivalent formulas each matrix uses the one with the largest divisor, so that it is well
+    Each matrix uses the one of four equivalent formulas that has the largest divisor. The result is then well
     conditioned everywhere, with finite gradients. The sign is arbitrary.
     """
     m = matrices
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    # Four candidates, each four times the quaternion times one of its own components.
+    # The four candidates: each is four times the quaternion, times one of its own components.
     candidates = torch.stack(
         [
             torch.stack([1 + m00 + m11 + m22, m[..., 2, 1] - m[..., 1, 2],
@@ -105,7 +105,7 @@ def multiply_quaternions(first: Float[Tensor, "*b 4"], second: Float[Tensor, "*b
 
 
 def rigid_transform(rotations: Float[Tensor, "*b 3 3"], translations: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Homogeneous matrices that rotate, then translate."""
+    """Homogeneous matrices that first rotate, then translate."""
     top = torch.cat([rotations, translations[..., None]], dim=-1)
     bottom = torch.zeros_like(top[..., :1, :])
     bottom[..., 0, 3] = 1
@@ -113,12 +113,12 @@ def rigid_transform(rotations: Float[Tensor, "*b 3 3"], translations: Float[Tens
 
 
 def compose_rigid(first: Float[Tensor, "4 4"], second: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """`first @ second`, added up in the order that `mien.runtime` adds, so that both round alike."""
+    """`first @ second`, summed in the order that `mien.runtime` uses, so that both round alike."""
     return _ComposeRigid.apply(first, second)  # pyright: ignore[reportReturnType]
 
 
 class _ComposeRigid(torch.autograd.Function):
-    """One node of the graph instead of twenty: a training step runs it once, on the caller's thread alone."""
+    """One autograd node instead of twenty: each training step runs it once, and only on the caller's thread."""
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:
@@ -145,7 +145,7 @@ class _ComposeRigid(torch.autograd.Function):
 
 
 def invert_rigid(transforms: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
-    """Inverses of rigid transforms, exact and cheaper than a general inverse; the same bits on every processor."""
+    """Inverses of rigid transforms: exact, cheaper than a general inverse, and the same bits on every processor."""
     rotation = transforms[..., :3, :3]
     x, y, z = (rotation * transforms[..., :3, 3:]).unbind(-2)
     return rigid_transform(rotation.transpose(-1, -2), -((x + y) + z))

@@ -1,4 +1,4 @@
-"""Files: what `mien.files` has, and torch tensors as safetensors. Nothing here knows what is stored."""
+"""Files: everything from `mien.files`, and torch tensors as safetensors. Nothing here depends on what is stored."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -44,7 +44,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 
 def read_tensors(path: Path, stage: str = "the stage that writes it", remedy: str | None = None) -> dict[str, Tensor]:
-    """Read safetensors as torch tensors on the CPU; `stage`, or else `remedy`, is what to name where that fails.
+    """Read safetensors as torch tensors on the CPU; error messages give `remedy`, or else name `stage`.
 
     Raises:
         UserError: the file is missing or damaged.

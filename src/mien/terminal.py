@@ -1,7 +1,7 @@
-"""The one door to the terminal: what people read is made harmless first, on standard error and on standard output.
+"""The one way to print: text for people is made harmless first, on standard error and on standard output.
 
-A file name may hold any character. An escape sequence in one would move the cursor, clear the screen or retitle the
-window of whoever reads a message about it, and a line break would make two messages of one.
+A file name may hold any character. An escape sequence in a name could move the cursor, clear the screen or change the
+window's title when a message about the file is printed, and a line break would split the message in two.
 """
 
 import os
@@ -11,19 +11,20 @@ import unicodedata
 from mien.errors import UserError
 
 _HIDDEN = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
-"""Categories of Unicode: controls, formats such as the reversal of text, halves of characters, ends of lines."""
+"""Unicode categories: control characters, format characters such as the reversal of text, halves of surrogate pairs,
+line and paragraph separators."""
 _JOINERS = frozenset("\u200c\u200d")
-"""Formats that belong to words and emoji."""
+"""Format characters that belong to words and emoji."""
 _FIRST_BYTE, _LAST_BYTE = "\udc80", "\udcff"
-"""What Python makes of bytes in file names that are no UTF-8."""
+"""Characters that Python uses for bytes in file names that are not UTF-8."""
 
 
 def printable(text: str, *, lines: bool = False) -> str:
-    r"""The text with every character that would act instead of being seen written as \x1b, \n and the like.
+    r"""The text with every control or format character written as an escape such as \x1b or \n.
 
     Args:
-        text: what is to be shown.
-        lines: whether line breaks stay what they are: for tables, never for messages.
+        text: the text to show.
+        lines: whether line breaks stay as they are. This is for tables, never for messages.
     """
     if text.isprintable():
         return text
@@ -31,20 +32,20 @@ def printable(text: str, *, lines: bool = False) -> str:
 
 
 def plain_name(text: str) -> str:
-    """A name made from a file's: with "_" for every character that acts, so that it can be written down anywhere."""
+    """A name derived from a file's name: every control or format character becomes "_", so that it is safe anywhere."""
     return "".join("_" if _acts(character, False) else character for character in text)
 
 
 def show(text: str, *, styled: bool = False) -> None:
-    """Print a result, one or several lines, on standard output.
+    """Print a result, which may have several lines, on standard output.
 
     Args:
         text: the result.
-        styled: whether it has escape sequences of ours; names in it are made `printable` by who puts them there.
+        styled: whether the text has escape sequences of mien. The caller then makes the names in it `printable`.
 
     Raises:
-        BrokenPipeError: whoever read standard output has closed it.
-        UserError: it cannot be written.
+        BrokenPipeError: the reader of standard output has closed it.
+        UserError: standard output cannot be written.
     """
     try:
         print(text if styled else printable(text, lines=True), flush=True)
@@ -55,14 +56,14 @@ def show(text: str, *, styled: bool = False) -> None:
 
 
 def tell(message: str) -> None:
-    """Print one line for people on standard error, without the libraries that draw progress bars."""
+    """Print one line for people on standard error. This needs no library for progress bars."""
     print(printable(message), file=sys.stderr, flush=True)
 
 
 def open_closed_streams() -> None:
-    """Give standard streams that were closed (`>&-`) a place where everything is dropped.
+    """Redirect standard streams that were closed (`>&-`) to the null device.
 
-    Otherwise the next file that is opened gets their number, and what a library prints ends up in it.
+    Otherwise the next file that is opened gets the number of a closed stream, and output of libraries ends up in it.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
@@ -77,7 +78,7 @@ def open_closed_streams() -> None:
 
 
 def drop_output() -> None:
-    """Send what is still to be printed nowhere: whoever read it is gone, and Python would complain of it at its end."""
+    """Discard output that cannot be written because its reader is gone; Python would complain about it at exit."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):
         try:

@@ -1,4 +1,4 @@
-"""Where things lie on disk: one workspace folder is one subject (design: sequences/NAME/..., runs/NAME/)."""
+"""Paths on disk: a workspace is a folder for one subject, with `sequences/NAME/` and `runs/NAME/` in it."""
 
 import shlex
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ _FOLDERS = ("sequences", "runs")
 
 @dataclass(frozen=True)
 class Workspace:
-    """`root/sequences/NAME/{capture,tracking,scoring}/` and `root/runs/NAME/`."""
+    """The folders `root/sequences/NAME/{capture,tracking,scoring}/` and `root/runs/NAME/`."""
 
     root: Path
 
     def sequence_dir(self, name: str) -> Path:
-        """Folder of one sequence.
+        """The folder of a sequence.
 
         Raises:
             UserError: the name leads out of the workspace.
@@ -25,7 +25,7 @@ class Workspace:
         return inside(self.root / "sequences", name)
 
     def run_dir(self, name: str) -> Path:
-        """Folder of one training run.
+        """The folder of a training run.
 
         Raises:
             UserError: the name leads out of the workspace.
@@ -47,18 +47,18 @@ class Workspace:
         return sorted(p.parent.name for p in self.root.glob("runs/*/config.json"))
 
     def pick_sequence(self, name: str | None) -> str:
-        """`name`, or the only sequence there is.
+        """`name`, or the only sequence if no name is given.
 
         Raises:
-            UserError: there is none, several and no name, or none of that name.
+            UserError: there is no sequence, none of that name, or several and no name is given.
         """
         return _pick("sequence", name, self.sequence_names(), self.root, "--sequence")
 
     def pick_run(self, name: str | None) -> str:
-        """`name`, or the only run there is; one that has made no avatar yet counts if there is no other.
+        """`name`, or the only run if no name is given. Runs without an avatar then count only if no run has one.
 
         Raises:
-            UserError: there is none, several and no name, or none of that name.
+            UserError: there is no run, none of that name, or several and no name is given.
         """
         names = self.run_names()
         trained = [run for run in names if (self.run_dir(run) / "avatar").is_dir()]
@@ -66,10 +66,10 @@ class Workspace:
 
 
 def open_workspace(root: Path) -> Workspace:
-    """An existing workspace, which nothing leads out of.
+    """Open an existing workspace, and check that nothing in it leads out of it.
 
     Raises:
-        UserError: the folder is not there, holds no sequences and no runs, or holds links (`mien.inside`).
+        UserError: the folder is missing, holds no sequences and no runs, or holds links (`mien.inside`).
     """
     workspace = Workspace(root)
     if root.is_file():
@@ -97,24 +97,24 @@ def open_workspace(root: Path) -> Workspace:
 
 
 def _check_first_captures(workspace: Workspace) -> None:
-    """Tell that a workspace without a sequence is one that is being made.
+    """Check that a workspace without a sequence is not being made at this moment.
 
     Raises:
-        BeingWrittenError: another process captures its first sequence.
+        BeingWrittenError: another process is capturing its first sequence.
     """
-    from mien.locks import AGAIN, check_free  # brings numpy
+    from mien.locks import AGAIN, check_free  # imports numpy
 
     for file in sorted(workspace.root.glob("sequences/.*.lock")):
         check_free(workspace.sequence_dir(file.name[1:].removesuffix(".lock")), AGAIN)
 
 
 def check_new_workspace(root: Path) -> None:
-    """A workspace may begin or go on here.
+    """Check that a workspace can be made or continued here.
 
     Raises:
         UserError: the folder cannot be written, belongs to another workspace, or holds links (`mien.inside`).
     """
-    from mien.files import check_writable  # brings numpy
+    from mien.files import check_writable  # imports numpy
 
     check_writable(root, folder=True)
     check_subtrees(root, *_FOLDERS)

@@ -1,4 +1,4 @@
-"""The sigmoid with the rounding of `mien.runtime`, so that pictures without torch are the same to the bit."""
+"""The sigmoid with the rounding of `mien.runtime`, so that pictures drawn without torch are identical to the bit."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from mien.arrays import unpacked
 
 
 def sigmoid(values: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
-    """1 / (1 + exp(-x)); differentiable, native for float32 on a CPU. NaN stays NaN."""
+    """1 / (1 + exp(-x)). Differentiable, and native for float32 on a CPU. NaN stays NaN."""
     if values.dtype != torch.float32 or values.device.type != "cpu":
         return values.sigmoid()
     return _Sigmoid.apply(values)  # pyright: ignore[reportReturnType]

@@ -1,4 +1,4 @@
-"""The seam: an avatar is a function from face parameters to Gaussians.
+"""The interface of avatars: an avatar is a function from face parameters to Gaussians.
 
 A new method is one file with an `Avatar`, one with its settings, and one line in `mien.avatar.methods`.
 """
@@ -20,7 +20,7 @@ from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 
 _CALM_SHARE = 0.1
-"""Share of the timesteps that count as at rest."""
+"""Share of the timesteps that are used to estimate the expression at rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Posed:
 
     gaussians: Gaussians
     aux: Mapping[str, Tensor]
-    """What the method's own regularizers need, computed once."""
+    """Tensors that the method's own regularizers need, computed once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,8 @@ class ParameterGroup:
     """Leaves of the autograd graph, by name."""
     rate: Rate
     moments: dict[str, Moments] | None = None
-    """Where the optimiser keeps its state, by the names of `tensors`; None: with the optimiser, by group and name."""
+    """Where the optimiser keeps its state, by the names of `tensors`. If it is None, the optimiser keeps the state
+    itself, by group and name."""
 
 
 def store_group(store: GaussianStore, name: str, rate: Rate) -> ParameterGroup:
@@ -55,12 +56,12 @@ def network_group(name: str, network: nn.Module, rate: Rate) -> ParameterGroup:
 
 
 class Avatar(nn.Module, ABC):
-    """Canonical Gaussians and how they depend on the face. All state is in the arguments, none in the order of calls.
+    """Canonical Gaussians and how they depend on the face. Results depend only on arguments, not on the order of calls.
 
-    A method's constructor takes `(config, face_model, face)`: the face parameters of all training timesteps, from
-    which it may take the subject's shape and statistics. Random numbers come from torch's default generator, which
-    the caller seeds. Every tensor that `pose` needs is a parameter, a buffer or in the store, so that loading is
-    generic: build with the avatar's `subject`, then overwrite.
+    A method's constructor takes `(config, face_model, face)`. `face` holds the face parameters of all training
+    timesteps, from which the method may take the subject's shape and statistics. Random numbers come from torch's
+    default generator, which the caller seeds. Every tensor that `pose` needs is a parameter, a buffer or in the store.
+    Loading is therefore generic: build an avatar with the stored `subject`, then overwrite its tensors.
     """
 
     def __init__(self, config: MethodConfig, face_model: FaceModel, face: FaceParams):
@@ -68,37 +69,37 @@ class Avatar(nn.Module, ABC):
         self.config = config
         self.face_model = face_model
         self.subject = neutral_of(face)
-        """One timestep: this person's identity and offsets, and how it looks at rest."""
+        """One timestep: this person's identity and offsets, and the face at rest."""
 
     @abstractmethod
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
-        """The Gaussians of some timesteps, batched; differentiable in `face` and in the avatar's parameters."""
+        """The Gaussians of some timesteps, as a batch. Differentiable in `face` and in the avatar's parameters."""
 
     @abstractmethod
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
-        """The method's own loss terms, weighted."""
+        """The method's own loss terms, already weighted."""
 
     @abstractmethod
     def parameter_groups(self) -> list[ParameterGroup]:
-        """What is trained at which rates; asked again after density control has changed the store."""
+        """The trained tensors and their learning rates. Called again after density control has changed the store."""
 
     @abstractmethod
     def gaussian_store(self) -> GaussianStore:
-        """Every per-Gaussian tensor."""
+        """The store that holds every per-Gaussian tensor."""
 
     @abstractmethod
     def density(self) -> DensityControl:
-        """Which density control, with this method's hooks."""
+        """The density control, with this method's hooks."""
 
     @abstractmethod
     def bake(self) -> BakedAvatar:
-        """What runs without this class: for files, the web, engines."""
+        """The avatar in a form that works without this class, for files, the web and game engines."""
 
 
 def move_avatar(avatar: Avatar, like: Tensor) -> None:
-    """Give an avatar, in place, the float dtype and the device of `like`, with its face model and its subject.
+    """Give an avatar, in place, the float dtype and the device of `like`, together with its face model and its subject.
 
-    To be done before training: the optimiser's state in the store stays where it is.
+    Call this before training, because the optimiser's state in the store is not moved.
     """
     if avatar.face_model.template.dtype == like.dtype and avatar.face_model.template.device == like.device:
         return
@@ -107,11 +108,11 @@ def move_avatar(avatar: Avatar, like: Tensor) -> None:
 
 
 def neutral_of(face: FaceParams) -> FaceParams:
-    """The person of `face` at rest, as one timestep: an estimate that a few bad frames do not move.
+    """The person of `face` at rest, as one timestep. A few bad frames do not change this estimate.
 
-    Expression: the median over the tenth of the timesteps with the smallest expression coefficients (their Euclidean
-    norm); what stays there, such as brows that the tracker always sees raised, is the person's own. Joints and head
-    pose: the median over all timesteps, because people mostly look where the camera is.
+    The expression is the median over the tenth of the timesteps with the smallest expression coefficients, measured by
+    their Euclidean norm. What remains in it belongs to the person, for example brows that the tracker always sees
+    raised. Joints and head pose are the medians over all timesteps, because people mostly look towards the camera.
     """
     face = face.detach()
     activity = face.expression.norm(dim=-1)

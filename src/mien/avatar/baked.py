@@ -1,9 +1,9 @@
-"""BakedAvatar: the closed family that exporters and the web runtime read without knowing the method.
+"""BakedAvatar: a closed family of formats that exporters and the web runtime read without knowing the method.
 
-An avatar's centres move with a mesh (`MeshBound`), by their own blend directions and skinning weights
-(`BlendSkinned`) or not at all (`Static`); its attributes are constant, or follow the expression linearly
-(`LinearBases`) or through a small network (`AttributeNetwork`). `pose_baked` is the reference of what a runtime has
-to do.
+An avatar's centres move with a mesh (`MeshBound`), move by their own blend directions and skinning weights
+(`BlendSkinned`), or do not move at all (`Static`). Its attributes are constant, or depend on the expression linearly
+(`LinearBases`) or through a small network (`AttributeNetwork`). `pose_baked` is the reference implementation for
+runtimes.
 """
 
 from dataclasses import dataclass, fields
@@ -22,10 +22,10 @@ from mien.gaussians import Gaussians, sh_from_rgb
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """m points of one person that move as a face model's vertices do (`FaceModel.head_vertices`), identity applied."""
+    """m points of one person that move like a face model's vertices (`FaceModel.head_vertices`), identity applied."""
 
     template: Float[Tensor, "m 3"]
-    """In the head frame, metres."""
+    """Rest positions in the head frame, in metres."""
     expression_names: tuple[str, ...]
     expression_basis: Float[Tensor, "e m 3"]
     joint_names: tuple[str, ...]
@@ -40,7 +40,7 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Attributes:
-    """Raw values of n Gaussians that do not depend on the binding."""
+    """Raw values of n Gaussians, independent of how the Gaussians are bound."""
 
     quats: Float[Tensor, "n 4"]
     log_scales: Float[Tensor, "n 3"]
@@ -50,7 +50,7 @@ class Attributes:
 
 @dataclass(frozen=True, eq=False)
 class LinearBases:
-    """What a unit of each expression coefficient adds to the raw values; None adds nothing."""
+    """Changes of the raw values per unit of each expression coefficient. None means no change."""
 
     means: Float[Tensor, "e n 3"] | None = None
     log_scales: Float[Tensor, "e n 3"] | None = None
@@ -60,66 +60,66 @@ class LinearBases:
 
 @dataclass(frozen=True, eq=False)
 class AttributeNetwork:
-    """A small network, the same for all Gaussians, whose outputs are added to the raw values.
+    """A small network, the same for all Gaussians. Its outputs are added to the raw values.
 
-    Its input is a row of `base` (and, behind it, what `input` names): `features` adds the expression's combination of
-    `basis`, and the free joints' of `joint_basis`, to the first f columns of `base`; `displacement` appends the
-    centre's motion from the rig's template, in metres.
+    Its input is a row of `base` with an addition. With `features`, two sums are added to the first f columns: `basis`
+    weighted by the expression, and `joint_basis` weighted by the free joints. With `displacement`, the centre's motion
+    from the rig's template is appended, in metres.
     """
 
     input: Literal["features", "displacement"]
     base: Float[Tensor, "n d"]
     basis: Float[Tensor, "e n f"]
     weights: tuple[Tensor, ...]
-    """[out, in] of each layer."""
+    """Weights of each layer, [out, in]."""
     biases: tuple[Tensor, ...]
     activation: Literal["relu", "leaky_relu", "softplus"]
-    """Between layers; leaky slope 0.01."""
+    """Activation between layers. The slope of leaky_relu is 0.01."""
     outputs: tuple[str, ...]
-    """Of quats, log_scales, opacity_logits, sh: in the order of the last layer's columns."""
+    """Names out of quats, log_scales, opacity_logits and sh, in the order of the last layer's columns."""
     joint_basis: Float[Tensor, "j n f"] | None = None
-    """Three for each free joint: what a radian of its axis-angle's components adds."""
+    """Three entries for each free joint: the change per radian of each component of its axis-angle vector."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshBound:
-    """Gaussians in the frames of a mesh's triangles (methods: gaussian_avatars)."""
+    """Gaussians in the frames of a mesh's triangles (method: gaussian_avatars)."""
 
     rig: Rig
     """The mesh's vertices."""
     faces: Int[Tensor, "f 3"]
     face_index: Int[Tensor, " n"]
-    """Index into `faces` of every Gaussian."""
+    """Index into `faces` for each Gaussian."""
     means: Float[Tensor, "n 3"]
-    """In triangle units, as the attributes' scales and rotations are."""
+    """Centres in the triangle's frame and units, like the scales and rotations in `attributes`."""
     attributes: Attributes
     sh_frame: Literal["world", "head"]
-    """In which frame the view direction of SH is taken."""
+    """Frame of the view direction for spherical harmonics."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlendSkinned:
-    """Gaussians that each carry their own blend directions and skinning weights (methods: mono_gaussian_avatar)."""
+    """Gaussians that each have their own blend directions and skinning weights (method: mono_gaussian_avatar)."""
 
     rig: Rig
     """The Gaussians' own centres."""
     attributes: Attributes
     scale_activation: Literal["exp", "sigmoid"] = "exp"
     scale_gain: float = 1.0
-    """With `sigmoid`: scale = gain * sigmoid(raw) + offset, metres."""
+    """With `sigmoid`: scale = gain * sigmoid(raw) + offset, in metres."""
     scale_offset: float = 0.0
     colour_activation: Literal["sh", "sigmoid"] = "sh"
-    """With `sigmoid`: the one SH coefficient is the logit of the colour."""
+    """With `sigmoid`: the only SH coefficient is the logit of the colour."""
     bases: LinearBases | None = None
     network: AttributeNetwork | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Static:
-    """Gaussians that stay where they are in the head frame (methods: headgas)."""
+    """Gaussians that do not move in the head frame (method: headgas)."""
 
     means: Float[Tensor, "n 3"]
-    """Metres."""
+    """Centres in the head frame, in metres."""
     attributes: Attributes
     expression_names: tuple[str, ...]
     joint_names: tuple[str, ...] = ()
@@ -149,7 +149,7 @@ def bake_rig(face_model: FaceModel, subject: FaceParams) -> Rig:
 
 
 def rig_points(rig: Rig, face: FaceParams) -> Float[Tensor, "b m 3"]:
-    """The rig's points in the head frame, metres; `face.identity` and `vertex_offsets` do not count."""
+    """The rig's points in the head frame, in metres. Ignores `face.identity` and `face.vertex_offsets`."""
     like = rig.template
     none = torch.zeros(0, 3, dtype=torch.long, device=like.device)
     model = FaceModel(
@@ -166,7 +166,7 @@ def rig_points(rig: Rig, face: FaceParams) -> Float[Tensor, "b m 3"]:
 
 
 def pose_baked(baked: BakedAvatar, face: FaceParams) -> Gaussians:
-    """The Gaussians of some timesteps; only expression, joints and head pose of `face` count."""
+    """The Gaussians of some timesteps. Only expression, joints and head pose of `face` are used."""
     if isinstance(baked, MeshBound):
         return _pose_mesh_bound(baked, face)
     if isinstance(baked, BlendSkinned):
@@ -202,7 +202,7 @@ def _raw_values(
     displacement: Float[Tensor, "b n 3"],
     face: FaceParams,
 ) -> dict[str, Tensor]:
-    """Raw values of some timesteps: constants, plus linear bases, plus the network's outputs."""
+    """Raw values of some timesteps: constants, plus linear bases, plus outputs of the network."""
     batch = len(face)
     raw = {f.name: (value := getattr(attributes, f.name)).expand(batch, *value.shape) for f in fields(Attributes)}
     raw["means"] = torch.zeros_like(displacement)

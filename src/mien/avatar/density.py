@@ -1,6 +1,6 @@
-"""What a method tells density control: the strategy, its settings, and the hooks that only the method can answer.
+"""Descriptions of a method's density control: the strategy, its settings, and hooks that only the method can provide.
 
-The strategies themselves are in `mien.training.density`; they see a `GaussianStore` and one of these descriptions.
+The strategies themselves are in `mien.training.density`. They see a `GaussianStore` and one of these descriptions.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,21 +16,21 @@ from mien.rotation import matrix_from_quaternion
 
 
 def keep_all_prunes(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """The hook of methods that let every Gaussian be pruned."""
+    """The hook of methods that allow every Gaussian to be pruned."""
     return prune
 
 
 def highest_opacities_seen(store: GaussianStore, seen: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """The hook of methods whose opacity depends on the face: a Gaussian counts by its highest since the last round."""
+    """The hook of methods whose opacity depends on the face: prune by the highest opacity since the last round."""
     return seen
 
 
 def split_along_axes(
     store: GaussianStore, parents: Int[Tensor, " p"], noise: Float[Tensor, "p 3"]
 ) -> dict[str, Tensor]:
-    """Where children of a split go, for stores with `means, quats, log_scales` in one frame: samples of the parent.
+    """Centres and scales of the children of a split, for stores with `means, quats, log_scales` in one frame.
 
-    The child's centre is drawn from the parent's own distribution in the parent's frame; scales shrink by 1.6.
+    Each centre is drawn from the parent's own distribution in the parent's frame. Scales shrink by a factor of 1.6.
     """
     log_scales = store["log_scales"].detach()[parents]
     rotations = matrix_from_quaternion(store["quats"].detach()[parents])
@@ -43,30 +43,31 @@ def split_along_axes(
 
 @dataclass(frozen=True)
 class GradientDensity:
-    """Duplicate, split, prune and reset opacity, driven by the centres' gradients on screen."""
+    """Grows Gaussians by the screen-space gradients of their centres, prunes them, and resets opacities."""
 
     settings: GradientSettings
     opacity_logits: str | None
-    """Name of the store's raw opacity, which resets lower; None where opacity comes from a network (no resets)."""
+    """Name of the store's raw opacity, which resets lower. None if opacity comes from a network: no resets then."""
     judged_opacities: Callable[[GaussianStore, Float[Tensor, " n"]], Float[Tensor, " n"]] = highest_opacities_seen
-    """(store, highest opacity of each since the last round) -> the opacity to prune by."""
+    """(store, highest opacity of each Gaussian since the last round) -> the opacity to prune by."""
     split: Callable[[GaussianStore, Int[Tensor, " p"], Float[Tensor, "p 3"]], dict[str, Tensor]] = split_along_axes
-    """(store, parents, standard normal noise) -> what differs between parents and children, by tensor name."""
+    """(store, parents, standard normal noise) -> tensors, by name, in which children differ from their parents."""
     may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = keep_all_prunes
-    """(store, prunes asked for) -> prunes granted."""
+    """(store, prunes requested) -> prunes allowed."""
 
 
 @dataclass(frozen=True)
 class RefillDensity:
-    """In each round, delete what was never visible and refill up to a target with children of random survivors."""
+    """Each round deletes Gaussians that were never visible, then adds children of random survivors up to a target."""
 
     settings: RefillSettings
     refill: Callable[[GaussianStore, Int[Tensor, " p"], Float[Tensor, "p 3"], float], Mapping[str, Tensor]]
-    """(store, parents, noise uniform in -0.5..0.5, fraction of the run) -> what differs from the parents."""
+    """(store, parents, noise uniform in -0.5..0.5, fraction of the run) -> tensors, by name, in which children differ
+    from their parents."""
     judged_opacities: Callable[[GaussianStore, Float[Tensor, " n"]], Float[Tensor, " n"]] = highest_opacities_seen
-    """(store, highest opacity of each since the last round) -> the opacity to prune by."""
+    """(store, highest opacity of each Gaussian since the last round) -> the opacity to prune by."""
     may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = keep_all_prunes
-    """(store, prunes asked for) -> prunes granted."""
+    """(store, prunes requested) -> prunes allowed."""
 
 
 @dataclass(frozen=True)

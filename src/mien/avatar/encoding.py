@@ -1,4 +1,4 @@
-"""What the networks of several methods share."""
+"""The positional encoding, which the networks of several methods share."""
 
 import torch
 from jaxtyping import Float

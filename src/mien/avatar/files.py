@@ -1,4 +1,4 @@
-"""Avatars on disk: a folder with avatar.json, avatar.safetensors and, where its licence allows, the face model."""
+"""Avatars on disk: a folder with avatar.json, avatar.safetensors and, if its licence allows it, the face model."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,7 +28,7 @@ _REMEDY = "delete the run's training.json, if it is there, and train it again wi
 
 @dataclass(frozen=True)
 class _Content:
-    """avatar.json."""
+    """Content of avatar.json."""
 
     kind: str
     """The method's name."""
@@ -41,7 +41,7 @@ class _Content:
 
 
 def write_avatar(folder: Path, avatar: Avatar) -> None:
-    """Write an avatar; avatar.json comes last, so that a folder that has it is whole."""
+    """Write an avatar. avatar.json is written last, so a folder that has it is complete."""
     tensors = {f"avatar.{name}": tensor for name, tensor in avatar.state_dict().items()}
     tensors |= {f"subject.{name}": tensor for name, tensor in avatar.subject.tensors().items()}
     write_tensors(folder / "avatar.safetensors", tensors)
@@ -61,11 +61,11 @@ def write_avatar(folder: Path, avatar: Avatar) -> None:
 
 
 def load_avatar(folder: Path) -> Avatar:
-    """The avatar of a run folder, or of an avatar folder itself.
+    """Load the avatar of a run folder, or of an avatar folder itself.
 
     Raises:
-        UserError: the folder holds no avatar, a damaged one, one that cannot be posed, one that is being written, one
-            whose face model is not to be had, or a link.
+        UserError: the folder holds no avatar, or holds a link; or the avatar is damaged, cannot be posed, is being
+            written, or needs a face model that is missing.
     """
     return read_beside_writers(lambda: _load_avatar(folder), [folder, folder / "avatar"], [folder, folder.parent])
 
@@ -107,10 +107,10 @@ def _load_avatar(folder: Path) -> Avatar:
 
 @torch.no_grad()
 def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: Path) -> None:
-    """Replace every tensor of an avatar, which may have had another number of Gaussians.
+    """Replace every tensor of an avatar. The number of Gaussians may change.
 
     Raises:
-        UserError: `state`, which came from `source`, is not of this method and config, or cannot be posed.
+        UserError: `state`, which was read from `source`, does not belong to this method and config, or cannot be posed.
     """
     misfit = _misfit(avatar.state_dict(), state, gaussians)
     if misfit is not None:
@@ -127,7 +127,7 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
 
 
 def _misfit(own: dict[str, Tensor], state: dict[str, Tensor], gaussians: int) -> str | None:
-    """Why `state` cannot replace `own`, found before room is made for so many Gaussians; None if it can."""
+    """The reason why `state` cannot replace `own`, or None. Found before memory for the Gaussians is allocated."""
     for name, tensor in own.items():
         if name not in state:
             return f"lacks {name!r}"

@@ -1,7 +1,7 @@
-"""GaussianAvatars (Qian et al., CVPR 2024): Gaussians that live in the frames of a face model's triangles.
+"""GaussianAvatars (Qian et al., CVPR 2024): Gaussians in the frames of a face model's triangles.
 
-Written from the paper and its supplement; what the published code does differently from the paper is noted where
-it matters. Lengths and scales in the store are in units of the triangle's own scale (`mien.avatar.rig`).
+Written from the paper and its supplement. Comments note where the published code differs from the paper in a way that
+matters. Lengths and scales in the store are in units of the triangle's own scale (`mien.avatar.rig`).
 """
 
 from typing import Literal
@@ -23,7 +23,7 @@ from mien.render.rendering import Rendering
 
 
 class GaussianAvatars(Avatar):
-    """One Gaussian per triangle to begin with; all ride on their triangle, so expression and pose move them."""
+    """Bound Gaussians, one per triangle at first. They follow their triangles, so expression and pose move them."""
 
     config: GaussianAvatarsConfig
 
@@ -35,7 +35,7 @@ class GaussianAvatars(Avatar):
             "quats": like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             "log_scales": like.new_zeros(n, 3),
             "opacity_logits": torch.logit(like.new_full((n,), 0.1)),
-            # Almost mid grey: the paper's code uses small random colours as the SH coefficients themselves.
+            # Almost mid grey: like the paper's code, use small random colours as the SH coefficients themselves.
             "sh_constant": torch.rand(n, 1, 3).to(like) / 255,
         }
         if config.sh_degree > 0:
@@ -43,12 +43,12 @@ class GaussianAvatars(Avatar):
         self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
-        """The Gaussians in world space, or in the head frame (`_sh_frame`), one batch entry a timestep."""
+        """The Gaussians in world space, or in the head frame (`_sh_frame`), with one batch entry per timestep."""
         sh = self._active_sh(progress)
         return Posed(ride(self.face_model, face, self.store, sh, in_head=self._sh_frame == "head"), {})
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
-        """Section 3.4: of the Gaussians in view, distances and scales beyond their thresholds, in triangle units."""
+        """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units."""
         config = self.config
         position, scale = triangle_penalties(
             self.store["means"],
@@ -60,7 +60,7 @@ class GaussianAvatars(Avatar):
         return {"position": position, "scale": scale}
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """One group a tensor."""
+        """One group per tensor."""
         config, rates = self.config, {}
         rates["means"], rates["log_scales"], rates["quats"] = (
             config.means_rate,
@@ -77,7 +77,7 @@ class GaussianAvatars(Avatar):
         return self.store
 
     def density(self) -> GradientDensity:
-        """Gradient-based; children stay on their parent's triangle, and no triangle loses its last Gaussian."""
+        """Gradient-based control. Children stay on their parent's triangle; no triangle loses its last Gaussian."""
         return GradientDensity(
             self.config.density,
             opacity_logits="opacity_logits",
@@ -96,15 +96,16 @@ class GaussianAvatars(Avatar):
 
     @property
     def _sh_frame(self) -> Literal["world", "head"]:
-        """The frame that Gaussians are given in.
+        """The frame in which the Gaussians are given.
 
-        Colours that no view changes look the same from either. In the head frame, lengths of a decimetre keep three
-        bits more than a metre from the camera, which edges of a millimetre need: float32 turns triangles by 1e-4 there.
+        Colours that do not depend on the view look the same in either frame. In the head frame, coordinates of a
+        decimetre keep three more bits than coordinates of a metre from the camera. Triangles with edges of a millimetre
+        need these bits: in world space, float32 turns them by 1e-4.
         """
         return "head" if self.config.sh_degree == 0 else self.config.sh_frame
 
     def _active_sh(self, progress: Progress) -> Float[Tensor, "n k 3"]:
-        """SH coefficients up to the degree that is switched on."""
+        """SH coefficients up to the degree that is active."""
         degree = self.config.sh_degree
         if degree == 0:
             return self.store["sh_constant"]
@@ -115,7 +116,7 @@ class GaussianAvatars(Avatar):
 
 
 def never_empty_a_triangle(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """Veto all prunes on a triangle that they would leave without Gaussians (section 3.3)."""
+    """Allow no prunes on a triangle that would otherwise lose all its Gaussians (section 3.3)."""
     face_index = store["face_index"]
     kept = torch.zeros(int(face_index.max()) + 1, dtype=torch.bool, device=prune.device)
     kept[face_index[~prune]] = True

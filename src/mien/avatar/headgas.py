@@ -1,10 +1,10 @@
-"""HeadGaS (Dhamo et al., ECCV 2024): Gaussians that stay in the head frame; the expression changes how they look.
+"""HeadGaS (Dhamo et al., ECCV 2024): Gaussians that do not move in the head frame; expressions change their appearance.
 
-No code was published: written from the paper's supplement and its equations. Each Gaussian blends a basis of latent
-features by the expression, and one small network turns the result into colour and opacity, so that lips fade where
-teeth appear. What the paper leaves open and was decided here: joints that no expression drives join the expression
-vector (nothing else would move the gaze), rates, the encoding's bands and lengths, and by which opacity to prune.
-Not there yet: the perceptual loss.
+No code was published, so this is written from the paper, its supplement and its equations. Each Gaussian blends a basis
+of latent features by the expression. One small network turns the result into colour and opacity, so that lips fade
+where teeth appear. The paper leaves some choices open, which were made here: joints that no expression drives are
+appended to the expression vector, because nothing else would move the gaze; the learning rates; the bands and the
+length unit of the encoding; and the opacity to prune by. The perceptual loss is not implemented yet.
 """
 
 import torch
@@ -27,7 +27,7 @@ _CHUNK = 512
 
 
 class HeadGas(Avatar):
-    """Static Gaussians in the head frame whose blended features become colour and opacity."""
+    """Static Gaussians in the head frame, with colour and opacity from blended features."""
 
     config: HeadGasConfig
 
@@ -40,7 +40,7 @@ class HeadGas(Avatar):
             "means": means,
             "quats": means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             "log_scales": neighbour_distances(means).clamp_min(1e-6).log()[:, None].repeat(1, 3),
-            # Zero bases as in the paper. With the inputs last, blending is one matrix-vector product.
+            # The bases start at zero, as in the paper. With the inputs last, blending is one matrix-vector product.
             "feature_bases": means.new_zeros(n, width, inputs),
             "neutral_features": means.new_zeros(n, width),
         }
@@ -51,12 +51,12 @@ class HeadGas(Avatar):
             nn.Linear(config.hidden, 3 * self._coefficients + 1),
         ).to(means)
         with torch.no_grad():
-            # Grey and faint, as 3D Gaussian Splatting starts.
+            # Start grey and faint, like 3D Gaussian Splatting.
             self._last_layer.bias.zero_()
             self._last_layer.bias[-1] = torch.logit(torch.tensor(0.1))
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
-        """The Gaussians in the head frame, one batch entry a timestep; only colours and opacities differ."""
+        """The Gaussians in the head frame, one batch entry per timestep. Only their colours and opacities differ."""
         store = self.store
         features = blend_features(store["feature_bases"], store["neutral_features"], face)
         encoding = self._encoding().expand(len(face), -1, -1)
@@ -69,11 +69,11 @@ class HeadGas(Avatar):
         return Posed(gaussians, {})
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
-        """None."""
+        """This method has no loss terms of its own."""
         return {}
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """One group a tensor, one for the network."""
+        """One group per tensor, and one for the network."""
         config = self.config
         rates = {"means": config.means_rate, "log_scales": config.log_scales_rate, "quats": config.quats_rate}
         rates |= {"feature_bases": config.features_rate, "neutral_features": config.features_rate}
@@ -85,11 +85,11 @@ class HeadGas(Avatar):
         return self.store
 
     def density(self) -> GradientDensity:
-        """Gradient-based; children copy features. A Gaussian counts by its highest opacity since the last round."""
+        """Gradient-based control. Children copy features. Pruning uses the highest opacity since the last round."""
         return GradientDensity(self.config.density, opacity_logits=None)
 
     def bake(self) -> Static:
-        """Static points, with the features' bases and the network."""
+        """Static points, with the bases of the features and the network."""
         store = {name: self.store[name].detach() for name in self.store.names()}
         n = len(self.store)
         bases = store["feature_bases"].permute(2, 0, 1)
@@ -122,7 +122,8 @@ class HeadGas(Avatar):
         return last
 
     def _encoding(self) -> Float[Tensor, "n c"]:
-        # Detached: centres follow what the picture says about where they are, not what the network makes of it.
+        # Detached, so that centres move only by their effect on the picture, not through the encoding of their
+        # position.
         points = self.store["means"].detach() / self.config.encoding_length
         return positional_encoding(points, self.config.encoding_bands)
 
@@ -130,19 +131,19 @@ class HeadGas(Avatar):
 def blend_features(
     bases: Float[Tensor, "n f i"], neutral: Float[Tensor, "n f"], face: FaceParams
 ) -> Float[Tensor, "b n f"]:
-    """F = F^T e + f0, where e is the expression and then the free joints' axis-angles, radians."""
+    """F = F^T e + f0, where e is the expression followed by the axis-angle vectors of the free joints, in radians."""
     inputs = torch.cat([face.expression, face.joints.flatten(1)], dim=-1)
     blended = bases.flatten(0, 1) @ inputs.T
     return neutral + blended.T.unflatten(-1, tuple(neutral.shape))
 
 
 def sample_surface(vertices: Float[Tensor, "v 3"], faces: Tensor, count: int) -> Float[Tensor, "n 3"]:
-    """Random points on a mesh, evenly by area; from torch's default generator."""
+    """Random points on a mesh, uniform by area, from torch's default generator."""
     corners = vertices[faces]
     v0, v1, v2 = corners.unbind(1)
     areas = torch.linalg.cross(v1 - v0, v2 - v0).norm(dim=-1)
     chosen = torch.multinomial(areas, count, replacement=True)
-    # The square root spreads points evenly over a triangle.
+    # The square root makes the points uniform over a triangle.
     along, across = torch.rand(2, count, 1).to(vertices)
     along = along.sqrt()
     weights = torch.cat([1 - along, along * (1 - across), along * across], dim=-1)
@@ -150,7 +151,7 @@ def sample_surface(vertices: Float[Tensor, "v 3"], faces: Tensor, count: int) ->
 
 
 def neighbour_distances(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Mean distance to the three nearest other points: 3D Gaussian Splatting's scales to begin with."""
+    """Mean distance to the three nearest other points, the initial scale in 3D Gaussian Splatting."""
     nearest = [
         torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist").topk(4, largest=False).values[:, 1:]
         for part in points.split(_CHUNK)

@@ -14,21 +14,21 @@ def _density() -> GradientSettings:
 
 @dataclass(frozen=True)
 class HeadGasConfig(MethodConfig):
-    """Settings of HeadGaS; defaults suit a CPU and runs of some thousand steps."""
+    """Settings of HeadGaS. The defaults suit a CPU and runs of some thousand steps."""
 
     points: Annotated[int, Range(4, 1_000_000), ToLoad(4)] = 2500
-    """Number of Gaussians to begin with, sampled on the subject's mesh."""
+    """Number of Gaussians at the start, sampled on the subject's mesh."""
     features: Annotated[int, Range(1, 1024)] = 16
-    """Number of latent features of each Gaussian (paper: 32). Memory and time of a step grow with it."""
+    """Number of latent features per Gaussian (paper: 32). More features need more memory and time per step."""
     hidden: Annotated[int, Range(1, 4096)] = 64
-    """Width of the network's one hidden layer."""
+    """Width of the network's only hidden layer."""
     encoding_bands: Annotated[int, Range(0, 24)] = 4
     """Number of octaves of the positional encoding."""
     encoding_length: Annotated[float, Range(1e-4, 1e4)] = 0.05
-    """Length that counts as one unit in the positional encoding, in metres."""
+    """Length of one unit in the positional encoding, in metres."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
-    """Degree of the spherical harmonics that colour depends on the view by (paper: 3). With one camera, colours that
-    depend on the view absorb the head's pose: keep 0."""
+    """Degree of the spherical harmonics for view-dependent colour (paper: 3). Keep 0 with a single camera, because
+    view-dependent colours then absorb the head's pose."""
     means_rate: Rate = Rate(1e-4, 1e-6)
     """Learning rate of the centres, in metres per step."""
     log_scales_rate: Rate = Rate(5e-3)
@@ -40,9 +40,9 @@ class HeadGasConfig(MethodConfig):
     network_rate: Rate = Rate(2e-3, 2e-4)
     """Learning rate of the network, per step."""
     density: GradientSettings = field(default_factory=_density)
-    """Density control: when and where Gaussians grow and are removed. Opacities come from the network, so none is ever
-    reset; the first of `opacity_resets` still says when large Gaussians begin to be removed."""
+    """Density control: when and where Gaussians are added and removed. Opacities come from the network and are never
+    reset. The first of `opacity_resets` after `start` still sets when large Gaussians are removed."""
 
 
 PRESETS = {"draft": HeadGasConfig(), "standard": HeadGasConfig()}
-"""What the presets mean for this method: a draft is only shorter."""
+"""Settings of this method for each preset. They are equal: a draft is only a shorter run."""

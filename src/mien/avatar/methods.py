@@ -1,7 +1,7 @@
-"""The methods there are: a new one is one line here.
+"""The list of methods. A new method adds one line here.
 
-Settings are imported at once, so that the command line can list and check them; avatars, which need torch, at their
-first use.
+Settings are imported at once, so that the command line can list and check them. Avatars need torch and are imported at
+their first use.
 """
 
 import importlib
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Method:
-    """A method: its settings by preset, and the class of its avatars."""
+    """A method: its settings for each preset, and the class of its avatars."""
 
     presets: Mapping[str, MethodConfig]
-    """What each preset of `mien.training.PRESETS` means for this method; all of one class."""
+    """Settings for each preset of `mien.training.PRESETS`, all of one class."""
     avatar_class: str
     """"MODULE:CLASS"; see `avatar`."""
 
@@ -33,7 +33,7 @@ class Method:
 
     @property
     def avatar(self) -> "type[Avatar]":
-        """The class of the method's avatars, which is called with (config, face_model, face)."""
+        """The class of the method's avatars. Its arguments are (config, face_model, face)."""
         module, name = self.avatar_class.split(":")
         return getattr(importlib.import_module(module), name)
 
@@ -48,10 +48,10 @@ METHODS = {
 
 
 def method_named(name: str) -> Method:
-    """A method by its name.
+    """The method of a name.
 
     Raises:
-        UserError: there is none of that name.
+        UserError: there is no method of that name.
     """
     if name not in METHODS:
         raise UserError(f"no method {name!r}; there are: {', '.join(METHODS)}")

@@ -1,12 +1,13 @@
-"""MonoGaussianAvatar (Chen et al., SIGGRAPH 2024): free points whose everything else comes from networks.
+"""MonoGaussianAvatar (Chen et al., SIGGRAPH 2024): free points, with all other properties predicted by networks.
 
-Points deform by their own blend directions and skinning weights, which networks predict from where the points are and
-which stay near those of the face model's nearest vertex. Written from the paper's supplement and the facts of its
-permissively licensed code. Different here: the face model is any `FaceModel` (its `head` joint, which rests in the
-head frame, is the paper's extra identity bone; a jaw may be derived from the expression); canonical is the mean
-expression of the training frames with free joints at rest; colours and rotations are what the heads say, without the
-published code's mixed-up columns; schedules are fractions of the run, which the paper's epochs 0..100 stretch over;
-networks are small enough for a CPU. Not there yet: the perceptual loss, batches, a learned background.
+Points deform by their own blend directions and skinning weights. Networks predict these from the points' positions, and
+losses keep them near those of the face model's nearest vertex. Written from the paper's supplement and from facts about
+its permissively licensed code. Differences from it: the face model is any `FaceModel` (its `head` joint, which is at
+rest in the head frame, is the paper's extra identity bone; a jaw may follow the expression); the canonical face has the
+mean expression of the training frames and free joints at rest; each head predicts its own attribute, while the
+published code mixes up columns of colours and rotations; schedules are fractions of the run, onto which the paper's
+epochs 0..100 are mapped; networks are small enough for a CPU. Not implemented yet: the perceptual loss, batches, a
+learned background.
 """
 
 import math
@@ -37,7 +38,7 @@ from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.rendering import Rendering
 from mien.rotation import matrix_from_axis_angle
 
-# What the schedules below are made of: the paper's epochs over 100.
+# The schedules below use the paper's epochs divided by 100.
 _GROWTH = (
     (0.05, 800), (0.10, 1600), (0.15, 3200), (0.20, 6400), (0.25, 10_000),
     (0.30, 20_000), (0.40, 40_000), (0.50, 80_000), (0.60, 100_000),
@@ -45,20 +46,20 @@ _GROWTH = (
 _SHRINKAGE = (
     *((time / 100, 0.75) for time in (5, 10, 15, 20, 25, 30, 40, 50)),
     (0.60, 0.9),
-    # Epoch 100 shrinks it once more: here that is the end of the run, after which nothing learns to live with it.
+    # The paper also shrinks at epoch 100. Here that would be the end of the run, with no training afterwards to adapt.
     *((time / 100, 0.75) for time in (65, 70, 75, 80, 85, 90, 95)),
 )
 
 
 class MonoGaussianAvatar(Avatar):
-    """Free points; networks predict attributes, blend directions and skinning weights."""
+    """Free points. Networks predict attributes, blend directions and skinning weights."""
 
     config: MonoGaussianAvatarConfig
 
     def __init__(self, config: MonoGaussianAvatarConfig, face_model: FaceModel, face: FaceParams):
         super().__init__(config, face_model, face)
         like = face_model.template
-        # Evenly in a cube, then pushed onto the sphere, as published.
+        # Uniform in a cube, then projected onto the sphere, as in the published code.
         cube = 2 * torch.rand(config.points, 3).to(like) - 1
         self.store = GaussianStore({"means": config.sphere_radius * torch.nn.functional.normalize(cube, dim=-1)})
         e, k = face.expression.shape[1], len(face_model.joint_names)
@@ -69,10 +70,10 @@ class MonoGaussianAvatar(Avatar):
         self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
-        """The Gaussians in the head frame, one batch entry a timestep."""
+        """The Gaussians in the head frame, one batch entry per timestep."""
         points = self._points()
         means, displacement = self._deformed(points, face)
-        # Detached, as published: attributes do not pull at points.
+        # Detached, as in the published code: attributes do not pull on the points.
         change = self.change(displacement.detach() / LENGTH_UNIT)
         raw = split_attributes(self.attributes(self.store["means"].detach() / LENGTH_UNIT) + change)
         scales = self.config.scale_gain * sigmoid(raw["log_scales"]) + rendering_radius(progress.fraction)
@@ -83,7 +84,7 @@ class MonoGaussianAvatar(Avatar):
         return Posed(gaussians, {name: points[name] for name in ("canonical", "expression", "pose", "weights")})
 
     def canonical_face(self) -> FaceParams:
-        """The mean expression of the training frames, free joints at rest, at the origin of the head frame."""
+        """The mean expression of the training frames with free joints at rest, at the origin of the head frame."""
         expression = self.get_buffer("canonical_expression")[None]
         still = torch.zeros_like(self.subject.head_rotation)
         joints = torch.zeros_like(self.subject.joints)
@@ -92,9 +93,10 @@ class MonoGaussianAvatar(Avatar):
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Distance of skinning weights and blend directions from those of the nearest canonical vertex.
 
-        Of `face_points` points in turn, which is what the paper's mean over all points is on average. Expression
-        directions count by coefficients in units of their mean variation over the training frames, so that the term
-        does not depend on how a face model scales its coefficients (the paper's weights belong to FLAME's).
+        Each step uses the next `face_points` points; on average, that is the paper's mean over all points. The squared
+        difference of an expression direction is multiplied by the squared mean variance of all coefficients over the
+        training frames, and divided by the variance of its own coefficient. The term then does not depend on how a face
+        model scales its coefficients (the paper's weights are for FLAME).
         """
         n = len(self.store)
         chosen = torch.arange(progress.step * self.config.face_points, (progress.step + 1) * self.config.face_points)
@@ -105,7 +107,7 @@ class MonoGaussianAvatar(Avatar):
         targets = model.expression_basis[:, nearest].permute(1, 2, 0)
         variance = self.get_buffer("expression_variance")
         unit = variance.mean().clamp_min(1e-8)
-        # Coefficients that never moved would weigh infinitely much.
+        # Coefficients that never moved would otherwise have an infinite weight.
         relative = (variance / unit).clamp_min(0.01)
         difference = (posed.aux["expression"][chosen] - targets) / LENGTH_UNIT
         losses["expression_directions"] = 10 * _mean_square(
@@ -119,18 +121,18 @@ class MonoGaussianAvatar(Avatar):
         return {name: weight * loss for name, loss in losses.items()}
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """The points, and one group a network."""
+        """One group for the points, and one per network."""
         rate = self.config.network_rate
         networks = {"attributes": self.attributes, "deformation": self.deformation, "change": self.change}
         groups = [network_group(name, network, rate) for name, network in networks.items()]
         return [store_group(self.store, "means", self.config.means_rate), *groups]
 
     def gaussian_store(self) -> GaussianStore:
-        """The points: everything else comes from networks."""
+        """The store of points. Everything else comes from networks."""
         return self.store
 
     def density(self) -> RefillDensity:
-        """Delete points that no view of the last round has shown, and refill up to the schedule's number."""
+        """Deletes points that no view of the last round has shown, then refills up to the scheduled number."""
         config = self.config
         times = tuple(index / config.rounds for index in range(1, config.rounds))
         targets = tuple(min(config.max_points, points_at(time, config.points)) for time in times)
@@ -149,8 +151,9 @@ class MonoGaussianAvatar(Avatar):
             skinning_weights=points["weights"],
             pose_basis=points["pose"].permute(2, 0, 1).contiguous(),
         )
-        # The network wants the motion from the canonical place, but is given that from rest: the difference is a
-        # constant of each point, and since both enter linearly, it takes the same columns of weights once more.
+        # The network takes the motion from the canonical position, but the runtime gives the motion from the rest
+        # position. They differ by a constant for each point. Both enter linearly, so the constant uses the same columns
+        # of weights again.
         first = weights[0] / LENGTH_UNIT
         network = AttributeNetwork(
             input="displacement",
@@ -172,7 +175,7 @@ class MonoGaussianAvatar(Avatar):
         )
 
     def _points(self) -> dict[str, Tensor]:
-        """Of each point: canonical place, rest place (metres), directions (metres a unit) and skinning weights."""
+        """Canonical and rest positions (metres), directions (metres per unit) and skinning weights of the points."""
         means = self.store["means"]
         offset, expression, pose, weights = self.deformation(means / LENGTH_UNIT)
         expression, pose = LENGTH_UNIT * expression, LENGTH_UNIT * pose
@@ -185,7 +188,7 @@ class MonoGaussianAvatar(Avatar):
     def _deformed(
         self, points: dict[str, Tensor], face: FaceParams
     ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
-        """Points in the head frame, metres, and how far they are from their canonical places."""
+        """Points in the head frame, and their motion from the canonical positions, both in metres."""
         shaped = points["rest"] + blend_directions(points["expression"], points["pose"], face)
         skinning = blend_transforms(points["weights"], self.face_model.joint_transforms(face))
         means = (skinning[..., :3] @ shaped[..., None])[..., 0] + skinning[..., 3]
@@ -195,39 +198,39 @@ class MonoGaussianAvatar(Avatar):
 def blend_directions(
     expression: Float[Tensor, "n 3 e"], pose: Float[Tensor, "n 3 p"], face: FaceParams
 ) -> Float[Tensor, "b n 3"]:
-    """E psi + P (R - I): what expression and free joints add before skinning."""
+    """E psi + P (R - I): the displacements from expression and free joints, before skinning."""
     turned = matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)
     added = expression.flatten(0, 1) @ face.expression.T + pose.flatten(0, 1) @ turned.flatten(1).T
     return added.T.unflatten(-1, (-1, 3))
 
 
 def blend_transforms(weights: Float[Tensor, "n k"], transforms: Float[Tensor, "b k 4 4"]) -> Float[Tensor, "b n 3 4"]:
-    """Each point's transform: the joints', averaged by its skinning weights."""
+    """Each point's transform: the mean of the joints' transforms, weighted by its skinning weights."""
     return (weights @ transforms[:, :, :3].flatten(2)).unflatten(-1, (3, 4))
 
 
 def unskin(points: Float[Tensor, "n 3"], transforms: Float[Tensor, "n 3 4"]) -> Float[Tensor, "n 3"]:
-    """Where points were before affine transforms moved them (inverse skinning)."""
+    """Positions of the points before affine transforms moved them (inverse skinning)."""
     a, b, c = transforms[..., :3].unbind(-2)
-    # Cramer's rule: several times as fast as a general inverse of many small matrices.
+    # Cramer's rule is several times as fast as a general inverse of many small matrices.
     columns = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
     determinant = (a * columns[..., 0]).sum(-1, keepdim=True)
     return (columns @ (points - transforms[..., 3])[..., None])[..., 0] / determinant
 
 
 def split_attributes(raw: Float[Tensor, "*b 11"]) -> dict[str, Tensor]:
-    """Columns of the attribute networks by name."""
+    """The columns of the attribute networks by name."""
     return dict(zip(ATTRIBUTES, raw.split(ATTRIBUTE_WIDTHS, dim=-1), strict=True))
 
 
 @torch.no_grad()
 def nearest_vertices(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "v 3"]) -> Int[Tensor, " n"]:
-    """The index of each point's nearest vertex."""
+    """The index of the vertex nearest to each point."""
     return torch.cdist(points, vertices).argmin(-1)
 
 
 def rendering_radius(fraction: float) -> float:
-    """Metres: what is added to all scales at a fraction of the run; also the spread of new points."""
+    """Length added to all scales at a fraction of the run, in metres. It is also the spread of new points."""
     radius = 0.15 * 0.75 ** math.log2(400 / 100) * LENGTH_UNIT
     return radius * math.prod(factor for time, factor in _SHRINKAGE if fraction >= time)
 
@@ -238,14 +241,14 @@ def points_at(fraction: float, first: int) -> int:
 
 
 def face_decay(fraction: float) -> float:
-    """How much of the face model's terms is left at a fraction of the run."""
+    """Factor on the weight of the face model's terms at a fraction of the run."""
     return 0.5 ** sum(fraction >= time for time in (0.2, 0.3, 0.5, 0.7))
 
 
 def _near_parents(
     store: GaussianStore, parents: Int[Tensor, " p"], noise: Float[Tensor, "p 3"], fraction: float
 ) -> dict[str, Tensor]:
-    """Children in a cube about their parents, with the rendering radius as its side."""
+    """Children in a cube around their parents. The side of the cube is the rendering radius."""
     return {"means": store["means"].detach()[parents] + noise.to(store["means"]) * rendering_radius(fraction)}
 
 

@@ -1,6 +1,6 @@
 """The three networks of MonoGaussianAvatar: attributes at rest, deformation of points, change of attributes.
 
-Lengths that go into and come out of them are in units of `LENGTH_UNIT`.
+Their inputs and outputs that are lengths are in units of `LENGTH_UNIT`.
 """
 
 import math
@@ -13,35 +13,35 @@ from torch.nn.utils.parametrizations import weight_norm
 from mien.avatar.encoding import positional_encoding
 
 LENGTH_UNIT = 0.25
-"""Metres. The paper's head model is four times life size, and its radii and weights belong to that size."""
+"""Unit of length, in metres. The paper's head model is four times life size, and its radii and weights fit that."""
 SKINNING_SHARPNESS = 20.0
-"""The softmax of skinning weights has a temperature of 1/20."""
+"""Factor on the logits of the skinning weights: their softmax has a temperature of 1/20."""
 _ENCODING_BANDS = 6
 _SOFTPLUS_SHARPNESS = 100.0
 
 ATTRIBUTES = ("log_scales", "quats", "opacity_logits", "sh")
-"""What the attribute networks answer with, in the order of the columns..."""
+"""Outputs of the attribute networks, in the order of their columns."""
 ATTRIBUTE_WIDTHS = (3, 4, 1, 3)
-"""...and how many columns each takes. Colours and scales go through a sigmoid: `log_scales` and `sh` are logits."""
+"""Number of columns of each output. Colours and scales go through a sigmoid: `log_scales` and `sh` are logits."""
 
 
 class AttributeNet(nn.Module):
-    """Raw attributes of a point at rest, from where it is.
+    """Raw attributes of a point at rest, given its position.
 
-    Differs from the published code: the trunk starts as a plain network does, not as a signed distance to a sphere.
+    Unlike in the published code, the trunk is initialised as a plain network, not as a signed distance to a sphere.
     """
 
     def __init__(self, width: int, layers: int):
         super().__init__()
         inputs = 3 + 6 * _ENCODING_BANDS
-        # The encoding enters a second time after the third layer, which leaves room for it.
+        # The encoding enters a second time after the third layer, which has fewer outputs to make room for it.
         self.skip = 3 if layers > 3 else None
         sizes = [inputs, *[width] * layers]
         outputs = [size - inputs if index + 1 == self.skip else size for index, size in enumerate(sizes[1:])]
         assert min(outputs) > 0, f"attribute width {width} leaves no room for {inputs} columns of encoding"
         self.trunk = nn.ModuleList(_normed(i, o) for i, o in zip(sizes[:-1], outputs, strict=True))
         with torch.no_grad():
-            # Smooth functions of the place to begin with: the encoding's waves come in as they are needed.
+            # Start with smooth functions of the position. The waves of the encoding come in as training needs them.
             self.trunk[0].parametrizations.weight.original1[:, 3:] = 0  # type: ignore[union-attr, index]
         self.colour = nn.Sequential(nn.Linear(width, width), _softplus(), nn.Linear(width, 3))
         self.scale = nn.Sequential(nn.Linear(width, width), _softplus(), nn.Linear(width, 3))
@@ -63,7 +63,7 @@ class AttributeNet(nn.Module):
 
 
 class DeformationNet(nn.Module):
-    """Offset, blend directions and skinning weights of a point, from where it is. At first: none, none, even."""
+    """Offset, blend directions and skinning weights of a point, given its position. At first zero, zero, equal."""
 
     def __init__(self, width: int, expressions: int, pose_features: int, joints: int):
         super().__init__()
@@ -89,11 +89,12 @@ class DeformationNet(nn.Module):
 
 
 class AttributeChangeNet(nn.Module):
-    """What is added to a point's raw attributes, from how far it has moved from its canonical place."""
+    """Changes of a point's raw attributes, given its motion from the canonical position."""
 
     def __init__(self, width: int):
         super().__init__()
-        # No activation after the third layer, as published: it and the next are one linear map.
+        # There is no activation after the third layer, as in the published code: this layer and the next form one
+        # linear map.
         first, second, third = (weight_norm(nn.Linear(size, width)) for size in (3, width, width))
         self.trunk = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), third)
         self.heads = nn.ModuleList(
@@ -106,7 +107,7 @@ class AttributeChangeNet(nn.Module):
         return torch.cat([head(values) for head in self.heads], dim=-1)
 
     def flattened(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Weights and biases of an equal plain network with ReLU between all its four layers."""
+        """Weights and biases of an equivalent plain network with ReLU between all of its four layers."""
         before = [_weight_and_bias(self.trunk[index]) for index in (0, 2)]
         (third, third_bias), hidden = _weight_and_bias(self.trunk[4]), self._layers(0)
         fan_out, fan_out_bias = (torch.cat(parts) for parts in zip(*hidden, strict=True))

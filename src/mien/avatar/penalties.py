@@ -1,4 +1,4 @@
-"""Penalties on Gaussians that stray from the triangle they ride on (GaussianAvatars, CVPR 2024, section 3.4)."""
+"""Penalties on Gaussians that stray from their triangles (GaussianAvatars, CVPR 2024, section 3.4)."""
 
 from typing import Any
 
@@ -20,17 +20,17 @@ def triangle_penalties(
     thresholds: Pair,
     weights: Pair,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """How far centres, and how much scales, exceed their thresholds: means over the Gaussians in view, weighted.
+    """Weighted means, over the visible Gaussians, of how far centres and scales exceed their thresholds.
 
-    Lengths are in units of the triangle's size. `thresholds` and `weights` are those of centres, then of scales.
+    Lengths are in units of the triangle's size. `thresholds` and `weights` hold the value for centres, then for scales.
     Differentiable in `means` and `log_scales`; native for float32 on a CPU.
 
     Args:
-        means: Centres in their triangle's frame.
+        means: Centres in the frames of their triangles.
         log_scales: Logarithms of the scales in the same units.
-        radii: Pixels on screen, 0 for what is not in view.
-        thresholds: What is smaller is free.
-        weights: Of what exceeds the thresholds.
+        radii: Radii on screen in pixels, 0 if not visible.
+        thresholds: Distance and scale up to which there is no penalty.
+        weights: Weights of the two penalties.
     """
     if means.dtype != torch.float32 or means.device.type != "cpu":
         return triangle_penalties_reference(means, log_scales, radii, thresholds, weights)

@@ -1,4 +1,4 @@
-"""Avatars as .mien files: baked, with what a program needs of the subject and of the face model."""
+"""Avatars as .mien files: the baked avatar, with the facts about subject and face model that a program needs."""
 
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -23,15 +23,15 @@ from mien.runtime.model import About, Neutral, PortableAvatar
 
 @torch.no_grad()
 def make_portable(avatar: Avatar, camera: Camera, name: str) -> PortableAvatar:
-    """What a .mien file holds of an avatar (`mien.runtime.write_portable` writes it).
+    """The content of a .mien file for an avatar (`mien.runtime.write_portable` writes it).
 
     Args:
-        avatar: trained.
-        camera: a good first view, such as the one it was trained with.
-        name: of the subject.
+        avatar: A trained avatar.
+        camera: A good first view, such as the one that the avatar was trained with.
+        name: The subject's name.
 
     Raises:
-        UserError: its face model may not be passed on.
+        UserError: the licence of its face model does not allow passing it on.
     """
     model, subject = avatar.face_model, avatar.subject
     if not model.shareable:
@@ -65,7 +65,7 @@ def make_portable(avatar: Avatar, camera: Camera, name: str) -> PortableAvatar:
 
 
 def read_baked(path: Path) -> BakedAvatar:
-    """The baked avatar of a .mien file, in torch.
+    """The baked avatar of a .mien file, as torch tensors.
 
     Raises:
         UserError: the file is missing, damaged or of another version.
@@ -74,7 +74,7 @@ def read_baked(path: Path) -> BakedAvatar:
 
 
 def as_numpy(value: Any) -> Any:
-    """Tensors, and dataclasses of `mien.avatar.baked`, as arrays and their namesakes of `mien.runtime.model`."""
+    """Turn tensors into arrays, and dataclasses of `mien.avatar.baked` into their namesakes of `mien.runtime.model`."""
     if isinstance(value, Tensor):
         array = value.detach().cpu().numpy()
         return np.array(array, np.float32 if value.is_floating_point() else np.int32, order="C")
@@ -82,7 +82,7 @@ def as_numpy(value: Any) -> Any:
 
 
 def as_torch(value: Any) -> Any:
-    """The way back from `as_numpy`."""
+    """The inverse of `as_numpy`."""
     if isinstance(value, np.ndarray):
         return torch.from_numpy(value.astype(np.float32 if value.dtype.kind == "f" else np.int64))
     return _translated(value, torch_side, as_torch)

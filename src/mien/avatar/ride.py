@@ -1,4 +1,4 @@
-"""From a face to the Gaussians that ride on its triangles: posing, rig and opacities as one operation."""
+"""The Gaussians that follow a face's triangles: posing, rig and opacities as one operation."""
 
 from typing import Any
 
@@ -22,10 +22,11 @@ _LOCAL = ("means", "quats", "log_scales", "opacity_logits")
 def ride(
     face_model: FaceModel, face: FaceParams, store: GaussianStore, sh: Float[Tensor, "n k 3"], in_head: bool
 ) -> Gaussians:
-    """The Gaussians of a store (`face_index`, `means, quats, log_scales` in triangle units, `opacity_logits`).
+    """The posed Gaussians of a store (`face_index`, `means, quats, log_scales` in triangle units, `opacity_logits`).
 
-    In world space, or `in_head`: in the head frame, with its pose. One batch entry a timestep; differentiable in the
-    store and in `face`. A single timestep on a CPU is one native call each way, which a training step is made of.
+    They are in world space or, with `in_head`, in the head frame together with its pose. There is one batch entry per
+    timestep. Differentiable in the store and in `face`. A single timestep on a CPU, which is the case in training,
+    takes one native call forward and one backward.
     """
     if len(face) == 1 and has_native_posing(face_model, face) and store["means"].dtype == torch.float32:
         compiled = compiled_model(face_model)
@@ -42,7 +43,7 @@ def ride(
 def ride_reference(
     face_model: FaceModel, face: FaceParams, store: GaussianStore, sh: Float[Tensor, "n k 3"], in_head: bool
 ) -> Gaussians:
-    """`ride` put together from its parts; any dtype, device and number of timesteps."""
+    """`ride` composed from its parts, for any dtype, device and number of timesteps."""
     vertices = face_model.head_vertices(face) if in_head else face_model(face)
     means, quats, log_scales, opacity_logits = (store[name] for name in _LOCAL)
     bound = bind_to_world(vertices, face_model.faces, store["face_index"], means, quats, log_scales)

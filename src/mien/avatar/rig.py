@@ -1,4 +1,4 @@
-"""Triangle frames, and Gaussians that ride on them (GaussianAvatars, CVPR 2024, section 3.2)."""
+"""Frames of triangles, and Gaussians that follow them (GaussianAvatars, CVPR 2024, section 3.2)."""
 
 from dataclasses import dataclass
 
@@ -13,26 +13,26 @@ from mien.arrays import unpacked
 from mien.rotation import multiply_quaternions, quaternion_from_matrix
 
 DEGENERATE_LENGTH = 1e-7
-"""Metres: a triangle whose first edge or height is shorter has no frame of its own."""
+"""Shortest first edge or height of a triangle that has a frame of its own, in metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleFrames:
-    """Where triangles are, how they are turned and how large they are: world = k R local + T."""
+    """Position, orientation and size of triangles: world = k R local + T."""
 
     R: Float[Tensor, "*b f 3 3"]
-    """Columns: along the first edge, along the normal, and their cross product."""
+    """Rotations. The columns are the directions along the first edge, along the normal, and their cross product."""
     T: Float[Tensor, "*b f 3"]
-    """Centroids, metres."""
+    """Centroids, in metres."""
     k: Float[Tensor, "*b f"]
-    """Mean of the first edge's length and the height over it, metres, positive."""
+    """Means of the first edge's length and the height over it, in metres, positive."""
 
 
 def triangle_frames(vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]) -> TriangleFrames:
-    """The frame of every triangle; differentiable in `vertices`.
+    """The frame of every triangle, differentiable in `vertices`.
 
-    A degenerate triangle (see `DEGENERATE_LENGTH`) gets a fixed rotation and the size 1e-7 m, both without gradient,
-    so that everything stays finite.
+    A degenerate triangle (see `DEGENERATE_LENGTH`) gets a fixed rotation and the size 1e-7 m, both without gradient, so
+    that everything stays finite.
     """
     v0, v1, v2 = (vertices[..., faces[:, i], :] for i in range(3))
     first, second = _usable_edges(v1 - v0, v2 - v0)
@@ -55,8 +55,8 @@ def frames_to_world(
 ) -> tuple[Float[Tensor, "*b n 3"], Float[Tensor, "*b n 4"], Float[Tensor, "*b n 3"]]:
     """Means, unit quats (wxyz) and scales in world space of Gaussians bound to triangles, in plain PyTorch.
 
-    `local_means` and exp(`log_scales`) are in units of their triangle's size; `local_quats` are normalised here.
-    Differentiable in all of them and in `frames`.
+    `local_means` and exp(`log_scales`) are in units of their triangle's size. `local_quats` are normalised here.
+    Differentiable in all of these and in `frames`.
     """
     R, T, k = frames.R[..., face_index, :, :], frames.T[..., face_index, :], frames.k[..., face_index, None]
     means = k * (R @ local_means[..., None])[..., 0] + T
@@ -75,13 +75,13 @@ def bind_to_world(
 ) -> tuple[Float[Tensor, "*b n 3"], Float[Tensor, "*b n 4"], Float[Tensor, "*b n 3"]]:
     """`frames_to_world` of the `triangle_frames` of a posed mesh; native for float32 on a CPU.
 
-    Gaussian i rides on triangle `face_index[i]`. Leading axes of `vertices` are timesteps. Differentiable in all but
-    the indices.
+    Gaussian i follows triangle `face_index[i]`. Leading axes of `vertices` are timesteps. Differentiable in everything
+    except the indices.
     """
     floats = (vertices, local_means, local_quats, log_scales)
     if any(tensor.device.type != "cpu" or tensor.dtype != torch.float32 for tensor in floats):
         return frames_to_world(triangle_frames(vertices, faces), face_index, local_means, local_quats, log_scales)
-    one_axis = vertices.ndim == 3  # no views then: they are nodes of the graph
+    one_axis = vertices.ndim == 3  # no views in this case, because each is a node of the graph
     flat = vertices if one_axis else vertices.reshape(-1, *vertices.shape[-2:])
     means, quats, scales = _BindToWorld.apply(flat, faces, face_index, local_means, local_quats, log_scales)
     if one_axis:
@@ -90,10 +90,10 @@ def bind_to_world(
 
 
 def rig_topology(vertex_count: int, faces: Int[Tensor, "f 3"], face_index: Int[Tensor, " n"]) -> _native.RigTopology:
-    """Who rides on which triangle, as the core takes it; made once for a `face_index` that nobody changes.
+    """The Gaussians on each triangle, in the form that the core takes. Cached until `face_index` changes.
 
     Raises:
-        IndexError: a vertex or a face is named that does not exist.
+        IndexError: a vertex or a face does not exist.
     """
     known, versions = _topologies.get(face_index), (faces._version, face_index._version)
     if known is None or known.faces is not faces or known.versions != versions or known.vertex_count != vertex_count:
@@ -104,7 +104,7 @@ def rig_topology(vertex_count: int, faces: Int[Tensor, "f 3"], face_index: Int[T
 
 @dataclass(frozen=True, eq=False)
 class _Topology:
-    """Of which tensors, in which version, a topology was made."""
+    """A topology, with the tensors that it was made from and their versions."""
 
     topology: _native.RigTopology
     vertex_count: int
@@ -113,7 +113,7 @@ class _Topology:
 
 
 _topologies = WeakIdKeyDictionary()
-"""By `face_index`."""
+"""Cached topologies, by `face_index`."""
 
 
 class _BindToWorld(torch.autograd.Function):
@@ -144,7 +144,7 @@ class _BindToWorld(torch.autograd.Function):
 
 
 def _usable_edges(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Two edges of every triangle, replaced by constants where the triangle is degenerate."""
+    """Two edges of every triangle, replaced by constants if the triangle is degenerate."""
     edge_length = first.detach().norm(dim=-1, keepdim=True)
     double_area = torch.linalg.cross(first.detach(), second.detach()).norm(dim=-1, keepdim=True)
     degenerate = (edge_length < DEGENERATE_LENGTH) | (double_area < DEGENERATE_LENGTH * edge_length)

@@ -1,4 +1,4 @@
-"""How far a run is, and learning rates that depend on it; without torch, because settings hold such rates."""
+"""Progress of a run, and learning rates that depend on it. Needs no torch, because settings hold such rates."""
 
 import math
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ from mien.ranges import FRACTION, Range
 
 @dataclass(frozen=True)
 class Progress:
-    """How far training is: all that schedules may depend on."""
+    """Progress of training: everything that schedules may depend on."""
 
     step: int
-    """Steps done before this one."""
+    """Number of steps before this one."""
     steps: int
-    """Steps of the whole run."""
+    """Number of steps of the whole run."""
     epoch: int = 0
-    """Passes over the training frames done before this one."""
+    """Number of passes over the training frames that were completed before this step."""
 
     @property
     def fraction(self) -> float:
@@ -25,7 +25,7 @@ class Progress:
 
 
 TRAINED = Progress(step=1, steps=1, epoch=1_000_000)
-"""The state after training: every schedule at its end."""
+"""Progress after training: every schedule is at its end."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class Rate:
     start: Annotated[float, Range(0, 100)]
     """The rate at the first step, or at `begin`. With 0, nothing is learned, whatever the end is."""
     end: Annotated[float | None, Range(1e-12, 100)] = None
-    """The rate at the last step. Without it, the rate stays as it starts."""
+    """The rate at the last step. If it is not given, the rate is constant."""
     begin: Annotated[float, FRACTION] = 0.0
-    """The fraction of the run before which the rate is 0."""
+    """The fraction of the run up to which the rate is 0."""
 
     def at(self, progress: Progress) -> float:
-        """The rate of one step."""
+        """The rate at a step."""
         if progress.fraction < self.begin:
             return 0.0
         if self.end is None or self.start == 0:

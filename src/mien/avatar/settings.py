@@ -1,6 +1,6 @@
-"""What the settings of several methods are made of; without torch, because the command line lists and checks them.
+"""Settings that several methods share. Needs no torch, because the command line lists and checks them.
 
-Every number has its range beside it (`mien.ranges`), and every field a sentence that `--help-all` shows.
+Every number has its range beside it (`mien.ranges`), and every field a description that `--help-all` shows.
 """
 
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from mien.avatar.schedules import Rate
 from mien.ranges import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
 
 MAX_GAUSSIANS = Range(1, 10_000_000)
-"""Numbers of Gaussians: a few make a picture, and tens of millions fit into no memory."""
+"""Range of a number of Gaussians. Tens of millions would not fit into memory."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,12 @@ class Photometric:
 class FaceTuning:
     """Whether and how fast training changes the tracked face parameters of each frame.
 
-    Only the frame of a step moves: unlike a dense Adam, momentum does not push frames that were not looked at.
+    A step changes only its own frame. In a dense Adam, momentum would also move frames that the step does not use.
     """
 
     enabled: bool = True
-    """Whether training corrects the tracking. Corrections are passed on to the held-out frames between training
-    frames."""
+    """Whether training corrects the tracking. Held-out frames get corrections interpolated from the training frames
+    around them."""
     expression: Rate = Rate(1e-3)
     """Learning rate of the expression coefficients, per step."""
     joints: Rate = Rate(1e-3)
@@ -47,7 +47,7 @@ class FaceTuning:
 
 @dataclass(frozen=True)
 class GradientSettings:
-    """Gradient-based density control (3D Gaussian Splatting, section 5): when and where Gaussians grow and go.
+    """Gradient-based density control (3D Gaussian Splatting, section 5): when and where Gaussians are added or removed.
 
     Times are fractions of the run, so that a schedule fits runs of any length.
     """
@@ -59,22 +59,23 @@ class GradientSettings:
     rounds: Annotated[int, COUNT_OR_NONE] = 16
     """Number of rounds, evenly spread from `start` to `stop`. With 0, the number of Gaussians never changes."""
     grow_gradient: Annotated[float, NOT_NEGATIVE] = 2e-4
-    """Gaussians grow if the mean gradient with respect to their centre, in normalised device coordinates, reaches
-    this."""
+    """Gaussians are duplicated or split if the mean gradient with respect to their centre, in normalised device
+    coordinates, reaches this."""
     split_size: Annotated[float, NOT_NEGATIVE] = 0.0025
-    """Gaussians that grow split in two if they are larger than this, in metres, and duplicate if they are smaller."""
+    """Gaussians that grow are split in two if they are larger than this, in metres, and duplicated otherwise."""
     prune_opacity: Annotated[float, FRACTION] = 0.005
     """Gaussians below this opacity are removed."""
     prune_size: Annotated[float, NOT_NEGATIVE] = 0.1
-    """Gaussians larger than this, in metres, are removed, once the first opacity reset after `start` has passed."""
+    """Gaussians larger than this, in metres, are removed. This begins with the first opacity reset after `start`."""
     prune_radius: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Gaussians that look larger than this radius, in pixels, are removed from the same time on. With 0, none is."""
+    """Gaussians with a larger radius on screen than this, in pixels, are removed. This begins with the first opacity
+    reset after `start`. 0 removes none."""
     opacity_resets: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = (0.1, 0.4)
     """Times at which opacities are lowered to `reset_opacity`, as fractions of the run."""
     reset_opacity: Annotated[float, Range(1e-6, 1)] = 0.01
-    """The highest opacity that a reset leaves."""
+    """Highest opacity that remains after a reset."""
     max_gaussians: Annotated[int, MAX_GAUSSIANS] = 40_000
-    """Growth stops at this number of Gaussians; those with the largest gradients grow first."""
+    """Largest number of Gaussians. Growth stops there; Gaussians with the largest gradients grow first."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,12 @@ class RefillSettings:
     targets: Annotated[tuple[int, ...], MAX_GAUSSIANS]
     """Number of Gaussians after each round."""
     prune_opacity: Annotated[float, FRACTION] = 0.1
-    """Gaussians whose opacity was never this high in any view since the last round are removed."""
+    """Gaussians are removed if their opacity stayed below this in all views since the last round."""
 
 
 @dataclass(frozen=True)
 class MethodConfig:
-    """What every method's settings hold; a method adds its own fields."""
+    """Settings that every method has. Each method adds its own fields."""
 
     photometric: Photometric = field(default_factory=Photometric)
     """Weights of the losses that compare a rendering with its target."""
@@ -99,9 +100,9 @@ class MethodConfig:
     """Whether and how fast training changes the tracked face parameters of each frame."""
 
     def check(self) -> None:
-        """Find that all numbers are in their ranges.
+        """Check that all numbers are in their ranges.
 
         Raises:
-            UserError: names the first option and value that is not, and the range.
+            UserError: a number is out of range. The message names the first such option, its value and the range.
         """
         check_ranges(self, lambda name: f"--method.{name.replace('_', '-')}")

@@ -1,4 +1,4 @@
-"""GaussianStore: every per-Gaussian tensor with its optimiser state, so that density control treats all alike."""
+"""GaussianStore: all per-Gaussian tensors with their optimiser state, so that density control treats all alike."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,27 +10,27 @@ from torch import Tensor, nn
 
 @dataclass(eq=False)
 class Moments:
-    """Adam's state of one tensor."""
+    """Adam's state for one tensor."""
 
     first: Tensor
     """Running mean of the gradient."""
     second: Tensor
     """Running mean of the squared gradient."""
     step: Float[Tensor, ""]
-    """How many updates it has seen."""
+    """Number of updates so far."""
 
     @staticmethod
     def zeros(like: Tensor) -> "Moments":
         """The state before the first update of a tensor."""
-        # Counted on the CPU: what is worked out of it are numbers of the host, which must not wait for a GPU.
+        # The step count stays on the CPU: numbers computed from it are needed there and must not wait for a GPU.
         return Moments(torch.zeros_like(like), torch.zeros_like(like), torch.zeros((), dtype=like.dtype))
 
 
 class GaussianStore(nn.Module):
-    """n Gaussians as a dict of equally long tensors: some are trained, others (triangle ids, ...) ride along.
+    """n Gaussians as a dict of equally long tensors. Some are trained; others, such as triangle indices, are fixed.
 
-    `select` and `append` replace the tensors: hold names, not tensors, across density control. The moments of trained
-    tensors live here too and follow every change; new Gaussians start with zero moments.
+    `select` and `append` replace the tensors: across density control, hold names and not tensors. The moments of
+    trained tensors are here too and follow every change. New Gaussians start with zero moments.
     """
 
     def __init__(self, trained: Mapping[str, Tensor], fixed: Mapping[str, Tensor] | None = None):
@@ -50,8 +50,8 @@ class GaussianStore(nn.Module):
         return self[self.names()[0]].shape[0]
 
     def __getitem__(self, name: str) -> Tensor:
-        """One per-Gaussian tensor, first axis n; a trained one is a leaf of the autograd graph."""
-        # Past torch's look-ups, which take ten times as long: a training step asks a dozen times.
+        """One per-Gaussian tensor with first axis n. A trained tensor is a leaf of the autograd graph."""
+        # This bypasses torch's look-ups, which take ten times as long: a training step needs a dozen.
         fixed = self._buffers.get(name)
         return self._modules["trained"]._parameters[name] if fixed is None else fixed  # pyright: ignore
 
@@ -60,14 +60,14 @@ class GaussianStore(nn.Module):
         return (*self.trained.keys(), *self.fixed_names)
 
     def select(self, kept: Tensor) -> None:
-        """Keep only the Gaussians where a bool mask [n] holds, or those at the given indices, in that order."""
+        """Keep only the Gaussians that a bool mask [n] selects, or those at the given indices, in that order."""
         kept = kept.nonzero()[:, 0] if kept.dtype == torch.bool else kept
         self._replace({name: self[name].detach()[kept] for name in self.names()})
         for state in self.moments.values():
             state.first, state.second = state.first[kept], state.second[kept]
 
     def append(self, parents: Tensor, overrides: Mapping[str, Tensor] | None = None) -> None:
-        """Add one child for each index in `parents` [c]: a copy of its parent but for the tensors in `overrides`."""
+        """Add one child for each index in `parents` [c]: a copy of its parent except for the tensors in `overrides`."""
         overrides = overrides or {}
         unknown = set(overrides) - set(self.names())
         assert not unknown, f"no such per-Gaussian tensors: {unknown}"
@@ -81,7 +81,7 @@ class GaussianStore(nn.Module):
             state.first, state.second = torch.cat([state.first, new]), torch.cat([state.second, new])
 
     def assign(self, name: str, value: Tensor) -> None:
-        """Overwrite a tensor from outside the optimiser (an opacity reset); its moments restart from zero."""
+        """Overwrite a tensor outside the optimiser, as an opacity reset does. Its moments restart from zero."""
         with torch.no_grad():
             self[name].copy_(value)
         if name in self.moments:
@@ -89,7 +89,7 @@ class GaussianStore(nn.Module):
             state.first, state.second = torch.zeros_like(state.first), torch.zeros_like(state.second)
 
     def resize(self, length: int) -> None:
-        """Make room for `length` Gaussians whose values are about to be loaded; moments are dropped."""
+        """Make room for `length` Gaussians whose values will be loaded next. Moments are dropped."""
         self.moments = {}
         self.select(torch.zeros(length, dtype=torch.long, device=self[self.names()[0]].device))
 

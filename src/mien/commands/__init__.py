@@ -1,4 +1,5 @@
-"""The sub-commands: one file each, a dataclass of arguments with `check()` and `run()`.
+"""The sub-commands: one file each, with a dataclass of arguments that has `check()` and `run()`.
 
-Neither importing one nor `check()` imports torch or another heavy library: mistakes are told at once.
+Neither the import of a sub-command nor its `check()` imports torch or another heavy library, so mistakes are reported
+at once.
 """

@@ -1,4 +1,4 @@
-"""`mien bench`."""
+"""`mien bench`: benchmarks."""
 
 import json
 import math
@@ -21,27 +21,27 @@ if TYPE_CHECKING:
 
 
 CaptureName = Literal["mono-short", "mono-long", "ring-16", "beard", "long-hair", "glasses", "off-model"]
-"""The keys of `mien.synthetic.REFERENCES` (a test compares them): options are read before torch is imported."""
+"""The keys of `mien.synthetic.REFERENCES`, written out because options are read before torch. A test compares them."""
 
 
 @dataclass(frozen=True)
 class Render:
-    """How fast the native core draws Gaussians on this machine, forward and backward, by size, threads and CPU kind."""
+    """Measure how fast the native core draws Gaussians, forward and backward, by size, threads and instruction set."""
 
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the machine and a list of rows for programs."""
+    """Print the machine and all rows as json, for programs."""
     seconds: float = 0.8
-    """To spend on each row; more finds a smaller minimum on a busy machine."""
+    """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     device: DeviceName = "cpu"
-    """cuda: gsplat on a GPU instead, at the papers' sizes."""
+    """Device to draw on. cuda measures gsplat on a GPU, at the sizes of the papers."""
 
     def check(self) -> None:
-        """Tell that CUDA lacks gsplat, or that there is no time to measure in."""
+        """Check that CUDA has gsplat and that there is time to measure."""
         check_device(self.device)
         _check_seconds(self.seconds)
 
     def run(self) -> None:
-        """Measure and print."""
+        """Measure and print the rows."""
         from mien.benchmarking.render import render_suite
 
         like = _gpu(self.device)
@@ -55,17 +55,17 @@ class Render:
 
 @dataclass(frozen=True)
 class Scaling:
-    """How drawing scales: 10,000 to 300,000 Gaussians, at the sizes that papers report and up to 2048x2048."""
+    """Measure how drawing scales: 10,000 to 300,000 Gaussians, at the sizes that papers report and up to 2048x2048."""
 
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the machine and a list of rows for programs."""
+    """Print the machine and all rows as json, for programs."""
     seconds: float = 0.8
-    """To spend on each row; more finds a smaller minimum on a busy machine."""
+    """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     plot: Path | None = None
-    """Write a chart here: .png, .svg or .pdf."""
+    """File for a chart: .png, .svg or .pdf (default: no chart)."""
 
     def check(self) -> None:
-        """Find out before any measuring whether the chart can be written, and whether there is time to measure in."""
+        """Check before any measurement that the chart can be written and that there is time to measure."""
         from mien.benchmarking.chart_path import check_chart_path
 
         _check_seconds(self.seconds)
@@ -73,7 +73,7 @@ class Scaling:
             check_chart_path(self.plot)
 
     def run(self) -> None:
-        """Measure, print and draw."""
+        """Measure and print the rows, then draw the chart."""
         from mien.benchmarking.charts import write_scaling_chart
         from mien.benchmarking.render import scaling_suite
 
@@ -84,22 +84,22 @@ class Scaling:
 
 @dataclass(frozen=True)
 class TrainStep:
-    """How long a `gaussian_avatars` step takes as `mien train` runs it (no footage needed), and posing with drawing."""
+    """Measure a training step of `gaussian_avatars` (no footage is needed), and posing together with drawing."""
 
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the machine and a list of rows for programs."""
+    """Print the machine and all rows as json, for programs."""
     seconds: float = 3.0
-    """To spend on each row; more finds a smaller minimum on a busy machine."""
+    """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     device: DeviceName = "cpu"
-    """cuda: on a GPU instead (gsplat draws), at the papers' sizes."""
+    """Device to train on. cuda measures a GPU, where gsplat draws, at the sizes of the papers."""
 
     def check(self) -> None:
-        """Tell that CUDA lacks gsplat, or that there is no time to measure in."""
+        """Check that CUDA has gsplat and that there is time to measure."""
         check_device(self.device)
         _check_seconds(self.seconds)
 
     def run(self) -> None:
-        """Measure and print."""
+        """Measure and print the rows."""
         from mien.benchmarking.train_step import train_step_suite
 
         like = _gpu(self.device)
@@ -113,29 +113,29 @@ class TrainStep:
 
 @dataclass(frozen=True)
 class Quality:
-    """How good the avatars and trackings are: the whole path over reference captures, with figures against the truth.
+    """Measure the quality of avatars and trackings: the whole path over reference captures, compared with the truth.
 
-    Each capture is drawn (once), captured, tracked, trained and evaluated; a stopped command goes on where it was.
+    Each capture is drawn (once), captured, tracked, trained and evaluated. A stopped command continues where it was.
     """
 
     captures: tuple[CaptureName, ...] = ()
     """Names of reference captures (default: all)."""
     method: MethodName = "gaussian_avatars"
-    """How the avatars are made."""
+    """Method of the avatars."""
     steps: int = 0
-    """Optimiser steps; 0 for each capture's own number."""
+    """Number of optimiser steps. 0 means each capture's own number."""
     out: Path = Path("out/bench-quality")
     """Folder for the drawn captures, the workspaces and the tables."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print a list of rows for programs."""
+    """Print all rows as json, for programs."""
 
     def check(self) -> None:
-        """Tell a negative number of steps."""
+        """Check that the number of steps is not negative."""
         if self.steps < 0:
             raise UserError(f"--steps {self.steps}: give a positive number, or 0 for each capture's own")
 
     def run(self) -> None:
-        """Walk every capture, then print the table."""
+        """Run every capture through all stages, then print the table."""
         from mien.commands.stages.quality import quality_stage
 
         quality_stage(self.out, self.captures, self.method, self.steps, as_json=self.as_json)
@@ -154,7 +154,7 @@ class Command:
     ]
 
     def check(self) -> None:
-        """Tell what can be told before the chosen benchmark."""
+        """Check the options of the chosen benchmark."""
         self.what.check()
 
     def run(self) -> None:
@@ -168,13 +168,13 @@ def _check_seconds(seconds: float) -> None:
 
 
 def _gpu(name: DeviceName) -> "torch.Tensor | None":
-    """A scalar on the GPU that was asked for, None where it is the processor."""
+    """A scalar on the chosen GPU, or None for the CPU."""
     device = choose_device(name)
     return like_on(device) if device.type == "cuda" else None
 
 
 def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) -> "tuple[Machine, list[BenchmarkRow]]":
-    """Print the machine and every row as soon as it is measured, or all of it as json; torch keeps to one thread."""
+    """Print the machine, and each row once it is measured, or everything as json. Torch uses one thread."""
     import torch
 
     from mien.benchmarking.timing import format_machine, format_row, measure_machine

@@ -1,4 +1,4 @@
-"""`mien capture`."""
+"""`mien capture`: from a video to a capture."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +14,8 @@ from mien.workspace import Workspace, check_new_workspace
 class Command:
     """Turn a video of one person into frames, mattes and landmarks, in OUT/sequences/NAME/capture.
 
-    Any video that a camera or telephone writes will do: upright or turned, HDR, variable frame rate, any length. One
-    that cuts to other shots becomes NAME-1, NAME-2, ... The same command goes on where it was stopped.
+    Any video from a camera or phone works: upright or turned, HDR, with a variable frame rate, of any length. A video
+    with cuts becomes the sequences NAME-1, NAME-2, ... A stopped command continues where it was if you run it again.
 
     Film half a minute or more, in even light, with the whole head in the picture: look around, talk, make faces.
 
@@ -25,15 +25,15 @@ class Command:
     video: Annotated[Path, tyro.conf.Positional]
     """A video file, or a folder of pictures in order."""
     out: Path
-    """Workspace folder of the person, new or with other videos of the same one."""
+    """Workspace folder of the person. It may be new, or hold other videos of the same person."""
     name: str | None = None
-    """Name of the sequence; by default the video's."""
+    """Name of the sequence (default: the video's name)."""
     replace: bool = False
-    """Replace a sequence of that name that was made from another video."""
+    """Replace a sequence of the same name that was made from another video."""
     settings: Annotated[CaptureSettings, tyro.conf.arg(name="capture")] = field(default_factory=CaptureSettings)
 
     def check(self) -> None:
-        """Tell what can be told without the libraries that capture."""
+        """Check options and paths without the libraries that capture."""
         from mien.commands.stages.names import sequence_names
 
         sequence_names([self.video], () if self.name is None else (self.name,))
@@ -41,7 +41,7 @@ class Command:
         check_new_workspace(self.out)
 
     def run(self) -> None:
-        """Capture and say what was found."""
+        """Capture the video and report what was found."""
         from mien.commands.stages.capturing import capture_stage
 
         capture_stage(Workspace(self.out), self.video, self.name, self.settings, self.replace)

@@ -1,4 +1,4 @@
-"""`--config FILE.json`: settings from a file, such as a run's config.json, whole or in parts."""
+"""`--config FILE.json`: settings from a file, such as a run's config.json. The file may hold only some settings."""
 
 import difflib
 import json
@@ -14,32 +14,31 @@ from mien.ranges import shown
 _FORMAT, _VERSION = "mien.run", 1
 _TAKEN = ("method", "settings")
 _NOT_TAKEN = ("format", "version", "checksum", "data", "mien", "command_line")
-"""What else a run's config.json holds: what it was trained on, by which version, by which command."""
+"""Other entries of a run's config.json: what it was trained on, by which version, with which command."""
 _LARGEST = 16 << 20
-"""Bytes; a run's config.json has some kilobytes."""
+"""Largest file that is read, in bytes. A run's config.json has some kilobytes."""
 
 
 @dataclass(frozen=True)
 class ConfigFile:
-    """What a file asks for; its fields and values are not checked yet."""
+    """The settings that a file asks for. Their names and values are not checked yet."""
 
     path: Path
     method: str | None
-    """Name of the method, if it says so."""
+    """Name of the method, if the file gives one."""
     method_changes: dict[str, Any]
     """The method's settings by name, without `kind`."""
     settings_changes: dict[str, Any]
     """Settings of the run by name."""
     sequences: tuple[str, ...]
-    """What the run of this file was trained on, which is not taken over."""
+    """Sequences that the run of this file was trained on. They are not taken over."""
 
 
 def read_config_file(path: Path) -> ConfigFile:
-    """Read a config.json: of a run, also edited (its checksum is not asked for), or written by hand.
+    """Read the config.json of a run, which may be edited (its checksum is not checked), or one written by hand.
 
     Raises:
-        UserError: the file is not there, is no json, is something else than settings, or names a method that there
-            is not.
+        UserError: the file is missing, is not json, holds something other than settings, or names an unknown method.
     """
     content = _read(path)
     for name in content:
@@ -79,7 +78,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _LARGEST:
             raise ValueError(f"{path.stat().st_size} bytes are too many")
-        text = path.read_text(encoding="utf-8-sig")  # editors of Windows put a mark at the beginning
+        text = path.read_text(encoding="utf-8-sig")  # editors on Windows write a byte order mark
         content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_each_once)
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"--config {path}: cannot be read as json ({error}); mend it or give another file") from None

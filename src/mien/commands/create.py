@@ -1,4 +1,4 @@
-"""`mien create`."""
+"""`mien create`: from videos to an avatar."""
 
 import shlex
 import time
@@ -16,32 +16,34 @@ from mien.workspace import Workspace, check_new_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Videos of one person in; an avatar, metrics and a report out. The same command goes on where it was stopped.
+    """Make an avatar, metrics and a report from videos of one person. A stopped command continues if you run it again.
 
-    Each video is captured on its own; all sequences of the workspace are tracked together, with one identity; the
-    avatar is trained on the videos named here.
+    Each video is captured separately. All sequences of the workspace are tracked together, with one identity. The
+    avatar is trained on the videos given here.
     """
 
     videos: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Video files, or folders of pictures in order."""
     out: Path
-    """Workspace folder to make or to go on with."""
+    """Workspace folder, new or existing."""
     name: tuple[str, ...] = ()
-    """Names of the sequences, one a video (default: the videos' names)."""
+    """Names of the sequences, one per video (default: the videos' names)."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
-    """Name of the run (default: the method's)."""
+    """Name of the run (default: the method's name)."""
     face_model: str = "anny"
-    """Name of a face model (see `mien face-models`), or a .npz or .pkl in FLAME's schema."""
+    """Name of a face model (see `mien face-models`), or a .npz or .pkl file in FLAME's schema."""
     preview: bool = False
-    """Show the fit of the face while it runs: OUT/tracking_preview.html, for a browser, is renewed as it goes on."""
+    """Show the fit of the face while it runs, in OUT/tracking_preview.html. Open that page in a browser; it is updated
+    while tracking runs."""
     overlay: Literal["auto", "all", "none"] = "auto"
-    """Frames in overlay.mp4: all of them, or of long clips every n-th so that there are at most 3,000 (auto)."""
+    """Frames in overlay.mp4: all frames (all), every n-th frame of long clips, at most 3,000 in total (auto), or no
+    overlay (none)."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
 
     def check(self) -> None:
-        """Tell what can be told without heavy libraries: options, names, paths."""
+        """Check options, names and paths without heavy libraries."""
         from mien.commands.stages.names import run_name, sequence_names
 
         self.options.check()
@@ -52,7 +54,7 @@ class Command:
         check_new_workspace(self.out)
 
     def run(self) -> None:
-        """All stages, each skipped if its result is current; what can be told before any work is told then."""
+        """Run all stages and skip those whose results are current. All possible checks come before any work."""
         from mien.commands.stages.capturing import capture_stage
         from mien.commands.stages.evaluating import evaluation_stage
         from mien.commands.stages.face_models import face_model_of

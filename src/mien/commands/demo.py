@@ -1,4 +1,4 @@
-"""`mien demo`."""
+"""`mien demo`: the whole path on a synthetic head."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,26 +8,26 @@ from mien.commands.options import PresetName, TrainOptions
 from mien.errors import UserError
 
 _LONGEST = 600.0
-"""Seconds: synthetic heads are drawn frame by frame."""
+"""Longest video in seconds. Synthetic heads are drawn frame by frame."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """The whole path on a synthetic head: draw a video, capture, track, train, evaluate, report."""
+    """Run the whole path on a synthetic head: draw a video, capture, track, train, evaluate, report."""
 
     out: Path = Path("out/demo")
-    """Workspace folder; the video lies in it."""
+    """Workspace folder. The video is written there, too."""
     preset: PresetName = "draft"
-    """As for `mien create`."""
+    """How thorough the training is, as for `mien create`: draft or standard."""
     steps: int = 0
-    """As for `mien create`."""
+    """Number of optimiser steps. 0 means the preset's number."""
     seconds: float = 0.0
-    """Length of the video; 0 for the recipe's."""
+    """Length of the video in seconds. 0 means the default length."""
     seed: int = 0
-    """Another head, another motion."""
+    """Seed of the head and its motion. Another seed gives another head and another motion."""
 
     def check(self) -> None:
-        """Tell what can be told without heavy libraries."""
+        """Check the options without heavy libraries."""
         from mien.files import check_writable
 
         TrainOptions(preset=self.preset, steps=self.steps).settings()
@@ -36,7 +36,7 @@ class Command:
         check_writable(self.out, folder=True)
 
     def run(self) -> None:
-        """Write the video unless it is there, then create."""
+        """Write the video unless it exists, then run `mien create` on it."""
         from dataclasses import replace
 
         from mien.locks import hold

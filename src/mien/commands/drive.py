@@ -1,4 +1,4 @@
-"""`mien drive`."""
+"""`mien drive`: an avatar that follows a driver."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,36 +13,37 @@ from mien.workspace import open_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Make an avatar do what someone else does: a video, a sequence, or what a phone or MediaPipe recorded."""
+    """Make an avatar follow somebody else: a video, a sequence, or a recording of a phone or of MediaPipe."""
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder of the avatar."""
     by: Path
-    """The driver: a workspace (may be the avatar's own), a video file (tracked first, and kept in the cache), a .csv of
+    """The driver: a workspace (also the avatar's own), a video file (tracked first, and kept in the cache), a .csv of
     Live Link Face, or a .json of blend shapes (docs/using.md)."""
     out: Path
-    """.mp4, .webm, a folder or NAME_%06d.png; a video or workspace shows the driver on the left."""
+    """Output: an .mp4, a .webm, a folder or NAME_%06d.png. If the driver has pictures, they are on the left."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
-    """Which of the avatar's runs (default: the only one)."""
+    """Name of the avatar's run (default: the only one)."""
     sequence: str | None = None
-    """Which of the driver's sequences (default: the only one)."""
+    """Name of the driver's sequence (default: the only one)."""
     head_pose: bool = True
-    """The head follows the driver's; with --no-head-pose it stays still and only the face moves."""
+    """Let the head follow the driver's head. With --no-head-pose the head stays still and only the face moves."""
     alone: bool = False
-    """Only the avatar, without the driver's pictures beside it."""
+    """Show only the avatar, without the driver's pictures beside it."""
     fps: float | None = None
-    """Frames a second that a .csv's timecode counts in (default: the smallest usual rate above its frame numbers)."""
+    """Frame rate of the timecode in a .csv, in frames per second (default: the smallest usual rate above its frame
+    numbers)."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
     def check(self) -> None:
-        """Tell what can be told without heavy libraries."""
+        """Check options and paths without heavy libraries."""
         open_workspace(self.workspace).pick_run(self.run_name)
-        # Of how many frames is not known before the driver is tracked, but a film or a sequence takes any number.
+        # The number of frames is known only after tracking, but a video or numbered pictures take any number.
         self.picture.plan(self.out, 2)
         check_driver(self.by, self.sequence, self.fps)
 
     def run(self) -> None:
-        """Track the driver if need be, then pose and render every timestep."""
+        """Track the driver if necessary, then pose and render every timestep."""
         from mien.commands.stages.driving import DriveOptions, drive_stage
         from mien.commands.stages.pictures import warn_of_white
 

@@ -1,4 +1,4 @@
-"""`mien evaluate`."""
+"""`mien evaluate`: figures, reports and comparisons."""
 
 import json
 import sys
@@ -17,44 +17,44 @@ JsonFlag = Annotated[bool, tyro.conf.arg(name="json")]
 
 @dataclass(frozen=True)
 class Command:
-    """Score a run on its held-out frames; or compare runs; or score pictures that another program made.
+    """Score a run on its held-out frames, compare runs, or score pictures that another program made.
 
     mien evaluate DIR [--run NAME]: metrics.json, report.html and side-by-side videos in DIR/runs/NAME.
-    mien evaluate DIR [DIR ...] --compare: one table over all runs that were evaluated, and compare.html.
+    mien evaluate DIR [DIR ...] --compare: one table over all evaluated runs, and compare.html.
     mien evaluate --images PRED --truth TRUTH: the same figures for pictures of any origin.
     """
 
     workspaces: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Workspace folders; one, unless runs are compared."""
+    """Workspace folders. Give one, or several with --compare."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
-    """Which run (default: the only one)."""
+    """Name of the run (default: the only one)."""
     drivers: tuple[Path, ...] = ()
     """Also score cross-reenactment: workspaces (or their sequences/NAME folders) whose motion drives the avatar."""
     pictures: bool = False
-    """Also write every scored picture and its truth as png: what other programs can be scored against."""
+    """Also write every scored picture and its truth as png, so that other programs can be scored on them."""
     perceptual: bool = True
-    """ST-LPIPS is computed, which takes most of the time; with --no-perceptual it is not."""
+    """Compute ST-LPIPS, which takes most of the time. --no-perceptual leaves it out."""
     perceptual_frames: int = 32
-    """ST-LPIPS is computed on at most this many frames, evenly spread; 0 for all."""
+    """Largest number of frames, evenly spread, on which ST-LPIPS is computed. 0 means all frames."""
     compare: bool = False
-    """One table over the runs of all workspaces given, as text and as compare.html in the first one."""
+    """Print one table over the runs of all given workspaces, and write compare.html into the first one."""
     images: Path | None = None
-    """Folder of pictures (or a video) to score; names must be those of their truths."""
+    """Folder of pictures (or a video) to score. The names must be those of the true pictures."""
     truth: Path | None = None
-    """Folder of true pictures (or a video)."""
+    """Folder of the true pictures (or a video)."""
     mattes: Path | None = None
-    """Folder of opacity pictures: what of the truth counts; the rest becomes the background."""
+    """Folder of opacity pictures. They select the part of the truth that counts; the rest becomes the background."""
     crops: Path | None = None
-    """crops.json with head boxes (default: the one in TRUTH, else the boxes of the mattes)."""
+    """A crops.json with head boxes (default: the one in TRUTH, or else the boxes of the mattes)."""
     background: Literal["white", "black"] = "white"
-    """What the pictures of --images lie over where there is no person."""
+    """Background of the pictures of --images outside the person."""
     out: Path | None = None
-    """Write the result of --images as json, or of --compare as html, to this file."""
+    """File for the result: json with --images, html with --compare."""
     as_json: JsonFlag = False
-    """Print the result on standard output for machines."""
+    """Print the result as json on standard output, for programs."""
 
     def check(self) -> None:
-        """Tell what can be told without heavy libraries: which of the three is asked for, and whether it is there."""
+        """Check without heavy libraries which of the three tasks is asked for, and that its input exists."""
         if self.perceptual_frames < 0:
             raise UserError(f"--perceptual-frames {self.perceptual_frames}: give a positive number, or 0 for all")
         if self.images is not None or self.truth is not None:
@@ -69,7 +69,7 @@ class Command:
                 workspace.pick_run(self.run_name)
 
     def run(self) -> None:
-        """Do which of the three is asked for."""
+        """Run the task that is asked for."""
         if self.images is not None and self.truth is not None:
             self._score_images(self.images, self.truth)
         elif self.compare:

@@ -1,4 +1,4 @@
-"""`mien export`."""
+"""`mien export`: avatars as files for other programs."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,20 +18,20 @@ class Command:
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
     out: Path
-    """The .mien or .ply to write; with --series the name of the .ply files, which get numbers: NAME_000000.ply."""
+    """The .mien or .ply file to write. With --series, the .ply files get numbers: NAME_000000.ply."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
-    """Which run (default: the only one)."""
+    """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()
-    """Expressions by name, and joints by radians, e.g. --set jawOpen=0.6 mouthSmileLeft=0.4 left_eye_y=0.2 (default:
-    the person's neutral)."""
+    """Expressions by name, and joint angles in radians, for example --set jawOpen=0.6 mouthSmileLeft=0.4 left_eye_y=0.2
+    (default: the person's neutral)."""
     series: str | None = None
-    """A .ply for every frame of a motion: the name of one of the workspace's sequences, or anything `mien drive --by`
-    takes. The head stays at the origin."""
+    """Write a .ply for every frame of a motion: the name of a sequence of the workspace, or anything that `mien drive
+    --by` takes. The head stays at the origin."""
     every: int = 1
-    """With --series: only every so many-th frame."""
+    """With --series, write only every n-th frame."""
 
     def check(self) -> None:
-        """Tell what can be told without heavy libraries."""
+        """Check options and paths without heavy libraries."""
         from mien.files import check_writable
 
         workspace = open_workspace(self.workspace)
@@ -48,7 +48,7 @@ class Command:
         check_writable(self.out if self.series is None else self._numbered(0))
 
     def run(self) -> None:
-        """Pose and write."""
+        """Pose the avatar and write the files."""
         from mien.avatar import load_avatar
 
         workspace = open_workspace(self.workspace)
@@ -98,7 +98,7 @@ class Command:
 
 
 def _write_ply(path: Path, avatar, face) -> int:
-    """One timestep with the head at the origin, since viewers turn around it: +y up, +z out of the face."""
+    """Write one timestep and return the number of Gaussians. The head is at the origin, +y up, +z out of the face."""
     import torch
 
     from mien.export import in_world, write_ply

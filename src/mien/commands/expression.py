@@ -8,15 +8,15 @@ from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 
 _WIDEST_TURN = 1.0
-"""Radians either way that a joint may be turned."""
+"""Largest angle of a joint in either direction, in radians."""
 
 
 def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, ...]) -> FaceParams:
-    """`face` with some coefficients or joint angles set by name, at every timestep; none set: `face` itself.
+    """`face` with some coefficients or joint angles set by name at every timestep. Without assignments, `face` itself.
 
     Raises:
-        UserError: an assignment is not NAME=NUMBER, the face model has no expression or joint of that name, or the
-            number is out of its range.
+        UserError: an assignment is not NAME=NUMBER, the face model has no such expression or joint, or the number is
+            out of its range.
     """
     expression, joints = face.expression.clone(), face.joints.flatten(1).clone()
     angles = _angle_names(model)
@@ -48,7 +48,7 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
 
 
 def _angle_names(model: FaceModel) -> tuple[str, ...]:
-    """In the order of the flattened `FaceParams.joints`."""
+    """Names of the joint angles, in the order of the flattened `FaceParams.joints`."""
     return tuple(f"{name}_{axis}" for name in model.free_joint_names for axis in "xyz")
 
 
@@ -63,7 +63,7 @@ def _check_name(name: str, model: FaceModel, assignment: str) -> None:
     names, angles = model.expression_names, _angle_names(model)
     if name in names or name in angles:
         return
-    # Letter by letter in small letters: `jawopen` is as near to jawOpen as can be.
+    # Compare in lower case, so that `jawopen` is as near to jawOpen as possible.
     folded = {known.lower(): known for known in (*names, *angles)}
     near = [folded[match] for match in difflib.get_close_matches(name.lower(), folded, 3, 0.6)]
     every = f"there are: {', '.join(names)}; and joints by radians: {', '.join(angles)}"

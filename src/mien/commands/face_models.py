@@ -1,4 +1,4 @@
-"""`mien face-models`."""
+"""`mien face-models`: the list of face models."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -13,22 +13,24 @@ from mien.terminal import show
 
 @dataclass(frozen=True)
 class Command:
-    """List the face models; with --add, take one of your own in; with --bake, make one ready before its first use."""
+    """List the face models. --add adds a model of your own; --bake prepares a model before its first use."""
 
     add: Path | None = None
-    """A head model in FLAME's schema (FLAME's own .pkl, or a .npz): it is kept with your other models, its landmarks
-    are placed (some minutes, once), and --face-model takes its name. A pickle is read without running anything."""
+    """A head model in FLAME's schema (FLAME's own .pkl, or a .npz) to add. It is kept with your other models, its
+    landmarks are placed (some minutes, once), and --face-model accepts its name. Reading a pickle runs no code from
+    it."""
     name: str | None = None
-    """Name of the added model (default: the file's)."""
+    """Name of the added model (default: the file's name)."""
     shareable: bool = False
-    """The added model's licence lets avatars carry a copy of it (FLAME's does not, FLAME Open's does)."""
+    """State that the added model's licence allows avatars to carry a copy of it (FLAME's does not, FLAME Open's
+    does)."""
     bake: str | None = None
-    """Name of a model to bake now."""
+    """Name of a model to prepare now."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print a list of objects for programs."""
+    """Print a json list of objects, for programs."""
 
     def check(self) -> None:
-        """Tell what can be told without heavy libraries."""
+        """Check the options without heavy libraries."""
         if self.add is None and (self.name is not None or self.shareable):
             raise UserError("--name and --shareable belong to a model that is added: give its file with --add FILE")
         if self.add is not None and not self.add.is_file():
@@ -37,7 +39,7 @@ class Command:
             )
 
     def run(self) -> None:
-        """Print the table."""
+        """Add or bake a model if asked for, then print the table."""
         from mien.face import available_face_models, load_face_model
 
         if self.add is not None:

@@ -1,4 +1,4 @@
-"""What several sub-commands ask: which method, how thorough, which settings in detail."""
+"""Options that several sub-commands share: the method, the preset, and the settings in detail."""
 
 import argparse
 from collections.abc import Sequence
@@ -26,58 +26,58 @@ else:
     PresetName = Literal[tuple(PRESETS)]
 
 _IN_DETAIL = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]
-"""Options that depend on the method: `with_settings` puts them here."""
+"""Options that depend on the method. `with_settings` fills them in."""
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """The dials of training; everything else is the preset's, the file's and the method's own."""
+    """The main options of training. All other settings come from the preset, the file and the method."""
 
     method: MethodName = "gaussian_avatars"
-    """How the avatar is made (docs/results.md compares them)."""
+    """Method that makes the avatar (compared in docs/results.md)."""
     config: Path | None = None
-    """A .json with settings, such as the config.json of a run, which this repeats (docs/settings.md). Options win over
-    the file, the file wins over the preset."""
+    """A .json with settings, for example the config.json of a run to repeat (docs/settings.md). Options override the
+    file, and the file overrides the preset."""
     preset: PresetName = "standard"
-    """draft: minutes; standard: the figures of docs/results.md."""
+    """draft takes minutes; standard gives the figures of docs/results.md."""
     split: Split = "blocks"
     """What is held out for scoring: every fifth block of 10 frames, the last 20 % (tail), or nothing (none)."""
     background: Literal["white", "random"] = "white"
-    """What training pictures lie over. random: for transparent renderings (no white in skin and outlines); it costs 0.1
-    to 0.4 dB over white."""
+    """Background of the training pictures. random suits transparent renderings (no white in skin and outlines) and
+    costs 0.1 to 0.4 dB."""
     steps: int = 0
-    """Optimiser steps instead of the preset's (schedules stretch with it); 0 for the preset's."""
+    """Number of optimiser steps, over which all schedules stretch. 0 means the preset's number."""
     seed: int = 0
-    """Same seed, same data, same settings: the same bytes."""
+    """Equal seed, data and settings give equal bytes."""
     hold_out: tuple[str, ...] = ()
-    """Whole sequences that are not trained on, only scored."""
+    """Whole sequences that are scored but not trained on."""
     hold_out_cameras: tuple[str, ...] = ()
-    """Ids of cameras that are not trained on, only scored (captures with several cameras)."""
+    """Ids of cameras that are scored but not trained on, for captures with several cameras."""
     device: DeviceName = "cpu"
-    """Where training runs. cpu: the same bytes every time; cuda: an NVIDIA GPU, through gsplat (docs/using.md
-    says how to install it); auto: a GPU where there is one. A run may be resumed on the other."""
+    """Device for training. cpu: always the same bytes; cuda: an NVIDIA GPU, through gsplat (docs/using.md says how to
+    install it); auto: a GPU if there is one. A run may resume on another device."""
     face_tuning: bool = True
-    """Training also corrects the tracking of the frames it sees (held-out frames get what lies beside them); with
-    --no-face-tuning it does not."""
+    """Let training correct the tracking. Held-out frames get interpolated corrections. --no-face-tuning keeps the
+    tracking as it is."""
     training: _IN_DETAIL = None
     """The other settings of the run."""
     method_settings: _IN_DETAIL = None
     """The method's own settings."""
 
     def check(self) -> None:
-        """Find that all settings make sense together, before any work.
+        """Check before any work that all settings are valid.
 
         Raises:
-            UserError: one is out of range; CUDA is asked for without gsplat.
+            UserError: one is out of range, or CUDA is asked for without gsplat.
         """
         self.settings()
         self.method_config()
 
     def settings(self) -> TrainSettings:
-        """The settings of the run: the preset's or the file's with these changes.
+        """The settings of the run: those of the preset or the file, with these options applied.
 
         Raises:
-            UserError: one is out of range; CUDA is asked for without gsplat.
+            UserError: one is out of range, or CUDA is asked for without gsplat.
         """
         check_device(self.device)
         if self.steps < 0:
@@ -97,7 +97,7 @@ class TrainOptions:
         return settings
 
     def method_config(self) -> MethodConfig:
-        """The method's settings: the preset's or the file's with these changes.
+        """The method's settings: those of the preset or the file, with these options applied.
 
         Raises:
             UserError: one is out of range.
@@ -105,7 +105,7 @@ class TrainOptions:
         config = PRESETS[self.preset].config(self.method)
         if self.method_settings is not None:
             config = applied(config, self.method_settings)
-        # Face tuning has two options that say the same: one that differs from the default was typed.
+        # Two options set face tuning. The one that differs from the default was typed.
         default = type(self).face_tuning
         typed = {self.face_tuning, config.face_tuning.enabled} != {default}
         config = replace(config, face_tuning=replace(config.face_tuning, enabled=default != typed))
@@ -113,7 +113,7 @@ class TrainOptions:
         return config
 
     def say_what_is_ignored(self) -> None:
-        """Say what the file holds that the run does not take from it: the data that its own run was trained on."""
+        """Report the entry of the file that the run does not use: the sequences that its own run was trained on."""
         from mien.progress import say
 
         sequences = read_config_file(self.config).sequences if self.config else ()
@@ -122,7 +122,7 @@ class TrainOptions:
 
 
 def training_options(command: type) -> str | None:
-    """The field of a command that holds `TrainOptions`, if it has them."""
+    """The name of the field of a command that holds `TrainOptions`, or None."""
     for name, hint in get_type_hints(command).items():
         if hint is TrainOptions:
             return name
@@ -132,7 +132,7 @@ def training_options(command: type) -> str | None:
 def with_settings(command: type, arguments: Sequence[str]) -> type:
     """A command with an option for every setting of the method that its arguments, or their --config, name.
 
-    Defaults are what the preset and the file say, so that options win over the file, and the file over the preset.
+    The preset and the file set the defaults, so that options override the file, and the file overrides the preset.
 
     Raises:
         UserError: the file cannot be used, or an option is a setting that the method does not have.
@@ -140,7 +140,7 @@ def with_settings(command: type, arguments: Sequence[str]) -> type:
     name = training_options(command)
     chosen = _chosen(arguments)
     if name is None or chosen.method not in (None, *METHODS) or chosen.preset not in (None, *PRESETS):
-        return command  # for wrong names, which tyro tells
+        return command  # tyro reports the wrong names
     file = read_config_file(Path(chosen.config)) if chosen.config is not None else None
     options = _with_defaults(chosen.method, chosen.preset or TrainOptions.preset, file, arguments)
     hint = get_type_hints(command, include_extras=True)[name]
@@ -149,7 +149,7 @@ def with_settings(command: type, arguments: Sequence[str]) -> type:
 
 
 def settings_groups(command: type, arguments: Sequence[str]) -> tuple[list[str], str]:
-    """Prefixes of the options that `with_settings` adds to a command, and what to type besides to see them."""
+    """The prefixes of the options that `with_settings` adds to a command, and the words to type to see them."""
     if training_options(command) is None:
         return [], ""
     method = _chosen(arguments).method
@@ -186,7 +186,7 @@ def _with_defaults(method: str | None, preset: str, file: ConfigFile | None, arg
 
 
 def _chosen(arguments: Sequence[str]) -> argparse.Namespace:
-    """What the words of a command line say about method, preset and file; None where they do not."""
+    """The method, preset and file that a command line names, or None for each that it does not name."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("method", "preset", "config"):
         parser.add_argument(f"--{name}", nargs="?")
@@ -194,10 +194,10 @@ def _chosen(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> None:
-    """Find before any work that somebody can be followed there: a workspace with that sequence, or a file.
+    """Check before any work that the driver exists: a workspace with that sequence, or a file.
 
     Raises:
-        UserError: it is not there, has no such sequence, or none to choose from, or a frame rate that is not asked for.
+        UserError: the driver is missing, does not have that sequence, has no sequences, or takes no frame rate.
     """
     suffix = by.suffix.lower() if by.is_file() else ""
     if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):

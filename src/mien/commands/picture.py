@@ -1,4 +1,4 @@
-"""What pictures of avatars look like, as several sub-commands ask: size, background."""
+"""Options for pictures of avatars that several sub-commands share: size and background."""
 
 import re
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import mien.export.output
 
 LARGEST_SIDE = 8192
-"""Pixels, as `mien.evaluation.cameras` has it."""
+"""Largest width or height in pixels, the same as `mien.limits.LARGEST_SIDE`."""
 _NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "green": (0.0, 1.0, 0.0)}
 _SMALLEST_SIDE = 16
 _HEX = re.compile(r"#?([0-9a-fA-F]{6})")
@@ -22,19 +22,20 @@ class PictureOptions:
     """Size and background of pictures."""
 
     size: int = 512
-    """Width and height, pixels, 16..8192."""
+    """Width and height in pixels, from 16 to 8192."""
     width: int | None = None
-    """Pixels, instead of --size; the head keeps its shape."""
+    """Width in pixels, instead of --size. The head keeps its shape."""
     height: int | None = None
-    """Pixels, instead of --size."""
+    """Height in pixels, instead of --size. The head keeps its shape."""
     background: str = "white"
-    """white, black, grey, green, a colour like #3060a0, or transparent (for .png and .webm; colours are straight)."""
+    """Background: white, black, grey, green, a colour like #3060a0, or transparent (for .png and .webm, with straight
+    colours)."""
 
     def plan(self, out: Path, frames: int) -> "mien.export.output.Output":
-        """Where pictures go, checked before any work.
+        """The output of the pictures, checked before any work.
 
         Raises:
-            UserError: a size, the background or the place is not possible.
+            UserError: a size, the background or the output is not possible.
         """
         from mien.export.output import plan_output
 
@@ -46,15 +47,15 @@ class PictureOptions:
         return plan_output(out, frames, self.background == "transparent")
 
     def shape(self) -> tuple[int, int]:
-        """Width and height."""
+        """Width and height in pixels."""
         wide, high = (self.size if given is None else given for given in (self.width, self.height))
         return wide, high
 
     def colour(self) -> tuple[float, float, float]:
-        """The background's colour; black for transparent.
+        """The background's colour. It is black for transparent pictures.
 
         Raises:
-            UserError: it is no colour.
+            UserError: it is not a colour.
         """
         if self.background == "transparent":
             return _NAMED["black"]

@@ -1,4 +1,4 @@
-"""`mien render`."""
+"""`mien render`: pictures of an avatar."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -21,40 +21,42 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Command:
-    """Render an avatar: a still, or a film along a camera path, at any expression or with a sequence's motion."""
+    """Render an avatar: a still, or a video along a camera path, at any expression or with a sequence's motion."""
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
     out: Path
-    """.png: a still; a folder or NAME_%06d.png: numbered pictures; .mp4 or .webm: a film."""
+    """Output: .png for a still, a folder or NAME_%06d.png for numbered pictures, .mp4 or .webm for a video."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
-    """Which run (default: the only one)."""
+    """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()
-    """Expressions by name, and joints by radians, e.g. --set jawOpen=0.6 mouthSmileLeft=0.4 left_eye_y=0.2 (default:
-    the person's neutral)."""
+    """Expressions by name, and joint angles in radians, for example --set jawOpen=0.6 mouthSmileLeft=0.4 left_eye_y=0.2
+    (default: the person's neutral)."""
     path: Literal["turntable", "orbit", "sway", "still", "captured"] = "turntable"
-    """How the camera moves: to the sides, on an oval, on a figure eight, not at all, or from camera to camera of the
-    capture. A .png is always a still."""
+    """Path of the camera: to both sides (turntable), an oval (orbit), a figure eight (sway), no motion (still), or from
+    camera to camera of the capture (captured). A .png is always a still."""
     cameras: Path | None = None
-    """Cameras from a json file, one a frame (format: docs/using.md), instead of --path; they keep their own sizes."""
+    """A json file of cameras, one per frame (format: docs/using.md), instead of --path. The cameras keep their own
+    sizes."""
     frames: int = 120
-    """Of the film."""
+    """Number of frames of the video."""
     fps: float = 25.0
-    """Of the film."""
+    """Frames per second of the video."""
     span: float = 40.0
-    """Degrees that the camera swings through, 360 for all the way round; sides that were not filmed look broken."""
+    """Angle that the camera swings through, in degrees. 360 goes all the way round, but sides that were not filmed look
+    broken."""
     tilt: float = 15.0
-    """Degrees that orbit and sway go up and down."""
+    """Angle that orbit and sway go up and down, in degrees."""
     zoom: float = 1.0
-    """Magnification, 1 for what the camera saw in training."""
+    """Magnification. 1 shows what the camera saw in training."""
     sequence: str | None = None
-    """Play this sequence's motion, a frame a timestep (`mien drive` has more)."""
+    """Name of a sequence whose motion the avatar plays, one frame per timestep (`mien drive` can do more)."""
     device: DeviceName = "cpu"
-    """Where it is posed and drawn: cpu, cuda (an NVIDIA GPU, through gsplat), or auto: a GPU where there is one."""
+    """Device that poses and draws: cpu, cuda (an NVIDIA GPU, through gsplat), or auto (a GPU if there is one)."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
     def check(self) -> None:
-        """Tell what can be told without heavy libraries."""
+        """Check options and paths without heavy libraries."""
         check_device(self.device)
         workspace = open_workspace(self.workspace)
         workspace.pick_run(self.run_name)
@@ -65,7 +67,7 @@ class Command:
             self.picture.plan(self.out, self._frames(None))
 
     def run(self) -> None:
-        """Pose and render frame by frame; what depends on files is checked first."""
+        """Pose and render frame by frame, after a check of everything that depends on files."""
         from mien.avatar import load_avatar, move_avatar
         from mien.commands.expression import with_expression
         from mien.commands.stages.pictures import draw, view, warn_of_white
@@ -126,7 +128,7 @@ class Command:
         return timesteps or (1 if self._is_still() else self.frames)
 
     def _given_cameras(self, workspace: Workspace, timesteps: int | None) -> "list[mien.camera.Camera] | None":
-        """Cameras that do not depend on the avatar, one a frame; None for a path around its head."""
+        """Cameras that do not depend on the avatar, one per frame, or None for a path around its head."""
         from mien.commands.stages.pictures import view
         from mien.evaluation.cameras import read_cameras
         from mien.tracking import read_tracking

@@ -1,7 +1,8 @@
 """Options for every field of some settings: `density.max_gaussians` of the method is --method.density.max-gaussians.
 
-The settings say it all themselves (`mien.avatar.settings`): names, types, ranges, and a sentence for the help. Options
-stand under a heading for each group of settings, and the learning rates of a group under one heading together.
+The settings themselves (`mien.avatar.settings`) hold everything about an option: name, type, range, and a description
+for the help. Options are listed under a heading for each group of settings. All learning rates of a group are under one
+heading.
 """
 
 import ast
@@ -21,36 +22,36 @@ from mien.ranges import Range, range_of
 Settings = TypeVar("Settings")
 _RATES = "Learning rates over the run: constant, or log-linear from start to end."
 _AS_FIELD = "__"
-"""Stands for the dot of a dotted name where Python wants an identifier."""
+"""Replaces the dot of a dotted name, because Python needs an identifier."""
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """One field that holds a value, in some settings or in settings within them."""
+    """One field that holds a value, in some settings or in nested settings."""
 
     name: str
-    """Dotted: `density.max_gaussians`."""
+    """Dotted name: `density.max_gaussians`."""
     heading: str
-    """Prefix of the options it stands with in the help."""
+    """Prefix of the options that the help lists it with."""
     about_heading: str
     about: str
     kind: Any
-    """Its type, without marks."""
+    """Type of the field, without marks."""
     allowed: Range | None
     value: Any
 
     def option(self, prefix: str) -> str:
-        """What people type."""
+        """The option as people type it."""
         return f"--{prefix}.{self.name.replace('_', '-')}"
 
 
 def leaves(settings: Any, prefix: str, names: Sequence[str] | None = None) -> list[Leaf]:
-    """All fields that hold values, with what the help says about them.
+    """All fields that hold values, with their descriptions for the help.
 
     Args:
-        settings: A dataclass whose values are the defaults.
-        prefix: How its options begin: "method" for --method.NAME.
-        names: Outermost fields to take; all of them without it.
+        settings: A dataclass with the default values.
+        prefix: Start of its options: "method" for --method.NAME.
+        names: Outermost fields to include (default: all).
     """
     about = (inspect.getdoc(type(settings)) or "").splitlines()[0]
     taken = [name for name in _names(settings) if names is None or name in names]
@@ -66,16 +67,16 @@ def _leaves_of(settings: Any, name: str, path: str, heading: str, about_heading:
     inside = (f"{heading}.rates", _RATES) if isinstance(value, Rate) else (f"{heading}.{name.replace('_', '-')}", about)
     found = [leaf for one in _names(value) for leaf in _leaves_of(value, one, f"{path}{name}.", *inside)]
     if isinstance(value, Rate):
-        # They stand with other rates, so the first of them says which rate it is.
+        # All rates are listed together, so the first line of each says which rate it is.
         found[0] = replace(found[0], about=f"{about} {found[0].about}")
     return found
 
 
 def options_type(listed: Sequence[Leaf], prefix: str) -> type:
-    """A dataclass that tyro turns into these options: a field for each heading, in it a field for each leaf."""
+    """A dataclass that tyro turns into these options. It has a field for each heading, which has one for each leaf."""
     import tyro
 
-    # What belongs to no group comes first.
+    # Options that belong to no group come first.
     headings: dict[str, list[tuple[str, Any, Any]]] = {prefix: [], f"{prefix}.rates": []}
     for leaf in listed:
         limits = "" if leaf.allowed is None else f"{leaf.allowed}; "
@@ -99,17 +100,17 @@ def options_type(listed: Sequence[Leaf], prefix: str) -> type:
 
 
 def applied(settings: Settings, options: Any) -> Settings:
-    """Settings with the values of such options, an instance of what `options_type` made."""
+    """Settings with the values of `options`, an instance of a class from `options_type`."""
     groups = [getattr(options, group.name) for group in fields(options)]
     typed = {one.name.replace(_AS_FIELD, "."): getattr(group, one.name) for group in groups for one in fields(group)}
     return _replaced(settings, typed)
 
 
 def check_names(arguments: Sequence[str], prefix: str, listed: Sequence[Leaf], owner: str) -> None:
-    """Find among the words of a command line a setting that there is not.
+    """Check that a command line names no unknown setting.
 
     Raises:
-        UserError: names it, the nearest one, and those that there are in its group.
+        UserError: it names one. The message gives the nearest setting and all settings of its group.
     """
     known = [leaf.option(prefix) for leaf in listed]
     for argument in arguments:
@@ -126,7 +127,7 @@ def check_names(arguments: Sequence[str], prefix: str, listed: Sequence[Leaf], o
 
 
 def _near(option: str, known: Sequence[str]) -> list[str]:
-    """The option that is nearest, if one is near by its last part: a name may be right and its group forgotten."""
+    """The option with the most similar last part, if there is one: a name may be right and its group forgotten."""
     names = [*known, *{name.rpartition(".")[0] for name in known}]
     lasts = {name: name.rpartition(".")[2] for name in names}
     near = difflib.get_close_matches(option.rpartition(".")[2], set(lasts.values()), 3)
@@ -160,7 +161,7 @@ def _replaced(settings: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _one_level(option: str, group: str) -> str:
-    """An option of a group, or the group within the group that it belongs to: `--method.density.*`."""
+    """An option of a group, or the nested group that it belongs to: `--method.density.*`."""
     first, dot, _ = option.removeprefix(f"{group}.").partition(".")
     return f"{group}.{first}" + (".*" if dot else "")
 

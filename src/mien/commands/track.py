@@ -1,4 +1,4 @@
-"""`mien track`."""
+"""`mien track`: from captures to trackings."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,31 +12,33 @@ from mien.workspace import open_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Fit the face model to all sequences of a workspace: DIR/sequences/NAME/tracking with overlay.mp4 and a report.
+    """Fit the face model to all sequences of a workspace. Writes DIR/sequences/NAME/tracking, an overlay and a report.
 
-    A workspace is one person, so its sequences are tracked together, with one identity. One that came new has all of
-    them tracked again.
+    A workspace is one person, so its sequences are tracked together, with one identity. If a sequence is added, all of
+    them are tracked again.
     """
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
     face_model: str = "anny"
-    """Name of a face model (see `mien face-models`), or a .npz or .pkl in FLAME's schema."""
+    """Name of a face model (see `mien face-models`), or a .npz or .pkl file in FLAME's schema."""
     again: bool = False
-    """Track again even if nothing changed. The scoring masks stay as they are."""
+    """Track again even if nothing has changed. The scoring masks stay as they are."""
     preview: bool = False
-    """Show the fit while it runs: DIR/tracking_preview.html, for a browser, is renewed every few seconds."""
+    """Show the fit while it runs, in DIR/tracking_preview.html. Open that page in a browser; it is updated every few
+    seconds."""
     overlay: Literal["auto", "all", "none"] = "auto"
-    """Frames in overlay.mp4: all of them, or of long clips every n-th so that there are at most 3,000 (auto)."""
+    """Frames in overlay.mp4: all frames (all), every n-th frame of long clips, at most 3,000 in total (auto), or no
+    overlay (none)."""
     settings: Annotated[TrackingSettings, tyro.conf.arg(name="tracking")] = field(default_factory=TrackingSettings)
 
     def check(self) -> None:
-        """Tell what can be told without heavy libraries."""
+        """Check options and paths without heavy libraries."""
         self.settings.check()
         open_workspace(self.workspace)
 
     def run(self) -> None:
-        """Track and write overlays and reports."""
+        """Track, and write overlays and reports."""
         from mien.commands.stages.tracking import tracking_stage
 
         tracking_stage(

@@ -1,4 +1,4 @@
-"""`mien train`."""
+"""`mien train`: from trackings to an avatar."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,18 +14,18 @@ from mien.workspace import Workspace, open_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Train an avatar on the tracked sequences of a workspace: DIR/runs/NAME. The same command resumes."""
+    """Train an avatar on the tracked sequences of a workspace, in DIR/runs/NAME. The same command resumes the run."""
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
     sequences: tuple[str, ...] = ()
-    """Which sequences (default: all that are tracked); those of --hold-out belong to the run as well."""
+    """Names of the sequences (default: all tracked ones). Those of --hold-out belong to the run as well."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
-    """Name of the run (default: the method's)."""
+    """Name of the run (default: the method's name)."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
 
     def check(self) -> None:
-        """Tell what can be told without heavy libraries."""
+        """Check options and paths without heavy libraries."""
         from mien.commands.stages.names import run_name
 
         self.options.check()
@@ -34,7 +34,7 @@ class Command:
         check_held_out(self._names(workspace), settings)
 
     def run(self) -> None:
-        """Train to the end."""
+        """Train the run to its end."""
         from mien.commands.stages.names import run_name
         from mien.commands.stages.training import training_stage
         from mien.training import check_run

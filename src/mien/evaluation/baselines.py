@@ -1,4 +1,4 @@
-"""What an avatar has to beat: the mean training picture, and the tracked mesh with the person's colours on it."""
+"""Baselines that an avatar has to beat: the mean training picture, and the tracked mesh with the person's colours."""
 
 from dataclasses import dataclass
 
@@ -12,9 +12,9 @@ from mien.evaluation.experiment import Experiment, Frame, spread_frames, target_
 from mien.render.mesh import rasterize_mesh, render_mesh, vertex_normals
 
 _COLOUR_FRAMES = 60
-"""Training frames, evenly spread, that vertex colours are averaged over: more change nothing that can be seen."""
+"""Number of training frames, evenly spread, for the mean vertex colours. More frames make no visible difference."""
 _DEPTH_TOLERANCE = 0.004
-"""Metres: a vertex this little behind what the depth picture shows still counts as seen."""
+"""Depth in metres behind the depth picture up to which a vertex still counts as visible."""
 _SMOOTHING_ROUNDS = 200
 
 
@@ -23,15 +23,15 @@ class Baselines:
     """Both baselines, ready to draw any frame."""
 
     mean_frames: dict[Frame, Float[Tensor, "h w 3"]]
-    """The mean training target of each sequence and camera (timestep 0 stands for all)."""
+    """The mean training target of each sequence and camera. The keys have timestep 0."""
     vertex_colors: Float[Tensor, "v 3"]
-    """0..1."""
+    """Mean colours of the vertices, 0..1."""
 
     def mean_frame_image(self, experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
         """The mean of the training targets of this frame's sequence and camera.
 
-        Where nothing of them was trained on (a held-out sequence, a held-out camera): the mean of the same camera's
-        pictures in other sequences, else of the same sequence's other cameras, else of all pictures of that size.
+        A held-out sequence or camera has no such mean. Its image is then the mean of the same camera's pictures in
+        other sequences, or else of the other cameras of the same sequence, or else of all pictures of that size.
         """
         camera, camera_id = experiment.camera(frame), experiment.camera_id(frame)
         size = (camera.height, camera.width, 3)
@@ -73,9 +73,10 @@ def _mean_frames(experiment: Experiment) -> dict[Frame, Float[Tensor, "h w 3"]]:
 
 
 def _vertex_colors(experiment: Experiment) -> Float[Tensor, "v 3"]:
-    """Colours of vertices: the mean of what training frames show where a vertex is seen, weighted by how squarely.
+    """Colours of the vertices: the mean over training frames that see the vertex, weighted by how squarely they do.
 
-    Vertices never seen (the back of the head, the inside of the mouth) take the mean of their neighbours' colours.
+    Vertices that are never seen (the back of the head, the inside of the mouth) get the mean of their neighbours'
+    colours.
     """
     face_model = experiment.avatar.face_model
     count = len(face_model.template)
@@ -94,9 +95,9 @@ def _vertex_colors(experiment: Experiment) -> Float[Tensor, "v 3"]:
 def _seen_colors(
     experiment: Experiment, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
 ) -> tuple[Float[Tensor, "v 3"], Float[Tensor, " v"]]:
-    """What one frame's target shows at each vertex, and how much that counts: 0 where hidden or beside the person.
+    """The colour of each vertex in one frame's target, and its weight: 0 if it is hidden or outside the person.
 
-    What the scoring mask cuts off the person, below the neck line, is white in the target and so on the mesh.
+    The part of the person that the scoring mask cuts off, below the neck line, is white in the target and on the mesh.
     """
     camera = experiment.camera(frame)
     pixels, depth = camera.project(vertices)
@@ -114,7 +115,7 @@ def _seen_colors(
 
 
 def _sample(picture: Float[Tensor, "h w c"], grid: Float[Tensor, "v 2"], mode: str) -> Float[Tensor, "v c"]:
-    """Values of a picture at points from -1 to 1."""
+    """Values of a picture at points in -1..1."""
     safe = grid.nan_to_num(2.0).clamp(-2, 2)[None, None]
     values = grid_sample(picture.permute(2, 0, 1)[None], safe, mode=mode, padding_mode="border", align_corners=False)
     return values[0, :, 0].T
@@ -123,7 +124,7 @@ def _sample(picture: Float[Tensor, "h w c"], grid: Float[Tensor, "v 2"], mode: s
 def _spread(
     colors: Float[Tensor, "v 3"], known: Tensor, faces: Int[Tensor, "f 3"], rounds: int = _SMOOTHING_ROUNDS
 ) -> Float[Tensor, "v 3"]:
-    """Colours where the unknown ones are smooth continuations of the known ones along the mesh's edges."""
+    """The colours with unknown ones replaced by a smooth continuation of the known ones along the mesh's edges."""
     edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).long()
     edges = torch.cat([edges, edges.flip(1)])
     edges = edges[~known[edges[:, 0]]]

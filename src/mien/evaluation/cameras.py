@@ -27,17 +27,17 @@ def turntable(
     span: float = 2 * math.pi,
     up: tuple[float, float, float] = _WORLD_UP,
 ) -> list[Camera]:
-    """Cameras that go once around `centre` at the distance, height and focal length of `camera`, the first of them.
+    """Cameras that circle `centre` once at the distance, height and focal length of `camera`, which is the first.
 
-    A `span` below a full turn swings instead: to span / 2 on the subject's left, back through the middle to the right
-    and home, slowing down at the ends, so that the path loops either way.
+    If `span` is below a full turn, the camera swings instead: to span / 2 on the subject's left, back through the
+    middle to the right, and home. It slows down at the ends. Either path loops.
 
     Args:
-        camera: Where the path starts; the centre keeps its place in the picture.
-        centre: What to go around, world space, metres (the head's: `FaceParams.head_translation`).
-        frames: How many cameras.
-        span: Radians, 2 pi for a full turn.
-        up: The axis of the turn in world space.
+        camera: The start of the path. The centre keeps its place in the picture.
+        centre: The point to circle, in world space, in metres (the head's: `FaceParams.head_translation`).
+        frames: Number of cameras.
+        span: Angle in radians, 2 pi for a full turn.
+        up: Axis of the turn in world space.
     """
     phases = [2 * math.pi * index / frames for index in range(frames)]
     full = span >= 2 * math.pi
@@ -47,15 +47,15 @@ def turntable(
 def sway(
     camera: Camera, centre: Float[Tensor, " 3"], frames: int, span: float, tilt: float, crossing: bool = True
 ) -> list[Camera]:
-    """Cameras on a figure eight lying on its side around `camera`'s place; without `crossing`, on an oval.
+    """Cameras on a horizontal figure eight around the position of `camera`, or on an oval without `crossing`.
 
     Args:
-        camera: The middle of the path; the centre keeps its place in the picture.
-        centre: What to look at, world space, metres.
-        frames: How many cameras; the path loops.
-        span: Radians from the far left to the far right.
-        tilt: Radians from the highest to the lowest.
-        crossing: Whether it is a figure eight.
+        camera: The middle of the path. The centre keeps its place in the picture.
+        centre: The point to look at, in world space, in metres.
+        frames: Number of cameras. The path loops.
+        span: Angle from the far left to the far right, in radians.
+        tilt: Angle from the highest to the lowest point, in radians.
+        crossing: Whether the path is a figure eight.
     """
     views = []
     for phase in (2 * math.pi * index / frames for index in range(frames)):
@@ -68,7 +68,7 @@ def sway(
 
 
 def fitted(camera: Camera, width: int, height: int, zoom: float = 1.0) -> Camera:
-    """The same view in a picture of another shape: all of it is seen, in the middle, magnified by `zoom`."""
+    """The same view in a picture of another shape: all of it is visible, centred, and magnified by `zoom`."""
     scale = min(width / camera.width, height / camera.height) * zoom
     K = camera.K * camera.K.new_tensor([[scale], [scale], [1.0]])
     K[0, 2] += 0.5 * (width - scale * camera.width)
@@ -77,7 +77,7 @@ def fitted(camera: Camera, width: int, height: int, zoom: float = 1.0) -> Camera
 
 
 def write_cameras(path: Path, cameras: Sequence[Camera]) -> None:
-    """Write cameras as `read_cameras` reads them."""
+    """Write cameras in the format that `read_cameras` reads."""
     listed = [
         {"K": camera.K.tolist(), "viewmat": camera.viewmat.tolist(), "width": camera.width, "height": camera.height}
         for camera in cameras
@@ -86,20 +86,20 @@ def write_cameras(path: Path, cameras: Sequence[Camera]) -> None:
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """A camera path from json: one camera a frame.
+    """Read a camera path from json, with one camera per frame.
 
     {"format": "mien.cameras", "version": 1, "cameras": [{"K": 3x3, "viewmat": 4x4, "width": .., "height": ..}, ...]}
-    with intrinsics in pixels and world-to-camera matrices with OpenCV axes, metres (docs/conventions.md).
+    Intrinsics are in pixels. World-to-camera matrices have OpenCV axes and metres (docs/conventions.md).
 
     Raises:
-        UserError: the file is missing or damaged, or a camera is incomplete, not finite, or no rigid view.
+        UserError: the file is missing or damaged, or a camera is incomplete, not finite, or not a rigid view.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file; name a json file of cameras (docs/using.md)")
     try:
         listed = read_json(path, FORMAT, VERSION).get("cameras")
     except UserError as error:
-        # Written by the user, not by a stage that could be run again.
+        # The user wrote this file, so there is no stage to run again.
         raise UserError(f"{str(error).split('; ')[0]}; write it as docs/using.md says") from None
     if not isinstance(listed, list) or not listed:
         raise UserError(f"{path}: has no list `cameras`; give one camera for every frame")
@@ -119,17 +119,17 @@ def _camera_of(entry: Any, where: str) -> Camera:
 
 
 def _whole(size: Any) -> Any:
-    """Other programs write 512.0."""
+    """A whole number that another program wrote as a float, such as 512.0, as an int; other values as they are."""
     return int(size) if isinstance(size, float) and size.is_integer() else size
 
 
 def orbit(
     camera: Camera, centre: Float[Tensor, " 3"], angle: float, up: tuple[float, float, float] = _WORLD_UP
 ) -> Camera:
-    """`camera` carried around `centre` by `angle` radians, counter-clockwise seen from above."""
+    """`camera` moved around `centre` by `angle` radians, counter-clockwise seen from above."""
     axis = torch.nn.functional.normalize(camera.viewmat.new_tensor(up), dim=0)
     turn = matrix_from_axis_angle(axis * angle)
     centre = centre.to(camera.viewmat)
-    # p -> turn (p - centre) + centre carries the camera; the world moves the other way.
+    # p -> turn (p - centre) + centre moves the camera; the world moves the other way.
     carry = rigid_transform(turn, centre - turn @ centre)
     return replace(camera, viewmat=camera.viewmat @ invert_rigid(carry))

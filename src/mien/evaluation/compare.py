@@ -1,4 +1,4 @@
-"""One table over runs: the figures of their metrics.json, side by side, and whether they may be compared at all."""
+"""One table over runs: figures from their metrics.json side by side, and whether they may be compared at all."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from mien.training import read_run_config
 COLUMNS = (
     ("psnr", "PSNR", 2, True), ("ssim", "SSIM", 3, True), ("l1", "L1", 4, False), ("perceptual", "ST-LPIPS", 3, False),
 )  # fmt: skip
-"""Metric, heading, digits, whether more is better."""
+"""Metric, heading, number of digits, whether higher is better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,11 +21,11 @@ class ScoredRun:
     """A run that was evaluated."""
 
     label: str
-    """Of the run; with its workspace's name where there are several."""
+    """Name of the run, with its workspace's name if there are several workspaces."""
     run_dir: Path
     method: str
     metrics: Mapping[str, Any]
-    """metrics.json."""
+    """Content of metrics.json."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +34,17 @@ class Row:
 
     label: str
     entry: Mapping[str, Any]
-    """`psnr`, ..., `head`: {...}."""
+    """Figures: `psnr`, ..., `head`: {...}."""
     run: ScoredRun | None
-    """None for baselines, and for what a run would be without its corrections."""
+    """The run, or None for baselines and for a run without its corrections."""
     faces: str
-    """What the face parameters of held-out frames were; of a baseline that depends on them: whose."""
+    """Source of the face parameters of held-out frames. For a baseline that depends on them: the runs."""
     baseline: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """One protocol on one set of frames: rows that may be compared with each other."""
+    """One protocol on one set of frames. Its rows may be compared with each other."""
 
     protocol: str
     split: str
@@ -54,7 +54,7 @@ class Table:
     rows: tuple[Row, ...]
 
     def best(self, part: str | None, metric: str, higher: bool) -> float | None:
-        """The best figure of a column among the runs, rounded as printed; None where there are not two runs."""
+        """The best figure of a column among the runs, rounded as printed, or None if fewer than two runs have one."""
         digits = next(digits for name, _, digits, _ in COLUMNS if name == metric)
         own = [figure(row.entry, part, metric) for row in self.rows if row.run is not None]
         known = [round(value, digits) for value in own if value is not None]
@@ -63,14 +63,14 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All tables, and what a reader has to know about them."""
+    """All tables, and the warnings that a reader has to know."""
 
     runs: tuple[ScoredRun, ...]
     tables: tuple[Table, ...]
     warnings: tuple[str, ...]
 
     def content(self) -> dict[str, Any]:
-        """The comparison for machines."""
+        """The comparison in a form for json."""
         return {
             "format": "mien.comparison",
             "version": 1,
@@ -89,7 +89,7 @@ class Comparison:
 
 
 def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
-    """Read the figures of some runs, by label, and sort them into tables of what may be compared.
+    """Read the figures of some runs, by label, and sort them into tables of comparable runs.
 
     Raises:
         UserError: none of them was evaluated, or a metrics.json is damaged or of another version.
@@ -109,12 +109,12 @@ def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
 
 
 def figure(entry: Mapping[str, Any], part: str | None, metric: str) -> float | None:
-    """One figure of a row; None where it was not computed."""
+    """One figure of a row, or None if it was not computed."""
     return (entry if part is None else entry[part]).get(metric)
 
 
 def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
-    """Tables by protocol and by the frames and masks that were scored, and warnings where those differ."""
+    """Tables by protocol and by the scored frames and masks, and warnings if those differ."""
     tables, warnings = [], []
     protocols = dict.fromkeys(
         name for run in runs for name, entry in run.metrics["protocols"].items() if "psnr" in entry
@@ -139,14 +139,14 @@ def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
 
 
 def _ground(entry: Mapping[str, Any]) -> str:
-    """What figures must have in common to be compared."""
+    """What two runs must have in common to be compared: the scored frames, pictures and masks."""
     frames = entry["per_frame"]
     keys = ("sequence", "timestep", "camera_id")
     return repr([entry.get("scored_on"), entry.get("pixels"), *(frames[key] for key in keys)])
 
 
 def _differences(table: Table) -> list[str]:
-    """What else is not alike in the runs of a table."""
+    """Warnings about other differences between the runs of a table."""
     own = [row for row in table.rows if row.run is not None]
     warnings = []
     if len({row.faces for row in own}) > 1:
@@ -175,7 +175,7 @@ def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
 
 
 def _baseline_rows(key: str, name: str, runs: Sequence[ScoredRun], protocol: str) -> list[Row]:
-    """A baseline's row, or one for each run where they differ (the mesh follows a run's corrected faces)."""
+    """The row of a baseline, or one row for each run if they differ (the mesh follows a run's corrected faces)."""
     found: dict[str, tuple[list[str], Any]] = {}
     for run in runs:
         entry = run.metrics["protocols"][protocol]["baselines"].get(key)

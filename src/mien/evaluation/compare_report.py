@@ -1,4 +1,4 @@
-"""compare.html: the tables, and the same held-out frames as every run draws them."""
+"""compare.html: the tables, and the same held-out frames as rendered by every run."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -30,8 +30,8 @@ def write_comparison(path: Path, comparison: Comparison, sequence_dirs: Mapping[
     """Write the page.
 
     Args:
-        path: Of the .html.
-        comparison: What to show.
+        path: The .html file.
+        comparison: The comparison to show.
         sequence_dirs: The folders of the sequences of each run, by the run's folder.
     """
     text = comparison_html(comparison, [_pictures(table, sequence_dirs) for table in comparison.tables])
@@ -39,7 +39,7 @@ def write_comparison(path: Path, comparison: Comparison, sequence_dirs: Mapping[
 
 
 def comparison_html(comparison: Comparison, pictures: Sequence[str]) -> str:
-    """The page as text; `pictures` holds a piece of HTML for each table."""
+    """The page as text. `pictures` holds a piece of HTML for each table."""
     style = files("mien.evaluation").joinpath("report.css").read_text(encoding="utf-8")
     body = ["<h1>Runs compared</h1>"]
     body.append(f'<p class="sub">{escape(", ".join(run.label for run in comparison.runs))}</p>')
@@ -106,7 +106,7 @@ def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> str
     truths: list[str] = []
     captions: list[str] = []
     for run in track_progress(runs, f"pictures {table.protocol}", len(runs)):
-        # One run's avatar and sequences at a time: memory does not grow with the number of runs.
+        # One run's avatar and sequences at a time, so that memory does not grow with the number of runs.
         experiment = load_experiments(run.run_dir, sequence_dirs[run.run_dir]).get(table.protocol)
         if experiment is None or len(experiment.held_out_frames) != count:
             raise UserError(

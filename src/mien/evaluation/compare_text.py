@@ -1,4 +1,4 @@
-"""A comparison as aligned text, the best figures in bold where a terminal shows it."""
+"""A comparison as aligned text, with the best figures in bold if the terminal can show that."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ def comparison_text(comparison: Comparison, bold: bool = False) -> str:
 
 
 def _table_text(table: Table, bold: bool) -> str:
-    """A heading and an aligned table; whole frame, then head crop."""
+    """A heading and an aligned table: first the whole frame, then the head crop."""
     sequences = ", ".join(sorted(set(table.rows[0].entry["per_frame"]["sequence"])))
     title = printable(f"{table.protocol}: {table.frames} frames held out of {sequences} ({table.split})")
     extra = ("Gaussians", "training", "ms/frame")
@@ -41,7 +41,7 @@ def _table_text(table: Table, bold: bool) -> str:
 
 
 def _cells(table: Table, row: Row) -> list[tuple[str, bool]]:
-    """A row's texts, and which of them are the best of their column."""
+    """The texts of a row, each with whether it is the best of its column."""
     cells = [(printable(row.label), False), (printable(row.faces), False)]
     for part, _ in _PARTS:
         for metric, _, digits, higher in COLUMNS:

@@ -1,4 +1,4 @@
-"""Cross-reenactment: another sequence's motion on the avatar, relative to each one's neutral; there is no truth."""
+"""Cross-reenactment: another sequence drives the avatar, relative to the neutrals of both. There is no true picture."""
 
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
@@ -38,18 +38,18 @@ _MEANS = (
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """An avatar that does what a driver does."""
+    """An avatar that a driver drives."""
 
     avatar: Avatar
     camera: Camera
     faces: FaceParams
-    """The avatar's, one a timestep of the driver."""
+    """Face parameters of the avatar, one per timestep of the driver."""
     driver: Capture
     tracking: Tracking
     driver_camera: int
-    """The driver's camera that looks at the face."""
+    """Index of the driver's camera that sees the face most squarely."""
     by_rest: tuple[int, ...]
-    """Timesteps with a tracked face, from the nearest to the driver's neutral to the farthest."""
+    """Timesteps with a tracked face, sorted by their distance from the driver's neutral, nearest first."""
 
     @torch.no_grad()
     def picture(self, timestep: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -63,7 +63,7 @@ class Driven:
 
 
 def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
-    """A run's avatar, seen by the camera of `sequence_dir` that looks at its face, driven by another sequence.
+    """A run's avatar, driven by another sequence, and seen by the most frontal camera of `sequence_dir`.
 
     Raises:
         UserError: the driver was tracked with another face model, or has no tracked frame.
@@ -96,7 +96,7 @@ def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
 
 
 def frontal_camera(cameras: Items[Camera], neutral: FaceParams) -> int:
-    """Which camera looks most squarely at the face of the one timestep `neutral`."""
+    """The index of the camera that sees the face of the one timestep `neutral` most squarely."""
     ahead = matrix_from_axis_angle(neutral.head_rotation)[0, :, 2]
     origin = neutral.head_translation[0]
     facing = [float(normalize(camera.position - origin, dim=0) @ ahead) for camera in cameras]
@@ -104,7 +104,7 @@ def frontal_camera(cameras: Items[Camera], neutral: FaceParams) -> int:
 
 
 def _activity(face: FaceParams, at_rest: FaceParams) -> list[float]:
-    """How far each timestep is from rest: expression coefficients and radians of head rotation alike."""
+    """The distance of each timestep from rest: expression coefficients plus the head's rotation in radians."""
     turn = matrix_from_axis_angle(at_rest.head_rotation).transpose(-1, -2) @ matrix_from_axis_angle(face.head_rotation)
     angle = ((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).arccos()
     return ((face.expression - at_rest.expression).norm(dim=-1) + angle).tolist()
@@ -115,14 +115,14 @@ def cross_reenactment(
 ) -> tuple[dict[str, Any], list[Path]]:
     """The protocol's entry of metrics.json, and side-by-side videos (driver, avatar) in the run's folder.
 
-    Figures are means over drivers; see `mien.evaluation.redetection` for what they measure. They say how much of the
-    motion arrives, not how good pictures look. The avatar's own sequence as a driver shows the best to be hoped for.
+    Figures are means over drivers; `mien.evaluation.redetection` describes them. They say how much of the motion
+    arrives, not how good pictures look. The avatar's own sequence as a driver shows the best that can be expected.
 
     Args:
         run_dir: A finished run.
-        sequence_dir: A sequence that it was trained on: whose camera the avatar is seen by.
+        sequence_dir: A sequence that the run was trained on. Its camera sees the avatar.
         driver_dirs: Folders of tracked sequences.
-        video_frames: At most this many frames a video; 0 for none.
+        video_frames: Largest number of frames per video, or 0 for no videos.
 
     Raises:
         UserError: a driver does not fit, or no face is found in its pictures.
@@ -143,10 +143,10 @@ def cross_reenactment(
 
 
 def measure(driven: Driven, name: str) -> dict[str, Any]:
-    """Figures of evenly spread frames of one driver.
+    """Figures of evenly spread frames of one driver. They are None if no face is found in the avatar's pictures.
 
     Raises:
-        UserError: no face is found in the driver's pictures, or none in the avatar's.
+        UserError: no face is found in the driver's pictures.
     """
     frames = evenly_spread(sorted(driven.by_rest), _FRAMES)
     seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -184,7 +184,7 @@ def _write_video(path: Path, driven: Driven, most: int) -> Path:
 
 
 def _driver_name(folder: Path) -> str:
-    """WORKSPACE_SEQUENCE, or the folder's name where it lies in no workspace; just one where both are the same."""
+    """WORKSPACE_SEQUENCE, or only one name if both are the same, or the folder's name if it is in no workspace."""
     folder = folder.resolve()
     in_workspace = folder.parent.name == "sequences"
     names = [folder.parent.parent.name, folder.name] if in_workspace else [folder.name]

@@ -1,4 +1,4 @@
-"""Cross-reenactment in report.html."""
+"""The section of report.html on cross-reenactment."""
 
 from collections.abc import Mapping, Sequence
 from html import escape

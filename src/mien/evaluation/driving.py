@@ -20,18 +20,18 @@ def drive(
     with_head_pose: bool = True,
     who: str = "the driver",
 ) -> FaceParams:
-    """Face parameters that make an avatar do what the driver does; its own identity and offsets stay.
+    """Face parameters that make an avatar follow the driver. Its own identity and offsets stay.
 
-    Expression coefficients are added as differences from each one's neutral. Joints, head rotation and translation are
-    the driver's motion relative to the driver's neutral, seen from the driver's neutral frame and done from the
-    avatar's: a nod stays a nod also where the two were filmed from different sides.
+    Expression coefficients are added as differences from the neutral of each person. Joints, head rotation and
+    translation transfer the driver's motion relative to the driver's neutral frame to the avatar's neutral frame. A nod
+    therefore stays a nod even if the two people were filmed from different sides.
 
     Args:
         driver: The timesteps to play.
         driver_neutral: One timestep of the driver at rest, see `neutral_of`.
         avatar_neutral: One timestep of the avatar's person at rest.
-        expression_bounds: `FaceModel.expression_bounds`; results are clamped there.
-        with_head_pose: Whether the head follows the driver's; else it stays at the avatar's neutral.
+        expression_bounds: `FaceModel.expression_bounds`, to which the results are clamped.
+        with_head_pose: Whether the head follows the driver's. If not, it stays at the avatar's neutral.
         who: What messages call the driver, such as its file.
 
     Raises:
@@ -75,19 +75,19 @@ def _times(shape: torch.Size) -> str:
 def _relative_rotation(
     driver: Float[Tensor, "b *j 3"], driver_neutral: Float[Tensor, "1 *j 3"], avatar_neutral: Float[Tensor, "1 *j 3"]
 ) -> Float[Tensor, "b *j 3"]:
-    """Axis-angle of: the avatar's neutral rotation, after what leads from the driver's neutral to the driver's."""
+    """Axis-angle vectors of the avatar's neutral rotation times the driver's rotation relative to its neutral."""
     motion = matrix_from_axis_angle(driver_neutral).transpose(-1, -2) @ matrix_from_axis_angle(driver)
     return axis_angle_from_matrix(matrix_from_axis_angle(avatar_neutral) @ motion)
 
 
 def face_of_motion(motion: Motion, model: FaceModel) -> tuple[FaceParams, FaceParams]:
-    """What another program recorded as face parameters of a face model, and the driver at rest (one timestep).
+    """The face parameters, for a face model, of a motion that another program recorded, and the driver at rest.
 
-    Coefficients go to the expressions of the same names, gaze to the eye joints. At rest all coefficients are zero,
-    which is what ARKit and MediaPipe mean by zero; the head is at rest where it mostly is.
+    Coefficients go to the expressions of the same names, gaze goes to the eye joints. At rest, which is one timestep,
+    all coefficients are zero, as in ARKit and MediaPipe, and the head has its median pose.
 
     Raises:
-        UserError: the face model knows none of ARKit's names.
+        UserError: the face model has none of ARKit's expressions.
     """
     known = [(ours, ARKIT_NAMES.index(name)) for ours, name in enumerate(model.expression_names) if name in ARKIT_NAMES]
     if not known:

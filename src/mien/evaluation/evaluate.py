@@ -23,7 +23,7 @@ from mien.storage import file_digest, write_json
 from mien.training import read_curves, read_run_config, read_training_summary
 
 _RECIPE = 2
-"""Raised whenever the same frame would be scored otherwise."""
+"""Version of the scoring. It is raised whenever the same frame would get other figures."""
 
 
 def evaluate(
@@ -32,20 +32,20 @@ def evaluate(
     settings: EvaluationSettings | None = None,
     driver_dirs: Items[Path] = (),
 ) -> dict[str, Any]:
-    """Score a run on its held-out frames; writes metrics.json and report.html into its folder.
+    """Score a run on its held-out frames, and write metrics.json and report.html into its folder.
 
     Args:
         run_dir: A finished run.
         sequence_dirs: The folders of the sequences it was trained on, in that order.
         settings: What to compute; None for the defaults.
-        driver_dirs: Folders of tracked sequences whose motion drives the avatar as well.
+        driver_dirs: Folders of tracked sequences that drive the avatar as well.
 
     Returns:
         The content of metrics.json: `protocols` and `training`.
 
     Raises:
-        UserError: the run is not finished, the sequences are others, or nothing was held out; or another process
-            writes the run.
+        UserError: the run is not finished, the sequences are not those of the run, nothing was held out, or another
+            process is writing the run.
     """
     check_tree(run_dir)
     with hold(run_dir):
@@ -98,7 +98,7 @@ def is_evaluated(run_dir: Path, sequence_dirs: Items[Path], settings: Evaluation
     """Whether metrics.json holds the figures that `evaluate` would write: same avatar, data and settings.
 
     Raises:
-        UserError: the run is not finished, or the sequences are others.
+        UserError: the run is not finished, or the sequences are not those of the run.
     """
     settings = settings or EvaluationSettings()
     try:
@@ -119,7 +119,7 @@ def _video(
 
 
 def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings: EvaluationSettings) -> str:
-    """What the figures of a frame depend on, as hex digits."""
+    """A hash of everything that the figures of a frame depend on, as hex digits."""
     content = [
         _RECIPE, protocol, file_digest(run_dir / "avatar" / "avatar.safetensors"),
         file_digest(run_dir / "face_track.safetensors"), experiment.digests, experiment.held_out_frames,

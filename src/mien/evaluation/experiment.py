@@ -1,4 +1,4 @@
-"""What is evaluated: an avatar, the sequences it was trained on, and which frames it has never seen."""
+"""The input of an evaluation: an avatar, the sequences it was trained on, and the frames it has never seen."""
 
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from mien.tracking import Scoring
 from mien.training.sequence import Sequence, composite
 
 FaceSource = Literal["as_tracked", "corrected"]
-"""Whether held-out frames are posed as the tracker left them, or with what training corrected in the frames beside
-them (never with anything learnt from their own pixels)."""
+"""Face parameters of held-out frames: as the tracker left them, or corrected by what training changed in neighbouring
+frames. Corrections never use the pixels of held-out frames."""
 
 
 _HEAD_MARGIN = 0.05
 
 
 class Frame(NamedTuple):
-    """One picture: a timestep of a sequence seen by a camera; indices."""
+    """One picture: the indices of a sequence, of a timestep in it, and of the camera."""
 
     sequence: int
     timestep: int
@@ -37,21 +37,21 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """All that an evaluation reads."""
+    """Everything that an evaluation reads."""
 
     avatar: Avatar
     sequences: tuple[Sequence, ...]
     faces: tuple[FaceParams, ...]
-    """One a sequence, all its timesteps: what the avatar is posed with."""
+    """Face parameters that pose the avatar: one entry per sequence, with all its timesteps."""
     face_source: FaceSource
     scorings: tuple[Scoring, ...]
-    """One a sequence: the frozen masks and head crops."""
+    """The frozen masks and head crops, one entry per sequence."""
     training_frames: tuple[Frame, ...]
     held_out_frames: tuple[Frame, ...]
     split: str
     """Name of the split: `blocks`, `tail`, `sequences`, `cameras`."""
     digests: tuple[dict[str, str], ...] = ()
-    """One a sequence: the hashes of its `pictures` and of its `mask`; empty where nothing was read from disk."""
+    """The hashes of the `pictures` and the `mask` of each sequence. Empty if nothing was read from disk."""
 
     def camera(self, frame: Frame) -> Camera:
         """The camera of a frame."""
@@ -62,24 +62,24 @@ class Experiment:
         return self.sequences[frame.sequence].capture.camera_ids[frame.camera]
 
     def crop(self, frame: Frame) -> Box:
-        """The head crop that was frozen with the scoring mask."""
+        """The head crop that was frozen together with the scoring mask."""
         left, top, width, height = (int(value) for value in self.scorings[frame.sequence].crops[frame[1:]])
         return left, top, width, height
 
     def face(self, frame: Frame) -> FaceParams:
-        """One timestep of face parameters."""
+        """The face parameters of one timestep."""
         return self.faces[frame.sequence][frame.timestep]
 
 
 def spread_frames(frames: Items[Frame], most: int) -> list[Frame]:
-    """At most `most` of the frames, evenly spread over sequences, cameras and time; 0 for all."""
-    # One camera after the other: a stride over cameras of the same timestep could meet one of them only.
+    """At most `most` of the frames, evenly spread over sequences, cameras and time. With 0, all of them."""
+    # Sort by camera first: a stride over the cameras of each timestep could always select the same one.
     ordered = sorted(frames, key=lambda frame: (frame.sequence, frame.camera, frame.timestep))
     return evenly_spread(ordered, most)
 
 
 def head_box(experiment: Experiment, frames: Items[Frame]) -> Box:
-    """A box around the head crops of some frames, with a margin: one cut for all, so that motion can be seen."""
+    """A box around the head crops of some frames, with a margin. One box for all frames keeps motion visible."""
     crops = np.array([experiment.crop(frame) for frame in frames])
     left, top = crops[:, :2].min(0)
     right, bottom = (crops[:, :2] + crops[:, 2:]).max(0)
@@ -88,14 +88,14 @@ def head_box(experiment: Experiment, frames: Items[Frame]) -> Box:
 
 
 def target_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
-    """What a rendering should equal, at 8 bits: the picture where the frozen scoring mask keeps it, over white."""
+    """The target of a rendering, at 8 bits: the picture inside the frozen scoring mask, over white."""
     picture = np.asarray(experiment.sequences[frame.sequence].capture.images[frame[1:]])
     mask = np.asarray(experiment.scorings[frame.sequence].masks[frame[1:]])
     return torch.from_numpy(composite(picture, mask, np.full(3, 255, np.uint8))).float() / 255
 
 
 def scored_on(experiment: Experiment, frames: Items[Frame]) -> dict[str, dict[str, str]]:
-    """The hashes of the pictures and of the mask of each sequence among some frames: what figures compare by."""
+    """The hashes of pictures and mask of each sequence among some frames. Only figures with equal hashes compare."""
     if not experiment.digests:
         return {}
     return {experiment.sequences[i].name: experiment.digests[i] for i in sorted({frame.sequence for frame in frames})}
@@ -106,7 +106,7 @@ def avatar_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]
     """The avatar posed and seen as in a frame, over white, clamped to 0..1.
 
     Raises:
-        UserError: what it is posed as, or it itself, gives Gaussians that are not finite.
+        UserError: the avatar or the face parameters give Gaussians that are not finite.
     """
     gaussians = experiment.avatar.pose(experiment.face(frame)).gaussians.timestep(0)
     white = torch.ones(3).to(gaussians.means)

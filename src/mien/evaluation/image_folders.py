@@ -1,4 +1,4 @@
-"""Pictures of any other program scored by the code that scores avatars: folders or videos, matched by name."""
+"""Scores for pictures of any program, by the code that scores avatars. Folders match by name, videos by order."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,23 +37,24 @@ Background = Literal["white", "black"]
 _COLORS = {"white": 255, "black": 0}
 _NAMED = 3
 _FARTHEST = 1_000_000
-"""Pixels of head boxes."""
+"""Largest coordinate or size of a head box, in pixels."""
 
 
 @dataclass(frozen=True)
 class ImageFolders:
-    """What is compared."""
+    """The pictures to compare."""
 
     images: Path
     """Folder of pictures, or a video."""
     truth: Path
-    """Folder of pictures, or a video."""
+    """Folder of the true pictures, or a video."""
     mattes: Path | None = None
-    """Folder of opacity pictures: the truth counts where they are white and is `background` elsewhere."""
+    """Folder of opacity pictures. The truth counts where they are white; elsewhere it is replaced by `background`."""
     crops: Path | None = None
-    """crops.json with a head box for each picture; None for the one in the folder `truth`, else the mattes' boxes."""
+    """crops.json with a head box for each picture. None means the file in the folder `truth`, or else the boxes of the
+    mattes."""
     background: Background = "white"
-    """Behind pictures with an alpha channel, and behind the truth where the mattes say so."""
+    """Colour behind pictures with an alpha channel, and behind the truth outside the mattes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +68,11 @@ class _Pair:
 
 
 def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) -> dict[str, Any]:
-    """Score pictures against their truth, matched by name (frames of a video: by order).
+    """Score pictures against their truth, matched by name, or for a video by order.
 
     Returns:
-        What `write_scores` writes: mean `psnr, ssim, l1, perceptual`, the same on the `head` crop (None where no crop
-        is known), how they were made, and `per_frame` figures.
+        The content that `write_scores` writes: mean `psnr, ssim, l1, perceptual`, the same on the `head` crop (None if
+        no crop is known), how they were computed, and `per_frame` figures.
 
     Raises:
         UserError: names, numbers or sizes do not match, or a picture cannot be read.
@@ -105,7 +106,7 @@ def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) 
 
 
 def write_scores(path: Path, scores: dict[str, Any]) -> None:
-    """Write what `score_folders` returned."""
+    """Write the result of `score_folders`."""
     write_json(path, SCORES_FORMAT, SCORES_VERSION, scores)
 
 
@@ -123,7 +124,7 @@ def read_crops(path: Path) -> dict[str, Box]:
     try:
         crops = read_json(path, CROPS_FORMAT, CROPS_VERSION).get("crops")
     except UserError as error:
-        # It lies beside the user's own pictures: no folder to delete, no stage to run.
+        # The file is beside the user's own pictures, so there is no folder to delete and no stage to run.
         raise UserError(f"{str(error).split('; ')[0]}; write it again, or leave it out") from None
     boxes: dict[str, Box] = {}
     for name, box in crops.items() if isinstance(crops, dict) else [("", None)]:
@@ -154,7 +155,7 @@ class _Pairs:
         self.crop_source = known if crops_path is None else "frozen head box of each frame"
 
     def read(self) -> Any:
-        """(index, pair) of every picture.
+        """Yield (index, pair) for every picture.
 
         Raises:
             UserError: a picture cannot be read, or has another size than its truth.
@@ -194,13 +195,13 @@ class _Pairs:
 
 
 def _matched(truth: PictureSource, images: PictureSource) -> list[str]:
-    """The names to score, in order: those of the truth.
+    """The names to score, in order. They are the names of the truth.
 
     Raises:
         UserError: a picture is missing, or a video has another number of frames.
     """
     if truth.names is None or images.names is None:
-        # Frames of a video have no names: their order has to do.
+        # Frames of a video have no names, so they match by order.
         if truth.count != images.count:
             raise UserError(
                 f"{images.path}: has {images.count} pictures, {truth.path} has {truth.count}; videos are matched by "
@@ -228,14 +229,14 @@ def _floats(image: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:
 
 
 def _flat(picture: UInt8[np.ndarray, "h w _"], color: UInt8[np.ndarray, " 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture without its alpha channel, if it has one: over a colour."""
+    """The picture over a colour, without its alpha channel if it has one."""
     if picture.shape[2] == 4:
         return composite(picture[..., :3], picture[..., 3], color)
     return picture
 
 
 def _opacity(picture: UInt8[np.ndarray, "h w _"]) -> UInt8[np.ndarray, "h w"]:
-    """A matte from its picture: the alpha channel where there is one, else the brightness of grey."""
+    """A matte from its picture: the alpha channel if there is one, or else the brightness."""
     return np.ascontiguousarray(picture[..., 3] if picture.shape[2] == 4 else picture[..., 1])
 
 

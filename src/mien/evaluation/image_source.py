@@ -1,4 +1,4 @@
-"""Pictures by name from a folder, or in order from a video; one is in memory at a time."""
+"""Pictures by name from a folder, or in order from a video. Only one is in memory at a time."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -24,15 +24,15 @@ class PictureSource:
     path: Path
     count: int
     names: list[str] | None
-    """File names without their ending, in order; None for a video."""
+    """File names without their endings, in order. None for a video."""
     files: dict[str, Path]
-    """By name; empty for a video."""
+    """Files by name. Empty for a video."""
 
     def read(self, names: Sequence[str]) -> Iterator[UInt8[np.ndarray, "h w _"]]:
-        """Pictures with 3 or 4 channels, of these names; a video's in order.
+        """Yield the pictures of these names, with 3 or 4 channels. A video's pictures come in order.
 
         Raises:
-            UserError: one cannot be read.
+            UserError: a picture cannot be read.
         """
         if self.names is None:
             yield from itertools.islice((picture for _, picture in read_video_frames(self.path)), len(names))
@@ -43,10 +43,10 @@ class PictureSource:
 
 
 def open_pictures(path: Path) -> PictureSource:
-    """The pictures at a path.
+    """Open the pictures at a path.
 
     Raises:
-        UserError: nothing is there, it holds no picture, or two of the same name.
+        UserError: the path is missing, holds no picture, or holds two pictures of the same name.
     """
     if path.is_file():
         count = sum(1 for _ in read_video_frames(path))
@@ -67,13 +67,13 @@ def open_pictures(path: Path) -> PictureSource:
 
 
 def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
-    """A picture of 8 bits a channel as RGB or RGBA; grey becomes RGB.
+    """A picture of 8 bits per channel as RGB or RGBA. Grey becomes RGB.
 
     Raises:
-        UserError: it is no picture, is cut off, is too large, or has more than 8 bits.
+        UserError: it is not a picture, is truncated, is too large, or has more than 8 bits.
     """
     try:
-        # libpng returns the upper half of a truncated file.
+        # libpng would return the upper half of a truncated file.
         cut = path.suffix.lower() == ".png" and _end_of(path) != b"IEND\xaeB`\x82"
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check the file") from None

@@ -1,4 +1,4 @@
-"""From folders to experiments: a run, and the sequences that it was trained on."""
+"""Loads experiments from folders: a run, and the sequences that it was trained on."""
 
 from collections.abc import Sequence as Items
 from dataclasses import replace
@@ -22,13 +22,13 @@ from mien.training.split import held_out
 
 
 def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Experiment]:
-    """What there is to evaluate, by protocol; nothing where nothing was held out.
+    """The experiments of a run, by protocol. The result is empty if nothing was held out.
 
-    - `self_reenactment` (`self_reenactment_tail` for that split): timesteps left out of sequences trained on.
-    - `self_reenactment_sequence`: sequences left out as a whole, posed as tracked.
-    - `novel_view`: cameras left out, at timesteps that other cameras were trained at.
+    - `self_reenactment` (`self_reenactment_tail` for that split): held-out timesteps of the training sequences.
+    - `self_reenactment_sequence`: whole held-out sequences, posed as tracked.
+    - `novel_view`: held-out cameras, at timesteps that were trained with other cameras.
 
-    The first two show all cameras, also those left out.
+    The first two include all cameras, also held-out ones.
 
     Raises:
         UserError: the run is not finished, or the sequences are not those that it was trained on.
@@ -76,7 +76,7 @@ def _digests(folder: Path) -> dict[str, str]:
 def held_out_by_protocol(
     sequences: Items[Sequence], settings: TrainSettings
 ) -> dict[str, tuple[str, tuple[Frame, ...]]]:
-    """Frames that training left out, by protocol, each with the name of its split; only protocols with a frame."""
+    """Held-out frames by protocol, each with the name of its split. Protocols without a frame are left out."""
     unseen_timesteps: list[Frame] = []
     unseen_sequences: list[Frame] = []
     unseen_cameras: list[Frame] = []
@@ -103,7 +103,7 @@ def held_out_by_protocol(
 
 
 def _faces_of_run(run_dir: Path, sequences: Items[Sequence], face_model: FaceModel) -> tuple[FaceParams, ...]:
-    """The face parameters that training ended with, one a sequence."""
+    """The face parameters at the end of training, one entry per sequence."""
     path = run_dir / "face_track.safetensors"
     tensors = read_tensors(path, "`mien train`")
     with expect_whole(path, "train it again"):
@@ -117,7 +117,7 @@ def _faces_of_run(run_dir: Path, sequences: Items[Sequence], face_model: FaceMod
 
 
 def _face_source(sequences: Items[Sequence], faces: Items[FaceParams], frames: Items[Frame]) -> FaceSource:
-    """Whether any held-out timestep is not as the tracker left it."""
+    """Whether the face parameters of any held-out timestep differ from the tracker's."""
     for frame in frames:
         tracked, used = sequences[frame.sequence].tracking.face[frame.timestep], faces[frame.sequence][frame.timestep]
         names = ("expression", "joints", "head_rotation", "head_translation")

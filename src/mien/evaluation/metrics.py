@@ -1,4 +1,4 @@
-"""Image metrics: pure functions of float32 RGB images in 0..1; what is averaged over is an argument."""
+"""Image metrics: pure functions of float32 RGB images in 0..1. Arguments select the pixels that are averaged."""
 
 import cv2
 import numpy as np
@@ -7,16 +7,16 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 PSNR_LIMIT = 100.0
-"""Decibels given to identical images, so that results stay finite."""
+"""PSNR of identical images in dB, so that results stay finite."""
 _WINDOW_SIZE, _WINDOW_SIGMA = 11, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 
 Box = tuple[int, int, int, int]
-"""left, top, width, height in pixels."""
+"""Left, top, width and height, in pixels."""
 
 
 def crop_to(image: Shaped[Tensor, "h w *c"], box: Box | None) -> Shaped[Tensor, "y x *c"]:
-    """The part of an image inside `box`, cut at the image's border; all of it where the box is None."""
+    """The part of an image inside `box`, cut at the image's border, or the whole image if the box is None."""
     if box is None:
         return image
     left, top, width, height = box
@@ -32,7 +32,7 @@ def l1(
     box: Box | None = None,
     mask: Bool[Tensor, "h w"] | None = None,
 ) -> float:
-    """Mean absolute difference over the channels of the pixels in `box` where `mask` holds, 0..1."""
+    """Mean absolute difference, 0..1, over the channels of the pixels in `box` that `mask` selects."""
     return float(_mean((crop_to(image, box) - crop_to(target, box)).abs(), box, mask))
 
 
@@ -42,10 +42,10 @@ def psnr(
     box: Box | None = None,
     mask: Bool[Tensor, "h w"] | None = None,
 ) -> float:
-    """Peak signal-to-noise ratio in dB for a peak of 1: -10 log10 of the squared difference's mean.
+    """Peak signal-to-noise ratio in dB for a peak of 1: -10 log10 of the mean squared difference.
 
-    The mean is over the channels of the pixels in `box` where `mask` holds; at most `PSNR_LIMIT`. The figure of a set
-    of frames is the mean of its frames' figures, as is usual in the field.
+    The mean is over the channels of the pixels in `box` that `mask` selects. The result is at most `PSNR_LIMIT`. The
+    figure for a set of frames is the mean of the figures of its frames, as is usual in the field.
     """
     squared = _mean((crop_to(image, box) - crop_to(target, box)) ** 2, box, mask)
     return float(-10 * torch.log10(squared.clamp_min(10 ** (-PSNR_LIMIT / 10))))
@@ -57,9 +57,9 @@ def ssim(
     box: Box | None = None,
     mask: Bool[Tensor, "h w"] | None = None,
 ) -> float:
-    """Structural similarity (Wang et al. 2004), the mean of `ssim_map` over channels and over `mask`.
+    """Structural similarity (Wang et al. 2004): the mean of `ssim_map` over channels and over `mask`.
 
-    Inside a box the image is cut first: windows at its border see zeros beyond it, not the rest of the image.
+    The image is cut to the box first: windows at the box's border see zeros beyond it, not the rest of the image.
     """
     return float(_mean(ssim_map(crop_to(image, box), crop_to(target, box)), box, mask))
 
@@ -67,8 +67,8 @@ def ssim(
 def ssim_map(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
     """Structural similarity of every pixel and channel, -1..1.
 
-    As training codes for 3D Gaussians define it: an 11x11 Gaussian window of sigma 1.5, zeros beyond the border,
-    C1 = 0.01^2 and C2 = 0.03^2 for a range of 1, each channel for itself.
+    The definition is that of training codes for 3D Gaussians: an 11x11 Gaussian window of sigma 1.5, zeros beyond the
+    border, C1 = 0.01^2 and C2 = 0.03^2 for a range of 1, and each channel separately.
     """
     x, y = (np.ascontiguousarray(t.detach().cpu().numpy()) for t in (image, target))
     mean_x, mean_y = _blur(x), _blur(y)
@@ -81,16 +81,16 @@ def ssim_map(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> F
 
 
 def _blur(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """The Gaussian window's weighted mean around every pixel, with zeros beyond the border."""
+    """The mean around every pixel, weighted by the Gaussian window, with zeros beyond the border."""
     offsets = np.arange(_WINDOW_SIZE) - _WINDOW_SIZE // 2
     window = np.exp(-(offsets**2) / (2 * _WINDOW_SIGMA**2)).astype(image.dtype)
     window = window / window.sum()
-    # Twenty times as fast as the same in torch on a CPU.
+    # OpenCV is twenty times as fast as torch for this on a CPU.
     return cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
 
 
 def _mean(values: Float[Tensor, "y x 3"], box: Box | None, mask: Bool[Tensor, "h w"] | None) -> Float[Tensor, ""]:
-    """Mean in double precision over all channels of the pixels that count."""
+    """The mean in double precision over all channels of the selected pixels."""
     if mask is None:
         return values.double().mean()
     kept = crop_to(mask, box)

@@ -1,4 +1,4 @@
-"""metrics.json as it is read: every figure that is compared or shown is there and is a number."""
+"""Reads metrics.json, and checks that every figure to compare or show is there and is a number."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,11 +14,11 @@ _METRICS = ("psnr", "ssim", "l1", "perceptual")
 _DRIVEN = ("expression_error", "expression_error_still", "head_rotation_error_degrees",
            "head_rotation_error_still_degrees", "faces_found")  # fmt: skip
 _MOST = 1e12
-"""Of any figure: seconds, decibels, numbers of Gaussians."""
+"""Largest figure of any kind: seconds, decibels, numbers of Gaussians."""
 
 
 def read_metrics(run_dir: Path) -> dict[str, Any]:
-    """What `evaluate` wrote.
+    """Read what `evaluate` wrote.
 
     Raises:
         UserError: the run was not evaluated, or the file is damaged.
@@ -31,10 +31,10 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
 
 
 def read_figures(run_dir: Path) -> dict[str, Any]:
-    """`read_metrics`, with every figure that tables, pages and lines show.
+    """`read_metrics`, with a check of every figure that tables, pages and lines show.
 
     Raises:
-        UserError: as `read_metrics`; or a figure is missing or of another type, as after an edit.
+        UserError: as for `read_metrics`; or a figure is missing or of another type, for example after an edit.
     """
     content, path = read_metrics(run_dir), run_dir / "metrics.json"
     with expect_whole(path, _REMEDY):
@@ -78,7 +78,7 @@ def _check_frames(frames: Mapping[str, Sequence[Any]]) -> None:
 
 
 def _check_row(row: Mapping[str, Any]) -> None:
-    """Figures of the whole frame and of the head crop; only the perceptual one may be left out."""
+    """Check the figures of the whole frame and of the head crop. Only PSNR is required."""
     for part in (row, row["head"]):
         for name in _METRICS:
             _require(_is_number(part.get(name)) or (name != "psnr" and part.get(name) is None), name)

@@ -1,4 +1,4 @@
-"""What an evaluation has scored so far, kept in the run's folder, so that an interrupted one goes on where it was."""
+"""Partial scores of an evaluation, kept in the run's folder so that an interrupted evaluation can continue."""
 
 import json
 from collections.abc import Mapping
@@ -14,24 +14,25 @@ from mien.limits import whole
 from mien.storage import write_atomically
 
 _LARGEST = 256 << 20
-"""Bytes of the file, or the number of a frame; a frame takes some hundred bytes."""
+"""Largest size of the file in bytes, and largest index in a frame. A frame takes some hundred bytes."""
 
 Scored = tuple[dict[str, Scores], float]
-"""A frame's figures by what was scored, and the seconds of rendering the avatar."""
+"""A frame's figures by the scored subject, and the seconds that rendering the avatar took."""
 
 
 @dataclass(frozen=True)
 class PartialScores:
-    """A file with a line for each frame that was scored, behind a line that says of what."""
+    """A file with one line per scored frame, after a first line with the fingerprint of the evaluation."""
 
     path: Path
     fingerprint: str
-    """Figures of anything else are dropped."""
+    """Identity of the evaluation. Figures of any other evaluation are dropped."""
 
     def read(self) -> dict[Frame, Scored]:
-        """Frames scored before; none where the file is of another run, other settings, or damaged.
+        """The frames that were scored before. Empty if the file is of another run or other settings, or is damaged.
 
-        Cuts the file back to its good lines (a killed process may leave half a line), or begins it.
+        Cuts the file back to its good lines, because a killed process may leave half a line. Creates the file if
+        needed.
         """
         good, found = [json.dumps({"scores_of": self.fingerprint})], {}
         lines = self._lines()
@@ -53,18 +54,18 @@ class PartialScores:
             return []
 
     def add(self, frame: Frame, scores: Mapping[str, Scores], seconds: float) -> None:
-        """Keep one more frame."""
+        """Append one more frame."""
         line = json.dumps({"frame": list(frame), "scores": dict(scores), "seconds": seconds})
         with open_to_append(self.path) as file:
             file.write(line + "\n")
 
     def remove(self) -> None:
-        """Forget everything: the figures are in metrics.json now."""
+        """Delete the file, because the figures are in metrics.json now."""
         self.path.unlink(missing_ok=True)
 
 
 def _parsed(line: str) -> tuple[Frame, Scored] | None:
-    """A line's frame and figures, or none where it is no whole line."""
+    """The frame and figures of a line, or None if the line is not complete."""
     try:
         content: dict[str, Any] = parse_json(line)
         frame = Frame(*(whole(number, 0, _LARGEST) for number in content["frame"]))

@@ -1,7 +1,7 @@
-"""ST-LPIPS: a learned perceptual distance (Ghildyal and Liu, ECCV 2022), from the weights that a package ships.
+"""ST-LPIPS: a learned perceptual distance (Ghildyal and Liu, ECCV 2022), with the weights that a package ships.
 
 Only the trained numbers of `stlpips-pytorch` are read. The network is written here, from the paper's description and
-the shapes in that file: the package's own code needs torchvision and is never imported.
+the shapes in that file. The package's own code needs torchvision and is never imported.
 """
 
 import importlib.util
@@ -24,15 +24,15 @@ _PACKAGE = "stlpips_pytorch"
 _BLUR = torch.tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])[None, None] / 16
 _STRIP = 16
 MINIMUM_SIZE = 32
-"""Pixels: smaller pictures have no features left in the deepest layers."""
+"""Smallest side of a picture in pixels. Smaller pictures have no features left in the deepest layers."""
 
 
 class PerceptualDistance(nn.Module):
-    """Distance between pictures by the features of a trained, anti-aliased AlexNet; 0 for equal ones, often below 1.
+    """Distance between pictures by the features of a trained, anti-aliased AlexNet. 0 for equal ones, often below 1.
 
-    Five feature maps are normalised to unit length at each pixel, their squared differences weighted by trained
-    factors a channel, averaged over the picture and summed (the form of LPIPS). ST-LPIPS keeps the first convolution
-    at stride 1 and replaces every stride by a blur and a subsampling, so that a shift of a few pixels costs little.
+    Five feature maps are normalised to unit length at each pixel. Their squared differences are weighted by trained
+    factors per channel, averaged over the picture, and summed, as in LPIPS. ST-LPIPS has stride 1 in the first
+    convolution and replaces every stride by a blur and a subsampling, so that a shift of a few pixels costs little.
     """
 
     shift: Tensor
@@ -51,10 +51,10 @@ class PerceptualDistance(nn.Module):
             self.register_buffer(f"channel_weights{index}", state[f"lin{index}.model.1.weight"][0, :, 0, 0])
 
     def features(self, image: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "c y x"]]:
-        """Five feature maps, of unit length at each pixel, of an image in 0..1: to be compared by `between`."""
+        """Five feature maps of an image in 0..1, of unit length at each pixel, to be compared by `between`."""
         assert min(image.shape[:2]) >= MINIMUM_SIZE, f"{tuple(image.shape)} is too small to compare"
         values = ((image.permute(2, 0, 1)[None] * 2 - 1) - self.shift) / self.scale
-        # In place wherever it can be: fresh large buffers cost as much as the arithmetic on them.
+        # Work in place if possible, because large new buffers cost as much as the arithmetic on them.
         maps = [self._first_map(values).relu_()]
         maps.append(self._convolve(1, _pool(maps[-1]), padding=2).relu_())
         maps.append(self._convolve(2, _pool(maps[-1]), padding=1).relu_())
@@ -63,7 +63,7 @@ class PerceptualDistance(nn.Module):
         return [m.div_(torch.linalg.vector_norm(m, dim=1, keepdim=True).add_(1e-10))[0] for m in maps]
 
     def between(self, first: list[Float[Tensor, "_ _ _"]], second: list[Float[Tensor, "_ _ _"]]) -> float:
-        """The distance of two pictures of the same size by their `features`."""
+        """The distance between two pictures of the same size, given their `features`."""
         total = 0.0
         for index, (a, b) in enumerate(zip(first, second, strict=True)):
             weights = getattr(self, f"channel_weights{index}")
@@ -72,14 +72,14 @@ class PerceptualDistance(nn.Module):
 
     @torch.no_grad()
     def forward(self, image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:
-        """The distance of two images in 0..1."""
+        """The distance between two images in 0..1."""
         return self.between(self.features(image), self.features(target))
 
     def _first_map(self, values: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "1 c y x"]:
-        """`_halve` of the first convolution, at a fifth of its cost: the two are one convolution inside the picture.
+        """`_halve` of the first convolution at a fifth of its cost: inside the picture, both are one convolution.
 
-        Mirroring the border is none. At the top and left it repeats the next sample; at the bottom and right the two
-        steps are done one after the other on narrow strips.
+        Mirroring at the border is not a convolution. At the top and left it repeats the next sample. At the bottom and
+        right, the two steps are done one after the other on narrow strips.
         """
 
         def stepwise(strip: Tensor) -> Tensor:
@@ -99,7 +99,7 @@ class PerceptualDistance(nn.Module):
 
 
 def _halve(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
-    """Blur by (1, 2, 1) / 4 both ways and keep every second sample, with the border mirrored by two samples."""
+    """Blur by (1, 2, 1) / 4 in both directions and keep every second sample. The border is mirrored by two samples."""
     channels = values.shape[1]
     kernel = _BLUR.to(values).expand(channels, 1, 3, 3)
     padded = torch.nn.functional.pad(values, (2, 2, 2, 2), mode="reflect")
@@ -107,8 +107,8 @@ def _halve(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
 
 
 def _pool(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
-    """Anti-aliased pooling: the maximum of 3x3 at every pixel, then `_halve`."""
-    # Five times as fast as max_pool2d with stride 1 on a CPU.
+    """Anti-aliased pooling: the maximum over 3x3 at every pixel, then `_halve`."""
+    # This is five times as fast as max_pool2d with stride 1 on a CPU.
     rows = torch.maximum(values[:, :, :-2], values[:, :, 1:-1])
     torch.maximum(rows, values[:, :, 2:], out=rows)
     largest = torch.maximum(rows[..., :-2], rows[..., 1:-1])
@@ -135,7 +135,7 @@ def load_perceptual(backbone: Backbone = "st-lpips-alex") -> PerceptualDistance:
 
 
 def weights_path(backbone: Backbone) -> Path:
-    """Where the installed package keeps a backbone's weights; finds the package without importing it."""
+    """The path of a backbone's weights in the installed package, which is found without importing it."""
     spec = importlib.util.find_spec(_PACKAGE)
     folders = spec.submodule_search_locations if spec is not None else None
     if not folders:

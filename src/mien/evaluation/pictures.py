@@ -1,4 +1,4 @@
-"""Pictures for people: side by side, error heat maps, contact sheets. uint8 RGB arrays throughout."""
+"""Pictures for people: side by side, error heat maps, contact sheets. All are uint8 RGB arrays."""
 
 import base64
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ def heat_colors(values: Float[np.ndarray, "*s"]) -> UInt8[np.ndarray, "*s 3"]:
 def error_heat(
     image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], limit: float = 0.25
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The mean absolute difference of the channels as heat; `limit` (0..1) and more is the brightest colour."""
+    """The mean absolute difference of the channels as a heat map. `limit` (0..1) and above get the brightest colour."""
     difference = (image - target).abs().mean(-1) / limit
     return heat_colors(difference.detach().cpu().numpy().astype(np.float32))
 
@@ -49,7 +49,7 @@ def side_by_side(images: Sequence[UInt8[np.ndarray, "_ _ 3"]], gap: int = 4) -> 
 def contact_sheet(
     images: Sequence[UInt8[np.ndarray, "_ _ 3"]], columns: int, gap: int = 4
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Pictures of one size in rows of `columns`; the last row is filled up with white."""
+    """Pictures of one size in rows of `columns`. The last row is filled with white."""
     assert images, "no pictures"
     blank = np.full_like(images[0], WHITE)
     padded = [*images, *([blank] * (-len(images) % columns))]
@@ -60,7 +60,7 @@ def contact_sheet(
 
 
 def shrunk(image: UInt8[np.ndarray, "_ _ 3"], largest: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    """The picture with its longer side at most `largest` pixels, by averaging areas; never enlarged."""
+    """The picture with its longer side at most `largest` pixels, by area averaging. It is never enlarged."""
     factor = largest / max(image.shape[:2])
     if factor >= 1:
         return image
@@ -69,7 +69,7 @@ def shrunk(image: UInt8[np.ndarray, "_ _ 3"], largest: int) -> UInt8[np.ndarray,
 
 
 def data_uri(image: UInt8[np.ndarray, "_ _ 3"], jpeg_quality: int | None = 90) -> str:
-    """The picture as text that stands in for a file in HTML: JPEG of a quality, or lossless PNG for None."""
+    """The picture as a data URI for HTML: JPEG of the given quality, or lossless PNG if it is None."""
     kind = "png" if jpeg_quality is None else "jpeg"
     options = [] if jpeg_quality is None else [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
     done, encoded = cv2.imencode(f".{kind}", np.ascontiguousarray(image[:, :, ::-1]), options)

@@ -1,4 +1,4 @@
-"""Line charts as inline SVG: no scripts, no fonts, colours from the page's CSS, so that they follow light and dark."""
+"""Line charts as inline SVG, without scripts or fonts. The page's CSS sets the colours, so they fit light and dark."""
 
 import math
 from collections.abc import Sequence
@@ -14,35 +14,35 @@ _MOST_POINTS = 400
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One line or one cloud of points."""
+    """A line or a cloud of points."""
 
     label: str
     x: Float[np.ndarray, " n"]
     y: Float[np.ndarray, " n"]
     """NaN breaks the line."""
     style: str = "main"
-    """CSS class of its colour: `main`, `second`, `quiet`."""
+    """CSS class that sets the colour: `main`, `second`, `quiet`."""
     points: bool = False
-    """Dots with tooltips instead of a line."""
+    """Whether to draw dots with tooltips instead of a line."""
 
 
 @dataclass(frozen=True)
 class Axes:
-    """What a chart is of."""
+    """Labels, size and shading of a chart."""
 
     x_label: str
     y_label: str
     width: int = 420
-    """Of the drawing's own units; the page scales it."""
+    """Width in the drawing's own units, which the page scales."""
     height: int = 220
     from_zero: bool = False
-    """Whether the y axis begins at 0."""
+    """Whether the y axis starts at 0."""
     shaded: tuple[tuple[float, float], ...] = ()
     """Spans of x with a tinted background."""
 
 
 def line_chart(series: Sequence[Series], axes: Axes) -> str:
-    """An <svg> of some series over common axes; series without a finite value are left out."""
+    """An <svg> of some series over common axes. Series without a finite value are left out."""
     drawn = [one for one in series if np.isfinite(one.y).any()]
     if not drawn:
         return '<p class="note">Nothing to draw.</p>'
@@ -62,7 +62,7 @@ def line_chart(series: Sequence[Series], axes: Axes) -> str:
 
 
 def thinned(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
-    """A long curve as the means of at most some hundred bins, for a small file and a calm line."""
+    """A long curve as the means of a limited number of bins, for a small file and a smooth line."""
     if len(x) <= _MOST_POINTS:
         return x, y
     bins = np.array_split(np.arange(len(x)), _MOST_POINTS)
@@ -70,7 +70,7 @@ def thinned(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[np.
 
 
 class _Plot:
-    """From values to places in the drawing."""
+    """Maps values to positions in the drawing."""
 
     def __init__(self, axes: Axes, x_range: tuple[float, float], y_range: tuple[float, float]) -> None:
         self._axes, self._x_range, self._y_range = axes, x_range, y_range
@@ -120,7 +120,7 @@ class _Plot:
 
 
 def _legend(series: Sequence[Series]) -> str:
-    """Names beside colours; a single series needs none."""
+    """Names beside colours. A single series needs none."""
     if len(series) < 2:
         return ""
     entries = "".join(f'<span><i class="{one.style}"></i>{escape(one.label)}</span>' for one in series)
@@ -140,7 +140,7 @@ def _padded(limits: tuple[float, float], from_zero: bool) -> tuple[float, float]
 
 
 def _ticks(low: float, high: float, about: int) -> list[float]:
-    """Round numbers between two limits: steps of 1, 2 or 5 times a power of ten."""
+    """Round numbers between two limits, in steps of 1, 2 or 5 times a power of ten."""
     rough = (high - low) / about
     power = 10.0 ** math.floor(math.log10(rough))
     step = min((factor * power for factor in (1, 2, 5, 10)), key=lambda size: abs(size - rough))
@@ -148,7 +148,7 @@ def _ticks(low: float, high: float, about: int) -> list[float]:
 
 
 def _number(value: float) -> str:
-    """A tick's text, short: 1200 as 1.2k, no trailing zeros."""
+    """The short text of a tick: 1200 becomes 1.2k, and there are no trailing zeros."""
     if abs(value) >= 1000:
         return f"{value / 1000:g}k"
     return f"{value:.4g}"

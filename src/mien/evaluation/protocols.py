@@ -1,4 +1,4 @@
-"""Protocols with a truth: the avatar and both baselines on the same held-out frames, by the same metrics."""
+"""Protocols with true pictures: the avatar and both baselines on the same held-out frames, by the same metrics."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -36,14 +36,14 @@ _CROP = "frozen head box of each frame"
 
 @dataclass(frozen=True)
 class EvaluationSettings(ScoreSettings):
-    """How to evaluate a run."""
+    """Settings of a run's evaluation."""
 
     baselines: bool = True
-    """Also score the mean training picture and the coloured mesh."""
+    """Whether to score the mean training picture and the coloured mesh as well."""
     video_frames: int = 600
-    """At most this many frames in each side-by-side video; 0 for no videos."""
+    """Largest number of frames in each side-by-side video. 0 makes no videos."""
     pictures: bool = False
-    """Also write every scored picture and its truth as png."""
+    """Whether to write every scored picture and its truth as png as well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,16 +52,16 @@ class Evaluation:
 
     frames: tuple[Frame, ...]
     scores: dict[str, tuple[Scores, ...]]
-    """By what was scored: `avatar`; if its faces are not as tracked, `as_tracked` with those; and with baselines
-    `mean_frame` and `mesh`; one entry a frame."""
+    """Figures by subject, with one entry per frame: `avatar`; `as_tracked`, if the avatar's faces are corrected; and,
+    with baselines, `mean_frame` and `mesh`."""
     seconds_per_frame: float
-    """Posing and rendering the avatar, the median."""
+    """Median time to pose and render the avatar."""
     baselines: Baselines | None
     training_psnr: dict[Frame, tuple[float, float]]
-    """Whole frame and head crop of some training frames, evenly spread: how much worse the held-out ones are."""
+    """PSNR on the whole frame and on the head crop of some training frames, evenly spread, for comparison."""
 
     def ranked(self) -> list[int]:
-        """Indices into `frames` from the worst PSNR of the avatar on the head crop to the best."""
+        """Indices into `frames`, from the worst PSNR of the avatar on the head crop to the best."""
         figures = [entry["head_psnr"] for entry in self.scores[AVATAR]]
         return sorted(range(len(figures)), key=figures.__getitem__)
 
@@ -69,13 +69,13 @@ class Evaluation:
 def evaluate_frames(
     experiment: Experiment, settings: EvaluationSettings, partial: PartialScores | None = None, title: str = "evaluate"
 ) -> Evaluation:
-    """Score every held-out frame. Rendering is done here, one frame after the other; scoring in threads.
+    """Score every held-out frame. Rendering runs here, frame by frame; scoring runs in threads.
 
     Args:
-        experiment: What to score.
+        experiment: The experiment to score.
         settings: What to compute.
-        partial: Figures of frames that an interrupted evaluation has computed already, and where new ones are kept.
-        title: Of the progress bar.
+        partial: Figures that an interrupted evaluation has computed. New ones are added.
+        title: Title of the progress bar.
     """
     assert experiment.held_out_frames, "nothing is held out"
     frames = experiment.held_out_frames
@@ -107,14 +107,14 @@ def evaluate_frames(
 
 
 def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
-    """Whether all are scored, by what is asked for of every frame."""
+    """Whether all subjects are scored, with every figure that each frame must have."""
     return scores.keys() == subjects and all(row.keys() >= _ALWAYS for row in scores.values())
 
 
 def _drawn(
     experiment: Experiment, frames: list[Frame], baselines: Baselines | None
 ) -> Iterator[tuple[Frame, dict[str, Tensor], float]]:
-    """Each frame with what is scored of it, by name, and the seconds that posing and rendering the avatar took."""
+    """Yield each frame with its pictures to score, by name, and the seconds to pose and render the avatar."""
     as_tracked = None if experiment.face_source == "as_tracked" else _as_tracked(experiment)
     for frame in frames:
         start = time.perf_counter()
@@ -129,7 +129,7 @@ def _drawn(
 
 
 def _as_tracked(experiment: Experiment) -> Experiment:
-    """The same with the motion that the tracker left; the person stays the one that was trained."""
+    """The experiment with the motion as the tracker left it. Identity and offsets stay those of training."""
     tracked = (
         replace(sequence.tracking.face, identity=used.identity, vertex_offsets=used.vertex_offsets)
         for sequence, used in zip(experiment.sequences, experiment.faces, strict=True)
@@ -138,7 +138,7 @@ def _as_tracked(experiment: Experiment) -> Experiment:
 
 
 def _training_psnr(experiment: Experiment) -> dict[Frame, tuple[float, float]]:
-    """PSNR on the whole frame and on the head crop of at most `_TRAINING_FRAMES` frames that were trained on."""
+    """PSNR on the whole frame and on the head crop of at most `_TRAINING_FRAMES` training frames."""
     figures = {}
     for frame in spread_frames(experiment.training_frames, _TRAINING_FRAMES):
         image, target = as_8_bit(avatar_image(experiment, frame)), target_image(experiment, frame)
@@ -147,7 +147,7 @@ def _training_psnr(experiment: Experiment) -> dict[Frame, tuple[float, float]]:
 
 
 def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: EvaluationSettings) -> dict[str, Any]:
-    """The protocol's entry of metrics.json: means over frames, how they were made, and every frame's figures."""
+    """The protocol's entry of metrics.json: means over frames, how they were computed, and every frame's figures."""
     scores = evaluation.scores
     own_rows = scores[AVATAR]
     return {
@@ -178,7 +178,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
 
 
 def _training_means(evaluation: Evaluation) -> dict[str, Any]:
-    """What the avatar reaches on frames that it was trained on: the gap to the protocol's figures is generalisation."""
+    """The avatar's mean PSNR on training frames. Its gap to the protocol's figures measures generalisation."""
     whole, head = zip(*evaluation.training_psnr.values(), strict=True)
     return {"psnr": fmean(whole), "head": {"psnr": fmean(head)}, "frames": len(whole)}
 

@@ -1,8 +1,8 @@
-"""What a face detector sees in pictures, relative to a frame at rest: how driven avatars are judged without a truth.
+"""Motion of a detected face relative to a frame at rest, to judge driven avatars without true pictures.
 
-Expression: where lips, lids and brows are once the head's pose, size and place are taken out (a similarity fitted to
-nose and eye corners), as a displacement from the same face at rest, in its own distance between the outer eye corners.
-So neither identity nor head pose count, only what moves. Both sides are measured by the same detector, alike.
+The expression is the displacement of lips, lids and brows from the same face at rest, after pose, size and position of
+the head are removed by a similarity fitted to nose and eye corners. Its unit is the distance between the outer eye
+corners. Neither identity nor head pose count, only what moves. The same detector measures driver and avatar.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _EYES = ((159, 145), (386, 374))
 
 
 class FaceReader:
-    """Landmarks of single pictures. Use as a context manager."""
+    """Detects landmarks in single pictures. Use as a context manager."""
 
     def __enter__(self) -> "FaceReader":
         module = load_solution("face_mesh")
@@ -39,10 +39,10 @@ class FaceReader:
         self._mesh.close()
 
     def read(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "l 3"] | None:
-        """Landmarks in pixels (z, away from the camera, in the same unit), or none where no face is found."""
+        """Landmarks in pixels (z, away from the camera, in the same unit), or None if no face is found."""
         picture = np.ascontiguousarray(image)
         if self._quiet_until_found:
-            # Its last warning comes with the first face.
+            # MediaPipe prints its last warning with the first face.
             with quiet_mediapipe():
                 found = self._mesh.process(picture).multi_face_landmarks
             self._quiet_until_found = not found
@@ -57,25 +57,25 @@ class FaceReader:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What one face does, relative to the same face at rest."""
+    """Motion of one face relative to the same face at rest."""
 
     displacement: Float[np.ndarray, "m 3"]
-    """Of lips, lids and brows, in distances between the outer eye corners."""
+    """Displacements of lips, lids and brows, in distances between the outer eye corners."""
     rotation: Float[np.ndarray, "3 3"]
-    """Of the head, in the camera's axes."""
+    """Rotation of the head, in the camera's axes."""
     mouth: float
     """Opening of the lips, in distances between the outer eye corners."""
     eyes: float
-    """Mean opening of the lids, alike."""
+    """Mean opening of the lids, in the same unit."""
 
 
 def motion(points: Float[np.ndarray, "l 3"], at_rest: Float[np.ndarray, "l 3"]) -> Motion:
-    """What a face does, from its landmarks and those of the same face at rest."""
+    """The motion of a face, from its landmarks and those of the same face at rest."""
     rotation, scale, shift = similarity(points[_RIGID], at_rest[_RIGID])
     aligned = scale * points @ rotation.T + shift
     unit = float(np.linalg.norm(at_rest[_OUTER_CORNERS[0]] - at_rest[_OUTER_CORNERS[1]]))
     displacement = (aligned - at_rest)[_MOVING] / unit
-    # The fit takes the picture back to rest: the head's own motion is the inverse.
+    # The fit takes the picture back to rest, so the head's own rotation is the inverse.
     return Motion(displacement, rotation.T, _opening(aligned, _MOUTH) / unit, _opening(aligned, _EYES) / unit)
 
 
@@ -93,15 +93,15 @@ def similarity(
 
 
 def angle_degrees(rotation: Float[np.ndarray, "3 3"]) -> float:
-    """The angle of a rotation."""
+    """The angle of a rotation in degrees."""
     return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
 
 
 def transfer_figures(pairs: list[tuple[Motion, Motion]]) -> dict[str, float | None]:
-    """How well (driver, avatar) motions agree, beside what an avatar that never moves would get (`..._still`).
+    """How well (driver, avatar) motions agree, and the same for an avatar that never moves (`..._still`).
 
-    Correlations are Pearson's, of an opening over the frames; None where the driver's hardly changes or for less than
-    three frames.
+    Correlations are Pearson's, of an opening over the frames. They are None if an opening hardly changes, or for fewer
+    than three frames.
     """
     driver, own = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
 

@@ -1,4 +1,4 @@
-"""report.html: one file to send around; no network, no scripts, light, dark and on paper."""
+"""report.html: one file that can be sent around. No network, no scripts; works in light, in dark and on paper."""
 
 import json
 import math
@@ -33,13 +33,13 @@ _METRICS = (("psnr", "PSNR, dB ↑", 2), ("ssim", "SSIM ↑", 3), ("l1", "L1 ↓
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """What a run's folder says about itself."""
+    """The records in a run's folder."""
 
     name: str
     config: Mapping[str, Any]
-    """config.json: method, settings, data, mien, command_line."""
+    """Content of config.json: method, settings, data, mien, command_line."""
     summary: Mapping[str, Any]
-    """training.json: steps, seconds, gaussians, step_ms_median, peak_memory_mb."""
+    """Content of training.json: steps, seconds, gaussians, step_ms_median, peak_memory_mb."""
     curves: Mapping[str, np.ndarray]
 
 
@@ -54,12 +54,12 @@ def write_report(
     """Write the page of a run.
 
     Args:
-        path: Of the .html.
+        path: The .html file.
         run: The run's own record.
         protocols: `protocols` of metrics.json.
-        results: What was evaluated and every frame's figures, by protocol.
+        results: The experiment and every frame's figures, by protocol.
         videos: Side-by-side videos by protocol, in or below the page's folder.
-        driven: The section on cross-reenactment, HTML.
+        driven: The section on cross-reenactment, as HTML.
     """
     text = report_html(
         run, protocols, results, {name: video.html(path.parent) for name, video in videos.items()}, driven
@@ -78,7 +78,7 @@ def report_html(
     videos: Mapping[str, str] = MappingProxyType({}),
     driven: str = "",
 ) -> str:
-    """The page as text; `videos` holds a piece of HTML by protocol."""
+    """The page as text. `videos` holds a piece of HTML by protocol."""
     style = files("mien.evaluation").joinpath("report.css").read_text(encoding="utf-8")
     title = f"{', '.join(entry['sequence'] for entry in run.config['data'])} · {run.config['method']['kind']}"
     body = [_heading(title, run), _tiles(run, protocols)]
@@ -113,12 +113,12 @@ def _heading(title: str, run: RunRecord) -> str:
 
 
 def _shortened(command_line: Sequence[str]) -> list[str]:
-    """The command as typed, without the folder that the program lies in."""
+    """The command as typed, without the folder of the program."""
     return [Path(command_line[0]).name, *command_line[1:]] if command_line else []
 
 
 def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> str:
-    """The few figures to look at first."""
+    """The few figures to read first."""
     tiles: list[tuple[str, str]] = []
     for name, entry in protocols.items():
         where = "" if len(protocols) == 1 else f", {_TITLES.get(name, name).lower()}"
@@ -135,7 +135,7 @@ def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> str:
 
 
 def _table(protocols: Mapping[str, Any]) -> str:
-    """Every metric of the avatar and of both baselines, whole frame and head crop."""
+    """Every metric of the avatar and of both baselines, on the whole frame and on the head crop."""
     parts = []
     for name, entry in protocols.items():
         corrected = {} if entry["face_params"] == "as_tracked" else {"as_tracked": entry["as_tracked"]}
@@ -166,7 +166,7 @@ def _table_head() -> str:
 
 
 def _cells(key: str, subjects: Mapping[str, Any]) -> str:
-    """One row's figures; the avatar's PSNR with its lead over the better baseline."""
+    """One row's figures. The avatar's PSNR includes its lead over the better baseline."""
     cells = []
     for part in (None, "head"):
         for index, (metric, _, digits) in enumerate(_METRICS):
@@ -203,7 +203,7 @@ def _settings(run: RunRecord) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Short words for a time: 45 s, 3 min 20 s, 2 h 5 min."""
+    """A time in short words: 45 s, 3 min 20 s, 2 h 5 min."""
     if seconds < 60:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

@@ -1,4 +1,4 @@
-"""The parts of report.html with pictures and charts; every function returns a piece of HTML."""
+"""The parts of report.html with pictures and charts. Every function returns a piece of HTML."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -22,7 +22,7 @@ _SMOOTHING = 15
 
 
 def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
-    """Truth, render and error of the best, the median and the worst held-out frame, and of some between."""
+    """Truth, rendering and error of the best, the median and the worst held-out frame, and of some between."""
     ranked = evaluation.ranked()
     middle = len(ranked) // 2
     places = _places(len(ranked), middle)
@@ -39,7 +39,7 @@ def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
 
 
 def _places(count: int, middle: int) -> list[int]:
-    """Evenly spread ranks from the last to the first; the inner one nearest to the median becomes the median."""
+    """Evenly spread ranks from the last to the first. The inner rank nearest to the median becomes the median."""
     places = sorted(set(np.linspace(0, count - 1, min(_ROWS, count)).round().astype(int).tolist()))
     if len(places) > 2:
         nearest = min(range(1, len(places) - 1), key=lambda index: abs(places[index] - middle))
@@ -64,7 +64,7 @@ def _comparison_row(experiment: Experiment, evaluation: Evaluation, index: int, 
 
 
 def over_time(experiment: Experiment, evaluation: Evaluation) -> str:
-    """PSNR of the head crop over the timesteps of each sequence and camera, held-out spans shaded."""
+    """PSNR of the head crop over the timesteps of each sequence and camera, with held-out spans shaded."""
     pairs = sorted({(frame.sequence, frame.camera) for frame in evaluation.frames})
     charts = []
     for sequence, camera in pairs[:4]:
@@ -85,7 +85,7 @@ def over_time(experiment: Experiment, evaluation: Evaluation) -> str:
 
 
 def spans(timesteps: Sequence[int]) -> tuple[tuple[float, float], ...]:
-    """Runs of consecutive timesteps as intervals that reach half a step over their ends."""
+    """Runs of consecutive timesteps as intervals that extend half a step beyond their ends."""
     found: list[tuple[float, float]] = []
     for timestep in sorted(timesteps):
         if found and timestep - 0.5 == found[-1][1]:
@@ -108,7 +108,7 @@ def training_curves(curves: Mapping[str, np.ndarray]) -> str:
     for name, title, from_zero in kinds:
         values = np.asarray(curves[name], dtype=np.float64)
         if name == "step_ms":
-            # The first step pays for caches; one late outlier would flatten the rest.
+            # The first step fills caches, and a single late outlier would flatten the rest.
             values = np.minimum(values, np.percentile(values, 99))
         series = [Series(title, steps, values)]
         if name in ("loss", "psnr"):
@@ -119,7 +119,7 @@ def training_curves(curves: Mapping[str, np.ndarray]) -> str:
 
 
 def _smooth(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of a sliding window of a fifteenth of the curve."""
+    """The mean over a sliding window of one fifteenth of the curve."""
     width = max(1, len(y) // _SMOOTHING)
     window = np.full(width, 1 / width)
     return np.convolve(x, window, "valid"), np.convolve(y, window, "valid")
@@ -174,7 +174,7 @@ def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> str:
 
 
 def frame_name(experiment: Experiment, frame: Frame) -> str:
-    """Words for a frame; a timestep below 0 stands for all, the camera is named where there are several."""
+    """A frame in words. A timestep below 0 means all timesteps. The camera is named if there are several."""
     sequence = experiment.sequences[frame.sequence]
     parts = [sequence.name]
     if len(sequence.capture.camera_ids) > 1:

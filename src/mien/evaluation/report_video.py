@@ -1,4 +1,4 @@
-"""Videos in report.html: inside the page where they are small, linked where they are not."""
+"""Videos in report.html: small ones inside the page, large ones as links."""
 
 import base64
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ _EMBEDDED_BYTES = 6 << 20
 
 
 def video_html(path: Path, page_folder: Path, note: str) -> str:
-    """The video inside the page where it is small, so that the page stays one file; else a link to it."""
+    """A video for the page: embedded if it is small, so that the page stays one file, or else linked."""
     link = path.relative_to(page_folder).as_posix()
     data = path.read_bytes()
     embedded = f"data:video/mp4;base64,{base64.b64encode(data).decode('ascii')}"
@@ -26,11 +26,11 @@ class ReportVideo:
 
     path: Path
     shown: int
-    """Frames in it..."""
+    """Number of frames in the video."""
     scored: int
-    """...of this many."""
+    """Number of frames that were scored."""
 
     def html(self, page_folder: Path) -> str:
-        """Truth, rendering and error, for the page."""
+        """The video of truth, rendering and error, as HTML for the page."""
         part = "" if self.shown == self.scored else f", {self.shown} of {self.scored} frames"
         return video_html(self.path, page_folder, f"Truth, rendering, error{part}")

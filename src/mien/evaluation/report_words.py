@@ -1,4 +1,4 @@
-"""What the terms in a report mean, for readers who see one for the first time."""
+"""Explanations of the terms in a report, for readers who see one for the first time."""
 
 GLOSSARY = {
     "Held out": (

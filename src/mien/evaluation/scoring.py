@@ -1,4 +1,4 @@
-"""Figures of pictures against a target: what protocols and pictures of other programs are scored by alike."""
+"""Figures of pictures against a target, computed alike for protocols and for pictures of other programs."""
 
 import os
 from collections import deque
@@ -19,38 +19,39 @@ from mien.threads import asked_threads
 
 METRICS = ("psnr", "ssim", "l1", "perceptual")
 _MOST_THREADS = 8
-"""Unless asked for: each holds some hundred megabytes of the perceptual metric's features."""
+"""Default limit of the threads. Each thread needs some hundred megabytes for the perceptual metric's features."""
 SSIM_WINDOW = "11x11 Gaussian window, sigma 1.5, zeros beyond the border"
 PIXELS = "8 bits a channel, rounded"
-"""What is scored: the pictures as a png file would hold them, so that files of any program score alike."""
+"""The scored pixels: those that a png file would hold, so that files of any program are scored alike."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Scores = Mapping[str, float]
-"""`psnr`, `ssim`, `l1`, `perceptual` and the same with `head_` in front."""
+"""`psnr`, `ssim`, `l1`, `perceptual`, and the same with the prefix `head_`."""
 
 
 @dataclass(frozen=True)
 class ScoreSettings:
-    """Which figures, and how."""
+    """Settings of the scoring: which figures, and how."""
 
     perceptual: bool = True
     """Whether to compute ST-LPIPS, which takes most of the time."""
     perceptual_frames: int = 32
-    """ST-LPIPS is computed on at most this many frames, evenly spread: 3 s each at 512x512; 0 for all."""
+    """Largest number of frames, evenly spread, on which ST-LPIPS is computed, 3 s each at 512x512. 0 means all
+    frames."""
     threads: int = 0
-    """Frames scored at a time; 0 for MIEN_THREADS or all cores. Figures do not depend on it."""
+    """Number of frames that are scored at a time. 0 means MIEN_THREADS or all cores. Figures do not depend on it."""
     backbone: Backbone = "st-lpips-alex"
     """Network of the perceptual metric."""
 
 
 def perceptual_metric(settings: ScoreSettings) -> PerceptualDistance | None:
-    """The perceptual metric, where it is asked for."""
+    """The perceptual metric, or None if it is not asked for."""
     return load_perceptual(settings.backbone) if settings.perceptual else None
 
 
 def as_8_bit(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """The image as a png file would hold it, back in 0..1."""
+    """The image as a png file would hold it, converted back to 0..1."""
     return torch.from_numpy(to_uint8(image)).float() / 255
 
 
@@ -61,7 +62,7 @@ def score_pictures(
     crop: Box | None,
     metric: PerceptualDistance | None,
 ) -> dict[str, Scores]:
-    """The figures of several pictures against one target, on the whole frame and, where given, on the head crop."""
+    """The figures of several pictures against one target, on the whole frame and on the head crop if it is given."""
     rows: dict[str, dict[str, float]] = {name: {} for name in pictures}
     parts = [("", None), *([("head_", crop)] if crop is not None else [])]
     for prefix, box in parts:
@@ -78,7 +79,7 @@ def score_pictures(
 
 
 def mean_scores(rows: Sequence[Scores]) -> dict[str, Any]:
-    """Means over the frames that have a figure, None where none has; those on the head crop under `head`."""
+    """Means over the frames that have a figure, or None if no frame has it. Head-crop figures are under `head`."""
 
     def mean(name: str) -> float | None:
         known = [row[name] for row in rows if name in row]
@@ -89,16 +90,16 @@ def mean_scores(rows: Sequence[Scores]) -> dict[str, Any]:
 
 
 def evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
-    """At most `most` of the items, the first always among them; 0 for all."""
+    """At most `most` of the items, always with the first one. With 0, all of them."""
     step = max(1, -(-len(items) // most)) if most else 1
     return list(items[::step])
 
 
 def worker_threads(threads: int) -> int:
-    """How many frames to work on at a time.
+    """The number of frames to score at a time.
 
     Raises:
-        UserError: MIEN_THREADS is no number of threads.
+        UserError: MIEN_THREADS is not a number of threads.
     """
     if threads > 0:
         return threads
@@ -106,7 +107,7 @@ def worker_threads(threads: int) -> int:
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """Results in order; at most two items a thread are prepared ahead, so that memory stays small."""
+    """Yield results in order. At most two items per thread are prepared ahead, so that memory stays small."""
     with ThreadPoolExecutor(threads) as pool:
         waiting: deque[Future[Result]] = deque()
         for item in items:

@@ -1,4 +1,4 @@
-"""What was scored as files: side-by-side videos for people, png pictures for other programs."""
+"""Scored pictures as files: side-by-side videos for people, png pictures for other programs."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,20 +17,20 @@ from mien.progress import track_progress
 from mien.storage import write_atomically
 
 HEAT_LIMIT = 0.25
-"""Error, of 1, that is the brightest colour of heat maps."""
+"""Error, of a range of 1, that gets the brightest colour of heat maps."""
 _LARGEST = 440
 _BAR = 26
 _CRF = 24
 
 
 def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evaluation, most: int) -> int:
-    """Write held-out frames as truth, rendering and error heat map side by side; returns how many.
+    """Write held-out frames as truth, rendering and error heat map side by side; return the number of frames.
 
     Args:
-        path: Of the .mp4.
-        experiment: What was evaluated.
+        path: The .mp4 file.
+        experiment: The evaluated experiment.
         evaluation: Its figures, which are written above the pictures.
-        most: Of many frames this many, the first ones of each sequence and camera.
+        most: Largest number of frames. If there are more, the first ones of each sequence and camera are used.
     """
     places = {frame: index for index, frame in enumerate(evaluation.frames)}
     frames = video_frames(evaluation.frames, most)
@@ -55,7 +55,7 @@ def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evalu
 
 
 def video_frames(frames: Sequence[Frame], most: int) -> list[Frame]:
-    """The frames of a video, one camera after the other, at most `most`: equally many of each, the first ones."""
+    """At most `most` frames for a video, camera by camera: the first ones of each, equally many."""
     groups: dict[tuple[int, int], list[Frame]] = {}
     for frame in sorted(frames, key=lambda one: (one.sequence, one.camera, one.timestep)):
         groups.setdefault((frame.sequence, frame.camera), []).append(frame)
@@ -75,7 +75,7 @@ def labelled_row(panels: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.n
 
 
 def same_size(pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Pictures in the size of the first: smaller ones get white around them, larger ones are shrunk."""
+    """Yield the pictures in the size of the first. Smaller ones get a white border, larger ones are shrunk."""
     size: tuple[int, int] | None = None
     for picture in pictures:
         if size is None:
@@ -92,10 +92,10 @@ def same_size(pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> Iterator[UInt8[
 
 
 def write_scored_pictures(folder: Path, experiment: Experiment) -> None:
-    """Write what was scored as FOLDER/{truth,rendering}/SEQUENCE_CAMERA_TIMESTEP.png, and truth/crops.json.
+    """Write scored pictures as FOLDER/{truth,rendering}/SEQUENCE_CAMERA_TIMESTEP.png, and truth/crops.json.
 
-    `score_folders` gives the figures of metrics.json for them; a folder of any other program's pictures of these names
-    is scored alike.
+    `score_folders` gives the figures of metrics.json for them. A folder of another program's pictures with these names
+    is scored in the same way.
     """
     crops: dict[str, Box] = {}
     frames = experiment.held_out_frames
@@ -108,7 +108,7 @@ def write_scored_pictures(folder: Path, experiment: Experiment) -> None:
 
 
 def picture_name(experiment: Experiment, frame: Frame) -> str:
-    """File name of a frame without its ending."""
+    """File name of a frame, without its ending."""
     return f"{experiment.sequences[frame.sequence].name}_{experiment.camera_id(frame)}_{frame.timestep:06d}"
 
 

@@ -1,15 +1,15 @@
-"""Figures as lines for people."""
+"""Figures as lines of text for people."""
 
 from collections.abc import Mapping
 from typing import Any
 
 NAMES = {"mean_frame": "mean training picture", "mesh": "coloured mesh"}
 FACES = {"corrected": "corrected", "as_tracked": "as tracked"}
-"""What posed held-out frames: the tracker alone, or with what training corrected beside them."""
+"""Names for the source of held-out face parameters: tracking with corrections from training, or tracking alone."""
 
 
 def protocol_line(name: str, entry: Mapping[str, Any]) -> str:
-    """A protocol of metrics.json in one line: what each PSNR is of, then the baselines' alike."""
+    """A protocol of metrics.json in one line: the PSNR figures of the avatar, then those of the baselines."""
     text = (
         f"{name} ({entry['split']}, {entry['frames']} frames): PSNR {_both(entry)}, faces {FACES[entry['face_params']]}"
     )
@@ -21,7 +21,7 @@ def protocol_line(name: str, entry: Mapping[str, Any]) -> str:
 
 
 def driven_line(entry: Mapping[str, Any]) -> str:
-    """Cross-reenactment in one line; figures beside what an avatar that never moves would get."""
+    """Cross-reenactment in one line, with the figures of an avatar that never moves for comparison."""
     text = f"cross_reenactment ({len(entry['drivers'])} drivers, {entry['frames']} frames): "
     if entry["expression_error"] is None:
         return f"{text}no face is found in any picture of the avatar"
@@ -34,7 +34,7 @@ def driven_line(entry: Mapping[str, Any]) -> str:
 
 
 def scores_lines(scores: Mapping[str, Any]) -> list[str]:
-    """The figures of `score_folders`, one line a part of the picture."""
+    """The figures of `score_folders`, with one line for each part of the picture."""
     lines = [f"{scores['frames']} pictures; whole frame: {_figures(scores)}"]
     if scores["crop"] is None:
         return [*lines, "head crop: not known; give --crops or --mattes"]

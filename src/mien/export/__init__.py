@@ -1,4 +1,4 @@
-"""Avatars and posed Gaussians as files for other programs: `write_*` and `read_*` side by side."""
+"""Avatars and posed Gaussians as files for other programs, with a `read_*` beside each `write_*`."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Gaussians from their local frame into world space, for programs that know no local frame."""
+"""Moves Gaussians from their local frame to world space, for programs that have no local frame."""
 
 import math
 
@@ -14,7 +14,7 @@ _DIRECTIONS = 64
 
 
 def in_world(gaussians: Gaussians) -> Gaussians:
-    """The same unbatched Gaussians without `T_world_local`: they look the same from every camera."""
+    """The same unbatched Gaussians without `T_world_local`. They look the same from every camera."""
     pose = gaussians.T_world_local
     if pose is None:
         return gaussians
@@ -26,10 +26,10 @@ def in_world(gaussians: Gaussians) -> Gaussians:
 
 
 def rotate_sh(sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
-    """SH coefficients of colours that turn with `rotation`: seen along R d, they are what they were along d.
+    """SH coefficients after `rotation`: along R d, the colours are what they were along d before.
 
-    A turn mixes coefficients of one degree linearly. The mixing matrix is solved for from values in many directions,
-    which is exact because the turned functions are again spherical harmonics.
+    A rotation mixes the coefficients of each degree linearly. The mixing matrix is solved from values in many
+    directions. This is exact, because the rotated functions are again spherical harmonics.
     """
     count = sh.shape[-2]
     directions = _spread_directions().to(sh.dtype)
@@ -39,7 +39,7 @@ def rotate_sh(sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Flo
 
 
 def _spread_directions() -> Float[Tensor, "d 3"]:
-    """Unit vectors all over the sphere, on a golden spiral."""
+    """Unit vectors spread over the whole sphere, on a golden spiral."""
     index = torch.arange(_DIRECTIONS, dtype=torch.float64)
     height = 1 - 2 * (index + 0.5) / _DIRECTIONS
     angle = index * math.pi * (3 - math.sqrt(5))

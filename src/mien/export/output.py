@@ -1,4 +1,4 @@
-"""Where pictures go, by the ending of a path; checked before any work, without the libraries that write them."""
+"""The output of pictures, chosen by the ending of a path. It is checked before any work, without heavy libraries."""
 
 import re
 from dataclasses import dataclass
@@ -14,26 +14,26 @@ _NUMBER = re.compile(r"%0?\d*d")
 
 @dataclass(frozen=True)
 class Output:
-    """Where pictures go, found to be possible before any of them is made."""
+    """A checked output for pictures."""
 
     path: Path
-    """A file; a folder or a pattern for `sequence`."""
+    """A file, or for `sequence` a folder or a pattern."""
     kind: Literal["still", "sequence", "mp4", "webm"]
     transparent: bool
 
     def numbered(self, index: int) -> Path:
-        """The file of one picture of a sequence."""
+        """The file of one picture in a sequence."""
         if _NUMBER.search(self.path.name):
             return self.path.with_name(_NUMBER.sub(lambda match: match.group() % index, self.path.name))
         return self.path / f"{index:06d}.png"
 
 
 def plan_output(path: Path, frames: int, transparent: bool = False) -> Output:
-    """What the ending of `path` asks for, checked before any work.
+    """The output for the ending of `path`, checked before any work.
 
     Raises:
-        UserError: the ending is none of `ENDINGS` or does not suit the number of frames or transparency, the place
-            cannot be written, or pictures of a longer sequence lie there.
+        UserError: the ending is not one of `ENDINGS`, or does not suit the number of frames or transparency; the place
+            cannot be written to, or already holds pictures of a longer sequence.
     """
     ending = path.suffix.lower()
     if ending == ".png" and _NUMBER.search(path.name):

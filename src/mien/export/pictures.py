@@ -1,7 +1,7 @@
 """Pictures as files, by the ending of a path: one .png, numbered .png files, .mp4, or .webm.
 
-Transparent pictures have four channels with straight (not premultiplied) colours, as PNG demands and as players take
-the alpha of a VP9 .webm. An .mp4 has no transparency.
+Transparent pictures have four channels with straight (not premultiplied) colours, because PNG requires that and players
+expect it for the alpha of a VP9 .webm. An .mp4 has no transparency.
 """
 
 import itertools
@@ -22,18 +22,18 @@ from mien.export.output import Output
 from mien.storage import cannot_write, write_atomically
 
 _ROWS = 512
-"""Of a picture are converted at once: an 8192x8192 picture would otherwise be held four times."""
+"""Number of rows converted at a time. An 8192x8192 picture would otherwise be in memory four times."""
 _FRINGE = 8
-"""Pixels that colours are spread beyond the opaque part, since video keeps colour at half the resolution."""
+"""Distance in pixels over which colours are spread beyond the opaque part: video halves the resolution of colour."""
 _WEBM_QUALITY = 24
-"""VP9's constant quality: 0 is lossless, 63 is worst."""
+"""VP9's constant quality, from 0 (lossless) to 63 (worst)."""
 
 
 def write_pictures(output: Output, pictures: Iterable[UInt8[np.ndarray, "h w _"]], fps: int | float) -> None:
-    """Write pictures (RGB, or RGBA where `output.transparent`), each file atomically; read once, all of one size.
+    """Write pictures (RGB, or RGBA if `output.transparent`), all of one size. Each file is written atomically.
 
     Raises:
-        UserError: there are none, or they cannot be written.
+        UserError: there are no pictures, or they cannot be written.
     """
     try:
         if output.kind == "mp4":
@@ -48,7 +48,7 @@ def write_pictures(output: Output, pictures: Iterable[UInt8[np.ndarray, "h w _"]
 
 
 def write_png(path: Path, picture: UInt8[np.ndarray, "h w _"]) -> None:
-    """One RGB or RGBA picture, atomically."""
+    """Write one RGB or RGBA picture atomically."""
     swapped = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA if picture.shape[2] == 4 else cv2.COLOR_RGB2BGR)
     done, encoded = cv2.imencode(".png", swapped)
     assert done, f"cannot encode a picture of shape {picture.shape}"
@@ -56,7 +56,7 @@ def write_png(path: Path, picture: UInt8[np.ndarray, "h w _"]) -> None:
 
 
 def to_rgb(image: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture in 0..1 as bytes, clamped and rounded, in bands of rows."""
+    """A picture in 0..1 as bytes, clamped and rounded. It is converted in bands of rows."""
     picture = np.empty(image.shape, np.uint8)
     for top in range(0, len(image), _ROWS):
         picture[top : top + _ROWS] = np.clip(image[top : top + _ROWS], 0, 1) * 255 + 0.5
@@ -64,7 +64,7 @@ def to_rgb(image: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def to_rgba(over_black: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 4"]:
-    """What was rendered over black, as straight colours and alpha; colours are 0 where nothing is."""
+    """A picture rendered over black, as straight colours and alpha. Colours are 0 where alpha is 0."""
     picture = np.empty((*alpha.shape, 4), np.uint8)
     for top in range(0, len(alpha), _ROWS):
         band = slice(top, top + _ROWS)
@@ -85,11 +85,11 @@ def _write_webm(output: Output, pictures: Iterable[np.ndarray], fps: int | float
 
 
 def _encode_webm(path: Path, pictures: Iterator[np.ndarray], shape: tuple[int, ...], fps: int | float) -> None:
-    """VP9 in BT.709, yuva420p where there is alpha; odd sizes get a repeated last row or column."""
+    """Encode VP9 in BT.709, yuva420p if there is alpha. Odd sizes get a repeated last row or column."""
     height, width, channels = shape
     options = {"crf": str(_WEBM_QUALITY), "b": "0", "deadline": "good", "cpu-used": "4", "row-mt": "1"}
     if channels == 4:
-        # Alternate reference frames and alpha do not go together in libvpx.
+        # libvpx does not support alternate reference frames together with alpha.
         options["auto-alt-ref"] = "0"
     with create_video(path) as container:
         stream = container.add_stream("libvpx-vp9", rate=Fraction(fps).limit_denominator(1001), options=options)
@@ -114,9 +114,9 @@ def _encode_webm(path: Path, pictures: Iterator[np.ndarray], shape: tuple[int, .
 
 
 def _spread_colours(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
-    """The same picture with the colours of its border continued outwards, where alpha is 0 and nobody sees them.
+    """The picture with the colours at its outline continued outwards, where alpha is low and hides them.
 
-    Video keeps colour at half the resolution and blurs it: without this, black would bleed into outlines.
+    Video keeps colour at half the resolution and blurs it. Without this, black would bleed into outlines.
     """
     alpha = picture[..., 3:].astype(np.float32)
     size = (2 * _FRINGE + 1, 2 * _FRINGE + 1)

@@ -1,4 +1,4 @@
-"""The standard 3D Gaussian .ply that viewers, editors and game engines read."""
+"""The standard .ply format of 3D Gaussians, which viewers, editors and game engines read."""
 
 import os
 from pathlib import Path
@@ -16,7 +16,7 @@ from mien.storage import write_atomically
 
 _HEADER_LIMIT = 65536
 _REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
-"""SH coefficients (1, 4, 9, 16) by the number of f_rest_* properties."""
+"""Number of SH coefficients (1, 4, 9, 16) by the number of f_rest_* properties."""
 _DIGITS_OF_COUNT = 12
 _MOST_GAUSSIANS = 2_000_000
 """Largest number of Gaussians that is read: a head has tens of thousands, and memory grows with it."""
@@ -25,19 +25,19 @@ _WORLD_COMMENT = "mien frame: world"
 
 
 def property_names(sh_coefficients: int) -> list[str]:
-    """The file's properties in order, all float32, for k = 1, 4, 9 or 16 SH coefficients a channel."""
+    """The file's properties in order, all float32, for k = 1, 4, 9 or 16 SH coefficients per channel."""
     rest = [f"f_rest_{i}" for i in range(3 * (sh_coefficients - 1))]
     dc, scales, quats = ([f"{name}_{i}" for i in range(n)] for name, n in (("f_dc", 3), ("scale", 3), ("rot", 4)))
     return ["x", "y", "z", "nx", "ny", "nz", *dc, *rest, "opacity", *scales, *quats]
 
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write unbatched Gaussians as binary little-endian .ply with raw values, as the 3DGS training code lays them out.
+    """Write unbatched Gaussians as binary little-endian .ply with raw values, in the layout of the 3DGS training code.
 
-    `opacity` is a logit, `scale_*` are natural logarithms of metres, `rot_*` is wxyz of unit length, `f_rest_*` holds
-    all coefficients of red, then of green, then of blue; normals are zero. Positions are in the Gaussians' own local
-    frame where `T_world_local` is set (a comment line keeps that pose for `read_ply`), else in world space: for other
-    programs, which know no local frame, use `in_world` first where the pose matters.
+    `opacity` is a logit, `scale_*` are natural logarithms of metres, `rot_*` is wxyz of unit length, and `f_rest_*`
+    holds all coefficients of red, then of green, then of blue. Normals are zero. Positions are in the Gaussians' local
+    frame if `T_world_local` is set, and in world space otherwise. A comment line keeps that pose for `read_ply`. Other
+    programs have no local frame: use `in_world` first if the pose matters to them.
 
     Raises:
         UserError: a value is NaN or infinite.
@@ -64,10 +64,10 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read a 3D Gaussian .ply, ours or another program's; properties it does not know are skipped.
+    """Read a 3D Gaussian .ply of mien or of another program. Unknown properties are skipped.
 
     Raises:
-        UserError: the file is missing, truncated, no ply, ASCII or big-endian, holds no 3D Gaussians, or NaN.
+        UserError: the file is missing, truncated, not a ply, ASCII or big-endian, or holds NaN or no 3D Gaussians.
     """
     try:
         with open_ordinary(path) as file:
@@ -101,8 +101,8 @@ def _read_header(path: Path, file: IO[bytes]) -> list[str]:
 
 
 def _raw_rows(gaussians: Gaussians) -> Float32[np.ndarray, "n p"]:
-    """One row of float32 a Gaussian, in the order of `property_names`."""
-    # Logits of exactly 0 and 1 are infinite; +-16.6 give 6e-8 and the float32 next to 1.
+    """One row of float32 per Gaussian, in the order of `property_names`."""
+    # Logits of exactly 0 and 1 are infinite. Logits of +-16.6 give 6e-8 and the float32 next to 1.
     opacities = gaussians.opacities.detach().double().clamp(6e-8, 1 - 6e-8)
     columns = (
         gaussians.means.detach(),
@@ -117,7 +117,7 @@ def _raw_rows(gaussians: Gaussians) -> Float32[np.ndarray, "n p"]:
 
 
 def _parse_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
-    """The number of vertices and the names of their properties, which must all be float32."""
+    """The number of vertices and the names of their properties. All properties must be float32."""
     if "format binary_little_endian 1.0" not in lines:
         found = next((line for line in lines if line.startswith("format")), "no format line")
         raise UserError(f"{path}: {found!r} is not supported; save it as binary_little_endian 1.0")
@@ -143,7 +143,7 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
 
 
 def _pose_of(path: Path, lines: list[str]) -> Tensor | None:
-    """T_world_local of the comment line, or none for a file in world space or of another program."""
+    """T_world_local from the comment line, or None for a file in world space or of another program."""
     marked = [line for line in lines if line.startswith(f"comment {_LOCAL_COMMENT}")]
     if not marked:
         return None
@@ -157,7 +157,7 @@ def _pose_of(path: Path, lines: list[str]) -> Tensor | None:
 
 
 def _activated(columns: dict[str, np.ndarray], pose: Tensor | None, path: Path) -> Gaussians:
-    """Gaussians of raw columns by name."""
+    """Gaussians from raw columns by name."""
     rest = sum(name.startswith("f_rest_") for name in columns)
     if rest not in _REST_COEFFICIENTS:
         raise UserError(f"{path}: {rest} f_rest_* properties; expected 0, 9, 24 or 45 (SH degree 0 to 3)")

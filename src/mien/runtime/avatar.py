@@ -1,4 +1,4 @@
-"""`load`, `Avatar` and `render`: the whole public face of the runtime."""
+"""`load`, `Avatar` and `render`: the whole public interface of the runtime."""
 
 import difflib
 from collections.abc import Mapping, Sequence
@@ -19,25 +19,25 @@ Vector = Sequence[float | int] | np.ndarray
 
 
 class Avatar:
-    """An avatar that runs on numpy and the native core alone."""
+    """An avatar that needs only numpy and the native core."""
 
     def __init__(self, portable: PortableAvatar):
         self.portable = portable
-        """All that the file holds, as plain arrays."""
+        """The whole content of the file, as plain arrays."""
 
     @property
     def expression_names(self) -> tuple[str, ...]:
-        """What `pose` knows by name, in the order of expression vectors."""
+        """Names of the expressions for `pose`, in the order of expression vectors."""
         return self.portable.expression_names
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Joints that turn by themselves; a jaw may follow an expression instead."""
+        """Names of the joints that `pose` can turn. A jaw may follow an expression instead."""
         return self.portable.joint_names
 
     @property
     def camera(self) -> Camera:
-        """The view the avatar was trained with."""
+        """The view that the avatar was trained with."""
         return self.portable.camera
 
     def face(
@@ -47,7 +47,7 @@ class Avatar:
         head_rotation: Vector | None = None,
         head_translation: Vector | None = None,
     ) -> Face:
-        """Face parameters: the person at rest, with what is given instead (see `pose`)."""
+        """Face parameters of the person at rest, with the given ones replaced (see `pose`)."""
         rest = self.portable.neutral
         return Face(
             _with_named(rest.expression, expression, self.expression_names, "expression"),
@@ -63,16 +63,16 @@ class Avatar:
         head_rotation: Vector | None = None,
         head_translation: Vector | None = None,
     ) -> Gaussians:
-        """The Gaussians of a face; what is not given is as the person is at rest.
+        """The Gaussians of a face. Parameters that are not given are those of the person at rest.
 
         Args:
             expression: Coefficients by name (others stay at rest), or all of them in the order of `expression_names`.
-            joints: Axis-angle in radians by name, or all of them [j, 3] in the order of `joint_names`.
-            head_rotation: Axis-angle of the head in world space, radians.
-            head_translation: Where the head's origin is in world space, metres.
+            joints: Axis-angle vectors in radians by name, or all of them [j, 3] in the order of `joint_names`.
+            head_rotation: Axis-angle vector of the head in world space, in radians.
+            head_translation: Position of the head's origin in world space, in metres.
 
         Raises:
-            ValueError: an unknown name, a wrong shape, or a number that is not finite.
+            ValueError: a name is unknown, a shape is wrong, or a number is not finite.
         """
         return pose(self.portable.baked, self.face(expression, joints, head_rotation, head_translation))
 
@@ -82,13 +82,13 @@ class Avatar:
         camera: Camera | None = None,
         background: Vector = (1.0, 1.0, 1.0),
     ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
-        """A picture and its alpha, as `render` gives them; at rest and seen as in training unless said otherwise."""
+        """A picture and its alpha, as from `render`. Defaults: the face at rest, and the camera of the training."""
         gaussians = self.pose() if gaussians is None else gaussians
         return render(gaussians, self.camera if camera is None else camera, background)
 
 
 def load(path: Path | str) -> Avatar:
-    """The avatar in a .mien file, as `mien export DIR --out NAME.mien` writes it.
+    """Load the avatar in a .mien file, as `mien export DIR --out NAME.mien` writes it.
 
     Example:
         >>> from mien import runtime
@@ -97,7 +97,7 @@ def load(path: Path | str) -> Avatar:
         >>> image, alpha = avatar.render(gaussians, avatar.camera.resized(512, 512))
 
     Raises:
-        UserError: the file is missing, damaged, or of another version; MIEN_THREADS is no number of threads.
+        UserError: the file is missing, damaged, or of another version, or MIEN_THREADS is not a number of threads.
     """
     asked_threads()
     return Avatar(read_portable(Path(path)))
@@ -106,13 +106,13 @@ def load(path: Path | str) -> Avatar:
 def render(
     gaussians: Gaussians, camera: Camera, background: Vector = (1.0, 1.0, 1.0)
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
-    """The picture of Gaussians over a background, RGB, 0..1 and above where colours are bright; and alpha, 0..1.
+    """The picture of Gaussians over a background (RGB, 0..1, higher for bright colours), and its alpha (0..1).
 
-    The picture is premultiplied: image = colours times alpha + (1 - alpha) times background. Over black,
-    dividing it by alpha gives straight colours. Kernel and constants are those of `mien.render.rasterize`.
+    The picture is premultiplied: image = colours times alpha + (1 - alpha) times background. Over black, dividing it by
+    alpha gives straight colours. The kernel and its constants are those of `mien.render.rasterize`.
 
     Raises:
-        ValueError: NaN or infinity in an input.
+        ValueError: an input holds NaN or infinity.
     """
     image = np.empty((camera.height, camera.width, 3), np.float32)
     alpha = np.empty((camera.height, camera.width), np.float32)
@@ -136,7 +136,7 @@ def _with_named(
     names: Sequence[str],
     of: str,
 ) -> np.ndarray:
-    """`rest` with the rows that are given by name, or all of them."""
+    """`rest` with the given rows replaced, by name or all of them."""
     if given is None:
         return rest
     if isinstance(given, Mapping):

@@ -1,4 +1,4 @@
-"""What must hold in a .mien file besides the shapes, so that posing never fails or reads outside of an array."""
+"""Checks of a .mien file besides the shapes, so that posing never fails or reads outside an array."""
 
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
@@ -22,23 +22,23 @@ from mien.runtime.model import (
 )
 
 MOST_SHAPES = 256
-"""Expressions, and nine of each free joint, that native/face.h takes."""
+"""Largest number of expressions, plus nine for each free joint, that native/face.h accepts."""
 _LARGEST_LOG_SCALE = 30
-"""Its exponential, and the square of that, are still float32 numbers."""
+"""Largest logarithm of a scale. Its exponential, and the square of that, still fit into float32."""
 
 
 def check(avatar: PortableAvatar, where: str) -> None:
-    """Moderate numbers, indices within their arrays, as many names as rows.
+    """Check that numbers are moderate, indices are within their arrays, and there are as many names as rows.
 
     Raises:
-        UserError: something does not hold; `where` is the file it came from.
+        UserError: a check fails. `where` names the file in the message.
     """
     for reason in _faults(avatar):
         raise UserError(f"{where}: {reason}; export it again with `mien export`")
 
 
 def baked_fault(baked: Baked) -> str | None:
-    """Why a baked avatar cannot be posed; None where it can."""
+    """The reason why a baked avatar cannot be posed, or None if it can."""
     return next(_baked_faults(baked), None)
 
 
@@ -65,7 +65,7 @@ def _faults(avatar: PortableAvatar) -> Iterator[str]:
 
 
 def _names(baked: Baked) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Of expressions and free joints."""
+    """The names of the expressions and of the free joints."""
     if isinstance(baked, Static):
         return baked.expression_names, baked.joint_names
     return baked.rig.expression_names, _free_names(baked.rig)

@@ -1,7 +1,7 @@
-"""The .mien file: one safetensors file whose metadata says what its arrays mean (docs/avatar_file.md).
+"""The .mien file: one safetensors file with metadata that gives its arrays their meaning (docs/avatar_file.md).
 
 The metadata has one entry, `mien`, a json text: `format` = "mien.baked", `version`, `sha256` of content and arrays, and
-`content`: the nested classes of `mien.runtime.model`, each with its `kind`; arrays are objects {"tensor": NAME}.
+`content`: the nested classes of `mien.runtime.model`, each with its `kind`. Arrays are objects {"tensor": NAME}.
 """
 
 import hashlib
@@ -28,25 +28,25 @@ _REMEDY = "write one with `mien export DIR --out me.mien`"
 
 
 def write_portable(path: Path, avatar: PortableAvatar) -> None:
-    """Write a .mien file, atomically; the same avatar gives the same bytes.
+    """Write a .mien file atomically. The same avatar gives the same bytes.
 
     Raises:
-        UserError: the path cannot be written, or an array is NaN or infinite.
+        UserError: the path cannot be written, or an array holds NaN or infinity.
     """
     check_writable(path)
     check(avatar, str(path))
     arrays: dict[str, np.ndarray] = {}
     content = _tree(avatar, "", arrays)
     header = {"format": FORMAT, "version": VERSION, "sha256": _digest(content, arrays), "content": content}
-    # One entry: safetensors puts several in random order.
+    # A single entry, because safetensors writes several in random order.
     write_arrays(path, arrays, {"mien": json.dumps(header, allow_nan=False, sort_keys=True)})
 
 
 def read_portable(path: Path) -> PortableAvatar:
-    """Read a .mien file; everything in it is checked, so that what comes back can be posed.
+    """Read a .mien file. All of its content is checked, so that the result can be posed.
 
     Raises:
-        UserError: the file is missing, damaged, of another version, or no .mien file.
+        UserError: the file is missing, damaged, of another version, or not a .mien file.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file; {_REMEDY}")
@@ -82,7 +82,7 @@ def _load(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
 
 
 def _tree(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
-    """`value` as json, its arrays put aside under their dotted paths."""
+    """`value` as json. Arrays are replaced by their dotted paths and put into `arrays` under these."""
     if isinstance(value, np.ndarray):
         arrays[path] = value
         return {"tensor": path}

@@ -1,7 +1,7 @@
-"""What a .mien file holds, as numpy arrays: the same classes and fields as `mien.avatar.baked` has with torch tensors.
+"""The content of a .mien file as numpy arrays. `mien.avatar.baked` has the same classes and fields with tensors.
 
-Letters in shapes mean the same in a whole file: n Gaussians, m points of the rig, f triangles, e expressions, k joints,
-j free joints, p pose correctives (9 a free joint), s SH coefficients a channel.
+Letters in shapes mean the same in the whole file: n Gaussians, m points of the rig, f triangles, e expressions, k
+joints, j free joints, p pose correctives (9 per free joint), s SH coefficients per channel.
 """
 
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from jaxtyping import Float32, Int32
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """m points of one person that move with expression and joints, in the head frame; identity is applied."""
+    """m points of one person, in the head frame, that move with expression and joints. Identity is applied."""
 
     template: Float32[np.ndarray, "m 3"]
-    """Metres."""
+    """Rest positions in metres."""
     expression_names: tuple[str, ...]
     expression_basis: Float32[np.ndarray, "e m 3"]
     joint_names: tuple[str, ...]
     joint_parents: tuple[int, ...]
-    """-1 for the head; parents come before children."""
+    """Index of each joint's parent, -1 for the head. Parents come before children."""
     joint_free: tuple[bool, ...]
     joint_template: Float32[np.ndarray, "k 3"]
     joint_rotation_basis: Float32[np.ndarray, "e k 3"]
@@ -32,7 +32,7 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Attributes:
-    """Raw values of n Gaussians that do not depend on the binding."""
+    """Raw values of n Gaussians, independent of how the Gaussians are bound."""
 
     quats: Float32[np.ndarray, "n 4"]
     log_scales: Float32[np.ndarray, "n 3"]
@@ -42,7 +42,7 @@ class Attributes:
 
 @dataclass(frozen=True, eq=False)
 class LinearBases:
-    """What a unit of each expression coefficient adds to the raw values; None adds nothing."""
+    """Changes of the raw values per unit of each expression coefficient. None means no change."""
 
     means: Float32[np.ndarray, "e n 3"] | None = None
     log_scales: Float32[np.ndarray, "e n 3"] | None = None
@@ -52,7 +52,7 @@ class LinearBases:
 
 @dataclass(frozen=True, eq=False)
 class AttributeNetwork:
-    """A small network, the same for all Gaussians, whose outputs are added to the raw values."""
+    """A small network, the same for all Gaussians. Its outputs are added to the raw values."""
 
     input: Literal["features", "displacement"]
     base: Float32[np.ndarray, "n _"]
@@ -66,7 +66,7 @@ class AttributeNetwork:
 
 @dataclass(frozen=True, eq=False)
 class MeshBound:
-    """Gaussians in the frames of a mesh's triangles (methods: gaussian_avatars)."""
+    """Gaussians in the frames of a mesh's triangles (method: gaussian_avatars)."""
 
     rig: Rig
     faces: Int32[np.ndarray, "f 3"]
@@ -78,7 +78,7 @@ class MeshBound:
 
 @dataclass(frozen=True, eq=False)
 class BlendSkinned:
-    """Gaussians that each carry their own blend directions and skinning weights (methods: mono_gaussian_avatar)."""
+    """Gaussians that each have their own blend directions and skinning weights (method: mono_gaussian_avatar)."""
 
     rig: Rig
     attributes: Attributes
@@ -92,7 +92,7 @@ class BlendSkinned:
 
 @dataclass(frozen=True, eq=False)
 class Static:
-    """Gaussians that stay where they are in the head frame (methods: headgas)."""
+    """Gaussians that do not move in the head frame (method: headgas)."""
 
     means: Float32[np.ndarray, "n 3"]
     attributes: Attributes
@@ -107,49 +107,49 @@ Baked = MeshBound | BlendSkinned | Static
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera with OpenCV axes (+x right, +y down, +z forward); pixel centres at +.5."""
+    """A pinhole camera with OpenCV axes (+x right, +y down, +z forward). Pixel centres are at +.5."""
 
     K: Float32[np.ndarray, "3 3"]
     """Intrinsics in pixels."""
     viewmat: Float32[np.ndarray, "4 4"]
     """T_camera_world, in metres."""
     width: int
-    """Pixels."""
+    """Width in pixels."""
     height: int
-    """Pixels."""
+    """Height in pixels."""
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same view with another number of pixels."""
+        """The same view with another resolution."""
         scale = np.array([[width / self.width], [height / self.height], [1.0]], np.float32)
         return Camera(self.K * scale, self.viewmat, width, height)
 
 
 @dataclass(frozen=True, eq=False)
 class Neutral:
-    """The person at rest, as training estimated it: where expressions start from."""
+    """The person at rest, as training estimated it. Expressions start from here."""
 
     expression: Float32[np.ndarray, " e"]
     joints: Float32[np.ndarray, "j 3"]
-    """Axis-angle, radians, of the free joints."""
+    """Axis-angle vectors of the free joints, in radians."""
     head_rotation: Float32[np.ndarray, " 3"]
-    """Axis-angle of the head frame in world space, radians."""
+    """Axis-angle vector of the head frame in world space, in radians."""
     head_translation: Float32[np.ndarray, " 3"]
-    """Origin of the head frame in world space, metres."""
+    """Origin of the head frame in world space, in metres."""
 
 
 @dataclass(frozen=True)
 class About:
-    """Where an avatar comes from."""
+    """The origin of an avatar."""
 
     name: str
-    """Of the subject."""
+    """Name of the subject."""
     method: str
     face_model: str
     face_model_hash: str
     licence: str
-    """Of the face model's data, a part of which lies in the file."""
+    """Licence of the face model's data. A part of these data is in the file."""
     mien: str
-    """The version that wrote it."""
+    """Version of mien that wrote the file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,10 +159,10 @@ class PortableAvatar:
     baked: Baked
     expression_names: tuple[str, ...]
     expression_bounds: Float32[np.ndarray, "e 2"]
-    """Beyond them an expression is out of the face model's reach; equal bounds mean that it does nothing."""
+    """Range of each expression that the face model can show. Equal bounds mean that the expression does nothing."""
     joint_names: tuple[str, ...]
-    """Of the free joints."""
+    """Names of the free joints."""
     neutral: Neutral
     camera: Camera
-    """The view it was trained with: a good first view."""
+    """The camera that the avatar was trained with: a good first view."""
     about: About

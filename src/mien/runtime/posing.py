@@ -1,4 +1,4 @@
-"""From face parameters to Gaussians, in numpy: what `mien.avatar.pose_baked` does in torch, for one timestep."""
+"""Posing in numpy: the Gaussians for face parameters, like `mien.avatar.pose_baked` in torch, for one timestep."""
 
 from dataclasses import dataclass, fields
 from weakref import WeakKeyDictionary
@@ -15,15 +15,15 @@ SH_C0 = 0.28209479177387814
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """What a face does at one moment."""
+    """Face parameters of one timestep."""
 
     expression: Float32[np.ndarray, " e"]
     joints: Float32[np.ndarray, "j 3"]
-    """Axis-angle, radians, of the free joints."""
+    """Axis-angle vectors of the free joints, in radians."""
     head_rotation: Float32[np.ndarray, " 3"]
-    """Axis-angle, radians."""
+    """Axis-angle vector of the head in world space, in radians."""
     head_translation: Float32[np.ndarray, " 3"]
-    """Metres."""
+    """Origin of the head frame in world space, in metres."""
 
     @property
     def T_world_head(self) -> Float32[np.ndarray, "4 4"]:
@@ -38,17 +38,17 @@ class Gaussians:
     """n activated Gaussians."""
 
     means: Float32[np.ndarray, "n 3"]
-    """Centres in the local frame, metres."""
+    """Centres in the local frame, in metres."""
     quats: Float32[np.ndarray, "n 4"]
-    """Rotations, wxyz; not always of unit length."""
+    """Rotations as wxyz quaternions, not always of unit length."""
     scales: Float32[np.ndarray, "n 3"]
-    """Standard deviations along the rotated axes, metres."""
+    """Standard deviations along the rotated axes, in metres."""
     opacities: Float32[np.ndarray, " n"]
-    """0..1."""
+    """Opacities, 0 to 1."""
     sh: Float32[np.ndarray, "n s 3"]
     """Real spherical-harmonics coefficients of the colour in the local frame."""
     T_world_local: Float32[np.ndarray, "4 4"] | None = None
-    """Rigid pose of the local frame; None: the world's."""
+    """Rigid pose of the local frame. None means that the local frame is the world's."""
 
     def __len__(self) -> int:
         """The number of Gaussians, n."""
@@ -79,7 +79,7 @@ def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
 
 
 def rig_points(rig: Rig, face: Face, in_world: bool = False) -> Float32[np.ndarray, "m 3"]:
-    """The rig's points in the head frame or in world space, metres: by the very operation that training uses."""
+    """The rig's points in the head frame or in world space, in metres, by the same operation as in training."""
     compiled = _compiled.get(rig)
     if compiled is None:
         compiled = _compiled[rig] = _native.make_face_model(
@@ -104,7 +104,7 @@ _compiled: "WeakKeyDictionary[Rig, _native.FaceModelData]" = WeakKeyDictionary()
 
 
 def _batch(values: np.ndarray) -> np.ndarray:
-    """One timestep's parameters as the core takes them."""
+    """One timestep's parameters in the form that the core takes."""
     return np.ascontiguousarray(values[None], np.float32)
 
 
@@ -130,7 +130,7 @@ def _raw_values(
     displacement: Float32[np.ndarray, "n 3"],
     face: Face,
 ) -> dict[str, np.ndarray]:
-    """Constants, plus linear bases, plus the network's outputs."""
+    """Constants, plus linear bases, plus outputs of the network."""
     raw = {f.name: getattr(attributes, f.name) for f in fields(Attributes)}
     raw["means"] = np.zeros_like(displacement)
     if bases is not None:
@@ -167,7 +167,7 @@ def run_network(
 
 
 def _combined(basis: Float32[np.ndarray, "b n w"], coefficients: Float32[np.ndarray, " b"]) -> np.ndarray:
-    """The basis weighed by coefficients; rows whose coefficient is zero are not even read."""
+    """Sum of the basis rows weighted by coefficients. Rows with a coefficient of zero are not read."""
     used = np.flatnonzero(coefficients)
     flat = basis.reshape(len(basis), -1)
     total = np.zeros(flat.shape[1], np.float32)
@@ -177,7 +177,7 @@ def _combined(basis: Float32[np.ndarray, "b n w"], coefficients: Float32[np.ndar
 
 
 def sigmoid(values: Float32[np.ndarray, "*s"]) -> Float32[np.ndarray, "*s"]:
-    """1 / (1 + exp(-x)), by the very operation that training uses."""
+    """1 / (1 + exp(-x)), by the same operation as in training."""
     out = np.empty(values.shape, np.float32)
     _native.sigmoid(np.ascontiguousarray(values, np.float32), out)
     return out

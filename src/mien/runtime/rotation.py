@@ -1,4 +1,4 @@
-"""Rotations in numpy: what `mien.rotation` has in torch."""
+"""Rotations in numpy, the counterpart of `mien.rotation` in torch."""
 
 import numpy as np
 from jaxtyping import Float
@@ -24,17 +24,17 @@ def matrix_from_axis_angle(axis_angle: Float[np.ndarray, "*b 3"]) -> Float[np.nd
 
 
 def compose_rigid(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """`first @ second`, added up in a fixed order: a matrix product's depends on the machine."""
+    """`first @ second`, summed in a fixed order, because the order of a matrix product depends on the machine."""
     columns = [first[:, axis, None] * second[axis] for axis in range(4)]
     return ((columns[0] + columns[1]) + columns[2]) + columns[3]
 
 
 def axis_angle_from_matrix(matrices: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:
-    """Axis-angle vectors, angle in 0..pi, of rotation matrices (by way of the unit quaternion's largest component)."""
+    """Axis-angle vectors, angle in 0..pi, of rotation matrices, from the unit quaternion's largest component."""
     flat = matrices.reshape(-1, 3, 3)
     vectors = np.zeros((len(flat), 3))
     for index, m in enumerate(flat):
-        # The symmetric matrix 4 q q^T of a wxyz quaternion; its largest row is best conditioned.
+        # The symmetric matrix 4 q q^T of a wxyz quaternion. Its largest row is the best conditioned.
         outer = np.array([
             [1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
             [m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
@@ -50,7 +50,7 @@ def axis_angle_from_matrix(matrices: Float[np.ndarray, "*b 3 3"]) -> Float[np.nd
 
 
 def rotation_of(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"] | None:
-    """The nearest rotation to a rotation times a scale; None for what is none."""
+    """The rotation nearest to a rotation times a scale, or None if the matrix is not near one."""
     u, sizes, vt = np.linalg.svd(matrix)
     if sizes[2] < 1e-6 or sizes[0] > 1.2 * sizes[2] or np.linalg.det(matrix) <= 0:
         return None

@@ -1,4 +1,4 @@
-"""Adam over parameter groups, with its state where density control and checkpoints can reach it."""
+"""Adam over parameter groups. Its state is accessible to density control and checkpoints."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,7 +15,7 @@ _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
 
 
 class Update(NamedTuple):
-    """What one step does to one tensor."""
+    """The change of one tensor in one step."""
 
     values: Tensor
     gradient: Tensor
@@ -24,16 +24,16 @@ class Update(NamedTuple):
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015) with the constants of 3D Gaussian Splatting; all tensors in one native call.
+    """Adam (Kingma and Ba 2015) with the constants of 3D Gaussian Splatting. One native call updates all tensors.
 
-    The state of per-Gaussian tensors lives in their store, that of networks here.
+    The state of per-Gaussian tensors is in their store, that of networks is here.
     """
 
     def __init__(self) -> None:
         self._moments: dict[str, dict[str, Moments]] = {}
 
     def step(self, groups: Iterable[ParameterGroup], progress: Progress) -> None:
-        """One update of every tensor that has a gradient, at the group's rate; clears the gradients."""
+        """Update every tensor that has a gradient, at its group's rate, and clear the gradients."""
         updates: list[Update] = []
         for group in groups:
             rate = group.rate.at(progress)
@@ -47,11 +47,11 @@ class Adam:
         update_all(updates)
 
     def state(self) -> dict[str, Moments]:
-        """The state of everything that has no store, by group and tensor."""
+        """The state of all tensors that have no store, by group and tensor."""
         return {f"{group}/{name}": state for group, own in self._moments.items() for name, state in own.items()}
 
     def load_state(self, state: Mapping[str, Moments]) -> None:
-        """Go on from what `state` returned."""
+        """Restore what `state` returned."""
         self._moments = {}
         for key, moments in state.items():
             group, name = key.split("/", 1)
@@ -65,7 +65,7 @@ class Adam:
 
 
 def update_all(updates: Sequence[Update]) -> None:
-    """Apply all updates in place, natively where tensors are float32, dense and on a CPU."""
+    """Apply all updates in place: natively if tensors are float32, contiguous and on a CPU."""
     tasks = []
     for update in updates:
         task = _native_task(update)
@@ -90,7 +90,7 @@ def update_reference(update: Update) -> None:
 
 
 def _native_task(update: Update) -> tuple[Any, Any, Any, Any, Any, float] | None:
-    """The update as the core takes it; None where the tensors are not what it takes."""
+    """The update in the form that the core takes, or None if it cannot take these tensors."""
     values, gradient, moments, rate = update
     arrays = (values, gradient, moments.first, moments.second, moments.step)
     for tensor in arrays:

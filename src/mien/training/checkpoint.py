@@ -1,4 +1,4 @@
-"""Checkpoints: everything that the rest of a run depends on, one file each, written atomically."""
+"""Checkpoints: everything that the rest of a run depends on. Each is one file, written atomically."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +17,12 @@ from mien.training.face_track import FaceTrack
 
 _KEPT = 2
 CURVES = {"step", "loss", "psnr", "gaussians", "step_ms"}
-"""That every run has."""
+"""Curves that every run has."""
 
 
 @dataclass(eq=False)
 class TrainingState:
-    """What training changes. Random numbers are functions of the seed and the step, so no generator is part of it."""
+    """Everything that training changes. Random numbers depend only on seed and step, so there is no generator."""
 
     avatar: Avatar
     adam: Adam
@@ -30,9 +30,9 @@ class TrainingState:
     track: FaceTrack
     curves: dict[str, list[float]]
     step: int = 0
-    """Steps done."""
+    """Number of steps done."""
     seconds: float = 0.0
-    """Spent on them."""
+    """Time spent on these steps, in seconds."""
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
@@ -50,23 +50,23 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
         "gaussians": torch.tensor(len(state.avatar.gaussian_store())),
     }
     write_tensors(folder / f"step_{state.step:07d}.safetensors", tensors, {"format": "mien.checkpoint", "version": "1"})
-    # Besides old checkpoints: what writing left behind when it was killed.
+    # Also delete unfinished files of a process that was killed while it wrote.
     for old in (*checkpoint_files(folder)[:-_KEPT], *folder.glob(".step_*")):
         old.unlink()
 
 
 def checkpoint_files(folder: Path) -> list[Path]:
-    """Checkpoints, oldest first."""
+    """The checkpoints, oldest first."""
     return sorted(folder.glob("step_*.safetensors"))
 
 
 def resume(folder: Path, state: TrainingState) -> None:
-    """Bring `state`, which is that of the run's start, to the newest checkpoint that can be read, if there is any.
+    """Restore the newest readable checkpoint into `state`, which is that of the run's start. There may be none.
 
-    Says which checkpoints are damaged, and where training goes on instead.
+    Reports damaged checkpoints, and where training continues instead.
 
     Raises:
-        UserError: a checkpoint is of another method or other settings.
+        UserError: a checkpoint belongs to another method or to other settings.
     """
     damaged = False
     for path in reversed(checkpoint_files(folder)):
@@ -117,7 +117,7 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
 
 
 def _check_like(found: dict[str, Tensor], own: dict[str, Tensor], gaussians: int | None) -> None:
-    """Tensors of the same names, types and shapes; where there are any, first axes are `gaussians`."""
+    """Check names, types and shapes against `own`. If `gaussians` is given, every first axis must have that length."""
     for name, tensor in own.items():
         shape = tensor.shape if gaussians is None else (gaussians, *tensor.shape[1:])
         if found[name].dtype != tensor.dtype or found[name].shape != shape:
@@ -125,7 +125,7 @@ def _check_like(found: dict[str, Tensor], own: dict[str, Tensor], gaussians: int
 
 
 def _moments(tensors: dict[str, Tensor], like: Tensor, owners: dict[str, Tensor]) -> dict[str, Moments]:
-    """Of tensors by name, on the device of `like`, but for the numbers of steps."""
+    """The moments by name, on the device of `like`, except for the step counts, which stay on the CPU."""
     moments = {}
     for name in dict.fromkeys(key.rpartition(":")[0] for key in tensors):
         first, second = (tensors[f"{name}:{field}"].to(like.device) for field in ("first", "second"))

@@ -1,7 +1,7 @@
-"""Density control: where Gaussians are added and removed.
+"""Density control: when and where Gaussians are added and removed.
 
-Strategies see a `GaussianStore`, what was posed and rendered, and the method's hooks; never the method. They keep
-statistics of one entry per Gaussian, which checkpoints save.
+Strategies see a `GaussianStore`, the posed Gaussians, the rendering, and the method's hooks, but never the method. They
+keep statistics with one entry per Gaussian, which checkpoints save.
 """
 
 from abc import ABC, abstractmethod
@@ -18,31 +18,31 @@ from mien.avatar import DensityControl, FixedDensity, GaussianStore, GradientDen
 from mien.render.rendering import Rendering
 
 Random = Callable[[], torch.Generator]
-"""Makes the generator of a step's random numbers, which few steps need."""
+"""Creates the generator for a step's random numbers. Few steps need one."""
 
 
 class DensityStrategy(ABC):
-    """Watches every step, and changes the store in some."""
+    """Observes every step, and changes the store in some of them."""
 
     @abstractmethod
     def observe(self, posed: Posed, rendering: Rendering) -> None:
-        """Take statistics after a step's backward pass; `posed` is of one timestep."""
+        """Update the statistics after a step's backward pass. `posed` holds one timestep."""
 
     @abstractmethod
     def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
-        """Change the store if it is time to, after the optimiser's step; True if it did."""
+        """Change the store if it is time for that. Called after the optimiser's step; returns whether it changed."""
 
     @abstractmethod
     def state(self) -> dict[str, Tensor]:
-        """What a checkpoint has to keep."""
+        """Tensors that a checkpoint has to save."""
 
     @abstractmethod
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` returned."""
+        """Restore what `state` returned."""
 
 
 def density_strategy(control: DensityControl, store: GaussianStore) -> DensityStrategy:
-    """The strategy that a method's description asks for."""
+    """The strategy for a method's description."""
     if isinstance(control, GradientDensity):
         return GradientStrategy(control, len(store), store[store.names()[0]].device)
     if isinstance(control, RefillDensity):
@@ -52,7 +52,7 @@ def density_strategy(control: DensityControl, store: GaussianStore) -> DensitySt
 
 
 class GradientStrategy(DensityStrategy):
-    """Duplicate small and split large Gaussians whose centres pull; prune faint ones; lower opacities at times."""
+    """Duplicates small and splits large Gaussians with strong gradients, prunes faint ones, and resets opacities."""
 
     def __init__(self, control: GradientDensity, gaussians: int, device: torch.device):
         self._control = control
@@ -60,11 +60,11 @@ class GradientStrategy(DensityStrategy):
         self._restart(gaussians)
 
     def observe(self, posed: Posed, rendering: Rendering) -> None:
-        """Add up gradients with respect to centres in normalised device coordinates, where visible."""
+        """Add up the gradients of the centres in normalised device coordinates, for visible Gaussians."""
         gradient = rendering.means2d_offset.grad
         assert gradient is not None, "observe() needs the gradients of a backward pass"
         height, width = rendering.image.shape[-3:-1]
-        # Pixels to normalised device coordinates, which span -1..1: the unit that thresholds are given in.
+        # Scale pixels to normalised device coordinates, which span -1..1: the unit of the thresholds.
         scale, opacities = (width / 2, height / 2), posed.gaussians.opacities.detach().reshape(-1)
         statistics = (self._pull, self._seen, self._radius, self._opacity)
         if gradient.device.type == "cpu" and gradient.dtype == torch.float32:
@@ -74,7 +74,7 @@ class GradientStrategy(DensityStrategy):
             observe_reference(gradient, rendering.radii, opacities, scale, *statistics)
 
     def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
-        """Grow and prune in rounds; reset opacities at their times."""
+        """Add and prune Gaussians in rounds, and reset opacities at their times."""
         settings = self._control.settings
         done = progress.step + 1
         changed = done in _round_steps(settings.start, settings.stop, settings.rounds, progress.steps)
@@ -92,7 +92,7 @@ class GradientStrategy(DensityStrategy):
         return {"pull": self._pull, "seen": self._seen, "radius": self._radius, "opacity": self._opacity}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` returned."""
+        """Restore what `state` returned."""
         self._pull, self._seen, self._radius, self._opacity = (
             state[name].to(self._device, copy=True) for name in ("pull", "seen", "radius", "opacity")
         )
@@ -108,7 +108,7 @@ class GradientStrategy(DensityStrategy):
         sizes = posed.gaussians.scales.detach().reshape(len(store), 3).amax(-1)
         prune = self._control.may_prune(store, self._to_prune(store, sizes, progress))
         if bool(prune.all()):
-            # An avatar of no Gaussians has no gradients to grow by: keep the one that was most visible.
+            # Without any Gaussian there are no gradients to grow by, so keep the one that was most visible.
             prune[self._opacity.argmax()] = False
         grow = self._to_grow(~prune, budget=settings.max_gaussians - int((~prune).sum()))
         split = grow & (sizes > settings.split_size)
@@ -133,7 +133,7 @@ class GradientStrategy(DensityStrategy):
         return prune
 
     def _to_grow(self, candidates: Bool[Tensor, " n"], budget: int) -> Bool[Tensor, " n"]:
-        """Those above the threshold; if there are more than the budget allows, those that pull most."""
+        """Gaussians above the threshold, or those with the largest gradients if the budget allows fewer."""
         pull = torch.where(candidates, self._pull / self._seen.clamp_min(1), -1.0)
         grow = pull >= self._control.settings.grow_gradient
         if int(grow.sum()) > budget:
@@ -149,7 +149,7 @@ def observe_reference(
     scale: tuple[float, float],
     *statistics: Tensor,
 ) -> None:
-    """`_native.observe_view` in plain PyTorch: adds a step to pull, seen, radius and opacity."""
+    """`_native.observe_view` in plain PyTorch: add a step to pull, seen, radius and opacity."""
     pull, seen, radius, opacity = statistics
     # Culled Gaussians have no gradient, so the sum needs no mask.
     pull += torch.hypot(gradient[:, 0] * scale[0], gradient[:, 1] * scale[1])
@@ -159,18 +159,18 @@ def observe_reference(
 
 
 class RefillStrategy(DensityStrategy):
-    """Delete what no view has shown, then refill up to the target with children of random survivors."""
+    """Deletes Gaussians that no view has shown, then refills up to the target with children of random survivors."""
 
     def __init__(self, control: RefillDensity, gaussians: int, device: torch.device):
         self._control = control
         self._opacity = torch.zeros(gaussians, device=device)
 
     def observe(self, posed: Posed, rendering: Rendering) -> None:
-        """Remember each Gaussian's highest opacity."""
+        """Update each Gaussian's highest opacity."""
         torch.maximum(self._opacity, posed.gaussians.opacities.detach().reshape(-1), out=self._opacity)
 
     def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
-        """Prune and refill at the rounds' times."""
+        """Prune and refill at the times of the rounds."""
         settings = self._control.settings
         due = [
             target
@@ -182,7 +182,7 @@ class RefillStrategy(DensityStrategy):
         unseen = self._control.judged_opacities(store, self._opacity) < settings.prune_opacity
         kept = ~self._control.may_prune(store, unseen)
         if not bool(kept.any()):
-            # An avatar of no Gaussians cannot be refilled: keep the one that was most visible.
+            # Without any Gaussian there is no parent for a refill, so keep the one that was most visible.
             kept[self._opacity.argmax()] = True
         store.select(kept)
         missing = due[-1] - len(store)
@@ -200,30 +200,30 @@ class RefillStrategy(DensityStrategy):
         return {"opacity": self._opacity}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` returned."""
+        """Restore what `state` returned."""
         self._opacity = state["opacity"].to(self._opacity, copy=True)
 
 
 class FixedStrategy(DensityStrategy):
-    """Changes nothing."""
+    """Never changes the store."""
 
     def observe(self, posed: Posed, rendering: Rendering) -> None:
-        """Nothing to watch."""
+        """Do nothing."""
 
     def control(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
-        """Never changes the store."""
+        """Return False, because the store never changes."""
         return False
 
     def state(self) -> dict[str, Tensor]:
-        """Nothing to keep."""
+        """An empty dict."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Nothing to load."""
+        """Do nothing."""
 
 
 @lru_cache
 def _round_steps(start: float, stop: float, rounds: int, steps: int) -> frozenset[int]:
-    """After how many steps each round happens, evenly from `start` to `stop` (fractions of the run)."""
+    """The numbers of steps after which the rounds happen, evenly from `start` to `stop` (fractions of the run)."""
     gaps = max(rounds - 1, 1)
     return frozenset(max(1, round((start + (stop - start) * index / gaps) * steps)) for index in range(rounds))

@@ -1,4 +1,4 @@
-"""FaceTrack: the face parameters of all timesteps as training sees them, tuned frame by frame where asked for."""
+"""FaceTrack: the face parameters of all timesteps during training, tuned frame by frame if settings ask for it."""
 
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
@@ -22,14 +22,14 @@ class _Row:
 
 
 class FaceTrack:
-    """One tensor per field, indexed by timestep, that starts from the tracking; with the optimiser's state.
+    """One tensor per field, indexed by timestep, with the optimiser's state. The tensors start from the tracking.
 
-    Each timestep has its own moments and step counts, and only the timestep of a step moves.
+    Each timestep has its own moments and step counts. A step changes only its own timestep.
 
     Args:
-        face: All timesteps of all sequences in a row.
-        tuning: Whether and how fast they move.
-        lengths: Timesteps of each sequence; one sequence by default.
+        face: All timesteps of all sequences, one sequence after the other.
+        tuning: Whether and how fast they change.
+        lengths: Number of timesteps of each sequence. Default: one sequence.
     """
 
     def __init__(self, face: FaceParams, tuning: FaceTuning, lengths: Items[int] = ()):
@@ -42,19 +42,19 @@ class FaceTrack:
         names = _FIELDS if tuning.enabled else ()
         self._moments = {name: Moments.zeros(self._fields[name]) for name in names}
         for moments in self._moments.values():
-            # On the CPU, wherever the rest is: what is worked out of it are numbers of the host.
+            # Step counts stay on the CPU: numbers computed from them are needed there.
             moments.step = torch.zeros(len(face))
 
     def face(self, index: int) -> FaceParams:
-        """One timestep; where tuning is on, its tensors are leaves that share memory with the track."""
+        """One timestep. With tuning, its tensors are leaves that share memory with the track."""
         return self._row(index).face
 
     def parameter_groups(self, index: int) -> list[ParameterGroup]:
-        """The groups of one timestep, whose `face(index)` was used since."""
+        """The parameter groups of one timestep. Their tensors are those of `face(index)`."""
         return self._row(index).groups
 
     def _row(self, index: int) -> "_Row":
-        # Made once: a dozen views would otherwise be made in every step. The track's tensors are never replaced.
+        # Cached, because a dozen views would otherwise be made in every step. The track's tensors are never replaced.
         if index not in self._rows:
             self._rows[index] = self._make_row(index)
         return self._rows[index]
@@ -71,11 +71,11 @@ class FaceTrack:
         return _Row(replace(self._start, **rows), groups)
 
     def params(self) -> FaceParams:
-        """All timesteps as they are now; those that training never saw get what it corrected in their neighbours.
+        """The current parameters of all timesteps. Timesteps without training get corrections from their neighbours.
 
-        What tracking gets wrong (depth, a tilt of the head) changes slowly. So a held-out timestep gets its sequence's
-        corrections, linear between the nearest trained timesteps and constant beyond the last; no pixel of a held-out
-        frame is looked at. A sequence of which nothing was trained on stays as tracked.
+        Errors of the tracking (depth, a tilt of the head) change slowly. A held-out timestep therefore gets its
+        sequence's corrections: linear between the nearest trained timesteps, and constant before the first and after
+        the last. This uses no pixel of a held-out frame. A sequence without any trained timestep stays as tracked.
         """
         fields = {name: tensor.clone() for name, tensor in self._fields.items()}
         for name, state in self._moments.items():
@@ -87,26 +87,26 @@ class FaceTrack:
         return replace(self._start, **fields)
 
     def state(self) -> dict[str, Tensor]:
-        """What a checkpoint has to keep; the tensors are the track's own."""
+        """Tensors that a checkpoint has to save. They share memory with the track."""
         state = {name: self._fields[name] for name in self._moments}
         for name, moments in self._moments.items():
             state |= {f"{name}.first": moments.first, f"{name}.second": moments.second, f"{name}.step": moments.step}
         return state
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` returned."""
+        """Restore what `state` returned."""
         for name, own in self.state().items():
             with torch.no_grad():
                 own.copy_(state[name])
 
 
 def spread_corrections(tuned: Tensor, tracked: Tensor, seen: Tensor) -> None:
-    """Give timesteps that were not `seen` the interpolated corrections `tuned - tracked` of the others, in place.
+    """Give the timesteps that are not `seen` corrections `tuned - tracked`, interpolated from the others, in place.
 
     Args:
-        tuned: [t, ...] parameters after training.
-        tracked: [t, ...] before training.
-        seen: bool [t].
+        tuned: Parameters after training, [t, ...].
+        tracked: Parameters before training, [t, ...].
+        seen: Which timesteps training has used, bool [t].
     """
     if not bool(seen.any()) or bool(seen.all()) or tuned.numel() == 0:
         return

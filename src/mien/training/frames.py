@@ -1,4 +1,4 @@
-"""Which frame a step looks at: every draw is a function of the seed and the step, so that runs resume exactly."""
+"""The frame of each step. Every random draw depends only on the seed and the step, so that runs resume exactly."""
 
 import hashlib
 from collections.abc import Sequence as Items
@@ -25,16 +25,16 @@ class Frame:
     timestep: int
     camera: int
     track_index: int
-    """Of the timestep among those of all sequences in a row."""
+    """Index of the timestep when all sequences are put one after the other."""
 
 
 def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list[Frame]:
-    """All frames that are usable, sharp and not held out: by their timestep, their sequence or their camera.
+    """All frames that are usable, sharp and not held out by their timestep, their sequence or their camera.
 
-    The split divides each sequence that is trained on; a sequence or a camera that is held out is so at all timesteps.
+    The split divides each sequence that is trained on. A held-out sequence or camera is held out at all timesteps.
 
     Raises:
-        UserError: there is none, or what is to be held out is not there.
+        UserError: no frame is left, or a sequence or camera to hold out does not exist.
     """
     names = [sequence.name for sequence in sequences]
     check_held_out(names, settings)
@@ -79,7 +79,7 @@ class FrameOrder:
 
 
 def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]:
-    """The background colour of a step."""
+    """The background colour of a step, 0 to 255."""
     if settings.background == "white":
         return np.full(3, 255, dtype=np.uint8)
     generator = random_at(settings.seed, _BACKGROUND, step)
@@ -87,12 +87,12 @@ def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]
 
 
 def density_random(settings: TrainSettings, step: int) -> torch.Generator:
-    """The random numbers of a step's density control."""
+    """The random numbers for a step's density control."""
     return random_at(settings.seed, _DENSITY, step)
 
 
 def random_at(seed: int, purpose: int, step: int) -> torch.Generator:
-    """A generator that depends on these three numbers only."""
-    # torch's CPU generator looks at the low 32 bits of its seed only, so the three have to be mixed into them.
+    """A generator that depends only on these three numbers."""
+    # torch's CPU generator uses only the low 32 bits of its seed, so the three numbers are hashed into them.
     digest = hashlib.blake2b(f"{seed} {purpose} {step}".encode(), digest_size=4).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest, "little"))

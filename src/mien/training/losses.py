@@ -1,4 +1,4 @@
-"""Losses that compare a rendering with its target: pure functions, means over the whole picture."""
+"""Losses that compare a rendering with its target. They are pure functions, and means over the whole picture."""
 
 import math
 
@@ -14,8 +14,8 @@ from mien.training.sequence import Target
 
 
 def picture_losses(rendering: Rendering, target: Target, weights: Photometric) -> dict[str, Float[Tensor, ""]]:
-    """The weighted losses of one picture, by name; differentiable in the rendering."""
-    # Outside of the target's box and what is drawn, both pictures show the background and nothing else.
+    """The weighted losses of one picture, by name. Differentiable in the rendering."""
+    # Outside the target's box and the drawn pixels, both pictures show only the background.
     photometric = photometric_loss(
         rendering.image, target.picture, weights.l1_weight, weights.ssim_weight, target.box, drawn=rendering.alpha
     )
@@ -27,7 +27,7 @@ def picture_losses(rendering: Rendering, target: Target, weights: Photometric) -
 
 
 def train_psnr(rendering: Rendering, target: Target) -> float:
-    """Peak signal-to-noise ratio of a training picture in dB, on the whole picture."""
+    """Peak signal-to-noise ratio of a training picture in dB, over the whole picture."""
     image, picture = rendering.image.detach(), target.picture
     if image.dtype == torch.float32 and image.device.type == "cpu":
         error = _native.mean_squared_difference(image.contiguous(), picture.contiguous())

@@ -12,13 +12,13 @@ from mien import _native
 from mien.arrays import recycled, unpacked
 
 WINDOW_RADIUS = 5
-"""Pixels: the SSIM window is 11x11."""
+"""Radius of the SSIM window in pixels: it is 11x11."""
 WINDOW_SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2
 _NATIVE_MIN_WIDTH = 6
 
 Box = tuple[int, int, int, int]
-"""left, top, width, height in pixels."""
+"""Left, top, width and height, in pixels."""
 
 
 def photometric_loss(
@@ -31,10 +31,11 @@ def photometric_loss(
 ) -> Float[Tensor, ""]:
     """`l1_weight` * mean |image - target| + `ssim_weight` * (1 - mean SSIM), fused and native on a CPU.
 
-    Differentiable in `image`. A uint8 `target` counts as 0..255. With a `box`, pixels outside count as equal in both
-    pictures (the windows of pixels inside still see them), and the means stay over the whole picture: the same value
-    and gradient in a fraction of the time where the pictures are equal beyond 5 pixels inside the box's edges.
-    With `drawn`, pictures are equal where it is 0 and the box does not reach: the native loss looks no further.
+    Differentiable in `image`. A uint8 `target` has colours 0..255. With a `box`, pixels outside count as equal in both
+    pictures, although the windows of pixels inside still see them, and the means stay over the whole picture. Value and
+    gradient are the same as without the box, in a fraction of the time, if the pictures differ only where they are at
+    least 5 pixels inside the box. `drawn` promises that the pictures are equal where it is 0 and outside the box; the
+    native loss skips these pixels.
     """
     assert image.shape == target.shape, (image.shape, target.shape)
     assert not target.requires_grad
@@ -51,7 +52,7 @@ def photometric_loss_reference(
     ssim_weight: float = 0.2,
     box: Box | None = None,
 ) -> Float[Tensor, ""]:
-    """`photometric_loss` in plain PyTorch, any dtype and device."""
+    """`photometric_loss` in plain PyTorch, for any dtype and device."""
     target = target.to(image) / 255 if target.dtype == torch.uint8 else target
     left, top, width, height = _clipped(box, image)
     inside = (slice(top, top + height), slice(left, left + width))
@@ -61,7 +62,7 @@ def photometric_loss_reference(
 
 
 def ssim_map(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
-    """Structural similarity of two pictures (0..1) around every pixel, at most 1; zeros lie beyond the border."""
+    """Structural similarity of two pictures (0..1) at every pixel, at most 1. Windows see zeros beyond the border."""
     statistics = (image, target, image * image, target * target, image * target)
     mean_x, mean_y, square_x, square_y, product = _blur(torch.stack(statistics))
     variance_x, variance_y = square_x - mean_x * mean_x, square_y - mean_y * mean_y
@@ -71,12 +72,12 @@ def ssim_map(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> F
 
 
 def ssim(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
-    """Mean of `ssim_map`: 1 for equal pictures."""
+    """Mean of `ssim_map`. It is 1 for equal pictures."""
     return ssim_map(image, target).mean()
 
 
 class _PhotometricLoss(torch.autograd.Function):
-    """Value and gradient come from one native pass; `backward` only scales the gradient."""
+    """One native pass computes value and gradient; `backward` only scales the gradient."""
 
     @staticmethod
     def forward(

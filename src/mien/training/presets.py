@@ -1,4 +1,4 @@
-"""Presets: from quick to good, one name for the settings of a run and of its method."""
+"""Presets, from quick to good: names for the settings of a run and of its method."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from mien.training.settings import TrainSettings
 
 @dataclass(frozen=True)
 class Preset:
-    """What a preset means: for the run it says so here, for each method in the file of its settings."""
+    """The settings of a run, which are given here, and of each method, which are in the file of its settings."""
 
     name: str
     settings: TrainSettings
@@ -25,4 +25,4 @@ class Preset:
 PRESETS = {
     preset.name: preset for preset in (Preset("draft", TrainSettings(steps=8_000)), Preset("standard", TrainSettings()))
 }
-"""By name, from quick to good."""
+"""Presets by name, from quick to good."""

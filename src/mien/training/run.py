@@ -31,14 +31,14 @@ _SUMMARY = "mien.training"
 _REMEDY = "put a copy back, or train again under another name (--run NAME); the run's folder holds the trained avatar"
 _AGAIN = "delete the run's training.json and run the same `mien train` again, which goes on from the last checkpoint"
 ANOTHER_RUN = f"{WAIT}, or give this run another name (--run NAME)"
-"""What to do where another process trains the run."""
+"""Remedy if another process is training the run."""
 _SUMMARIES, _MOST = ("steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"), 1 << 62
 _FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
-"""Settings that say how a run is made, not what it is: it may go on with others."""
+"""Settings that say how a run is computed, not what it computes. They may change when the run continues."""
 
 
 def claim_run(run_dir: Path, sequences: Items[Sequence], method_config: MethodConfig, settings: TrainSettings) -> None:
-    """Write config.json, or find that the one there asks for the same run.
+    """Write config.json, or check that the existing one asks for the same run.
 
     Raises:
         UserError: the folder holds a run with other settings, method or data.
@@ -60,10 +60,10 @@ def claim_run(run_dir: Path, sequences: Items[Sequence], method_config: MethodCo
 def check_run(
     run_dir: Path, method_config: MethodConfig, settings: TrainSettings, names: Items[str] | None = None
 ) -> bool:
-    """Whether the folder holds a run already, which then has to be one with these choices (and sequences).
+    """Whether the folder already holds a run. If so, check that it has these choices (and sequences).
 
     Raises:
-        UserError: it holds another one.
+        UserError: it holds a different run.
     """
     if not (run_dir / "config.json").is_file():
         return False
@@ -80,10 +80,10 @@ def check_run(
 
 
 def check_data(run_dir: Path, trackings: Mapping[str, Tracking]) -> None:
-    """Find that sequences are still tracked as they were when a run was trained on them.
+    """Check that sequences were not tracked again since a run was trained on them.
 
     Raises:
-        UserError: some were tracked again since.
+        UserError: some were tracked again.
     """
     outdated = outdated_sequences(run_dir, trackings)
     if outdated:
@@ -94,14 +94,14 @@ def check_data(run_dir: Path, trackings: Mapping[str, Tracking]) -> None:
 
 
 def outdated_sequences(run_dir: Path, trackings: Mapping[str, Tracking]) -> list[str]:
-    """Names of the sequences that a run was trained on and that these trackings (by name) have otherwise."""
+    """Names of the sequences among `trackings` (by name) whose tracking is not the one that the run was trained on."""
     data = read_run_config(run_dir)["data"]
     known = [entry for entry in data if entry["sequence"] in trackings]
     return [e["sequence"] for e in known if e.get("tracking") != _tracking_digest(trackings[e["sequence"]])]
 
 
 def read_run_config(run_dir: Path) -> dict[str, Any]:
-    """What config.json says: method, settings, data, mien (version) and command_line.
+    """The content of config.json: method, settings, data, mien (version) and command_line.
 
     Raises:
         UserError: it is missing or damaged.
@@ -118,7 +118,7 @@ def read_run_config(run_dir: Path) -> dict[str, Any]:
 
 
 def run_camera(run_dir: Path) -> Camera:
-    """The first camera that a run was trained with.
+    """The first camera that the run was trained with.
 
     Raises:
         UserError: config.json is missing or damaged.
@@ -139,17 +139,17 @@ def is_finished(run_dir: Path) -> bool:
 
 
 def check_untouched(run_dir: Path) -> None:
-    """Find before any work that no other process is at a run that is to be trained.
+    """Check before any work that no other process is training this run.
 
     Raises:
-        BeingWrittenError: one is.
+        BeingWrittenError: another process is.
     """
     if not is_finished(run_dir):
         check_free(run_dir, ANOTHER_RUN)
 
 
 def write_results(run_dir: Path, state: TrainingState) -> None:
-    """Write everything that outlives training; training.json comes last and marks the run as finished."""
+    """Write everything that is kept after training. training.json is last and marks the run as finished."""
     write_avatar(run_dir / "avatar", state.avatar)
     write_tensors(run_dir / "face_track.safetensors", state.track.params().tensors())
     curves = {name: torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
@@ -179,7 +179,7 @@ def read_training_summary(run_dir: Path) -> dict[str, Any]:
 
 
 def read_curves(run_dir: Path) -> dict[str, np.ndarray]:
-    """Equally long curves of a finished run: step, loss, psnr, gaussians, step_ms, and each loss by name.
+    """The curves of a finished run, all of one length: step, loss, psnr, gaussians, step_ms, and each loss by name.
 
     Raises:
         UserError: they are missing or damaged.
@@ -202,7 +202,7 @@ def _choices(method_config: MethodConfig, settings: TrainSettings) -> dict[str, 
 
 
 def _fingerprint(sequence: Sequence) -> dict[str, Any]:
-    """What tells two sequences apart: their source and how they were tracked."""
+    """The source and the tracking of a sequence, which distinguish it from others."""
     first = sequence.tracking.cameras[0]
     return {
         "sequence": sequence.name,
@@ -229,7 +229,7 @@ def _tracking_digest(tracking: Tracking) -> str:
 
 
 def _differences(found: Any, wanted: Any, name: str = "") -> set[str]:
-    """Dotted names of what differs between two json values, apart from what may."""
+    """Dotted names of the entries in which two json values differ, apart from those that are free to change."""
     if isinstance(found, dict) and isinstance(wanted, dict):
         names = (set(found) | set(wanted)) - set(_FREE_TO_CHANGE)
         return set().union(*(_differences(found.get(n), wanted.get(n), f"{name}.{n}".lstrip(".")) for n in names))

@@ -1,4 +1,4 @@
-"""Sequence: what training needs to know about one filmed sequence, and the pictures it is compared with."""
+"""Sequence: what training needs of one filmed sequence, and the target pictures."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,26 +22,26 @@ _ON_CPU = torch.zeros(())
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """One sequence: pictures, the tracked face, and the frozen mask that says what is trained on and scored."""
+    """One sequence: pictures, the tracked face, and the frozen mask of the pixels that are trained on and scored."""
 
     name: str
     capture: Capture
     tracking: Tracking
     scoring: UInt8[np.ndarray, "t c h w"]
-    """Opacity of what counts (the matte above the neck line), 255 = all."""
+    """Opacity of the pixels that count (the matte above the neck line). 255 is opaque."""
     folder: Path | None = None
     """Where it was read from, for messages."""
 
     def usable(self) -> np.ndarray:
-        """Bool [t, c]: the face was tracked, and found in this very picture or in another camera's.
+        """Bool [t, c]: the face was tracked, and was found in this picture, or the cameras are calibrated.
 
-        A calibrated camera sees the tracked head also where it finds no face: from behind, say.
+        A calibrated camera sees the tracked head even if it finds no face, for example from behind.
         """
         tracked = self.tracking.valid.numpy()[:, None]
         return (self.capture.valid | (self.capture.calibration is not None)) & tracked
 
     def sharp(self) -> np.ndarray:
-        """Bool [t, c]: not marked as blurred by the capture."""
+        """Bool [t, c]: the capture did not mark the picture as blurred."""
         quality = self.capture.quality
         return np.ones(self.capture.valid.shape, bool) if quality is None else ~quality.blurred
 
@@ -49,29 +49,29 @@ class Sequence:
 def composite(
     image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"], background: UInt8[np.ndarray, " 3"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """`image` where the matte is opaque, over `background`; rounded to the nearest integer."""
+    """`image` over `background`, blended by the matte and rounded to the nearest integer."""
     alpha = matte[..., None].astype(np.uint16)
     mixed = image * alpha + background.astype(np.uint16) * (255 - alpha)
-    # Division by 255, rounded, in integers: exact for 16 bits.
+    # Rounded division by 255 in integers, exact for 16 bits.
     mixed += 128
     return ((mixed + (mixed >> 8)) >> 8).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What a rendering is compared with."""
+    """The picture that a rendering is compared with."""
 
     picture: UInt8[Tensor, "h w 3"]
-    """Composited on the background that the rendering has."""
+    """The picture, composited on the rendering's background."""
     matte: UInt8[Tensor, "h w"]
-    """Opacity of what counts."""
+    """Opacity of the pixels that count."""
     box: Box
-    """Left, top, width and height, pixels, outside of which there is only background."""
+    """Left, top, width and height of a box, in pixels. Outside it there is only background."""
     background: Float[Tensor, " 3"]
-    """Its colour, 0..1."""
+    """Colour of the background, 0..1."""
 
     def pinned(self) -> "Target":
-        """The same in memory that a GPU reads while the host goes on."""
+        """This target in pinned memory, which a GPU can read asynchronously."""
         return replace(
             self,
             picture=self.picture.pin_memory(),
@@ -80,7 +80,7 @@ class Target:
         )
 
     def to(self, like: Tensor) -> "Target":
-        """The same on the device of `like`, with a background of its dtype; the host does not wait for the copies."""
+        """This target on the device of `like`, with a background of its dtype. The copies are asynchronous."""
         return replace(
             self,
             picture=self.picture.to(like.device, non_blocking=True),
@@ -90,13 +90,13 @@ class Target:
 
 
 class Targets:
-    """The pictures of one sequence at training resolution, composited; those over a fixed background are kept.
+    """The pictures of one sequence at training resolution, composited. Pictures over a fixed background are cached.
 
     Args:
-        sequence: Whose pictures.
-        resolution: Longer side in pixels; 0 for the capture's own.
-        share: The number of sequences that share the memory for kept pictures.
-        like: Cameras and targets come with its float dtype and on its device.
+        sequence: The sequence.
+        resolution: Longer side in pixels, or 0 for the capture's own.
+        share: Number of sequences that share the memory for cached pictures.
+        like: Cameras and targets have its float dtype and its device.
     """
 
     def __init__(self, sequence: Sequence, resolution: int, share: int = 1, like: Tensor = _ON_CPU):
@@ -113,11 +113,11 @@ class Targets:
         self._room = _CACHE_BYTES // (share * self.width * self.height * 4)
 
     def camera(self, camera: int) -> Camera:
-        """The camera of the training pictures."""
+        """A camera at training resolution."""
         return self.cameras[camera]
 
     def target(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool) -> Target:
-        """The picture over a background; `keep` it if the same background will be asked for again."""
+        """The picture over a background. `keep` caches it, for use with the same background again."""
         key = (timestep, camera, background.tobytes())
         target = self._kept.get(key)
         if target is None:
@@ -145,11 +145,11 @@ class Targets:
 
 
 def read_sequence(folder: Path) -> Sequence:
-    """The sequence in FOLDER/{capture,tracking,scoring}; its name is the folder's.
+    """The sequence in FOLDER/{capture,tracking,scoring}. Its name is that of the folder.
 
     Raises:
-        UserError: a part is missing, damaged, of another version or being written, or is not of the same pictures as
-            the others.
+        UserError: a part is missing, damaged, of another version, is being written, or does not belong to the other
+            parts.
     """
     parts = [folder / name for name in ("capture", "tracking", "scoring")]
     return read_beside_writers(lambda: _read_parts(folder), parts, [folder])
@@ -164,10 +164,10 @@ def _read_parts(folder: Path) -> Sequence:
 
 
 def sequence_of(folder: Path, scoring: Scoring) -> Sequence:
-    """`read_sequence` where its scoring is read already.
+    """Like `read_sequence`, with a scoring that was read before.
 
     Raises:
-        UserError: as `read_sequence`.
+        UserError: as for `read_sequence`.
     """
     capture, tracking = read_capture(folder / "capture"), read_tracking(folder / "tracking")
     check_tracking_of(capture, tracking, folder / "tracking")

@@ -1,4 +1,4 @@
-"""TrainSettings: what a run is, apart from the method."""
+"""TrainSettings: the settings of a run that do not depend on the method."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,23 +14,23 @@ Split = Literal["blocks", "tail", "none"]
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Settings of a training run. The method's own (losses, rates, density control) are in its config."""
+    """Settings of a training run. Losses, rates and density control are settings of the method."""
 
     steps: Annotated[int, Range(1, 1_000_000_000)] = 15_000
     """Number of optimiser steps, one frame each. All schedules stretch with it."""
     split: Split = "blocks"
     """What is held out: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none)."""
     background: Literal["white", "random"] = "white"
-    """What pictures are composited on. A random colour in each step keeps Gaussians from painting the background, which
-    can show as white needles in new poses; it costs 0.1 to 0.4 dB over white."""
+    """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
+    which can show as white needles in new poses. It costs 0.1 to 0.4 dB compared with white."""
     resolution: Annotated[int, Range(16, 8192, or_zero=True)] = 0
-    """Longer side of the training pictures, in pixels. 0 keeps the capture's own; pictures are never enlarged."""
+    """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
     """Seed of all random numbers. The same seed, settings and data give the same bytes on a CPU."""
     threads: Annotated[int, Range(0, 256)] = 0
-    """Number of threads of native operations. 0 takes MIEN_THREADS or all cores. Results do not depend on it."""
+    """Number of threads of native operations. 0 means MIEN_THREADS or all cores. Results do not depend on it."""
     device: DeviceName = "cpu"
-    """Where training runs. On `cuda` (through gsplat) the same seed does not give the same bytes."""
+    """Device that training runs on. On `cuda` (through gsplat), the same seed does not give the same bytes."""
     checkpoint_every: Annotated[int, Range(1, 1_000_000_000)] = 1_000
     """Number of steps between checkpoints."""
     record_every: Annotated[int, Range(1, 1_000_000_000)] = 10
@@ -41,28 +41,28 @@ class TrainSettings:
     """Ids of cameras that are not trained on, in any sequence."""
 
     def check(self) -> None:
-        """Find that all numbers are in their ranges.
+        """Check that all numbers are in their ranges.
 
         Raises:
-            UserError: names the first option and value that is not, and the range.
+            UserError: a number is out of range. The message names the first such option, its value and the range.
         """
         check_ranges(self, lambda name: ("--" if name in DIALS else "--training.") + name.replace("_", "-"))
 
     @property
     def holds_out(self) -> bool:
-        """Whether anything is left to score."""
+        """Whether anything is held out for scoring."""
         return self.split != "none" or bool(self.held_out_sequences or self.held_out_cameras)
 
 
 DIALS = ("steps", "split", "background", "seed", "device", "held_out_sequences", "held_out_cameras")
-"""Fields that the command line asks by options of their own; the others are `--training.NAME`."""
+"""Fields that have command-line options of their own; the others are `--training.NAME`."""
 
 
 def check_held_out(names: Sequence[str], settings: TrainSettings) -> None:
-    """Find that the sequences to be held out are among a run's, and that others remain.
+    """Check that the held-out sequences belong to a run, and that others remain.
 
     Raises:
-        UserError: they are not, or nothing remains.
+        UserError: one does not belong to it, or none remains.
     """
     unknown = [name for name in settings.held_out_sequences if name not in names]
     if unknown:

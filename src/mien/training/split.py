@@ -1,4 +1,4 @@
-"""Which timesteps are held out."""
+"""The split: which timesteps are held out."""
 
 import torch
 from jaxtyping import Bool
@@ -11,11 +11,11 @@ _TAIL_SHARE = 0.2
 
 
 def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
-    """Which of a sequence's timesteps are for testing.
+    """Which of a sequence's timesteps are held out for testing.
 
-    `blocks`: every fifth block of 10, beginning with the fifth, so that poses and expressions of the test are about
-    those of training; clips of fewer than 50 have shorter blocks, so that they have a fifth one. `tail`: the last
-    20 %, which may show what was never seen. `none`: nothing.
+    `blocks`: every fifth block of 10, starting with the fifth, so that test poses and expressions resemble those of
+        training. Clips of fewer than 50 timesteps have shorter blocks, so that they have a fifth one. `tail`: the last
+        20 %, which may show things that were never seen. `none`: nothing.
     """
     index = torch.arange(timesteps)
     if split == "blocks":

@@ -1,4 +1,4 @@
-"""The training loop: one frame a step, whatever the method."""
+"""The training loop: one frame per step, for every method."""
 
 import signal
 import threading
@@ -34,16 +34,16 @@ from mien.training.sequence import Sequence, Targets
 from mien.training.settings import TrainSettings
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
-"""(title, total, completed) -> a context whose value moves the bar on."""
+"""(title, total, completed) -> a context manager whose value moves the bar on."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """What training reads and never changes."""
+    """Data that training reads and never changes."""
 
     order: FrameOrder
     targets: tuple[Targets, ...]
-    """One a sequence."""
+    """One entry per sequence."""
 
 
 def train(
@@ -54,16 +54,16 @@ def train(
     run_dir: Path,
     progress: ProgressBar = progress_bar,
 ) -> Avatar:
-    """Train an avatar on some sequences of one subject; the result is also in `run_dir`.
+    """Train an avatar on some sequences of one subject. The result is also in `run_dir`.
 
-    If `run_dir` holds a run with the same settings that was stopped, it goes on where that was and ends with the same
-    bytes as if it had never stopped; if that run is finished, its avatar is loaded.
+    If `run_dir` holds a stopped run with the same settings, training continues where it stopped, and the result has the
+    same bytes as without the stop. If that run is finished, its avatar is loaded.
 
     Raises:
         UserError: a setting is out of range, or training diverges; `run_dir` holds another run, or another process
-            writes it; the face model is not the one the sequences were tracked with; they were not tracked together;
-            nothing is left to train on.
-        KeyboardInterrupt: after Ctrl-C, when a checkpoint is safe.
+            writes it; the face model differs from that of the tracking; the sequences were not tracked together; or no
+            frame is left to train on.
+        KeyboardInterrupt: after Ctrl-C, once a checkpoint is written.
     """
     method_config.check()
     settings.check()
@@ -74,7 +74,7 @@ def train(
         return load_avatar(run_dir)
     with hold(run_dir, remedy=ANOTHER_RUN):
         claim_run(run_dir, sequences, method_config, settings)
-        if is_finished(run_dir):  # by another process, before this one got the lock
+        if is_finished(run_dir):  # another process finished it before this one got the lock
             return load_avatar(run_dir)
         like = like_on(choose_device(settings.device))
         targets = [Targets(sequence, settings.resolution, len(sequences), like) for sequence in sequences]
@@ -86,7 +86,7 @@ def train(
 def _train_to_the_end(
     state: TrainingState, data: TrainingData, settings: TrainSettings, run_dir: Path, progress: ProgressBar
 ) -> None:
-    """Go on from the newest checkpoint, if there is one, and write the results."""
+    """Continue from the newest checkpoint, if there is one, and write the results."""
     resume(run_dir / "checkpoints", state)
     with _one_torch_thread(), _native_threads(settings.threads), _deferred_interrupt() as interrupted:
         with progress("training", settings.steps, state.step) as advance:
@@ -106,7 +106,7 @@ def _train_to_the_end(
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:
-    """Find that training has not diverged, before anything of it is written.
+    """Check that training has not diverged, before anything is written.
 
     Raises:
         UserError: the avatar holds NaN or infinity.
@@ -124,10 +124,10 @@ def _diverged(run_dir: Path, state: TrainingState, what: str) -> UserError:
 
 
 def check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
-    """Sequences go together: one person, fitted with this face model.
+    """Check that the sequences show one person, fitted with this face model.
 
     Raises:
-        UserError: they were tracked apart, or with another face model.
+        UserError: they were tracked separately, or with another face model.
     """
     for sequence in sequences:
         if sequence.tracking.face_model_hash != face_model.content_hash:
@@ -150,7 +150,7 @@ def start(
     settings: TrainSettings,
     like: Tensor | None = None,
 ) -> TrainingState:
-    """The state before the first step, with the float dtype and on the device of `like` (float32 on the CPU)."""
+    """The state before the first step, with the float dtype and device of `like` (default: float32 on the CPU)."""
     face = concatenate([sequence.tracking.face for sequence in sequences])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
@@ -164,7 +164,7 @@ def start(
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
-    """One step of training: pose, render, compare, improve, grow and prune. Returns words for the progress bar."""
+    """Run one training step: pose, render, compare, update, add and prune. Returns a text for the progress bar."""
     began = time.perf_counter()
     frame, epoch = data.order.at(state.step)
     progress = Progress(state.step, settings.steps, epoch)
@@ -200,7 +200,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
 
 @contextmanager
 def _one_torch_thread() -> Iterator[None]:
-    """Keep torch on one thread: its pool and the native one would wait for each other."""
+    """Keep torch on one thread: its thread pool and the native one would wait for each other."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -211,7 +211,7 @@ def _one_torch_thread() -> Iterator[None]:
 
 @contextmanager
 def _native_threads(count: int) -> Iterator[None]:
-    """Give native operations so many threads; 0 leaves them as they are."""
+    """Let native operations use `count` threads; 0 changes nothing."""
     before = _native.thread_count()
     if count > 0:
         _native.set_thread_count(count)
@@ -224,7 +224,7 @@ def _native_threads(count: int) -> Iterator[None]:
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C into a question that is asked between steps, so that no step is left half done."""
+    """Turn Ctrl-C into a function that reports it between steps, so that no step is left half done."""
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield asked.is_set

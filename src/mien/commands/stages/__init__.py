@@ -1,1 +1,1 @@
-"""The stages as the command line runs them: each reads its folders, skips what is current, writes its own folder."""
+"""The stages as the command line runs them: each reads its folders, skips current results, writes its own folder."""

@@ -1,4 +1,4 @@
-"""Video -> Capture, as the command line runs it."""
+"""From a video to captures, as the command line runs it."""
 
 from pathlib import Path
 
@@ -12,10 +12,10 @@ from mien.workspace import Workspace
 def capture_stage(
     workspace: Workspace, video: Path, name: str | None, settings: CaptureSettings, replace: bool = False
 ) -> list[str]:
-    """Capture a video into the workspace; returns the names of its sequences (one for each part).
+    """Capture a video into the workspace; return the names of its sequences, one for each part.
 
     Raises:
-        UserError: the video is bad, or a sequence of that name was made from something else and not `replace`.
+        UserError: the video is bad, or without `replace` a sequence of that name was made from another source.
     """
     name = sequence_name(video, name)
     check_writable(workspace.root, folder=True)

@@ -1,4 +1,4 @@
-"""Avatar + motion -> pictures, as the command line runs it."""
+"""From an avatar and a motion to pictures, as the command line runs it."""
 
 import itertools
 from collections.abc import Callable
@@ -34,27 +34,27 @@ from mien.workspace import Workspace, open_workspace
 
 @dataclass(frozen=True, eq=False)
 class Driver:
-    """Who is followed."""
+    """The driver of an avatar."""
 
     face: FaceParams
     at_rest: FaceParams
-    """One timestep."""
+    """The driver at rest, as one timestep."""
     fps: float
     pictures: Callable[[int], np.ndarray] | None
-    """The driver's picture at a timestep; None where there are none."""
+    """Returns the driver's picture at a timestep. None if there are no pictures."""
 
 
 def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None) -> Driver:
-    """A driver from a workspace, a video (captured and tracked, and kept for the next time), a csv or a json file.
+    """Open a driver: a workspace, a video (captured, tracked and kept in the cache), or a csv or json file.
 
     Args:
-        by: whichever of these.
-        sequence: of the workspace; of a video with cuts, one of its parts instead of all in a row.
-        face_model: the avatar's.
-        fps: that the timecode of a csv counts in.
+        by: The workspace or file.
+        sequence: Name of a sequence of the workspace. For a video with cuts: one part instead of all parts in a row.
+        face_model: The avatar's face model.
+        fps: Frame rate of the timecode in a csv.
 
     Raises:
-        UserError: it is none of these, or its stages fail.
+        UserError: `by` is none of these, or a stage fails.
     """
     check_driver(by, sequence, fps)
     suffix = by.suffix.lower() if by.is_file() else ""
@@ -74,7 +74,7 @@ def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: floa
 
 
 def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
-    """Names of a video's sequences in this user's cache, captured and tracked unless they are there."""
+    """The workspace of a video in this user's cache, and its sequences. They are captured and tracked if needed."""
     workspace = Workspace(cache_folder() / "drivers" / f"{video.stem}-{file_digest(video)[:12]}")
     capture_stage(workspace, video, None, CaptureSettings())
     # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
@@ -103,22 +103,22 @@ def _driver_of(folders: list[Path]) -> Driver:
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """How a driver is followed and shown."""
+    """How the avatar follows the driver, and what is shown."""
 
     sequence: str | None = None
-    """Which of the driver's sequences."""
+    """Name of the driver's sequence."""
     head_pose: bool = True
     alone: bool = False
     fps: float | None = None
-    """That the timecode of a csv counts in."""
+    """Frame rate of the timecode in a csv."""
 
 
 def drive_stage(
     run_dir: Path, by: Path, out: Path, options: DriveOptions | None = None, picture: PictureOptions | None = None
 ) -> None:
-    """Play a run's avatar as a driver moves, the driver's pictures beside it unless `alone` or there are none."""
+    """Render a run's avatar as it follows a driver. Pictures of the driver are beside it, unless `alone` is set."""
     options, look = options or DriveOptions(), picture or PictureOptions()
-    # Whether it is many frames is not known before the driver is tracked, but a film or a sequence takes any number.
+    # The number of frames is known only after tracking, but a video or numbered pictures take any number.
     output = look.plan(out, 2)
     avatar = load_avatar(run_dir)
     driver = open_driver(by, options.sequence, avatar.face_model, options.fps)

@@ -1,4 +1,4 @@
-"""Run -> metrics, as the command line runs it."""
+"""From a run to metrics, as the command line runs it."""
 
 from collections.abc import Sequence as Items
 from pathlib import Path
@@ -24,13 +24,13 @@ def evaluation_stage(
     *,
     again: bool = True,
 ) -> dict[str, Any]:
-    """Evaluate a run on what it held out, and on other sequences' motion; returns the content of metrics.json.
+    """Evaluate a run on its held-out frames and on the motion of drivers; return the content of metrics.json.
 
     Args:
-        workspace: Where the run is.
-        run: Its name.
+        workspace: The workspace of the run.
+        run: Name of the run.
         settings: What to compute; None for the defaults.
-        drivers: Workspaces or folders of sequences whose motion drives the avatar as well.
+        drivers: Workspaces or folders of sequences that drive the avatar as well.
         again: Whether to score again what was scored with the same settings.
     """
     run_dir = workspace.run_dir(run)
@@ -51,7 +51,7 @@ def run_sequences(workspace: Workspace, run_dir: Path) -> list[Path]:
 
 
 def comparison_stage(workspaces: Items[Workspace], run: str | None, out: Path | None) -> Comparison:
-    """Compare the runs of some workspaces and write the page, in the first workspace unless told otherwise."""
+    """Compare the runs of some workspaces and write the page to `out`, by default into the first workspace."""
     roots = [workspace.root.resolve() for workspace in workspaces]
     by_name = len({root.name for root in roots}) == len(roots)
     run_dirs: dict[str, Path] = {}
@@ -70,7 +70,7 @@ def comparison_stage(workspaces: Items[Workspace], run: str | None, out: Path | 
 
 
 def _driver_folders(drivers: Items[Path]) -> list[Path]:
-    """Sequence folders: those given, and all of the workspaces given."""
+    """The folders of the given sequences, and of all sequences in the given workspaces."""
     folders: list[Path] = []
     for driver in drivers:
         if (driver / "tracking").is_dir():

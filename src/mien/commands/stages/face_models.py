@@ -15,14 +15,15 @@ from mien.tracking.regions import with_regions_by_landmarks
 
 _SUFFIXES = (".npz", ".pkl", ".pickle")
 _FIRST_PICTURES = 80
-"""Drawn of a model whose lips and brows are not known yet; then all of `EmbeddingSettings` with these painted."""
+"""Number of pictures in the first round, when lips and brows are not known. The second round paints these, and uses the
+number in `EmbeddingSettings`."""
 
 
 def face_model_of(choice: str) -> FaceModel:
-    """The face model of that name, or of that file: one in FLAME's schema is added at its first use.
+    """The face model of a name or a file. A file in FLAME's schema is added at its first use.
 
     Raises:
-        UserError: there is no such model, or the file is none.
+        UserError: there is no such model, or the file is not a face model.
     """
     path = Path(choice).expanduser()
     if path.suffix.lower() in _SUFFIXES:
@@ -36,12 +37,13 @@ def face_model_of(choice: str) -> FaceModel:
 
 
 def add_face_model_stage(path: Path, name: str | None = None, shareable: bool = False) -> FaceModel:
-    """Make a file in FLAME's schema a face model of this user's, named after the file or as told; current ones stay.
+    """Add a file in FLAME's schema to this user's face models, unless it is already there.
 
-    Its landmarks are placed by drawing it and letting the landmark detector look (some minutes, once).
+    The default name is the file's. Landmarks are placed by running the landmark detector on pictures of the model (some
+    minutes, once).
 
     Raises:
-        UserError: the file is missing, damaged or in another schema; or its name is taken.
+        UserError: the file is missing, damaged or in another schema, or the name is taken.
     """
     name = name or path.stem.lower().replace(" ", "_")
     if not name.replace("-", "").replace("_", "").isalnum():

@@ -1,4 +1,4 @@
-"""Names that become folders."""
+"""Names of sequences and runs, which become names of folders."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -12,10 +12,10 @@ from mien.terminal import plain_name
 
 
 def sequence_name(video: Path, name: str | None) -> str:
-    """`name`, or the video's name without its ending (with "_" for control characters), if it can be a folder's.
+    """`name`, or the video's name without its ending (with "_" for control characters), if a folder can have it.
 
     Raises:
-        UserError: it is empty, too long, or holds path separators or control characters.
+        UserError: the name is empty, too long, or holds path separators or control characters.
     """
     name = plain_name(video.stem) if name is None else name
     if not is_plain_name(name):
@@ -24,19 +24,20 @@ def sequence_name(video: Path, name: str | None) -> str:
 
 
 def run_name(name: str) -> str:
-    """`name`, if it can be a folder's.
+    """`name`, if a folder can have it.
 
     Raises:
-        UserError: it is empty, too long, or holds path separators or control characters.
+        UserError: the name is empty, too long, or holds path separators or control characters.
     """
     return sequence_name(Path(name), name)
 
 
 def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
-    """A name for each video: those given, or else the videos' own.
+    """A name for each video: the given names, or else the names of the videos.
 
     Raises:
-        UserError: no video, one that is not there, a wrong number of names, two alike, or one that no folder can have.
+        UserError: there is no video, a video is missing, the number of names is wrong, two names are equal, or no
+            folder can have a name.
     """
     if not videos:
         raise UserError("no video; name one or several: mien create VIDEO [VIDEO ...] --out DIR")
@@ -53,7 +54,7 @@ def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
 
 
 def doubled_videos(videos: Sequence[Path], names: Sequence[str], held_out: Sequence[str]) -> Iterator[str]:
-    """What to tell of videos with the same content: they add nothing, and one that is held out is trained on."""
+    """Yield warnings about videos with the same content: they add nothing, or training uses held-out frames."""
 
     def is_held_out(name: str) -> bool:
         # A part of a video with cuts is called NAME-1.

@@ -1,4 +1,4 @@
-"""Posed Gaussians -> pictures, as options of the command line ask."""
+"""From posed Gaussians to pictures, with the options of the command line."""
 
 from pathlib import Path
 
@@ -18,13 +18,13 @@ from mien.training import read_run_config
 
 
 def view(look: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
-    """The camera in pictures of this size."""
+    """The camera for pictures of the chosen size."""
     return fitted(camera, *look.shape(), zoom)
 
 
 @torch.no_grad()
 def draw(look: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8[np.ndarray, "h w _"]:
-    """RGB over the background, or RGBA with straight colours."""
+    """The picture as RGB over the background, or as RGBA with straight colours."""
     background = torch.tensor(look.colour()).to(gaussians.means)
     with drawable("the avatar posed like this", "choose another pose or camera, or train it again"):
         rendering = rasterize(gaussians, camera, background)
@@ -33,7 +33,7 @@ def draw(look: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8[np
 
 
 def warn_of_white(look: PictureOptions, run_dir: Path) -> None:
-    """Say so where transparency is asked of a run that has learned to lean on white."""
+    """Warn if transparent pictures are asked for but the run was trained over white."""
     if look.background == "transparent" and read_run_config(run_dir)["settings"].get("background") == "white":
         say(
             "this avatar was trained over white, and bright skin and outlines may let light through; "

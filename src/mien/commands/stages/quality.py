@@ -1,4 +1,4 @@
-"""Reference captures -> a table of figures, as the command line runs it."""
+"""From reference captures to a table of figures, as the command line runs it."""
 
 import json
 import shutil
@@ -42,10 +42,10 @@ _SCORED = EvaluationSettings(perceptual_frames=8, video_frames=0)
 
 
 def quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
-    """Walk the reference captures and print their figures; writes OUT/quality.json, quality.md and contact_sheet.png.
+    """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png.
 
     Raises:
-        UserError: a capture or the method is unknown, or another process walks them in the same folder.
+        UserError: a capture or the method is unknown, or another process is running them in the same folder.
     """
     references = [reference_named(name) for name in captures or REFERENCES]
     method_named(method)
@@ -69,7 +69,7 @@ def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int
 
 
 def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
-    """All stages on one reference capture, each skipped where its result is current; its row and its pictures."""
+    """Run all stages on one reference capture and skip those with current results; return its row and its pictures."""
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
     times = _Times(workspace.root / _TIMES)
     say(f"== {reference.name}: {reference.what}")
@@ -103,7 +103,7 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
 
 
 def _capture(workspace: Workspace, drawn: Path, name: str) -> None:
-    """Capture the drawn video as a user's, or take over what was drawn by calibrated cameras."""
+    """Capture a drawn video like a user's video, or copy the capture of calibrated cameras."""
     if (drawn / "video.mp4").is_file():
         capture_stage(workspace, drawn / "video.mp4", name, CaptureSettings(cuts=False), replace=True)
         return
@@ -124,7 +124,7 @@ def _errors(workspace: Workspace, drawn: Path, name: str) -> TrackingErrors:
 
 
 class _Times:
-    """Seconds of each stage, kept over calls: a stage that had nothing to do does not overwrite what it once took."""
+    """Seconds of each stage, kept between calls. A stage with nothing to do does not overwrite its earlier time."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -135,7 +135,7 @@ class _Times:
 
     @contextmanager
     def measured(self, stage: str) -> Iterator[None]:
-        """Time what is inside."""
+        """Measure the time inside the context."""
         began = time.monotonic()
         yield
         spent = round(time.monotonic() - began, 1)
@@ -145,11 +145,11 @@ class _Times:
 
 @torch.no_grad()
 def _strip(workspace: Workspace, run: str) -> np.ndarray:
-    """Head crops of held-out pictures above, of the avatar below, side by side."""
+    """Head crops of held-out pictures in a row, above those of the avatar."""
     run_dir = workspace.run_dir(run)
     experiment: Experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
     frames = experiment.held_out_frames
-    # Not evenly spread, which with several cameras would show one camera again and again.
+    # Choose at random: evenly spread frames of several cameras could show one camera again and again.
     places = np.random.default_rng(0).choice(len(frames), _SHEET_FRAMES, replace=len(frames) < _SHEET_FRAMES)
     chosen = [frames[index] for index in np.sort(places)]
     rows = [
@@ -162,7 +162,7 @@ def _strip(workspace: Workspace, run: str) -> np.ndarray:
 
 
 def _small(image: np.ndarray) -> np.ndarray:
-    """Shrunk or enlarged into a white square."""
+    """The picture scaled into a white square."""
     scale = _SHEET_SIDE / max(image.shape[:2])
     size = tuple(max(1, round(side * scale)) for side in image.shape[1::-1])
     scaled = cv2.resize(image, size, interpolation=cv2.INTER_AREA)

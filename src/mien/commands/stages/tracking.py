@@ -1,4 +1,4 @@
-"""Captures -> Trackings, as the command line runs it: current trackings are read back."""
+"""From captures to trackings, as the command line runs it. Current trackings are read back."""
 
 import hashlib
 import json
@@ -36,11 +36,12 @@ from mien.training import outdated_sequences
 from mien.workspace import Workspace
 
 _TRACKING_RECIPE = 12
-"""Raised whenever the same captures would be tracked otherwise, so that old trackings are not taken for current."""
+"""Version of the tracking. It is raised whenever the same captures would be tracked differently, so that old trackings
+no longer count as current."""
 
 
 Overlay = Literal["auto", "all", "none"]
-"""Which frames overlay.mp4 shows."""
+"""Frames that overlay.mp4 shows."""
 
 
 def tracking_stage(
@@ -51,15 +52,14 @@ def tracking_stage(
     overlay: Overlay = "auto",
     preview: bool = False,
 ) -> dict[str, Tracking]:
-    """Track all sequences of a workspace together, with one identity; current trackings are read back.
+    """Track all sequences of a workspace together, with one identity; return the trackings by name.
 
-    The face model is given by its name or by a file (`face_model_of`). Writes overlays and, once for ever, the scoring
-    masks. Sequences with too few faces are left out, unless that leaves
-    none; returns the others' trackings by name. Nobody else may write any of the sequences meanwhile, unless all is
-    current and nothing is written.
+    Current trackings are read back. The face model is a name or a file (`face_model_of`). Writes overlays and, only
+    once, the scoring masks. Sequences with too few faces are left out, unless that would leave none. No other process
+    may write a sequence meanwhile, unless everything is current and nothing is written.
 
     Raises:
-        BeingWrittenError: another process writes one of the sequences.
+        BeingWrittenError: another process is writing one of the sequences.
     """
     face_model = face_model_of(face_model_choice)
     names = workspace.sequence_names()
@@ -83,7 +83,7 @@ def tracking_stage(
 def _finished_trackings(
     workspace: Workspace, names: list[str], face_model: FaceModel, settings: TrackingSettings, overlay: Overlay
 ) -> dict[str, Tracking] | None:
-    """The trackings, if all that the stage writes is there and current."""
+    """The trackings, if all results of the stage exist and are current."""
     try:
         fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
         trackings = _current_trackings(workspace, names, fingerprint, face_model, tell=False)
@@ -93,7 +93,7 @@ def _finished_trackings(
                 return None
             if not all(_is_shown(folder, tracking, overlay)):
                 return None
-    except UserError:  # told where it is written again
+    except UserError:  # reported when the results are written again
         return None
     return trackings
 
@@ -101,7 +101,7 @@ def _finished_trackings(
 def _write_what_follows(
     workspace: Workspace, trackings: Mapping[str, Tracking], face_model: FaceModel, overlay: Overlay
 ) -> None:
-    """Scoring masks, reports and overlays, where they are missing or older."""
+    """Write scoring masks, reports and overlays that are missing or outdated."""
     for name, tracking in trackings.items():
         folder = workspace.sequence_dir(name)
         capture_hash = read_capture_hash(folder / "capture")
@@ -126,7 +126,7 @@ def _tracking_fingerprint(
 def _current_trackings(
     workspace: Workspace, names: list[str], fingerprint: str, face_model: FaceModel, tell: bool = True
 ) -> dict[str, Tracking] | None:
-    """The trackings that are there, if they are what these captures and settings give; `tell` says why where not."""
+    """The existing trackings, if they fit these captures and settings. If not, `tell` reports why."""
     found, missing = {}, []
     for name in names:
         folder = workspace.sequence_dir(name) / "tracking"
@@ -145,7 +145,7 @@ def _current_trackings(
     if not found:
         return None
     if all(tracking.settings.get("fingerprint") == fingerprint for tracking in found.values()):
-        # Those without a tracking had too few faces, or tracking was stopped before they were written.
+        # Sequences without a tracking had too few faces, or tracking was stopped before theirs were written.
         return None if set(missing) & together else found
     if not tell:
         return None
@@ -171,7 +171,7 @@ def _track(
     keep = workspace.root / "sequences" / f".tracking-{fingerprint}"
     for other in workspace.root.glob("sequences/.tracking-*"):
         if other != keep and other.is_dir():
-            remove_tree(other)  # of other captures or settings
+            remove_tree(other)  # kept for other captures or settings
     page = workspace.root / "tracking_preview.html" if preview else None
     if page is not None:
         say(f"Open {page} in a browser: it is renewed while the fit goes on")
@@ -189,7 +189,7 @@ def _track(
 def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking]) -> None:
     outdated = []
     for run in workspace.run_names():
-        # A damaged run is told where it is used.
+        # A damaged run is reported when it is used.
         with suppress(UserError):
             if outdated_sequences(workspace.run_dir(run), trackings):
                 outdated.append(run)
@@ -201,7 +201,7 @@ def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking])
 
 
 def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, overlay: Overlay) -> None:
-    """Write the residual report and overlay.mp4, unless those there are newer than the tracking."""
+    """Write the residual report and overlay.mp4, unless they are newer than the tracking."""
     reported, shown = _is_shown(folder, tracking, overlay)
     if reported and shown:
         return
@@ -219,7 +219,7 @@ def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, over
 
 
 def _is_shown(folder: Path, tracking: Tracking, overlay: Overlay) -> tuple[bool, bool]:
-    """Whether the residual report, and the overlay that is asked for, are there and newer than the tracking."""
+    """Whether the residual report and the chosen overlay exist and are newer than the tracking."""
     video, report, written = (folder / "tracking" / name for name in ("overlay.mp4", "report.html", "tracking.json"))
     if overlay == "none":
         return _is_newer(report, written), True
@@ -228,7 +228,7 @@ def _is_shown(folder: Path, tracking: Tracking, overlay: Overlay) -> tuple[bool,
 
 
 def _stride(tracking: Tracking, overlay: Overlay) -> int:
-    """The overlay shows every so many-th frame."""
+    """The n for which the overlay shows every n-th frame."""
     return overlay_stride(len(tracking.valid)) if overlay == "auto" else 1
 
 

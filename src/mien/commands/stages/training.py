@@ -1,4 +1,4 @@
-"""Sequences -> a run, as the command line runs it."""
+"""From sequences to a run, as the command line runs it."""
 
 from mien.avatar import MethodConfig
 from mien.face import FaceModel, load_face_model
@@ -19,7 +19,7 @@ from mien.workspace import Workspace
 def training_stage(
     workspace: Workspace, sequences: list[str], run: str, method: MethodConfig, settings: TrainSettings
 ) -> None:
-    """Train a run on some sequences of the workspace; a finished or interrupted one goes on where it was."""
+    """Train a run on some sequences of the workspace. An interrupted run continues; a finished run stays as it is."""
     run_dir = workspace.run_dir(run)
     check_untouched(run_dir)
     folders = [workspace.sequence_dir(name) for name in sequences]
