@@ -40,7 +40,7 @@ def sheet_frames(tracking: Tracking, flagged: Sequence[int], alone: Sequence[int
     Args:
         tracking: The tracking. At least one of its frames has a face.
         flagged: Timesteps that stand out. Those with the largest residuals are shown, each from its worst camera.
-        alone: Timesteps tracked from landmarks alone. If half of all timesteps or more are, none is shown for it.
+        alone: Timesteps tracked from landmarks alone. If they are half of those with a face or more, none is shown.
     """
     frontal, valid = frontal_camera(tracking), tracking.valid.nonzero()[:, 0]
     even = valid[torch.linspace(0, len(valid) - 1, min(_EVEN, len(valid))).round().long()].tolist()
