@@ -23,8 +23,8 @@ def render_gsplat(
 ) -> Rendering:
     """Render one view of unbatched CUDA Gaussians, given in the camera's world.
 
-    It calls gsplat's single steps instead of its `rasterization`, to add `means2d_offset` between projection and
-    blending, so that the offset collects the gradient of the centres.
+    It calls gsplat's single steps instead of its `rasterization`, because `means2d_offset` is added between projection
+    and blending, where it collects the gradient of the centres.
     """
     gsplat = _import_gsplat()
     if not gaussians.means.is_cuda or gaussians.means.dtype != torch.float32:

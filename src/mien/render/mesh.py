@@ -96,7 +96,7 @@ def interpolate(
 def interpolate_reference(
     fragments: MeshFragments, attributes: Float[Tensor, "a c"], corners: Int[Tensor, "f 3"]
 ) -> Float[Tensor, "h w c"]:
-    """`interpolate` in plain PyTorch, for any dtype. `corners` are rows of `attributes` for every triangle."""
+    """`interpolate` in plain PyTorch, for any dtype. `corners` has the three rows of `attributes` of each triangle."""
     covered = fragments.face_index >= 0
     values = attributes[corners[fragments.face_index[covered].long()]]
     weights = fragments.barycentric[covered].to(attributes)

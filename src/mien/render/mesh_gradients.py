@@ -2,7 +2,7 @@
 
 There are single operations (`image_points`, `differentiable_fragments`, `interpolate`, `sample_texture`, `antialias`)
 and one that combines them with light and a robust loss in a single pass (`mesh_loss`). Each has a twin in plain PyTorch
-in `mien.render.mesh_reference`. They run on one thread, release the GIL, and are the same to the bit in every run.
+in `mien.render.mesh_reference`. They run on one thread, release the GIL, and are deterministic to the bit.
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ class LitMesh:
     face_weights: Float[Tensor, " f"]
     """Weight of each triangle's pixels. It is 0 for a triangle that only hides what is behind it."""
     edges: MeshEdges
-    """The edges with silhouettes that receive gradients."""
+    """Edges at which silhouettes are antialiased, so that the loss can move them."""
 
 
 def mesh_edges(faces: Int[Tensor, "f 3"], used: Tensor | None = None) -> MeshEdges:

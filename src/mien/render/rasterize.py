@@ -1,4 +1,4 @@
-"""`rasterize`: it turns Gaussians and cameras into pictures, chooses the back end and unrolls batches."""
+"""The function `rasterize` turns Gaussians and cameras into pictures. It chooses the back end and unrolls batches."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

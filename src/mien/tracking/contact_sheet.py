@@ -15,7 +15,7 @@ from mien.tracking.overlay import OverlayPainter, frontal_camera
 from mien.tracking.tracking import Tracking
 
 _EVEN, _MOST_FLAGGED, _MOST_ALONE = 8, 8, 4
-"""Number of evenly spread frames, and most flagged frames and most frames tracked from landmarks alone."""
+"""Largest numbers of evenly spread frames, of flagged frames, and of frames tracked from landmarks alone."""
 _TILE = 240
 """Side of each tile, in pixels."""
 _STRIPS = 2

@@ -1,4 +1,4 @@
-"""Systematic offsets of a landmark detector from the landmarks of a face model: measured once, expected by the tracker.
+"""Systematic offsets of a landmark detector from the landmarks of a face model, measured once for the tracker.
 
 The embedding gives the point of the surface for each landmark. But a detector has habits. It puts the chin where its
 annotators did, closes eyelids too late, turns heads too little, and gets the shape of every person slightly wrong.
@@ -30,7 +30,7 @@ class DetectorResponse:
 
     mean: Float[Tensor, "l 3"]
     by_turn: Float[Tensor, "2 l 3"]
-    """Offset per radian of the x and y components of the head rotation (roughly pitch and yaw) to the camera."""
+    """Offset per radian of the x and y components (roughly pitch and yaw) of the head rotation seen by the camera."""
     by_expression: Float[Tensor, "e l 3"]
     """Offset per unit of each expression coefficient."""
     by_person: Float[Tensor, "k l 3"]

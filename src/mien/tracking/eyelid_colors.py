@@ -20,8 +20,8 @@ _ROUNDS = 20
 _SAMPLES = 20_000
 _LEAST_SAMPLES = 100
 _COLOR_SIGMA, _SKIN_SIGMA = 0.15, 0.15
-"""Standard deviations of logarithms of colours: about each colour of a palette, and of plain skin on the lids in
-addition to that of the skin around the eye."""
+"""Standard deviations of logarithms of colours. The first is about each colour of a palette. The second is that of
+plain skin on the lids, in addition to the spread of the skin around the eye."""
 _EDGE_SHARE = 0.1
 """Share of plain skin that may have any colour of the edge palette: moles, folds, make-up."""
 _EYE_SHARE = 0.2

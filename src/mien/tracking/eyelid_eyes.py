@@ -14,13 +14,13 @@ from mien.tracking.parameters import ParameterLayout
 from mien.tracking.photometric_texture import HIDING_REGIONS
 
 _LIDS_REACH, _AROUND_REACH = 1.3, 3.5
-"""Distance from an eyeball's centre within which its lids lie, and everything that may hide it, in radii."""
+"""Distances from an eyeball's centre that contain its lids, and everything that may hide it, in radii."""
 _STEPS = 64
 """Number of equal steps of a coefficient. Lids touch at the first step at which the least of the eyeball is seen."""
 _MOST_CLOSING = 1.25
 """A coefficient closes an eye if the lids meet within this multiple of its upper bound."""
 _OTHERS_SHARE = 0.2
-"""A coefficient that moves the other eye's lids by more than this share belongs to neither eye alone."""
+"""A coefficient is not an eye's own if it moves the other eye's lids by more than this share."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Trust in the landmarks of several cameras that see a head at once: the head's direction decides.
+"""Trust in the landmarks of several cameras that see a head at once, by the head's direction.
 
 In pictures from the side a detector guesses the far half of the face, and its landmarks of the near half change with
 the view. A single camera is fully trusted, because the effect of turns on landmarks was measured for that case

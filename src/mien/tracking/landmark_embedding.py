@@ -230,7 +230,7 @@ def _errors(
     views: Views, corners: Int[Tensor, "t 3"], weights: Float[Tensor, "p 3"], landmark: int
 ) -> Float[Tensor, "n t p"]:
     """Distances in pixels of points of triangles from the detected landmark in each view."""
-    # Weights times depth give the projected point as a mixture of the projected corners.
+    # The pixel of a point on a triangle is the mean of its corners' pixels, weighted by barycentrics times depth.
     scaled = weights * views.depth[:, corners][:, :, None]
     scaled = scaled / scaled.sum(-1, keepdim=True)
     points = scaled @ views.vertices[:, corners]

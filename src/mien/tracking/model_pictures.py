@@ -54,7 +54,7 @@ class Comparison:
     window: Window
 
     image: Float[Tensor, "h w 3"]
-    """The model's colours, 0..1, with smooth differences of light corrected to the picture; NaN where not compared."""
+    """The model's colours, 0..1, plus the smooth differences of light to the picture; NaN where not compared."""
     difference: Float[Tensor, "h w"]
     """Length of the difference of the three colours; NaN where not compared."""
     rms: float

@@ -1,8 +1,8 @@
 """The cost of a head's outline: the distance from the mesh's outline to the edge of the matte.
 
-Landmarks and texture lie on the face. The distance from it at which ears and sides of the jaw appear shows the
-perspective, and with it the focal length and the direction of the head. Points of the mesh's outline are drawn to the
-nearest edge of the matte along the outline's normal.
+Landmarks and texture lie on the face. How far from it the ears and the sides of the jaw appear shows the perspective,
+and with it the focal length and the direction of the head. Points of the mesh's outline are pulled to the nearest edge
+of the matte along the outline's normal.
 """
 
 from dataclasses import dataclass
@@ -137,7 +137,7 @@ class OutlineTerm:
         return slopes[seen].double(), distance[seen].double(), weights.double(), cost
 
     def outline(self, vertices: Float[Tensor, "v 3"], camera: Camera) -> Outline:
-        """The points at which the drawn mesh ends and something else begins."""
+        """The points of the mesh's outline against the background."""
         faces = self.model.face_model.faces
         pixels, _ = camera.project(vertices)
         first, second, third = pixels[faces].unbind(1)

@@ -35,7 +35,7 @@ _RATES = {"lights": "light", "log_focals": "focal"}
 _GLOBAL_RATE, _EPOCH_DECAY = 0.1, 0.9
 """Factor of the initial learning rates in the first epoch, and decay from one epoch to the next."""
 _GOOD_COSINE = 0.5
-"""Cosine of the viewing angle from which a triangle's texels count fully. Below it they count in proportion."""
+"""Least cosine of the viewing angle at which a triangle's texels count fully. Below it they count in proportion."""
 _BATCHES = 40
 """Largest number of batches in an epoch. Frames err alike, so longer clips need no more steps of shared parameters."""
 _AT_ONCE = 16

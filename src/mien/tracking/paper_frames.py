@@ -1,4 +1,4 @@
-"""The start of the global epochs of the `paper` schedule: texture and light, and the pass along the frames."""
+"""The steps before the global epochs of the `paper` schedule: the pass along the frames, then texture and light."""
 
 from collections.abc import Sequence
 from dataclasses import replace

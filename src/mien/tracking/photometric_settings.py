@@ -34,8 +34,8 @@ class PhotometricSettings:
     focal_sigma: Annotated[float, POSITIVE] = 0.04
     """Standard deviation of the logarithm of an unknown focal length from that of the fit to landmarks."""
     outline_weight: Annotated[float, NOT_NEGATIVE] = 10.0
-    """Weight of the outline of a head against the background in a keyframe; 0 switches it off. It is used for a single
-    camera only, to which it shows perspective."""
+    """Weight of the outline of a head against the background in a keyframe; 0 switches it off. It is used only with a
+    single camera, which needs the outline to see perspective."""
     independent_pixels: Annotated[float, POSITIVE] = 100.0
     """Number of independent pixels that all pixels of a picture are worth, because their errors are correlated. It
     weighs them against landmarks and priors in the steps of identity and focal length, which use many pictures."""

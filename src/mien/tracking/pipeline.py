@@ -126,7 +126,7 @@ def _without_turn_habits(model: LandmarkModel, shots: Sequence[Shot], fit: Fit, 
 
 def _response(face_model: FaceModel, shots: Sequence[Shot], settings: TrackingSettings) -> DetectorResponse:
     response = read_response(face_model, settings.bias_sigma)
-    # The response to turns was measured with one camera. It follows the head's rotation only with a single camera.
+    # The response to turns was measured for one camera. With several cameras no one of them defines the turn.
     return response if all(len(shot.cameras) == 1 for shot in shots) else response.without_turns()
 
 

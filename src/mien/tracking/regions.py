@@ -19,8 +19,8 @@ _LIP_DEPTH, _LID_WIDTH = 0.008, 0.006
 _MOUTH_REACH, _SOCKET_REACH = 0.075, 0.025
 """Largest distances of the mouth's inside from the middle of the lips, and of a socket from its eyeball, in metres."""
 _HAIRLINE, _NECK = 0.010, 0.030
-"""Height of the hairline above the forehead's highest landmark, and depth of the neck's start below the chin, measured
-to a plane slanted like the jaw. Metres."""
+"""Height of the hairline above the forehead's highest landmark, and distance of the neck below the chin, measured to a
+plane slanted like the jaw. Both are in metres."""
 
 
 def with_regions_by_landmarks(model: FaceModel) -> FaceModel:

@@ -42,7 +42,7 @@ _WAYS = {
 def write_report_page(
     folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict[str, Any]
 ) -> None:
-    """Write report.html into `folder`. Except for the overlay video it is complete in one file.
+    """Write report.html into `folder`. Except for the overlay video, the page is complete in one file.
 
     Args:
         folder: Folder of the tracking, which has residuals.png already.

@@ -39,8 +39,8 @@ class TrackingSettings:
 
     focal: float | None = None
     """Focal length in pixels of the capture's pictures, if known. The default is 1.5 times the larger side of the
-    source picture, or 2.2 times the side of a square one, which was cut out of a larger one. The fit may change the
-    default a little, because landmarks of a face hardly determine it. Calibrated cameras keep their own."""
+    source picture, or 2.2 times the side of a square picture, which must be a crop. The fit changes the default only a
+    little, because landmarks of a face hardly determine it. Calibrated cameras keep their own."""
     same_camera: bool = False
     """Whether all sequences were filmed with the same camera and zoom, so that they share one focal length."""
     landmarks: LandmarkSet = "mediapipe"

@@ -20,11 +20,11 @@ _LEAST_FRAMES = 3
 _DEFAULT_FOCAL = 1.5
 """Assumed focal length in larger sides of the source picture: between a phone's wide lens and a portrait lens."""
 _CROPPED_FOCAL = 2.2
-"""Assumed focal length of a nearly square picture. No camera films squares, so it was cut out around a head."""
+"""The same for a nearly square picture. No camera films squares, so the picture was cropped around a head."""
 _SQUARE = 1.1
 """Ratio of sides below which a picture counts as square."""
 _FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-"""T_camera_head of a head that looks straight against the camera's direction, placed at the camera's centre."""
+"""T_camera_head of a head that looks towards the camera, but is placed at the camera's centre."""
 
 
 @dataclass(frozen=True, eq=False)

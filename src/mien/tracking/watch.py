@@ -17,4 +17,4 @@ class Watch(Protocol):
 
 
 def nobody(stage: str, progress: float, look: Callable[[], object] | None = None) -> None:
-    """Ignore the progress: the observer if there is none."""
+    """Ignore the progress. This is the `Watch` of a fit that nobody watches."""
