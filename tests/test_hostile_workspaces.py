@@ -565,12 +565,6 @@ def test_kept_pieces_of_a_tracking_that_are_of_no_use(
     monkeypatch.setattr(pipeline, "_track_subject", fit)
     capture = read_capture(workspace / "sequences" / "clip" / "capture")
     arguments: Any = ([capture], toy_face_model(), TrackingSettings(), keep, None)
-        [read_capture(workspace / "sequences" / "clip" / "capture")],
-        toy_face_model(),
-        TrackingSettings(),
-        keep,
-        None,
-    )
     assert track_subject(*arguments) == []
     assert seen == [True, False]
     assert "starts again" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Motion recorded by other programs: one named reader a convention."""
+"""Motion recorded by other programs, with one reader for each format."""
 
 from mien.motion.blendshape_json import read_blendshape_json
 from mien.motion.live_link_face import read_live_link_face

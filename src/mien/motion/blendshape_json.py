@@ -1,10 +1,13 @@
-"""Blend shapes as json: our plain list of frames, and MediaPipe FaceLandmarker's own results.
+"""Blend shapes as json: a plain list of frames, or the results of MediaPipe's FaceLandmarker.
 
-Plain: [{"timestamp_ms": 0, "blendshapes": {"jawOpen": 0.3, ...}}, ...]; names that are absent are 0.
-FaceLandmarker: one result or a list of them as its JavaScript gives them, with "timestamp_ms" (or "timestampMs") added:
-{"faceBlendshapes": [{"categories": [{"categoryName": .., "score": ..}, ...]}],
- "facialTransformationMatrixes": [{"rows": 4, "columns": 4, "data": [16 numbers, column by column]}]}; centimetres,
-OpenGL axes. Only the first face counts. A frame without a face repeats the one before.
+The plain format is [{"timestamp_ms": 0, "blendshapes": {"jawOpen": 0.3, ...}}, ...]. Missing names are 0.
+
+The FaceLandmarker format is one result of its JavaScript API or a list of them, with "timestamp_ms" (or "timestampMs")
+added: {"faceBlendshapes": [{"categories": [{"categoryName": .., "score": ..}, ...]}],
+ "facialTransformationMatrixes": [{"rows": 4, "columns": 4, "data": [16 numbers, column by column]}]}. Matrices are in
+centimetres, with OpenGL axes. Only the first face counts.
+
+A frame without a face repeats the frame before it.
 """
 
 import difflib
@@ -23,19 +26,19 @@ _NO_EXPRESSION = "_neutral"
 _DEFAULT_FPS = 30.0
 _CENTIMETRE = 0.01
 _FARTHEST = 1e6
-"""Centimetres."""
+"""Largest number in a transformation matrix (translations are in centimetres)."""
 _LATEST = 1e15
-"""Milliseconds: thirty thousand years, so that every clock's zero will do."""
+"""Largest timestamp in milliseconds: thirty thousand years, so the zero of any clock is accepted."""
 _SHOWN = 80
-"""Characters of a value that a message shows."""
+"""Largest number of characters of a value that a message shows."""
 
 
 def read_blendshape_json(path: Path) -> Motion:
-    """Motion from json of blend shapes.
+    """Read motion from blend shapes as json.
 
     Raises:
-        UserError: the file cannot be read or is neither kind of json, a name is unknown, a score is NaN or out of
-            range, or times do not increase (naming the frame).
+        UserError: The file cannot be read or has neither format, a name is unknown, a score is NaN or out of range, or
+            times do not increase. The message names the frame.
     """
     try:
         check_size(path)
@@ -69,10 +72,12 @@ def read_blendshape_json(path: Path) -> Motion:
 
 
 def from_face_landmarker(frame: dict[str, Any], where: str) -> tuple[dict[str, Any] | None, np.ndarray | None]:
-    """Scores by name and T_camera_face [4, 4] (centimetres, OpenGL axes) of a result's first face, where it has one.
+    """Scores by name and T_camera_face [4, 4] (centimetres, OpenGL axes) of the first face in a result.
+
+    Either is None if the result does not have it.
 
     Raises:
-        UserError: it is laid out otherwise.
+        UserError: The result has another layout, or its matrix holds NaN or huge numbers.
     """
     try:
         faces, poses = frame["faceBlendshapes"], frame.get("facialTransformationMatrixes") or []
@@ -107,7 +112,7 @@ def _row(scores: dict[str, Any], where: str) -> np.ndarray:
 
 
 def _seconds(frames: list[dict[str, Any]], path: Path) -> np.ndarray:
-    """Times of the frames; none of them has one: 30 a second."""
+    """Times of the frames in seconds. If no frame has a time, there are 30 frames per second."""
     stamps = [frame.get("timestamp_ms", frame.get("timestampMs")) for frame in frames]
     if all(stamp is None for stamp in stamps):
         return np.arange(len(frames)) / _DEFAULT_FPS
@@ -120,9 +125,9 @@ def _seconds(frames: list[dict[str, Any]], path: Path) -> np.ndarray:
 
 
 def _short(value: object) -> str:
-    """A value as messages show it."""
+    """A value as messages show it, cut to `_SHOWN` characters."""
     try:
         text = repr(value)
-    except ValueError:  # thousands of digits
+    except ValueError:  # Python refuses to print integers with thousands of digits.
         text = f"a number of {type(value).__name__} with thousands of digits"
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."

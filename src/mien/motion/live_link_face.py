@@ -1,10 +1,10 @@
-"""Live Link Face: the csv that the iPhone app writes of ARKit's blend shapes.
+"""Live Link Face: the csv of ARKit blend shapes that the iPhone app writes.
 
-Columns: Timecode (HH:MM:SS:FF.fraction), BlendshapeCount, 52 coefficients with a capital first letter (EyeBlinkLeft),
-then optionally HeadYaw, HeadPitch, HeadRoll and Yaw, Pitch, Roll of LeftEye and RightEye. Angles are radians, in the
-order yaw, pitch, roll: yaw positive to the subject's right, pitch down, roll to the subject's left shoulder. These are
-Unreal's angles of ARKit's transforms; signs and order of the eyes' were checked on real takes, by the eyeLook
-coefficients beside them, and the head's are taken to be the same.
+The columns are Timecode (HH:MM:SS:FF.fraction), BlendshapeCount, 52 coefficients with a capital first letter
+(EyeBlinkLeft), then optionally HeadYaw, HeadPitch, HeadRoll and Yaw, Pitch, Roll of LeftEye and RightEye. Angles are in
+radians, in the order yaw, pitch, roll. Yaw is positive to the subject's right, pitch downwards, roll to the subject's
+left shoulder. These are Unreal's angles of ARKit's transforms. Their signs and order were checked for the eyes on real
+takes, against the eyeLook coefficients; those of the head are assumed to be the same.
 """
 
 import csv
@@ -24,19 +24,20 @@ _TIMECODE = re.compile(r"([0-9]{1,4}):([0-9]{1,2}):([0-9]{1,2})[:;]([0-9]{1,4})(
 _RATES = (24, 25, 30, 48, 50, 60, 90, 120, 240)
 _USUAL_RATE = 60
 _SHOWN = 40
-"""Characters of a cell that a message shows."""
+"""Largest number of characters of a cell that a message shows."""
 
 
 def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
-    """Motion from a csv of Live Link Face. Rows without a face (count 0) repeat the row before.
+    """Read motion from a csv of Live Link Face. Rows without a face (count 0) repeat the row before.
 
     Args:
-        path: of the csv.
-        fps: of the timecode; by default the smallest usual rate above its highest frame number, or 60 for takes of
-            less than a second.
+        path: The csv file.
+        fps: Frames per second of the timecode. The default is the smallest usual rate above its highest frame number,
+            or 60 for takes of less than a second.
 
     Raises:
-        UserError: the file cannot be read, lacks columns, or a value is missing, NaN or out of range (naming the line).
+        UserError: The file cannot be read, lacks columns, or a value is missing, NaN or out of range. The message names
+            the line.
     """
     header, lines = _read_rows(path)
     columns = {name.strip().lower(): index for index, name in enumerate(header)}
@@ -77,7 +78,7 @@ _SIDES = ("Left", "Right")
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The header, and the other rows that are not empty with their line numbers."""
+    """The header, and all further rows that are not empty, with their line numbers."""
     try:
         check_size(path)
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -91,7 +92,7 @@ def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def _has_face(row: list[str], columns: dict[str, int], width: int) -> bool:
-    """The app writes a count of 0, with or without zeros behind it, where it lost the face."""
+    """Whether a row has a face. If the face is lost, the app writes a count of 0, with or without zeros after it."""
     count = columns.get("blendshapecount")
     return not (count is not None and count < len(row) and row[count].strip() == "0" and len(row) <= width)
 
@@ -113,7 +114,7 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
 
 
 def _short(text: str, *, bare: bool = False) -> str:
-    """A cell as messages show it."""
+    """A cell as messages show it, cut to `_SHOWN` characters."""
     cut = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
     return cut if bare else repr(cut)
 
@@ -142,7 +143,7 @@ def _seconds(path: Path, timecodes: list[tuple[int, str]], fps: float | None) ->
 
 
 def _turned(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """Axis-angle of yaw, then pitch, then roll about the turned axes, in the frame of `Motion`."""
+    """Axis-angle rotation of yaw, then pitch, then roll about the turned axes, in the frame of `Motion`."""
     x, y, z = np.eye(3)
     turn = [matrix_from_axis_angle(angle[:, None] * axis) for angle, axis in ((yaw, -y), (pitch, x), (roll, -z))]
     return axis_angle_from_matrix(turn[0] @ turn[1] @ turn[2]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Motion: what a driver's face does over time, in ARKit's terms, whatever recorded it."""
+"""Motion of a driver's face over time, in ARKit's terms, from any recorder."""
 
 import math
 import stat
@@ -25,33 +25,35 @@ ARKIT_NAMES = (
 """ARKit's 52 blend shapes, in the order of Live Link Face's columns."""
 
 LOOK_ANGLE = math.radians(30)
-"""How far an eye turns for an eyeLook coefficient of 1; Apple names no angle, and this is about as far as eyes go."""
+"""Rotation of an eye for an eyeLook coefficient of 1, in radians. Apple gives no angle; this is about the most that
+eyes turn."""
 LONGEST_GAP = 60.0
-"""Seconds between two moments that are filled by a straight line; more is another recording."""
+"""Longest gap between two moments, in seconds, that is interpolated. A longer gap means another recording."""
 MOST_MOMENTS = 500_000
-"""Two hours at 60 a second."""
+"""Largest number of moments in a recording: about two hours at 60 per second."""
 LARGEST_FILE = 128 << 20
-"""Bytes of a recording; an hour of Live Link Face has as many."""
+"""Largest recording that is read, in bytes. An hour of Live Link Face has about this size."""
 SMALLEST, LARGEST = -0.5, 1.5
-"""Coefficients go from 0 to 1; programs that calibrate or exaggerate go a little beyond."""
+"""Bounds of a coefficient. They go from 0 to 1, and a little beyond in programs that calibrate or exaggerate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A face at t evenly spaced moments; the driver's face at rest is all zeros."""
+    """A face at t evenly spaced moments. The driver's face at rest is all zeros."""
 
     fps: float
-    """Moments a second."""
+    """Moments per second."""
     coefficients: Float32[np.ndarray, "t 52"]
-    """Of `ARKIT_NAMES`, 0..1."""
+    """Coefficients of `ARKIT_NAMES`, 0..1."""
     eyes: Float32[np.ndarray, "t 2 3"]
-    """Axis-angle of left and right eye in the head frame, radians (+x to the subject's left, +y up, +z ahead)."""
+    """Axis-angle rotations of left and right eye in the head frame (+x to the subject's left, +y up, +z ahead), in
+    radians."""
     head_rotation: Float32[np.ndarray, "t 3"]
-    """Axis-angle of the head in the world (+y up, +z towards the camera), radians; zeros where nothing is known."""
+    """Axis-angle rotation of the head in the world (+y up, +z towards the camera), in radians; zeros if unknown."""
     head_translation: Float32[np.ndarray, "t 3"]
-    """Metres; zeros where nothing is known."""
+    """Translation of the head in metres; zeros if unknown."""
     lost: int
-    """Moments at which no face was found: they repeat the one before."""
+    """Number of recorded frames without a face. They repeat the frame before."""
 
     def __len__(self) -> int:
         """The number of moments, t."""
@@ -59,7 +61,7 @@ class Motion:
 
 
 def gaze_of(coefficients: Float32[np.ndarray, "t 52"]) -> Float32[np.ndarray, "t 2 3"]:
-    """How the eyes turn for eyeLook coefficients: down is positive about x, to the subject's left about y."""
+    """Rotations of the eyes for eyeLook coefficients: positive about x is down, about y to the subject's left."""
     look = {name: coefficients[:, index] for index, name in enumerate(ARKIT_NAMES) if name.startswith("eyeLook")}
     eyes = np.zeros((len(coefficients), 2, 3), np.float32)
     for index, (side, left, right) in enumerate((("Left", "Out", "In"), ("Right", "In", "Out"))):
@@ -69,9 +71,9 @@ def gaze_of(coefficients: Float32[np.ndarray, "t 52"]) -> Float32[np.ndarray, "t
 
 
 def evenly(seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]) -> tuple[float, Float[np.ndarray, "t c"]]:
-    """Frames a second and rows at even spacing: as they are if they are even already, else interpolated linearly.
+    """Frames per second and evenly spaced rows. Rows that are even already stay; others are interpolated linearly.
 
-    `seconds` increases strictly.
+    `seconds` must increase strictly.
     """
     if len(rows) < 2:
         return 30.0, rows
@@ -84,11 +86,11 @@ def evenly(seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]) -> 
 
 
 def check_size(path: Path) -> None:
-    """Refuse a recording that would fill the memory, or that would be waited for, before it is opened.
+    """Refuse a recording that is too large for the memory, or that would never end, before it is opened.
 
     Raises:
-        UserError: it has more than `LARGEST_FILE` bytes, or is a pipe, a device or a folder.
-        OSError: it is missing.
+        UserError: The file has more than `LARGEST_FILE` bytes, or is a pipe, a device or a folder.
+        OSError: The file is missing.
     """
     if not stat.S_ISREG(path.stat().st_mode):
         raise UserError(f"{path}: is no ordinary file; copy it to one")
@@ -97,14 +99,14 @@ def check_size(path: Path) -> None:
 
 
 def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -> None:
-    """Refuse times that `evenly` would fill with moments that nobody recorded.
+    """Refuse times for which `evenly` would make up too many moments.
 
     Args:
-        seconds: increasing strictly.
-        where: names a row's place in its file.
+        seconds: The times, which increase strictly.
+        where: Returns the name of a row's place in its file.
 
     Raises:
-        UserError: a gap is longer than `LONGEST_GAP`, or there would be more than `MOST_MOMENTS`.
+        UserError: A gap is longer than `LONGEST_GAP`, or there would be more than `MOST_MOMENTS`.
     """
     steps = np.diff(seconds)
     longest = int(np.argmax(steps)) if len(steps) else 0
@@ -122,6 +124,6 @@ def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -
 
 
 def held(rows: Float[np.ndarray, "r c"], found: np.ndarray) -> Float[np.ndarray, "r c"]:
-    """Rows where no face was found repeat the last one before them (the first found one, at the start)."""
+    """The rows, with each row without a face replaced by the last one before it (at the start, by the first one)."""
     last = np.maximum.accumulate(np.where(found, np.arange(len(rows)), -1))
     return rows[np.where(last < 0, int(np.argmax(found)), last)]

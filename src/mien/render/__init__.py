@@ -1,4 +1,4 @@
-"""render."""
+"""Pictures of Gaussians and of meshes, with gradients."""
 
 from mien.render.mesh import (
     Headlight,

@@ -1,4 +1,4 @@
-"""CUDA: one view through gsplat's kernels, with the contract of the other back ends."""
+"""The CUDA back end: one view through gsplat's kernels, with the same interface as the other back ends."""
 
 import math
 from types import ModuleType
@@ -15,16 +15,16 @@ from mien.render.rendering import Rendering
 from mien.render.validation import check_finite
 
 _TILE = 16
-"""Pixels; what gsplat's kernels are tuned for."""
+"""Side of a tile in pixels, for which gsplat's kernels are tuned."""
 
 
 def render_gsplat(
     gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], means2d_offset: Float[Tensor, "n 2"]
 ) -> Rendering:
-    """One view of unbatched CUDA Gaussians given in the camera's world.
+    """Render one view of unbatched CUDA Gaussians, given in the camera's world.
 
-    gsplat's single steps are called instead of its `rasterization`, so that `means2d_offset` can be added between
-    projection and blending and collects the gradient of the centres.
+    It calls gsplat's single steps instead of its `rasterization`, because `means2d_offset` is added between projection
+    and blending, where it collects the gradient of the centres.
     """
     gsplat = _import_gsplat()
     if not gaussians.means.is_cuda or gaussians.means.dtype != torch.float32:
@@ -43,7 +43,7 @@ def render_gsplat(
     degree = math.isqrt(gaussians.sh.shape[-2]) - 1
     directions = (means - camera_position)[None]
     colors = gsplat.spherical_harmonics(degree, directions, gaussians.sh[None].contiguous(), masks=visible)
-    # The next step makes the host wait for the number of pairs, so that asking here, once, costs next to nothing.
+    # The next step makes the host wait for the number of pairs anyway, so this check costs almost nothing here.
     check_finite(gaussians, camera, background)
     columns, rows = math.ceil(camera.width / _TILE), math.ceil(camera.height / _TILE)
     _, intersections, flat_ids = gsplat.isect_tiles(
@@ -59,16 +59,16 @@ def render_gsplat(
 
 @torch.no_grad()
 def _three_sigma(conics: Float[Tensor, "n 3"], visible: Tensor) -> Tensor:
-    """3 sigma of the longer axis in pixels; gsplat's own radii are boxes that depend on opacity."""
+    """3 sigma of the longer axis in pixels. gsplat's own radii are boxes that depend on opacity."""
     xx, xy, yy = conics.unbind(-1)
-    smallest = 0.5 * (xx + yy) - torch.sqrt(0.25 * (xx - yy) ** 2 + xy**2)  # eigenvalue of the inverse covariance
+    smallest = 0.5 * (xx + yy) - torch.sqrt(0.25 * (xx - yy) ** 2 + xy**2)  # Eigenvalue of the inverse covariance.
     radii = torch.ceil(3 / smallest.clamp_min(1e-12).sqrt())
     return torch.where(visible, radii, 0).to(torch.int32)
 
 
 def _import_gsplat() -> ModuleType:
     try:
-        import gsplat  # pyright: ignore[reportMissingImports]  # only there with the extra
+        import gsplat  # pyright: ignore[reportMissingImports]  # an optional package
     except ImportError as error:
         remedy = "install it with `.venv/bin/uv pip install 'gsplat>=1.5'`"
         raise UserError(f"rendering on a GPU needs gsplat: {remedy}") from error

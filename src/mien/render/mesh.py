@@ -1,7 +1,7 @@
 """Triangle meshes: visible fragments, interpolation, textures, simple light, pictures.
 
-Differentiable in what is interpolated, in textures and in light; in the vertices with `mien.render.mesh_gradients`.
-Everything runs on one thread of a CPU and releases the GIL: several Python threads can each draw a frame.
+Pictures are differentiable in interpolated attributes, textures and light, and with `mien.render.mesh_gradients` in the
+vertices. Everything runs on one CPU thread and releases the GIL, so several Python threads can each draw a frame.
 """
 
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from mien.render.mesh_functions import interpolate_rows, look_up_texture
 
 @dataclass(frozen=True, eq=False)
 class MeshFragments:
-    """What each pixel centre of a picture sees of a mesh."""
+    """The point of a mesh that is visible at each pixel centre of a picture."""
 
     face_index: Int[Tensor, "h w"]
-    """int32; -1 where no triangle is."""
+    """Index of the visible triangle, int32; -1 if there is none."""
     barycentric: Float[Tensor, "h w 3"]
-    """Perspective-correct weights of the triangle's corners; 0 where no triangle is."""
+    """Perspective-correct weights of the triangle's corners; 0 if there is none."""
     depth: Float[Tensor, "h w"]
-    """Camera z in metres; infinite where no triangle is."""
+    """Camera z in metres; infinite if there is no triangle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Texture:
 
     image: Float[Tensor, "th tw c"]
     uv: Float[Tensor, "v 2"] | Float[Tensor, "f 3 2"]
-    """Per vertex, or per corner of every triangle (`uv[uv_faces]`); 0..1, v upwards."""
+    """Texture coordinates per vertex, or per corner of every triangle (`uv[uv_faces]`); 0..1, v upwards."""
 
 
 @dataclass(frozen=True)
@@ -42,23 +42,23 @@ class Headlight:
     """A distant white lamp that moves with the camera, and ambient light (Lambert's law)."""
 
     direction: tuple[float, float, float] = (-0.3, -0.5, -1.0)
-    """Towards the lamp in camera axes: the default is up, left and behind the camera."""
+    """Direction to the lamp in camera axes. The default is up, left and behind the camera."""
     ambient: float = 0.3
-    """Light that reaches every surface; the lamp adds the rest up to 1."""
+    """Light that reaches every surface. The lamp adds the rest up to 1."""
 
 
 GREY = (0.75, 0.75, 0.75)
-"""The colour of a surface that has none."""
+"""Default colour of a surface."""
 
 
 def rasterize_mesh(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], camera: Camera, cull_backfaces: bool = False
 ) -> MeshFragments:
-    """The triangle that each pixel centre sees, by z-buffer.
+    """Find the triangle that is visible at each pixel centre, with a z-buffer.
 
-    Triangles are cut at the near plane (0.01 m); those that share an edge leave no gap between them and hit no pixel
-    twice. A triangle with a vertex that is not finite is not drawn. With `cull_backfaces`, neither are triangles whose
-    vertices go clockwise on screen. Not differentiable.
+    Triangles are cut at the near plane (0.01 m). Two that share an edge leave no gap and never hit a pixel twice. A
+    triangle with a vertex that is not finite is not drawn. With `cull_backfaces`, triangles with clockwise vertices on
+    screen are not drawn either. The result is not differentiable.
     """
     shape = (camera.height, camera.width)
     fragments = MeshFragments(
@@ -80,9 +80,9 @@ def rasterize_mesh(
 def interpolate(
     fragments: MeshFragments, attributes: Float[Tensor, "v c"] | Float[Tensor, "f 3 c"], faces: Int[Tensor, "f 3"]
 ) -> Float[Tensor, "h w c"]:
-    """Attributes of vertices, or of every triangle's corners, at each pixel; 0 where no triangle is.
+    """Interpolate attributes of vertices, or of every triangle's corners, at each pixel; 0 if there is no triangle.
 
-    Differentiable in `attributes`, and in the barycentrics where these are (`differentiable_fragments`).
+    The result is differentiable in `attributes`, and in the barycentrics if these are (`differentiable_fragments`).
     """
     corners = faces
     if attributes.ndim == 3:
@@ -96,7 +96,7 @@ def interpolate(
 def interpolate_reference(
     fragments: MeshFragments, attributes: Float[Tensor, "a c"], corners: Int[Tensor, "f 3"]
 ) -> Float[Tensor, "h w c"]:
-    """`interpolate` in plain PyTorch, any dtype: rows of `attributes` at the corners of every triangle."""
+    """`interpolate` in plain PyTorch, for any dtype. `corners` has the three rows of `attributes` of each triangle."""
     covered = fragments.face_index >= 0
     values = attributes[corners[fragments.face_index[covered].long()]]
     weights = fragments.barycentric[covered].to(attributes)
@@ -105,17 +105,18 @@ def interpolate_reference(
 
 
 def sample_texture(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n c"]:
-    """Bilinear look-up; (0, 0) is the lower left corner of the texture's picture, v goes up. Clamped at the borders.
+    """Sample a float32 texture bilinearly, clamped at the borders.
 
-    float32. Differentiable in both arguments.
+    The point (0, 0) is the lower left corner of the texture's picture, and v goes up. The result is differentiable in
+    both arguments.
     """
     return look_up_texture(texture, uv)
 
 
 def vertex_normals(vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "*b v 3"]:
-    """Unit normals, outwards for counter-clockwise triangles: means of the triangles' normals weighted by area.
+    """Unit normals of the vertices: means of the triangles' normals weighted by area. They are differentiable.
 
-    Zero where a vertex has no triangle with an area. Differentiable.
+    Normals of counter-clockwise triangles point outwards. A vertex without a triangle with an area has a zero normal.
     """
     a, b, c = (vertices[..., faces[:, i], :] for i in range(3))
     area_normals = torch.linalg.cross(b - a, c - a)
@@ -128,7 +129,7 @@ def vertex_normals(vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"])
 def sh_basis(directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 9"]:
     """The real spherical harmonics of degrees 0 to 2 at unit directions, orthonormal over the sphere.
 
-    Order 1, y, z, x, xy, yz, 3z^2 - 1, xz, x^2 - y^2, all with positive factors.
+    The order is 1, y, z, x, xy, yz, 3z^2 - 1, xz, x^2 - y^2, all with positive factors.
     """
     x, y, z = directions.unbind(-1)
     return torch.stack(
@@ -148,9 +149,9 @@ def sh_basis(directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 9"]:
 
 
 def shade(normals: Float[Tensor, "*b 3"], sh_light: Float[Tensor, "9 c"]) -> Float[Tensor, "*b c"]:
-    """Light that reaches surfaces with these unit normals: colour is albedo times this.
+    """Light that reaches surfaces with these unit normals. Colour is albedo times this light.
 
-    Linear and not clamped; a first coefficient of sqrt(4 pi) alone gives 1 everywhere. Differentiable.
+    It is linear, differentiable and not clamped. A first coefficient of sqrt(4 pi) alone gives 1 everywhere.
     """
     return sh_basis(normals) @ sh_light
 
@@ -166,18 +167,18 @@ def render_mesh(
     background: tuple[float, float, float] | Float[Tensor, "h w 3"] = (1.0, 1.0, 1.0),
     supersample: int = 1,
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """A picture of a mesh and its coverage (alpha, 0..1).
+    """Draw a picture of a mesh and its coverage (alpha, 0..1).
 
     Args:
-        vertices: World space, metres.
-        faces: Counter-clockwise seen from outside; both sides are drawn.
-        camera: What the picture is taken with.
-        colors: Albedo of vertices, of triangles' corners, or a texture. None is grey.
-        light: A lamp at the camera, or SH coefficients over world-space normals (`shade`). None leaves `colors`
-            unlit, and lights a mesh without colours by the default lamp.
+        vertices: Vertices in world space, in metres.
+        faces: Triangles, counter-clockwise seen from outside. Both sides are drawn.
+        camera: The camera.
+        colors: Albedo of vertices or of triangles' corners, or a texture. None is grey.
+        light: A lamp at the camera, or spherical harmonics coefficients over world-space normals (`shade`). None leaves
+            `colors` unlit, and lights a mesh without colours by the default lamp.
         normals: Unit vertex normals, instead of `vertex_normals`.
         background: One colour, or a picture of the camera's size.
-        supersample: Samples along each side of a pixel; their mean is taken.
+        supersample: Number of samples along each side of a pixel. The pixel is their mean.
     """
     fine = camera.resized(camera.width * supersample, camera.height * supersample)
     fragments = rasterize_mesh(vertices, faces, fine)
@@ -196,7 +197,7 @@ def render_mesh(
 
 
 def _at_pixels(fragments: MeshFragments, pixels: Int[Tensor, " p"]) -> MeshFragments:
-    """Some fragments as a picture one pixel high: a head leaves most of a picture empty."""
+    """Some fragments as a picture one pixel high, which saves time because a head leaves most of a picture empty."""
     return MeshFragments(
         fragments.face_index.flatten().index_select(0, pixels)[None],
         fragments.barycentric.flatten(0, 1).index_select(0, pixels)[None],
@@ -238,5 +239,5 @@ def _shrink(image: Float[Tensor, "h w c"], factor: int) -> Tensor:
 
 
 def _plain(tensor: Tensor) -> Tensor:
-    """As the native core takes it; the binding itself would cut the autograd graph without a word."""
+    """The tensor for the native core. It is detached here, because the binding would detach it silently."""
     return tensor.detach().to(torch.float32).contiguous()

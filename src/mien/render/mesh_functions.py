@@ -1,4 +1,4 @@
-"""Autograd around the native mesh operations; `mien.render.mesh` and `mien.render.mesh_gradients` are their doors."""
+"""Autograd functions of the native mesh operations, for `mien.render.mesh` and `mien.render.mesh_gradients`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,19 +10,20 @@ from torch.autograd.function import once_differentiable
 from mien import _native
 
 attach_barycentrics: Callable[..., Tensor]
-"""(barycentric, points, face_index, depth, faces): the barycentrics again, whose gradient goes to the image points."""
+"""(barycentric, points, face_index, depth, faces): the same barycentrics, with a gradient to the image points."""
 interpolate_rows: Callable[..., Tensor]
 """(attributes, barycentric, face_index, corners): rows of attributes mixed by barycentrics."""
 look_up_texture: Callable[..., Tensor]
-"""(texture, uv)."""
+"""(texture, uv): `mien.render.mesh.sample_texture`."""
 blend_silhouettes: Callable[..., Tensor]
-"""(image, points, face_index, barycentric, depth, faces, edge_vertices, edge_faces, opposite)."""
+"""(image, points, face_index, barycentric, depth, faces, edge_vertices, edge_faces, opposite):
+`mien.render.mesh_gradients.antialias`."""
 compare_picture: Callable[..., Tensor]
 """(points, normals, texture, light, mesh, target, picture): `mien.render.mesh_gradients.mesh_loss`."""
 
 
 class _Barycentrics(torch.autograd.Function):
-    """The identity on barycentrics, whose gradient goes to the image points that they come from."""
+    """The identity on barycentrics. The gradient goes to the image points that they were computed from."""
 
     @staticmethod
     def forward(ctx: Any, barycentric: Tensor, points: Tensor, face_index: Tensor, depth: Tensor, faces: Tensor):
@@ -39,7 +40,7 @@ class _Barycentrics(torch.autograd.Function):
 
 
 class _Interpolate(torch.autograd.Function):
-    """Rows of attributes, mixed by barycentrics."""
+    """Rows of attributes mixed by barycentrics."""
 
     @staticmethod
     def forward(ctx: Any, attributes: Tensor, barycentric: Tensor, face_index: Tensor, corners: Tensor):
@@ -62,7 +63,7 @@ class _Interpolate(torch.autograd.Function):
 
 
 class _SampleTexture(torch.autograd.Function):
-    """Bilinear look-up of any number of points."""
+    """Bilinear texture look-up at any number of points."""
 
     @staticmethod
     def forward(ctx: Any, texture: Tensor, uv: Tensor):
@@ -84,7 +85,7 @@ class _SampleTexture(torch.autograd.Function):
 
 
 class _Antialias(torch.autograd.Function):
-    """A picture blended along the silhouettes of what it shows."""
+    """A picture blended along the silhouettes of the mesh that it shows."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, points: Tensor, *mesh: Tensor):
@@ -108,7 +109,7 @@ class _Antialias(torch.autograd.Function):
 
 
 class _MeshLoss(torch.autograd.Function):
-    """`mesh_loss`: its value comes with all gradients at once, which wait for the backward pass."""
+    """`mesh_loss`. The forward pass computes the value and all gradients at once and keeps them for `backward`."""
 
     @staticmethod
     def forward(

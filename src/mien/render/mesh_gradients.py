@@ -1,8 +1,8 @@
-"""Gradients of pictures of meshes with respect to the mesh: through what a pixel shows, and through silhouettes.
+"""Gradients of pictures of meshes with respect to the mesh: through the visible surface and through silhouettes.
 
-Made of operations that can be used alone (`image_points`, `differentiable_fragments`, `interpolate`, `sample_texture`,
-`antialias`) and of one that does all of them with light and a robust loss in one pass (`mesh_loss`). Each has a twin in
-plain PyTorch in `mien.render.mesh_reference`. One thread, GIL released, the same to the bit in every run.
+There are single operations (`image_points`, `differentiable_fragments`, `interpolate`, `sample_texture`, `antialias`)
+and one that combines them with light and a robust loss in a single pass (`mesh_loss`). Each has a twin in plain PyTorch
+in `mien.render.mesh_reference`. They run on one thread, release the GIL, and are deterministic to the bit.
 """
 
 from dataclasses import dataclass, replace
@@ -23,28 +23,28 @@ class MeshEdges:
 
     vertices: Int[Tensor, "e 2"]
     faces: Int[Tensor, "e 2"]
-    """Triangles on both sides; the second is -1 at a border."""
+    """Triangles on both sides of each edge. The second is -1 at a border."""
     opposite: Int[Tensor, " e"]
-    """The first triangle's third vertex: on which side of a silhouette the mesh lies."""
+    """Third vertex of the first triangle, which shows on which side of a silhouette the mesh is."""
 
 
 @dataclass(frozen=True, eq=False)
 class LitMesh:
-    """What of a textured mesh stays the same from picture to picture."""
+    """Constants of a textured mesh, which are the same for all pictures."""
 
     faces: Int[Tensor, "f 3"]
     uv: Float[Tensor, "f 3 2"]
-    """Of every triangle's corners; 0..1, v upwards."""
+    """Texture coordinates of every triangle's corners; 0..1, v upwards."""
     face_weights: Float[Tensor, " f"]
-    """How far a triangle's pixels count; 0 for one that only hides what is behind it."""
+    """Weight of each triangle's pixels. It is 0 for a triangle that only hides what is behind it."""
     edges: MeshEdges
-    """Those whose silhouettes are drawn to where colours change."""
+    """Edges at which silhouettes are antialiased, so that the loss can move them."""
 
 
 def mesh_edges(faces: Int[Tensor, "f 3"], used: Tensor | None = None) -> MeshEdges:
-    """All edges of a mesh; with `used` [f], only those between triangles that are all used.
+    """All edges of a mesh. With `used` [f], only those between used triangles.
 
-    An edge of more than two triangles counts for each two of them that follow one another.
+    An edge of more than two triangles is listed once for each pair of consecutive triangles.
     """
     table = faces.cpu().numpy()
     corners = np.concatenate([table[:, [0, 1, 2]], table[:, [1, 2, 0]], table[:, [2, 0, 1]]])
@@ -66,16 +66,16 @@ def mesh_edges(faces: Int[Tensor, "f 3"], used: Tensor | None = None) -> MeshEdg
 
 
 def image_points(camera: Camera, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
-    """World-space points as (x, y) pixels times depth, and depth in metres. Differentiable, in the camera as well."""
+    """World-space points as (x, y) in pixels times depth, and depth in metres. Differentiable, also in the camera."""
     return (vertices @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
 
 
 def differentiable_fragments(
     fragments: MeshFragments, points: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
 ) -> MeshFragments:
-    """The same fragments with barycentrics that are differentiable in the image points they were drawn from.
+    """The same fragments with barycentrics that are differentiable in the image points.
 
-    What is seen stays as it is, and so does depth. A barycentric that was clamped at 0 does not move.
+    Visibility and depth have no gradient, nor has a barycentric that was clamped at 0.
     """
     barycentric = attach_barycentrics(fragments.barycentric, points, fragments.face_index, fragments.depth, faces)
     return replace(fragments, barycentric=barycentric)
@@ -88,13 +88,13 @@ def antialias(
     faces: Int[Tensor, "f 3"],
     edges: MeshEdges,
 ) -> Float[Tensor, "h w c"]:
-    """A picture blended across silhouettes, which makes it differentiable in where they are.
+    """Blend a picture across silhouettes, which makes it differentiable in their positions.
 
-    Where a silhouette passes between the centres of two neighbouring pixels, the one that it covers by less or more
-    than half gets the share of the other's colour that it should have (as in Laine et al. 2020, section 3.6). Here
-    silhouettes are found by walking the mesh's own edges: at a contour the triangles that pixels see are slivers, whose
-    edges miss most crossings. An edge counts where the outer pixel sees something farther away, and of several
-    crossings between two pixels the outermost one does.
+    If a silhouette passes between the centres of two neighbouring pixels, the pixel that it crosses gets the share of
+    the other's colour that it should have (as in Laine et al. 2020, section 3.6). Silhouettes are found by walking the
+    mesh's own edges, because the triangles visible at a contour are slivers, and their edges miss most crossings. An
+    edge counts if the outer pixel shows something farther away. Of several crossings between two pixels only the
+    outermost counts.
     """
     fixed = (fragments.face_index, fragments.barycentric.detach(), fragments.depth, faces)
     return blend_silhouettes(image, points, *fixed, edges.vertices, edges.faces, edges.opposite)
@@ -110,22 +110,22 @@ def mesh_loss(
     target: tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], float],
     picture: Float[Tensor, "h w 3"] | None = None,
 ) -> Float[Tensor, ""]:
-    """How far the lit, textured mesh is from a picture; differentiable in points, normals, texture and light.
+    """Difference between the lit, textured mesh and a picture, differentiable in points, normals, texture and light.
 
-    The picture is albedo times SH light, antialiased along `mesh.edges`, before the target itself: only what the mesh
-    covers can differ. The loss is the mean over pixels, weighted by mask and triangle, of
-    sqrt(|difference|^2 + epsilon^2) - epsilon over the three colours together (Charbonnier), which is L1's pull on
-    outliers without its kink.
+    The drawn picture is albedo times light (spherical harmonics), antialiased along `mesh.edges`, with the target as
+    background, so only pixels that the mesh covers can differ. The loss is the mean over pixels, weighted by mask and
+    triangle, of sqrt(|difference|^2 + epsilon^2) - epsilon over the three colours together (Charbonnier). It pulls on
+    outliers like L1 but has no kink.
 
     Args:
-        fragments: The mesh as it is seen (`rasterize_mesh`); float32.
-        points: `image_points` of its vertices.
-        normals: Of its vertices, of any length.
-        mesh: Its triangles, texture coordinates, weights and edges.
-        texture: Albedo; rows from v = 1 down.
-        light: SH coefficients over the normals' directions, as `mien.render.mesh.shade`.
-        target: The picture, how far each of its pixels counts, and epsilon.
-        picture: If given, what was drawn is written there.
+        fragments: The visible fragments of the mesh (`rasterize_mesh`), float32.
+        points: `image_points` of the vertices.
+        normals: Normals of the vertices, of any length.
+        mesh: Triangles, texture coordinates, weights and edges of the mesh.
+        texture: Albedo, with rows from v = 1 down.
+        light: Spherical harmonics coefficients over the normals' directions, as in `mien.render.mesh.shade`.
+        target: The picture, the weight of each of its pixels, and epsilon.
+        picture: If given, receives the drawn picture.
     """
     constants = (
         fragments.face_index, fragments.barycentric.detach(), fragments.depth, mesh.faces, mesh.edges.vertices,

@@ -1,4 +1,4 @@
-"""The differentiable mesh operations in plain PyTorch, any dtype: what the native ones are tested against."""
+"""The differentiable mesh operations in plain PyTorch, for any dtype. The native ones are tested against them."""
 
 import torch
 from jaxtyping import Float, Int
@@ -12,7 +12,7 @@ from mien.render.mesh_gradients import LitMesh, MeshEdges
 def barycentrics_reference(
     fragments: MeshFragments, points: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
 ) -> Float[Tensor, "h w 3"]:
-    """Barycentrics of the fragments' triangles, computed from image points, clamped at 0."""
+    """Barycentrics of the fragments' triangles, computed from image points and clamped at 0."""
     covered = fragments.face_index >= 0
     rows, columns = covered.nonzero().unbind(1)
     pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones(len(rows))], dim=-1).to(points)
@@ -26,7 +26,7 @@ def barycentrics_reference(
 
 
 def sample_texture_reference(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n c"]:
-    """`mien.render.mesh.sample_texture`."""
+    """Reference of `mien.render.mesh.sample_texture`."""
     grid = torch.stack([2 * uv[..., 0] - 1, 1 - 2 * uv[..., 1]], dim=-1).reshape(1, 1, -1, 2)
     sampled = grid_sample(
         texture.permute(2, 0, 1)[None], grid, mode="bilinear", padding_mode="border", align_corners=False
@@ -41,7 +41,7 @@ def antialias_reference(
     faces: Int[Tensor, "f 3"],
     edges: MeshEdges,
 ) -> Float[Tensor, "h w c"]:
-    """`mien.render.mesh_gradients.antialias`."""
+    """Reference of `mien.render.mesh_gradients.antialias`."""
     inner, outer, position = _crossings(fragments, points, faces, edges)
     beyond = position - 0.5
     changed, other = torch.where(beyond > 0, outer, inner), torch.where(beyond > 0, inner, outer)
@@ -58,7 +58,7 @@ def mesh_loss_reference(
     light: Float[Tensor, "9 3"],
     target: tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], float],
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 3"]]:
-    """`mien.render.mesh_gradients.mesh_loss`, and the picture."""
+    """Reference of `mien.render.mesh_gradients.mesh_loss`; also returns the drawn picture."""
     image, mask, epsilon = target
     seen = MeshFragments(fragments.face_index, barycentrics_reference(fragments, points, mesh.faces), fragments.depth)
     corners = torch.arange(3 * len(mesh.faces)).view(-1, 3)
@@ -77,7 +77,7 @@ def mesh_loss_reference(
 def _crossings(
     fragments: MeshFragments, points: Tensor, faces: Int[Tensor, "f 3"], edges: MeshEdges
 ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, " n"]]:
-    """Inner and outer pixel of every silhouette's crossing, and where it is between them (0..1, differentiable)."""
+    """Inner and outer pixel of every crossing of a silhouette, and its position between them (0..1, differentiable)."""
     a, b, c = points.detach()[faces].unbind(1)
     front = torch.sign((a * torch.linalg.cross(b, c)).sum(-1))
     first, second = edges.faces.long().unbind(1)
@@ -87,7 +87,7 @@ def _crossings(
     third = points.detach()[edges.opposite[silhouette].long()]
     inside = third[:, :2] / third[:, 2:] - xy[:, 0].detach()
     step = (xy[:, 1] - xy[:, 0]).detach()
-    vertical = (step[:, 0].abs() > step[:, 1].abs()).long()  # 1: pixels above each other
+    vertical = (step[:, 0].abs() > step[:, 1].abs()).long()  # 1 for pixels one above the other.
     side = step[:, 0] * inside[:, 1] - step[:, 1] * inside[:, 0]
     towards = torch.where(vertical == 1, side * step[:, 0], -side * step[:, 1]) < 0
 
@@ -124,7 +124,7 @@ def _crossings(
 
 
 def _outermost(pair: Int[Tensor, " n"], position: Float[Tensor, " n"]) -> Int[Tensor, " k"]:
-    """Of entries with the same pair, the one with the largest position (the first of equal ones)."""
+    """Indices of the entries with the largest position of each pair (the first of equal ones)."""
     best: dict[int, int] = {}
     for index, (key, value) in enumerate(zip(pair.tolist(), position.tolist(), strict=True)):
         if key not in best or value > float(position[best[key]]):

@@ -1,4 +1,4 @@
-"""The CPU rasterizer: autograd around the C++ core (native/README.md has its algorithm)."""
+"""The CPU rasterizer: autograd around the C++ core (native/README.md describes the algorithm)."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,18 +14,18 @@ from mien.render.rendering import Rendering, View
 from mien.render.validation import TooManyPairsError, check_finite
 
 _TOO_MANY_PAIRS = "too many pairs"
-"""How the native core begins its complaint (`native/rasterize_bin.cpp`)."""
+"""Start of the native core's message for this error (`native/rasterize_bin.cpp`)."""
 _INPUTS = 9
-"""Tensors a view: offset of the centres, means, quats, scales, opacities, sh, background, viewmat, K."""
+"""Number of tensors per view: offset of the centres, means, quats, scales, opacities, sh, background, viewmat, K."""
 
 
 def render_native(
     views: Sequence[View], background: Float[Tensor, " 3"], means2d_offsets: Sequence[Float[Tensor, "n 2"]]
 ) -> list[Rendering]:
-    """Views of unbatched float32 CPU Gaussians given in their camera's world; of several, each gets one thread.
+    """Render views of unbatched float32 CPU Gaussians, given in their camera's world. Each of several gets one thread.
 
-    Differentiable in the Gaussians, the background, `means2d_offsets` (whose values are not read), `camera.viewmat`
-    and `camera.K`. The result does not depend on the number of threads.
+    The result is differentiable in the Gaussians, the background, `means2d_offsets` (their values are not read),
+    `camera.viewmat` and `camera.K`. It does not depend on the number of threads.
     """
     inputs: list[Tensor] = []
     for (gaussians, camera), offset in zip(views, means2d_offsets, strict=True):
@@ -52,7 +52,7 @@ def render_native(
 
 
 class _NotFiniteError(ValueError):
-    """A NaN or an infinity in one of the views, not yet named."""
+    """A NaN or an infinity in one of the views. `check_finite` then names the tensor."""
 
     def __init__(self, view: int):
         super().__init__("rasterize: NaN or infinity in an input")
@@ -60,7 +60,7 @@ class _NotFiniteError(ValueError):
 
 
 class _Rasterize(torch.autograd.Function):
-    """`_INPUTS` tensors a view in; image, alpha and radii of each view out."""
+    """Takes `_INPUTS` tensors per view and returns image, alpha and radii of each view."""
 
     @staticmethod
     def forward(ctx: Any, sizes: list[tuple[int, int]], *inputs: Tensor) -> tuple[Tensor, ...]:

@@ -1,6 +1,6 @@
-"""How one Gaussian becomes a splat on the screen, in plain PyTorch: the constants and the formulas.
+"""Projection of a Gaussian to a splat on the screen, in plain PyTorch: the constants and the formulas.
 
-Every back end follows this file (docs/conventions.md): the native kernels and the web runtime repeat its numbers.
+Every back end follows this file (docs/conventions.md). The native kernels and the web runtime repeat its numbers.
 """
 
 from dataclasses import dataclass
@@ -14,31 +14,31 @@ from mien.gaussians import SH_C0, Gaussians
 from mien.rotation import matrix_from_quaternion
 
 NEAR = 0.01
-"""Metres: what is nearer to the camera is not drawn."""
+"""Least depth of a Gaussian that is drawn, in metres."""
 DILATION = 0.3
-"""Pixels squared, added to the diagonal of each 2D covariance: no splat is smaller than about a pixel."""
+"""Added to the diagonal of each 2D covariance, in pixels squared, so that no splat is smaller than about a pixel."""
 ALPHA_MAX = 0.999
 ALPHA_MIN = 1 / 255
-"""Contributions below this are dropped."""
+"""Contributions with a smaller alpha are dropped."""
 TRANSMITTANCE_MIN = 1e-4
-"""A Gaussian that would leave this much light or less is not blended and ends the pixel."""
+"""A Gaussian that would reduce the transmittance to this or less is not blended and ends the pixel."""
 FOV_MARGIN = 0.3
-"""The Jacobian is taken at a direction at most this many half-images outside the picture."""
+"""The Jacobian is computed at a direction at most this many half-images outside the picture."""
 
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """Projected Gaussians, in the order in which they were given."""
+    """Projected Gaussians, in the order of the input."""
 
     means2d: Float[Tensor, "n 2"]
-    """Pixels."""
+    """Projected centres, in pixels."""
     covariances: Float[Tensor, "n 3"]
-    """xx, xy, yy in pixels squared, dilated."""
+    """Dilated 2D covariances xx, xy, yy, in pixels squared."""
     depths: Float[Tensor, " n"]
     opacities: Float[Tensor, " n"]
     colors: Float[Tensor, "n 3"]
     extents: Float[Tensor, "n 2"]
-    """Half size of the box outside which alpha is below ALPHA_MIN, in pixels."""
+    """Half sizes of the box outside of which alpha is below ALPHA_MIN, in pixels."""
     drawn: Bool[Tensor, " n"]
 
     def radii(self) -> Int[Tensor, " n"]:
@@ -49,20 +49,20 @@ class Splats:
 
 
 def project_splats(gaussians: Gaussians, camera: Camera, means2d_offset: Float[Tensor, "n 2"]) -> Splats:
-    """EWA splatting (Zwicker 2001) of unbatched Gaussians whose local frame is the camera's world; differentiable."""
+    """Project unbatched Gaussians, given in the camera's world, by EWA splatting (Zwicker 2001). Differentiable."""
     rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     points = gaussians.means @ rotation.T + translation
     depths = points[:, 2]
     in_front = depths > NEAR
-    points = torch.where(in_front[:, None], points, torch.ones_like(points))  # keeps what is not drawn out of gradients
+    points = torch.where(in_front[:, None], points, torch.ones_like(points))  # undrawn points get no gradient
     jacobian = projection_jacobian(points, camera)
     axes = matrix_from_quaternion(gaussians.quats) * gaussians.scales[:, None, :]
-    half = jacobian @ rotation @ axes  # [n, 2, 3]: the covariance is half @ half.T
+    half = jacobian @ rotation @ axes  # [n, 2, 3]; the covariance is half @ half.T.
     covariance = half @ half.transpose(1, 2)
     xx, xy, yy = covariance[:, 0, 0] + DILATION, covariance[:, 0, 1], covariance[:, 1, 1] + DILATION
     means2d = (points @ camera.K.T)[:, :2] / points[:, 2:] + means2d_offset
     with torch.no_grad():
-        cutoff = 2 * torch.log(gaussians.opacities / ALPHA_MIN)  # the squared Mahalanobis distance where alpha is 1/255
+        cutoff = 2 * torch.log(gaussians.opacities / ALPHA_MIN)  # squared Mahalanobis distance at alpha 1/255
         extents = torch.sqrt(cutoff.clamp_min(0)[:, None] * torch.stack([xx, yy], -1))
         size = torch.tensor([camera.width, camera.height]).to(means2d)
         on_screen = ((means2d + extents > 0) & (means2d - extents < size)).all(-1)
@@ -78,8 +78,8 @@ def project_splats(gaussians: Gaussians, camera: Camera, means2d_offset: Float[T
 def projection_jacobian(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 2 3"]:
     """The derivative of pixels with respect to camera-space points.
 
-    Far outside the picture the affine approximation explodes; so the direction is clamped to a margin around the
-    picture, as 3D Gaussian Splatting does. The margin counts as a constant.
+    Far outside the picture the affine approximation explodes, so the direction is clamped to a margin around the
+    picture, as in 3D Gaussian Splatting. The margin has no gradient.
     """
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     x, y, z = points.unbind(-1)
@@ -95,7 +95,7 @@ def projection_jacobian(points: Float[Tensor, "n 3"], camera: Camera) -> Float[T
 
 
 def spherical_harmonics(sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Colours before the + 0.5: real spherical harmonics (Sloan 2013), as used by 3D Gaussian Splatting."""
+    """Colours before 0.5 is added, from real spherical harmonics (Sloan 2013) as in 3D Gaussian Splatting."""
     basis = spherical_harmonics_basis(directions, sh.shape[-2])
     return (basis[:, :, None] * sh).sum(1)
 

@@ -1,4 +1,4 @@
-"""`rasterize`: Gaussians and cameras to pictures; picks the back end and unrolls batches."""
+"""The function `rasterize` turns Gaussians and cameras into pictures. It chooses the back end and unrolls batches."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,9 +19,9 @@ from mien.rotation import compose_rigid
 
 Backend = Literal["auto", "native", "gsplat", "reference"]
 RenderView = Callable[[Gaussians, Camera, Tensor, Tensor], Rendering]
-"""One view of unbatched Gaussians given in the camera's world, over a background, with offsets of the 2D centres."""
+"""Renders unbatched Gaussians, given in the camera's world, over a background, with offsets of the 2D centres."""
 RenderViews = Callable[[Sequence[View], Tensor, Sequence[Tensor]], list[Rendering]]
-"""Several of them over one background, each with its own offsets."""
+"""Renders several views over one background, each with its own offsets."""
 
 
 def _one_by_one(render_view: RenderView) -> RenderViews:
@@ -45,20 +45,21 @@ def rasterize(
     backend: Backend = "auto",
     depth: bool = False,
 ) -> Rendering:
-    """The picture of `gaussians` seen by `camera` over `background` (RGB; black by default).
+    """Render `gaussians` seen by `camera` over `background` (RGB; black by default).
 
-    A sequence of cameras, batched Gaussians, or both with equal lengths give a batch; what has no batch is shared.
-    All cameras of a batch have one size. `T_world_local` of the Gaussians moves the camera, not the Gaussians, so
-    spherical harmonics are evaluated in the local frame. The kernel's constants are those of docs/conventions.md.
+    A sequence of cameras, batched Gaussians, or both with equal lengths give a batch. Inputs without a batch axis are
+    shared. All cameras of a batch have one size. `T_world_local` of the Gaussians moves the camera, not the Gaussians,
+    so spherical harmonics are evaluated in the local frame. The constants are those of docs/conventions.md.
 
-    Differentiable in the Gaussians (with `T_world_local`), the background and `camera.viewmat`. The rendering's
-    `means2d_offset` is a leaf whose `.grad` is the gradient with respect to the projected centres, in pixels.
-    With `depth` the rendering also has a depth picture, which takes a second pass.
+    The picture is differentiable in the Gaussians (with `T_world_local`), the background and `camera.viewmat`. The
+    rendering's `means2d_offset` is a leaf, and its `.grad` is the gradient with respect to the projected centres, in
+    pixels. With `depth` the rendering also has a depth picture, which takes a second pass.
 
     `auto` is `native` for float32 on a CPU, `gsplat` on a GPU, and otherwise (float64) the slow `reference`.
 
     Raises:
-        ValueError: NaN or infinity in an input (naming it), shapes or lengths that do not fit, a wrong dtype or device.
+        ValueError: An input holds NaN or infinity (the message names it), shapes or lengths do not fit, or a dtype or
+            device is wrong.
     """
     if background is None:
         background = gaussians.means.new_zeros(3)
@@ -68,7 +69,7 @@ def rasterize(
         raise ValueError(f"rasterize: unknown backend {backend!r}, expected auto, {', '.join(_BACKENDS)}")
     batch = _views(gaussians, camera)
     shape = (len(gaussians), 2) if batch is None else (len(batch), len(gaussians), 2)
-    # One zero seen everywhere: nothing is to be cleared, and its gradient is a whole tensor all the same.
+    # An expanded zero needs no cleared memory, and its gradient is still a full tensor.
     offset = gaussians.means.new_zeros(()).expand(shape).requires_grad_(torch.is_grad_enabled())
     if batch is None:
         assert isinstance(camera, Camera)
@@ -87,7 +88,7 @@ def rasterize(
 
 
 def _depths(views: Sequence[View], pictures: Sequence[Rendering], render_views: RenderViews) -> list[Tensor]:
-    """The expected depth of each view: depths blended as if they were colours, over the same weights' sum."""
+    """The expected depth of each view: depths blended like colours, divided by the sum of their weights."""
     coloured = []
     for gaussians, camera in views:
         depths = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
@@ -101,14 +102,14 @@ def _depths(views: Sequence[View], pictures: Sequence[Rendering], render_views: 
 
 
 def choose_backend(like: Tensor) -> Literal["native", "gsplat", "reference"]:
-    """The back end for tensors with this dtype and device."""
+    """The back end for tensors with the dtype and device of `like`."""
     if like.is_cuda:
         return "gsplat"
     return "native" if like.dtype == torch.float32 else "reference"
 
 
 def _views(gaussians: Gaussians, camera: Camera | Sequence[Camera]) -> list[tuple[Gaussians, Camera]] | None:
-    """Each picture's Gaussians and camera; None where there is no batch."""
+    """The Gaussians and camera of each picture of a batch; None if there is no batch."""
     count = _timesteps(gaussians)
     if isinstance(camera, Camera):
         if count is None:
@@ -127,7 +128,7 @@ def _views(gaussians: Gaussians, camera: Camera | Sequence[Camera]) -> list[tupl
 
 
 def _timesteps(gaussians: Gaussians) -> int | None:
-    """The length of the batch axis, None without one."""
+    """The length of the batch axis; None if there is none."""
     pose = gaussians.T_world_local
     entries = [(gaussians.means, 2), (gaussians.quats, 2), (gaussians.scales, 2), (gaussians.opacities, 1)]
     entries += [(gaussians.sh, 3)] + ([] if pose is None else [(pose, 2)])

@@ -1,4 +1,4 @@
-"""The rasterizer in plain PyTorch: what every other back end is measured against. Any dtype and device, slow."""
+"""The rasterizer in plain PyTorch, for any dtype and device. It is slow, and the reference for all other back ends."""
 
 import torch
 from jaxtyping import Float
@@ -11,15 +11,16 @@ from mien.render.rendering import Rendering
 from mien.render.validation import check_finite
 
 _TILE = 32
-"""Pixels: small enough that the dense [gaussians, pixels] tables of one tile fit in memory."""
+"""Side of a tile in pixels, small enough that the dense [gaussians, pixels] tables of one tile fit in memory."""
 
 
 def render_reference(
     gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], means2d_offset: Float[Tensor, "n 2"]
 ) -> Rendering:
-    """One view of unbatched Gaussians given in the camera's world; autograd does the rest.
+    """Render one view of unbatched Gaussians, given in the camera's world.
 
-    Differentiable in the Gaussians, the background, `means2d_offset`, `camera.viewmat` and `camera.K`.
+    Autograd makes it differentiable in the Gaussians, the background, `means2d_offset`, `camera.viewmat` and
+    `camera.K`.
     """
     check_finite(gaussians, camera, background)
     splats = project_splats(gaussians, camera, means2d_offset)
@@ -47,7 +48,7 @@ def _overlapping(splats: Splats, order: Tensor, xs: Tensor, ys: Tensor) -> Tenso
 def _blend(
     splats: Splats, chosen: Tensor, xs: Float[Tensor, " w"], ys: Float[Tensor, " h"], background: Float[Tensor, " 3"]
 ) -> Float[Tensor, "h w 4"]:
-    """RGB over the background, and alpha, of one tile; `chosen` lists its splats front to back."""
+    """RGB over the background and alpha of one tile. `chosen` lists its splats from front to back."""
     xx, xy, yy = splats.covariances[chosen].unbind(-1)
     determinant = xx * yy - xy * xy
     dx = xs[None, None, :] - splats.means2d[chosen, 0, None, None]
@@ -57,7 +58,7 @@ def _blend(
     exponent = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
     alpha = torch.clamp_max(splats.opacities[chosen, None, None] * torch.exp(-exponent), ALPHA_MAX)
     alpha = torch.where(alpha < ALPHA_MIN, 0, alpha)
-    # Transmittance only falls, so the test also holds for all that lies behind the Gaussian that ends the pixel.
+    # Transmittance only falls, so the test also fails for all Gaussians behind the one that ends the pixel.
     blended = torch.cumprod(1 - alpha.detach(), dim=0) > TRANSMITTANCE_MIN
     alpha = torch.where(blended, alpha, 0)
     transmittance = torch.cumprod(torch.cat([alpha.new_ones(1, len(ys), len(xs)), 1 - alpha]), 0)

@@ -1,4 +1,4 @@
-"""What a rasterizer refuses, in words."""
+"""Errors for inputs that a rasterizer refuses."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,15 +16,15 @@ class CannotDrawError(ValueError):
 
 
 class NotFiniteError(CannotDrawError):
-    """What is to be drawn holds NaN or infinity."""
+    """An input of a rasterizer holds NaN or infinity."""
 
 
 class TooManyPairsError(CannotDrawError):
-    """The Gaussians touch more tiles, all together, than the native rasterizer can count."""
+    """The Gaussians touch more tiles in total than the native rasterizer can count."""
 
 
 def check_shapes(gaussians: Gaussians, background: Tensor) -> None:
-    """Raise ValueError for shapes, dtypes and devices that do not fit together."""
+    """Raise ValueError if shapes, dtypes or devices do not fit together."""
     means, quats, scales, opacities, sh = _parts(gaussians)
     count, dtype, device = len(gaussians), means.dtype, means.device
     for name, tensor, shape in (
@@ -44,9 +44,9 @@ def check_shapes(gaussians: Gaussians, background: Tensor) -> None:
 
 
 def check_finite(gaussians: Gaussians, camera: Camera, background: Tensor) -> None:
-    """Raise `NotFiniteError` that names the first NaN or infinity by tensor and index."""
+    """Raise a `NotFiniteError` that names the tensor and index of the first NaN or infinity."""
     tensors = named_tensors(gaussians, background) | {"camera.viewmat": camera.viewmat, "camera.K": camera.K}
-    # One question for all: on a GPU every answer makes the host wait.
+    # Check all tensors at once, because on a GPU every answer makes the host wait.
     if bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors.values()]).all()):
         return
     for name, tensor in tensors.items():
@@ -59,10 +59,14 @@ def check_finite(gaussians: Gaussians, camera: Camera, background: Tensor) -> No
 
 @contextmanager
 def drawable(what: str, remedy: str) -> Iterator[None]:
-    """Tell the user where an avatar that was read, posed as asked, cannot be drawn.
+    """Turn a `CannotDrawError` inside the context into a message for the user.
+
+    Args:
+        what: What cannot be drawn, for the start of the message.
+        remedy: What to do about it, for the end of the message.
 
     Raises:
-        UserError: inside, a rasterizer met NaN or infinity, or more Gaussians on more tiles than it can count.
+        UserError: A rasterizer found NaN or infinity, or Gaussians on more tiles than it can count.
     """
     try:
         yield
@@ -71,7 +75,7 @@ def drawable(what: str, remedy: str) -> Iterator[None]:
 
 
 def named_tensors(gaussians: Gaussians, background: Tensor) -> dict[str, Tensor]:
-    """The inputs under the names that users know them by."""
+    """The inputs by the names that messages use."""
     names = ("means", "quats", "scales", "opacities", "sh")
     return dict(zip(names, _parts(gaussians), strict=True)) | {"background": background}
 

@@ -1,4 +1,4 @@
-"""The face model fitted to a capture: tracking, its files, the neck line and the frozen scoring mask."""
+"""Fit of the face model to a capture: the tracking, its files, the neck line and the fixed scoring mask."""
 
 from typing import TYPE_CHECKING
 

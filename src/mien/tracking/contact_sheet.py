@@ -1,4 +1,4 @@
-"""A contact sheet: frames spread over the capture, and those that stand out, each in all its panels."""
+"""Contact sheet of a tracking: evenly spread frames and frames that stand out, each with all its panels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from mien.tracking.overlay import OverlayPainter, frontal_camera
 from mien.tracking.tracking import Tracking
 
 _EVEN, _MOST_FLAGGED, _MOST_ALONE = 8, 8, 4
-"""Frames spread evenly, those that stand out most, and those that landmarks alone decided."""
+"""Largest numbers of evenly spread frames, of flagged frames, and of frames tracked from landmarks alone."""
 _TILE = 240
-"""Pixels of each side."""
+"""Side of each tile, in pixels."""
 _STRIPS = 2
-"""Frames beside each other."""
+"""Number of frames side by side."""
 _GAP = 4
 _PAPER = 255
 
@@ -31,16 +31,16 @@ class SheetFrame:
     timestep: int
     camera: int
     why: str = ""
-    """What is odd about it."""
+    """Why the frame stands out; empty for an evenly spread frame."""
 
 
 def sheet_frames(tracking: Tracking, flagged: Sequence[int], alone: Sequence[int]) -> list[SheetFrame]:
-    """Which frames to show, in the order of time: evenly spread ones as the frontal camera saw them, and odd ones.
+    """The frames to show, in the order of time: evenly spread ones from the frontal camera, and ones that stand out.
 
     Args:
-        tracking: With a frame at least that has a face.
-        flagged: Timesteps that stand out; those with the largest residuals are shown, as the worst camera saw them.
-        alone: Timesteps that landmarks alone decided; where these are most of them all, they are not odd.
+        tracking: The tracking. At least one of its frames has a face.
+        flagged: Timesteps that stand out. Those with the largest residuals are shown, each from its worst camera.
+        alone: Timesteps tracked from landmarks alone. If they are half of those with a face or more, none is shown.
     """
     frontal, valid = frontal_camera(tracking), tracking.valid.nonzero()[:, 0]
     even = valid[torch.linspace(0, len(valid) - 1, min(_EVEN, len(valid))).round().long()].tolist()
@@ -56,7 +56,7 @@ def sheet_frames(tracking: Tracking, flagged: Sequence[int], alone: Sequence[int
 
 
 def worst_of_runs(timesteps: Sequence[int], values: Float[np.ndarray, " t"]) -> list[int]:
-    """Of neighbouring timesteps the one with the largest value; the worst first."""
+    """The timestep with the largest value of each run of neighbouring timesteps, the worst first."""
     known = np.nan_to_num(values, nan=-np.inf)
     runs = np.split(np.array(timesteps, dtype=np.int64), np.nonzero(np.diff(timesteps) > 1)[0] + 1)
     worst = [int(run[known[run].argmax()]) for run in runs if len(run)]
@@ -66,7 +66,7 @@ def worst_of_runs(timesteps: Sequence[int], values: Float[np.ndarray, " t"]) -> 
 def contact_sheet(
     capture: Capture, tracking: Tracking, face_model: FaceModel, frames: Sequence[SheetFrame]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Each frame as a strip: the picture, the mesh over it and, where pixels were looked at, the model's, and heat."""
+    """The frames as a grid of strips (see `strip`)."""
     painter = OverlayPainter(capture, tracking, face_model)
     strips = [strip(painter, capture, frame, _name(capture, frame)) for frame in frames]
     columns = min(_STRIPS, len(strips))
@@ -81,7 +81,7 @@ def _name(capture: Capture, frame: SheetFrame) -> str:
 
 
 def strip(painter: OverlayPainter, capture: Capture, frame: SheetFrame, name: str) -> UInt8[np.ndarray, "h w 3"]:
-    """A frame's picture, the mesh over it, and, where pixels were looked at, the model's picture and heat."""
+    """A frame's picture and the mesh over it. If pixels were compared, also the model's picture and the heat map."""
     image = np.asarray(capture.images[frame.timestep, frame.camera])
     rows, columns = painter.head_box(frame.timestep, frame.camera)
     panels = [image, *painter.panels(frame.timestep, frame.camera)[1:]]
@@ -100,5 +100,5 @@ def _joined(pictures: Sequence[UInt8[np.ndarray, "_ _ 3"]], axis: int) -> UInt8[
 
 
 def _camera_of_face(residuals: Float[torch.Tensor, " c"]) -> int:
-    """One that found a face, if any did."""
+    """The first camera that found a face; the first of all if none did."""
     return int(residuals.isfinite().int().argmax())

@@ -1,8 +1,8 @@
-"""Where a landmark detector sees the points of a face model on people: measured once, and what trackers expect.
+"""Systematic offsets of a landmark detector from the landmarks of a face model, measured once for the tracker.
 
-The embedding names the point of the surface that each landmark means. But a detector has habits: it puts a chin where
-its annotators did, closes lids later than they close, turns heads less than they turn, and takes every person a little
-for somebody else. `mien.synthetic.detector_calibration` measures these habits over synthetic people.
+The embedding gives the point of the surface for each landmark. But a detector has habits. It puts the chin where its
+annotators did, closes eyelids too late, turns heads too little, and gets the shape of every person slightly wrong.
+`mien.synthetic.detector_calibration` measures these habits on synthetic people.
 """
 
 from dataclasses import dataclass, replace
@@ -18,46 +18,49 @@ from mien.face import FaceModel
 
 _COMMAND = "python -m mien.synthetic.detector_calibration"
 _LARGEST_TURN = 0.6
-"""Radians beyond which turns were not measured."""
+"""Largest turn that was measured, in radians."""
 
 
 @dataclass(frozen=True, eq=False)
 class DetectorResponse:
-    """Offsets of l detected points from a face model's, metres in the head frame at rest, float64: a linear model."""
+    """Linear model of the offsets of l detected landmarks from the face model's.
+
+    Offsets are in metres, in the head frame at rest, float64.
+    """
 
     mean: Float[Tensor, "l 3"]
     by_turn: Float[Tensor, "2 l 3"]
-    """A radian of the head rotation's x and y components (about pitch and yaw), seen from the camera."""
+    """Offset per radian of the x and y components (roughly pitch and yaw) of the head rotation seen by the camera."""
     by_expression: Float[Tensor, "e l 3"]
-    """A unit of each coefficient."""
+    """Offset per unit of each expression coefficient."""
     by_person: Float[Tensor, "k l 3"]
-    """A standard deviation of each principal component of what differs between people."""
+    """Offset per standard deviation of each principal component of the differences between people."""
     rest_sigma: float
-    """Standard deviation along each axis of what these components leave of a person."""
+    """Standard deviation, along each axis, of the part of a person's offsets that these components do not explain."""
 
     def of_turns(self, head_rotation: Float[Tensor, "b 3"]) -> Float[Tensor, "b l 3"]:
-        """The part that follows the head's turning away from the camera."""
+        """The part of the offsets that depends on how far the head turns away from the camera."""
         turns = head_rotation[:, :2].clamp(-_LARGEST_TURN, _LARGEST_TURN)
         return (turns @ self.by_turn.flatten(1)).reshape(len(turns), *self.mean.shape)
 
     def of_person(self, person: Float[Tensor, " k"]) -> Float[Tensor, "l 3"]:
-        """The part that is a person's own, beside the mean."""
+        """The part of the offsets that one person adds to the mean."""
         return (person @ self.by_person.flatten(1)).reshape(self.mean.shape)
 
     def at(self, landmarks: Int[Tensor, " n"]) -> "DetectorResponse":
-        """Of some of the landmarks."""
+        """The response for some of the landmarks."""
         return DetectorResponse(
             self.mean[landmarks], self.by_turn[:, landmarks], self.by_expression[:, landmarks],
             self.by_person[:, landmarks], self.rest_sigma,
         )  # fmt: skip
 
     def without_turns(self) -> "DetectorResponse":
-        """For several cameras, which see a head from as many sides."""
+        """The response for several cameras. They see the head from several sides, so no one turn applies."""
         return replace(self, by_turn=torch.zeros_like(self.by_turn))
 
 
 def unknown_response(landmarks: int, expressions: int, sigma: float) -> DetectorResponse:
-    """Nothing known but how far points may be off."""
+    """A response of zeros: only the standard deviation `sigma` of the offsets is known."""
     zeros = torch.zeros(landmarks, 3, dtype=torch.float64)
     return DetectorResponse(
         zeros, zeros.expand(2, -1, -1), zeros.expand(expressions, -1, -1), zeros.expand(0, -1, -1), sigma
@@ -65,12 +68,15 @@ def unknown_response(landmarks: int, expressions: int, sigma: float) -> Detector
 
 
 def response_path(face_model_name: str) -> Path:
-    """The file of a face model that comes with mien; it need not exist."""
+    """Path of the response file that ships with mien for a face model. The file may not exist."""
     return Path(str(resources.files("mien.tracking") / "data" / f"{face_model_name}_detector.npz"))
 
 
 def read_response(face_model: FaceModel, sigma: float) -> DetectorResponse:
-    """What was measured for this face model; for another mesh than the measured one nothing but `sigma` is known."""
+    """Read the response measured for this face model.
+
+    If it was never measured, or on another mesh, only `sigma` is known.
+    """
     path, expressions = response_path(face_model.name), len(face_model.expression_names)
     landmarks = len(face_model.landmarks["mediapipe"].faces)
     if not path.is_file():
@@ -78,7 +84,7 @@ def read_response(face_model: FaceModel, sigma: float) -> DetectorResponse:
     with np.load(path, allow_pickle=False) as file:
         if str(file["topology_hash"]) != face_model.topology_hash:
             return unknown_response(landmarks, expressions, sigma)
-        scale = 1e-3  # kept in millimetres: half precision is fine for them
+        scale = 1e-3  # Files hold millimetres, for which half precision is enough.
         mean, by_turn, by_expression, by_person = (
             scale * torch.from_numpy(file[name].astype(np.float64))
             for name in ("mean", "by_turn", "by_expression", "by_person")
@@ -87,7 +93,7 @@ def read_response(face_model: FaceModel, sigma: float) -> DetectorResponse:
 
 
 def write_response(path: Path, face_model: FaceModel, response: DetectorResponse, people: int) -> None:
-    """Write what `read_response` reads."""
+    """Write a response for `read_response`."""
     arrays = {
         name: (1e3 * getattr(response, name)).numpy().astype(np.float16)
         for name in ("mean", "by_turn", "by_expression", "by_person")

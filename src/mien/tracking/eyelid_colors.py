@@ -1,8 +1,9 @@
-"""What a person's eyeballs look like beside the skin around them, and how well positions of lids explain a picture.
+"""Colours of a person's eyeballs and of the skin around them, and how well positions of the lids explain a picture.
 
-Two palettes are learned from the clip itself, where lids are tracked open: of what is eyeball, and of what is beside
-it, lashes and folds among it. A position of the lids makes every pixel eyeball, edge of a lid, or plain skin. Lashes
-are dark as irises are, but only near the edge of a lid; so an open eye is not taken for one closed and full of lashes.
+Two palettes are learned from the clip itself, from frames in which the lids are tracked open: one of the eyeball, one
+of its surroundings, with lashes and folds. A position of the lids makes each pixel eyeball, edge of a lid, or plain
+skin. Lashes are as dark as irises but occur only near the edge of a lid, so an open eye is not mistaken for a closed
+one full of lashes.
 """
 
 from collections.abc import Sequence
@@ -14,44 +15,45 @@ from jaxtyping import Float
 from mien.tracking.eyelid_crops import EyeCrop
 
 _EYE_COLORS, _EDGE_COLORS = 6, 8
-"""Of the palettes."""
+"""Number of colours in each palette."""
 _ROUNDS = 20
 _SAMPLES = 20_000
 _LEAST_SAMPLES = 100
 _COLOR_SIGMA, _SKIN_SIGMA = 0.15, 0.15
-"""Of a palette's colour, and of what plain skin differs by beside what it does around the eye: logarithms."""
+"""Standard deviations of logarithms of colours. The first is about each colour of a palette. The second is that of
+plain skin on the lids, in addition to the spread of the skin around the eye."""
 _EDGE_SHARE = 0.1
-"""Of plain skin that may have any of the edge's colours: moles, folds, make-up."""
+"""Share of plain skin that may have any colour of the edge palette: moles, folds, make-up."""
 _EYE_SHARE = 0.2
-"""Of the edge of a lid that may have any of the eyeball's colours: lashes are as dark as pupils."""
+"""Share of the edge of a lid that may have any colour of the eyeball palette: lashes are as dark as pupils."""
 _ANYTHING = 0.05
-"""Density of colours that are none of these: reflections, frames of glasses."""
+"""Density of all other colours, such as reflections and frames of glasses."""
 
 
 @dataclass(frozen=True, eq=False)
 class Palette:
-    """A mixture of k normal distributions of colours, alike in all directions."""
+    """A mixture of k isotropic normal distributions of colours."""
 
     means: Float[np.ndarray, "k 3"]
     shares: Float[np.ndarray, " k"]
 
     def density(self, colors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """But for a factor that all densities here lack."""
+        """Density of each colour, up to a factor that is the same for all densities in this module."""
         return (self.shares * _normal(((colors[:, None] - self.means) ** 2).sum(-1), _COLOR_SIGMA)).sum(1)
 
 
 @dataclass(frozen=True, eq=False)
 class EyeColors:
-    """Of one eye of one person, as differences of logarithms from the skin around it."""
+    """Colours of one eye of one person, as differences of logarithms from the skin around the eye."""
 
     eyeball: Palette
     edge: Palette
     skin_sigma: float
 
     def costs(self, crop: EyeCrop, band: int) -> Float[np.ndarray, " k"]:
-        """Negative logarithms of how likely the pixels are at each position of the lids, but for a constant.
+        """Negative log-likelihood of the pixels at each of the k positions of the lids, up to a constant.
 
-        `band` positions back, what was eyeball is edge of the upper lid.
+        At each position, pixels that were eyeball up to `band` positions earlier are the edge of the upper lid.
         """
         edge = self.edge.density(crop.colors)
         plain = _normal((crop.colors**2).sum(1), self.skin_sigma)
@@ -65,7 +67,10 @@ class EyeColors:
 
 
 def learn_colors(crops: Sequence[EyeCrop]) -> EyeColors | None:
-    """The colours of an eye from pictures in most of which lids are about where they are tracked; None from too few."""
+    """Learn the colours of an eye from pictures, most of which are tracked with about the right position of the lids.
+
+    Returns None if there are too few pixels.
+    """
     inside, beside = (
         np.concatenate([crop.colors[getattr(crop, name)] for crop in crops] or [np.zeros((0, 3), np.float32)])
         for name in ("inside", "beside")
@@ -81,7 +86,7 @@ def _normal(squared: Float[np.ndarray, "..."], sigma: float) -> Float[np.ndarray
 
 
 def _palette(colors: Float[np.ndarray, "n 3"], count: int) -> Palette:
-    """By k means that start from equal parts in the order of brightness."""
+    """A palette found by k-means, which starts from equal parts of the colours in the order of brightness."""
     colors = colors[:: max(len(colors) // _SAMPLES, 1)].astype(np.float64)
     order = np.array_split(colors[colors.sum(1).argsort(kind="stable")], count)
     means = np.stack([part.mean(0) for part in order])

@@ -1,4 +1,4 @@
-"""What a picture shows where an eye may be open: colours, and how much of each pixel is eyeball as the lids move."""
+"""Pixels of a picture around an eye: their colours, and how much of each is eyeball as the lids move."""
 
 from dataclasses import dataclass
 
@@ -13,21 +13,21 @@ from mien.render.mesh import rasterize_mesh
 from mien.tracking.eyelid_eyes import Eye
 
 _LARGEST = 40
-"""Pixels: eyeballs wider than this are looked at in a smaller picture."""
+"""Largest width of an eyeball, in pixels. If it is wider, the picture is scaled down."""
 _SMALLEST = 20
-"""Pixels: eyeballs narrower than this show too little."""
+"""Smallest width of an eyeball, in pixels. Narrower eyeballs show too little and are skipped."""
 _SHARPER = 2
-"""Edges of lids are drawn at so many times the picture's size, so that they fall between pixels as well."""
+"""The mesh is drawn at this multiple of the picture's size, so that edges of lids can lie between pixels."""
 _MARGIN = 2
-"""Pixels around the eyeball."""
+"""Margin around the eyeball, in pixels."""
 _LEAST_COSINE = 0.25
-"""Between skin and the direction to the camera, for it to tell the colour of skin."""
+"""Smallest cosine between the normal of skin and the direction to the camera at which the skin's colour is used."""
 _RING, _SMOOTH = 0.3, 0.18
-"""How far skin around the eye counts, and over how much of it its colour is smoothed, in widths of the opening."""
+"""Width of the ring of skin around the eye, and sigma of the blur of its colour, in widths of the opening."""
 _LEAST_RING, _LEAST_OPENING = 12, 12
-"""Pixels of skin, and of what an open eye would show, below which nothing is told."""
+"""Fewest pixels of the ring of skin, and of the opening of the eye. With fewer the eye is skipped."""
 _DARKEST = 0.03
-"""Added to colours before their logarithm: noise in the dark is no colour."""
+"""Value added to colours before the logarithm, so that noise in dark pixels does not matter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,15 +35,15 @@ class EyeCrop:
     """The n pixels of a picture that the lids of one eye may cover or uncover."""
 
     colors: Float[np.ndarray, "n 3"]
-    """Logarithms of colours, less those of the skin around the eye: what remains when the light changes."""
+    """Logarithms of colours minus those of the skin around the eye. Changes of light cancel in the difference."""
     uncovered: Float[np.ndarray, "k n"]
     """How much of each pixel is eyeball at each position of the lids, 0..1."""
     spread: float
-    """Root mean square of the same for the skin around the eye."""
+    """Root mean square of the same differences over the skin around the eye."""
     beside: Bool[np.ndarray, " n"]
-    """Neither eyeball nor right at its edge, at the position of the lids that was tracked."""
+    """Whether a pixel is neither eyeball nor next to it, at the tracked position of the lids."""
     inside: Bool[np.ndarray, " n"]
-    """Eyeball, and not right at its edge, at the position of the lids that was tracked."""
+    """Whether a pixel is eyeball and not at its edge, at the tracked position of the lids."""
 
 
 def eye_crop(
@@ -54,15 +54,15 @@ def eye_crop(
     tracked: float,
     positions: list[float],
 ) -> EyeCrop | None:
-    """What a picture shows of an eye; None where that is too little.
+    """The pixels of an eye in a picture, or None if the picture shows too little of it.
 
     Args:
         eye: The eye.
-        picture: sRGB.
-        camera: That took it.
-        corners: The eye's vertices in world space with lids at rest (0), and where they meet (1).
-        tracked: Where the lids are taken to be, in the same unit.
-        positions: Where they might be, the most open first; `tracked` is added as the last.
+        picture: The picture, sRGB.
+        camera: The camera that took the picture.
+        corners: The eye's vertices in world space with the lids at rest (position 0) and closed (position 1).
+        tracked: Tracked position of the lids, on the same scale.
+        positions: Possible positions of the lids, the most open first.
     """
     found = _part(picture, camera, corners[0, eye.faces[: eye.ball].flatten().unique()])
     if found is None:
@@ -90,7 +90,10 @@ def eye_crop(
 def _part(
     picture: UInt8[np.ndarray, "h w 3"], camera: Camera, ball: Float[Tensor, "b 3"]
 ) -> tuple[Float[np.ndarray, "ph pw 3"], Bool[np.ndarray, "ph pw"], Camera] | None:
-    """The part of the picture around an eyeball, which of its pixels the picture has, and its camera."""
+    """The crop around an eyeball, which of its pixels lie inside the picture, and its camera.
+
+    Returns None if the eyeball is too small, outside the picture, or behind the camera.
+    """
     points, depth = camera.project(ball)
     if not (depth > 0).all():
         return None
@@ -123,7 +126,7 @@ def _uncovered(eye: Eye, vertices: Float[Tensor, "n 3"], sharper: Camera) -> Flo
 def _around(
     eye: Eye, vertices: Float[Tensor, "n 3"], view: Camera
 ) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Where skin is seen from in front, and what something hides that is neither eyeball nor lid."""
+    """Which pixels show skin that faces the camera, and which show something that is neither eyeball nor lid."""
     seen = rasterize_mesh(vertices, eye.faces, view).face_index.long()
     triangles = vertices[eye.faces]
     normals = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -140,7 +143,10 @@ def _logarithms(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]
 def _without_skin(
     colors: Float[np.ndarray, "h w 3"], opening: Bool[np.ndarray, "h w"], skin: Bool[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w 3"] | None, float]:
-    """Colours less the smooth one of the skin around an opening, and how much that skin's own differ from it."""
+    """Colours minus the smoothed colour of the skin around an opening, and that skin's own spread about it.
+
+    The colours are None if too little skin is seen.
+    """
     columns = np.flatnonzero(opening.any(axis=0))
     width = max(int(np.ptp(columns)) if len(columns) else 0, 6)
     reach = 2 * max(int(_RING * width), 3) + 1
@@ -152,7 +158,7 @@ def _without_skin(
         return None, 0.0
     middle = np.median(colors[ring], axis=0)
     away = np.abs(colors - middle).sum(-1)
-    # What differs much from the middle colour, such as the frame of glasses, is no skin.
+    # Pixels far from the median colour, such as the frame of glasses, are not skin.
     weight = (ring / (1 + (away / (2 * (np.median(away[ring]) + 0.05))) ** 4)).astype(np.float32)
     summed = cv2.GaussianBlur(colors * weight[..., None], (0, 0), _SMOOTH * width)
     total = cv2.GaussianBlur(weight, (0, 0), _SMOOTH * width)[..., None]

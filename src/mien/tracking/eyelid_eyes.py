@@ -1,4 +1,4 @@
-"""The eyes of a face model: their balls, the skin around them, and the coefficient that closes their lids."""
+"""The eyes of a face model: the eyeballs, the skin around them, and the coefficient that closes their lids."""
 
 from dataclasses import dataclass, replace
 
@@ -14,45 +14,45 @@ from mien.tracking.parameters import ParameterLayout
 from mien.tracking.photometric_texture import HIDING_REGIONS
 
 _LIDS_REACH, _AROUND_REACH = 1.3, 3.5
-"""How far from an eyeball's centre its lids and what may hide it reach, in its radii."""
+"""Distances from an eyeball's centre that contain its lids, and everything that may hide it, in radii."""
 _STEPS = 64
-"""Lids touch at the first of so many equal parts of a coefficient's range at which it covers all that it ever does."""
+"""Number of equal steps of a coefficient. Lids touch at the first step at which the least of the eyeball is seen."""
 _MOST_CLOSING = 1.25
-"""Times its upper bound: a coefficient that would have to go farther to close an eye does not close it."""
+"""A coefficient closes an eye if the lids meet within this multiple of its upper bound."""
 _OTHERS_SHARE = 0.2
-"""A coefficient that moves the other eye's lids by more than this part is not this eye's own."""
+"""A coefficient is not an eye's own if it moves the other eye's lids by more than this share."""
 
 
 @dataclass(frozen=True, eq=False)
 class Eye:
-    """One eye, and what closes it."""
+    """One eye and the coefficient that closes it."""
 
     column: int
-    """Of the parameters: the coefficient that moves the lids."""
+    """Column of the state that holds the coefficient that moves the lids."""
     closed: float
-    """Its value where the lids of the mean person have met: what is worth 1 of ARKit's, which closes an eye firmly, or
-    more where they do not touch before."""
+    """Value of the coefficient at which the lids of the mean person have met. It is worth 1 of the ARKit coefficient,
+    which closes an eye firmly, or more if the lids do not touch before."""
     vertices: Int[Tensor, " n"]
-    """Of the face model, those that the triangles below have."""
+    """Indices, in the face model, of the vertices of the triangles below."""
     faces: Int[Tensor, "f 3"]
-    """Triangles of the eyeball, then of its lids, then of what is around them; among `vertices`."""
+    """Triangles of the eyeball, then of its lids, then of their surroundings, as indices into `vertices`."""
     ball: int
-    """How many of them are the eyeball's."""
+    """Number of triangles of the eyeball."""
     lids: int
-    """How many of them are the eyeball's and the lids'."""
+    """Number of triangles of the eyeball and the lids together."""
     skin: Bool[Tensor, " f"]
-    """Which of them show skin."""
+    """Which triangles are skin."""
     forward: Float[Tensor, " 3"]
-    """From the eyeball's centre through its lids, head frame."""
+    """Direction from the eyeball's centre through its lids, in the head frame."""
 
     @property
     def moving(self) -> Int[Tensor, "m 3"]:
-        """The eyeball's triangles, then the lids'."""
+        """The triangles of the eyeball, then those of the lids."""
         return self.faces[: self.lids]
 
 
 def eyes_of(model: FaceModel, layout: ParameterLayout) -> list[Eye]:
-    """The eyes whose lids a coefficient of their own closes; none where the model has no eyeballs or no such ones."""
+    """The eyes that have a coefficient of their own to close the lids. Empty if the model has no eyeballs."""
     ball = model.region_mask("eyes", "irises")
     if not ball.any() or len(layout.expression_index) == 0:
         return []
@@ -72,7 +72,7 @@ def eyes_of(model: FaceModel, layout: ParameterLayout) -> list[Eye]:
 
 
 def _closing(model: FaceModel, layout: ParameterLayout, pairs: tuple[tuple[int, int], ...]) -> Float[Tensor, " n"]:
-    """By which part of the mean person's gap between the lids each free coefficient narrows it."""
+    """The share of the mean person's gap between the lids that each free coefficient closes, per unit."""
     upper, lower = (list(side) for side in zip(*pairs, strict=True))
     marks = model.landmark_positions(model.template, "mediapipe")
     moved = model.landmark_positions(model.expression_basis[layout.expression_index], "mediapipe")
@@ -87,7 +87,7 @@ def _coefficient(
     of_other: Float[Tensor, " n"],
     lids: tuple[int, ...],
 ) -> tuple[int, float] | None:
-    """Which free coefficient closes an eye with the least motion elsewhere, and at what value; None if none does."""
+    """The free coefficient that closes an eye with the least motion elsewhere, and its upper bound; or None."""
     bounds = model.expression_bounds[layout.expression_index]
     able = (closing * _MOST_CLOSING * bounds[:, 1] >= 1) & (of_other.abs() < _OTHERS_SHARE * closing)
     if not able.any():
@@ -135,7 +135,7 @@ def _where_lids_touch(
     centre: Float[Tensor, " 3"],
     radius: Float[Tensor, ""],
 ) -> float:
-    """The coefficient at which nothing of the eyeball is seen any more from far in front."""
+    """The value of the coefficient at which the least of the eyeball is seen from far in front."""
     width, far = 192, 40.0 * radius
     focal = width * far / (4 * radius)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, width / 2], [0, 0, 1]])

@@ -1,10 +1,10 @@
-"""Lids put where the picture has them: blinks that a landmark detector misses, behind glasses above all.
+"""Eyelids placed from the pictures. This finds blinks that a landmark detector misses, above all behind glasses.
 
-Skin is tracked by its texture, but what lids uncover is no part of it. So each picture is asked apart which position of
-the lids explains it best: every pixel that the lids may cover looks like this person's eyeball or like the skin around
-the eye (`eyelid_colors`). The answer is weighed against where the fit has the lids, which is right within a few
-hundredths of a blink or wrong altogether. Nothing is smoothed over time, and nothing assumes that anybody blinks: the
-position of lids in most frames is taken from the fit, that of closed lids from the model, where they meet.
+Skin is tracked by its texture, but the texture does not include what the lids uncover. So each picture decides on its
+own which position of the lids explains it best: every pixel that the lids may cover looks like this person's eyeball
+or like the skin around the eye (`eyelid_colors`). This is weighed against the lids of the fit, which are right within
+a few hundredths of a blink, or altogether wrong. Nothing is smoothed over time, and nothing assumes that anybody
+blinks: the usual position of the lids comes from the fit, and the closed position from the model.
 """
 
 from collections.abc import Sequence
@@ -25,25 +25,26 @@ from mien.tracking.shot import Shot
 from mien.tracking.stages import Fit, SequenceFit, box_of
 
 _POSITIONS = np.linspace(-0.4, 1.2, 13)
-"""Of the lids: 0 at rest, 1 where they meet. Below 0 they are wider open than at rest."""
+"""Positions of the lids that are tried: 0 is at rest, 1 is closed, below 0 is wider open than at rest."""
 _BAND = 4
-"""Positions over which lashes and the edge of the upper lid reach, a little generously."""
+"""Width of the lashes and the edge of the upper lid, in positions; a generous estimate."""
 _FINE, _BLUR = 0.01, 0.08
-"""Step, and standard deviation of the smoothing, of costs between the positions."""
+"""Step of the fine positions that costs are interpolated to, and standard deviation of the smoothing kernel."""
 _DOUBT = 8.0
-"""What costs are divided by: neighbouring pixels err together."""
+"""Divisor of the costs, because errors of neighbouring pixels are correlated."""
 _DISAGREEMENT = 0.07
-"""Where, in a quarter of the frames, the fit's lids cost more than this part of the range of costs above the best ones,
-the colours mislead."""
+"""Largest upper quartile, over the frames, of the cost of the fit's lids above the best one, as a share of the range
+of costs. If it is larger, the colours are misleading and count less."""
 _SIGMA = 0.12
-"""How far a good fit's lids are off."""
+"""Standard deviation of the lids of a good fit."""
 _FAR = 0.4
-"""The same for what is left of it where only the middle is asked for."""
+"""Wider standard deviation of the fit's lids, for the estimate of the usual offset between colours and fit."""
 _LEARNED_FROM = 100
-"""Pictures."""
+"""Largest number of pictures that colours are learned from."""
 _LEAST_PICTURES = 10
+"""Fewest pictures that must show an eye for its lids to be placed."""
 _LEAST_FACING = 0.35
-"""Cosine between an eye's direction and that to the camera."""
+"""Smallest cosine between an eye's direction and the direction to the camera."""
 
 
 def place_lids(
@@ -52,13 +53,15 @@ def place_lids(
     fit: Fit,
     weight: float,
 ) -> Fit:
-    """The fit with lids where pictures have them; as it is where the model's lids cannot close, or eyes are too small.
+    """Return the fit with the lids placed from the pictures.
+
+    Lids stay as they are if the model cannot close them or the eyes are too small in the pictures.
 
     Args:
         model: The face model reduced to its landmarks.
         shots: The sequences.
-        fit: Of them; everything but the lids stays.
-        weight: Of pictures against the fit: 1 as measured, 0 for the fit alone.
+        fit: The fit of the sequences. Everything but the lids stays as it is.
+        weight: Weight of the pictures against the fit: 1 as measured, 0 for the fit alone.
     """
     eyes = eyes_of(model.face_model.to(torch.zeros(())), model.layout) if weight > 0 else []
     sequences = []
@@ -70,7 +73,7 @@ def place_lids(
 
 
 class _Sequence:
-    """The pictures of one sequence, at the lids' positions so far."""
+    """The pictures of one sequence and its fit so far."""
 
     def __init__(self, model: LandmarkModel, shot: Shot, fit: Fit, own: SequenceFit, eyes: Sequence[Eye]):
         self.model, self.shot, self.fit, self.own, self.eyes = model, shot, fit, own, eyes
@@ -78,7 +81,7 @@ class _Sequence:
         self.timesteps = shot.valid.nonzero()[:, 0].tolist()
 
     def crops(self, row: int, positions: list[float]) -> list[EyeCrop | None]:
-        """Of each eye, by the camera that it faces."""
+        """The crop of each eye, in the picture of the camera that the eye faces most directly."""
         columns = [eye.column for eye in self.eyes]
         states = self.own.state[[row, row]].clone()
         states[0, columns], states[1, columns] = 0.0, states.new_tensor([eye.closed for eye in self.eyes])
@@ -135,7 +138,7 @@ def _costs(crop: EyeCrop | None, colors: EyeColors | None) -> Float[np.ndarray, 
 
 
 def _learned(sequence: _Sequence) -> list[EyeColors | None]:
-    """The colours of each eye."""
+    """The colours of each eye, or None for an eye that is seen too little."""
     rows = torch.linspace(0, len(sequence.own.state) - 1, min(_LEARNED_FROM, len(sequence.own.state)))
     ends = [float(_POSITIONS[0])]
     crops = in_threads(lambda row: sequence.crops(row, ends), rows.round().long().unique().tolist())
@@ -148,10 +151,11 @@ def _learned(sequence: _Sequence) -> list[EyeColors | None]:
 def weighed(
     costs: Float[np.ndarray, "n k"], tracked: Float[np.ndarray, " n"], weight: float
 ) -> Float[np.ndarray, " n"]:
-    """Positions of lids in n frames that costs of k positions and the tracked ones agree on best.
+    """The positions of the lids in n frames that best suit both the costs of k positions and the tracked positions.
 
-    What the colours find too open or too closed in most frames is corrected by the fit there, and not where lids meet.
-    If they contradict the fit in many frames, they count for little in all.
+    If the colours place the lids too open or too closed in most frames, the fit corrects them. The correction is full
+    at the usual position and vanishes where the lids meet. If the colours contradict the fit in many frames, they count
+    for little in all frames.
     """
     fine = np.arange(_POSITIONS[0], _POSITIONS[-1] + _FINE / 2, _FINE)
     near = np.exp(-0.5 * ((fine[:, None] - _POSITIONS) / _BLUR) ** 2)
@@ -165,7 +169,7 @@ def weighed(
     middle = fine[(costs + 0.5 * ((fine - tracked[:, None]) / _FAR) ** 2).argmin(1)]
     shift = np.median((middle - tracked)[often])
     share = ((1 - fine) / max(1 - np.median(tracked[often]), 0.3)).clip(0, 1.2)
-    # Where the most open position is the best one, what is seen is no eye: hair, a brow, a hand.
+    # If the most open position is the best one, the pixels do not show an eye but hair, a brow or a hand.
     costs[costs[:, 0] <= costs.min(1)] = 0
     corrected = fine - shift * share
     far = np.log1p(((corrected - tracked[:, None]) / _SIGMA) ** 2)

@@ -1,7 +1,7 @@
-"""Which of the cameras that see a head at once to believe about its landmarks: those that it faces.
+"""Trust in the landmarks of several cameras that see a head at once, by the head's direction.
 
-In pictures from the side a detector guesses the far half of the face, and what it makes of the near one changes with
-the view. A single camera is believed as it is: what turns do to landmarks there was measured
+In pictures from the side a detector guesses the far half of the face, and its landmarks of the near half change with
+the view. A single camera is fully trusted, because the effect of turns on landmarks was measured for that case
 (`mien.tracking.detector_response`).
 """
 
@@ -13,16 +13,16 @@ from mien.rotation import matrix_from_axis_angle
 from mien.tracking.views import CameraBatch, Views
 
 _SIDEWAYS = 0.3
-"""Radians between the way the face looks and the camera at which a picture counts half."""
+"""Angle between the direction of the face and the camera at which a picture counts half, in radians."""
 
 
 def trust_of(views: Views, state: Float[Tensor, "v p"], cameras: CameraBatch) -> Float[Tensor, " n"]:
-    """How much each picture's landmarks count, 0..1; 1 in the picture of each timestep that sees the face best.
+    """Weight of each picture's landmarks, 0..1. It is 1 for the most frontal picture of each timestep.
 
     Args:
         views: The pictures.
-        state: Of the timesteps: rotation vectors (radians) and translations (metres) of the head first.
-        cameras: In the frame of the state.
+        state: Parameters of the timesteps. The first six are the head's axis-angle rotation and translation (metres).
+        cameras: The cameras, in the frame of the state.
     """
     ahead = matrix_from_axis_angle(state[:, :3])[views.row, :, 2]
     sight = cameras.centres[views.camera] - state[views.row, 3:6]

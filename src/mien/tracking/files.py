@@ -1,4 +1,4 @@
-"""A tracking on disk: tracking.json (what it is) and tracking.safetensors (the numbers)."""
+"""A tracking on disk: tracking.json with its description and tracking.safetensors with its numbers."""
 
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ _REMEDY = "delete the folder and run `mien track` again"
 
 
 def write_tracking(path: Path, tracking: Tracking) -> None:
-    """Write a tracking into the folder `path`. The json goes last and vouches for the numbers by their hash."""
+    """Write a tracking into the folder `path`. The json is written last and holds the hash of the numbers."""
     check_tree(path)
     tensors = {
         **tracking.face.tensors(),
@@ -61,11 +61,11 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
 
 
 def read_tracking(path: Path) -> Tracking:
-    """Read what `write_tracking` wrote.
+    """Read a tracking that `write_tracking` wrote.
 
     Raises:
-        UserError: something is missing, damaged, of another version, not finite, beyond `mien.limits`, being written,
-            or a link.
+        UserError: A file is missing, damaged, of another version, being written, or a link, or it holds numbers that
+            are not finite or exceed `mien.limits`.
     """
     return read_beside_writers(lambda: _read_tracking(path), [path], [path.parent])
 
@@ -93,10 +93,10 @@ def _read_tracking(path: Path) -> Tracking:
 
 
 def check_tracking_of(capture: Capture, tracking: Tracking, where: Path) -> None:
-    """Find that a tracking has the timesteps, cameras and picture sizes of a capture.
+    """Check that a tracking has the timesteps, cameras and picture sizes of a capture.
 
     Raises:
-        UserError: it has not; `where` is the tracking's folder.
+        UserError: It has not. The message names `where`, the tracking's folder.
     """
     sizes = {(camera.width, camera.height) for camera in tracking.cameras}
     found = (len(tracking.face), len(tracking.cameras), sizes)
@@ -121,7 +121,7 @@ def _text(value: object) -> str:
 
 
 def _read_settings(settings: Any) -> dict[str, Any]:
-    """As they are, but for what is looked at before a tracking is made again."""
+    """The settings unchanged. Only `tracked_together` is checked: it is read before a capture is tracked again."""
     together = settings.get("tracked_together", [])
     if not (isinstance(together, list) and all(isinstance(name, str) for name in together)):
         raise ValueError("tracked_together is no list of names")
@@ -129,7 +129,7 @@ def _read_settings(settings: Any) -> dict[str, Any]:
 
 
 def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Every tensor is there, its axes agree with the others', and its numbers are finite."""
+    """Check that no tensor is missing, that axes of the same name agree, and that all numbers are finite."""
     sizes: dict[str, int] = {"3": 3, "4": 4, "9": 9}
     for name, axes in _AXES.items():
         if name not in tensors:

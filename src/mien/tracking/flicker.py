@@ -1,7 +1,7 @@
-"""Landmarks that swing between two answers: what a detector does that starts from where it saw the face last.
+"""Flicker of landmarks: a detector that crops each picture by its last answer can swing between two answers.
 
-Where nothing moves, its crop of the next picture depends on its last answer and that on the crop, and it may go to and
-fro for ever. A face does not: nothing of it moves up in one frame and down in the next, again and again.
+If nothing moves, the crop of the next picture depends on the last answer and the answer on the crop, so landmarks may
+go to and fro for ever. No part of a face does that: none moves up in one frame and down in the next, again and again.
 """
 
 import torch
@@ -9,16 +9,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 _SWING = 0.3
-"""Squared way between frames two apart, of that between neighbours: 0 for swings, 0.5 for noise, 2 for motion."""
+"""Largest ratio of squared motion over two frames to the sum of both squared single-frame motions that counts as a
+swing. The ratio is 0 for a swing, 0.5 for noise and 2 for steady motion."""
 _LEAST_RUN = 4
-"""Frames in a row that swing; a blink is one."""
+"""Fewest frames in a row that swing. A blink is a single swing and is kept."""
 
 
 def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c"]) -> Float[Tensor, "t c l 2"]:
-    """The same with frames of longer swings replaced by the mean of both answers.
+    """Return the landmarks, with the mean of both answers wherever they swing for several frames.
 
     Args:
-        landmarks: Pixels; of any value where not seen.
+        landmarks: Landmarks in pixels; any value where not seen.
         seen: Whether the camera found a face.
     """
     if len(landmarks) < _LEAST_RUN + 2:
@@ -26,10 +27,10 @@ def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c
     steps = (landmarks[1:] - landmarks[:-1]).square().sum((-1, -2))
     across = (landmarks[2:] - landmarks[:-2]).square().sum((-1, -2))
     swings = torch.zeros_like(seen)
-    swings[1:-1] = across < _SWING * (steps[1:] + steps[:-1])  # not a number is no swing
+    swings[1:-1] = across < _SWING * (steps[1:] + steps[:-1])  # False for NaN
     swings[1:-1] &= seen[:-2] & seen[1:-1] & seen[2:]
     runs = _of_runs(swings)
-    # The ends of a run swing as well, but have one neighbour only that does.
+    # The frames at both ends of a run swing too, but with only one of their neighbours.
     linked = (runs[:-1] | runs[1:])[..., None, None]
     forward = torch.where(linked, landmarks[1:] - landmarks[:-1], 0.0)
     towards, neighbours = torch.zeros_like(landmarks), torch.zeros_like(landmarks[:, :, :1, :1])
@@ -41,7 +42,7 @@ def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c
 
 
 def _of_runs(swings: Bool[Tensor, "t c"]) -> Bool[Tensor, "t c"]:
-    """Which of them are in runs that are long enough."""
+    """Which swings belong to a run of at least `_LEAST_RUN` frames."""
     whole = swings.unfold(0, _LEAST_RUN, 1).all(-1)
     kept = torch.zeros_like(swings)
     for shift in range(_LEAST_RUN):

@@ -1,4 +1,4 @@
-"""The first stage of tracking: where the head is and how it is turned, of every timestep alone."""
+"""The first stage of tracking: the rotation and translation of the head, fitted at each timestep alone."""
 
 from dataclasses import replace
 
@@ -17,16 +17,16 @@ from mien.tracking.views import CameraBatch, Views
 
 _ITERATIONS = 15
 _OUTLIER = 40.0
-"""Sigmas: a head that is turned away lies far from the frontal start."""
+"""Outlier threshold in sigmas. It is wide because a turned head is far from the frontal start."""
 
 
 def fit_head_pose(
     model: LandmarkModel, views: Views, cameras: CameraBatch, subject: Subject, settings: TrackingSettings
 ) -> Float[Tensor, "v 6"]:
-    """Head rotation and translation of every timestep alone, from points that expressions hardly move.
+    """Fit head rotation and translation at each timestep alone, from landmarks that expressions hardly move.
 
-    Every picture is fitted by itself first, from a head that faces its camera. Where several cameras see a timestep,
-    the one of these fits that suits all of them best is where their joint fit starts.
+    Each picture is fitted by itself first, starting from a head that faces its camera. If several cameras see a
+    timestep, their joint fit starts from the one of these poses that suits all of them best.
     """
     weights = rigid_weights()
     rigid = (weights > 0).nonzero()[:, 0]
@@ -52,7 +52,7 @@ def landmark_term(
     cameras: CameraBatch,
     settings: TrackingSettings,
 ) -> LandmarkTerm:
-    """The cost of landmarks whose errors are known in metres on a face at its median depth from each camera."""
+    """The landmark cost, with the expected error turned from metres into pixels at the median depth in each camera."""
     towards, origin = cameras.viewmat[:, 2, :3], cameras.viewmat[:, 2, 3]
     depth = (state[views.row, 3:6] * towards[views.camera]).sum(-1) + origin[views.camera]
     sigma = torch.ones_like(origin)
@@ -87,7 +87,7 @@ def _minimize(
 def _facing_the_cameras(
     points: Float[Tensor, "l 3"], detected: Float[Tensor, "n l 2"], cameras: CameraBatch
 ) -> Float[Tensor, "n 6"]:
-    """Heads that look straight into each picture's camera, with the size and place of the detected points."""
+    """Head poses that look straight into each picture's camera and match the size and place of the detected points."""
     centre = detected.mean(1)
     spread = (detected - centre[:, None]).norm(dim=-1).mean(1)
     focal = cameras.K[:, 0, 0]
@@ -101,7 +101,7 @@ def _facing_the_cameras(
 
 
 def _first_picture(views: Views) -> Tensor:
-    """The index of a picture of each timestep."""
+    """The index of the first picture of each timestep."""
     first = torch.zeros(views.rows, dtype=torch.long)
     first[views.row.flip(0)] = torch.arange(len(views.row) - 1, -1, -1)
     return first
@@ -110,7 +110,7 @@ def _first_picture(views: Views) -> Tensor:
 def _best_for_all(
     term: LandmarkTerm, poses: Float[Tensor, "n 6"], subject: Subject, cameras: CameraBatch
 ) -> Float[Tensor, "v 6"]:
-    """For every timestep, that of its pictures' own poses which fits all of its pictures best."""
+    """For each timestep, the pose that fits all of its pictures best, out of the poses fitted to single pictures."""
     views = term.views
     best = poses[_first_picture(views)]
     lowest = term.cost(best, subject, cameras)
@@ -125,7 +125,7 @@ def _best_for_all(
 
 
 def relative_rotation(rotations: Float[Tensor, "t 3"], R_new_old: Float[Tensor, "3 3"]) -> Float[Tensor, "t 3"]:
-    """Rotation vectors in another frame, without jumps by whole turns from one timestep to the next."""
+    """Axis-angle rotations in another frame, without jumps by whole turns from one timestep to the next."""
     turned = axis_angle_from_matrix(R_new_old @ matrix_from_axis_angle(rotations))
     for index in range(1, len(turned)):
         angle = turned[index].norm()

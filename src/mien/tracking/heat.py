@@ -1,31 +1,31 @@
-"""Differences of colours as heat, with a legend."""
+"""Heat maps of colour differences, with a legend."""
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 _HOTTEST = 0.15
-"""Length of a difference of colours (each 0..1) that is drawn brightest."""
+"""Length of the colour difference (each channel 0..1) that is drawn brightest."""
 _DIMMED = 0.35
-"""Brightness of what is not compared."""
+"""Brightness of pixels that are not compared."""
 _MARGIN, _BAR = 8, 8
 _WHITE, _BLACK = (255, 255, 255), (0, 0, 0)
 
 
 def heat_map(difference: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Differences in the colours of `inferno`: black is none, or not known (NaN)."""
+    """Differences in the colours of `inferno`. Black is no difference, or an unknown one (NaN)."""
     levels = np.clip(np.nan_to_num(difference) * (255 / _HOTTEST), 0, 255).astype(np.uint8)
     return _inferno(levels)
 
 
 def dimmed(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture in dark grey, as what does not matter."""
+    """The picture in dark grey, as a background."""
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     return cv2.cvtColor(cv2.convertScaleAbs(grey, alpha=_DIMMED), cv2.COLOR_GRAY2RGB)
 
 
 def draw_legend(picture: UInt8[np.ndarray, "h w 3"], top: int) -> None:
-    """A bar of colours at the left, from no difference to the largest that is told apart; none on small pictures."""
+    """Draw a colour bar at the left, from no difference to the largest that is shown. Small pictures get none."""
     height, width = picture.shape[:2]
     length = min(120, width // 2 - 2 * _MARGIN)
     if length < 32 or height < top + 64:
@@ -39,9 +39,9 @@ def draw_legend(picture: UInt8[np.ndarray, "h w 3"], top: int) -> None:
 
 
 def write_text(picture: UInt8[np.ndarray, "h w 3"], text: str, at: tuple[int, int], size: float = 0.5) -> None:
-    """White letters with a black rim; `at` is the left end of their foot."""
+    """Draw white letters with a black rim. `at` is the left end of their baseline."""
     left, foot = at
-    # A thicker letter is wider, too: the rim is the same letter shifted.
+    # The rim is the same letters shifted, because thicker letters would also be wider.
     rim = [(left + x, foot + y, _BLACK) for x in (-1, 0, 1) for y in (-1, 0, 1)]
     for x, y, color in (*rim, (left, foot, _WHITE)):
         cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)

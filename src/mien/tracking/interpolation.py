@@ -1,4 +1,4 @@
-"""Frames without a face: their parameters come from their neighbours."""
+"""Parameters of frames without a face, interpolated from their neighbours."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from mien.face import FaceParams
 def fill_gaps(face: FaceParams, valid: Bool[Tensor, " t"]) -> FaceParams:
     """Parameters of all t timesteps from those of the valid ones: linear between neighbours, constant at the ends.
 
-    Rotation vectors of a head in view are far from pi, so that they interpolate like any other parameter.
+    The rotation of a head in view is far from pi, so axis-angle vectors interpolate like any other parameter.
     """
     assert len(face) == int(valid.sum())
     known = valid.nonzero()[:, 0].numpy()

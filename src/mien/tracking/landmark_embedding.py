@@ -1,8 +1,8 @@
-"""Where MediaPipe's 478 landmarks lie on a face model: `python -m mien.tracking.landmark_embedding anny`.
+"""Place MediaPipe's 478 landmarks on a face model: `python -m mien.tracking.landmark_embedding anny`.
 
-Works for any FaceModel: draw it with random identities, mild expressions, gazes and views, let the landmark detector
-look at the pictures, and take for each landmark the point of the surface that projects nearest to where it was found.
-The result ships with mien (src/mien/face/data), so that only who changes a face model's mesh has to run this.
+This works for any FaceModel. It draws the model with random identities, mild expressions, gazes and views, runs the
+landmark detector on the pictures, and takes for each landmark the point of the surface that projects nearest to the
+detections. The result ships with mien (src/mien/face/data), so this has to run only after a change of the mesh.
 """
 
 from collections.abc import Sequence
@@ -29,47 +29,47 @@ from mien.tracking.landmark_groups import IBUG68, LANDMARKS, LEFT_IRIS, RIGHT_IR
 _FACE_REGIONS = ("skin", "face", "lips", "eyelids", "brows", "nose", "scalp", "ears")
 _EYE_REGIONS = ("eyes", "irises")
 _SCALP_FRONT = 0.06
-"""Metres ahead of the head frame's origin: only there landmarks may be on the scalp."""
+"""Landmarks may lie on the scalp only farther ahead of the head frame's origin than this, in metres."""
 _LEAST_SEEN = 0.25
-"""Share of the pictures in which a triangle is seen, for landmarks to be on it."""
+"""Landmarks may lie on a triangle only if it is seen in at least this share of the pictures."""
 _WALL = (0.6, 0.6, 0.6)
 _SUBDIVISIONS = 12
-"""Steps along a triangle's side at which points are tried."""
+"""Number of steps along a triangle's side between the points that are tried."""
 _COARSE_VIEWS, _COARSE_SUBDIVISIONS, _BEST_TRIANGLES = 16, 3, 16
-"""The search over all triangles uses so many views and points, and passes on so many triangles."""
+"""Views and subdivisions of the coarse search over all triangles, and the number of triangles that it passes on."""
 
 
 @dataclass(frozen=True)
 class EmbeddingSettings:
-    """Pictures that the embedding is fitted to."""
+    """The pictures that the embedding is fitted to."""
 
     pictures: int = 240
-    """How many are drawn; the detector fails on some."""
+    """Number of pictures drawn. The detector fails on some of them."""
     size: int = 512
-    """Pixels."""
+    """Width and height of the pictures, in pixels."""
     yaw: float = 0.45
-    """Largest turn to either side, radians."""
+    """Largest turn to either side, in radians."""
     pitch: float = 0.2
-    """Largest turn up or down, radians."""
+    """Largest turn up or down, in radians."""
     gaze: float = 0.2
-    """Largest turn of the eyes either way, radians."""
+    """Largest turn of the eyes in any direction, in radians."""
     identity: float = 0.8
-    """Standard deviation of identity coefficients."""
+    """Standard deviation of the identity coefficients."""
     clamp: float = 10.0
-    """An error in pixels counts at most so much: detections fail now and then."""
+    """Errors are clamped to this many pixels, because detections fail now and then."""
     seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """What the landmarks of one face model look like in n pictures."""
+    """Vertices of one face model and detected landmarks in n pictures."""
 
     vertices: Float[Tensor, "n v 2"]
-    """Projected vertices, pixels."""
+    """Projected vertices, in pixels."""
     depth: Float[Tensor, "n v"]
-    """Metres: perspective needs it between vertices."""
+    """Depths of the vertices in metres, for perspective-correct points between them."""
     detected: Float[Tensor, "n l 2"]
-    """Pixels."""
+    """Detected landmarks, in pixels."""
 
 
 def embed_landmarks(
@@ -78,7 +78,7 @@ def embed_landmarks(
     """The `mediapipe` and `ibug68` landmark sets of a face model, and each MediaPipe landmark's median error in pixels.
 
     Raises:
-        UserError: the detector finds no face in most pictures.
+        UserError: The detector finds no face in most pictures.
     """
     settings = settings or EmbeddingSettings()
     views, seen = _draw_and_detect(model, settings)
@@ -98,8 +98,8 @@ def embed_landmarks(
 def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.Generator) -> FaceParams:
     """One timestep of a random person with a mild expression, turned a little, at the world's origin.
 
-    Half of them open the mouth, a third close the eyes: on closed lips or open lids alone a point of the upper one
-    cannot be told from its neighbour on the lower one.
+    Half of the people open the mouth and a third close the eyes. From closed lips or open lids alone, a point of the
+    upper one cannot be told from its neighbour on the lower one.
     """
 
     def uniform(*shape: int) -> Tensor:
@@ -136,13 +136,13 @@ def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.
 
 
 def _sometimes(share: float, generator: torch.Generator) -> float:
-    """0, or in a share of the cases a random number up to 1."""
+    """A random number up to 1 in a share of the cases, otherwise 0."""
     chance, amount = torch.rand(2, generator=generator).tolist()
     return amount if chance < share else 0.0
 
 
 def paint(model: FaceModel, generator: torch.Generator) -> Float[Tensor, "f 3 3"]:
-    """A plain albedo of every triangle's corners by region, with a random skin tone."""
+    """An albedo for the corners of every triangle: one colour per region, with a random skin tone."""
     skin = torch.tensor([0.85, 0.65, 0.55]) * (0.55 + 0.45 * torch.rand(1, generator=generator))
     tint = torch.tensor([1.0, 1.0, 1.0])
     tones = {
@@ -161,7 +161,7 @@ def paint(model: FaceModel, generator: torch.Generator) -> Float[Tensor, "f 3 3"
 
 
 def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[Views, Float[Tensor, " f"]]:
-    """What was found where, and in which share of these pictures every triangle is seen."""
+    """Draw the pictures and detect landmarks. Also returns the share of the pictures in which each triangle is seen."""
     seen = torch.zeros(len(model.faces))
     generator = torch.Generator().manual_seed(settings.seed)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -192,7 +192,7 @@ def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[Vie
 
 
 def _random_camera(settings: EmbeddingSettings, generator: torch.Generator) -> Camera:
-    """In front of the head, which fills half of the picture."""
+    """A camera in front of the head, which fills half of the picture."""
     distance = 0.6 + 0.6 * float(torch.rand((), generator=generator))
     turned = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
     viewmat = rigid_transform(turned, torch.tensor([0.0, -0.01, distance]))
@@ -203,7 +203,7 @@ def _allowed(model: FaceModel, regions: Sequence[str], seen: Float[Tensor, " f"]
     mask = model.region_mask(*regions)
     assert mask.any(), f"{model.name} has none of the regions {', '.join(regions)}"
     mask &= ~model.region_mask("scalp") | (model.template[model.faces].mean(1)[:, 2] > _SCALP_FRONT)
-    # What is hidden (a lid's inner side) may be nearer in every picture and yet be the wrong point.
+    # Hidden triangles, such as the inner side of a lid, may project nearer in every picture and still be wrong.
     return mask & (seen >= _LEAST_SEEN)
 
 
@@ -211,7 +211,7 @@ def _best_point(
     views: Views, faces: Int[Tensor, "f 3"], allowed: Bool[Tensor, " f"], landmark: int, clamp: float
 ) -> tuple[Tensor, Float[Tensor, " 3"], Tensor]:
     """Triangle, barycentric weights and median error of the point with the least sum of clamped pixel errors."""
-    # First all triangles with few points in some of the views, then the best triangles with all.
+    # First try few points of all triangles in some of the views, then all points of the best triangles in all views.
     some = Views(
         *(part[:: max(1, len(part) // _COARSE_VIEWS)] for part in (views.vertices, views.depth, views.detected))
     )
@@ -229,8 +229,8 @@ def _best_point(
 def _errors(
     views: Views, corners: Int[Tensor, "t 3"], weights: Float[Tensor, "p 3"], landmark: int
 ) -> Float[Tensor, "n t p"]:
-    """How far, in pixels, points of triangles are from where a landmark was found in each view."""
-    # Straight lines in space project to straight lines, on which the farther corner pulls a point more.
+    """Distances in pixels of points of triangles from the detected landmark in each view."""
+    # The pixel of a point on a triangle is the mean of its corners' pixels, weighted by barycentrics times depth.
     scaled = weights * views.depth[:, corners][:, :, None]
     scaled = scaled / scaled.sum(-1, keepdim=True)
     points = scaled @ views.vertices[:, corners]
@@ -238,7 +238,7 @@ def _errors(
 
 
 def _triangle_grid(subdivisions: int) -> Float[Tensor, "p 3"]:
-    """Barycentric weights evenly over a triangle."""
+    """Barycentric weights of points spread evenly over a triangle."""
     steps = [(i, j, subdivisions - i - j) for i in range(subdivisions + 1) for j in range(subdivisions + 1 - i)]
     return torch.tensor(steps, dtype=torch.float32) / subdivisions
 

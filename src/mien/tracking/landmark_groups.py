@@ -1,4 +1,4 @@
-"""Which of MediaPipe's 478 landmarks show what, and how much a tracker trusts each."""
+"""Groups of MediaPipe's 478 landmarks, and the weight of each landmark in a fit."""
 
 import torch
 from jaxtyping import Float
@@ -7,13 +7,13 @@ from torch import Tensor
 from mien.tracking.settings import LandmarkSet
 
 LANDMARKS = 478
-"""468 of the face mesh and 5 of each iris."""
+"""Number of landmarks: 468 of the face mesh and 5 of each iris."""
 
 OVAL = (
     10, 21, 54, 58, 67, 93, 103, 109, 127, 132, 136, 148, 149, 150, 152, 162, 172, 176, 234, 251, 284, 288, 297, 323,
     332, 338, 356, 361, 365, 377, 378, 379, 389, 397, 400, 454,
 )  # fmt: skip
-"""The outline of the face: a silhouette that slides over the skin, little evidence for any point of it."""
+"""The outline of the face. It is a silhouette that slides over the skin, so it says little about any one point."""
 LIPS = (
     0, 13, 14, 17, 37, 39, 40, 61, 78, 80, 81, 82, 84, 87, 88, 91, 95, 146, 178, 181, 185, 191, 267, 269, 270, 291, 308,
     310, 311, 312, 314, 317, 318, 321, 324, 375, 402, 405, 409, 415,
@@ -21,7 +21,7 @@ LIPS = (
 LEFT_EYELIDS = (249, 263, 362, 373, 374, 380, 381, 382, 384, 385, 386, 387, 388, 390, 398, 466)
 RIGHT_EYELIDS = (7, 33, 133, 144, 145, 153, 154, 155, 157, 158, 159, 160, 161, 163, 173, 246)
 LEFT_LID_PAIRS, RIGHT_LID_PAIRS = ((386, 374), (385, 380), (387, 373)), ((159, 145), (158, 153), (160, 144))
-"""Across the opening of an eye: upper lid, lower lid."""
+"""Pairs of landmarks across the opening of an eye: upper lid, lower lid."""
 BROWS = (46, 52, 53, 55, 63, 65, 66, 70, 105, 107, 276, 282, 283, 285, 293, 295, 296, 300, 334, 336)
 NOSE = (1, 2, 4, 5, 6, 19, 45, 48, 64, 94, 97, 98, 115, 168, 195, 197, 220, 275, 278, 294, 326, 327, 344, 440)
 EYE_CORNERS = (33, 133, 263, 362)
@@ -37,16 +37,16 @@ IBUG68 = (
     61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181,  # outer lips
     78, 82, 13, 312, 308, 317, 14, 87,  # inner lips
 )  # fmt: skip
-"""MediaPipe's landmark for each of 300-W's 68 points. The first 17 are the silhouette there, and fixed points here."""
+"""MediaPipe's landmark for each of 300-W's 68 points. The first 17 are a silhouette there, but fixed points here."""
 
 _CONTOUR = 17
-"""How many of them are the contour's."""
+"""Number of points of `IBUG68` on the contour; they come first."""
 
 _WEIGHTS = ((OVAL, 0.15), (NOSE, 3.0), (LIPS, 3.0), (LEFT_EYELIDS + RIGHT_EYELIDS, 5.0), (LEFT_IRIS + RIGHT_IRIS, 4.0))
 
 
 def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"]:
-    """How much each landmark counts in a fit, 0 for those that are not of the set; the mean is 1."""
+    """Weight of each landmark in a fit. It is 0 for landmarks outside the set, and the mean is 1."""
     weights = torch.ones(LANDMARKS, dtype=torch.float64)
     for group, weight in _WEIGHTS:
         weights[list(group)] = weight
@@ -58,7 +58,10 @@ def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"
 
 
 def rigid_weights() -> Float[Tensor, " l"]:
-    """The same for a fit of the head pose alone: only points that expressions hardly move, the mean is 1."""
+    """Weight of each landmark in a fit of the head pose alone.
+
+    Only landmarks that expressions hardly move have a weight, and the mean is 1.
+    """
     weights = torch.zeros(LANDMARKS, dtype=torch.float64)
     weights[list(NOSE + EYE_CORNERS)] = 1.0
     weights[list(OVAL)] = 0.05

@@ -1,4 +1,4 @@
-"""A face model reduced to its landmarks, with analytic derivatives: what Levenberg-Marquardt needs of it."""
+"""A face model reduced to its landmarks, with analytic derivatives for Levenberg-Marquardt."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,16 +17,16 @@ from mien.tracking.views import CameraBatch
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Where landmarks are in the picture, and how that changes with each parameter, in pixels a unit."""
+    """Projected landmarks in pixels, and their derivatives by each parameter."""
 
     pixels: Float[Tensor, "b l 2"]
     by_frame: Float[Tensor, "b l 2 p"]
-    """With the per-frame parameters, in the order of the layout."""
+    """Derivatives by the per-frame parameters, in the order of the layout."""
     by_identity: Float[Tensor, "b l 2 i"] | None
     by_log_focal: Float[Tensor, "b l 2"]
     by_bias: Float[Tensor, "b l 2 3"]
     by_person: Float[Tensor, "b l 2 k"] | None
-    """With the components of what a detector makes of a person."""
+    """Derivatives by the detector's components of a person (`DetectorResponse.by_person`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +34,8 @@ class LandmarkModel:
     """The l landmarks of a face model and the k joints that move them, in float64.
 
     Skinning is linear in the vertices, and landmarks are fixed mixtures of vertices. So a landmark is
-    sum_k R_k y_k + W_k t_k, where y_k, the weighted sum of its vertices' rest positions for joint k, is linear in
-    identity and expression: exact, and hundreds of times cheaper than posing the mesh.
+    sum_k R_k y_k + W_k t_k. Here y_k is the weighted sum of its vertices' rest positions for joint k, which is linear
+    in identity and expression. This is exact, and hundreds of times cheaper than posing the mesh.
     """
 
     face_model: FaceModel
@@ -46,12 +46,12 @@ class LandmarkModel:
     pose_basis: Float[Tensor, "q k l 3"] | None
     joint_weights: Float[Tensor, "k l"]
     joints: Int[Tensor, " k"]
-    """Which of the face model's joints these are: those that move a landmark."""
+    """Indices of the k joints in the face model: those that move a landmark."""
     response: DetectorResponse
-    """Of the detector; its part that follows expressions is in their basis already."""
+    """Response of the detector. Its part by expression is already included in `expression_basis`."""
 
     def at(self, landmarks: Int[Tensor, " n"], layout: ParameterLayout) -> "LandmarkModel":
-        """Some of the landmarks, under other free parameters."""
+        """The model of some of the landmarks, with another layout of the free parameters."""
         return replace(
             self,
             layout=layout,
@@ -66,7 +66,7 @@ class LandmarkModel:
     def head_points(
         self, face: FaceParams, bias: Float[Tensor, "l 3"]
     ) -> tuple[Float[Tensor, "b l 3"], Float[Tensor, "b k l 3"], Float[Tensor, "b k 4 4"]]:
-        """Landmarks in the head frame; also the weighted rest positions y_k and the joint transforms behind them."""
+        """Landmarks in the head frame, the weighted rest positions y_k, and the joint transforms."""
         k, points = self.joint_weights.shape
         static = self.rest + torch.einsum("i,iklc->klc", face.identity, self.identity_basis)
         static = static + self.joint_weights[:, :, None] * bias
@@ -87,7 +87,7 @@ class LandmarkModel:
         cameras: CameraBatch,
         row: Int[Tensor, " b"],
     ) -> Float[Tensor, "b l 2"]:
-        """Landmarks of v timesteps in b pictures, each of the timestep `row` and with its own camera; pixels."""
+        """Landmarks in b pictures of v timesteps, in pixels. Each picture has its timestep `row` and its own camera."""
         face = self.layout.face_params(state, identity)
         points, _, _ = self.head_points(face, bias)
         pose = face.T_world_head
@@ -103,9 +103,9 @@ class LandmarkModel:
         row: Int[Tensor, " b"],
         with_identity: bool = False,
     ) -> Linearization:
-        """Landmarks of v timesteps in b pictures, each of the timestep `row` and with its own camera; and derivatives.
+        """Landmarks in b pictures of v timesteps, with derivatives. Each picture has its timestep `row` and its camera.
 
-        Everything up to the head frame is worked out once a timestep, however many cameras saw it.
+        Everything up to the head frame is computed once for each timestep, however many cameras saw it.
         """
         face = self.layout.face_params(state, identity)
         points, shaped, transforms = self.head_points(face, bias)
@@ -130,7 +130,7 @@ class LandmarkModel:
     def _by_joint_motion(
         self, transforms: Float[Tensor, "v k 4 4"], shaped: Float[Tensor, "v k l 3"], face: FaceParams
     ) -> tuple[Float[Tensor, "v l 3 m"], Float[Tensor, "v l 3 d"]]:
-        """Head-frame points through the joints: by free ones' components, and by expressions that move a joint."""
+        """Derivatives of head-frame points through the joints: by free angles, and by expressions that move a joint."""
         free, derived = self.layout.joint_index, self.layout.derived_expression
         count, angles = len(free), face.joints.flatten(1)
         at = torch.cat([angles[:, free], face.expression[:, derived]], dim=1)
@@ -157,7 +157,7 @@ class LandmarkModel:
         return self.face_model.joint_transforms(face)[:, self.joints]
 
     def _by_identity(self, transforms: Float[Tensor, "v k 4 4"], face: FaceParams) -> Float[Tensor, "v l 3 i"]:
-        """Head-frame points by identity: of the rest shape, and of where the joints are."""
+        """Derivatives of head-frame points by identity, through the rest shape and through the places of the joints."""
 
         def shifts(identity: Tensor) -> Tensor:
             return self._joint_transforms(replace(face, identity=identity))[:, :, :3, 3]
@@ -172,7 +172,7 @@ class LandmarkModel:
 def reduce_face_model(
     face_model: FaceModel, layout: ParameterLayout, response: DetectorResponse | None = None
 ) -> LandmarkModel:
-    """The face model reduced to its MediaPipe landmarks as a detector sees them, in float64."""
+    """Reduce a face model to its MediaPipe landmarks as the detector sees them, in float64."""
     model = face_model.to(torch.zeros((), dtype=torch.float64))
     marks = model.landmarks["mediapipe"]
     corners = model.faces[marks.faces]
@@ -202,7 +202,7 @@ def reduce_face_model(
 def _project_with_derivatives(
     points: Float[Tensor, "b l 3"], cameras: CameraBatch
 ) -> tuple[Float[Tensor, "b l 2"], Float[Tensor, "b l 2 3"], Float[Tensor, "b l 2"]]:
-    """Pixels of world-space points, and their derivatives by the point and by the logarithm of the focal length."""
+    """Projections of world-space points in pixels, with derivatives by the point and by the log of the focal length."""
     in_camera = points @ cameras.viewmat[:, :3, :3].mT + cameras.viewmat[:, None, :3, 3]
     inverse_depth = 1 / in_camera[..., 2]
     focal = cameras.K[:, [0, 1], [0, 1]]
@@ -218,7 +218,7 @@ def _project_with_derivatives(
 def _chained(
     by_head: Float[Tensor, "b l 2 3"], of_head: Float[Tensor, "v l 3 s"], row: Int[Tensor, " b"]
 ) -> Float[Tensor, "b l 2 s"]:
-    """by_head @ of_head[row]: axis by axis, many times faster than as many tiny matrix products."""
+    """Compute by_head @ of_head[row] axis by axis, which is many times faster than as many tiny matrix products."""
     out = by_head[..., :1] * of_head[row, :, None, 0]
     for axis in (1, 2):
         out.addcmul_(by_head[..., axis, None], of_head[row, :, None, axis])
@@ -226,7 +226,7 @@ def _chained(
 
 
 def _through_joints(transforms: Float[Tensor, "v k 4 4"], basis: Float[Tensor, "e k l 3"]) -> Float[Tensor, "v l 3 e"]:
-    """What a basis of rest positions does to head-frame points, summed over joints, as one matrix product."""
+    """Effect of a basis of rest positions on head-frame points, summed over the joints in one matrix product."""
     timesteps, joints = transforms.shape[:2]
     left = transforms[:, :, :3, :3].transpose(1, 2).reshape(timesteps * 3, joints * 3)
     right = basis.permute(1, 3, 2, 0).reshape(joints * 3, -1)
@@ -234,9 +234,9 @@ def _through_joints(transforms: Float[Tensor, "v k 4 4"], basis: Float[Tensor, "
 
 
 def _derivatives(function: Callable[[Tensor], Tensor], at: Float[Tensor, "*b q"]) -> Float[Tensor, "q ..."]:
-    """Derivatives by each of the last axis' parameters, alike for the whole batch, by central differences.
+    """Derivatives by each parameter along the last axis, for the whole batch at once, by central differences.
 
-    Only the short chain of joints goes through here; in float64 the error is below 1e-9.
+    Only the short chain of joints is differentiated this way. In float64 the error is below 1e-9.
     """
     step = 1e-5 * torch.eye(at.shape[-1]).to(at)
     return torch.stack([(function(at + shift) - function(at - shift)) / 2e-5 for shift in step])

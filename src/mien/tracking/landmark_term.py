@@ -13,43 +13,43 @@ from mien.tracking.solver import NormalEquations, SharedEquations
 from mien.tracking.views import CameraBatch, Views
 
 _CHUNK = 48
-"""Pictures linearised at once: bounds the memory to about 100 MB."""
+"""Number of pictures linearised at once, which takes about 100 MB of memory."""
 _PROJECTED = 512
-"""Pictures projected at once, with about as much memory."""
+"""Number of pictures projected at once, which takes about as much memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What is the same in all sequences of a person."""
+    """Parameters of a person that all sequences share."""
 
     identity: Float[Tensor, " i"]
     bias: Float[Tensor, "l 3"]
-    """How far each landmark lies from where the model has it, at rest, in the head frame, metres: the detector means
-    other points than the embedding, and no identity basis spans every face."""
+    """Offset of each landmark from the model's, at rest, in the head frame, in metres. The detector marks other points
+    than the embedding, and no identity basis spans every face."""
     vertex_offsets: Float[Tensor, "v 3"] | None = None
-    """Static offsets of the mesh, where pixels told them; the bias then holds what they move of landmarks."""
+    """Static offsets of the mesh, if it was fitted to pixels. The bias then includes their effect on the landmarks."""
     person: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
-    """What the detector makes of this person, in `DetectorResponse.by_person`: part of the bias."""
+    """Coefficients of this person in `DetectorResponse.by_person`. Their offsets are part of the bias."""
 
     @property
     def shared(self) -> Float[Tensor, " s"]:
-        """Identity, then person: what all pictures tell together."""
+        """Identity, then person: the parameters that are fitted to all pictures together."""
         return torch.cat([self.identity, self.person])
 
     @property
     def columns_of_pixels(self) -> Int[Tensor, " _"]:
-        """Which of `shared` and the logarithm of the focal length pixels tell: not what a detector makes of people."""
+        """Indices, in `shared` and the log of the focal length, of what is fitted to pixels: all but `person`."""
         return torch.cat([torch.arange(len(self.identity)), torch.tensor([len(self.shared)])])
 
     def moved(self, step: Float[Tensor, " s"], response: DetectorResponse) -> "Subject":
-        """With `shared` changed by a step."""
+        """The subject with `shared` changed by a step."""
         identity, person = step.split([len(self.identity), len(self.person)])
         bias = self.bias + response.of_person(person)
         return replace(self, identity=self.identity + identity, person=self.person + person, bias=bias)
 
 
 def unknown_subject(model: LandmarkModel) -> Subject:
-    """An average person."""
+    """The subject before any fit: an average person."""
     response = model.response
     zeros = response.mean.new_zeros
     return Subject(zeros(len(model.identity_basis)), response.mean, person=zeros(len(response.by_person)))
@@ -57,21 +57,20 @@ def unknown_subject(model: LandmarkModel) -> Subject:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkTerm:
-    """Costs of the v timesteps of one sequence.
+    """Landmark costs of the v timesteps of one sequence.
 
-    A timestep's is the sum of t w_l rho(|r_l|^2 / sigma^2) over its pictures and their landmarks, plus the prior's;
-    t is the picture's trust.
-    rho(s) = c^2 s / (c^2 + s) (Geman and McClure): an outlier's pull fades.
+    The cost of a timestep is the sum of t w_l rho(|r_l|^2 / sigma^2) over its pictures and their landmarks, plus the
+    prior's; t is the picture's trust. With rho(s) = c^2 s / (c^2 + s) (Geman and McClure) the pull of outliers fades.
     """
 
     model: LandmarkModel
     views: Views
     weights: Float[Tensor, " l"]
-    """They sum to the number of independent points that all landmarks of a picture are worth."""
+    """Weights of the landmarks. They sum to the number of independent points that a picture's landmarks are worth."""
     sigma: Float[Tensor, " c"]
-    """Expected distance in each camera, pixels."""
+    """Expected distance in each camera, in pixels."""
     outlier: float
-    """c: beyond this many sigmas a landmark hardly counts."""
+    """The c of rho: beyond this many sigmas a landmark hardly counts."""
 
     def at(self, rows: Int[Tensor, " k"]) -> "LandmarkTerm":
         """The same term over some of the timesteps."""
@@ -80,7 +79,7 @@ class LandmarkTerm:
     def robust(
         self, residual: Float[Tensor, "n l 2"], pictures: Views
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n l"]]:
-        """Costs of pictures whose landmarks are off by this, and the weight of each square in them."""
+        """Robust costs of pictures with these residuals, and the weight of each landmark's squared residual."""
         variance = self.sigma[pictures.camera][:, None] ** 2
         squared = (residual**2).sum(-1) / variance
         least = self.outlier**2
@@ -95,28 +94,28 @@ class LandmarkTerm:
     def _offsets(
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
     ) -> Iterator[tuple[Float[Tensor, "m l 2"], Views]]:
-        """From detected to projected landmarks in all pictures, a bounded number at a time, and these pictures."""
+        """Yield the offsets from detected to projected landmarks, and their pictures, a bounded number at a time."""
         for start in range(0, len(self.views.row), _PROJECTED):
             pictures = self.views.some(slice(start, start + _PROJECTED))
-            # What is the same for all cameras of a timestep is worked out once.
+            # Landmarks of a timestep are posed once for all of its cameras.
             seen, place = pictures.row.unique(return_inverse=True)
             batch = cameras[pictures.camera]
             projected = self.model.project(state[seen], subject.identity, subject.bias, batch, place)
             yield projected - pictures.detected, pictures
 
     def cost(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
-        """Of each timestep."""
+        """The cost of each timestep."""
         of_pictures = torch.cat([self.robust(*part)[0] for part in self._offsets(state, subject, cameras)])
         return self._prior(state)[0].index_add(0, self.views.row, of_pictures)
 
     def residuals(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "n l"]:
-        """Distances of detected from projected landmarks in each picture, pixels."""
+        """Distances between detected and projected landmarks in each picture, in pixels."""
         return torch.cat([offsets.norm(dim=-1) for offsets, _ in self._offsets(state, subject, cameras)])
 
     def linearizations(
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch, with_identity: bool = False
     ) -> "Iterator[WeightedLinearization]":
-        """Linearisations of all pictures, a bounded number at a time."""
+        """Yield linearisations of all pictures, a bounded number at a time."""
         for start in range(0, len(self.views.row), _CHUNK):
             pictures = self.views.some(slice(start, start + _CHUNK))
             seen, place = pictures.row.unique(return_inverse=True)
@@ -127,7 +126,7 @@ class LandmarkTerm:
             yield WeightedLinearization(at, pictures.row, residual, weights, cost)
 
     def equations(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> NormalEquations:
-        """Of each timestep on its own, the shared parameters fixed."""
+        """The normal equations of each timestep on its own, with the shared parameters fixed."""
         equations = self._prior_equations(state)
         for part in self.linearizations(state, subject, cameras):
             part.add_to(equations)
@@ -136,7 +135,10 @@ class LandmarkTerm:
     def joint_equations(
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
     ) -> tuple[NormalEquations, SharedEquations]:
-        """Of each timestep, and of what they share: `Subject.shared`, then the logarithm of the focal length."""
+        """The normal equations of each timestep and of the shared parameters.
+
+        The shared parameters are `Subject.shared`, then the logarithm of the focal length.
+        """
         equations = self._prior_equations(state)
         size = len(subject.shared) + 1
         shared = SharedEquations(

@@ -1,4 +1,4 @@
-"""What the tracked model looks like beside a picture: its texture in its light, and by how much colours differ."""
+"""Pictures of the tracked model with its texture and light, and the difference of their colours from the capture's."""
 
 from dataclasses import dataclass
 
@@ -20,23 +20,23 @@ from mien.tracking.views import CameraBatch, batch_of
 _OUTLIER = 10.0
 """Beyond this many standard deviations a pixel hardly counts for `Comparison.rms`."""
 _LEAST_PIXELS = 100.0
-"""Fewer show nothing of a face."""
+"""Fewest pixels of a comparison. Fewer show nothing of a face."""
 _MARGIN, _LEAST_WINDOW = 3, 8
-"""Pixels around a mesh, and the least size of a window."""
+"""Margin around a mesh and least size of a window, in pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The part of a picture that a mesh may cover: a head leaves most of a picture empty."""
+    """The part of a picture that a mesh may cover. A head leaves most of a picture empty."""
 
     camera: Camera
-    """For that part alone."""
+    """The camera of that part alone."""
     rows: slice
     columns: slice
 
 
 def window_of(camera: Camera, vertices: Float[Tensor, "v 3"]) -> Window:
-    """Where a mesh is in a picture; at least some pixels of it."""
+    """The window of a mesh in a picture. It is never smaller than 8 x 8 pixels."""
     points, depth = camera.project(vertices)
     points = points[depth > 0] if (depth > 0).any() else points.new_zeros(1, 2)
     size = torch.tensor([camera.width, camera.height])
@@ -49,16 +49,16 @@ def window_of(camera: Camera, vertices: Float[Tensor, "v 3"]) -> Window:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A picture and the model's, in the part that the mesh may cover."""
+    """Comparison of a picture with the model's picture, in the part that the mesh may cover."""
 
     window: Window
 
     image: Float[Tensor, "h w 3"]
-    """The model's colours, 0..1, smooth differences of light taken from the picture; NaN where nothing was compared."""
+    """The model's colours, 0..1, plus the smooth differences of light to the picture; NaN where not compared."""
     difference: Float[Tensor, "h w"]
-    """Length of the difference of the three colours; NaN where nothing was compared."""
+    """Length of the difference of the three colours; NaN where not compared."""
     rms: float
-    """Root mean square of the differences, outliers faded; NaN where there are too few."""
+    """Robust root mean square of the differences; NaN if too few pixels were compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class ModelPictures:
 
     @torch.no_grad()
     def compare(self, timestep: int, camera: int, vertices: Float[Tensor, "v 3"]) -> Comparison:
-        """One picture with the model's. Safe to call from several threads at once."""
+        """Compare one picture with the model's. Several threads may call this at once."""
         picture = self.pictures.picture(timestep, camera, self.cameras)
         window = window_of(picture.camera, vertices)
         part = window.rows, window.columns
@@ -89,7 +89,7 @@ class ModelPictures:
 
 
 def model_pictures(capture: Capture, tracking: Tracking, face_model: FaceModel) -> ModelPictures | None:
-    """What draws the model's pictures; None where pixels were not looked at (`Tracking.looks`)."""
+    """The model's pictures of a tracked capture, or None if it was not fitted to pixels (`Tracking.looks`)."""
     looks = tracking.looks
     if looks is None:
         return None
@@ -101,15 +101,18 @@ def model_pictures(capture: Capture, tracking: Tracking, face_model: FaceModel) 
 def looks_in_world(
     appearance: Appearance, light: Float[Tensor, "9 3"], T_world_fit: Float[Tensor, "4 4"] | None, light_extent: float
 ) -> Looks:
-    """What a fit found, its light turned from the frame of the fit into the world's."""
+    """The looks that a fit found, with the light turned from the frame of the fit to the world frame."""
     if T_world_fit is not None:
         light = turn_light(light, T_world_fit[:3, :3].to(light))
     return Looks(appearance.albedo, appearance.trust, light, appearance.sigma, light_extent)
 
 
 def turn_light(light: Float[Tensor, "9 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "9 3"]:
-    """SH light that shines on turned normals as `light` does on these: both frames see the same light."""
+    """The spherical harmonics of the same light in a turned frame.
+
+    The result shades a turned normal as `light` shades the normal itself.
+    """
     normals = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     turned = sh_basis(normals.double() @ rotation.double().T)
-    # Rotations map the harmonics of a degree to themselves, so that the fit is exact.
+    # Rotations map the harmonics of each degree to themselves, so the fit is exact.
     return torch.linalg.lstsq(turned, sh_basis(normals.double()) @ light.double()).solution.to(light).contiguous()

@@ -1,4 +1,4 @@
-"""The neck line: where a tracked head ends in the picture, so that shoulders and clothes can be cut off."""
+"""The neck line: the line in a picture at which a tracked head ends, to cut off shoulders and clothes."""
 
 from collections import defaultdict
 
@@ -10,9 +10,9 @@ from mien.camera import Camera
 from mien.face import FaceModel, FaceParams
 
 _CHUNK = 32
-"""Timesteps posed at once."""
+"""Number of timesteps posed at once."""
 _MIDDLE_OF_NECK = (0.4, 0.7)
-"""Part of the way from the base of the neck to its top."""
+"""Range of the middle of the neck, as shares of the way from its base to its top."""
 
 
 def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
@@ -27,9 +27,9 @@ def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
 
 
 def neck_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
-    """The vertices around the middle of the neck, where it is a column: its base spreads over the shoulders.
+    """The vertices around the middle of the neck, which is a column there. Its base spreads over the shoulders.
 
-    A face model without a region `neck` has its bottom vertices instead.
+    For a face model without a region `neck` these are the bottom vertices.
     """
     bottom = bottom_vertices(face_model)
     neck = face_model.faces[face_model.region_mask("neck")].unique()
@@ -43,9 +43,9 @@ def neck_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
 
 
 def fit_neck_lines(face_model: FaceModel, face: FaceParams, cameras: tuple[Camera, ...]) -> Float[Tensor, "t c 3"]:
-    """Lines through the projected bottom vertices of every timestep in every camera (`Tracking.neck_lines`).
+    """Fit a line to the projected bottom vertices of every timestep in every camera (`Tracking.neck_lines`).
 
-    GaussianAvatars (arXiv:2312.02069), supplement A: a line fitted to the tracked mesh's bottom vertices.
+    This is the neck line of GaussianAvatars (arXiv:2312.02069), supplement A.
     """
     bottom = bottom_vertices(face_model)
     up = torch.tensor([0.0, 0.1, 0.0]).to(face.head_translation)
@@ -63,7 +63,7 @@ def fit_neck_lines(face_model: FaceModel, face: FaceParams, cameras: tuple[Camer
 def _line(
     points: Float[Tensor, "b n 2"], inside: Float[Tensor, "b 2"], above: Float[Tensor, "b 2"]
 ) -> Float[Tensor, "b 3"]:
-    """Total least squares lines (a, b, d), positive on the side of `above`."""
+    """Total least squares lines (a, b, d), with a x + b y + d positive on the side of `above`."""
     centre = points.mean(1)
     centred = points - centre[:, None]
     normal = torch.linalg.eigh(centred.mT @ centred).eigenvectors[..., 0]

@@ -1,4 +1,4 @@
-"""What a fit led to, as Trackings: in world space, with every timestep, and with what pixels said."""
+"""Results of a fit as Trackings: in world space, for every timestep, with the results of the fit to pixels."""
 
 import dataclasses
 import json
@@ -25,7 +25,7 @@ from mien.tracking.stages import SequenceFit, all_landmarks
 from mien.tracking.tracking import Looks, Tracking
 
 _SOME = 8
-"""Frames that are named where there are many."""
+"""Largest number of frames that a message lists."""
 
 
 def as_tracking(
@@ -36,7 +36,7 @@ def as_tracking(
     own: SequenceFit,
     settings: TrackingSettings,
 ) -> Tracking:
-    """One sequence of a fit to landmarks."""
+    """The tracking of one sequence from a fit to landmarks."""
     views = shot.views
     residuals = torch.full((len(shot.valid), len(own.cameras)), torch.nan)
     distances = all_landmarks(model, views, own, settings).residuals(own.state, subject, own.cameras)
@@ -69,7 +69,7 @@ def _in_world(face: FaceParams, T_world_fit: Float[Tensor, "4 4"] | None) -> Fac
 
 
 def _jsonable(settings: dict) -> dict:
-    """Settings as json holds them: it has no infinity."""
+    """Settings as json can hold them. Infinity becomes a string, because json has no infinity."""
     return json.loads(json.dumps(settings).replace("Infinity", '"inf"'))
 
 
@@ -80,7 +80,7 @@ def with_pixels(
     face_model: FaceModel,
     settings: TrackingSettings,
 ) -> list[Tracking]:
-    """The trackings with what pixels said."""
+    """The trackings with the results of the fit to pixels: looks and pixel residuals."""
     complete = []
     for index, (tracking, shot) in enumerate(zip(trackings, shots, strict=True)):
         tracking = replace(tracking, looks=looks_of(refined, index, shot, settings))
@@ -91,7 +91,7 @@ def with_pixels(
 
 
 def _residuals(tracking: Tracking, shot: Shot, face_model: FaceModel) -> Float[Tensor, "v c"]:
-    """By how much colours differ in pictures with a face; NaN where a camera found none."""
+    """Colour differences of the pictures with a face (`Comparison.rms`); NaN where a camera found none."""
     pictures = model_pictures(shot.capture, tracking, face_model)
     assert pictures is not None
     found = torch.full((int(shot.valid.sum()), len(tracking.cameras)), torch.nan)
@@ -118,6 +118,6 @@ def _with_pixel_residuals(tracking: Tracking, shot: Shot, found: Float[Tensor, "
 
 
 def looks_of(refined: PhotometricFit, sequence: int, shot: Shot, settings: TrackingSettings) -> Looks:
-    """Texture, and light of one of the sequences."""
+    """The texture, and the light of one of the sequences."""
     extent = settings.photometric.light_extent if settings.schedule == "fast" else settings.paper.light_extent
     return looks_in_world(refined.appearance, refined.lights[sequence], shot.T_world_fit, extent)

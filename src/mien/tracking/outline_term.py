@@ -1,8 +1,8 @@
-"""The cost of a head's outline: where it ends against the background, as mattes have it.
+"""The cost of a head's outline: the distance from the mesh's outline to the edge of the matte.
 
-Landmarks and texture lie on the face; how far away from it ears and jaw sides appear tells perspective, and with it the
-focal length and which way the head is turned. Points of the mesh's outline are drawn to the nearest edge of the matte
-along the outline's normal.
+Landmarks and texture lie on the face. How far from it the ears and the sides of the jaw appear shows the perspective,
+and with it the focal length and the direction of the head. Points of the mesh's outline are pulled to the nearest edge
+of the matte along the outline's normal.
 """
 
 from dataclasses import dataclass
@@ -24,17 +24,18 @@ from mien.tracking.solver import NormalEquations, SharedEquations
 from mien.tracking.views import CameraBatch, Views
 
 _HIDDEN_REGIONS = ("scalp", "neck", "mouth", "teeth", "tongue", "eye_sockets", "eyes", "irises", "eyelids")
-"""Whose outline says nothing: hair, collars and lashes are there."""
+"""Regions whose outline is not used, because hair, collars and lashes hide it."""
 _REACH = 0.012
-"""Metres along the normal within which an edge of the matte is looked for."""
+"""Largest distance along the normal at which an edge of the matte is searched, in metres."""
 _PROFILE = 49
-"""Samples of the matte along the normal."""
+"""Number of samples of the matte along the normal."""
 _BESIDE = 1.5
-"""Pixels outside of the outline where nothing of the mesh may be."""
+"""Distance outside of the outline, in pixels, at which there must be no mesh."""
 _SIGMA = 0.0015
-"""Expected distance, metres."""
+"""Expected distance, in metres."""
 _OUTLIERS = (4.0, 2.0)
-"""In sigmas, of mattes that end inside of the mesh and outside: hair, beards and collars stand out."""
+"""Outlier thresholds in sigmas, for mattes that end inside and outside of the mesh. The second is smaller, because
+hair, beards and collars extend the matte."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,37 +43,40 @@ class Outline:
     """k points of a posed mesh's outline in a picture."""
 
     ends: Int[Tensor, "k 2"]
-    """The vertices of the edge whose middle the point is."""
+    """The two vertices of each edge. The point is the middle of the edge."""
     points: Float[Tensor, "k 2"]
-    """Pixels."""
+    """Positions of the points, in pixels."""
     normals: Float[Tensor, "k 2"]
-    """Unit, outwards."""
+    """Unit normals that point outwards."""
     lengths: Float[Tensor, " k"]
-    """Of the edges, pixels."""
+    """Lengths of the edges, in pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class OutlineTerm:
-    """Costs of the v timesteps of one sequence: the robust mean over each picture's outline."""
+    """Outline costs of the v timesteps of one sequence: a robust mean over each picture's outline."""
 
     model: SurfaceModel
     capture: Capture
     timesteps: Int[Tensor, " v"]
-    """Of the capture."""
+    """Timesteps of the capture."""
     views: Views
     ends: Int[Tensor, "e 2"]
-    """Vertices of the mesh's edges."""
+    """The two vertices of each edge of the mesh."""
     sides: Int[Tensor, "e 2"]
-    """Their triangles."""
+    """The two triangles at each edge."""
     used: Bool[Tensor, " f"]
-    """Triangles whose outline says something."""
+    """Which triangles have an outline that is used."""
     weight: float
-    """What the outline of a picture is worth."""
+    """Weight of the outline of a picture."""
 
     def joint_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch
     ) -> tuple[NormalEquations, SharedEquations]:
-        """Of some timesteps, and of what they share: `Subject.shared`, then the logarithm of the focal length."""
+        """The normal equations of some timesteps and of the shared parameters.
+
+        The shared parameters are `Subject.shared`, then the logarithm of the focal length.
+        """
         size = state.shape[1] + len(subject.columns_of_pixels)
 
         def of_row(row: int) -> tuple[float, Tensor, Tensor]:
@@ -102,7 +106,11 @@ class OutlineTerm:
         camera: int,
         cameras: CameraBatch,
     ) -> tuple[Float[Tensor, "k q"], Float[Tensor, " k"], Float[Tensor, " k"], float]:
-        """Of one picture: how the points move outwards, how far they should, their weights, and the cost."""
+        """Residuals of one picture.
+
+        Returns:
+            Derivatives of each point's outward motion, each point's distance to the edge, the weights, and the cost.
+        """
         size = (self.capture.width, self.capture.height)
         view = Camera(cameras.K[camera], cameras.viewmat[camera], *size).to(torch.zeros(()))
         outline = self.outline(vertices, view)
@@ -129,7 +137,7 @@ class OutlineTerm:
         return slopes[seen].double(), distance[seen].double(), weights.double(), cost
 
     def outline(self, vertices: Float[Tensor, "v 3"], camera: Camera) -> Outline:
-        """Where the mesh ends against what is not mesh."""
+        """The points of the mesh's outline against the background."""
         faces = self.model.face_model.faces
         pixels, _ = camera.project(vertices)
         first, second, third = pixels[faces].unbind(1)
@@ -165,7 +173,7 @@ def outline_term(
 
 
 def _covered(drawn: Int[Tensor, "h w"], points: Float[Tensor, "k 2"]) -> Bool[Tensor, " k"]:
-    """Whether there is mesh; outside of the picture nobody knows."""
+    """Whether the mesh covers each point. Points outside of the picture count as covered."""
     height, width = drawn.shape
     column, row = points.floor().long().unbind(1)
     within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -173,7 +181,7 @@ def _covered(drawn: Int[Tensor, "h w"], points: Float[Tensor, "k 2"]) -> Bool[Te
 
 
 def edge_distances(matte: np.ndarray, outline: Outline, reach: float) -> Float[Tensor, " k"]:
-    """How far along its normal each point is from where the matte ends, pixels; NaN where that is not within reach."""
+    """Distance along the normal from each point to the edge of the matte, in pixels; NaN if there is none in reach."""
     steps = np.linspace(-reach, reach, _PROFILE, dtype=np.float32)
     path = outline.points.numpy()[:, None] + steps[:, None] * outline.normals.numpy()[:, None]
     if not len(path):

@@ -1,4 +1,4 @@
-"""The overlay video: does the tracked mesh sit on the picture?"""
+"""The overlay video, which shows whether the tracked mesh fits the pictures."""
 
 import math
 from collections.abc import Iterator
@@ -31,22 +31,23 @@ _MESH_OPACITY = 0.6
 _GREEN, _RED, _BLUE = (60, 255, 60), (255, 60, 40), (60, 160, 255)
 _SUBPIXEL_BITS = 4
 _GRID_WIDTH = 1920
-"""Pixels."""
+"""Largest width of a grid of pictures, in pixels."""
 _MOST_PICTURES = 3000
 _CRF, _PRESET = 21, "veryfast"
-"""To look at, not to measure: a quarter of the time that `write_video` takes by default."""
+"""Quality that is enough for viewing. Writing takes a quarter of the time of `write_video`'s defaults."""
 
 
 def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, every: int = 1) -> None:
-    """Write a video of `OverlayPainter.picture`; of every n-th timestep, if so wished, at as many frames a second less.
+    """Write a video of `OverlayPainter.picture`.
 
-    Several cameras come as a grid, in the order of the capture, shrunk to at most 1920 pixels across.
+    If `every` is n, it shows every n-th timestep at 1/n of the frame rate, so it lasts as long as the capture. Several
+    cameras form a grid, in the order of the capture, which is scaled down to at most 1920 pixels across.
     """
     write_video(path, _pictures(capture, tracking, face_model, every), capture.fps / every, _CRF, _PRESET)
 
 
 def overlay_stride(timesteps: int) -> int:
-    """Of how many timesteps a long clip's overlay shows one: so that there are at most 3,000 pictures."""
+    """Stride between the timesteps that an overlay shows, so that a long clip has at most 3,000 pictures."""
     return math.ceil(timesteps / _MOST_PICTURES)
 
 
@@ -58,7 +59,7 @@ def draw_overlay(
 
 
 class OverlayPainter:
-    """Draws a tracking over its capture. Immutable; safe to call from several threads at once."""
+    """Draws a tracking over its capture. It is immutable, so several threads may use it at once."""
 
     def __init__(self, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
         self._capture, self._tracking, self._face_model = capture, tracking, face_model
@@ -66,7 +67,7 @@ class OverlayPainter:
         self._models = model_pictures(capture, tracking, face_model)
 
     def picture(self, timestep: int, camera_index: int = 0) -> UInt8[np.ndarray, "h2 w2 3"]:
-        """The panels in one picture: two side by side, or four as a square."""
+        """The panels joined into one picture: two side by side, or four in a square."""
         panels = self.panels(timestep, camera_index)
         write_text(panels[0], self._caption(timestep, camera_index), (8, 20))
         for panel, name in zip(panels[2:], ("model", "difference"), strict=False):
@@ -78,10 +79,11 @@ class OverlayPainter:
 
     @torch.no_grad()
     def panels(self, timestep: int, camera_index: int = 0) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """Pictures of the capture's size.
+        """The two or four panels of a picture, each of the capture's size.
 
-        First with detected (green) and mesh (red) landmarks and the neck line; second with the mesh; and, where pixels
-        were looked at, third the model's own picture, and fourth how much its colours differ from the first.
+        The first shows detected (green) and mesh (red) landmarks and the neck line, the second the mesh. If the
+        tracking was fitted to pixels, the third shows the model's own picture and the fourth the difference of its
+        colours from the capture's.
         """
         image = np.asarray(self._capture.images[timestep, camera_index])
         vertices = self._face_model(self._tracking.face[timestep])[0]
@@ -92,7 +94,7 @@ class OverlayPainter:
 
     @torch.no_grad()
     def head_box(self, timestep: int, camera_index: int = 0) -> tuple[slice, slice]:
-        """Rows and columns of a square around the head, as far as the picture goes."""
+        """Rows and columns of a square around the head, kept inside the picture."""
         camera = self._tracking.cameras[camera_index]
         window = window_of(camera, self._face_model(self._tracking.face[timestep])[0])
         side = min(round(1.15 * max(window.camera.width, window.camera.height)), camera.width, camera.height)
@@ -106,7 +108,7 @@ class OverlayPainter:
     ) -> UInt8[np.ndarray, "h w 3"]:
         tracking, camera = self._tracking, self._tracking.cameras[camera_index]
         marks = camera.project(self._face_model.landmark_positions(vertices, "mediapipe"))[0].numpy()
-        picture = image.copy()  # a capture read from disk is read-only
+        picture = image.copy()  # A capture read from disk is read-only.
         detected = np.asarray(self._capture.landmarks[timestep, camera_index])
         if np.isfinite(detected).all():
             _draw_points(picture, detected, _GREEN)
@@ -151,7 +153,7 @@ class OverlayPainter:
 
 
 def frontal_camera(tracking: Tracking) -> int:
-    """The camera that the tracked face looks at most."""
+    """The index of the camera that the tracked face looks at most directly."""
     ahead = tracking.face.T_world_head[tracking.valid][:, :3, 2]
     origins = tracking.face.head_translation[tracking.valid]
     facing = [
@@ -162,7 +164,7 @@ def frontal_camera(tracking: Tracking) -> int:
 
 
 def region_colors(face_model: FaceModel) -> Float[torch.Tensor, "f 3 3"]:
-    """A colour for every triangle's corners that tells lips, lids, irises, ears apart."""
+    """Colours of the corners of every triangle, which tell lips, lids, irises, ears and other regions apart."""
     palette = torch.tensor([_REGION_COLORS.get(name, _SKIN) for name in face_model.region_names])
     return palette[face_model.face_regions.long()][:, None].expand(-1, 3, -1)
 
@@ -170,7 +172,7 @@ def region_colors(face_model: FaceModel) -> Float[torch.Tensor, "f 3 3"]:
 def draw_overlay_grid(
     capture: Capture, tracking: Tracking, face_model: FaceModel, timestep: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A timestep of the overlay video: the pictures of all cameras side by side, in about a square."""
+    """One timestep of the overlay video: the pictures of all cameras in a roughly square grid."""
     return _grid(OverlayPainter(capture, tracking, face_model), len(tracking.cameras), timestep)
 
 
@@ -182,7 +184,7 @@ def _grid(painter: OverlayPainter, cameras: int, timestep: int) -> UInt8[np.ndar
     columns = math.ceil(math.sqrt(cameras * tall / wide))
     rows = math.ceil(cameras / columns)
     scale = min(1.0, _GRID_WIDTH / (columns * wide))
-    # Even sizes, as video codecs want them.
+    # Video codecs need even sizes.
     width, height = (max(2, round(side * scale / 2) * 2) for side in (wide, tall))
     grid = np.zeros((rows * height, columns * width, 3), np.uint8)
     for index, picture in enumerate(pictures):
@@ -215,5 +217,5 @@ def _draw_line(image: UInt8[np.ndarray, "h w 3"], line: Float[np.ndarray, " 3"],
 
 
 def _fixed_point(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
-    """As OpenCV draws them: pixel centres at whole numbers, with some bits behind the point."""
+    """Points in OpenCV's fixed-point format, with pixel centres at whole numbers."""
     return np.round(np.clip((points - 0.5) * (1 << _SUBPIXEL_BITS), -(2**28), 2**28)).astype(np.int32)

@@ -1,4 +1,4 @@
-"""The `paper` schedule: all frames together by gradient descent in random order, from where `fast` ends."""
+"""The `paper` schedule: gradient descent over all frames in random order, which starts from the result of `fast`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,23 +29,23 @@ def fit_by_descent(
     watch: Watch,
     refined: PhotometricFit | None = None,
 ) -> PhotometricFit:
-    """A fit refined as in the supplement of GaussianAvatars, section A: by its global epochs, if pixels were fitted to.
+    """Refine a fit as in the supplement of GaussianAvatars, section A.
 
-    Otherwise all of it; frames whose landmarks were lost in its pass along the frames go back to where landmarks had
-    them, and are not `improved`.
+    If the fit was already fitted to pixels, only the global epochs run. Otherwise the pass along the frames runs first.
+    A frame whose landmarks get lost in that pass keeps its fit to landmarks and is not `improved`.
 
     Args:
         model: The face model reduced to its landmarks.
         shots: The sequences.
-        lenses: The unknown focal length of each (`lenses_of`).
-        fit: What landmarks, or the schedule `fast`, led to.
-        settings: Of the whole tracking.
-        keeper: Of what an interrupted fit of the same input goes on from.
-        watch: Is told how far it has come.
+        lenses: Index of each sequence's unknown focal length (`lenses_of`).
+        fit: The fit to landmarks, or that of the schedule `fast`.
+        settings: Settings of the whole tracking.
+        keeper: Keeps the state from which an interrupted fit of the same input resumes.
+        watch: Receives the progress.
         refined: `fit` with texture and light, if it was fitted to pixels.
     """
     if refined is not None and not (refined.appearance.trust > 0).any():
-        return refined  # pictures show nothing that could be fitted
+        return refined  # The pictures show nothing to fit to.
     scene = paper_scene(model, shots, lenses, fit, settings, refined)
     descent = Descent(scene, first_state(scene, fit, lenses, refined))
     descent.resume(keeper)
@@ -76,7 +76,7 @@ def fit_by_descent(
 
 
 def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: PhotometricFit | None) -> PhotometricFit:
-    """The fit with texture and light; texels are trusted as the triangles that they are on."""
+    """The fit with texture and light. Each texel has the trust of its triangle."""
     state, fit = descent.state, _as_fit(scene, descent.state, fit)
     fragments = texture_space(scene.face_model, scene.settings.texture_size).fragments
     trust = torch.cat([descent.trusted(), torch.zeros(1)])[fragments.face_index.long()]
@@ -90,7 +90,7 @@ def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: Phot
 
 
 def _as_fit(scene: PaperScene, state: PaperState, fit: Fit) -> Fit:
-    """As landmarks' fit is given; what offsets move of landmarks goes to their bias as well."""
+    """The state as a fit to landmarks. The effect of the offsets on landmarks is added to the bias."""
     with torch.no_grad():
         offsets = state.offsets if scene.settings.offset_sigma > 0 else None
         moved = scene.landmarks.positions(state.offsets, scene.mesh.faces).double()

@@ -1,4 +1,4 @@
-"""Adam for tensors and for single rows of tensors, with its state where a file can hold it."""
+"""Adam for tensors and for single rows of tensors, with a state that can be written to a file."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,8 @@ from torch import Tensor
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-12
 
 _SETTLED = 2.0
-"""Gradient of a cost of one that is off by one standard deviation. Plain Adam moves by its whole rate however little
-there is to gain: each frame trembled about its place by that."""
+"""Gradient of a squared cost at one standard deviation; it damps steps with smaller gradients. Plain Adam moves by its
+whole rate however small the gradient is, which made each frame tremble about its place."""
 
 
 @dataclass(eq=False)
@@ -23,11 +23,18 @@ class Moments:
 
     @staticmethod
     def like(values: Tensor) -> "Moments":
-        """For values that have not moved yet."""
+        """Zero moments for values that have not moved yet."""
         return Moments(torch.zeros_like(values), torch.zeros_like(values))
 
     def step(self, values: Tensor, gradient: Tensor, rate: float, settled: float = _EPSILON) -> None:
-        """Move the values in place (Kingma and Ba 2015), by less than `rate` where gradients are about `settled`."""
+        """Move the values in place (Kingma and Ba 2015), by less than `rate` if gradients are not far above `settled`.
+
+        Args:
+            values: The values to move.
+            gradient: Gradient of the cost by the values.
+            rate: Learning rate.
+            settled: Gradient at which a step is half of `rate`.
+        """
         self.count += 1
         self.first.lerp_(gradient, 1 - _BETA1)
         self.second.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
@@ -38,18 +45,18 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class RowStepper:
-    """Moves a timestep's parameters by Adam, in coordinates in which landmarks tell all of them equally well."""
+    """Moves a timestep's parameters by Adam, in coordinates that landmarks determine equally well."""
 
     row: Float[Tensor, " p"]
-    """Moved in place."""
+    """The parameters, which are moved in place."""
     whitening: Float[Tensor, "p p"]
-    """From standard deviations that landmarks leave to parameters."""
+    """Transform to parameters from independent coordinates in units of the standard deviations left by landmarks."""
     moments: Moments
     bounds: tuple[Float[Tensor, " p"], Float[Tensor, " p"]]
 
     @torch.no_grad()
     def step(self, gradient: Float[Tensor, " p"], rate: float) -> None:
-        """One step of at most about `rate` standard deviations; within the bounds."""
+        """Take one step of at most about `rate` standard deviations and clip to the bounds."""
         move = torch.zeros_like(self.row)
         self.moments.step(move, gradient @ self.whitening, rate, _SETTLED)
         self.row.add_(self.whitening @ move)

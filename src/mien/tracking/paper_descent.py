@@ -1,4 +1,4 @@
-"""The global epochs of the `paper` schedule, and what its steps share and remember."""
+"""The global epochs of the `paper` schedule, and the state that all its steps share."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -31,22 +31,22 @@ from mien.tracking.resume import Keeper
 
 _PIECE = "descent"
 _RATES = {"lights": "light", "log_focals": "focal"}
-"""Names of rates that differ from the parameters'."""
+"""Names of learning rates that differ from the names of their parameters."""
 _GLOBAL_RATE, _EPOCH_DECAY = 0.1, 0.9
-"""Of the first rates in the first epoch, and from one to the next."""
+"""Factor of the initial learning rates in the first epoch, and decay from one epoch to the next."""
 _GOOD_COSINE = 0.5
-"""Of triangles seen less frontally, texels count in proportion."""
+"""Least cosine of the viewing angle at which a triangle's texels count fully. Below it they count in proportion."""
 _BATCHES = 40
-"""Into so many an epoch's frames are drawn at most: frames err alike, so more of them say no more about a person."""
+"""Largest number of batches in an epoch. Frames err alike, so longer clips need no more steps of shared parameters."""
 _AT_ONCE = 16
-"""Frames of a batch whose gradients are kept together: some 60 MB."""
+"""Number of frames of a batch whose gradients are in memory together, about 60 MB."""
 _TEXTURE_EVERY = 4
-"""Frames at least whose gradients by the texture are taken together: its step costs as much as a picture."""
+"""Fewest frames whose texture gradients are summed for one step. A step of the texture costs as much as a picture."""
 
 
 @dataclass(frozen=True)
 class _Place:
-    """A picture of a batch."""
+    """One picture of a batch."""
 
     sequence: int
     row: int
@@ -54,21 +54,21 @@ class _Place:
 
 
 class Descent:
-    """A fit on its way: the parameters and what Adam knows of them."""
+    """A fit in progress: the parameters and the state of their optimisers."""
 
     def __init__(self, scene: PaperScene, state: PaperState) -> None:
         self.scene, self.state = scene, state
         self.start = [rows.clone() for rows in state.frames]
-        """Where the frames' parameters began."""
+        """The frames' parameters at the start."""
         self.frames = sum(len(rows) for rows in state.frames)
         self.done = 0
-        """Frames, those of past epochs as well."""
+        """Number of frames done, over the pass along the frames and all epochs."""
         self.lost: list[tuple[int, int]] = []
         self._steppers: dict[tuple[int, int], RowStepper] = {}
         self._moments: dict[str, Moments] = {}
 
     def resume(self, keeper: Keeper) -> None:
-        """Go on from what a keeper has."""
+        """Resume from the state that a keeper holds, if any."""
         tensors = keeper.read(_PIECE)
         if tensors is None:
             return
@@ -85,11 +85,11 @@ class Descent:
             )
 
     def offer(self, keeper: Keeper) -> None:
-        """Keep how far it has come, if it is time."""
+        """Offer the present state to the keeper, which stores it if it is time."""
         keeper.offer(_PIECE, lambda: pack(self.state, self._moments, self._steppers, self.lost, self.done))
 
     def fit_epoch(self, epoch: int, advance: Advance, keeper: Keeper) -> None:
-        """A step of every frame in random order; batches of them move what is shared as well."""
+        """Take one step of every frame in random order. Each batch of frames also moves the shared parameters."""
         if self.done >= self.frames * (2 + epoch):
             return
         pairs = [(sequence, row) for sequence, rows in enumerate(self.state.frames) for row in range(len(rows))]
@@ -114,7 +114,7 @@ class Descent:
         self.offer(keeper)
 
     def _step_frames(self, batch: Sequence[_Place], scale: float) -> dict[str, Tensor]:
-        """Move each frame's own parameters; the summed gradients of what they share."""
+        """Move each frame's own parameters and return the summed gradients of the shared parameters."""
         weights, total = self.trusted(), {}
         for some in (batch[start : start + _AT_ONCE] for start in range(0, len(batch), _AT_ONCE)):
             for place, gradients in zip(some, in_threads(partial(self._gradients, weights), some), strict=True):
@@ -129,7 +129,7 @@ class Descent:
         return total
 
     def _gradients(self, weights: Float[Tensor, " f"], place: _Place) -> dict[str, Tensor]:
-        """Of one frame's cost, by all that it depends on."""
+        """Gradients of one frame's cost by all parameters that it depends on."""
         names = ["row", "identity", "texture", "light"]
         names += ["offsets"] if self.scene.settings.offset_sigma > 0 else []
         names += ["log_focals"] if len(self.state.log_focals) else []
@@ -145,7 +145,7 @@ class Descent:
         }
 
     def _step_shared(self, gradients: dict[str, Tensor], scale: float, share: float, frames: int) -> None:
-        """Move what frames share, by a batch's summed gradients and its share of what is known beforehand."""
+        """Move the shared parameters by a batch's summed gradients and its share of the priors' gradients."""
         state, rates = self.state, self.scene.settings.rates
         leaves = {name: getattr(state, name).clone().requires_grad_() for name in gradients}
         with torch.enable_grad():
@@ -162,17 +162,17 @@ class Descent:
     def frame_cost(
         self, shown: Shown, moving: Moving, weights: Float[Tensor, " f"], past_only: bool
     ) -> Float[Tensor, ""]:
-        """Of a timestep in one picture: colours, landmarks, prior, and smoothness unless only the past is known."""
+        """The cost of a timestep in one picture: colours, landmarks, prior, and smoothness unless `past_only`."""
         scene = self.scene
         vertices, _ = posed(scene, moving)
         own, rows = scene.sequences[shown.sequence], self.state.frames[shown.sequence]
         cost = color_term(scene, shown, moving, vertices, weights) + landmark_terms(scene, shown, moving)
         cost = cost + prior_term(scene, moving.row)
-        # With the past alone, steady motion would go on past what pictures say: heads drifted by degrees.
+        # Smoothness with the past alone would continue steady motion against the pictures: heads drifted by degrees.
         return cost if past_only else cost + smoothness_term(own, rows, shown.row, moving.row)
 
     def moving(self, shown: Shown, names: Sequence[str]) -> tuple[Moving, dict[str, Tensor]]:
-        """The parameters at a picture; those named are leaves."""
+        """The parameters for a picture, and those in `names` as leaves for gradients."""
         state = self.state
         values = {"row": state.frames[shown.sequence][shown.row], "light": state.lights[shown.sequence]}
         values |= {name: getattr(state, name) for name in ("identity", "offsets", "texture", "log_focals")}
@@ -180,12 +180,12 @@ class Descent:
         return Moving(**(values | leaves)), leaves
 
     def within(self, row: Float[Tensor, "*t p"]) -> Float[Tensor, "*t p"]:
-        """The nearest parameters that may be."""
+        """The parameters clipped to their bounds."""
         layout = self.scene.layout
         return torch.minimum(torch.maximum(row, layout.lower.to(row)), layout.upper.to(row))
 
     def stepper(self, sequence: int, row: int, past_only: bool) -> RowStepper:
-        """What moves a timestep's parameters, new."""
+        """A new stepper for a timestep's parameters."""
         values = self.state.frames[sequence][row]
         layout = self.scene.layout
         linked = torch.cat([torch.zeros(1), self.scene.sequences[sequence].smoothness.linked, torch.zeros(1)])
@@ -194,9 +194,9 @@ class Descent:
         return RowStepper(values, whitening, Moments.like(values), (layout.lower.float(), layout.upper.float()))
 
     def cameras(self, sequence: int, row: int) -> list[int]:
-        """Those that found a face at a timestep."""
+        """The cameras that found a face at a timestep."""
         return self.scene.sequences[sequence].seen_by(row)
 
     def trusted(self) -> Float[Tensor, " f"]:
-        """How far the texels of each triangle were seen frontally, 0..1."""
+        """Weight of the texels of each triangle, 0..1, by how frontally the triangle was seen."""
         return self.scene.used * (self.state.sight / _GOOD_COSINE).clamp_max(1.0)

@@ -1,4 +1,4 @@
-"""Where the global epochs of the `paper` schedule begin: texture and light, and frame after frame from landmarks."""
+"""The steps before the global epochs of the `paper` schedule: the pass along the frames, then texture and light."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,22 +22,22 @@ from mien.tracking.paper_terms import (
 from mien.tracking.resume import Keeper
 
 _LAST_RATE = 0.1
-"""Of the first rates at the last of a frame's steps."""
+"""Factor of the learning rates at the last of a frame's steps."""
 _BETTER_SIGHT = 0.15
-"""By this much a frame must see a triangle more frontally than those before, to have its texels learned anew."""
+"""A frame must see a triangle more frontally than earlier frames by this cosine for its texels to be learned again."""
 _LEAST_COSINE = 0.1
 _TEXTURE_FRAMES, _TEXTURE_ROUNDS = 40, 6
-"""Frames of each sequence, and steps at each, from which texture and light are made anew before the epochs."""
+"""Frames of each sequence, and steps at each, from which texture and light are fitted before the epochs."""
 _LOST = 3.0
-"""Standard deviations by which landmarks may be farther off than where they were fitted alone."""
+"""Landmarks are lost if they are farther off than in their own fit by more than this many standard deviations."""
 _LIGHT_EVERY = 10
-"""Steps between looks at what of a picture is light."""
+"""Steps between estimates of the unexplained light of a picture."""
 _OTHER_FIRST = 5
-"""Part of the first frame's steps that the first frames of further sequences get."""
+"""The first frames of further sequences get the first frame's number of steps divided by this."""
 
 
 def fit_looks(descent: Descent) -> None:
-    """Texture and light anew, all else fixed, from frames all along the sequences in random order."""
+    """Fit texture and light again, all else fixed, to frames spread over the sequences, in random order."""
     chosen = _some_frames(descent)
     moments: dict[str, Moments] = {}
     order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(chosen)), _TEXTURE_ROUNDS))
@@ -49,7 +49,7 @@ def fit_looks(descent: Descent) -> None:
 
 
 def look_around(descent: Descent) -> None:
-    """Find out how frontally the frames see each triangle."""
+    """Measure how frontally the frames see each triangle, and keep the best in the state."""
     for sequence, row in _some_frames(descent):
         for camera in descent.cameras(sequence, row):
             shown = show(descent.scene, sequence, row, camera)
@@ -81,7 +81,7 @@ def _step_looks(descent: Descent, shown: Shown, moments: dict[str, Moments], rat
 
 
 def fit_sequence(descent: Descent, sequence: int, advance: Advance, keeper: Keeper) -> None:
-    """The first frame to convergence, then each next frame from the one before it, moved as its landmarks did."""
+    """Fit the first frame to convergence, then each next frame from the one before it, moved as its landmarks moved."""
     rows, start = descent.state.frames[sequence], descent.start[sequence]
     before = sum(len(own) for own in descent.state.frames[:sequence])
     for row in range(max(descent.done - before, 0), len(rows)):
@@ -102,10 +102,10 @@ def fit_sequence(descent: Descent, sequence: int, advance: Advance, keeper: Keep
 
 
 def recentre(descent: Descent) -> None:
-    """What all frames inherited from the first one's error, taken back.
+    """Remove the error that all frames inherited from the first frame.
 
-    Each frame was fitted to a texture that began with the first one, and with how its landmarks happened to err.
-    The middle difference from landmarks over all frames is that error; theirs averages out.
+    Each frame was fitted to a texture that started from the first frame with the errors of its landmarks. The median
+    difference from the fit to landmarks over all frames is that error, because the errors of all landmarks average out.
     """
     for rows, was in zip(descent.state.frames, descent.start, strict=True):
         rows.copy_(descent.within(rows + (was - rows).median(0).values))
@@ -113,7 +113,7 @@ def recentre(descent: Descent) -> None:
 
 @torch.no_grad()
 def _is_lost(descent: Descent, shown: Shown) -> bool:
-    """Whether landmarks are far worse off than where they were fitted alone."""
+    """Whether the landmarks' cost is far worse than in their own fit."""
     scene, moving = descent.scene, descent.moving(shown, ())[0]
     start = descent.start[shown.sequence][shown.row]
     now, then = (float(landmark_terms(scene, shown, at)) for at in (moving, replace(moving, row=start)))
@@ -157,7 +157,7 @@ def _fit_row(descent: Descent, shown: Sequence[Shown], steps: int) -> None:
 
 
 def _learn_texture(descent: Descent, shown: Shown) -> None:
-    """Texels of triangles that this frame shows better than those before it."""
+    """Learn the texels of triangles that this frame shows more frontally than the frames before it."""
     scene, state = descent.scene, descent.state
     with torch.no_grad():
         sight = sight_of(scene, shown, descent.moving(shown, ())[0])
@@ -175,5 +175,5 @@ def _learn_texture(descent: Descent, shown: Shown) -> None:
 
 
 def _fading(step: int, steps: int) -> float:
-    """Of the first rate at a step."""
+    """Factor of the learning rate at a step."""
     return 1 - (1 - _LAST_RATE) * step / max(steps - 1, 1)

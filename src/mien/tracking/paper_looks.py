@@ -1,4 +1,4 @@
-"""What pictures show of the surface, for the texture of the `paper` schedule."""
+"""Visibility and colours of the surface in the pictures, for the texture of the `paper` schedule."""
 
 import torch
 from jaxtyping import Float
@@ -11,7 +11,7 @@ from mien.tracking.paper_terms import Moving, Shown, posed, see
 
 @torch.no_grad()
 def sight_of(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Tensor, " f"]:
-    """Cosines between normals of the triangles that a picture shows and the direction to the camera, else 0."""
+    """Cosine between each triangle's normal and the direction to the camera; 0 if the picture does not show it."""
     vertices, _ = posed(scene, moving)
     camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
     visible = see(vertices, scene, camera.resized(*reversed(shown.mask.shape))).face_index
@@ -26,7 +26,7 @@ def sight_of(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Tensor, "
 
 @torch.no_grad()
 def guess_texture(scene: PaperScene, shown: Shown, moving: Moving, texture: Float[Tensor, "th tw 3"]) -> None:
-    """Make the texture skin of one colour: the median of what the mesh covers."""
+    """Fill the texture with one skin colour: the median of the pixels that the mesh covers."""
     vertices, _ = posed(scene, moving)
     camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
     visible = see(vertices, scene, camera.resized(*reversed(shown.mask.shape))).face_index
@@ -36,7 +36,7 @@ def guess_texture(scene: PaperScene, shown: Shown, moving: Moving, texture: Floa
 
 
 def roughness_gradient(scene: PaperScene, texture: Float[Tensor, "th tw 3"]) -> Float[Tensor, "th tw 3"]:
-    """Gradient of the squared differences between neighbouring texels; as a mean, like a picture."""
+    """Gradient of the squared differences between neighbouring texels, scaled like the cost of a picture."""
     gradient = torch.zeros_like(texture)
     for axis in (0, 1):
         step = texture.detach().diff(dim=axis)

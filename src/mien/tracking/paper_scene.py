@@ -1,4 +1,4 @@
-"""What the `paper` schedule fits: the parameters, and what stays the same while they move."""
+"""The parameters that the `paper` schedule fits, and the constants of the fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ from mien.tracking.stages import Fit, SequenceFit, all_landmarks, quiet_landmark
 from mien.tracking.views import CameraBatch
 
 _STIFF_REGIONS = ("eyes", "irises", "eyelids", "teeth", "tongue", "mouth", "eye_sockets", "scalp", "neck", "ears")
-"""Regions without offsets: they close on each other, or nothing shows where they are."""
+"""Regions without vertex offsets. They close on each other, or the pictures do not show where they are."""
 
 
 @dataclass(eq=False)
 class PaperState:
-    """All that is fitted; float32. Mutable: Adam writes into it."""
+    """All parameters that are fitted, float32. Mutable: Adam writes into it."""
 
     identity: Float[Tensor, " i"]
     offsets: Float[Tensor, "v 3"]
@@ -39,12 +39,12 @@ class PaperState:
     lights: Float[Tensor, "s 9 3"]
     log_focals: Float[Tensor, " g"]
     frames: list[Float[Tensor, "_ p"]]
-    """Of each sequence, a row a timestep with a face (their numbers differ)."""
+    """Parameters of each sequence: one row for each timestep with a face, so lengths differ."""
     sight: Float[Tensor, " f"]
-    """The best cosine between a triangle's normal and the direction to a camera of a frame that its texels are from."""
+    """Cosine between each triangle's normal and the direction to the camera in the frame that its texels are from."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """By name, for a file."""
+        """The parameters by name, for a file."""
         frames = {f"frames_{index}": rows for index, rows in enumerate(self.frames)}
         names = ("identity", "offsets", "texture", "lights", "log_focals", "sight")
         return {name: getattr(self, name) for name in names} | frames
@@ -52,23 +52,23 @@ class PaperState:
 
 @dataclass(frozen=True, eq=False)
 class SequenceScene:
-    """One sequence as it was found."""
+    """Constants of one sequence."""
 
     timesteps: Int[Tensor, " t"]
     pictures: Pictures
     cameras: CameraBatch
-    """float32, with the focal length of the fit to landmarks."""
+    """Cameras in float32, with the focal length of the initial fit."""
     smoothness: Smoothness
     lens: int | None
     terms: tuple[LandmarkTerm, ...]
-    """Landmarks of each row alone; float64."""
+    """The landmark term of each row alone, float64."""
 
     def seen_by(self, row: int) -> list[int]:
-        """The cameras that found a face."""
+        """The cameras that found a face at this row."""
         return self.terms[row].views.camera.tolist()
 
     def cameras_at(self, log_focals: Float[Tensor, " g"]) -> CameraBatch:
-        """With the present focal lengths. Differentiable."""
+        """The cameras with the given focal lengths. This is differentiable."""
         if self.lens is None:
             return self.cameras
         factor, one = log_focals[self.lens].exp(), log_focals.new_ones(())
@@ -78,30 +78,31 @@ class SequenceScene:
 
 @dataclass(frozen=True, eq=False)
 class PaperScene:
-    """Everything that does not move."""
+    """All constants of the fit."""
 
     face_model: FaceModel
     layout: ParameterLayout
     precision: Float[Tensor, "p p"]
     landmarks: Landmarks
     bias: Float[Tensor, "l 3"]
-    """Of landmarks, as `Subject.bias`; float64."""
+    """Bias of the landmarks (`Subject.bias`), float64."""
     mesh: LitMesh
     used: Float[Tensor, " f"]
     identity: Float[Tensor, " i"]
-    """Where landmarks had it."""
+    """Identity of the initial fit."""
     offset_share: Float[Tensor, "v 1"]
-    """0 for vertices that get no offset."""
+    """1 for vertices that get an offset, 0 for the others."""
     neighbours: tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, "v 1"]]
-    """Pairs of vertices along edges, and one over the number of each vertex's neighbours."""
+    """First and second vertices of the pairs along edges, and 1 / number of neighbours of each vertex."""
     sequences: tuple[SequenceScene, ...]
     settings: PaperSettings
 
     def whitening(
         self, sequence: int, row: int, state: Float[Tensor, " p"], differences: float
     ) -> Float[Tensor, "p p"]:
-        """Turns independent steps of one standard deviation, which landmarks and smoothness leave, into parameters.
+        """Matrix that turns independent steps into steps of a timestep's parameters.
 
+        A step of 1 is one standard deviation, as far as landmarks and smoothness determine the parameters.
         `differences` is the sum of squares of the timestep's factors in the second differences that count.
         """
         own = self.sequences[sequence]
@@ -114,7 +115,7 @@ class PaperScene:
             return torch.linalg.inv(torch.linalg.cholesky(hessian)).T.float().contiguous()
 
     def camera(self, sequence: int, camera: int, log_focals: Float[Tensor, " g"]) -> Camera:
-        """Of a picture of the capture's size, with the present focal length."""
+        """A camera for pictures of the capture's size, with the given focal lengths."""
         own = self.sequences[sequence]
         cameras, capture = own.cameras_at(log_focals), own.pictures.capture
         return Camera(cameras.K[camera], cameras.viewmat[camera], capture.width, capture.height)
@@ -128,7 +129,7 @@ def paper_scene(
     settings: TrackingSettings,
     refined: PhotometricFit | None = None,
 ) -> PaperScene:
-    """Constants of the fit, from what landmarks led to, or pixels as well."""
+    """The constants of the fit, from a fit to landmarks and, if there is one, a fit to pixels (`refined`)."""
     face_model = model.face_model.to(torch.zeros(()))
     used = ~face_model.region_mask(*HIDING_REGIONS)
     weights = used.float() if refined is None else used * _trust(face_model, refined)
@@ -149,7 +150,7 @@ def paper_scene(
 
 
 def _trust(face_model: FaceModel, refined: PhotometricFit) -> Float[Tensor, " f"]:
-    """The mean trust in each triangle's texels: where pictures contradict each other, as at glasses, they say less."""
+    """Mean trust of each triangle's texels. It is small if pictures contradict each other, as at glasses."""
     trust, count = refined.appearance.trust, len(face_model.faces)
     face_index = texture_space(face_model, len(trust)).fragments.face_index.long().flatten()
     face_index = torch.where(face_index < 0, count, face_index)
@@ -161,7 +162,7 @@ def _trust(face_model: FaceModel, refined: PhotometricFit) -> Float[Tensor, " f"
 def first_state(
     scene: PaperScene, fit: Fit, lenses: Sequence[int | None], refined: PhotometricFit | None = None
 ) -> PaperState:
-    """Where a fit led to; texture and light are even unless pixels were looked at."""
+    """The state at the start, from the given fit. Texture and light are even unless there is a fit to pixels."""
     lights = [even_light() for _ in scene.sequences] if refined is None else list(refined.lights)
     return PaperState(
         identity=scene.identity.clone(),
@@ -175,7 +176,7 @@ def first_state(
 
 
 def _first_texture(size: int, refined: PhotometricFit | None) -> Float[Tensor, "th tw 3"]:
-    """What is known of it, of the middle colour elsewhere."""
+    """The texture of the fit to pixels, with the median colour in unknown texels; grey if there is none."""
     texture = torch.full((size, size, 3), 0.5)
     if refined is None or not (refined.appearance.trust > 0).any():
         return texture

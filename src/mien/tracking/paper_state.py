@@ -1,4 +1,4 @@
-"""All that a fit of the `paper` schedule goes on from, as tensors by name."""
+"""The state of a fit of the `paper` schedule as named tensors, from which an interrupted fit resumes."""
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ def pack(
     lost: list[tuple[int, int]],
     done: int,
 ) -> dict[str, Tensor]:
-    """Everything that a fit goes on from, by name."""
+    """The complete state of a fit as tensors by name."""
     tensors = state.tensors() | {"done": torch.tensor([done]), "lost": torch.tensor(lost).reshape(-1, 2)}
     every = {f"moments/{name}": own for name, own in moments.items()}
     every |= {f"rows/{sequence}/{row}": own.moments for (sequence, row), own in steppers.items()}
@@ -24,13 +24,13 @@ def pack(
 
 
 def unpack_state(state: PaperState, tensors: dict[str, Tensor]) -> None:
-    """Fill in a state of the same sizes, in place."""
+    """Copy the tensors into a state of the same sizes, in place."""
     for name, tensor in state.tensors().items():
         tensor.copy_(tensors[name])
 
 
 def unpack_moments(tensors: dict[str, Tensor], prefix: str) -> dict[str, Moments]:
-    """Moments whose names begin with a prefix, by the rest of their names."""
+    """The moments whose names begin with a prefix, by the rest of their names."""
     names = {name[len(prefix) :].rsplit("/", 1)[0] for name in tensors if name.startswith(prefix)}
     return {
         name: Moments(

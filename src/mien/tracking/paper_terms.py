@@ -19,12 +19,12 @@ from mien.tracking.solver import Smoothness
 from mien.tracking.views import CameraBatch
 
 GAPS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS, (13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
-"""Pairs of landmarks, upper and lower, whose distance tells how far eyes and mouth are open."""
+"""Pairs of upper and lower landmarks. Their distances show how far eyes and mouth are open."""
 
 _BLUR_AT = 4.0
-"""Pixels of standard deviation to which pictures are shrunk for a wide blur."""
+"""For a wide blur, pictures are scaled down until its standard deviation is about this many pixels."""
 _LIGHT = 0.1
-"""Differences of colours of more than this are not taken for light."""
+"""Colour differences above this hardly count as light."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Moving:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A picture that is fitted to."""
+    """A picture that the fit uses."""
 
     sequence: int
     row: int
@@ -51,14 +51,14 @@ class Shown:
 
 
 def show(scene: PaperScene, sequence: int, row: int, camera: int) -> Shown:
-    """Read a picture."""
+    """Read a picture of a sequence."""
     own = scene.sequences[sequence]
     image = own.pictures.picture(int(own.timesteps[row]), camera, own.cameras).image
     return Shown(sequence, row, camera, image, torch.ones(image.shape[:2]))
 
 
 def posed(scene: PaperScene, moving: Moving) -> tuple[Float[Tensor, "v 3"], FaceParams]:
-    """Vertices in the world of the fit."""
+    """Vertices in the frame of the fit, and the face parameters."""
     face = scene.layout.face_params(moving.row[None], moving.identity)
     face = replace(face, vertex_offsets=moving.offsets)
     return scene.face_model(face)[0], face
@@ -67,9 +67,10 @@ def posed(scene: PaperScene, moving: Moving) -> tuple[Float[Tensor, "v 3"], Face
 def color_term(
     scene: PaperScene, shown: Shown, moving: Moving, vertices: Float[Tensor, "v 3"], weights: Float[Tensor, " f"]
 ) -> Float[Tensor, ""]:
-    """The difference between picture and rendering, over the triangles that count.
+    """The colour difference between picture and rendering, over triangles with a weight.
 
-    Vertices are not moved for the sake of shading: what a few harmonics do not explain of light would turn heads.
+    Shading has no gradient by the vertices. Otherwise light that a few spherical harmonics do not explain would turn
+    heads.
     """
     camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
     height, width = shown.mask.shape
@@ -84,7 +85,7 @@ def color_term(
 
 @torch.no_grad()
 def without_smooth_difference(scene: PaperScene, shown: Shown, moving: Moving, weights: Float[Tensor, " f"]) -> Shown:
-    """The picture less what differs from its rendering over many pixels: light that harmonics do not explain."""
+    """The picture minus its smooth difference from the rendering, which is light that the model does not explain."""
     vertices, _ = posed(scene, moving)
     height, width = shown.mask.shape
     camera = scene.camera(shown.sequence, shown.camera, moving.log_focals).resized(width, height)
@@ -96,7 +97,7 @@ def without_smooth_difference(scene: PaperScene, shown: Shown, moving: Moving, w
     )  # fmt: skip
     lit = torch.cat([weights, weights.new_zeros(1)])[fragments.face_index.long()][..., None]
     difference = shown.image - picture
-    # Outliers, as where hair hides skin, say nothing about the light beside them.
+    # Outliers, such as hair that hides skin, say nothing about the light around them.
     lit = lit * (_LIGHT**2 / (_LIGHT**2 + difference.square().sum(-1, keepdim=True)))
     depth = float(camera.project(vertices.mean(0, keepdim=True))[1])
     sigma = max(scene.settings.light_extent * float(camera.K[0, 0]) / depth, 1.0)
@@ -106,7 +107,7 @@ def without_smooth_difference(scene: PaperScene, shown: Shown, moving: Moving, w
 
 
 def _blurred(image: Float[np.ndarray, "h w c"], sigma: float) -> Float[np.ndarray, "h w c"]:
-    """Blurred at a fraction of the size where that is wide: the same within a hundredth, many times faster."""
+    """Blur a picture; a wide blur runs on a smaller copy. The result is the same within 0.01, many times faster."""
     height, width = image.shape[:2]
     factor = max(int(sigma / _BLUR_AT), 1)
     small = cv2.resize(image, (max(width // factor, 1), max(height // factor, 1)), interpolation=cv2.INTER_AREA)
@@ -115,17 +116,17 @@ def _blurred(image: Float[np.ndarray, "h w c"], sigma: float) -> Float[np.ndarra
 
 
 def see(vertices: Float[Tensor, "v 3"], scene: PaperScene, camera: Camera) -> MeshFragments:
-    """What a camera sees of the mesh."""
+    """Rasterise the mesh in a camera, without gradients."""
     fixed = replace(camera, K=camera.K.detach())
     return rasterize_mesh(vertices.detach(), scene.mesh.faces, fixed)
 
 
 def landmark_terms(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Tensor, ""]:
-    """Landmarks in all pictures of the timestep as a detector sees them, and the gaps between lids and between lips."""
+    """The cost of landmarks in all pictures of the timestep, and of the gaps between lids and between lips."""
     own = scene.sequences[shown.sequence]
     term, cameras = own.terms[shown.row], own.cameras_at(moving.log_focals)
     views = term.views
-    # What offsets move of landmarks is worked out as `_as_fit` does in the end: as part of their bias.
+    # The effect of the offsets on landmarks is added to the bias, as `_as_fit` does at the end.
     moved = scene.landmarks.positions(moving.offsets, scene.mesh.faces).double()
     cameras = CameraBatch(cameras.K.double(), cameras.viewmat.double())[views.camera]
     state, identity = moving.row.double()[None], moving.identity.double()
@@ -138,21 +139,21 @@ def landmark_terms(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Ten
 
 
 def prior_term(scene: PaperScene, row: Float[Tensor, " p"]) -> Float[Tensor, ""]:
-    """Of a timestep's own parameters."""
+    """The prior cost of a timestep's own parameters."""
     return (row * (scene.precision @ row)).sum()
 
 
 def smoothness_term(
     own: SequenceScene, rows: Float[Tensor, "t p"], index: int, row: Float[Tensor, " p"]
 ) -> Float[Tensor, ""]:
-    """Accelerations that the timestep has a part in."""
+    """The cost of the accelerations that involve the timestep."""
     first, last = max(index - 2, 0), min(index + 3, len(rows))
     window = torch.cat([rows[first:index], row[None], rows[index + 1 : last]])
     return Smoothness(own.smoothness.precision, own.smoothness.linked[first:last]).cost(window)
 
 
 def shared_terms(scene: PaperScene, state: PaperState) -> Float[Tensor, ""]:
-    """Of identity, offsets, light and focal lengths."""
+    """The prior costs of identity, offsets, light and focal lengths."""
     settings = scene.settings
     total = ((state.identity - scene.identity) / settings.identity_sigma).square().sum()
     total = total + (state.log_focals / settings.focal_sigma).square().sum()
@@ -162,7 +163,7 @@ def shared_terms(scene: PaperScene, state: PaperState) -> Float[Tensor, ""]:
 
 
 def light_term(scene: PaperScene, light: Float[Tensor, "9 3"]) -> Float[Tensor, ""]:
-    """Pulls light to be even and grey."""
+    """Cost that pulls the light towards an even grey."""
     settings = scene.settings
     even = light.new_zeros(9, 1)
     even[0] = math.sqrt(4 * math.pi)
@@ -171,7 +172,7 @@ def light_term(scene: PaperScene, light: Float[Tensor, "9 3"]) -> Float[Tensor, 
 
 
 def offset_term(scene: PaperScene, offsets: Float[Tensor, "v 3"]) -> Float[Tensor, ""]:
-    """Keeps vertex offsets small and smooth (uniform Laplacian); a patch of about 100 vertices counts as one."""
+    """Cost that keeps vertex offsets small and smooth (uniform Laplacian). About 100 vertices count as one."""
     if scene.settings.offset_sigma == 0:
         return offsets.new_zeros(())
     first, second, share = scene.neighbours

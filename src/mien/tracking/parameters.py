@@ -9,26 +9,28 @@ from torch import Tensor
 from mien.face import FaceModel, FaceParams
 
 _JOINT_SIGMAS = {"eye": (0.4, 0.4, 0.0), "neck": (0.0, 0.0, 0.0), "jaw": (0.25, 0.05, 0.03)}
-"""Priors (radians) of joints by a word in their name: eyes do not roll, a face shows nothing of its neck, and a jaw
-opens (about x), shifts aside a little (about y) and hardly twists."""
+"""Prior standard deviations of joint angles in radians, by a word in the joint's name; 0 fixes an angle. Eyes do not
+roll, a face says nothing about its neck, and a jaw opens (about x), shifts a little (about y) and hardly twists."""
 _JAW_BOUNDS = (-0.03, 0.6)
-"""Of the opening: teeth stop it one way, ligaments the other."""
+"""Bounds of the jaw's opening angle in radians. Teeth stop it one way, ligaments the other."""
 _OTHER_JOINT_SIGMAS = (0.2, 0.2, 0.2)
 _JAW_OPEN = 0.35
-"""Radians, of a wide open mouth."""
+"""Opening angle of a wide open mouth, in radians."""
 _EYES_ALIKE_SIGMA = (0.1, 0.03)
-"""How much the two eyes' angles (up-down, left-right) may differ, radians: they look at the same thing."""
+"""Standard deviations of the difference of the two eyes' angles (up-down, left-right), in radians. The eyes look at
+the same thing."""
 _EXPRESSION_SIGMAS = {
     "brow": 0.25, "cheek": 0.3, "nose": 0.3, "jaw": 0.5, "mouth": 0.4, "eyeLook": 0.3, "eyeBlink": 2.0, "eyeWide": 1.0,
     "eye": 0.5,
 }  # fmt: skip
-"""Priors of coefficients whose name begins with a word; brows are kept in, else they follow the head's pitch."""
+"""Prior standard deviations of expression coefficients, by the beginning of their name. That of brows is small,
+because otherwise they follow the head's pitch."""
 _OTHER_EXPRESSION_SIGMA = 0.4
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterLayout:
-    """Which component of the vector is what: rotation (3), translation (3), expression, joint angles."""
+    """The order of the vector's components: rotation (3), translation (3), expression, joint angles."""
 
     names: tuple[str, ...]
     expression_index: Int[Tensor, " n"]
@@ -36,37 +38,37 @@ class ParameterLayout:
     joint_index: Int[Tensor, " m"]
     """Components of the flattened `FaceParams.joints` that the fit may move."""
     derived_expression: Int[Tensor, " d"]
-    """Expressions that move a joint, and with it landmarks."""
+    """Free expressions that move a joint and, with it, landmarks."""
     derived_column: Int[Tensor, " d"]
-    """Where they are among `expression_index`."""
+    """Positions of `derived_expression` in `expression_index`."""
     expressions: int
-    """Of the face model."""
+    """Number of expressions of the face model."""
     joints: int
-    """Free joints of the face model."""
+    """Number of free joints of the face model."""
     lower: Float[Tensor, " p"]
     upper: Float[Tensor, " p"]
     precision: Float[Tensor, "p p"]
-    """Of the prior, whose mean is zero; zero for the head pose."""
+    """Precision matrix of the prior, whose mean is zero. It is zero for the head pose."""
     units: Float[Tensor, " q"]
-    """How much of each expression coefficient, then joint angle, is worth 1 of one of ARKit's coefficients."""
+    """The amount of each expression coefficient, then of each joint angle, that is worth 1 of an ARKit coefficient."""
 
     @property
     def size(self) -> int:
-        """The number of parameters a frame, p."""
+        """The number of parameters per frame, p."""
         return len(self.names)
 
     @property
     def expression_columns(self) -> slice:
-        """Where the expression is in the vector."""
+        """The columns of the expression in the vector."""
         return slice(6, 6 + len(self.expression_index))
 
     @property
     def joint_columns(self) -> slice:
-        """Where the joint angles are in the vector."""
+        """The columns of the joint angles in the vector."""
         return slice(6 + len(self.expression_index), self.size)
 
     def face_params(self, state: Float[Tensor, "b p"], identity: Float[Tensor, " i"]) -> FaceParams:
-        """The vectors as face parameters; what the fit may not move is zero."""
+        """The vectors as face parameters. Parameters that the fit may not move are zero."""
         expression = state.new_zeros(len(state), self.expressions)
         expression[:, self.expression_index] = state[:, self.expression_columns]
         joints = state.new_zeros(len(state), self.joints * 3)
@@ -107,7 +109,7 @@ def layout_of(face_model: FaceModel) -> ParameterLayout:
 
 
 def _joints_behind_landmarks(face_model: FaceModel) -> list[int]:
-    """Joints that move landmarks, and those that move these joints."""
+    """Joints that move landmarks, and all their parents."""
     corners = face_model.faces[face_model.landmarks["mediapipe"].faces]
     relevant = set(face_model.skinning_weights[corners].sum((0, 1)).nonzero()[:, 0].tolist())
     for index in reversed(range(len(face_model.joint_names))):
@@ -150,7 +152,7 @@ def _tie_eyes(precision: Float[Tensor, "p p"], names: list[str]) -> None:
 
 
 def pose_only(layout: ParameterLayout) -> ParameterLayout:
-    """The layout of a fit that moves nothing but the head."""
+    """The layout of a fit that moves only the head pose."""
     none = torch.zeros(0, dtype=torch.long)
     return ParameterLayout(
         layout.names[:6], none, none, none, none, layout.expressions, layout.joints,

@@ -1,4 +1,4 @@
-"""The photometric stage: faces tracked from landmarks are moved until one texture fits all pictures."""
+"""The photometric stage: it moves faces that were tracked from landmarks until one texture fits all pictures."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,21 +37,21 @@ from mien.tracking.watch import Watch
 
 _DAMPING = 1e-3
 _WORSE = 1.02
-"""A frame whose cost grows by more than this factor in a step goes back to where it was."""
+"""A step of a frame is undone if it multiplies the frame's cost by this factor or more."""
 _FRAMES_AT_ONCE = 256
-"""Timesteps whose equations are kept together: some seconds of work, and some 10 MB."""
+"""Number of timesteps whose equations are stored as one piece: a few seconds of work, about 10 MB."""
 _SHARED_COST, _LOOK_COST, _LIDS_PART = 100, 40, 4
-"""About how long a step of identity and a look at the texture take, in timesteps of a step of all frames; and how many
-times longer such a step takes than lids do."""
+"""Costs for the progress bar. The first two are the durations of a step of identity and an estimate of the texture, in
+timesteps of a step of all frames. The third is how many times longer a step of all frames takes than the lids."""
 _LEAST_KEYFRAMES = 3
-"""However many cameras there are: the mouth must be seen open and closed."""
+"""Fewest keyframes for any number of cameras, because the mouth must be seen open and closed."""
 _LEAST_SHARE = 0.03
-"""Of a frame in the texture, however far it is from the middle pose: it may be the only one that sees an ear."""
+"""Least weight of a frame in the texture, however far from the middle pose. It may be the only one to show an ear."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """What all steps of one round have in common."""
+    """Data and settings that all steps of one round share."""
 
     model: SurfaceModel
     space: TextureSpace
@@ -62,23 +62,23 @@ class _Round:
 
     @property
     def keyframes(self) -> int:
-        """Timesteps of each sequence for the steps of what they share."""
+        """Number of keyframes of each sequence for the steps of the shared parameters."""
         pictures = 2 * self.settings.keyframes // max(shot.capture.valid.shape[1] for shot in self.shots)
         return min(self.settings.keyframes, max(pictures, _LEAST_KEYFRAMES))
 
     def pictures(self, shot: Shot) -> Pictures:
-        """Of a sequence, at this round's size."""
+        """The pictures of a sequence at this round's size."""
         return Pictures(shot.capture, max(round(min(shot.capture.width, shot.capture.height) / self.size), 1))
 
     def light_radius(self, shot: Shot, own: SequenceFit) -> int:
-        """Pixels over which a smooth difference counts as light."""
+        """Radius in pixels over which a smooth difference counts as light."""
         cameras = own.cameras
         depth = (own.state[:, 3:6] @ cameras.viewmat[0, 2, :3] + cameras.viewmat[0, 2, 3]).median()
         extent = self.settings.light_extent * float(cameras.K[0, 0, 0] / depth)
         return max(round(extent / self.pictures(shot).shrink), 2)
 
     def terms(self, at: PhotometricFit, independent_pixels: float) -> list[PhotometricTerm]:
-        """The cost of every sequence; `independent_pixels` are what all of a picture are worth."""
+        """The cost of every sequence. All pixels of a picture are worth `independent_pixels` independent ones."""
         surface = self.space.native(at.appearance, self.settings.outlier)
         return [
             PhotometricTerm(
@@ -89,7 +89,7 @@ class _Round:
         ]  # fmt: skip
 
     def look(self, at: PhotometricFit) -> PhotometricFit:
-        """Texture and light anew, from where the faces are now."""
+        """Estimate texture and light again, from the present positions of the faces."""
         sightings = [
             self._sightings(shot, marks, own, at.fit.subject.identity, light)
             for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
@@ -135,21 +135,21 @@ def refine_photometrically(
     keeper: Keeper,
     watch: Watch,
 ) -> PhotometricFit:
-    """A fit to landmarks refined until pictures agree with a texture that all of them share.
+    """Refine a fit to landmarks until the pictures agree with one texture that they all share.
 
-    In each round: identity and unknown focal lengths from keyframes (from the second round on), the albedo by robust
-    least squares a texel in turn with SH light, then one Gauss-Newton step of all timesteps of each sequence under
-    their smoothness cost. Landmarks stay in the cost with less weight: irises, lids and lips need them. Lids are put
-    where pictures have them at the end (`place_lids`). Deterministic.
+    Each round fits identity and unknown focal lengths to keyframes (from the second round on), then the albedo by
+    robust least squares per texel in turn with the light (spherical harmonics), then takes one Gauss-Newton step of all
+    timesteps of each sequence under their smoothness cost. Landmarks stay in the cost with less weight; irises, lids
+    and lips need them. At the end the lids are placed from the pictures (`place_lids`). The result is deterministic.
 
     Args:
         model: The face model reduced to its landmarks.
         shots: The sequences.
-        lenses: The unknown focal length of each (`lenses_of`).
-        fit: What landmarks led to.
-        settings: Of the whole tracking.
-        keeper: Of what an interrupted fit of the same input goes on from.
-        watch: Is told how far it has come.
+        lenses: Index of each sequence's unknown focal length (`lenses_of`).
+        fit: The fit to landmarks.
+        settings: Settings of the whole tracking.
+        keeper: Keeps the pieces from which an interrupted fit of the same input resumes.
+        watch: Receives the progress.
     """
     own_settings = settings.photometric
     landmarks = [
@@ -169,7 +169,7 @@ def refine_photometrically(
     outlines = [
         outline_term(
             surface, shot.capture, shot.valid.nonzero()[:, 0], shot.views,
-            own_settings.outline_weight if len(shot.cameras) == 1 else 0.0,  # several see depth by themselves
+            own_settings.outline_weight if len(shot.cameras) == 1 else 0.0,  # Several cameras see depth without it.
         )
         for shot in shots
     ]  # fmt: skip
@@ -237,7 +237,7 @@ def _step_sequences(
     name: str,
     advance: Callable[[int], None],
 ) -> PhotometricFit:
-    """One step of all timesteps of every sequence; its parts are kept by names that begin with `name`."""
+    """Take one step of all timesteps of every sequence. Its pieces are kept under names that begin with `name`."""
     sequences, improved = [], []
     terms = now.terms(at, now.settings.independent_pixels_of_frames)
     parts = zip(terms, now.shots, at.fit.sequences, at.improved, strict=True)
@@ -257,7 +257,7 @@ def _equations(
     name: str,
     advance: Callable[[int], None],
 ) -> NormalEquations:
-    """Of all timesteps, some of them at a time; those that an interrupted fit had made are read."""
+    """The equations of all timesteps, computed in pieces. Pieces that an interrupted fit has kept are read."""
 
     def made(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
         found = term.equations(own.state, rows, subject, own.cameras)
@@ -282,7 +282,7 @@ def _step(
     name: str,
     advance: Callable[[int], None],
 ) -> tuple[Float[Tensor, "v p"], Bool[Tensor, " v"]]:
-    """All timesteps moved by one Gauss-Newton step, except those that it would make worse; and which ones moved."""
+    """Move all timesteps by one Gauss-Newton step, except those that it makes worse; also returns which ones moved."""
     box, state = box_of(term.layout), own.state
     equations = _equations(term, subject, own, keeper, name, advance)
     damping = torch.diag_embed(_DAMPING * equations.hessian.diagonal(dim1=1, dim2=2))

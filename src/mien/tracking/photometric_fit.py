@@ -1,4 +1,4 @@
-"""What a fit to pixels comes to: the fit, and the subject's looks."""
+"""The result of a fit to pixels: the fit and the subject's appearance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,19 +13,19 @@ from mien.tracking.stages import Fit, fit_of
 
 @dataclass(frozen=True, eq=False)
 class PhotometricFit:
-    """A fit with what it found out about the subject's looks."""
+    """A fit to pixels with the texture and light that it found."""
 
     fit: Fit
     appearance: Appearance
     lights: tuple[Float[Tensor, "9 3"], ...]
-    """Of each sequence."""
+    """Light of each sequence."""
     improved: tuple[Bool[Tensor, " _"], ...]
-    """Of each sequence, timesteps that pixels made better; the others stay as landmarks had them."""
+    """Timesteps of each sequence that the fit to pixels improved. The others keep their fit to landmarks."""
     residuals: tuple[Float[Tensor, "_ _"], ...] = ()
-    """Of each sequence: `PhotometricTerm.residuals`, NaN where not improved."""
+    """`PhotometricTerm.residuals` of each sequence; NaN where not improved."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """By name, for a file: all but the residuals."""
+        """Everything but the residuals as tensors by name, for a file."""
         tensors = self.fit.tensors() | {"albedo": self.appearance.albedo, "trust": self.appearance.trust}
         tensors["sigma"] = torch.tensor([self.appearance.sigma], dtype=torch.float64)
         for index, (light, improved) in enumerate(zip(self.lights, self.improved, strict=True)):
@@ -34,7 +34,7 @@ class PhotometricFit:
 
 
 def photometric_fit_of(tensors: Mapping[str, Tensor]) -> PhotometricFit:
-    """The fit with these tensors (`PhotometricFit.tensors`)."""
+    """The fit made of tensors by name (`PhotometricFit.tensors`)."""
     fit = fit_of(tensors)
     count = range(len(fit.sequences))
     return PhotometricFit(

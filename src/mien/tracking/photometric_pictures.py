@@ -1,4 +1,4 @@
-"""Pictures as the photometric fit sees them: smoothed, shrunk, and masked to what can be trusted."""
+"""Pictures for the photometric fit: smoothed, scaled down, and masked to the pixels that can be trusted."""
 
 from dataclasses import dataclass
 
@@ -13,9 +13,9 @@ from mien.capture.capture import Capture
 from mien.tracking.views import CameraBatch
 
 _BLUR = 0.8
-"""Standard deviation in pixels of each level: without it, colours between pixels are guesses."""
+"""Standard deviation of the blur, in pixels of the scaled picture. Without it, colours between pixels are guesses."""
 _MATTE_MARGIN = 2
-"""Pixels of each level along the person's outline that do not count: they mix with the background."""
+"""Margin along the person's outline that is masked, in pixels of the scaled picture: it mixes with the background."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +24,9 @@ class Picture:
 
     camera: Camera
     image: Float[Tensor, "h w 3"]
-    """0..1, sRGB."""
+    """Colours, sRGB, 0..1."""
     mask: Float[Tensor, "h w"]
-    """How far a pixel counts, 0..1."""
+    """Weight of each pixel, 0..1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +35,10 @@ class Pictures:
 
     capture: Capture
     shrink: int
-    """1 for the capture's size, 2 for half of it, ..."""
+    """Factor by which pictures are scaled down: 1 for the capture's size, 2 for half of it."""
 
     def picture(self, timestep: int, camera: int, cameras: CameraBatch) -> Picture:
-        """The picture of one camera. Safe to call from several threads at once."""
+        """The picture of one camera. Several threads may call this at once."""
         capture = self.capture
         width, height = max(capture.width // self.shrink, 8), max(capture.height // self.shrink, 8)
         image = np.asarray(capture.images[timestep, camera])

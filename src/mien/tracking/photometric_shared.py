@@ -1,4 +1,4 @@
-"""What the sequences of a subject share, fitted to pixels and landmarks of keyframes: identity and focal lengths."""
+"""Identity and focal lengths of a subject's sequences, fitted to pixels and landmarks of keyframes."""
 
 import math
 from collections.abc import Sequence
@@ -15,23 +15,24 @@ from mien.tracking.solver import joined, joined_shared, solve_arrow
 from mien.tracking.stages import Fit, SequenceFit, box_of, choose_keyframes
 
 _DAMPING = 1e-6
-"""Hardly any: what tells the focal length from depth is a thousandth of what either does alone."""
+"""Damping of a step. It is tiny, because the effect that separates focal length from depth is a thousandth of the
+effect of either alone."""
 _SMOOTHING = 0.3
-"""Of how pose steps follow the pose, in keyframes."""
+"""Ridge regularisation of the affine map from poses to pose steps, in keyframes."""
 _FOCAL_STEP = 0.2
-"""The logarithm of a focal length changes by no more than this in a step."""
+"""Largest change of the logarithm of a focal length in one step."""
 
 
 @dataclass(frozen=True, eq=False)
 class SharedPrior:
-    """What is known of the shared parameters before pixels are looked at."""
+    """Prior of the shared parameters for the fit to pixels."""
 
     lenses: Sequence[int | None]
-    """The lens of each sequence; None where the focal length is known."""
+    """The lens of each sequence; None if the focal length is known."""
     focal: Float[Tensor, " q"]
-    """The focal length of each sequence that landmarks led to, pixels."""
+    """The focal length of each sequence from the fit to landmarks, in pixels."""
     focal_sigma: float
-    """Of its logarithm."""
+    """Standard deviation of the logarithm of a focal length."""
     identity_weight: float
 
     @property
@@ -43,10 +44,10 @@ class SharedPrior:
 def step_shared(
     terms: Sequence[PhotometricTerm], outlines: Sequence[OutlineTerm], fit: Fit, prior: SharedPrior, keyframes: int
 ) -> Fit:
-    """One Gauss-Newton step of identity and focal lengths, the keyframes' own parameters eliminated.
+    """Take one Gauss-Newton step of identity and focal lengths, with the keyframes' own parameters eliminated.
 
-    A texture that was made with these very poses hardly resists a change that shifts every view alike, but it resists
-    one that the views contradict: what is gained is depth, from parallax. Outlines tell perspective.
+    A texture that was estimated with these very poses hardly resists a change that shifts all views alike, but it
+    resists a change that the views contradict. So the step gains depth, from parallax. Outlines show the perspective.
     """
     subject, box = fit.subject, box_of(terms[0].layout)
     rows = [choose_keyframes(own.state[:, :6], keyframes) for own in fit.sequences]
@@ -62,7 +63,7 @@ def step_shared(
     equations = joined(frames)
     state = torch.cat([own.state[chosen] for own, chosen in zip(fit.sequences, rows, strict=True)])
     held = box.held(state, equations.gradient)
-    held[:, 6:] = True  # an expression that all frames share belongs to identity, but would drift here
+    held[:, 6:] = True  # An expression that all frames share belongs to identity, but would drift here.
     step, shared_step = solve_arrow(equations, joined_shared(shared).with_prior(precision, values), held, _DAMPING)
     sequences = []
     steps = step.split([len(chosen) for chosen in rows])
@@ -77,9 +78,9 @@ def step_shared(
 def moved_like_keyframes(
     state: Float[Tensor, "v p"], chosen: Int[Tensor, " k"], step: Float[Tensor, "k p"]
 ) -> Float[Tensor, "v p"]:
-    """All timesteps moved as keyframes are: head poses by a step that is affine in the pose, expressions not at all.
+    """Move all timesteps as the keyframes moved: head poses by a step that is affine in the pose, nothing else.
 
-    A longer lens moves heads away in proportion to their depth, and turns them farther in proportion to their turns.
+    A longer lens moves heads away in proportion to their depth and turns them farther in proportion to their rotation.
     """
     pose = state[:, :6]
     middle, scale = pose[chosen].mean(0), pose[chosen].std(0, correction=0).clamp_min(1e-3)
@@ -92,7 +93,7 @@ def moved_like_keyframes(
 
 
 def _prior(fit: Fit, prior: SharedPrior) -> tuple[Float[Tensor, " s"], Float[Tensor, " s"]]:
-    """Precisions of the shared parameters, and how far they are from what is expected."""
+    """Precisions of the shared parameters, and their present offsets from the prior's means."""
     identity = fit.subject.identity
     weights, values = identity.new_zeros(prior.groups), identity.new_zeros(prior.groups)
     for own, lens, first in zip(fit.sequences, prior.lenses, prior.focal, strict=True):

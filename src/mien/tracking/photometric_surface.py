@@ -1,4 +1,4 @@
-"""The whole surface of a face model posed in float32, with the derivatives of its vertices."""
+"""The surface of a face model posed in float32, with the derivatives of its vertices."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,13 +17,13 @@ from mien.tracking.views import CameraBatch
 
 @dataclass(frozen=True, eq=False)
 class PosedSurface:
-    """One timestep in world space."""
+    """The surface at one timestep, in world space."""
 
     vertices: Float[Tensor, "v 3"]
     normals: Float[Tensor, "v 3"]
     jacobian: Float[Tensor, "v 3 p"] | None
-    """Derivatives of the vertices by the per-frame parameters, then (if asked for) by the identity, which leaves out
-    that joints move with it: a joint turns what a photometric fit looks at by little or nothing."""
+    """Derivatives of the vertices by the per-frame parameters, then, if requested, by the identity. The latter ignore
+    that joints move with the identity, because joints hardly turn the parts that a photometric fit uses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +32,10 @@ class SurfaceModel:
 
     face_model: FaceModel
     exact: FaceModel
-    """The same in float64, for the chain of joints."""
+    """The same face model in float64, for the chain of joints."""
     layout: ParameterLayout
     expression_basis: Float[Tensor, "v 3 e"]
-    """Of the expressions that the fit may move."""
+    """Basis of the expressions that the fit may move."""
     identity_basis: Float[Tensor, "v 3 i"]
 
     def pose(
@@ -47,7 +47,7 @@ class SurfaceModel:
         derive: bool = True,
         derive_identity: bool = False,
     ) -> PosedSurface:
-        """Vertices, normals and derivatives of one timestep; `state` and `identity` in float64."""
+        """Vertices, normals and derivatives of one timestep. `state` and `identity` are float64."""
         exact = self.layout.face_params(state[None], identity)
         face = replace(exact.to(self.face_model.template), vertex_offsets=offsets)
         shaped = self._shaped(face)
@@ -89,7 +89,7 @@ class SurfaceModel:
     def _by_joint_motion(
         self, face: FaceParams, shaped: Float[Tensor, "v 3"]
     ) -> tuple[Float[Tensor, "v 3 m"], Float[Tensor, "v 3 d"]]:
-        """In the head frame: by free joint angles, and by expressions that move a joint."""
+        """Derivatives in the head frame by free joint angles, and by expressions that move a joint."""
         free, derived = self.layout.joint_index, self.layout.derived_expression
         angles = face.joints.flatten(1)
         at = torch.cat([angles[0, free], face.expression[0, derived]])
@@ -114,7 +114,7 @@ class SurfaceModel:
         return (weighted @ by_transforms.permute(1, 3, 2, 0).reshape(k * 4, 3 * n)).reshape(-1, 3, n)
 
     def _pose_correctives(self, face: FaceParams) -> Float[Tensor, "v 3 m"]:
-        """At rest, by the free joint angles."""
+        """Derivatives of the pose correctives, at rest, by the free joint angles."""
         assert self.face_model.pose_basis is not None
         angles = face.joints.flatten(1)
         free = self.layout.joint_index
@@ -129,7 +129,7 @@ class SurfaceModel:
 
 
 def surface_model(face_model: FaceModel, layout: ParameterLayout) -> SurfaceModel:
-    """The face model with its bases laid out for derivatives."""
+    """Make the surface model of a face model and a layout."""
     model = face_model.to(torch.zeros(()))
     return SurfaceModel(
         model,
@@ -141,7 +141,7 @@ def surface_model(face_model: FaceModel, layout: ParameterLayout) -> SurfaceMode
 
 
 def _apply(turns: Float[Tensor, "v 3 3"], basis: Float[Tensor, "v 3 n"]) -> Float[Tensor, "v 3 n"]:
-    """Matrix products a vertex; as sums of long rows, since small matrices one by one are slow."""
+    """Multiply the basis by one matrix per vertex, as sums of long rows, because many small products are slow."""
     out = turns[:, :, 0, None] * basis[:, None, 0]
     out.addcmul_(turns[:, :, 1, None], basis[:, None, 1])
     return out.addcmul_(turns[:, :, 2, None], basis[:, None, 2])
@@ -152,15 +152,18 @@ def _rotate(rotation: Float[Tensor, "3 3"], vectors: Float[Tensor, "v 3 n"]) -> 
 
 
 def _derivatives(function: Callable[[Tensor], Tensor], at: Float[Tensor, " q"]) -> Float[Tensor, "q ..."]:
-    """Central differences in float64 of a function of many rows of parameters."""
+    """Derivatives of a function by each parameter, by central differences. It takes a batch of parameter vectors."""
     step = 1e-5 * torch.eye(len(at)).to(at)
     return (function(at + step) - function(at - step)) / 2e-5
 
 
 def by_log_focal(vertices: Float[Tensor, "v 3"], cameras: CameraBatch, seen_by: list[int]) -> Float[Tensor, "v 3 1"]:
-    """How vertices would have to move across the line of sight to look as through a longer lens."""
+    """Motion of vertices across the line of sight that looks like a change of the focal length, per log focal length.
+
+    It is zero if several cameras see the timestep.
+    """
     if len(seen_by) != 1:
-        return torch.zeros(len(vertices), 3, 1)  # several cameras are calibrated
+        return torch.zeros(len(vertices), 3, 1)  # Several cameras are calibrated.
     viewmat = cameras.viewmat[seen_by[0]].float()
     across = vertices @ viewmat[:2, :3].T + viewmat[:2, 3]
     return (across @ viewmat[:2, :3])[..., None]

@@ -1,4 +1,4 @@
-"""The cost of pixels and landmarks of one sequence, with its normal equations."""
+"""The cost of the pixels and landmarks of one sequence, with its normal equations."""
 
 from dataclasses import dataclass, replace
 
@@ -17,40 +17,40 @@ from mien.tracking.solver import NormalEquations, SharedEquations, joined
 from mien.tracking.views import CameraBatch
 
 _LEAST_PIXELS = 100.0
-"""Fewer show nothing of a face."""
+"""Fewest pixels of a comparison. Fewer show nothing of a face."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhotometricTerm:
     """Costs of the v timesteps of one sequence: pixels, landmarks, and the prior.
 
-    Of a picture the robust mean over its pixels counts (native/mesh_align.h), so that it weighs the same at any size.
+    The cost of a picture is a robust mean over its pixels (native/mesh_align.h), so it does not depend on their number.
     """
 
     model: SurfaceModel
     landmarks: LandmarkTerm
     pictures: Pictures
     timesteps: Int[Tensor, " v"]
-    """Of the capture."""
+    """Timesteps of the capture."""
     surface: "_native.AlignSurface"
-    """The texture, and how well it is known."""
+    """The texture and its trust."""
     light: Float[Tensor, "9 3"]
     light_radius: int
-    """Pixels over which a smooth difference counts as light."""
+    """Radius in pixels over which a smooth difference counts as light."""
     weight: float
-    """What the pixels of a picture are worth."""
+    """Weight of the pixels of a picture."""
     sigma: float
-    """Of the texture: the expected difference of a colour."""
+    """Expected difference between a colour of the picture and of the texture."""
 
     @property
     def layout(self) -> ParameterLayout:
-        """Of the timesteps' parameters."""
+        """Layout of the timesteps' parameters."""
         return self.model.layout
 
     def equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch
     ) -> NormalEquations:
-        """Of some timesteps, each on its own, the shared parameters fixed."""
+        """The normal equations of some timesteps, each on its own, with the shared parameters fixed."""
         pixels = self._pixel_equations(state, rows, subject, cameras, shared=False)
         marks = self.landmarks.at(rows).equations(state[rows], subject, cameras)
         return NormalEquations(
@@ -58,7 +58,7 @@ class PhotometricTerm:
         )
 
     def costs(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
-        """Of each timestep."""
+        """The cost of each timestep."""
 
         def of_row(row: int) -> float:
             posed = self.model.pose(state[row], subject.identity, derive=False)
@@ -68,7 +68,7 @@ class PhotometricTerm:
         return self.landmarks.cost(state, subject, cameras) + self.weight * pixels
 
     def residuals(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "v c"]:
-        """Root mean square difference of colours, outliers faded; NaN where a camera compared nothing."""
+        """Robust root mean square of the colour differences; NaN where too few pixels of a camera were compared."""
         found = torch.full((len(state), len(cameras)), torch.nan)
 
         def of_row(row: int) -> None:
@@ -86,7 +86,10 @@ class PhotometricTerm:
     def joint_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch
     ) -> tuple[NormalEquations, SharedEquations]:
-        """Of some timesteps, and of what they share: `Subject.shared`, then the logarithm of the focal length."""
+        """The normal equations of some timesteps and of the shared parameters.
+
+        The shared parameters are `Subject.shared`, then the logarithm of the focal length.
+        """
         marks, shared = self.landmarks.at(rows).joint_equations(state[rows], subject, cameras)
         pixels = self._pixel_equations(state, rows, subject, cameras, shared=True)
         own, of_pixels = pixels.split(state.shape[1], subject.columns_of_pixels, len(subject.shared) + 1)
@@ -114,7 +117,7 @@ class PhotometricTerm:
     def _align(
         self, posed: PosedSurface, row: int, camera: int, cameras: CameraBatch
     ) -> tuple[float, Float[Tensor, " s"], Float[Tensor, "s s"]]:
-        """Cost of one picture, half its gradient and half its Hessian (of no parameters without a Jacobian)."""
+        """Cost of one picture, half its gradient and half its Hessian. Both are empty without a Jacobian."""
         size = 0 if posed.jacobian is None else posed.jacobian.shape[2]
         gradient, hessian = torch.empty(size), torch.empty(size, size)
         derivatives = (None, None, None) if posed.jacobian is None else (posed.jacobian, hessian, gradient)

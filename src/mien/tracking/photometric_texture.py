@@ -1,4 +1,4 @@
-"""The subject's skin as a texture, and the light it is seen in, from pictures whose faces are about tracked."""
+"""The subject's skin as a texture, and the light of each sequence, from pictures with roughly tracked faces."""
 
 import math
 from collections.abc import Sequence
@@ -16,28 +16,29 @@ from mien.tracking.photometric_pictures import Picture
 from mien.tracking.photometric_surface import PosedSurface
 
 HIDING_REGIONS = ("scalp", "neck", "mouth", "teeth", "tongue", "eye_sockets", "ears", "eyes", "irises")
-"""What takes no part but hides what is behind it: hair and collars cover it, or it moves by itself."""
+"""Regions that take no part in the fit but hide what is behind them. Hair and collars cover them, or they move by
+themselves."""
 _LEAST_COSINE = 0.25
-"""Between a surface's normal and the direction to the camera."""
+"""Least cosine between the surface's normal and the direction to the camera."""
 _LEAST_WEIGHT = 0.05
-"""Of a texel's sightings (cosine squared each), below which it is not known."""
+"""Least total weight of a texel's sightings (each the squared cosine) for the texel to be known."""
 _FIRST_SIGMA, _SIGMAS = 0.1, (0.01, 0.1)
-"""Expected difference of a colour before anything is known, and its bounds afterwards."""
+"""Expected colour difference before anything is known, and its bounds afterwards."""
 _ROUNDS = 3
-"""Of albedo and light in turn."""
+"""Number of rounds of albedo and light in turn."""
 _LIGHT_STIFFNESS = 0.02
-"""Pull of the light towards an even one, of what the pictures say."""
+"""Weight of the prior that pulls the light towards an even one, relative to the evidence of the pictures."""
 
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """An albedo texture and what of it can be trusted."""
+    """An albedo texture and the trust in each texel."""
 
     albedo: Float[Tensor, "th tw 3"]
     trust: Float[Tensor, "th tw"]
-    """0 where not known; less where the pictures contradict each other."""
+    """Trust in each texel, 0..1: 0 if unknown, below 1 if the pictures contradict each other."""
     sigma: float
-    """Expected difference between picture and prediction."""
+    """Expected colour difference between picture and prediction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +49,14 @@ class Sighting:
     picture: Picture
     light: Float[Tensor, "9 3"]
     share: float = 1.0
-    """Of the texture."""
+    """Weight of the picture in the texture."""
 
     def weighted(self) -> "Sighting":
-        """With its share in the mask."""
+        """The sighting with its share multiplied into the mask."""
         return replace(self, picture=replace(self.picture, mask=self.picture.mask * self.share))
 
     def arguments(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """As the native core takes them."""
+        """The arguments for the native core."""
         camera, picture = self.picture.camera, self.picture
         posed = self.posed
         return posed.vertices, posed.normals, camera.K, camera.viewmat, picture.image, picture.mask, self.light
@@ -63,7 +64,7 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class TextureSpace:
-    """Which point of the surface each texel shows."""
+    """The point of the surface that each texel shows."""
 
     faces: Int[Tensor, "f 3"]
     corners: Float[Tensor, "f 3 2"]
@@ -72,7 +73,7 @@ class TextureSpace:
     fragments: MeshFragments
 
     def native(self, appearance: Appearance, outlier: float) -> "_native.AlignSurface":
-        """The surface with this appearance for the native core."""
+        """The surface with an appearance, for the native core."""
         return _native.AlignSurface(
             self.faces, self.corners, self.used.to(torch.uint8), appearance.albedo, appearance.trust,
             appearance.sigma, outlier, _LEAST_COSINE,
@@ -80,7 +81,7 @@ class TextureSpace:
 
 
 def texture_space(face_model: FaceModel, size: int) -> TextureSpace:
-    """The face model's texture coordinates as a picture of `size` texels along each side."""
+    """Rasterise the face model's texture coordinates into a texture with `size` texels along each side."""
     corners = face_model.uv[face_model.uv_faces].contiguous()
     flat = torch.stack([corners[..., 0] * size, (1 - corners[..., 1]) * size, torch.ones(corners.shape[:2])], dim=-1)
     camera = Camera(torch.eye(3), torch.eye(4), size, size)
@@ -91,14 +92,14 @@ def texture_space(face_model: FaceModel, size: int) -> TextureSpace:
 
 
 def even_light() -> Float[Tensor, "9 3"]:
-    """Light that leaves an albedo as it is."""
+    """The light that leaves an albedo unchanged."""
     light = torch.zeros(9, 3)
     light[0] = math.sqrt(4 * math.pi)
     return light
 
 
 def unknown_appearance(space: TextureSpace) -> Appearance:
-    """Nothing known."""
+    """The appearance before any picture: no texel is known."""
     size = space.fragments.face_index.shape
     return Appearance(torch.zeros(*size, 3), torch.zeros(size), _FIRST_SIGMA)
 
@@ -106,14 +107,16 @@ def unknown_appearance(space: TextureSpace) -> Appearance:
 def estimate_appearance(
     space: TextureSpace, sightings: Sequence[Sequence[Sighting]], start: Appearance, outlier: float, light_radius: int
 ) -> tuple[Appearance, list[Float[Tensor, "9 3"]]]:
-    """Albedo by least squares a texel, robust from the second round on, in turn with the light of every sequence.
+    """Estimate the albedo in turn with the light of every sequence.
+
+    The albedo is a least squares fit for each texel, which is robust from the second round on.
 
     Args:
-        space: Where texels are.
-        sightings: Of each sequence, under the light known so far.
-        start: What is known so far; its sigma scales the robust weights.
-        outlier: In sigmas.
-        light_radius: Pixels over which a smooth difference counts as light, and is left out of the texture.
+        space: The texels.
+        sightings: Sightings of each sequence, with the light known so far.
+        start: The appearance known so far. Its sigma scales the robust weights.
+        outlier: Outlier threshold in sigmas.
+        light_radius: Radius in pixels over which a smooth difference counts as light and is left out of the texture.
     """
     appearance, known = start, bool((start.trust > 0).any())
     lights = [own[0].light for own in sightings]
@@ -136,7 +139,7 @@ def estimate_appearance(
 def _without_smooth_residual(
     space: TextureSpace, sighting: Sighting, appearance: Appearance, outlier: float, radius: int
 ) -> Sighting:
-    """The same with what differs from the prediction over more than `radius` pixels taken out of the picture."""
+    """The sighting without the part of its difference from the prediction that is smooth over `radius` pixels."""
     smooth = torch.empty_like(sighting.picture.image)
     surface = space.native(appearance, outlier)
     _native.align_mesh(surface, *sighting.arguments(), radius, None, None, None, None, smooth)
@@ -169,7 +172,7 @@ def _bake(
 
 
 def _one_color(appearance: Appearance) -> Appearance:
-    """Its median colour everywhere: what varies is light, to begin with."""
+    """The appearance with its median colour in all known texels. At the start, all variation counts as light."""
     median = appearance.albedo[appearance.trust > 0].median(0).values
     return replace(appearance, albedo=(appearance.trust > 0)[..., None] * median, sigma=_FIRST_SIGMA)
 

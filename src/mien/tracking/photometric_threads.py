@@ -1,4 +1,4 @@
-"""Frames side by side: one thread each."""
+"""Process frames in parallel, each in one thread."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -12,11 +12,11 @@ from mien.threads import thread_count
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 _AHEAD = 2
-"""Results that may wait beside those being made."""
+"""Number of finished results that may wait, in addition to one for each thread."""
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """The function's results in order, by up to MIEN_THREADS threads (all cores) that share no work between them."""
+    """The function's results for all items, in order. It uses up to MIEN_THREADS threads (by default, all cores)."""
     threads = min(thread_count(), len(items))
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -30,7 +30,7 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
 
 
 def stream_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
-    """As `in_threads`, one result after another: only a few more than there are threads wait to be taken."""
+    """Yield the results of `in_threads` one after another. Only a few more results than threads are in memory."""
     with ThreadPoolExecutor(thread_count(), initializer=_prepare) as pool:
         waiting: deque[Future[Result]] = deque()
         try:
@@ -47,4 +47,4 @@ def stream_in_threads(function: Callable[[Item], Result], items: Sequence[Item])
 
 def _prepare() -> None:
     torch.set_num_threads(1)
-    torch.set_grad_enabled(False)  # the mode is a thread's own
+    torch.set_grad_enabled(False)  # Each thread has its own mode.

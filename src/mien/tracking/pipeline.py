@@ -1,4 +1,4 @@
-"""Captures -> Trackings: the stages in their order. What is the subject's is shared by all of its sequences."""
+"""Track captures: all stages in their order. All sequences of a subject share the subject's parameters."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -45,11 +45,11 @@ from mien.tracking.watch import Watch, nobody
 
 DEFAULTS = TrackingSettings()
 _COSTS = {"head pose": 10, "identity": 10, "frames": 140, "sequence": 100}
-"""About how long each stage takes a timestep, for the progress bar: so in a clip of 15,000; multiples of ten."""
+"""Relative duration of each stage per timestep, for the progress bar, as in a clip of 15,000; multiples of ten."""
 
 
 def track(capture: Capture, face_model: FaceModel, settings: TrackingSettings = DEFAULTS) -> Tracking:
-    """The face model fitted to one capture: `track_subject` of a single sequence."""
+    """Fit a face model to one capture: `track_subject` of a single sequence."""
     return track_subject([capture], face_model, settings)[0]
 
 
@@ -60,24 +60,29 @@ def track_subject(
     keep: Path | None = None,
     preview: Path | None = None,
 ) -> list[Tracking]:
-    """The face model fitted to landmarks and pixels of all sequences of one person, with one identity.
+    """Fit a face model to landmarks and pixels of all sequences of one person, with one identity.
 
-    Stages: head pose of every timestep alone; identity (and unknown focal lengths) from keyframes of all sequences;
-    every timestep alone; all timesteps of each sequence together, smooth over time; then, unless the schedule is
-    `landmarks`, the fit to pixels (`refine_photometrically`). Deterministic.
+        The stages are: the head pose of every timestep alone; identity (and unknown focal lengths) from keyframes of all
+        sequences; every timestep alone; all timesteps of each sequence together, smooth over time; then, unless the
+        schedule is `landmarks`, the fit to pixels (`refine_photometrically`, `fit_by_descent`). The result is
+        deterministic.
 
-    Sequences may differ in size, frame rate and number of cameras. Several cameras have to be calibrated
-    (`Capture.calibration`): they stay as they are, give the metric scale, and a camera that found no face at a timestep
-    adds nothing to it. With one uncalibrated camera, metric scale comes from the identity prior.
+        Sequences may differ in size, frame rate and number of cameras. Several cameras must be calibrated
+        (`Capture.calibration`). They stay as they are and give the metric scale, and a camera that found no face at a
+        timestep adds nothing to it. With one uncalibrated camera, the metric scale comes from the identity prior.
 
-    `keep` is a folder of its own for finished parts, from which interrupted tracking of the same captures with the
-    same settings goes on, to the same numbers. It is removed at the end. If its parts, whole as their files are, do not
-    fit, tracking starts again.
-
-    `preview` is an .html (with a .png beside it) that shows how far the fit has come, written anew every few seconds.
+    Args:
+        captures: The sequences of one person.
+        face_model: The face model.
+        settings: The settings.
+        keep: A folder of its own for finished pieces, which is removed at the end. Interrupted tracking of the same
+            captures with the same settings resumes from it and gives the same numbers. If its pieces do not fit,
+            tracking starts again.
+        preview: An .html file (with a .png beside it) that shows the state of the fit. It is written again every few
+            seconds.
 
     Raises:
-        UserError: a capture has several cameras without calibration, too few timesteps with a face, or landmarks that
+        UserError: A capture has several cameras without calibration, too few timesteps with a face, or landmarks that
             no face could have; or the model lacks the landmarks.
     """
     assert captures, "nothing to track"
@@ -141,7 +146,7 @@ def _without_turn_habits(model: LandmarkModel, shots: Sequence[Shot], fit: Fit, 
 
 def _response(face_model: FaceModel, shots: Sequence[Shot], settings: TrackingSettings) -> DetectorResponse:
     response = read_response(face_model, settings.bias_sigma)
-    # Turns were measured as one camera sees them, and are the head's own only where that camera is all there is.
+    # The response to turns was measured for one camera. With several cameras no one of them defines the turn.
     return response if all(len(shot.cameras) == 1 for shot in shots) else response.without_turns()
 
 

@@ -1,4 +1,4 @@
-"""A fit while it runs: a page, and a picture beside it, that are written anew every few seconds."""
+"""Preview of a running fit: a page, with a picture beside it, which is written again every few seconds."""
 
 import base64
 import time
@@ -29,21 +29,21 @@ from mien.tracking.tracking import Tracking
 DONE = "done"
 _INTERVAL_SECONDS = 3.0
 _LARGEST_SHARE = 0.1
-"""Of the time, for looking."""
+"""Largest share of the time that the preview may take."""
 _CURVE_FRAMES, _STRIPS = 48, 3
-"""Frames whose residuals are shown, of all sequences together, and those shown as pictures."""
+"""Number of frames, over all sequences, with residuals in the curves, and number of frames shown as pictures."""
 _MOST_BYTES = 64 << 20
-"""Of pictures that are kept for it."""
+"""Largest size of the pictures that the preview keeps in memory, in bytes."""
 _WIDTH, _HEADER, _CURVE = 960, 48, 150
 _PANELS = (("picture", False), ("mesh", False), ("model", False), ("difference", True))
-"""Of a strip, and whether a legend stands in the upper corner."""
+"""Panels of a strip, each with whether a legend is in its upper corner."""
 _INK, _PAPER, _FAINT = (40, 40, 40), 250, (190, 190, 190)
 _COLORS = ((30, 90, 200), (200, 60, 30))
-"""Of the curves: landmarks, colours."""
+"""Colours of the two curves: landmarks, then colours."""
 
 
 class Preview:
-    """Draws some frames and the residuals of a fit whenever it is due (`Watch`). Mutable."""
+    """A `Watch` that draws some frames and the residuals of a fit every few seconds. Mutable."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class Preview:
         self._before: list[Float[np.ndarray, " n"]] = []
 
     def __call__(self, stage: str, progress: float, look: Callable[[], object] | None = None) -> None:
-        """Write the page, unless the last time is not long ago; the end is always shown."""
+        """Write the page, unless it was written a moment ago. The end is always shown."""
         self._look = look or self._look
         start = time.monotonic()
         if start < self._due and stage != DONE:
@@ -124,7 +124,7 @@ class Preview:
 
 
 class _Sample:
-    """Some timesteps of a sequence as if there were no others. Immutable."""
+    """Some timesteps of a sequence as a sequence of their own. Immutable."""
 
     def __init__(self, shot: Shot, count: int) -> None:
         valid = shot.valid.nonzero()[:, 0]
@@ -149,7 +149,7 @@ def _strips(
 
 
 def _head(first: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Name the panels, on the first strip."""
+    """Write the names of the panels on the first strip."""
     tile = len(first)
     for index in range(1, first.shape[1] // tile):
         name, legend = _PANELS[index]
@@ -157,7 +157,7 @@ def _head(first: UInt8[np.ndarray, "h w 3"]) -> None:
 
 
 def _color_residuals(capture: Capture, tracking: Tracking, face_model: FaceModel) -> Float[np.ndarray, " k"]:
-    """Of the frontal camera; NaN where pixels were not looked at."""
+    """Colour residuals in the frontal camera; NaN if the fit has no texture yet."""
     found, pictures = np.full(capture.timesteps, np.nan), model_pictures(capture, tracking, face_model)
     if pictures is not None:
         camera = frontal_camera(tracking)
@@ -169,7 +169,7 @@ def _color_residuals(capture: Capture, tracking: Tracking, face_model: FaceModel
 def _plot(
     curves: Sequence[Float[np.ndarray, " n"]], before: Sequence[Float[np.ndarray, " n"]], labels: Sequence[str]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Residuals over the frames, one below the other; grey is what they were at the last look."""
+    """Plots of the residuals over the frames, one below the other. The previous residuals are grey."""
     names = ("landmarks, median distance in px", "colours, rms of the three channels, whole pictures, in %")
     shown = [index for index, values in enumerate(curves) if np.isfinite(values).any()]
     plots = [np.full((1, _WIDTH, 3), _PAPER, np.uint8)]

@@ -1,4 +1,4 @@
-"""Regions of a face model that came without: lips, lids, brows, nose, ears, hair, neck by where landmarks are."""
+"""Regions for a face model without any: lips, lids, brows, nose, ears, hair and neck, placed by its landmarks."""
 
 from dataclasses import replace
 
@@ -15,15 +15,16 @@ _LIPS_OUTER = (61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269,
 _BROWS = ((70, 63, 105, 66, 107, 55, 65, 52, 53, 46), (300, 293, 334, 296, 336, 285, 295, 282, 283, 276))
 _FOREHEAD, _CHIN, _TEMPLES, _TRAGI, _JAW_CORNERS = 10, 152, (127, 356), (234, 454), (58, 288)
 _LIP_DEPTH, _LID_WIDTH = 0.008, 0.006
-"""How far from their landmarks lips and lids reach, metres."""
+"""Largest distance of lips and lids from their landmarks, in metres."""
 _MOUTH_REACH, _SOCKET_REACH = 0.075, 0.025
-"""How far what lies inside may be from the middle of the lips, and of an eyeball."""
+"""Largest distances of the mouth's inside from the middle of the lips, and of a socket from its eyeball, in metres."""
 _HAIRLINE, _NECK = 0.010, 0.030
-"""Above the forehead's highest landmark; and below the chin, along a plane slanted like the jaw."""
+"""Height of the hairline above the forehead's highest landmark, and distance of the neck below the chin, measured to a
+plane slanted like the jaw. Both are in metres."""
 
 
 def with_regions_by_landmarks(model: FaceModel) -> FaceModel:
-    """The same model with regions as the default model has them, but for teeth and tongue; eyes stay as they are."""
+    """Return the model with the regions of the default model, except teeth and tongue. Eyes stay as they are."""
     marks = model.landmark_positions(model.template, "mediapipe").numpy()
     middle = model.template[model.faces].numpy().mean(1)
     outside = outside_of(model.template.numpy(), model.faces.numpy())
@@ -58,7 +59,7 @@ def _around_the_face(
 def _around_eyes(
     model: FaceModel, middle: Float[np.ndarray, "f 3"], marks: Float[np.ndarray, "l 3"], outside: Bool[np.ndarray, " f"]
 ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
-    """Lids and sockets."""
+    """The triangles of the lids and of the sockets."""
     balls = model.region_mask("eyes", "irises").numpy()
     eyelids, sockets = np.zeros(len(middle), bool), np.zeros(len(middle), bool)
     for lids in (LEFT_EYELIDS, RIGHT_EYELIDS):
@@ -74,7 +75,7 @@ def _around_eyes(
 def _named(model: FaceModel, found: dict[str, Bool[np.ndarray, " f"]]) -> FaceModel:
     names = ("skin", "eyes", "irises", *found)
     regions = np.zeros(len(model.faces), np.int64)
-    for name, mask in found.items():  # later ones over earlier ones
+    for name, mask in found.items():  # Later regions overwrite earlier ones.
         regions[mask] = names.index(name)
     for name in ("eyes", "irises"):
         regions[model.region_mask(name).numpy()] = names.index(name)
@@ -84,7 +85,7 @@ def _named(model: FaceModel, found: dict[str, Bool[np.ndarray, " f"]]) -> FaceMo
 def _within(
     points: Float[np.ndarray, "n 3"], ring: Float[np.ndarray, "m 3"], hull: bool = False
 ) -> Bool[np.ndarray, " n"]:
-    """Which points are inside a polygon as seen from the front."""
+    """Which points are inside a polygon, seen from the front."""
     polygon = (1000 * ring[:, :2]).astype(np.float32)
     polygon = cv2.convexHull(polygon)[:, 0] if hull else polygon
     return np.array([cv2.pointPolygonTest(polygon, (x, y), False) > 0 for x, y in (1000 * points[:, :2]).tolist()])

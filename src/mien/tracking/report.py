@@ -1,4 +1,4 @@
-"""The residual report: figures and a plot that tell whether a tracking can be trusted."""
+"""The residual report: figures and a plot that show whether a tracking can be trusted."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,23 +36,23 @@ _GROUPS = {
     "irises": LEFT_IRIS + RIGHT_IRIS,
 }  # fmt: skip
 _NEAR_FRONTAL = 0.26
-"""Radians of yaw: 15 degrees."""
+"""Largest yaw of a frame that counts as frontal: 15 degrees, in radians."""
 _MOVED = 0.03
-"""Standard deviation from which a coefficient counts as used."""
+"""Standard deviation above which a coefficient counts as used."""
 _CHUNK = 32
 _NAMED = 10
-"""Runs of flagged frames whose worst the plot names."""
+"""Largest number of runs of flagged frames in which the plot names the worst frame."""
 _LEAST_COLOR = 0.005
-"""By which colours must stand out, 0..1."""
+"""Least amount (0..1) by which a frame's colour residual must stand out to be flagged."""
 
 
 def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel) -> dict:
     """Figures about a tracking: residuals, jitter, constancy of the iris distance, leaks of pose into expression.
 
-    `mesh_distance_px` is from landmarks to the mesh itself; `residual` allows every landmark its static offset.
-    `iris_distance` is the distance of the detected irises in metres at the tracked depth, which should be constant.
-    Where there are several cameras, jitter, irises, depth, pitch and yaw are those that the most frontal one sees, and
-    `cameras` has the residuals of each.
+    `mesh_distance_px` is the distance from landmarks to the mesh itself; `residual_px` allows every landmark its static
+    offset. `iris_distance` is the distance of the detected irises in metres at the tracked depth, which should be
+    constant. With several cameras, jitter, irises, depth, pitch and yaw are those of the most frontal camera, and
+    `cameras` has the residuals of each camera.
     """
     valid, frontal = tracking.valid, frontal_camera(tracking)
     marks = _landmarks(face_model, tracking)
@@ -89,7 +89,7 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
 
 
 def seen_rotation(tracking: Tracking, camera: int) -> Float[Tensor, "t 3"]:
-    """Head rotations as a camera sees them, axis-angle in radians: zero for a head that looks straight into it."""
+    """Head rotations relative to a camera, axis-angle in radians. A head that looks straight into it has zero."""
     facing = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
     R_seen_world = facing @ tracking.cameras[camera].viewmat[:3, :3]
     return axis_angle_from_matrix(R_seen_world @ matrix_from_axis_angle(tracking.face.head_rotation))
@@ -116,12 +116,12 @@ def _of_cameras(capture: Capture, tracking: Tracking) -> dict[str, dict]:
 
 
 def _timestep_residuals(tracking: Tracking) -> Float[Tensor, " t"]:
-    """The median over the cameras that found the face, pixels; NaN where none did."""
+    """Median residual over the cameras that found the face, in pixels; NaN if none did."""
     return tracking.residuals.nanmedian(1).values
 
 
 def _flagged(tracking: Tracking) -> Bool[Tensor, " t"]:
-    """Frames whose landmarks or colours stand out."""
+    """Frames with landmark or colour residuals that stand out."""
     flagged = flagged_frames(_timestep_residuals(tracking))
     if tracking.pixel_residuals is not None:
         flagged |= flagged_frames(tracking.pixel_residuals.nanmedian(1).values, _LEAST_COLOR)
@@ -129,14 +129,14 @@ def _flagged(tracking: Tracking) -> Bool[Tensor, " t"]:
 
 
 def _landmarks_only(tracking: Tracking) -> Bool[Tensor, " t"]:
-    """Frames with a face whose pixels were no help."""
+    """Frames with a face that were tracked from landmarks alone."""
     if tracking.pixel_residuals is None:
         return tracking.valid
     return tracking.valid & tracking.pixel_residuals.isnan().all(1)
 
 
 def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> str:
-    """Write residuals.json, residuals.png and report.html into `folder`; returns what to know first in a few words."""
+    """Write residuals.json, residuals.png and report.html into `folder` and return the main findings as text."""
     report = residual_report(capture, tracking, face_model)
     write_json(folder / "residuals.json", _FORMAT, _VERSION, report)
     write_atomically(folder / "residuals.png", lambda path: _plot(path, capture, tracking, face_model, report))
@@ -147,7 +147,7 @@ def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, fa
 def iris_distances(
     tracking: Tracking, detected: Float[Tensor, "t l 2"], depth: Float[Tensor, "t l"], camera: int = 0
 ) -> Float[Tensor, " t"]:
-    """Distance of the detected iris centres, metres at the tracked depth; foreshortening by head turns is undone."""
+    """Distance of the detected iris centres in metres, at the tracked depth, corrected for foreshortening by turns."""
     right, left = RIGHT_IRIS[0], LEFT_IRIS[0]
     apart = (detected[:, left] - detected[:, right]).norm(dim=-1)
     focal = tracking.cameras[camera].K[0, 0]
@@ -156,7 +156,7 @@ def iris_distances(
 
 
 def flagged_frames(residuals: Float[Tensor, " t"], least: float = 0.1) -> Bool[Tensor, " t"]:
-    """Frames whose residual stands out: above median + 4 robust standard deviations + `least`; never missing ones."""
+    """Frames with a residual above median + 4 robust standard deviations + `least`. NaN is never flagged."""
     known = residuals[residuals.isfinite()]
     if len(known) == 0:
         return torch.zeros_like(residuals, dtype=torch.bool)
@@ -172,7 +172,7 @@ def _landmarks(face_model: FaceModel, tracking: Tracking) -> Float[Tensor, "t l 
 
 
 def _jitter(points: Float[Tensor, "t l d"], valid: Bool[Tensor, " t"]) -> float | None:
-    """Median size of second differences over time, inside the face (the oval's points slide)."""
+    """Median size of second differences over time, without the points of the face's outline, which slide."""
     inner = [index for index in range(points.shape[1]) if index not in OVAL]
     second = (points[2:] - 2 * points[1:-1] + points[:-2])[:, inner].norm(dim=-1)
     known = second[valid[2:] & valid[1:-1] & valid[:-2]]
@@ -186,7 +186,7 @@ def _constancy(distances: Float[Tensor, " n"]) -> dict[str, float | None]:
 
 
 def _correlations(tracking: Tracking, face_model: FaceModel, angle: Float[Tensor, " t"]) -> dict[str, float]:
-    """Pearson's r of every expression coefficient in use with an angle."""
+    """Pearson's correlation of every expression coefficient in use with an angle."""
     expression, angle = tracking.face.expression[tracking.valid], angle[tracking.valid]
     moved = (expression.std(0) > _MOVED).nonzero()[:, 0].tolist()
     return {face_model.expression_names[i]: float(torch.corrcoef(torch.stack([expression[:, i], angle]))[0, 1])
@@ -201,7 +201,7 @@ def _summary(values: Float[Tensor, "*n"]) -> dict[str, float | None]:
 
 
 def _plot(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict) -> None:
-    from matplotlib.figure import Figure  # slow to import, and only needed here
+    from matplotlib.figure import Figure  # It is slow to import and only needed here.
 
     time = np.asarray(capture.timestamps)
     frontal, residuals = frontal_camera(tracking), _timestep_residuals(tracking)
@@ -232,7 +232,7 @@ def _plot(path: Path, capture: Capture, tracking: Tracking, face_model: FaceMode
 
 
 def _plot_flagged(axis: "Axes", time: np.ndarray, values: np.ndarray, flagged: list[int], label: str) -> None:
-    """A curve; the worst of the flagged frames are named."""
+    """Plot a curve, mark the flagged frames and name the worst of them."""
     axis.plot(time, values)
     axis.set_ylabel(label)
     if not flagged:

@@ -1,4 +1,4 @@
-"""report.html of a tracking: what was fitted and how well, what stands out, and pictures to look at."""
+"""The page report.html of a tracking: findings, figures, and pictures of typical frames and of those that stand out."""
 
 import base64
 import re
@@ -26,7 +26,7 @@ _STYLE = (
 )
 _JPEG_QUALITY = 85
 _SOME = 40
-"""Frames that are named where there are many."""
+"""Largest number of frames, or runs of frames, that a finding names."""
 _FOCAL_FROM = {
     "calibrated": "as calibrated",
     "given": "as given",
@@ -42,14 +42,14 @@ _WAYS = {
 def write_report_page(
     folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict[str, Any]
 ) -> None:
-    """Write report.html into `folder`, beside residuals.png: one file to send around, but for the overlay video.
+    """Write report.html into `folder`. Except for the overlay video, the page is complete in one file.
 
     Args:
-        folder: Of the tracking.
-        capture: What was tracked.
-        tracking: What was found.
-        face_model: What it was tracked with.
-        report: Of `residual_report`.
+        folder: Folder of the tracking, which has residuals.png already.
+        capture: The capture.
+        tracking: The tracking of the capture.
+        face_model: The face model of the tracking.
+        report: The result of `residual_report`.
     """
     frames = sheet_frames(tracking, report["flagged_frames"], report["landmarks_only_frames"])
     sheet = contact_sheet(capture, tracking, face_model, frames)
@@ -59,7 +59,7 @@ def write_report_page(
 
 
 def page_html(name: str, tracking: Tracking, report: dict[str, Any], plot: str, sheet: str) -> str:
-    """The page; `plot` and `sheet` are addresses of pictures."""
+    """The page as html. `plot` and `sheet` are addresses of pictures."""
     panels = "the picture, the tracked mesh over it"
     if tracking.looks is not None:
         panels += (", the model's own picture (its texture in the fitted light), and the difference of colours"
@@ -77,12 +77,12 @@ def page_html(name: str, tracking: Tracking, report: dict[str, Any], plot: str, 
 
 
 def _with_code(text: str) -> str:
-    """As html, with what stands between backticks as code."""
+    """The text as html, with text between backticks as code."""
     return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
 def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]]:
-    """What to know first, each with the class `odd` if it is a reason to look closer."""
+    """The main findings as pairs of class and text. The class is `odd` if the finding is a reason to look closer."""
     schedule = str(tracking.settings.get("schedule", "landmarks"))
     with_face = report["frames"] - len(report["frames_without_face"])
     found = [("", _WAYS.get(schedule, f"Schedule `{schedule}`."))]
@@ -109,7 +109,7 @@ def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]
 
 
 def named(timesteps: Sequence[int]) -> str:
-    """Numbers of frames, runs of them in short: 3, 7-9, 12."""
+    """Numbers of frames as text, with runs abbreviated: 3, 7-9, 12."""
     runs: list[list[int]] = []
     for timestep in timesteps:
         if runs and timestep == runs[-1][1] + 1:

@@ -1,4 +1,4 @@
-"""What interrupted tracking goes on from: a folder of finished pieces, each a file that is written as a whole."""
+"""Finished pieces of tracking in a folder, from which interrupted tracking resumes. Each is a file, written whole."""
 
 import time
 from collections.abc import Callable
@@ -18,9 +18,9 @@ _ENDING = ".safetensors"
 
 @dataclass(eq=False)
 class Keeper:
-    """Keeps pieces of a fit by name in a folder of their own; nowhere if there is no folder. Mutable.
+    """Keeps pieces of a fit by name in a folder of their own. Without a folder it keeps nothing. Mutable.
 
-    What a piece holds has to follow from the fit's input and its name alone.
+    A piece must depend on nothing but its name and the fit's input.
     """
 
     folder: Path | None = None
@@ -28,7 +28,7 @@ class Keeper:
     resumed: bool = False
 
     def once(self, name: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
-        """The piece as `make` returns it, kept from then on; or as it was kept."""
+        """Return the kept piece, or call `make` and keep its result."""
         found = self.read(name)
         if found is not None:
             return found
@@ -37,13 +37,13 @@ class Keeper:
         return made
 
     def offer(self, name: str, make: Callable[[], dict[str, Tensor]]) -> None:
-        """Keep the piece instead of its older version, unless the last time is less than 20 seconds ago."""
+        """Replace the kept piece by a newer version, unless that was done less than 20 seconds ago."""
         if self.folder is not None and time.monotonic() - self.last >= _INTERVAL_SECONDS:
             self._write(name, make())
             self.last = time.monotonic()
 
     def read(self, name: str) -> dict[str, Tensor] | None:
-        """The piece, if it was kept and can be read."""
+        """The kept piece, or None if there is none or it cannot be read."""
         path = self._path(name)
         if path is None or not path.is_file():
             return None
@@ -58,13 +58,13 @@ class Keeper:
         return _as_read(tensors)
 
     def drop(self, beginning: str) -> None:
-        """Forget the pieces whose names begin so: what was made of them is kept."""
+        """Remove the pieces with names that begin with `beginning`, once their result is kept."""
         if self.folder is not None:
             for path in self.folder.glob(f"{beginning}*{_ENDING}"):
                 path.unlink(missing_ok=True)
 
     def forget(self) -> None:
-        """The fit is done."""
+        """Remove the whole folder, because the fit is done."""
         if self.folder is not None:
             remove_tree(self.folder)
 
@@ -79,5 +79,5 @@ class Keeper:
 
 
 def _as_read(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Whole copies, whether made or read: matrix products take other paths where memory is laid out otherwise."""
+    """Contiguous copies of tensors, whether made or read, because matrix products depend on the layout in memory."""
     return {name: tensor.detach().clone().contiguous() for name, tensor in tensors.items()}

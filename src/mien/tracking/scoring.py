@@ -1,4 +1,4 @@
-"""The scoring mask: what of each picture belongs to the head, frozen once a sequence so that runs compare."""
+"""The scoring mask: the part of each picture that shows the head, fixed once per sequence so that runs compare."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,30 +17,30 @@ from mien.tracking.neck_line import neck_vertices
 from mien.tracking.tracking import Tracking
 
 _SILHOUETTE_MARGIN = 0.015
-"""By how much the projected head is widened, in its own widths: tracking is not exact to the pixel."""
+"""Margin around the projected head, in its own widths, because tracking is not exact to the pixel."""
 _NECK_MARGIN = 1.15
-"""Beside the neck's middle this many of its half widths are kept..."""
+"""Half of the width that is kept at the neck line, in half widths of the neck."""
 _SLOPE = 1.0
-"""...and this much more with every pixel above the line: hair stays, collars and shoulders go."""
+"""Growth of that half width with every pixel above the neck line. Hair is kept; collars and shoulders are cut off."""
 _FAINT = 32
-"""Opacity (of 255) from which a pixel counts for connection and for the crop."""
+"""Least opacity (of 255) of a pixel that counts for connection and for the crop."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scoring:
-    """What is trained on and scored, frames of t timesteps and c cameras."""
+    """The parts of the pictures of t timesteps and c cameras that are trained on and scored."""
 
     masks: UInt8[np.ndarray, "t c h w"]
-    """Opacity of the head, 255 = head: the matte, cut below the neck line. A memory map where they are many."""
+    """Opacity of the head (255 is head): the matte, cut below the neck line. It is a memory map if there are many."""
     crops: Int[np.ndarray, "t c 4"]
-    """Left, top, width, height of the head crop, pixels: the box of the mask."""
+    """Left, top, width and height of the head crop in pixels: the box of the mask."""
 
 
 def make_scoring(capture: Capture, tracking: Tracking, face_model: FaceModel, scratch: Path | None = None) -> Scoring:
-    """Masks and head crops of every frame; masks too many for the memory lie in a nameless file in `scratch`.
+    """Make masks and head crops of every frame. Masks too large for the memory are in an unnamed file in `scratch`.
 
-    A pixel keeps its matte if it is above the neck line and not far beside the neck, or inside the projected head (a
-    bowed chin hangs below the line); what is then not connected to the head goes as well.
+    A pixel keeps its matte if it is above the neck line and not far beside the neck, or inside the projected head,
+    because a lowered chin is below the line. Parts that are then not connected to the head are removed.
     """
     masks = PictureStack(capture.mattes.shape, scratch)
     crops = np.zeros((*capture.mattes.shape[:2], 4), np.int64)
@@ -61,12 +61,12 @@ def make_scoring(capture: Capture, tracking: Tracking, face_model: FaceModel, sc
 def above_neck_line(
     line: Float[np.ndarray, " 3"], neck: Float[np.ndarray, "n 2"], camera: Camera
 ) -> Float[np.ndarray, "h w"]:
-    """1 above the neck line and near the neck, 0 elsewhere, with borders one pixel soft.
+    """1 above the neck line and near the neck, 0 elsewhere, with soft borders one pixel wide.
 
     Args:
-        line: as `Tracking.neck_lines`.
-        neck: pixels of the middle of the neck, which tell where it is and how wide.
-        camera: whose picture it is.
+        line: The neck line (`Tracking.neck_lines`).
+        neck: Projected vertices of the middle of the neck in pixels, which give its place and width.
+        camera: The camera that took the picture.
     """
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     a, b, d = (float(value) for value in line)
@@ -81,12 +81,12 @@ def above_neck_line(
 def cut_matte(
     matte: UInt8[np.ndarray, "h w"], head: Bool[np.ndarray, "h w"], keep: Float[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w"]:
-    """The matte where `keep` is or the head; parts that do not touch the head go.
+    """The matte times `keep`, but whole inside the head. Parts that do not touch the head are removed.
 
     Args:
-        matte: 255 = person.
-        head: the projected head without its neck.
-        keep: 0..1.
+        matte: The matte; 255 is person.
+        head: The projected head without its neck.
+        keep: The share of the matte that is kept outside of the head, 0..1.
     """
     columns = np.flatnonzero(head.any(0))
     margin = round(_SILHOUETTE_MARGIN * (columns[-1] - columns[0] + 1)) if len(columns) else 0
@@ -100,7 +100,7 @@ def cut_matte(
 
 
 def head_crop(mask: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " 4"]:
-    """Left, top, width, height of the box of the mask; the whole picture where nothing is in it."""
+    """Left, top, width and height of the box of the mask; the whole picture if the mask is empty."""
     rows, columns = np.flatnonzero((mask >= _FAINT).any(1)), np.flatnonzero((mask >= _FAINT).any(0))
     if len(rows) == 0:
         return np.array([0, 0, mask.shape[1], mask.shape[0]])

@@ -1,4 +1,4 @@
-"""The scoring mask on disk: scoring.json, crops.safetensors, masks/CAMERA/000000.png. Written once, never changed."""
+"""The scoring mask on disk: scoring.json, crops.safetensors, masks/CAMERA/000000.png. It is written once."""
 
 import hashlib
 import tempfile
@@ -21,24 +21,24 @@ _REMEDY = "delete the folder and run `mien track` again (scores before and after
 
 
 def scoring_exists(path: Path, capture_hash: str | None = None) -> bool:
-    """Whether the folder `path` holds a scoring already: any, or one of the capture with this hash."""
+    """Whether the folder `path` already holds a scoring. With a hash, only a scoring of that capture counts."""
     file = path / "scoring.json"
     if capture_hash is None or not file.is_file():
         return file.is_file()
-    # Scorings of the first release do not say; they were removed whenever their capture changed.
+    # Scorings of the first release have no hash. They were removed whenever their capture changed.
     return read_json(file, _FORMAT, _VERSION, _STAGE).get("capture_hash", capture_hash) == capture_hash
 
 
 def write_scoring(path: Path, scoring: Scoring, capture_hash: str | None = None) -> None:
-    """Write a scoring as the folder `path`, all or nothing. One of the same capture that is there stays as it is.
+    """Write a scoring as the folder `path`, all or nothing. An existing scoring of the same capture is kept.
 
     Args:
-        path: of the folder.
-        scoring: what to write.
-        capture_hash: of the capture that it belongs to.
+        path: The folder.
+        scoring: The scoring.
+        capture_hash: Hash of the capture that it belongs to.
 
     Raises:
-        UserError: there is a scoring that cannot be read.
+        UserError: There is a scoring that cannot be read.
     """
     if scoring_exists(path, capture_hash):
         return
@@ -54,14 +54,14 @@ def write_scoring(path: Path, scoring: Scoring, capture_hash: str | None = None)
 
 
 def read_scoring(path: Path, capture_hash: str | None = None) -> Scoring:
-    """Read what `write_scoring` wrote.
+    """Read a scoring that `write_scoring` wrote.
 
     Args:
-        path: of the folder.
-        capture_hash: of the capture that it has to belong to; None for any.
+        path: The folder.
+        capture_hash: Hash of the capture that it must belong to; None for any.
 
     Raises:
-        UserError: something is missing, damaged, not what was written, of another capture, being written, or a link.
+        UserError: A file is missing, damaged, changed, of another capture, being written, or a link.
     """
     return read_beside_writers(lambda: _read_scoring(path, capture_hash), [path], [path.parent])
 
@@ -78,7 +78,7 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
         sides = side(content["height"]), side(content["width"])
         counts = content["timesteps"], content["cameras"]
     crops = read_arrays(path / "crops.safetensors", _STAGE).get("crops")
-    # Its size bounds what is looked for: the json may name any number.
+    # The size of the crops bounds the number of masks that are read. The json may claim any number.
     if crops is None or crops.shape != (*counts, 4) or crops.dtype != np.int32 or crops.size == 0:
         raise UserError(f"{path / 'crops.safetensors'}: has not 4 whole numbers for each frame; {_REMEDY}")
     shape = (*crops.shape[:2], *sides)
@@ -87,7 +87,7 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
         (left + width).max() <= shape[3] and (top + height).max() <= shape[2]
     ):
         raise UserError(f"{path / 'crops.safetensors'}: a crop reaches out of the picture; {_REMEDY}")
-    # Before room is made for all: a damaged size may ask for more memory than there is.
+    # Check this before memory for all masks is reserved: a damaged size may ask for more than there is.
     missing = [t_c for t_c in np.ndindex(*shape[:2]) if not _mask_file(path, *t_c).is_file()]
     if missing:
         raise UserError(f"{_mask_file(path, *missing[0])}: missing; {_REMEDY}")
@@ -104,10 +104,10 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
 
 
 def read_scoring_hash(path: Path) -> str:
-    """The hash over masks and crops of a scoring on disk, without reading them.
+    """The hash of masks and crops of a scoring on disk, without reading them.
 
     Raises:
-        UserError: there is no scoring, or one of another version.
+        UserError: There is no scoring, or it has another version.
     """
     return str(read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE).get("sha256"))
 

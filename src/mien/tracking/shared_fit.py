@@ -1,4 +1,4 @@
-"""What the sequences of a subject share, fitted to keyframes of all of them: identity, landmark bias, focal lengths."""
+"""The fit of the parameters that sequences share, to keyframes: identity, landmark bias, focal lengths."""
 
 import math
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ from mien.tracking.stages import Fit, SequenceFit, box_of, fit_bias
 
 _ROUNDS, _ITERATIONS = 4, 6
 _FOCAL_SIGMA = 0.03
-"""Of the logarithm of the focal length, every keyframe's word."""
+"""Standard deviation of the logarithm of the focal length. The prior counts once for each keyframe."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Joint:
-    """A candidate of the joint fit: timesteps of all sequences, identity, and the logarithms of the free focals."""
+    """A candidate of the joint fit, with the logarithms of the free focal lengths relative to the start."""
 
     fit: Fit
     log_focals: Float[Tensor, " g"]
@@ -30,14 +30,14 @@ class _Joint:
 def fit_shared(
     terms: Sequence[LandmarkTerm], fit: Fit, lenses: Sequence[int | None], settings: TrackingSettings
 ) -> Fit:
-    """Identity, landmark bias and unknown focal lengths, jointly with the keyframes' own parameters.
+    """Fit identity, landmark bias and unknown focal lengths jointly with the keyframes' own parameters.
 
     Args:
-        terms: One a sequence, over its keyframes.
-        fit: The state at the keyframes.
-        lenses: The lens of each sequence; sequences with the same number have the same focal length but for their
-            pictures' size, and None is a known one, which stays.
-        settings: Weights of the priors.
+        terms: The landmark term of each sequence, over its keyframes.
+        fit: The fit so far, at the keyframes.
+        lenses: The lens of each sequence. Sequences with the same number share one focal length, up to the size of
+            their pictures. None is a known focal length, which is kept.
+        settings: Settings with the weights of the priors.
     """
     for _ in range(_ROUNDS):
         fit = _fit_jointly(terms, fit, lenses, settings)
@@ -76,7 +76,7 @@ def _fit_jointly(
 
 
 def _precision(fit: Fit, lenses: Sequence[int | None], settings: TrackingSettings) -> Float[Tensor, " s"]:
-    """Of the priors of identity and free focal lengths."""
+    """Precisions of the priors of `Subject.shared` and the free focal lengths."""
     subject = torch.ones_like(fit.subject.shared)
     subject[: len(fit.subject.identity)] = settings.identity_weight
     groups = sorted({lens for lens in lenses if lens is not None})
@@ -93,7 +93,7 @@ def _shared_values(at: _Joint) -> Float[Tensor, " s"]:
 def _equations(
     terms: Sequence[LandmarkTerm], fit: Fit, lenses: Sequence[int | None], free: int
 ) -> tuple[NormalEquations, SharedEquations]:
-    """Of the timesteps of all sequences in a row, and of identity and the free focal lengths."""
+    """The equations of the timesteps of all sequences in a row, and of the shared parameters and free focal lengths."""
     frames, shared = [], []
     for term, own, lens in zip(terms, fit.sequences, lenses, strict=True):
         own_frames, own_shared = term.joint_equations(own.state, fit.subject, own.cameras)
@@ -103,7 +103,7 @@ def _equations(
 
 
 def placed(own: SharedEquations, lens: int | None, free: int) -> SharedEquations:
-    """A sequence's blocks (subject, focal length) among those of all focal lengths; a known one falls away."""
+    """A sequence's blocks (subject, focal length), placed among all focal lengths. A known one is dropped."""
     subject = len(own.gradient) - 1
     placing = own.gradient.new_zeros(subject + 1, subject + free)
     placing[:subject, :subject] = torch.eye(subject)

@@ -1,4 +1,4 @@
-"""A capture as tracking sees it: detected landmarks, cameras as far as they are known, and a frame to fit in."""
+"""A capture as input of a fit: detected landmarks, known or assumed cameras, and the frame of the fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,32 +18,32 @@ from mien.tracking.views import CameraBatch, Views, batch_of
 
 _LEAST_FRAMES = 3
 _DEFAULT_FOCAL = 1.5
-"""Times the larger side of the source picture: between a telephone's wide lens and a portrait lens."""
+"""Assumed focal length in larger sides of the source picture: between a phone's wide lens and a portrait lens."""
 _CROPPED_FOCAL = 2.2
-"""The same of a picture that is about square: no camera films squares, so that it was cut around a head."""
+"""The same for a nearly square picture. No camera films squares, so the picture was cropped around a head."""
 _SQUARE = 1.1
 """Ratio of sides below which a picture counts as square."""
 _FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-"""T_camera_head of a head at the camera's centre that looks the way the camera is seen."""
+"""T_camera_head of a head that looks towards the camera, but is placed at the camera's centre."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One sequence's input to a fit."""
+    """The input of one sequence to a fit."""
 
     views: Views
     valid: Bool[Tensor, " t"]
-    """Timesteps in which some camera found a face: the rows of `views`."""
+    """Timesteps in which at least one camera found a face. They are the rows of `views`."""
     cameras: CameraBatch
-    """In the frame of the fit, in which a head that looks into the camera that saw it most has a rotation of about
-    zero: rotation vectors stay far from a half turn, whatever the calibration's world is."""
+    """Cameras in the frame of the fit. In this frame a head that looks into the camera that found most faces has a
+    rotation of about zero, so axis-angle rotations stay far from half a turn in any calibrated world."""
     fps: float
     capture: Capture
     T_world_fit: Float[Tensor, "4 4"] | None
-    """Where the cameras are calibrated; None where the frame of the fit is the world's."""
+    """Transform from the frame of the fit to the calibrated world; None if they are the same."""
 
     def cameras_in_world(self, fitted: CameraBatch) -> tuple[Camera, ...]:
-        """The cameras as a tracking holds them: the calibrated ones, or with the fitted focal length."""
+        """The cameras of the tracking: the calibrated ones, or those with the fitted focal length."""
         if self.capture.calibration is not None:
             return self.capture.calibration
         like, size = torch.zeros(()), (self.capture.width, self.capture.height)
@@ -57,10 +57,10 @@ def has_enough_faces(capture: Capture) -> bool:
 
 
 def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
-    """What there is to fit to.
+    """Make the input of a fit from a capture.
 
     Raises:
-        UserError: several cameras without calibration, or too few timesteps with a face.
+        UserError: The capture has several cameras without calibration, or too few timesteps with a face.
     """
     cameras = len(capture.camera_ids)
     if cameras != 1 and capture.calibration is None:
@@ -89,13 +89,13 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
 
 
 def _seen(capture: Capture) -> Bool[Tensor, "t c"]:
-    """In which pictures a face was found."""
+    """The pictures in which a face was found."""
     finite = np.isfinite(np.asarray(capture.landmarks)).all((-1, -2))
     return torch.from_numpy(np.asarray(capture.valid, dtype=bool) & finite)
 
 
 def lenses_of(captures: Sequence[Capture], settings: TrackingSettings) -> list[int | None]:
-    """For each capture, the number of the unknown focal length that it has; None where that is known."""
+    """The number of the unknown focal length of each capture; None if the focal length is known."""
     lenses: list[int | None] = []
     free = 0
     for capture in captures:
@@ -108,7 +108,7 @@ def lenses_of(captures: Sequence[Capture], settings: TrackingSettings) -> list[i
 
 
 def initial_camera(capture: Capture, settings: TrackingSettings) -> Camera:
-    """The camera of the captured pictures, float64, with a given or assumed focal length."""
+    """The camera of the captured pictures, with the given or an assumed focal length, in float64."""
     focal_x, focal_y = _source_focal(capture) if settings.focal is None else (settings.focal, settings.focal)
     x, y = (float(value) for value in capture.principal_point[0])
     K = torch.tensor([[focal_x, 0, x], [0, focal_y, y], [0, 0, 1]], dtype=torch.float64)
@@ -116,7 +116,7 @@ def initial_camera(capture: Capture, settings: TrackingSettings) -> Camera:
 
 
 def _source_focal(capture: Capture) -> tuple[float, float]:
-    """The assumed focal lengths along x and y in pixels of the capture: it may be a shrunk crop of what was filmed."""
+    """The assumed focal lengths along x and y, in pixels of the capture, which may be a scaled crop of the source."""
     crop = capture.source.get("crop", {"width": capture.width, "height": capture.height})
     sides = capture.source.get("picture_size", (crop["width"], crop["height"]))
     assumed = (_CROPPED_FOCAL if max(sides) < _SQUARE * min(sides) else _DEFAULT_FOCAL) * float(max(sides))

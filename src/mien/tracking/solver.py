@@ -1,4 +1,4 @@
-"""Batched Levenberg-Marquardt: small dense problems side by side, tied by shared parameters or along time."""
+"""Batched Levenberg-Marquardt: many small dense problems, coupled by shared parameters or along time."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -10,23 +10,27 @@ from torch import Tensor
 
 _DAMPING_START, _DAMPING_LEAST, _DAMPING_MOST = 1e-3, 1e-7, 1e7
 _SEGMENT = 1024
-"""Blocks of a chain whose factors are kept at a time: some 120 MB for pairs of frames with 60 parameters."""
+"""Number of blocks of a chain whose factors are in memory at once: about 120 MB for pairs of frames with 60 parameters.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Half the gradient and the Gauss-Newton half Hessian of b frames, with the cost they belong to."""
+    """Cost of b frames, with half its gradient and half its Gauss-Newton Hessian."""
 
     cost: Float[Tensor, " b"]
     gradient: Float[Tensor, "b p"]
     hessian: Float[Tensor, "b p p"]
 
     def plus(self, other: "NormalEquations") -> "NormalEquations":
-        """Of both costs together."""
+        """The equations of the sum of both costs."""
         return NormalEquations(self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian)
 
     def split(self, own: int, columns: Int[Tensor, " k"], size: int) -> "tuple[NormalEquations, SharedEquations]":
-        """Of each frame's first `own` parameters, and of the other k, which are `columns` of `size` shared ones."""
+        """Split into the frames' own equations and shared ones.
+
+        The first `own` parameters belong to each frame. The other k are the `columns` of `size` shared parameters.
+        """
         across = self.hessian.new_zeros(len(self.cost), own, size)
         across[:, :, columns] = self.hessian[:, :own, own:]
         hessian, gradient = self.hessian.new_zeros(size, size), self.gradient.new_zeros(size)
@@ -48,7 +52,7 @@ class Box:
         return torch.minimum(torch.maximum(state, self.lower), self.upper)
 
     def held(self, state: Float[Tensor, "b p"], gradient: Float[Tensor, "b p"]) -> Bool[Tensor, "b p"]:
-        """Parameters at a bound that the gradient's descent would push through it: the active set."""
+        """The active set: parameters at a bound that a descent step would push beyond it."""
         return ((state <= self.lower) & (gradient > 0)) | ((state >= self.upper) & (gradient < 0))
 
 
@@ -59,9 +63,9 @@ def minimize_frames(
     box: Box,
     iterations: int,
 ) -> Float[Tensor, "b p"]:
-    """Levenberg-Marquardt within bounds on b independent frames, each with its own damping.
+    """Minimise b independent frames within bounds by Levenberg-Marquardt, each with its own damping.
 
-    Parameters held by a bound are left out of the step (a projected Newton step), the rest is clipped.
+    Parameters held by a bound take no part in the step (a projected Newton step), and the result is clipped.
     """
     state = box.clip(start)
     damping = state.new_full((len(state),), _DAMPING_START)
@@ -86,7 +90,7 @@ def _damped_step(
 
 
 def hold(equations: NormalEquations, held: Bool[Tensor, "b p"]) -> NormalEquations:
-    """The same equations with some parameters kept still: their rows and columns become the identity's."""
+    """The equations with some parameters held fixed: their rows and columns become those of the identity."""
     moving = (~held).to(equations.hessian)
     kept = equations.hessian * moving[:, :, None] * moving[:, None, :]
     return NormalEquations(equations.cost, equations.gradient * moving, kept + torch.diag_embed(1 - moving))
@@ -103,26 +107,26 @@ def joined(parts: Sequence[NormalEquations]) -> NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class SharedEquations:
-    """Blocks of s parameters that b frames share."""
+    """Blocks of the normal equations for s parameters that b frames share."""
 
     across: Float[Tensor, "b p s"]
-    """Half Hessian, mixed with each frame's own parameters."""
+    """Half the Hessian between each frame's own parameters and the shared ones."""
     hessian: Float[Tensor, "s s"]
     gradient: Float[Tensor, " s"]
     """Half the gradient."""
 
     def plus(self, other: "SharedEquations") -> "SharedEquations":
-        """Of both costs together."""
+        """The blocks of the sum of both costs."""
         across, hessian = self.across + other.across, self.hessian + other.hessian
         return SharedEquations(across, hessian, self.gradient + other.gradient)
 
     def with_prior(self, precision: Float[Tensor, " s"], values: Float[Tensor, " s"]) -> "SharedEquations":
-        """Under a quadratic cost on the values."""
+        """The blocks with a quadratic cost on the shared values added."""
         return SharedEquations(self.across, self.hessian + torch.diag(precision), self.gradient + precision * values)
 
 
 def joined_shared(parts: Sequence[SharedEquations]) -> SharedEquations:
-    """The blocks of all parts' frames."""
+    """The blocks of all parts' frames in a row, with the shared ones summed."""
     return SharedEquations(
         torch.cat([part.across for part in parts]),
         torch.stack([part.hessian for part in parts]).sum(0),
@@ -133,7 +137,7 @@ def joined_shared(parts: Sequence[SharedEquations]) -> SharedEquations:
 def solve_arrow(
     frames: NormalEquations, shared: SharedEquations, held: Bool[Tensor, "b p"], damping: float
 ) -> tuple[Float[Tensor, "b p"], Float[Tensor, " s"]]:
-    """One damped step of b frames' parameters and of what they share, by the Schur complement."""
+    """One damped step of the frames' own parameters and the shared ones, by the Schur complement."""
     frames, across = hold(frames, held), shared.across * (~held)[:, :, None]
     diagonal = frames.hessian.diagonal(dim1=-2, dim2=-1)
     factor = torch.linalg.cholesky(frames.hessian + torch.diag_embed(diagonal * damping + 1e-12))
@@ -147,34 +151,34 @@ def solve_arrow(
 
 @dataclass(frozen=True, eq=False)
 class Smoothness:
-    """Robust costs on the acceleration d[t] = x[t-1] - 2 x[t] + x[t+1] of each parameter.
+    """Robust cost of the acceleration d[t] = x[t-1] - 2 x[t] + x[t+1] of each parameter.
 
-    A second difference leaves steady motion alone, and the chain is solved as a whole, forward and backward in time:
-    it damps jitter without lag. The cost of a parameter's s = precision d^2 is 2 c^2 (sqrt(1 + s / c^2) - 1): square
-    for jitter, but only linear (pseudo-Huber) from c sigmas on, so that a sudden turn keeps its speed.
+    A second difference is zero for steady motion, and the chain is solved as a whole, forward and backward in time, so
+    jitter is damped without lag. With s = precision d^2 the cost is 2 c^2 (sqrt(1 + s / c^2) - 1): quadratic for
+    jitter, but only linear (pseudo-Huber) beyond c sigmas, so that a sudden turn keeps its speed.
     """
 
     precision: Float[Tensor, " p"]
-    """Of each parameter's second difference."""
+    """Precision of each parameter's second difference."""
     linked: Bool[Tensor, " t"]
-    """Whether the second difference centred at each timestep counts (False at the ends and beside missing frames)."""
+    """Whether the second difference centred at each timestep counts. It does not at the ends and beside gaps."""
     outlier: float = 1.5
-    """c: sigmas from which the cost is about linear."""
+    """The c of the cost: number of sigmas beyond which it is about linear."""
 
     def differences(self, state: Float[Tensor, "t p"]) -> Float[Tensor, "t p"]:
-        """Second differences where they count, else zero."""
+        """Second differences; zero where they do not count."""
         second = torch.zeros_like(state)
         second[1:-1] = state[:-2] - 2 * state[1:-1] + state[2:]
         return second * self.linked[:, None]
 
     def cost(self, state: Float[Tensor, "t p"]) -> Float[Tensor, ""]:
-        """Of all parameters over all time."""
+        """The cost of all parameters over all timesteps."""
         square = self.outlier**2
         relative = self.differences(state) ** 2 * self.precision / square
         return 2 * square * ((1 + relative).sqrt() - 1).sum()
 
     def weights(self, state: Float[Tensor, "t p"]) -> Float[Tensor, "t p"]:
-        """Of each squared second difference in the quadratic cost with the same gradient; 0 where none counts."""
+        """Weights of the squared second differences in the quadratic cost with the same gradient; 0 if not linked."""
         relative = self.differences(state) ** 2 * self.precision / self.outlier**2
         return self.linked[:, None] * self.precision / (1 + relative).sqrt()
 
@@ -187,7 +191,10 @@ class Smoothness:
         return gradient
 
     def bands(self, state: Float[Tensor, "t p"]) -> tuple[Tensor, Tensor, Tensor]:
-        """The half Hessian of that quadratic cost along time: diagonal, first and second upper off-diagonal, [t, p]."""
+        """Bands of half the Hessian of that quadratic cost along time, [t, p] each.
+
+        They are the diagonal and the first and second upper off-diagonals.
+        """
         weights = self.weights(state)
         before, after, first, second = (torch.zeros_like(weights) for _ in range(4))
         before[1:], after[:-1] = weights[:-1], weights[1:]
@@ -199,9 +206,9 @@ class Smoothness:
 def solve_chain(
     frames: NormalEquations, smoothness: Smoothness, state: Float[Tensor, "t p"], held: Bool[Tensor, "t p"]
 ) -> Float[Tensor, "t p"]:
-    """The Gauss-Newton step of all frames under the smoothness cost; direct, by block-tridiagonal elimination.
+    """The Gauss-Newton step of all frames under the smoothness cost, solved by block-tridiagonal elimination.
 
-    Two frames make one block, so that second differences couple neighbouring blocks only.
+    Two frames form one block, so second differences couple only neighbouring blocks.
     """
     t, p = state.shape
     moving = (~held).to(state)
@@ -234,10 +241,10 @@ def solve_chain(
 def _solve_tridiagonal(
     own: Callable[[int], Tensor], upper: Callable[[int], Tensor], right: Float[Tensor, "n q"]
 ) -> Float[Tensor, "n q"]:
-    """Solve a symmetric positive definite block-tridiagonal system; `upper(i)` couples block i to block i + 1.
+    """Solve a symmetric positive definite block-tridiagonal system. `upper(i)` couples block i to block i + 1.
 
-    Factors are kept for a segment of blocks at a time. A system of several segments is eliminated twice: first to know
-    where each segment begins, then from the last segment to the first, to go back through each.
+    Only the factors of one segment of blocks are in memory. A system of several segments is eliminated twice: first to
+    find the reduced block at the start of each segment, then from the last segment to the first, for substitution.
     """
     starts = range(0, len(right), _SEGMENT)
     begins = [(own(0), right[0])]
@@ -253,7 +260,7 @@ def _solve_tridiagonal(
             if index + 1 < len(right):
                 side = side - upper(index) @ solution[index + 1]
             solution[index] = torch.cholesky_solve(side[:, None], factor)[:, 0]
-        steps.clear()  # before the next segment's are made
+        steps.clear()  # Free the memory before the next segment.
     return solution
 
 
@@ -264,7 +271,7 @@ def _eliminate(
     begin: tuple[Tensor, Tensor],
     blocks: range,
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Factor, reduced block and right side of consecutive blocks, of which `begin` is the first's."""
+    """Yield factor, reduced block and right side of consecutive blocks. `begin` has block and side of the first."""
     block, side = begin
     for index in blocks:
         factor = torch.linalg.cholesky(block)

@@ -1,4 +1,4 @@
-"""The stages of tracking from landmarks: each takes what is known so far and returns it refined."""
+"""The stages of tracking from landmarks. Each stage takes the fit so far and returns it refined."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -29,33 +29,33 @@ from mien.tracking.views import CameraBatch, Views
 
 _FRAME_ITERATIONS = 12
 _FRAMES_AT_ONCE = 512
-"""Timesteps fitted side by side, each alone: bounds the memory to some 100 MB."""
+"""Number of timesteps fitted in one batch, which takes about 100 MB of memory."""
 _ROUNDS = 2
 SEQUENCE_ITERATIONS = 10
-"""At most, in all rounds together."""
+"""Largest number of iterations of the fit over time, in all rounds together."""
 _RIM_BIAS_SHARE = 0.25
-"""Of other landmarks' standard deviation of the static offset: for lids and lips."""
+"""Standard deviation of the static offset for lids and lips, as a share of that of other landmarks."""
 _LINE_SEARCH = (1.0, 0.5, 0.25, 0.1)
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceFit:
-    """What is a sequence's own: its cameras, and the parameters of the v timesteps in which a face was found."""
+    """Fit of one sequence: its cameras, and the parameters of the v timesteps in which a face was found."""
 
     cameras: CameraBatch
     state: Float[Tensor, "v p"]
-    """In the order of the layout."""
+    """Parameters in the order of the layout."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The state of tracking: what the sequences of a subject share, and what is each one's own."""
+    """The state of tracking: the subject's parameters, which all sequences share, and those of each sequence."""
 
     subject: Subject
     sequences: tuple[SequenceFit, ...]
 
     def tensors(self) -> dict[str, Tensor]:
-        """By name, for a file."""
+        """The fit as tensors by name, for a file."""
         tensors = {"identity": self.subject.identity, "bias": self.subject.bias, "person": self.subject.person}
         if self.subject.vertex_offsets is not None:
             tensors["vertex_offsets"] = self.subject.vertex_offsets
@@ -66,7 +66,7 @@ class Fit:
 
 
 def fit_of(tensors: Mapping[str, Tensor]) -> Fit:
-    """The fit with these tensors (`Fit.tensors`)."""
+    """The fit made of tensors by name (`Fit.tensors`)."""
     subject = Subject(tensors["identity"], tensors["bias"], tensors.get("vertex_offsets"), tensors["person"])
     sequences: list[SequenceFit] = []
     while f"state_{len(sequences)}" in tensors:
@@ -76,7 +76,7 @@ def fit_of(tensors: Mapping[str, Tensor]) -> Fit:
 
 
 def choose_keyframes(pose: Float[Tensor, "v 6"], count: int) -> Int[Tensor, " k"]:
-    """Frames whose head rotations lie as far apart as can be, the first one in the middle of them all."""
+    """Choose frames with head rotations as far apart as possible, starting from the one nearest to the median."""
     rotations = pose[:, :3]
     chosen = [int((rotations - rotations.median(0).values).norm(dim=1).argmin())]
     distance = (rotations - rotations[chosen[0]]).norm(dim=1)
@@ -88,11 +88,11 @@ def choose_keyframes(pose: Float[Tensor, "v 6"], count: int) -> Int[Tensor, " k"
 
 
 def fit_bias(terms: Sequence[LandmarkTerm], fit: Fit) -> Fit:
-    """The static offset of every landmark, all else fixed.
+    """Fit the static offset of every landmark, with all else fixed.
 
-    Beside what is expected of the detector, irises get none (their place tells scale and gaze), lids and lips little
-    (closed is closed for everyone), and the offsets together hold no translation, rotation or scaling, which belong to
-    pose and identity.
+    Beyond the detector's expected offsets, irises get none, because their position determines scale and gaze. Lids and
+    lips get little, because closed is closed for everyone. All offsets together contain no translation, rotation or
+    scaling, which belong to pose and identity.
     """
     bias, response = fit.subject.bias, terms[0].model.response
     expected = response.mean + response.of_person(fit.subject.person)
@@ -135,7 +135,7 @@ def fit_frames(
     keeper: Keeper | None = None,
     name: str = "frames",
 ) -> SequenceFit:
-    """Pose, expression and eyes of every timestep alone; `advance` is told of timesteps that are done."""
+    """Fit pose, expression and eyes at every timestep alone. `advance` receives the number of finished timesteps."""
     keeper, parts = keeper or Keeper(), []
 
     def fitted(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
@@ -160,9 +160,9 @@ def fit_sequences(
     advance: Callable[[int], None] = lambda timesteps: None,
     keeper: Keeper | None = None,
 ) -> Fit:
-    """All timesteps of each sequence together under its smoothness cost, alternating with the landmarks' bias.
+    """Fit all timesteps of each sequence together under its smoothness cost, in turn with the landmarks' bias.
 
-    `advance` is told of timesteps that are done, of all iterations (`SEQUENCE_ITERATIONS`) together.
+    `advance` receives the number of finished timesteps in each of the `SEQUENCE_ITERATIONS` iterations.
     """
     keeper = keeper or Keeper()
 
@@ -214,14 +214,14 @@ def smoothness_of(
     settings: SmoothnessSettings,
     cameras: CameraBatch | None = None,
 ) -> Smoothness:
-    """The smoothness cost over the valid timesteps; missing ones cut the chain.
+    """The smoothness cost over the valid timesteps. Missing timesteps break the chain.
 
     Args:
-        layout: Of the parameters.
+        layout: Layout of the parameters.
         valid: Timesteps in which a face was found.
-        fps: Frames a second.
-        settings: How smooth.
-        cameras: Of the sequence. A single one sees depth less well; by default it looks along z.
+        fps: Frames per second.
+        settings: The smoothness settings.
+        cameras: Cameras of the sequence. A single camera sees depth less well. The default looks along z.
     """
     sigmas = torch.full((layout.size,), math.inf, dtype=torch.float64)
     sigmas[:3] = settings.rotation
@@ -229,7 +229,7 @@ def smoothness_of(
     if cameras is not None:
         along_sight = cameras.viewmat[0, 2, :3] ** 2 if len(cameras) == 1 else torch.zeros_like(along_sight)
     sigmas[3:6] = settings.translation + (settings.depth - settings.translation) * along_sight
-    # Eyes and lids may jump; a neck is not moved by fits.
+    # Eyes and lids may jump.
     slow = torch.tensor(["eye" not in name.lower() for name in layout.names[6:]], dtype=torch.bool)
     sigmas[6:] = torch.where(slow, settings.expression * layout.units, torch.inf)
     frames = valid.nonzero()[:, 0]
@@ -240,18 +240,21 @@ def smoothness_of(
 
 
 def widen(pose: Float[Tensor, "v 6"], layout: ParameterLayout) -> Float[Tensor, "v p"]:
-    """Head poses as whole vectors: everything else at rest."""
+    """Head poses as complete parameter vectors, with everything else at rest."""
     return torch.cat([pose, pose.new_zeros(len(pose), layout.size - 6)], dim=1)
 
 
 def all_landmarks(model: LandmarkModel, views: Views, own: SequenceFit, settings: TrackingSettings) -> LandmarkTerm:
-    """The cost of all landmarks at the depth of a fit, whose head poses tell which pictures to trust."""
+    """The cost of all landmarks at the depth of a fit. Its head poses determine the trust in each picture."""
     views = replace(views, trust=trust_of(views, own.state, own.cameras))
     return landmark_term(model, views, landmark_weights(settings.landmarks), own.state, own.cameras, settings)
 
 
 def quiet_landmarks(term: LandmarkTerm, share: float) -> LandmarkTerm:
-    """With a share of the weight, but for what opens and closes: no texture shows a closed mouth and an open one."""
+    """The term with a share of its weight, except for lips, lids and irises.
+
+    These keep their weight, because one texture cannot show both an open and a closed mouth.
+    """
     kept = torch.full_like(term.weights, share)
     kept[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS + LEFT_IRIS + RIGHT_IRIS)] = 1
     return replace(term, weights=term.weights * kept)

@@ -11,47 +11,47 @@ from mien.face import FaceParams
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """What a fit to pixels found out about the subject's skin, and about the light of one sequence."""
+    """The subject's skin and the light of one sequence, from a fit to pixels."""
 
     texture: Float[Tensor, "th tw 3"]
-    """Albedo, by the face model's texture coordinates: a colour (0..1, sRGB) is albedo times light."""
+    """Albedo in the face model's texture coordinates. A colour (0..1, sRGB) is albedo times light."""
     trust: Float[Tensor, "th tw"]
-    """0 where a texel is not known; less than 1 where pictures contradict each other."""
+    """Trust in each texel: 0 if it is unknown, below 1 if pictures contradict each other."""
     light: Float[Tensor, "9 3"]
-    """SH coefficients over world-space normals (`mien.render.mesh.shade`)."""
+    """Spherical harmonics coefficients over world-space normals (`mien.render.mesh.shade`)."""
     sigma: float
     """Expected difference between the colours of a picture and of the model."""
     light_extent: float
-    """Metres on the face over which a smooth difference counts as light that the model does not explain."""
+    """Extent on the face, in metres, over which a smooth difference counts as light that the model does not explain."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tracking:
     """Face parameters and cameras of one sequence of t timesteps and c cameras.
 
-    With one camera of unknown place the world frame is the camera's with y up and z backward (viewmat =
-    diag(1, -1, -1, 1)): a face that looks into the camera has a head rotation of about zero. Calibrated cameras stay in
-    the world that they were given in.
+    With one uncalibrated camera the world frame is the camera's with y up and z backward (viewmat =
+    diag(1, -1, -1, 1)), so a face that looks into the camera has a head rotation of about zero. Calibrated cameras stay
+    in the world of their calibration.
     """
 
     face_model: str
-    """Name, for `mien.face.load_face_model`."""
+    """Name of the face model, for `mien.face.load_face_model`."""
     face_model_hash: str
-    """`FaceModel.content_hash` it was fitted with."""
+    """`FaceModel.content_hash` of the face model."""
     face: FaceParams
-    """All t timesteps; where `valid` is False, interpolated from the neighbours."""
+    """Face parameters of all t timesteps. Those that are not `valid` are interpolated from their neighbours."""
     valid: Bool[Tensor, " t"]
-    """Some camera found a face."""
+    """Whether at least one camera found a face."""
     cameras: tuple[Camera, ...]
-    """One a camera_id, for pictures of the capture's size."""
+    """The camera of each camera_id, for pictures of the capture's size."""
     neck_lines: Float[Tensor, "t c 3"]
-    """(a, b, d) with a^2 + b^2 = 1: pixels with a x + b y + d >= 0 are above the neck line, and kept."""
+    """Neck lines (a, b, d) with a^2 + b^2 = 1. Pixels with a x + b y + d >= 0 are above the line and are kept."""
     residuals: Float[Tensor, "t c"]
-    """Median distance of landmarks from their fit, pixels; NaN where the camera found no face."""
+    """Median distance of landmarks from their fit, in pixels; NaN where the camera found no face."""
     pixel_residuals: Float[Tensor, "t c"] | None = None
-    """Root mean square by which colours differ from the texture that all pictures share, 0..1, outliers faded; NaN
-    where pixels were no help and landmarks alone decided. None: pixels were not looked at."""
+    """Robust root mean square difference of colours (0..1) from the texture that all pictures share. NaN where
+    landmarks alone determined the fit. None if there was no fit to pixels."""
     looks: Looks | None = None
-    """How the model looks; None: pixels were not looked at, or gave nothing."""
+    """Texture and light of the model. None if there was no fit to pixels or it found no texture."""
     settings: dict = field(default_factory=dict)
-    """How it was made, for the report."""
+    """Settings of the tracking, for the report."""

@@ -1,11 +1,11 @@
-"""What of expressions goes with the head's turns, taken for as little as one frame knows of it.
+"""Correction of expressions that follow the head's turns.
 
-Frames are fitted as if their errors were their own. Those of light, shape, focal length and detector are not: they go
-with the head's turns and are the same whenever it turns there, and expressions that explain them nod with the head.
-How far a coefficient follows turns is therefore known no better than from one frame, however many there are: the
-landmarks' information of one frame is weighed against the prior of one frame, so that a jaw that drops as the head
-tips back stays, and a cheek that seems to rise by half a millimetre goes. Coefficients are weighed together: those that
-undo each other on the face go first, and lips that they close stay closed.
+The fit treats errors of frames as independent. But errors of light, shape, focal length and detector follow the head's
+turns and recur whenever the head turns the same way, and expressions that explain them move with the head. So all
+frames together know no better than a single frame how far a coefficient follows the turns. The correction weighs the
+landmarks' information of one frame against the prior of one frame: a jaw that drops as the head tips back remains, and
+a cheek that seems to rise by half a millimetre does not. Coefficients are weighed together, so those that cancel each
+other on the face vanish first, and lips that they close stay closed.
 """
 
 from dataclasses import replace
@@ -18,19 +18,19 @@ from mien.tracking.landmark_term import LandmarkTerm, Subject
 from mien.tracking.stages import SequenceFit, box_of
 
 _LEAST_TURN = 1e-4
-"""Radians of standard deviation below which a head does not turn."""
+"""Standard deviation of a rotation below which the head counts as still, in radians."""
 
 
 def without_turn_habits(term: LandmarkTerm, subject: Subject, own: SequenceFit) -> SequenceFit:
-    """The sequence with what in its expressions is linear in the head's turns shrunk to what one frame tells of it.
+    """Shrink the part of a sequence's expressions that is linear in the head's turns to what one frame supports.
 
     Args:
-        term: The landmarks of the sequence, in the frame of the fit, where rotations are about zero.
-        subject: Of the fit.
-        own: Of the fit; poses and joints stay.
+        term: The landmark term of the sequence, in the frame of the fit, where rotations are about zero.
+        subject: The subject of the fit.
+        own: The sequence of the fit. Poses and joints stay as they are.
     """
     layout, state = term.model.layout, own.state
-    turns = _independent(state[:, :2])  # up and down, left and right
+    turns = _independent(state[:, :2])  # The turns up and down, left and right.
     columns = layout.expression_columns
     if turns.shape[1] == 0 or columns.start == columns.stop:
         return own
@@ -45,6 +45,6 @@ def without_turn_habits(term: LandmarkTerm, subject: Subject, own: SequenceFit) 
 
 
 def _independent(turns: Float[Tensor, "v 2"]) -> Float[Tensor, "v q"]:
-    """Orthonormal directions of what turns about their mean; fewer where the head hardly turns."""
+    """Orthonormal basis of the turns about their mean. It has fewer columns if the head hardly turns."""
     left, lengths, _ = torch.linalg.svd(turns - turns.mean(0), full_matrices=False)
     return left[:, lengths > _LEAST_TURN * len(turns) ** 0.5]

@@ -1,4 +1,4 @@
-"""What a fit looks at: pictures in which a face was found, and the cameras that took them."""
+"""The data of a fit: pictures in which a face was found, and the cameras that took them."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from mien.camera import Camera
 
 @dataclass(frozen=True, eq=False)
 class CameraBatch:
-    """c pinhole cameras side by side, as tensors (docs/conventions.md)."""
+    """A batch of c pinhole cameras as tensors (docs/conventions.md)."""
 
     K: Float[Tensor, "c 3 3"]
     viewmat: Float[Tensor, "c 4 4"]
@@ -26,16 +26,16 @@ class CameraBatch:
 
     @property
     def centres(self) -> Float[Tensor, "c 3"]:
-        """Where the cameras are, world space."""
+        """The cameras' positions in world space."""
         return -(self.viewmat[:, :3, :3].mT @ self.viewmat[:, :3, 3:])[..., 0]
 
     def project(self, points: Float[Tensor, "c l 3"]) -> Float[Tensor, "c l 2"]:
-        """Each camera's own world-space points in its picture, pixels."""
+        """Project each camera's own world-space points into its picture, in pixels."""
         in_camera = points @ self.viewmat[:, :3, :3].mT + self.viewmat[:, None, :3, 3]
         return (in_camera @ self.K.mT)[..., :2] / in_camera[..., 2:]
 
     def with_focal(self, factor: float) -> "CameraBatch":
-        """The same cameras with longer (or shorter) lenses."""
+        """The same cameras with their focal lengths multiplied by a factor."""
         K = self.K.clone()
         K[:, 0, 0] *= factor
         K[:, 1, 1] *= factor
@@ -43,7 +43,7 @@ class CameraBatch:
 
 
 def batch_of(cameras: tuple[Camera, ...]) -> CameraBatch:
-    """Cameras as a batch, float64."""
+    """The cameras as a batch, in float64."""
     return CameraBatch(
         torch.stack([camera.K.double() for camera in cameras]),
         torch.stack([camera.viewmat.double() for camera in cameras]),
@@ -52,16 +52,16 @@ def batch_of(cameras: tuple[Camera, ...]) -> CameraBatch:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """n pictures of v timesteps of one sequence: in each, one camera found the landmarks of the face."""
+    """The n pictures of v timesteps of one sequence in which a camera found the landmarks of the face."""
 
     detected: Float[Tensor, "n l 2"]
-    """Pixels."""
+    """Detected landmarks, in pixels."""
     row: Int[Tensor, " n"]
-    """Which of the v timesteps; every timestep has a picture at least."""
+    """Index of each picture's timestep among the v. Every timestep has at least one picture."""
     camera: Int[Tensor, " n"]
-    """Which of the sequence's cameras."""
+    """Index of each picture's camera in the sequence."""
     trust: Float[Tensor, " n"]
-    """How much each picture's landmarks count, 0..1 (`mien.tracking.facing`)."""
+    """Weight of each picture's landmarks, 0..1 (`mien.tracking.facing`)."""
 
     @property
     def rows(self) -> int:
@@ -69,7 +69,7 @@ class Views:
         return int(self.row.max()) + 1
 
     def at(self, rows: Int[Tensor, " k"]) -> "Views":
-        """The pictures of some of the timesteps, which are counted anew."""
+        """The pictures of some of the timesteps, with rows numbered in the order given."""
         new_row = torch.full((self.rows,), -1)
         new_row[rows] = torch.arange(len(rows))
         kept = new_row[self.row] >= 0
@@ -80,11 +80,11 @@ class Views:
         return self.camera[self.row == row].tolist()
 
     def some(self, pictures: slice) -> "Views":
-        """Some of the pictures; timesteps keep their numbers."""
+        """Some of the pictures. Timesteps keep their numbers."""
         return Views(self.detected[pictures], self.row[pictures], self.camera[pictures], self.trust[pictures])
 
     def of_landmarks(self, landmarks: Int[Tensor, " k"]) -> "Views":
-        """The same pictures with some of the landmarks only."""
+        """The same pictures with only some of the landmarks."""
         return replace(self, detected=self.detected[:, landmarks])
 
     def apart(self) -> "Views":

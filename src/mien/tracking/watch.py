@@ -1,20 +1,20 @@
-"""Who wants to see how far a fit has come."""
+"""Observers of the progress of a fit."""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 
-@runtime_checkable  # for beartype, which checks annotations during tests
+@runtime_checkable  # Beartype needs this to check annotations during tests.
 class Watch(Protocol):
-    """Is told of a fit on its way."""
+    """Receives the progress of a running fit."""
 
     def __call__(self, stage: str, progress: float, look: Callable[[], object] | None = None) -> None:
-        """The stage that runs, which part of its work is done, and, if the fit changed, what gives it as it is now.
+        """Receive the stage that runs, the share of its work that is done, and, if the fit changed, a way to get it.
 
-        `look` returns a `Fit` or a `PhotometricFit`, and may be called later, or never.
+        `look` returns a `Fit` or a `PhotometricFit`. It may be called later, or never.
         """
         ...
 
 
 def nobody(stage: str, progress: float, look: Callable[[], object] | None = None) -> None:
-    """Does not want to see it."""
+    """Ignore the progress. This is the `Watch` of a fit that nobody watches."""
