@@ -62,14 +62,14 @@ def track_subject(
 ) -> list[Tracking]:
     """Fit a face model to landmarks and pixels of all sequences of one person, with one identity.
 
-        The stages are: the head pose of every timestep alone; identity (and unknown focal lengths) from keyframes of all
-        sequences; every timestep alone; all timesteps of each sequence together, smooth over time; then, unless the
-        schedule is `landmarks`, the fit to pixels (`refine_photometrically`, `fit_by_descent`). The result is
-        deterministic.
+    The stages are: the head pose of every timestep alone; identity (and unknown focal lengths) from keyframes of all
+    sequences; every timestep alone; all timesteps of each sequence together, smooth over time; then, unless the
+    schedule is `landmarks`, the fit to pixels (`refine_photometrically`, `fit_by_descent`). The result is
+    deterministic.
 
-        Sequences may differ in size, frame rate and number of cameras. Several cameras must be calibrated
-        (`Capture.calibration`). They stay as they are and give the metric scale, and a camera that found no face at a
-        timestep adds nothing to it. With one uncalibrated camera, the metric scale comes from the identity prior.
+    Sequences may differ in size, frame rate and number of cameras. Several cameras must be calibrated
+    (`Capture.calibration`). They stay as they are and give the metric scale, and a camera that found no face at a
+    timestep adds nothing to it. With one uncalibrated camera, the metric scale comes from the identity prior.
 
     Args:
         captures: The sequences of one person.

@@ -1,0 +1,81 @@
+"""Links of the documentation: files and headings that they point to exist."""
+
+import re
+from functools import cache
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+_OUTSIDE_DOCS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md", "native/README.md")
+PAGES = [*(ROOT / name for name in _OUTSIDE_DOCS), *sorted((ROOT / "docs").rglob("*.md"))]
+CURRENT = [page for page in PAGES if page.parent.name != "history" and page.name != "CHANGELOG.md"]
+"""Pages that describe this version, not earlier ones."""
+_LINK = re.compile(r"!?\[[^\]]*\]\(<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\)")
+_ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
+_PATH = re.compile(r"(?<![\w./])((?:docs|native|examples|benchmarks|src|tests)/[\w./-]+\.(?:md|py|h|cpp))\b")
+"""A file that the text names without a link."""
+
+
+def prose(page: Path) -> str:
+    """The text of a page without fenced and indented code."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    return re.sub(r"(?m)^ {4,}.*$", "", text)
+
+
+@cache
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives the headings of a page."""
+    found: dict[str, int] = {}
+    for heading in re.findall(r"^#{1,6} +(.+?) *#*$", prose(page), flags=re.MULTILINE):
+        text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading)
+        slug = re.sub(r"[^\w\- ]", "", text.lower()).replace(" ", "-")
+        found[slug] = found.get(slug, -1) + 1
+        if found[slug]:
+            found[f"{slug}-{found[slug]}"] = 0
+    return set(found)
+
+
+def broken_links(page: Path, root: Path = ROOT) -> list[str]:
+    """The relative links of a page that lead out of the repository, or to a file or heading that does not exist."""
+    broken = []
+    for target in _LINK.findall(prose(page)):
+        if _ADDRESS.match(target):
+            continue
+        path, _, anchor = unquote(target).partition("#")
+        linked = (page.parent / path).resolve() if path else page
+        missing = not linked.is_relative_to(root.resolve()) or not linked.exists()
+        if missing or (anchor and anchor not in anchors(linked)):
+            broken.append(target)
+    return broken
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    assert broken_links(page) == []
+
+
+@pytest.mark.parametrize("page", CURRENT, ids=lambda page: str(page.relative_to(ROOT)))
+def test_files_that_pages_name_exist(page: Path) -> None:
+    text = re.sub(r"`[^`\n]*[A-Z*{][A-Z*{]+[^`\n]*`", "", prose(page))  # NAME.py and patterns
+    assert [path for path in _PATH.findall(text) if not (ROOT / path).exists()] == []
+
+
+def test_every_page_of_the_documentation_is_linked() -> None:
+    linked = {
+        (page.parent / unquote(target).partition("#")[0]).resolve()
+        for page in PAGES
+        for target in _LINK.findall(prose(page))
+        if not _ADDRESS.match(target)
+    }
+    assert [page.name for page in PAGES if page.resolve() not in linked and page.name != "README.md"] == []
+
+
+def test_broken_links_are_found(tmp_path: Path) -> None:
+    (tmp_path / "other.md").write_text("# One `thing`, here\n\n## Twice\n\n## Twice\n", encoding="utf-8")
+    page = tmp_path / "page.md"
+    good = "[a](other.md) [b](other.md#one-thing-here) [c](other.md#twice-1) [d](https://example.org/x) [e](#title)"
+    bad = "[f](none.md) [g](other.md#nowhere) [h](../outside.md) ![i](none.png)"
+    page.write_text(f"# Title\n\n{good}\n{bad}\n\n    [code](none.md)\n\n```\n[code](none.md)\n```\n", encoding="utf-8")
+    assert broken_links(page, tmp_path) == ["none.md", "other.md#nowhere", "../outside.md", "none.png"]
