@@ -119,12 +119,15 @@ def render(
     radii = np.empty(len(gaussians), np.int32)
     pose = gaussians.T_world_local
     viewmat = camera.viewmat if pose is None else compose_rigid(camera.viewmat, pose)
-    inputs = (
-        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, background, viewmat,
-        camera.K,
-    )  # fmt: skip
     # The core takes arrays as they lie in memory; the caller's may be transposed, or of another type.
-    frame = _native.rasterize_forward(*(np.ascontiguousarray(a, np.float32) for a in inputs), image, alpha, radii)
+    means, quats, scales, opacities, sh, colour, view, K = (
+        np.ascontiguousarray(array, np.float32)
+        for array in (
+            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, background, viewmat,
+            camera.K,
+        )
+    )  # fmt: skip
+    frame = _native.rasterize_forward(means, quats, scales, opacities, sh, colour, view, K, image, alpha, radii)
     if frame is None:
         raise ValueError("render: NaN or infinity in the Gaussians, the camera or the background")
     return image, alpha
