@@ -49,6 +49,8 @@ def main() -> int:
         )
         tally = campaign.run(plan, folder, asked.findings)
         print(tally.table())
+        for missed in tally.missed:
+            print(f"missed by the fuzzers: {missed}")
         return int(bool(tally.findings or tally.missed))
     finally:
         if asked.keep:

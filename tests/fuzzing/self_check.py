@@ -27,6 +27,7 @@ from fuzzing.repairs import repair_around, repair_portable, repair_tensors, with
 from fuzzing.targets import TARGETS, Target
 from fuzzing.tensor_faults import joined, split
 from fuzzing.workers import run_cases
+from mien import cli
 from mien.errors import UserError
 
 _LIMITS = {"seconds": 1.5, "memory": 64 << 20}
@@ -73,6 +74,12 @@ def _raise(error: Exception) -> Callable[[Path, Path], Any]:
     return read
 
 
+def _complain_as_it_comes(file: Path) -> None:
+    """A command line whose door to the terminal is open (in a child: nobody else sees it)."""
+    cli._complain = lambda message: print(message, file=sys.stderr) or 2  # type: ignore[func-returns-value]
+    raise UserError(f"{file}: two\nlines")
+
+
 def _call(root: Path, file: Path) -> None:
     with socket.socket() as caller:
         caller.connect(("127.0.0.1", int((root / "port").read_text())))
@@ -87,7 +94,7 @@ _WRONG: dict[str, Callable[[Path, Path], Any]] = {
     "hang": lambda root, file: time.sleep(60),
     "memory": lambda root, file: np.ones(100 << 20, np.uint8).sum(),
     "traceback": _raise(KeyError("x")),
-    "message": lambda root, file: _raise(UserError(f"{file}: two\nlines"))(root, file),
+    "message": lambda root, file: _complain_as_it_comes(file),
     "nameless": _raise(UserError("a file: cannot be read")),
     "outside": lambda root, file: (root.parent / "outside/victim").write_bytes(b"gone"),
     "leftover": lambda root, file: tempfile.mkdtemp(),

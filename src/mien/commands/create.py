@@ -33,8 +33,7 @@ class Command:
     face_model: str = "anny"
     """Name of a face model (see `mien face-models`), or a .npz or .pkl file in FLAME's schema."""
     preview: bool = False
-    """Show the fit of the face while it runs, in OUT/tracking_preview.html. Open that page in a browser; it is updated
-    while tracking runs."""
+    """Show the fit of the face while it runs, in OUT/tracking_preview.html (for a browser)."""
     overlay: Literal["auto", "all", "none"] = "auto"
     """Frames in overlay.mp4: all frames (all), every n-th frame of long clips, at most 3,000 in total (auto), or no
     overlay (none)."""
