@@ -28,8 +28,7 @@ class Command:
     """Show the fit while it runs, in DIR/tracking_preview.html. Open that page in a browser; it is updated every few
     seconds."""
     overlay: Literal["auto", "all", "none"] = "auto"
-    """Frames in overlay.mp4: all frames (all), every n-th frame of long clips, at most 3,000 in total (auto), or no
-    overlay (none)."""
+    """Frames in overlay.mp4: all of them, every n-th one of long clips, at most 3,000 (auto), or none."""
     settings: Annotated[TrackingSettings, tyro.conf.arg(name="tracking")] = field(default_factory=TrackingSettings)
 
     def check(self) -> None:
