@@ -1,7 +1,7 @@
 # make setup | demo | test | test-312 | test-exact | sanitize | fuzz | lint | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
-PYTHON312 ?= python3.12
+PYTHON312 ?= $(shell for python in python3.12 $(HOME)/.pyenv/versions/3.12*/bin/python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 VENV ?= .venv
 BIN := $(VENV)/bin
 NATIVE := $(wildcard native/*.*) CMakeLists.txt
