@@ -26,13 +26,14 @@ from mien.picture_files import decode_png
 from mien.render.validation import NotFiniteError
 from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.training import read_curves, train, trainer
+from mien.training.checkpoint import checkpoint_files, resume
 from toy_scene import toy_sequence
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
-    train_toy.main(folder, 2)
+    train_toy.main(folder, 4)
     return folder
 
 
@@ -142,6 +143,25 @@ def test_curves_that_lack_one(run: Path, tmp_path: Path) -> None:
     write_tensors(tmp_path / "curves.safetensors", curves)
     with pytest.raises(UserError, match=r"curves\.safetensors: lacks psnr"):
         read_curves(tmp_path)
+
+
+def test_curves_that_no_plot_can_show(run: Path, tmp_path: Path) -> None:
+    curves = read_tensors(run / "curves.safetensors")
+    curves["step"][-1] = 1e300
+    write_tensors(tmp_path / "curves.safetensors", curves)
+    with pytest.raises(UserError, match=r"curves\.safetensors: holds numbers beyond 1e\+12"):
+        read_curves(tmp_path)
+
+
+def test_moments_of_another_type(run: Path, tmp_path: Path) -> None:
+    newest = checkpoint_files(run / "checkpoints")[-1]
+    tensors = read_tensors(newest)
+    tensors["store.means:first"] = tensors["store.means:first"].to(torch.int8)
+    write_tensors(tmp_path / newest.name, tensors)
+    model, sequence = toy_sequence(timesteps=5, size=32)
+    state = trainer.start([sequence], model, train_toy.CONFIG, train_toy.SETTINGS)
+    with pytest.raises(UserError, match="the moments of means are of another type"):
+        resume(tmp_path, state)
 
 
 def test_a_tracking_of_another_size_names_its_folder(tmp_path: Path) -> None:

@@ -64,8 +64,9 @@ def test_a_title_in_another_encoding_is_no_obstacle(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     encode(path, title="Song X")
     path.write_bytes(path.read_bytes().replace(b"Song X", b"Song \xfc"))
-    with pytest.raises(UnicodeDecodeError):
-        av.open(str(path))
+    if int(av.__version__.split(".")[0]) < 19:
+        with pytest.raises(UnicodeDecodeError):
+            av.open(str(path))
     assert count_frames(path) == len(list(read_video_frames(path))) == 5
 
 

@@ -150,7 +150,7 @@ def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
         name for name, f in known.items() if name not in value and f.default is MISSING and f.default_factory is MISSING
     ]
     if unknown or missing:
-        raise UserError(f"{where}: unknown {sorted(unknown)}, missing {missing}")
+        raise UserError(f"{where}: unknown {_in_short(sorted(unknown))}, missing {_in_short(missing)}")
     return hint(**{name: _decode(hints[name], value[name], f"{where}.{name}") for name in known if name in value})
 
 

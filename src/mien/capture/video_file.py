@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import av
 import av.error
@@ -42,6 +42,8 @@ _LISTS = (
 )
 """Beginnings of files that name other files or addresses instead of holding pictures, and their descriptions."""
 _SNIFFED = 4096
+_ANY_TITLE: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
+"""Titles may have any encoding. PyAV 19 takes them as they are and no longer has the argument."""
 _BUFFER = 1 << 16
 """Bytes that FFmpeg requests at a time."""
 
@@ -82,8 +84,8 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
                 # message can name them.
                 options={"max_pixels": str(4 * LARGEST_FRAME)},
                 container_options={"format_whitelist": ",".join(_CONTAINERS), "protocol_whitelist": "none"},
-                metadata_errors="replace",  # titles may have any encoding
                 buffer_size=_BUFFER,
+                **_ANY_TITLE,
             )
         except (av.error.FFmpegError, OSError) as error:
             raise UserError(f"{path}: {_why_not(path, error)}") from None

@@ -47,6 +47,8 @@ _SHAPES = {
 _KEYS = frozenset({*_SHAPES, "kintree_table", "identities", "vt", "ft"})
 _OTHERS = frozenset({"lmk_face_idx", "lmk_bary_coords", "mean"})
 """Keys by which FLAME's other files are recognised."""
+_LONGEST_NAME = 40
+"""Characters of a name that a message shows."""
 _NAMED = 20
 _LARGEST_NUMBER = 1e6
 """Bound of all numbers in the file: metres, weights and indices."""
@@ -196,7 +198,8 @@ def _remedy(names: list[str]) -> str:
         return "this is a landmark embedding: give the model itself (generic_model.pkl or flame2023.pkl)"
     if {"mean", "tex_dir"} & set(names):
         return "this is FLAME's texture space: give the model itself (generic_model.pkl or flame2023.pkl)"
-    return f"it needs {', '.join(_SHAPES)} and kintree_table (here: {', '.join(sorted(names)[:_NAMED]) or 'nothing'})"
+    here = ", ".join(name[:_LONGEST_NAME] for name in sorted(names)[:_NAMED]) or "nothing"
+    return f"it needs {', '.join(_SHAPES)} and kintree_table (here: {here})"
 
 
 def _check_shape(path: Path, key: str, array: np.ndarray, wanted: str, sizes: dict[str, int]) -> None:

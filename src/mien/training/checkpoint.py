@@ -129,7 +129,10 @@ def _moments(tensors: dict[str, Tensor], like: Tensor, owners: dict[str, Tensor]
     moments = {}
     for name in dict.fromkeys(key.rpartition(":")[0] for key in tensors):
         first, second = (tensors[f"{name}:{field}"].to(like.device) for field in ("first", "second"))
-        if not first.shape == second.shape == owners[name].shape or tensors[f"{name}:step"].ndim:
+        step = tensors[f"{name}:step"]
+        if not first.shape == second.shape == owners[name].shape or step.ndim:
             raise ValueError(f"the moments of {name} are of another shape")
+        if not (first.dtype == second.dtype == owners[name].dtype and step.dtype in (torch.float32, torch.int64)):
+            raise ValueError(f"the moments of {name} are of another type")
         moments[name] = Moments(first, second, tensors[f"{name}:step"])
     return moments

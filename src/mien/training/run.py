@@ -33,6 +33,8 @@ _AGAIN = "delete the run's training.json and run the same `mien train` again, wh
 ANOTHER_RUN = f"{WAIT}, or give this run another name (--run NAME)"
 """Remedy if another process is training the run."""
 _SUMMARIES, _MOST = ("steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"), 1 << 62
+_LARGEST_OF_CURVES = 1e12
+"""Largest number in a curve that is read. Real ones stay far below, and plots cannot divide their range beyond it."""
 _FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
 """Settings that say how a run is computed, not what it computes. They may change when the run continues."""
 
@@ -189,6 +191,8 @@ def read_curves(run_dir: Path) -> dict[str, np.ndarray]:
     shapes = {curve.shape for curve in curves.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1 or any(curve.dtype != np.float64 for curve in curves.values()):
         raise UserError(f"{path}: holds no curves of one length; {_AGAIN}")
+    if any(np.abs(curve[np.isfinite(curve)]).max(initial=0.0) > _LARGEST_OF_CURVES for curve in curves.values()):
+        raise UserError(f"{path}: holds numbers beyond {_LARGEST_OF_CURVES:g}; {_AGAIN}")
     if not curves.keys() >= CURVES:
         raise UserError(f"{path}: lacks {', '.join(sorted(CURVES - curves.keys()))}; {_AGAIN}")
     return curves
