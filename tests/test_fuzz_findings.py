@@ -22,7 +22,7 @@ from mien.face.checks import check_face_params
 from mien.face.flame import read_flame
 from mien.face.loading import read_landmarks
 from mien.motion import read_blendshape_json, read_live_link_face
-from mien.picture_files import decode_png
+from mien.picture_files import decode_png, png_fits
 from mien.render.validation import NotFiniteError
 from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.training import read_curves, train, trainer
@@ -194,3 +194,13 @@ def test_divergence_names_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     model, sequence = toy_sequence(timesteps=5, size=32)
     with pytest.raises(UserError, match=r"run: training diverged by step 0 \(means\[0\] is nan\)"):
         train([sequence], model, train_toy.CONFIG, train_toy.SETTINGS, tmp_path / "run")
+
+
+def test_a_png_chunk_that_is_longer_than_its_file() -> None:
+    """A decoder takes memory for the length that a chunk announces: 4 GB for a picture of 8x8 pixels."""
+    data = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
+    assert png_fits(data)
+    assert png_fits(data + b"whatever other programs add")
+    place = data.index(b"IDAT") - 4
+    assert not png_fits(data[:place] + b"\xff\xff\xff\xf0" + data[place + 4 :])
+    assert not png_fits(data[:-12])

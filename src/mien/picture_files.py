@@ -117,6 +117,19 @@ class PictureStack:
         return self._array if self._file is None else map_pictures(self._file, self._shape)
 
 
+def png_fits(data: bytes) -> bool:
+    """Whether the chunks of a PNG lie within its bytes. A decoder takes memory for the length that each announces."""
+    position = len(_PNG_SIGNATURE)
+    while position + 12 <= len(data):
+        length, kind = int.from_bytes(data[position : position + 4], "big"), data[position + 4 : position + 8]
+        position += 12 + length
+        if position > len(data):
+            return False
+        if kind == b"IEND":
+            return True
+    return False
+
+
 def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndarray, "..."]:
     """Read a picture that mien wrote inside a workspace, [h, w] or [h, w, 3] (RGB). Its header is checked first.
 
@@ -142,7 +155,7 @@ def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndar
         raise UserError(f"{path}: truncated; {remedy}")
     picture = None
     # Check the width and height in the header first, because the decoder would allocate them.
-    if data[:8] == _PNG_SIGNATURE and data[16:24] == struct.pack(">II", shape[1], shape[0]):
+    if data[:8] == _PNG_SIGNATURE and png_fits(data) and data[16:24] == struct.pack(">II", shape[1], shape[0]):
         with contextlib.suppress(cv2.error):
             flags = cv2.IMREAD_COLOR_RGB if len(shape) == 3 else cv2.IMREAD_GRAYSCALE
             picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

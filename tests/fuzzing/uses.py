@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import tempfile
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from random import Random
@@ -81,7 +82,8 @@ def use_evaluation(root: Path, found: Any, dice: Random) -> None:
 def use_training(root: Path, found: Any, dice: Random) -> None:
     run = root / (RUN if dice.random() < 0.7 else "W/runs/new")
     if dice.random() < 0.7:
-        (run / "training.json").unlink(missing_ok=True)
+        with suppress(IsADirectoryError):
+            (run / "training.json").unlink(missing_ok=True)
     settings = replace(SETTINGS, split="tail")
     settings = settings if run.name == "toy" else replace(settings, steps=2)
     train([read_sequence(root / SEQUENCE)], toy_face_model(), CONFIG, settings, run)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from mien.errors import UserError
+from mien.picture_files import png_fits
 
 LARGEST_PICTURE = 8192 * 8192
 """Largest number of pixels of a picture, which is also the most that mien renders."""
@@ -72,7 +73,7 @@ def announced_size(data: bytes) -> tuple[int, int] | None:
 
 def _png(data: bytes) -> tuple[int, int] | None:
     width, height = struct.unpack_from(">II", data, 16)
-    return (width, height) if data[12:16] == b"IHDR" else None
+    return (width, height) if data[12:16] == b"IHDR" and png_fits(data) else None
 
 
 def _bmp(data: bytes) -> tuple[int, int] | None:

@@ -69,7 +69,7 @@ def read_portable(path: Path) -> PortableAvatar:
             raise UserError(f"{path}: is not what was written; copy it again, or export it again with `mien export`")
         tree = _restored(header["content"], arrays)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise UserError(f"{path}: damaged ({error!r}); export it again with `mien export`") from None
+        raise UserError(f"{path}: damaged ({repr(error)[:200]}); export it again with `mien export`") from None
     with expect_whole(path, "export it again with `mien export`"), jaxtyped("context"):
         avatar: PortableAvatar = decode(PortableAvatar, tree, str(path), "export it again with `mien export`")
     check(avatar, str(path))

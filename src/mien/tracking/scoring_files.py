@@ -95,6 +95,8 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
     masks, digest = PictureStack(shape, path), hashlib.sha256()
     for timestep, camera in np.ndindex(*shape[:2]):
         mask = decode_png(_mask_file(path, timestep, camera), shape[2:], _REMEDY)
+        if mask.any() and not crops[timestep, camera, 2:].all():
+            raise UserError(f"{path / 'crops.safetensors'}: a crop holds nothing of its mask; {_REMEDY}")
         masks.write(timestep, camera, mask)
         digest.update(mask.tobytes())
     digest.update(crops.astype(np.int32).tobytes())

@@ -191,6 +191,8 @@ def read_curves(run_dir: Path) -> dict[str, np.ndarray]:
     shapes = {curve.shape for curve in curves.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1 or any(curve.dtype != np.float64 for curve in curves.values()):
         raise UserError(f"{path}: holds no curves of one length; {_AGAIN}")
+    if not all(np.isfinite(curve).any() for curve in curves.values()):
+        raise UserError(f"{path}: a curve holds no finite number; {_AGAIN}")
     if any(np.abs(curve[np.isfinite(curve)]).max(initial=0.0) > _LARGEST_OF_CURVES for curve in curves.values()):
         raise UserError(f"{path}: holds numbers beyond {_LARGEST_OF_CURVES:g}; {_AGAIN}")
     if not curves.keys() >= CURVES:
