@@ -25,6 +25,7 @@ from mien.motion import read_blendshape_json, read_live_link_face
 from mien.picture_files import decode_png, png_fits
 from mien.render.validation import NotFiniteError
 from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
+from mien.tracking import Scoring, read_scoring, write_scoring
 from mien.training import read_curves, train, trainer
 from mien.training.checkpoint import checkpoint_files, resume
 from toy_scene import toy_sequence
@@ -151,6 +152,21 @@ def test_curves_that_no_plot_can_show(run: Path, tmp_path: Path) -> None:
     write_tensors(tmp_path / "curves.safetensors", curves)
     with pytest.raises(UserError, match=r"curves\.safetensors: holds numbers beyond 1e\+12"):
         read_curves(tmp_path)
+
+
+def test_a_curve_without_a_number(run: Path, tmp_path: Path) -> None:
+    curves = read_tensors(run / "curves.safetensors")
+    curves["loss"].fill_(torch.nan)
+    write_tensors(tmp_path / "curves.safetensors", curves)
+    with pytest.raises(UserError, match="a curve holds no finite number"):
+        read_curves(tmp_path)
+
+
+def test_a_crop_that_misses_its_mask(tmp_path: Path) -> None:
+    masks, crops = np.full((2, 1, 8, 8), 255, np.uint8), np.array([[[0, 0, 8, 8]], [[0, 0, 0, 0]]])
+    write_scoring(tmp_path / "scoring", Scoring(masks, crops))
+    with pytest.raises(UserError, match=r"crops\.safetensors: a crop holds nothing of its mask"):
+        read_scoring(tmp_path / "scoring")
 
 
 def test_moments_of_another_type(run: Path, tmp_path: Path) -> None:
