@@ -1,4 +1,4 @@
-"""How much results differ between processors, emulated by environment: the table of docs/reproducibility.md.
+"""Measure how results differ between processors, emulated by environment: the table of docs/reproducibility.md.
 
     python benchmarks/processors.py --out out/processors                  # some minutes
     python benchmarks/processors.py --out out/processors --settings isa-avx2 old
@@ -74,7 +74,7 @@ def draw(out: Path, size: int, frames: int) -> None:
 
 
 def work(out: Path, name: str, steps: int) -> None:
-    """What one processor makes of it: OUT/NAME.npz and OUT/run-NAME."""
+    """Track, train and render as one processor; write OUT/NAME.npz and OUT/run-NAME."""
     torch.set_num_threads(1)
     capture, truth = read_capture(out / "capture"), read_tracking(out / "truth")
     model = load_face_model(truth.face_model)
@@ -95,7 +95,7 @@ def work(out: Path, name: str, steps: int) -> None:
 
 
 def over_white(capture: Capture) -> np.ndarray:
-    """What was trained on, float32."""
+    """Training pictures, float32."""
     alpha = capture.mattes[:, 0, ..., None] / np.float32(255)
     return alpha * (capture.images[:, 0] / np.float32(255)) + 1 - alpha
 

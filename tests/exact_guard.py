@@ -90,7 +90,7 @@ class _TorchGuard(TorchDispatchMode):
 
 
 def _added(source: Any, out: Any) -> int:
-    """How many elements went into each of the result's."""
+    """Count the elements that went into each element of the result."""
     result = out[0] if isinstance(out, tuple) else out
     return source.numel() // max(result.numel(), 1) if result.numel() != source.numel() else FEW
 
@@ -136,6 +136,6 @@ def _trace_steps(frame: FrameType, event: str, _: Any) -> Callable[..., Any]:
 
 @cache
 def _products_in(code: CodeType) -> frozenset[int]:
-    """Where a function's own code has an `@` between values."""
+    """Find the lines of a function's own code that have an `@` between values."""
     steps = dis.get_instructions(code)
     return frozenset(step.offset for step in steps if step.opname == "BINARY_OP" and step.argrepr in ("@", "@="))

@@ -1,4 +1,4 @@
-"""What tests may need and a machine may lack: the reason they are skipped with, and what to do to have them run."""
+"""Needs of tests that a machine may lack: the reason for a skip, and the remedy that makes the test run."""
 
 import os
 from collections import Counter
@@ -42,7 +42,7 @@ def use_instructions(isa: str) -> None:
 
 
 def skipped_lines(reasons: Iterable[str]) -> list[str]:
-    """What to print of the tests that were skipped: their number by reason, each with its remedy if there is one."""
+    """Count the skipped tests by reason, one line each, with the remedy if there is one."""
     counts = Counter(reason.removeprefix("Skipped: ") for reason in reasons)
     if not counts:
         return ["No test was skipped."]

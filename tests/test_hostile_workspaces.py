@@ -143,7 +143,7 @@ def test_the_workspace_itself_may_be_reached_by_a_link(workspace: Path, tmp_path
 
 
 def test_the_library_follows_no_link_either(workspace: Path, victim: Path) -> None:
-    """Who calls functions has no command that looks at the workspace first."""
+    """Functions check for themselves: no command has checked the workspace for their caller."""
     clip, run = workspace / "sequences/clip", workspace / "runs/toy"
     for place, read in (
         (clip / "capture/cache", lambda: read_capture(clip / "capture")),
@@ -552,7 +552,7 @@ def test_json_is_written_as_it_is_read(tmp_path: Path) -> None:
 def test_kept_pieces_of_a_tracking_that_are_of_no_use(
     workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whole files of the right names that hold something else: tracking starts again, once."""
+    """Tracking starts again, once, if the kept files are whole but hold something else."""
     keep, seen = tmp_path / ".tracking-0123", []
     keep.mkdir()
 

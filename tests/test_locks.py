@@ -450,7 +450,7 @@ def both(cache: Path) -> Iterator[Pair]:
 
 
 def commands_that_write(studio: Studio, folder: Path) -> dict[str, tuple[Path, list[str]]]:
-    """What each writes, and the command."""
+    """Place that a command writes, and the command."""
     root, video, runs = studio.root, str(studio.video), studio.root / "runs"
     clip = studio.root / "sequences" / "clip"
     return {

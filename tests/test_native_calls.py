@@ -57,7 +57,7 @@ EXPECTED = {
 
 @pytest.fixture(scope="module")
 def results() -> dict[str, tuple[str, str]]:
-    """What came of each case, up to one that ends the process."""
+    """Run the cases and return the outcome of each, up to one that ends the process."""
     script = Path(__file__).with_name("native_cases.py")
     environment = {**os.environ, "MIEN_THREADS": "2"}
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, env=environment, timeout=300)

@@ -1,4 +1,4 @@
-"""What is said of skipped tests."""
+"""The summary of skipped tests names reason and remedy."""
 
 from needs import IS_ROOT, NO_INSTRUCTIONS, NO_TEST_DATA, skipped_lines
 

@@ -24,7 +24,7 @@ PLACES = {
 
 
 def run_python(arguments: list[str], environment: dict[str, str], folder: Path | None = None) -> str:
-    """What a new Python prints that has nothing of this process's locale, home and threads."""
+    """Run Python without this process's locale, home and threads; return its output."""
     kept = {name: value for name, value in os.environ.items() if name not in OF_PLACES}
     done = subprocess.run(
         [sys.executable, *arguments], cwd=folder, env={**kept, **environment}, capture_output=True, check=False
@@ -34,7 +34,7 @@ def run_python(arguments: list[str], environment: dict[str, str], folder: Path |
 
 
 def hashes(place: Path) -> dict[str, str]:
-    """Of the files that are the same everywhere; curves hold times."""
+    """Digests of the files that are the same everywhere. Curves hold times, so they are left out."""
     files = [path for kind in ("*.png", "*.safetensors") for path in place.rglob(kind)]
     return {
         str(path.relative_to(place)): hashlib.sha256(path.read_bytes()).hexdigest()

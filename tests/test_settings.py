@@ -37,7 +37,7 @@ Choices = tuple[MethodConfig, TrainSettings]
 
 @pytest.fixture
 def workspace(tmp_path: Path) -> Path:
-    """What `mien train` looks at before any work: a tracked sequence."""
+    """A tracked sequence, which `mien train` checks before any work."""
     for name in ("capture/capture.json", "tracking/tracking.json"):
         path = tmp_path / "w" / "sequences" / "clip" / name
         path.parent.mkdir(parents=True)
@@ -47,7 +47,7 @@ def workspace(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def choices(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """What `mien train` with some options would train with."""
+    """The settings that `mien train` uses with some options."""
     asked: list[Choices] = []
 
     def remember(workspace: object, names: object, run: object, method: MethodConfig, settings: TrainSettings) -> None:

@@ -1,4 +1,4 @@
-"""What reaches a terminal: names that would act are shown instead, and closed outputs end a command quietly."""
+"""Output on a terminal: control characters are shown instead of sent, and a closed output ends a command quietly."""
 
 import io
 import os

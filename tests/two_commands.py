@@ -28,21 +28,21 @@ WORK = {
     "capture": ("mien.capture.from_video", "survey_source"),
     "evaluate": ("mien.evaluation.evaluate", "_evaluate"),
 }
-"""What a command does while it writes: module and function."""
+"""Function, with its module, that a command runs while it writes."""
 _TIMESTEPS, _SIZE = 5, 48
 _PATIENCE_SECONDS = 120
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a command ended."""
+    """Outcome of a command."""
 
     pid: int
     code: int
     told: str
     """Standard error."""
     worked: list[tuple[str, float, float]]
-    """What of `WORK` was done, from when to when on the system's clock."""
+    """Calls of `WORK` that were made, with start and end on the system's clock."""
 
 
 class Pair:

@@ -92,7 +92,7 @@ def no_such_setting(given: str, owner: str, near: Sequence[str], known: Sequence
 
 
 def _in_words(hint: Any) -> str:
-    """What to give for a setting of some type in a json file, in words."""
+    """Describe the values that a setting of some type may have in a json file."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Literal:
         return "one of " + ", ".join(str(part) for part in parts)

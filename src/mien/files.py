@@ -246,7 +246,7 @@ def read_arrays(path: Path, stage: str = _ANY_STAGE) -> dict[str, np.ndarray]:
 def read_safetensors(
     path: Path, load: Callable[[Path], Any], stage: str = _ANY_STAGE, remedy: str | None = None
 ) -> Any:
-    """What `load` reads from a safetensors file; a missing or damaged file is reported in one line.
+    """Read a safetensors file by `load`; a missing or damaged file is reported in one line.
 
     `remedy` replaces "run `stage` again" in the message.
 

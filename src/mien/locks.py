@@ -42,7 +42,9 @@ _REMOVED = frozenset({errno.ENOENT, errno.ESTALE})
 """Errors if the process that released the lock has removed the file and the folders that stayed empty (ESTALE: on
 another machine)."""
 _PATIENCE_SECONDS, _STEP_SECONDS = 0.5, 0.01
-"""How long to try again for a lock without a readable holder. The holder may be a reader that checks the lock for a
+"""Seconds to try again for a lock without a readable holder, and between two tries.
+
+The holder may be a reader that checks the lock for a
 moment, a process that was killed and is about to end, or a process that is about to sign."""
 _NAMELESS = "which has not left its name"
 _PAUSES_SECONDS = (0.0, 0.02, 0.05, 0.1)
@@ -107,7 +109,7 @@ def holder_of(place: Path) -> str | None:
 
 
 def read_beside_writers(read: Callable[[], Result], folders: Sequence[Path], places: Sequence[Path]) -> Result:
-    """What `read` returns. If it fails because a writer replaced files meanwhile, it is called again.
+    """Return the result of `read`. If it fails because a writer replaced files meanwhile, it is called again.
 
     Args:
         read: raises a UserError if files are missing or damaged.

@@ -25,7 +25,7 @@ from fuzzing.workers import run_cases
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked for."""
+    """Options of a campaign."""
 
     seed: int
     cases: int
@@ -52,7 +52,7 @@ class Tally:
     megabytes: float = 0.0
     """Most that one took."""
     missed: list[str] = field(default_factory=list)
-    """What the fuzzers would not have found."""
+    """Faults that the self-check planted and the fuzzers did not find."""
 
     def add(self, result: Result) -> None:
         self.outcomes[result.format, result.outcome] += 1
@@ -188,7 +188,7 @@ def make_material_aside(material: Path) -> None:
 
 
 def _aside(work: Callable[[], Any]) -> Any:
-    """What `work` returns, as json, from a process of its own: this one stays without threads, to be forked safely."""
+    """Run `work` in its own process and return its result as json. This one stays without threads, to fork safely."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:

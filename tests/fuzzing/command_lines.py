@@ -88,7 +88,7 @@ _SURROUNDINGS: dict[str, dict[str, Any]] = {
     "hung up": {"signal": 1},
 }
 AT_START = frozenset({"LANG=C", "ascii", "stdout closed", "stderr closed", "stdin closed", "few open files"})
-"""What Python looks at once, when it starts: only in a process that is started."""
+"""Variables that Python reads only when it starts. They need a new process."""
 
 
 @dataclass
@@ -99,7 +99,7 @@ class Line:
     heavy: bool = False
     surroundings: dict[str, Any] = field(default_factory=dict)
     names: list[str] = field(default_factory=list)
-    """Of the surroundings and of faults in the workspace."""
+    """Names of the surroundings and of the faults in the workspace."""
 
     @property
     def apart(self) -> bool:

@@ -1,4 +1,4 @@
-"""What was read, as something that can be compared and looked through."""
+"""Converts a read object to values that can be compared and searched."""
 
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -59,4 +59,4 @@ _MAY_BE_NAN = frozenset(
         "settings",
     }
 )
-"""Of a face that was not found, or what is only shown."""
+"""Names of values that may be NaN: a face was not found, or the value is only shown."""

@@ -20,12 +20,12 @@ from fuzzing.text_faults import faulty_ply, faulty_table, playlist
 DAMAGE = "damage"
 """Name of the faults that a checksum has to notice."""
 _REPAIRED, _WITHOUT = 0.75, 0.9
-"""Of faulty json, how much has its checksum made right, and how much has that or none at all."""
+"""Shares of faulty json files with a corrected checksum, and with a corrected checksum or none."""
 
 
 @dataclass
 class Place:
-    """Where a case works. `file` changes where it is renamed."""
+    """Folder and file of a case. `file` changes if the file is renamed."""
 
     root: Path
     """The copies."""
@@ -33,7 +33,7 @@ class Place:
     canary: Path
     """Outside: nothing may be written there."""
     port: int
-    """Of this machine: nothing may connect to it."""
+    """Port of this machine to which nothing may connect."""
 
     def filled(self, data: bytes) -> bytes:
         """Bytes with the names of folder and port for their placeholders."""

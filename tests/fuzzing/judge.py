@@ -40,7 +40,7 @@ _INNER = ("site-packages", "fuzzing/", "lib/python")
 
 @dataclass(frozen=True)
 class Bench:
-    """Where a worker's cases live."""
+    """Folders in which a worker runs its cases."""
 
     folder: Path
     material: Path
@@ -58,7 +58,7 @@ class Bench:
 
     @property
     def told(self) -> Path:
-        """What the case prints."""
+        """File of what the case prints."""
         return self.folder / "told.txt"
 
     def patience(self) -> float:
@@ -80,19 +80,19 @@ class Bench:
 
 @dataclass
 class Result:
-    """What became of a case."""
+    """Verdict on a case."""
 
     case: str
     """TARGET:SEED:NUMBER."""
     format: str
     kind: str = ""
-    """Of the fault."""
+    """Kind of the fault."""
     outcome: str = ""
     """refused, accepted, or finding."""
     findings: list[str] = field(default_factory=list)
     message: str = ""
     cause: str = ""
-    """What findings of the same origin share."""
+    """Name of the origin, which findings of the same origin share."""
     traceback: list[str] = field(default_factory=list)
     seconds: float = 0.0
     megabytes: float = 0.0

@@ -148,7 +148,7 @@ def copy_of(material: Path, parts: tuple[str, ...], root: Path) -> None:
 
 
 def summary(material: Path) -> str:
-    """How many files there are of each ending."""
+    """Count the files of each ending."""
     endings = [path.suffix or path.name for path in material.rglob("*") if path.is_file()]
     return json.dumps({ending: endings.count(ending) for ending in sorted(set(endings))})
 

@@ -307,7 +307,7 @@ def main() -> int:
 
 
 def report(results: collections.Counter[tuple[str, str]]) -> None:
-    """How many calls each function had, and how many it took."""
+    """Print the number of calls of each function, and of those that it accepted."""
     for name in sorted({name for name, _ in results}):
         own = {result: count for (of, result), count in results.items() if of == name}
         print(f"{name:28} {sum(own.values()):6} calls  {own.get('accepted', 0):6} accepted")

@@ -1,4 +1,4 @@
-"""How each kind of file is read: from the folder with the copies, and the faulty file."""
+"""Readers of each kind of file: from the folder with the copies, and the faulty file."""
 
 import itertools
 import os

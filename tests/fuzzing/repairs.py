@@ -18,7 +18,7 @@ import safetensors.numpy
 from fuzzing.tensor_faults import joined, split
 
 _UNSOUND = (Exception,)
-"""What a file may be too faulty for: it stays as it is then."""
+"""Errors of a file that is too faulty to be repaired. It stays as it is."""
 _GEOMETRY = (
     "template", "faces", "identity_basis", "expression_basis", "joint_template", "joint_identity_basis",
     "joint_rotation_basis", "joint_translation_basis", "skinning_weights", "pose_basis",

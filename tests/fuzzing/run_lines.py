@@ -26,7 +26,7 @@ LINES, LIGHT, HEAVY = "command lines", "line", "heavy line"
 FINE = frozenset({0, 2, 130, 141, 143})
 TESTS = str(Path(__file__).parent.parent)
 APART = 0.08
-"""Of the lines, how many are started, not forked, whatever they need."""
+"""Share of the lines that run in a new process instead of a fork, whatever they need."""
 _SECONDS = 60.0
 """A busy machine needs as long for a command on small input; those that take longer are told to stop then."""
 _TO_END = 20.0
@@ -197,7 +197,7 @@ def _faults_of_end(code: int | None, told: str, line: Line) -> Iterator[str]:
 
 
 def _cause(code: int | None, told: str, line: Line) -> str:
-    """What findings of the same origin share: where the traceback ends, or else the command and its surroundings."""
+    """Name the origin of a finding: the end of its traceback, or else the command and its surroundings."""
     text = told
     for log in re.findall(r"the traceback is in (\S+);", told):
         with contextlib.suppress(OSError):

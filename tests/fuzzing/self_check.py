@@ -34,7 +34,7 @@ _LIMITS = {"seconds": 1.5, "memory": 64 << 20}
 
 
 def failures(folder: Path, material: Path) -> Iterator[str]:
-    """What the fuzzers miss; nothing where all is well."""
+    """Yield a line for everything that the fuzzers would miss. None is yielded if all is well."""
     for expected, read in _WRONG.items():
         name = f"wrong: {expected}"
         TARGETS[name] = Target(name, "self", "head.ply", ("head.ply",), read, fault=_no_fault)

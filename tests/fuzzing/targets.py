@@ -1,4 +1,4 @@
-"""What is fuzzed: which file is made faulty, how it is read, and what is done with what was read."""
+"""Targets of the fuzzer: the file that is made faulty, its reader, and the use of what was read."""
 
 import math
 from collections.abc import Callable
@@ -27,14 +27,14 @@ class Target:
     files: str
     """Pattern below the material."""
     parts: tuple[str, ...]
-    """Of the material, that reading takes."""
+    """Parts of the material that the reader needs."""
     read: Read
     use: Use = uses.nothing
     exact: bool = False
     """Whether bytes that were damaged without repair have to be refused, or to give the very content."""
     fault: Callable[[Place, Random], str] = faults.faulty_file
     weight: float = 1.0
-    """How often, beside the others."""
+    """Relative frequency among the targets."""
     named: bool = True
     """Whether the message has to name a file of the folder."""
 

@@ -113,7 +113,7 @@ def _child(cases: list[str], bench: Bench, listener: socket.socket, writing: int
 
 
 class _Expected:
-    """What each file holds undamaged, read once a process."""
+    """Content of each undamaged file, read once per process."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench, self._known = bench, {}

@@ -25,7 +25,7 @@ _CALM_SHARE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """What `Avatar.pose` returns."""
+    """Gaussians of some timesteps, as `Avatar.pose` returns them."""
 
     gaussians: Gaussians
     aux: Mapping[str, Tensor]
@@ -41,7 +41,7 @@ class ParameterGroup:
     """Leaves of the autograd graph, by name."""
     rate: Rate
     moments: dict[str, Moments] | None = None
-    """Where the optimiser keeps its state, by the names of `tensors`. If it is None, the optimiser keeps the state
+    """State of the optimiser, by the names of `tensors`. If it is None, the optimiser keeps the state
     itself, by group and name."""
 
 

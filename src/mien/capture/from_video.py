@@ -38,7 +38,7 @@ _STATE, _CHUNKS = "state.json", "chunks"
 
 @dataclass(frozen=True)
 class _Job:
-    """What the user asked for."""
+    """Request of the user: a source, a name and settings."""
 
     frames: FrameSource
     settings: CaptureSettings

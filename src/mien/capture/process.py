@@ -69,7 +69,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """What the user gave besides the source video."""
+    """Clean plate, mattes and landmarks that the user gave with the source video."""
 
     plate: UInt8[np.ndarray, "h w 3"] | None = None
     mattes: GivenMattes | None = None

@@ -29,7 +29,7 @@ _DEFAULT_FPS = 25.0
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video file states about itself. Only decoding shows the truth."""
+    """Facts that a video file states about itself. Only decoding shows whether they are true."""
 
     fps: float
     """Average frames per second."""

@@ -41,7 +41,7 @@ class TrainOptions:
     preset: PresetName = "standard"
     """draft takes minutes; standard gives the figures of docs/results.md."""
     split: Split = "blocks"
-    """What is held out for scoring: every fifth block of 10 frames, the last 20 % (tail), or nothing (none)."""
+    """Frames held out for scoring: every fifth block of 10 frames, the last 20 % (tail), or nothing (none)."""
     background: Literal["white", "random"] = "white"
     """Background of the training pictures. random suits transparent renderings (no white in skin and outlines) and
     costs 0.1 to 0.4 dB."""

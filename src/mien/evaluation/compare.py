@@ -139,7 +139,7 @@ def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
 
 
 def _ground(entry: Mapping[str, Any]) -> str:
-    """What two runs must have in common to be compared: the scored frames, pictures and masks."""
+    """Two runs can be compared if they share these: the scored frames, pictures and masks."""
     frames = entry["per_frame"]
     keys = ("sequence", "timestep", "camera_id")
     return repr([entry.get("scored_on"), entry.get("pixels"), *(frames[key] for key in keys)])

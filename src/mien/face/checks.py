@@ -20,7 +20,7 @@ _AXES = {
 """Axes of the tensors of `FaceModel`."""
 _OPTIONAL = ("pose_basis", "expression_sigmas")
 _INDICES = {"faces": "v", "uv_faces": "u", "face_regions": "r"}
-"""What the values of these tensors count."""
+"""Axis into which the values of each of these tensors are indices."""
 
 
 def check_face_model(model: FaceModel, where: str, remedy: str) -> None:

@@ -33,7 +33,7 @@ _SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
 ADDED_RECIPE = 1
 """Recipe version, raised whenever adding a user's file gives a different result."""
 _PLACE_AGAIN = "delete it and add the face model again (`mien face-models --add FILE`)"
-"""What to do about landmarks that cannot be read."""
+"""Remedy for landmarks that cannot be read."""
 _LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
 
 

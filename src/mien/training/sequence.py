@@ -30,7 +30,7 @@ class Sequence:
     scoring: UInt8[np.ndarray, "t c h w"]
     """Opacity of the pixels that count (the matte above the neck line). 255 is opaque."""
     folder: Path | None = None
-    """Where it was read from, for messages."""
+    """Folder that it was read from, for messages."""
 
     def usable(self) -> np.ndarray:
         """Bool [t, c]: the face was tracked, and was found in this picture, or the cameras are calibrated.

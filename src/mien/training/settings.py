@@ -19,7 +19,7 @@ class TrainSettings:
     steps: Annotated[int, Range(1, 1_000_000_000)] = 15_000
     """Number of optimiser steps, one frame each. All schedules stretch with it."""
     split: Split = "blocks"
-    """What is held out: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none)."""
+    """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none)."""
     background: Literal["white", "random"] = "white"
     """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
     which can show as white needles in new poses. It costs 0.1 to 0.4 dB compared with white."""
