@@ -9,13 +9,10 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.face import FaceModel, load_face_model
 from mien.render.mesh import rasterize_mesh
-from mien.tracking.landmark_model import LandmarkModel, reduce_face_model
-from mien.tracking.landmark_term import unknown_subject
-from mien.tracking.parameters import layout_of
+from mien.tracking.fitting import Fit, SequenceFit, Shot, batch_of, layout_of, shot_of
+from mien.tracking.landmarks import LandmarkModel, reduce_face_model
+from mien.tracking.landmarks.term import unknown_subject
 from mien.tracking.settings import TrackingSettings
-from mien.tracking.shot import Shot, shot_of
-from mien.tracking.stages import Fit, SequenceFit
-from mien.tracking.views import batch_of
 from tracking_case import capture_of
 
 SKIN, WHITE, IRIS = (0.72, 0.5, 0.42), (0.9, 0.88, 0.86), (0.2, 0.22, 0.3)

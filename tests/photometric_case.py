@@ -12,7 +12,7 @@ from mien.capture import Capture
 from mien.face import FaceModel, FaceParams
 from mien.render.mesh import Texture, render_mesh
 from mien.tracking import Tracking
-from mien.tracking.parameters import layout_of
+from mien.tracking.fitting import layout_of
 from small_face_model import make_small_face_model
 from tracking_case import capture_of
 

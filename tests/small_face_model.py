@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from mien.face import FaceModel, Landmarks
-from mien.tracking.landmark_groups import LEFT_IRIS, RIGHT_IRIS
+from mien.tracking.landmarks import LEFT_IRIS, RIGHT_IRIS
 
 
 def make_small_face_model(identities: int = 6, expressions: int = 8, seed: int = 0) -> FaceModel:

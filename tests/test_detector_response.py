@@ -10,14 +10,12 @@ import torch
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.synthetic.detector_calibration import Sightings, fit_response
-from mien.tracking.detector_response import DetectorResponse, read_response, unknown_response, write_response
-from mien.tracking.landmark_model import reduce_face_model
-from mien.tracking.landmark_term import unknown_subject
-from mien.tracking.parameters import layout_of
+from mien.tracking.fitting import CameraBatch, Fit, SequenceFit, Views, batch_of, layout_of
+from mien.tracking.landmarks import DetectorResponse, all_landmarks, read_response, reduce_face_model, write_response
+from mien.tracking.landmarks.detector_response import unknown_response
+from mien.tracking.landmarks.shared_fit import fit_shared
+from mien.tracking.landmarks.term import unknown_subject
 from mien.tracking.settings import TrackingSettings
-from mien.tracking.shared_fit import fit_shared
-from mien.tracking.stages import Fit, SequenceFit, all_landmarks
-from mien.tracking.views import CameraBatch, Views, batch_of
 from small_face_model import make_small_face_model
 from tracking_case import still_camera
 
@@ -48,7 +46,7 @@ def test_a_file_is_read_as_it_was_written(tmp_path, monkeypatch):
     response = _some_response(len(model.expression_names))
     path = tmp_path / "small_detector.npz"
     write_response(path, model, response, 5)
-    monkeypatch.setattr("mien.tracking.detector_response.response_path", lambda name: path)
+    monkeypatch.setattr("mien.tracking.landmarks.detector_response.response_path", lambda name: path)
     read = read_response(model, 0.003)
     for name in ("mean", "by_turn", "by_expression", "by_person"):
         torch.testing.assert_close(getattr(read, name), getattr(response, name), atol=3e-6, rtol=0)

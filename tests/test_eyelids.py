@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from blink_case import SKIN, BlinkCase
-from mien.tracking.eyelid_eyes import eyes_of
-from mien.tracking.eyelids import place_lids, weighed
-from mien.tracking.parameters import layout_of
-from mien.tracking.views import CameraBatch, Views
+from mien.tracking.eyelids import place_lids
+from mien.tracking.eyelids.eyes import eyes_of
+from mien.tracking.eyelids.placing import weighed
+from mien.tracking.fitting import CameraBatch, Views, layout_of
 from small_face_model import make_small_face_model
 
 TIMESTEPS = 24

@@ -9,13 +9,10 @@ import torch
 from mien.camera import camera_from_fov
 from mien.face import load_face_model, loading
 from mien.rotation import matrix_from_axis_angle, rigid_transform
-from mien.tracking.landmark_embedding import (
-    EmbeddingSettings,
-    Views,
-    _best_point,
-    embed_landmarks,
-)
-from mien.tracking.landmark_groups import IBUG68, LEFT_EYELIDS, RIGHT_EYELIDS
+from mien.tracking.fitting import Views
+from mien.tracking.landmarks import LEFT_EYELIDS, RIGHT_EYELIDS, EmbeddingSettings, embed_landmarks
+from mien.tracking.landmarks.embedding import _best_point
+from mien.tracking.landmarks.groups import IBUG68
 from small_face_model import make_small_face_model
 
 

@@ -3,8 +3,8 @@
 import torch
 
 from mien.camera import look_at
-from mien.tracking.facing import trust_of
-from mien.tracking.views import CameraBatch, Views
+from mien.tracking.fitting import CameraBatch, Views
+from mien.tracking.landmarks.term import trust_of
 from tracking_case import still_camera
 
 HEAD = torch.tensor([0.0, 0.0, -0.9], dtype=torch.float64)

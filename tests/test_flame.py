@@ -16,9 +16,9 @@ from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.flame import flame_face_model, read_flame
 from mien.face.inert_pickle import read_inert_pickle
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking.parameters import layout_of
-from mien.tracking.photometric_texture import texture_space
-from mien.tracking.regions import with_regions_by_landmarks
+from mien.tracking.fitting import layout_of
+from mien.tracking.landmarks import with_regions_by_landmarks
+from mien.tracking.pixels import texture_space
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import torch
 
-from mien.tracking.flicker import without_flicker
+from mien.tracking.fitting.shot import without_flicker
 
 
 def _still(timesteps: int = 20, noise: float = 0.0) -> torch.Tensor:

@@ -15,8 +15,9 @@ from capture_helpers import random_capture
 from mien import picture_files
 from mien.capture import read_capture, write_capture
 from mien.picture_files import PictureStack, map_pictures
-from mien.tracking import landmark_term, make_scoring, read_scoring, solver, stages, track, write_scoring
-from mien.tracking.landmark_model import LandmarkModel
+from mien.tracking import make_scoring, read_scoring, track, write_scoring
+from mien.tracking.fitting import solver
+from mien.tracking.landmarks import LandmarkModel, stages, term
 from needs import NO_PROC
 from small_face_model import make_small_face_model
 from test_tracking_scoring import _tracking, _upright
@@ -126,8 +127,8 @@ def test_tracking_looks_at_a_bounded_number_of_frames_at_once(monkeypatch: pytes
             return original(self, state, *arguments, **options)
 
         monkeypatch.setattr(LandmarkModel, name, watched)
-    monkeypatch.setattr(landmark_term, "_PROJECTED", 16)
-    monkeypatch.setattr(landmark_term, "_CHUNK", 14)
+    monkeypatch.setattr(term, "_PROJECTED", 16)
+    monkeypatch.setattr(term, "_CHUNK", 14)
     monkeypatch.setattr(stages, "_FRAMES_AT_ONCE", 18)
     monkeypatch.setattr(solver, "_SEGMENT", 5)
     found = track(case.capture, model)

@@ -7,12 +7,10 @@ import pytest
 import torch
 
 from mien.tracking import TrackingSettings, track
-from mien.tracking.landmark_term import Subject
-from mien.tracking.outline_term import OutlineTerm, edge_distances, outline_term
-from mien.tracking.parameters import layout_of
-from mien.tracking.photometric_shared import moved_like_keyframes
-from mien.tracking.photometric_surface import surface_model
-from mien.tracking.views import Views, batch_of
+from mien.tracking.fitting import Subject, Views, batch_of, layout_of
+from mien.tracking.pixels.outline import OutlineTerm, edge_distances, outline_term
+from mien.tracking.pixels.shared import moved_like_keyframes
+from mien.tracking.pixels.surface import surface_model
 from photometric_case import SIZE, PhotometricCase, make_photometric_case
 
 

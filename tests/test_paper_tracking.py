@@ -7,18 +7,16 @@ from typing import Literal
 import pytest
 import torch
 
-from mien.tracking import Tracking, TrackingSettings, paper_descent, resume, track, track_subject
-from mien.tracking.landmark_model import reduce_face_model
-from mien.tracking.landmark_term import unknown_subject
-from mien.tracking.paper_adam import Moments
-from mien.tracking.paper_descent import Descent
-from mien.tracking.paper_scene import first_state, paper_scene
-from mien.tracking.paper_settings import PaperSettings
-from mien.tracking.paper_terms import landmark_terms, prior_term, show
-from mien.tracking.parameters import layout_of
-from mien.tracking.resume import Keeper
-from mien.tracking.shot import lenses_of, shot_of
-from mien.tracking.stages import Fit, SequenceFit, all_landmarks, quiet_landmarks, widen
+from mien.tracking import Tracking, TrackingSettings, track, track_subject
+from mien.tracking.descent import epochs
+from mien.tracking.descent.adam import Moments
+from mien.tracking.descent.epochs import Descent
+from mien.tracking.descent.scene import first_state, paper_scene
+from mien.tracking.descent.terms import landmark_terms, prior_term, show
+from mien.tracking.fitting import Fit, Keeper, SequenceFit, layout_of, lenses_of, resume, shot_of, widen
+from mien.tracking.landmarks import all_landmarks, quiet_landmarks, reduce_face_model
+from mien.tracking.landmarks.term import unknown_subject
+from mien.tracking.settings import PaperSettings
 from photometric_case import FOCAL, PhotometricCase, assert_alike, make_photometric_case
 from test_photometric_tracking import turn_error, wobble
 
@@ -60,7 +58,7 @@ def test_it_says_how_it_was_made(by_descent):
 
 
 def test_the_same_with_any_number_of_threads(case, monkeypatch):
-    monkeypatch.setattr(paper_descent, "_BATCHES", 2)  # so that a batch has several frames
+    monkeypatch.setattr(epochs, "_BATCHES", 2)  # so that a batch has several frames
     short, runs = replace(QUICK, epochs=1), []
     for threads in ("1", "2"):
         monkeypatch.setenv("MIEN_THREADS", threads)

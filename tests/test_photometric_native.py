@@ -11,17 +11,10 @@ from mien.camera import Camera
 from mien.render.mesh import Texture as MeshTexture
 from mien.render.mesh import interpolate, rasterize_mesh, render_mesh, sample_texture, shade, vertex_normals
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking.photometric_pictures import Picture
-from mien.tracking.photometric_surface import PosedSurface
-from mien.tracking.photometric_texture import (
-    Appearance,
-    Sighting,
-    TextureSpace,
-    estimate_appearance,
-    even_light,
-    texture_space,
-    unknown_appearance,
-)
+from mien.tracking.pixels import Appearance, even_light, texture_space
+from mien.tracking.pixels.pictures import Picture
+from mien.tracking.pixels.surface import PosedSurface
+from mien.tracking.pixels.texture import Sighting, TextureSpace, estimate_appearance, unknown_appearance
 from photometric_case import make_textured_model, smooth_noise
 
 SIZE, SIGMA, OUTLIER, LEAST_COSINE = 72, 0.07, 2.0, 0.25

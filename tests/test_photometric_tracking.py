@@ -8,9 +8,9 @@ import torch
 
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import Tracking, TrackingSettings, residual_report, track, track_subject
-from mien.tracking.parameters import layout_of
-from mien.tracking.photometric_settings import PhotometricSettings
-from mien.tracking.photometric_surface import surface_model
+from mien.tracking.fitting import layout_of
+from mien.tracking.pixels.surface import surface_model
+from mien.tracking.settings import PhotometricSettings
 from photometric_case import FOCAL, PhotometricCase, make_photometric_case, make_textured_model
 from tracking_case import make_tracking_case
 

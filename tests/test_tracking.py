@@ -10,10 +10,9 @@ from mien.errors import UserError
 from mien.face import load_face_model
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import TrackingSettings, residual_report, track
-from mien.tracking.landmark_groups import landmark_weights
-from mien.tracking.paper_settings import PaperSettings
-from mien.tracking.photometric_settings import PhotometricSettings
-from mien.tracking.shot import initial_camera
+from mien.tracking.fitting.shot import initial_camera
+from mien.tracking.landmarks.groups import landmark_weights
+from mien.tracking.settings import PaperSettings, PhotometricSettings
 from small_face_model import make_small_face_model
 from tracking_case import FOCAL, capture_of, make_tracking_case
 

@@ -6,13 +6,18 @@ import pytest
 import torch
 
 from mien.tracking import SmoothnessSettings
-from mien.tracking import landmark_groups as groups
-from mien.tracking.interpolation import fill_gaps
-from mien.tracking.landmark_model import reduce_face_model
-from mien.tracking.parameters import layout_of
-from mien.tracking.solver import Box, NormalEquations, Smoothness, minimize_frames, solve_chain
-from mien.tracking.stages import smoothness_of
-from mien.tracking.views import batch_of
+from mien.tracking.fitting import (
+    Bounds,
+    NormalEquations,
+    Smoothness,
+    batch_of,
+    layout_of,
+    minimize_frames,
+    smoothness_of,
+    solve_chain,
+)
+from mien.tracking.landmarks import groups, reduce_face_model
+from mien.tracking.landmarks.outcome import fill_gaps
 from small_face_model import make_small_face_model
 from tracking_case import still_camera
 
@@ -95,7 +100,7 @@ def test_bounded_least_squares():
     def equations(state):
         return NormalEquations(cost(state), (state - target) @ metric, metric.expand(2, 2, 2))
 
-    box = Box(torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64))
+    box = Bounds(torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64))
     found = minimize_frames(equations, cost, torch.full((2, 2), 0.5, dtype=torch.float64), box, 30)
     assert found[0, 0] == 1
     assert found[1, 0] == 0

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from mien.capture.video import probe_video
+from mien.parallel import stream_in_threads
 from mien.render.mesh import shade
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import (
@@ -19,15 +20,13 @@ from mien.tracking import (
     write_overlay,
     write_residual_report,
 )
-from mien.tracking.contact_sheet import contact_sheet, sheet_frames, worst_of_runs
-from mien.tracking.heat import heat_map
-from mien.tracking.model_pictures import looks_in_world, model_pictures, turn_light, window_of
-from mien.tracking.overlay import OverlayPainter, overlay_stride
-from mien.tracking.paper_settings import PaperSettings
-from mien.tracking.photometric_settings import PhotometricSettings
-from mien.tracking.photometric_texture import Appearance, even_light
-from mien.tracking.photometric_threads import stream_in_threads
-from mien.tracking.report_page import findings, named
+from mien.tracking.pixels import Appearance, even_light, model_pictures, window_of
+from mien.tracking.pixels.outcome import looks_in_world, turn_light
+from mien.tracking.report.contact_sheet import contact_sheet, sheet_frames, worst_of_runs
+from mien.tracking.report.heat import heat_map
+from mien.tracking.report.overlay import OverlayPainter, overlay_stride
+from mien.tracking.report.page import findings, named
+from mien.tracking.settings import PaperSettings, PhotometricSettings
 from photometric_case import FOCAL, SIZE, PhotometricCase, make_photometric_case, smooth_noise
 
 FAST = TrackingSettings(focal=FOCAL, photometric=PhotometricSettings(texture_size=128, keyframes=8, shared_steps=1))

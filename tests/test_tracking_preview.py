@@ -11,13 +11,11 @@ import torch
 
 from mien.capture import Capture
 from mien.face import FaceModel
-from mien.tracking import TrackingSettings, preview, track_subject
-from mien.tracking.landmark_model import reduce_face_model
-from mien.tracking.paper_settings import PaperSettings
-from mien.tracking.parameters import layout_of
-from mien.tracking.photometric_settings import PhotometricSettings
-from mien.tracking.preview import Preview
-from mien.tracking.shot import shot_of
+from mien.tracking import TrackingSettings, track_subject
+from mien.tracking.fitting import layout_of, shot_of
+from mien.tracking.landmarks import reduce_face_model
+from mien.tracking.report import Preview, preview
+from mien.tracking.settings import PaperSettings, PhotometricSettings
 from photometric_case import FOCAL, assert_alike, make_photometric_case
 
 FAST = TrackingSettings(focal=FOCAL, photometric=PhotometricSettings(texture_size=64, keyframes=4, shared_steps=1))

@@ -10,9 +10,11 @@ import torch
 
 from mien.capture import write_capture
 from mien.cli import main
-from mien.tracking import Tracking, TrackingSettings, photometric, stages, track_subject
-from mien.tracking.photometric_settings import PhotometricSettings
-from mien.tracking.resume import Keeper
+from mien.tracking import Tracking, TrackingSettings, track_subject
+from mien.tracking.fitting import Keeper
+from mien.tracking.landmarks import stages
+from mien.tracking.pixels import refine
+from mien.tracking.settings import PhotometricSettings
 from photometric_case import PhotometricCase, assert_alike, make_photometric_case, make_textured_model
 
 FAST = TrackingSettings(photometric=PhotometricSettings(texture_size=128, keyframes=4, shared_steps=1))
@@ -27,14 +29,14 @@ def case() -> PhotometricCase:
 @pytest.fixture(autouse=True)
 def few_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stages, "_FRAMES_AT_ONCE", 5)
-    monkeypatch.setattr(photometric, "_FRAMES_AT_ONCE", 3)
+    monkeypatch.setattr(refine, "_FRAMES_AT_ONCE", 3)
 
 
 @pytest.fixture(scope="module")
 def expected(case: PhotometricCase) -> Tracking:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(stages, "_FRAMES_AT_ONCE", 5)
-        patched.setattr(photometric, "_FRAMES_AT_ONCE", 3)
+        patched.setattr(refine, "_FRAMES_AT_ONCE", 3)
         return track_subject([case.capture], case.model, FAST)[0]
 
 
@@ -75,7 +77,7 @@ SLOWLY = """
 import sys, time
 import mien.commands.stages.tracking as stage
 from mien.cli import main
-from mien.tracking.resume import Keeper
+from mien.tracking.fitting import Keeper
 from photometric_case import make_textured_model
 
 def slowly(self, name, tensors):

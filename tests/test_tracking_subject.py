@@ -12,7 +12,7 @@ from mien.face import FaceModel, FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle, rigid_transform
 from mien.tracking import Tracking, TrackingSettings, read_tracking, residual_report, track, track_subject
 from mien.tracking import write_tracking as write
-from mien.tracking.overlay import frontal_camera
+from mien.tracking.report.overlay import frontal_camera
 from small_face_model import make_small_face_model
 from tracking_case import FOCAL, FPS, SIZE, capture_of, make_tracking_case, still_camera
 

@@ -6,12 +6,9 @@ import pytest
 import torch
 
 from mien.tracking import TrackingSettings
-from mien.tracking.landmark_model import reduce_face_model
-from mien.tracking.landmark_term import LandmarkTerm, unknown_subject
-from mien.tracking.parameters import layout_of
-from mien.tracking.shot import shot_of
-from mien.tracking.stages import SequenceFit, all_landmarks
-from mien.tracking.turn_habits import without_turn_habits
+from mien.tracking.fitting import SequenceFit, layout_of, shot_of
+from mien.tracking.landmarks import LandmarkTerm, all_landmarks, reduce_face_model, without_turn_habits
+from mien.tracking.landmarks.term import unknown_subject
 from tracking_case import make_tracking_case
 
 PLAIN, FAINT = 6, 7

@@ -20,7 +20,7 @@ from mien.face.cache import cache_folder
 from mien.runtime import load as load_portable
 from mien.synthetic import SyntheticRecipe, synthesize
 from mien.tracking import TrackingSettings, read_tracking, track
-from mien.tracking.paper_settings import PaperSettings
+from mien.tracking.settings import PaperSettings
 from tracking_case import capture_of, still_camera
 
 

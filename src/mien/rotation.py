@@ -149,3 +149,15 @@ def invert_rigid(transforms: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]
     rotation = transforms[..., :3, :3]
     x, y, z = (rotation * transforms[..., :3, 3:]).unbind(-2)
     return rigid_transform(rotation.transpose(-1, -2), -((x + y) + z))
+
+
+def left_jacobian(axis_angle: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
+    """Left Jacobian of SO(3): exp(a + d) = exp(J d) exp(a) to first order."""
+    squared = (axis_angle * axis_angle).sum(-1)[:, None, None]
+    small = squared < _SMALL_ANGLE_SQUARED
+    safe = torch.where(small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    first = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
+    second = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
+    cross = skew(axis_angle)
+    return torch.eye(3).to(axis_angle) + first * cross + second * (cross @ cross)

@@ -6,8 +6,8 @@ from pathlib import Path
 import torch
 
 from mien.tracking import TrackingSettings, track_subject
-from mien.tracking.photometric_settings import PhotometricSettings
-from mien.tracking.resume import Keeper
+from mien.tracking.fitting import Keeper
+from mien.tracking.settings import PhotometricSettings
 from photometric_case import make_photometric_case, make_textured_model
 
 SETTINGS = TrackingSettings(photometric=PhotometricSettings(texture_size=128, keyframes=2, shared_steps=1))

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.synthetic import Truth
 from mien.tracking import Tracking, frontal_camera
-from mien.tracking.landmark_groups import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
+from mien.tracking.landmarks import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
 
 LIDS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS)
 """MediaPipe's pairs of landmarks across the eyes' openings (`LIDS`), and of the eyes' corners (`_CORNERS`)."""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
-from mien.tracking.landmark_groups import BROWS, EYE_CORNERS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
+from mien.tracking.landmarks import BROWS, EYE_CORNERS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 
 MEASURED_BY = "MediaPipe face mesh, 478 points in 3D, each picture by itself"
 _RIGID = np.array(NOSE + EYE_CORNERS)

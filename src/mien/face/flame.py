@@ -25,7 +25,7 @@ from mien.face.npz import read_npz
 
 JOINTS = ("head", "neck", "jaw", "left_eye", "right_eye")
 REGIONS = ("skin", "neck", "eyes", "irises")
-"""Regions that follow from skinning weights. `mien.tracking.regions` finds more, by landmarks."""
+"""Regions that follow from skinning weights. `mien.tracking.landmarks` finds more, by landmarks."""
 
 _CHAIN = (-1, 0, 1, 1, 1)
 """Parents in FLAME's chain: the root, the neck on it, jaw and eyes on the neck."""

@@ -185,7 +185,7 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
         if content["topology_hash"] != model.topology_hash:
             raise UserError(
                 f"{file}: the landmarks of {name} were made for another mesh: run "
-                f"python -m mien.tracking.landmark_embedding {name}"
+                f"python -m mien.tracking.landmarks {name}"
             )
         return {str(key): _landmarks(marks, model) for key, marks in content["landmarks"].items()}
 

@@ -3,8 +3,8 @@
 Run as `python -m mien.synthetic.detector_calibration anny`.
 
 It draws synthetic people with skin, hair, glasses and beards through many kinds of lenses, runs the detector on them,
-and fits the model of `mien.tracking.detector_response`. The result ships with mien (src/mien/tracking/data). Run this
-only after a change of a face model, its landmarks or the painter: 200 people take half an hour.
+and fits the model of `mien.tracking.landmarks.DetectorResponse`. The result ships with mien (src/mien/tracking/data).
+Run this only after a change of a face model, its landmarks or the painter: 200 people take half an hour.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from mien.progress import say, track_progress
 from mien.rotation import matrix_from_axis_angle
 from mien.synthetic.recipe import Segment, SyntheticRecipe
 from mien.synthetic.scene import SyntheticScene
-from mien.tracking.detector_response import DetectorResponse, response_path, write_response
+from mien.tracking.landmarks import DetectorResponse, response_path, write_response
 
 _FIRST_SEED = 500
 """First seed, far from those of the reference captures, so that nobody is both calibrated on and measured on."""

@@ -6,32 +6,60 @@ from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mien.tracking.files import check_tracking_of, read_tracking, write_tracking
-    from mien.tracking.overlay import draw_overlay, draw_overlay_grid, frontal_camera, overlay_stride, write_overlay
+    from mien.tracking.fitting import has_enough_faces
     from mien.tracking.pipeline import track, track_subject
-    from mien.tracking.report import residual_report, write_residual_report
-    from mien.tracking.scoring import Scoring, make_scoring
-    from mien.tracking.scoring_files import read_scoring, read_scoring_hash, scoring_exists, write_scoring
-    from mien.tracking.settings import SmoothnessSettings, TrackingSettings
-    from mien.tracking.shot import has_enough_faces
+    from mien.tracking.report import (
+        draw_overlay,
+        draw_overlay_grid,
+        frontal_camera,
+        overlay_stride,
+        residual_report,
+        write_overlay,
+        write_residual_report,
+    )
+    from mien.tracking.scoring import (
+        Scoring,
+        make_scoring,
+        read_scoring,
+        read_scoring_hash,
+        scoring_exists,
+        write_scoring,
+    )
+    from mien.tracking.settings import PaperSettings, PhotometricSettings, SmoothnessSettings, TrackingSettings
     from mien.tracking.tracking import Looks, Tracking
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
+            "fitting": ["has_enough_faces"],
             "files": ["check_tracking_of", "read_tracking", "write_tracking"],
-            "overlay": ["draw_overlay", "draw_overlay_grid", "frontal_camera", "overlay_stride", "write_overlay"],
             "pipeline": ["track", "track_subject"],
-            "report": ["residual_report", "write_residual_report"],
-            "scoring": ["Scoring", "make_scoring"],
-            "scoring_files": ["read_scoring", "read_scoring_hash", "scoring_exists", "write_scoring"],
-            "settings": ["SmoothnessSettings", "TrackingSettings"],
-            "shot": ["has_enough_faces"],
+            "report": [
+                "draw_overlay",
+                "draw_overlay_grid",
+                "frontal_camera",
+                "overlay_stride",
+                "residual_report",
+                "write_overlay",
+                "write_residual_report",
+            ],
+            "scoring": [
+                "Scoring",
+                "make_scoring",
+                "read_scoring",
+                "read_scoring_hash",
+                "scoring_exists",
+                "write_scoring",
+            ],
+            "settings": ["PaperSettings", "PhotometricSettings", "SmoothnessSettings", "TrackingSettings"],
             "tracking": ["Looks", "Tracking"],
         },
     )
 
 __all__ = [
     "Looks",
+    "PaperSettings",
+    "PhotometricSettings",
     "Scoring",
     "SmoothnessSettings",
     "Tracking",

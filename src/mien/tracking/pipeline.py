@@ -2,50 +2,41 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from mien.capture.capture import Capture
 from mien.errors import UserError
 from mien.face import FaceModel
 from mien.inside import remove_tree
-from mien.progress import progress_bar, say
-from mien.tracking.detector_response import DetectorResponse, read_response
-from mien.tracking.head_pose import fit_head_pose
-from mien.tracking.landmark_model import LandmarkModel, reduce_face_model
-from mien.tracking.landmark_term import unknown_subject
-from mien.tracking.outcome import as_tracking, with_pixels
-from mien.tracking.paper import fit_by_descent
-from mien.tracking.parameters import layout_of
-from mien.tracking.photometric import refine_photometrically
-from mien.tracking.photometric_fit import PhotometricFit
-from mien.tracking.preview import DONE, Preview
-from mien.tracking.resume import Keeper
-from mien.tracking.settings import TrackingSettings
-from mien.tracking.shared_fit import fit_shared
-from mien.tracking.shot import Shot, lenses_of, shot_of
-from mien.tracking.stages import (
-    SEQUENCE_ITERATIONS,
+from mien.progress import say
+from mien.tracking.descent import fit_by_descent
+from mien.tracking.fitting import (
     Fit,
-    SequenceFit,
-    all_landmarks,
-    choose_keyframes,
-    fit_frames,
-    fit_of,
-    fit_sequences,
-    smoothness_of,
-    widen,
+    Keeper,
+    Shot,
+    layout_of,
+    lenses_of,
+    nobody,
+    shot_of,
 )
+from mien.tracking.landmarks import (
+    DetectorResponse,
+    LandmarkModel,
+    all_landmarks,
+    as_tracking,
+    fit_landmarks,
+    read_response,
+    reduce_face_model,
+    without_turn_habits,
+)
+from mien.tracking.pixels import PhotometricFit, refine_photometrically, with_pixels
+from mien.tracking.report import DONE, Preview
+from mien.tracking.settings import TrackingSettings
 from mien.tracking.tracking import Tracking
-from mien.tracking.turn_habits import without_turn_habits
-from mien.tracking.watch import Watch, nobody
 
 DEFAULTS = TrackingSettings()
-_COSTS = {"head pose": 10, "identity": 10, "frames": 140, "sequence": 100}
-"""Relative duration of each stage per timestep, for the progress bar, as in a clip of 15,000; multiples of ten."""
 
 
 def track(capture: Capture, face_model: FaceModel, settings: TrackingSettings = DEFAULTS) -> Tracking:
@@ -113,7 +104,7 @@ def _track_subject(
         lenses = lenses_of(captures, settings)
         watch = nobody if preview is None else Preview(preview, face_model, model, shots, settings)
         try:
-            fit = _fit_landmarks(model, shots, lenses, settings, keeper, watch)
+            fit = fit_landmarks(model, shots, lenses, settings, keeper, watch)
         except torch.linalg.LinAlgError:
             names = ", ".join(capture.name for capture in captures)
             raise UserError(
@@ -148,56 +139,3 @@ def _response(face_model: FaceModel, shots: Sequence[Shot], settings: TrackingSe
     response = read_response(face_model, settings.bias_sigma)
     # The response to turns was measured for one camera. With several cameras no one of them defines the turn.
     return response if all(len(shot.cameras) == 1 for shot in shots) else response.without_turns()
-
-
-def _fit_landmarks(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    lenses: Sequence[int | None],
-    settings: TrackingSettings,
-    keeper: Keeper,
-    watch: Watch,
-) -> Fit:
-    subject = unknown_subject(model)
-    frames = sum(int(shot.valid.sum()) for shot in shots)
-    total, done = frames * sum(_COSTS.values()), 0
-    with progress_bar("Tracking", total=total) as advance:
-
-        def advance_by(stage: str, timesteps: int, share: int = 1) -> None:
-            nonlocal done
-            amount = timesteps * _COSTS[stage] // share
-            done += amount
-            advance(amount, status=stage)
-            watch(f"landmarks, {stage}", done / total)
-
-        def identify() -> dict[str, Tensor]:
-            starts = []
-            for shot in shots:
-                pose = fit_head_pose(model, shot.views, shot.cameras, subject, settings)
-                starts.append(SequenceFit(shot.cameras, widen(pose, model.layout)))
-                advance_by("head pose", len(pose))
-            watch("landmarks, identity", done / total, lambda: Fit(subject, tuple(starts)))
-            terms, keyframes = [], []
-            for shot, own in zip(shots, starts, strict=True):
-                chosen = choose_keyframes(own.state[:, :6], settings.keyframes)
-                terms.append(all_landmarks(model, shot.views, own, settings).at(chosen))
-                keyframes.append(replace(own, state=own.state[chosen]))
-            return fit_shared(terms, Fit(subject, tuple(keyframes)), lenses, settings).tensors()
-
-        known = fit_of(keeper.once("identity", identify))
-        advance_by("identity", frames)
-
-        terms, sequences = [], []
-        for number, (shot, key) in enumerate(zip(shots, known.sequences, strict=True)):
-            pose = fit_head_pose(model, shot.views, key.cameras, known.subject, settings)
-            own = SequenceFit(key.cameras, widen(pose, model.layout))
-            terms.append(all_landmarks(model, shot.views, own, settings))
-            advance_frames, name = partial(advance_by, "frames"), f"frames-{number}"
-            sequences.append(fit_frames(terms[-1], known.subject, own, advance_frames, keeper, name))
-
-        alone = Fit(known.subject, tuple(sequences))
-        watch("landmarks, sequence", done / total, lambda: alone)
-        smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
-                      for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
-        advance_one = partial(advance_by, "sequence", share=SEQUENCE_ITERATIONS)
-        return fit_sequences(terms, alone, smoothness, advance_one, keeper)

@@ -1,13 +1,11 @@
-"""Settings of tracking."""
+"""Settings of tracking: of the fit to landmarks, of the fit to pixels, and of the paper's descent."""
 
 import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 from mien.errors import UserError
-from mien.ranges import COUNT, NOT_NEGATIVE, POSITIVE, Range, check_ranges
-from mien.tracking.paper_settings import PaperSettings
-from mien.tracking.photometric_settings import PhotometricSettings
+from mien.ranges import COUNT, COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges
 
 _FOCALS = (10.0, 1e6)
 """Smallest and largest focal length in pixels: a fisheye thumbnail, and a 16K picture through a telescope."""
@@ -15,6 +13,8 @@ _DEVIATION = Range(5e-324, math.inf, words="a number above 0, or inf for none")
 
 LandmarkSet = Literal["mediapipe", "ibug51"]
 """All 478 landmarks, or the 68 of 300-W without their contour (supplement of GaussianAvatars, section A) and irises."""
+_TEXELS = Range(16, 8192)
+"""Allowed number of texels along a side of a texture."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,120 @@ class SmoothnessSettings:
     expression: Annotated[float, _DEVIATION] = 100.0
     """Second derivative of expression coefficients, per second squared. Those of the eyes and eyelids are not smoothed,
     because they move too fast."""
+
+
+@dataclass(frozen=True)
+class PhotometricSettings:
+    """The fit of faces to pixels, after the fit to landmarks."""
+
+    sizes: Annotated[tuple[int, ...], Range(16, 8192, filled=True)] = (256, 256)
+    """Size of the pictures in each round, in pixels. They are scaled down by the whole number that brings their shorter
+    side nearest to it. The texture is estimated again before each round."""
+    texture_size: Annotated[int, _TEXELS] = 512
+    """Texels along each side of the texture."""
+    texture_frames: Annotated[int, COUNT] = 48
+    """Frames of each sequence that the texture is estimated from."""
+    reference_angle: Annotated[float, POSITIVE] = 0.12
+    """Head rotation from the median pose, in radians, within which frames decide the texture; others hardly count. With
+    equal weights every pose would keep its own error, because the texture would reproduce it wherever only such frames
+    see the skin. With several cameras all frames count alike, because each pose is seen from many sides."""
+    shared_steps: Annotated[int, COUNT_OR_NONE] = 3
+    """Gauss-Newton steps of identity and focal length before each round but the first."""
+    shared_steps_of_cameras: Annotated[int, COUNT_OR_NONE] = 8
+    """The same number for several cameras. They see depth, so the shape keeps improving for more steps."""
+    keyframes: Annotated[int, COUNT] = 24
+    """Timesteps of each sequence for these steps. With several cameras there are fewer, so that the number of pictures
+    is at most about twice this number."""
+    focal_sigma: Annotated[float, POSITIVE] = 0.04
+    """Standard deviation of the logarithm of an unknown focal length from that of the fit to landmarks."""
+    outline_weight: Annotated[float, NOT_NEGATIVE] = 10.0
+    """Weight of the outline of a head against the background in a keyframe; 0 switches it off. It is used only with a
+    single camera, which needs the outline to see perspective."""
+    independent_pixels: Annotated[float, POSITIVE] = 100.0
+    """Number of independent pixels that all pixels of a picture are worth, because their errors are correlated. It
+    weighs them against landmarks and priors in the steps of identity and focal length, which use many pictures."""
+    independent_pixels_of_frames: Annotated[float, POSITIVE] = 50.0
+    """The same number for the steps of frames. If it is much larger, errors of texture, light and shape become
+    expressions, most of which follow the head's turns. If it is much smaller, only landmarks determine the shape."""
+    landmark_share: Annotated[float, FRACTION] = 0.3
+    """Weight of landmarks, as a share of their weight in the fit to landmarks alone. Those of lips, lids and irises
+    keep their full weight."""
+    light_extent: Annotated[float, POSITIVE] = 0.012
+    """Extent on the face, in metres, over which a smooth difference counts as light that the model does not explain."""
+    outlier: Annotated[float, POSITIVE] = 10.0
+    """Number of standard deviations of its colour beyond which a pixel's pull fades. It is large, because faces that
+    are off by some pixels make most pixels differ by several, and the fit learns from those."""
+    lids: Annotated[float, NOT_NEGATIVE] = 1.0
+    """Weight of the colours in the eyes against the lids of the fit: 1 as measured, 0 switches it off. The detector
+    misses blinks behind glasses."""
+
+
+@dataclass(frozen=True)
+class PaperRates:
+    """Learning rates of Adam at the start of a fit. The global epochs start at a tenth of them."""
+
+    frame: Annotated[float, NOT_NEGATIVE] = 0.3
+    """Learning rate of a frame's own parameters, in standard deviations that its landmarks leave, so that head rotation
+    and translation, or two expressions that look alike, do not hinder each other."""
+    identity: Annotated[float, NOT_NEGATIVE] = 1e-2
+    """Learning rate of identity coefficients."""
+    offsets: Annotated[float, NOT_NEGATIVE] = 1e-4
+    """Learning rate of vertex offsets, in metres."""
+    texture: Annotated[float, NOT_NEGATIVE] = 1e-2
+    """Learning rate of the albedo (0..1)."""
+    light: Annotated[float, NOT_NEGATIVE] = 5e-3
+    """Learning rate of the light's spherical harmonics."""
+    focal: Annotated[float, NOT_NEGATIVE] = 1e-3
+    """Learning rate of the logarithm of an unknown focal length."""
+
+
+@dataclass(frozen=True)
+class PaperSettings:
+    """Tracking by gradient descent as in the supplement of GaussianAvatars (section A), from a better start."""
+
+    start: Literal["fast", "landmarks"] = "fast"
+    """Start of the fit. fast: the global epochs start from the result of the schedule `fast`, which is better and
+    quicker. landmarks: as in the supplement, the first frame is fitted to convergence, then each next frame from the
+    one before it, then the epochs run."""
+    first_steps: Annotated[int, COUNT_OR_NONE] = 500
+    """Optimiser steps at the first frame, half of them for texture and light alone. Only with start `landmarks`."""
+    steps: Annotated[int, COUNT_OR_NONE] = 50
+    """Optimiser steps for each next frame, which starts from the frame before it. Only with start `landmarks`."""
+    epochs: Annotated[int, COUNT_OR_NONE] = 30
+    """Passes over all frames in random order that refine everything."""
+    texture_size: Annotated[int, _TEXELS] = 512
+    """Texels along each side of the texture."""
+    texture_steps: Annotated[int, COUNT_OR_NONE] = 8
+    """Optimiser steps for texels that a frame shows better than earlier frames. Only with start `landmarks`."""
+    shrink: Annotated[int, Range(1, 64)] = 1
+    """Factor by which pictures are scaled down for the fit. 2 is four times as fast, and less exact."""
+    color_weight: Annotated[float, NOT_NEGATIVE] = 3e3
+    """Weight of the mean colour difference (0..1) between picture and rendering. In the other costs, one squared
+    standard deviation counts 1."""
+    color_epsilon: Annotated[float, POSITIVE] = 0.02
+    """Colour difference below which the pull fades."""
+    light_extent: Annotated[float, POSITIVE] = 0.012
+    """Extent on the face, in metres, over which a smooth difference counts as light that the model does not explain."""
+    landmark_share: Annotated[float, FRACTION] = 0.3
+    """Weight of landmarks, as a share of their weight in the fit to landmarks alone."""
+    gap_weight: Annotated[float, NOT_NEGATIVE] = 1.0
+    """Weight of the gaps between lids and between lips, relative to a landmark's weight."""
+    identity_sigma: Annotated[float, POSITIVE] = 0.5
+    """Standard deviation of identity coefficients from those of the fit to landmarks."""
+    offset_sigma: Annotated[float, NOT_NEGATIVE] = 0.002
+    """Standard deviation of vertex offsets, in metres; 0 switches them off."""
+    offset_bend: Annotated[float, POSITIVE] = 0.0001
+    """Standard deviation of a vertex's offset from the mean of its neighbours', in metres."""
+    texture_roughness: Annotated[float, NOT_NEGATIVE] = 0.1
+    """Standard deviation of the difference between neighbouring texels."""
+    light_sigma: Annotated[float, POSITIVE] = 0.3
+    """Standard deviation of the light's spherical harmonics from an even light."""
+    grey_sigma: Annotated[float, POSITIVE] = 0.05
+    """Standard deviation of the light's colour channels from their mean."""
+    focal_sigma: Annotated[float, POSITIVE] = 0.03
+    """Standard deviation of the logarithm of an unknown focal length from that of the fit to landmarks."""
+    rates: PaperRates = field(default_factory=PaperRates)
+    """Learning rates."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +173,7 @@ class TrackingSettings:
     """Weight of the identity's unit-variance prior."""
     bias_sigma: Annotated[float, POSITIVE] = 0.003
     """Standard deviation of a landmark's offset on the subject from the model's, in metres. All sequences share the
-    offsets. It is used only for face models without a measured `mien.tracking.detector_response`."""
+    offsets. It is used only for face models without a measured `mien.tracking.landmarks.DetectorResponse`."""
     smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
     """Smoothness over time."""
     schedule: Literal["landmarks", "fast", "paper"] = "fast"

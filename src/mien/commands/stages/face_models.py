@@ -10,8 +10,7 @@ from mien.face.loading import cache_folder, is_built_in
 from mien.locks import hold
 from mien.progress import say
 from mien.storage import file_digest
-from mien.tracking.landmark_embedding import EmbeddingSettings, embed_landmarks
-from mien.tracking.regions import with_regions_by_landmarks
+from mien.tracking.landmarks import EmbeddingSettings, embed_landmarks, with_regions_by_landmarks
 
 _SUFFIXES = (".npz", ".pkl", ".pickle")
 _FIRST_PICTURES = 80

@@ -1,0 +1,100 @@
+"""The `paper` schedule: gradient descent over all frames in random order, which starts from the result of `fast`."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from mien.progress import progress_bar
+from mien.tracking.descent.epochs import Descent
+from mien.tracking.descent.frames import fit_looks, fit_sequence, look_around, recentre
+from mien.tracking.descent.scene import PaperScene, PaperState, first_state, paper_scene
+from mien.tracking.fitting import Fit, Keeper, Shot, Watch
+from mien.tracking.landmarks import LandmarkModel
+from mien.tracking.pixels import Appearance, PhotometricFit, texture_space
+from mien.tracking.settings import TrackingSettings
+
+
+def fit_by_descent(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    lenses: Sequence[int | None],
+    fit: Fit,
+    settings: TrackingSettings,
+    keeper: Keeper,
+    watch: Watch,
+    refined: PhotometricFit | None = None,
+) -> PhotometricFit:
+    """Refine a fit as in the supplement of GaussianAvatars, section A.
+
+    If the fit was already fitted to pixels, only the global epochs run. Otherwise the pass along the frames runs first.
+    A frame whose landmarks get lost in that pass keeps its fit to landmarks and is not `improved`.
+
+    Args:
+        model: The face model reduced to its landmarks.
+        shots: The sequences.
+        lenses: Index of each sequence's unknown focal length (`lenses_of`).
+        fit: The fit to landmarks, or that of the schedule `fast`.
+        settings: Settings of the whole tracking.
+        keeper: Keeps the state from which an interrupted fit of the same input resumes.
+        watch: Receives the progress.
+        refined: `fit` with texture and light, if it was fitted to pixels.
+    """
+    if refined is not None and not (refined.appearance.trust > 0).any():
+        return refined  # The pictures show nothing to fit to.
+    scene = paper_scene(model, shots, lenses, fit, settings, refined)
+    descent = Descent(scene, first_state(scene, fit, lenses, refined))
+    descent.resume(keeper)
+    if refined is not None:
+        descent.done = max(descent.done, descent.frames)
+    total = descent.frames * (1 + settings.paper.epochs)
+    done = min(descent.done, total)
+
+    def outcome() -> PhotometricFit:
+        return _as_photometric(scene, descent, fit, refined)
+
+    with torch.enable_grad(), progress_bar("Refining by descent", total, done) as advance:
+
+        def step(amount: int = 1, status: str = "") -> None:
+            nonlocal done
+            done += amount
+            advance(amount, status=status)
+            watch(f"pixels, {status}", done / total, outcome)
+
+        for sequence in range(len(shots) if refined is None else 0):
+            fit_sequence(descent, sequence, step, keeper)
+        if descent.done == descent.frames:
+            look_around(descent) if refined is not None else recentre(descent)
+            fit_looks(descent)
+        for epoch in range(settings.paper.epochs):
+            descent.fit_epoch(epoch, step, keeper)
+    return outcome()
+
+
+def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: PhotometricFit | None) -> PhotometricFit:
+    """The fit with texture and light. Each texel has the trust of its triangle."""
+    state, fit = descent.state, _as_fit(scene, descent.state, fit)
+    fragments = texture_space(scene.face_model, scene.settings.texture_size).fragments
+    trust = torch.cat([descent.trusted(), torch.zeros(1)])[fragments.face_index.long()]
+    improved = [torch.ones(len(rows), dtype=torch.bool) for rows in state.frames]
+    if refined is not None:
+        improved = [own.clone() for own in refined.improved]
+    for sequence, row in descent.lost:
+        improved[sequence][row] = False
+    appearance = Appearance(state.texture, trust, scene.settings.color_epsilon)
+    return PhotometricFit(fit, appearance, tuple(state.lights), tuple(improved))
+
+
+def _as_fit(scene: PaperScene, state: PaperState, fit: Fit) -> Fit:
+    """The state as a fit to landmarks. The effect of the offsets on landmarks is added to the bias."""
+    with torch.no_grad():
+        offsets = state.offsets if scene.settings.offset_sigma > 0 else None
+        moved = scene.landmarks.positions(state.offsets, scene.mesh.faces).double()
+    subject = replace(
+        fit.subject, identity=state.identity.double(), bias=fit.subject.bias + moved, vertex_offsets=offsets
+    )
+    sequences = []
+    for own, was, rows in zip(scene.sequences, fit.sequences, state.frames, strict=True):
+        factor = 1.0 if own.lens is None else float(state.log_focals[own.lens].exp())
+        sequences.append(replace(was, cameras=was.cameras.with_focal(factor), state=rows.double()))
+    return Fit(subject, tuple(sequences))

@@ -1,0 +1,219 @@
+"""The costs of the `paper` schedule. One unit is one squared standard deviation, as in the fit to landmarks."""
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import cosine_similarity
+
+from mien.camera import Camera
+from mien.face import FaceParams
+from mien.render.mesh import MeshFragments, rasterize_mesh, vertex_normals
+from mien.render.mesh_gradients import image_points, mesh_loss
+from mien.tracking.descent.scene import PaperScene, PaperState, SequenceScene
+from mien.tracking.fitting import CameraBatch, Smoothness
+from mien.tracking.landmarks import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
+
+GAPS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS, (13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
+"""Pairs of upper and lower landmarks. Their distances show how far eyes and mouth are open."""
+
+_BLUR_AT = 4.0
+"""For a wide blur, pictures are scaled down until its standard deviation is about this many pixels."""
+_LIGHT = 0.1
+"""Colour differences above this hardly count as light."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """The parameters that a step may move, as leaves or constants."""
+
+    row: Float[Tensor, " p"]
+    identity: Float[Tensor, " i"]
+    offsets: Float[Tensor, "v 3"]
+    texture: Float[Tensor, "th tw 3"]
+    light: Float[Tensor, "9 3"]
+    log_focals: Float[Tensor, " g"]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A picture that the fit uses."""
+
+    sequence: int
+    row: int
+    camera: int
+    image: Float[Tensor, "h w 3"]
+    mask: Float[Tensor, "h w"]
+
+
+def show(scene: PaperScene, sequence: int, row: int, camera: int) -> Shown:
+    """Read a picture of a sequence."""
+    own = scene.sequences[sequence]
+    image = own.pictures.picture(int(own.timesteps[row]), camera, own.cameras).image
+    return Shown(sequence, row, camera, image, torch.ones(image.shape[:2]))
+
+
+def posed(scene: PaperScene, moving: Moving) -> tuple[Float[Tensor, "v 3"], FaceParams]:
+    """Vertices in the frame of the fit, and the face parameters."""
+    face = scene.layout.face_params(moving.row[None], moving.identity)
+    face = replace(face, vertex_offsets=moving.offsets)
+    return scene.face_model(face)[0], face
+
+
+def color_term(
+    scene: PaperScene, shown: Shown, moving: Moving, vertices: Float[Tensor, "v 3"], weights: Float[Tensor, " f"]
+) -> Float[Tensor, ""]:
+    """The colour difference between picture and rendering, over triangles with a weight.
+
+    Shading has no gradient by the vertices. Otherwise light that a few spherical harmonics do not explain would turn
+    heads.
+    """
+    camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
+    height, width = shown.mask.shape
+    camera = camera.resized(width, height)
+    fragments = see(vertices, scene, camera)
+    mesh = replace(scene.mesh, face_weights=weights)
+    return scene.settings.color_weight * mesh_loss(
+        fragments, image_points(camera, vertices), vertex_normals(vertices.detach(), mesh.faces), mesh,
+        moving.texture, moving.light, (shown.image, shown.mask, scene.settings.color_epsilon),
+    )  # fmt: skip
+
+
+@torch.no_grad()
+def without_smooth_difference(scene: PaperScene, shown: Shown, moving: Moving, weights: Float[Tensor, " f"]) -> Shown:
+    """The picture minus its smooth difference from the rendering, which is light that the model does not explain."""
+    vertices, _ = posed(scene, moving)
+    height, width = shown.mask.shape
+    camera = scene.camera(shown.sequence, shown.camera, moving.log_focals).resized(width, height)
+    fragments, picture = see(vertices, scene, camera), torch.empty_like(shown.image)
+    mesh_loss(
+        fragments, image_points(camera, vertices), vertex_normals(vertices, scene.mesh.faces),
+        replace(scene.mesh, face_weights=weights), moving.texture, moving.light,
+        (shown.image, shown.mask, scene.settings.color_epsilon), picture,
+    )  # fmt: skip
+    lit = torch.cat([weights, weights.new_zeros(1)])[fragments.face_index.long()][..., None]
+    difference = shown.image - picture
+    # Outliers, such as hair that hides skin, say nothing about the light around them.
+    lit = lit * (_LIGHT**2 / (_LIGHT**2 + difference.square().sum(-1, keepdim=True)))
+    depth = float(camera.project(vertices.mean(0, keepdim=True))[1])
+    sigma = max(scene.settings.light_extent * float(camera.K[0, 0]) / depth, 1.0)
+    sums = _blurred(torch.cat([difference * lit, lit], dim=-1).numpy(), sigma)
+    smooth = torch.from_numpy(sums[..., :3] / np.maximum(sums[..., 3:], 1e-3)) * (lit > 0)
+    return replace(shown, image=shown.image - smooth)
+
+
+def _blurred(image: Float[np.ndarray, "h w c"], sigma: float) -> Float[np.ndarray, "h w c"]:
+    """Blur a picture; a wide blur runs on a smaller copy. The result is the same within 0.01, many times faster."""
+    height, width = image.shape[:2]
+    factor = max(int(sigma / _BLUR_AT), 1)
+    small = cv2.resize(image, (max(width // factor, 1), max(height // factor, 1)), interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), sigma / factor)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def see(vertices: Float[Tensor, "v 3"], scene: PaperScene, camera: Camera) -> MeshFragments:
+    """Rasterise the mesh in a camera, without gradients."""
+    fixed = replace(camera, K=camera.K.detach())
+    return rasterize_mesh(vertices.detach(), scene.mesh.faces, fixed)
+
+
+def landmark_terms(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Tensor, ""]:
+    """The cost of landmarks in all pictures of the timestep, and of the gaps between lids and between lips."""
+    own = scene.sequences[shown.sequence]
+    term, cameras = own.terms[shown.row], own.cameras_at(moving.log_focals)
+    views = term.views
+    # The effect of the offsets on landmarks is added to the bias, as `_as_fit` does at the end.
+    moved = scene.landmarks.positions(moving.offsets, scene.mesh.faces).double()
+    cameras = CameraBatch(cameras.K.double(), cameras.viewmat.double())[views.camera]
+    state, identity = moving.row.double()[None], moving.identity.double()
+    projected = term.model.project(state, identity, scene.bias + moved, cameras, views.row)
+    residual = projected - views.detected
+    upper, lower = (torch.tensor(column) for column in zip(*GAPS, strict=True))
+    gap_weights = scene.settings.gap_weight * term.weights[upper]
+    gaps = replace(term, weights=gap_weights).robust(residual[:, upper] - residual[:, lower], views)[0]
+    return (term.robust(residual, views)[0] + gaps).sum().float()
+
+
+def prior_term(scene: PaperScene, row: Float[Tensor, " p"]) -> Float[Tensor, ""]:
+    """The prior cost of a timestep's own parameters."""
+    return (row * (scene.precision @ row)).sum()
+
+
+def smoothness_term(
+    own: SequenceScene, rows: Float[Tensor, "t p"], index: int, row: Float[Tensor, " p"]
+) -> Float[Tensor, ""]:
+    """The cost of the accelerations that involve the timestep."""
+    first, last = max(index - 2, 0), min(index + 3, len(rows))
+    window = torch.cat([rows[first:index], row[None], rows[index + 1 : last]])
+    return Smoothness(own.smoothness.precision, own.smoothness.linked[first:last]).cost(window)
+
+
+def shared_terms(scene: PaperScene, state: PaperState) -> Float[Tensor, ""]:
+    """The prior costs of identity, offsets, light and focal lengths."""
+    settings = scene.settings
+    total = ((state.identity - scene.identity) / settings.identity_sigma).square().sum()
+    total = total + (state.log_focals / settings.focal_sigma).square().sum()
+    for light in state.lights:
+        total = total + light_term(scene, light)
+    return total + offset_term(scene, state.offsets)
+
+
+def light_term(scene: PaperScene, light: Float[Tensor, "9 3"]) -> Float[Tensor, ""]:
+    """Cost that pulls the light towards an even grey."""
+    settings = scene.settings
+    even = light.new_zeros(9, 1)
+    even[0] = math.sqrt(4 * math.pi)
+    tinted = light - light.mean(1, keepdim=True)
+    return ((light - even) / settings.light_sigma).square().sum() + (tinted / settings.grey_sigma).square().sum()
+
+
+def offset_term(scene: PaperScene, offsets: Float[Tensor, "v 3"]) -> Float[Tensor, ""]:
+    """Cost that keeps vertex offsets small and smooth (uniform Laplacian). About 100 vertices count as one."""
+    if scene.settings.offset_sigma == 0:
+        return offsets.new_zeros(())
+    first, second, share = scene.neighbours
+    mean = torch.zeros_like(offsets).index_add(0, first, offsets[second]) * share
+    small = (offsets / scene.settings.offset_sigma).square().sum()
+    smooth = ((offsets - mean) / scene.settings.offset_bend).square().sum()
+    return (small + smooth) / 100
+
+
+@torch.no_grad()
+def sight_of(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Tensor, " f"]:
+    """Cosine between each triangle's normal and the direction to the camera; 0 if the picture does not show it."""
+    vertices, _ = posed(scene, moving)
+    camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
+    visible = see(vertices, scene, camera.resized(*reversed(shown.mask.shape))).face_index
+    corners = vertices[scene.mesh.faces]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cosine = cosine_similarity(normals, camera.position - corners.mean(1), dim=1)
+    out = torch.zeros(len(corners))
+    faces = visible[visible >= 0].long().unique()
+    out[faces] = cosine[faces].clamp_min(0)
+    return out
+
+
+@torch.no_grad()
+def guess_texture(scene: PaperScene, shown: Shown, moving: Moving, texture: Float[Tensor, "th tw 3"]) -> None:
+    """Fill the texture with one skin colour: the median of the pixels that the mesh covers."""
+    vertices, _ = posed(scene, moving)
+    camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
+    visible = see(vertices, scene, camera.resized(*reversed(shown.mask.shape))).face_index
+    used = torch.cat([scene.used, torch.zeros(1)])[visible.long()] > 0
+    if used.any():
+        texture[:] = shown.image[used].median(0).values
+
+
+def roughness_gradient(scene: PaperScene, texture: Float[Tensor, "th tw 3"]) -> Float[Tensor, "th tw 3"]:
+    """Gradient of the squared differences between neighbouring texels, scaled like the cost of a picture."""
+    gradient = torch.zeros_like(texture)
+    for axis in (0, 1):
+        step = texture.detach().diff(dim=axis)
+        size = texture.shape[axis] - 1
+        gradient.narrow(axis, 1, size).add_(step)
+        gradient.narrow(axis, 0, size).sub_(step)
+    return gradient * (2 / scene.settings.texture_roughness**2 / texture.shape[0])

@@ -1,0 +1,151 @@
+"""The eyes of a face model: the eyeballs, the skin around them, and the coefficient that closes their lids."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.face import FaceModel
+from mien.render.mesh import rasterize_mesh
+from mien.tracking.fitting import HIDING_REGIONS, ParameterLayout
+from mien.tracking.landmarks import LEFT_EYELIDS, LEFT_LID_PAIRS, RIGHT_EYELIDS, RIGHT_LID_PAIRS
+
+_LIDS_REACH, _AROUND_REACH = 1.3, 3.5
+"""Distances from an eyeball's centre that contain its lids, and everything that may hide it, in radii."""
+_STEPS = 64
+"""Number of equal steps of a coefficient. Lids touch at the first step at which the least of the eyeball is seen."""
+_MOST_CLOSING = 1.25
+"""A coefficient closes an eye if the lids meet within this multiple of its upper bound."""
+_OTHERS_SHARE = 0.2
+"""A coefficient is not an eye's own if it moves the other eye's lids by more than this share."""
+
+
+@dataclass(frozen=True, eq=False)
+class Eye:
+    """One eye and the coefficient that closes it."""
+
+    column: int
+    """Column of the state that holds the coefficient that moves the lids."""
+    closed: float
+    """Value of the coefficient at which the lids of the mean person have met. It is worth 1 of the ARKit coefficient,
+    which closes an eye firmly, or more if the lids do not touch before."""
+    vertices: Int[Tensor, " n"]
+    """Indices, in the face model, of the vertices of the triangles below."""
+    faces: Int[Tensor, "f 3"]
+    """Triangles of the eyeball, then of its lids, then of their surroundings, as indices into `vertices`."""
+    ball: int
+    """Number of triangles of the eyeball."""
+    lids: int
+    """Number of triangles of the eyeball and the lids together."""
+    skin: Bool[Tensor, " f"]
+    """Which triangles are skin."""
+    forward: Float[Tensor, " 3"]
+    """Direction from the eyeball's centre through its lids, in the head frame."""
+
+    @property
+    def moving(self) -> Int[Tensor, "m 3"]:
+        """The triangles of the eyeball, then those of the lids."""
+        return self.faces[: self.lids]
+
+
+def eyes_of(model: FaceModel, layout: ParameterLayout) -> list[Eye]:
+    """The eyes that have a coefficient of their own to close the lids. Empty if the model has no eyeballs."""
+    ball = model.region_mask("eyes", "irises")
+    if not ball.any() or len(layout.expression_index) == 0:
+        return []
+    pairs = (RIGHT_LID_PAIRS, LEFT_LID_PAIRS)
+    closing = torch.stack([_closing(model, layout, pair) for pair in pairs])
+    marks = model.landmark_positions(model.template, "mediapipe")
+    middles = torch.stack([marks[list(lids)].mean(0) for lids in (RIGHT_EYELIDS, LEFT_EYELIDS)])
+    centres = model.template[model.faces].mean(1)
+    nearest = torch.cdist(centres, middles).argmin(1)
+    eyes = []
+    for number, lids in enumerate((RIGHT_EYELIDS, LEFT_EYELIDS)):
+        found = _coefficient(model, layout, closing[number], closing[1 - number], lids)
+        own = ball & (nearest == number)
+        if found is not None and own.any():
+            eyes.append(_eye(model, layout, own, middles[number], *found))
+    return eyes
+
+
+def _closing(model: FaceModel, layout: ParameterLayout, pairs: tuple[tuple[int, int], ...]) -> Float[Tensor, " n"]:
+    """The share of the mean person's gap between the lids that each free coefficient closes, per unit."""
+    upper, lower = (list(side) for side in zip(*pairs, strict=True))
+    marks = model.landmark_positions(model.template, "mediapipe")
+    moved = model.landmark_positions(model.expression_basis[layout.expression_index], "mediapipe")
+    gap, change = marks[upper] - marks[lower], moved[:, upper] - moved[:, lower]
+    return -((change * gap).sum(-1) / (gap**2).sum(-1)).mean(1)
+
+
+def _coefficient(
+    model: FaceModel,
+    layout: ParameterLayout,
+    closing: Float[Tensor, " n"],
+    of_other: Float[Tensor, " n"],
+    lids: tuple[int, ...],
+) -> tuple[int, float] | None:
+    """The free coefficient that closes an eye with the least motion elsewhere, and its upper bound; or None."""
+    bounds = model.expression_bounds[layout.expression_index]
+    able = (closing * _MOST_CLOSING * bounds[:, 1] >= 1) & (of_other.abs() < _OTHERS_SHARE * closing)
+    if not able.any():
+        return None
+    moved = model.landmark_positions(model.expression_basis[layout.expression_index], "mediapipe")
+    elsewhere = torch.ones(moved.shape[1], dtype=torch.bool)
+    elsewhere[list(lids)] = False
+    cost = (moved[:, elsewhere] ** 2).sum((1, 2)) / closing**2
+    index = int(cost.where(able, torch.inf).argmin())
+    return index, float(bounds[index, 1])
+
+
+def _eye(
+    model: FaceModel,
+    layout: ParameterLayout,
+    ball: Bool[Tensor, " f"],
+    middle: Float[Tensor, " 3"],
+    index: int,
+    most: float,
+) -> Eye:
+    own = model.template[model.faces[ball].flatten().unique()]
+    centre = own.mean(0)
+    radius = (own - centre).norm(dim=1).max()
+    distance = (model.template - centre).norm(dim=1)
+    lids = (distance < _LIDS_REACH * radius)[model.faces].any(1) & ~ball
+    around = (distance < _AROUND_REACH * radius)[model.faces].any(1) & ~ball & ~lids
+    forward = torch.nn.functional.normalize(middle - centre, dim=0)
+    parts = [part.nonzero()[:, 0] for part in (ball, lids, around)]
+    triangles = torch.cat(parts)
+    vertices, faces = model.faces[triangles].unique(return_inverse=True)
+    skin = ~model.region_mask(*HIDING_REGIONS)[triangles]
+    eye = Eye(
+        layout.expression_columns.start + index, most, vertices, faces, len(parts[0]), len(parts[0]) + len(parts[1]),
+        skin, forward,
+    )  # fmt: skip
+    motion = model.expression_basis[layout.expression_index[index]][vertices]
+    touching = _where_lids_touch(eye, model.template[vertices], motion, centre, radius)
+    return replace(eye, closed=min(max(touching, float(layout.units[index])), most))
+
+
+def _where_lids_touch(
+    eye: Eye,
+    rest: Float[Tensor, "n 3"],
+    motion: Float[Tensor, "n 3"],
+    centre: Float[Tensor, " 3"],
+    radius: Float[Tensor, ""],
+) -> float:
+    """The value of the coefficient at which the least of the eyeball is seen from far in front."""
+    width, far = 192, 40.0 * radius
+    focal = width * far / (4 * radius)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, width / 2], [0, 0, 1]])
+    viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    viewmat[:3, 3] = torch.stack([-centre[0], centre[1], centre[2] + far])
+    camera = Camera(K, viewmat, width, width)
+
+    def left(amount: float) -> int:
+        seen = rasterize_mesh(rest + amount * motion, eye.moving, camera).face_index
+        return int(((seen >= 0) & (seen < eye.ball)).sum())
+
+    amounts = [eye.closed * step / _STEPS for step in range(_STEPS + 1)]
+    areas = [left(amount) for amount in amounts]
+    return amounts[areas.index(min(areas))]

@@ -1,0 +1,175 @@
+"""Eyelids placed from the pictures. This finds blinks that a landmark detector misses, above all behind glasses.
+
+Skin is tracked by its texture, but the texture does not include what the lids uncover. So each picture decides on its
+own which position of the lids explains it best: every pixel that the lids may cover looks like this person's eyeball
+or like the skin around the eye (`eyelid_colors`). This is weighed against the lids of the fit, which are right within
+a few hundredths of a blink, or altogether wrong. Nothing is smoothed over time, and nothing assumes that anybody
+blinks: the usual position of the lids comes from the fit, and the closed position from the model.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.parallel import in_threads
+from mien.tracking.eyelids.colors import EyeColors, learn_colors
+from mien.tracking.eyelids.crops import EyeCrop, eye_crop
+from mien.tracking.eyelids.eyes import Eye, eyes_of
+from mien.tracking.fitting import Fit, SequenceFit, Shot
+from mien.tracking.landmarks import LandmarkModel
+
+_POSITIONS = np.linspace(-0.4, 1.2, 13)
+"""Positions of the lids that are tried: 0 is at rest, 1 is closed, below 0 is wider open than at rest."""
+_BAND = 4
+"""Width of the lashes and the edge of the upper lid, in positions; a generous estimate."""
+_FINE, _BLUR = 0.01, 0.08
+"""Step of the fine positions that costs are interpolated to, and standard deviation of the smoothing kernel."""
+_DOUBT = 8.0
+"""Divisor of the costs, because errors of neighbouring pixels are correlated."""
+_DISAGREEMENT = 0.07
+"""Largest upper quartile, over the frames, of the cost of the fit's lids above the best one, as a share of the range
+of costs. If it is larger, the colours are misleading and count less."""
+_SIGMA = 0.12
+"""Standard deviation of the lids of a good fit."""
+_FAR = 0.4
+"""Wider standard deviation of the fit's lids, for the estimate of the usual offset between colours and fit."""
+_LEARNED_FROM = 100
+"""Largest number of pictures that colours are learned from."""
+_LEAST_PICTURES = 10
+"""Fewest pictures that must show an eye for its lids to be placed."""
+_LEAST_FACING = 0.35
+"""Smallest cosine between an eye's direction and the direction to the camera."""
+
+
+def place_lids(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    fit: Fit,
+    weight: float,
+) -> Fit:
+    """Return the fit with the lids placed from the pictures.
+
+    Lids stay as they are if the model cannot close them or the eyes are too small in the pictures.
+
+    Args:
+        model: The face model reduced to its landmarks.
+        shots: The sequences.
+        fit: The fit of the sequences. Everything but the lids stays as it is.
+        weight: Weight of the pictures against the fit: 1 as measured, 0 for the fit alone.
+    """
+    eyes = eyes_of(model.face_model.to(torch.zeros(())), model.layout) if weight > 0 else []
+    sequences = []
+    for shot, own in zip(shots, fit.sequences, strict=True):
+        if eyes:
+            own = replace(own, state=_placed(_Sequence(model, shot, fit, own, eyes), weight))
+        sequences.append(own)
+    return replace(fit, sequences=tuple(sequences))
+
+
+class _Sequence:
+    """The pictures of one sequence and its fit so far."""
+
+    def __init__(self, model: LandmarkModel, shot: Shot, fit: Fit, own: SequenceFit, eyes: Sequence[Eye]):
+        self.model, self.shot, self.fit, self.own, self.eyes = model, shot, fit, own, eyes
+        self.face_model = model.face_model.to(torch.zeros(()))
+        self.timesteps = shot.valid.nonzero()[:, 0].tolist()
+
+    def crops(self, row: int, positions: list[float]) -> list[EyeCrop | None]:
+        """The crop of each eye, in the picture of the camera that the eye faces most directly."""
+        columns = [eye.column for eye in self.eyes]
+        states = self.own.state[[row, row]].clone()
+        states[0, columns], states[1, columns] = 0.0, states.new_tensor([eye.closed for eye in self.eyes])
+        face = self.model.layout.face_params(states, self.fit.subject.identity)
+        face = replace(face.to(self.face_model.template), vertex_offsets=self.fit.subject.vertex_offsets)
+        vertices, turn = self.face_model(face), face.T_world_head[0, :3, :3]
+        return [self._crop(eye, row, vertices[:, eye.vertices], turn @ eye.forward, positions) for eye in self.eyes]
+
+    def _crop(
+        self,
+        eye: Eye,
+        row: int,
+        corners: Float[Tensor, "2 n 3"],
+        forward: Float[Tensor, " 3"],
+        positions: list[float],
+    ) -> EyeCrop | None:
+        middle = corners[0].mean(0)
+        capture, best, facing = self.shot.capture, None, _LEAST_FACING
+        for index in self.shot.views.seen_by(row):
+            K, viewmat = self.own.cameras.K[index].float(), self.own.cameras.viewmat[index].float()
+            camera = Camera(K, viewmat, capture.width, capture.height)
+            towards = camera.position - middle
+            cosine = float(forward @ towards / towards.norm())
+            if cosine > facing:
+                best, facing = (index, camera), cosine
+        if best is None:
+            return None
+        picture = np.asarray(capture.images[self.timesteps[row], best[0]])
+        tracked = float(self.own.state[row, eye.column]) / eye.closed
+        return eye_crop(eye, picture, best[1], corners, tracked, positions)
+
+
+def _placed(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
+    state = sequence.own.state.clone()
+    colors = _learned(sequence)
+
+    def of_row(row: int) -> list[Float[np.ndarray, " k"] | None]:
+        crops = sequence.crops(row, _POSITIONS.tolist())
+        return [_costs(*pair) for pair in zip(crops, colors, strict=True)]
+
+    costs = in_threads(of_row, list(range(len(state))))
+    for number, eye in enumerate(sequence.eyes):
+        of_eye = [row[number] for row in costs]
+        seen = np.array([cost is not None for cost in of_eye])
+        if seen.sum() >= _LEAST_PICTURES:
+            known = np.stack([cost for cost in of_eye if cost is not None])
+            before = state[torch.from_numpy(seen), eye.column].numpy() / eye.closed
+            state[torch.from_numpy(seen), eye.column] = torch.from_numpy(weighed(known, before, weight)) * eye.closed
+    return sequence.model.layout.bounds.clip(state)
+
+
+def _costs(crop: EyeCrop | None, colors: EyeColors | None) -> Float[np.ndarray, " k"] | None:
+    return None if crop is None or colors is None else colors.costs(crop, _BAND)
+
+
+def _learned(sequence: _Sequence) -> list[EyeColors | None]:
+    """The colours of each eye, or None for an eye that is seen too little."""
+    rows = torch.linspace(0, len(sequence.own.state) - 1, min(_LEARNED_FROM, len(sequence.own.state)))
+    ends = [float(_POSITIONS[0])]
+    crops = in_threads(lambda row: sequence.crops(row, ends), rows.round().long().unique().tolist())
+    return [
+        learn_colors([crop for row in crops if (crop := row[number]) is not None])
+        for number in range(len(sequence.eyes))
+    ]
+
+
+def weighed(
+    costs: Float[np.ndarray, "n k"], tracked: Float[np.ndarray, " n"], weight: float
+) -> Float[np.ndarray, " n"]:
+    """The positions of the lids in n frames that best suit both the costs of k positions and the tracked positions.
+
+    If the colours place the lids too open or too closed in most frames, the fit corrects them. The correction is full
+    at the usual position and vanishes where the lids meet. If the colours contradict the fit in many frames, they count
+    for little in all frames.
+    """
+    fine = np.arange(_POSITIONS[0], _POSITIONS[-1] + _FINE / 2, _FINE)
+    near = np.exp(-0.5 * ((fine[:, None] - _POSITIONS) / _BLUR) ** 2)
+    costs = costs @ (near / near.sum(1, keepdims=True)).T
+    at = np.round((tracked - fine[0]) / _FINE).astype(int).clip(0, len(fine) - 1)
+    above = (costs[np.arange(len(costs)), at] - costs.min(1)) / np.ptp(costs, axis=1).clip(1e-9)
+    costs = costs * (weight / _DOUBT / max(1.0, float(np.quantile(above, 0.75)) / _DISAGREEMENT) ** 4)
+
+    usual = np.median(tracked)
+    often = tracked < usual + 0.1
+    middle = fine[(costs + 0.5 * ((fine - tracked[:, None]) / _FAR) ** 2).argmin(1)]
+    shift = np.median((middle - tracked)[often])
+    share = ((1 - fine) / max(1 - np.median(tracked[often]), 0.3)).clip(0, 1.2)
+    # If the most open position is the best one, the pixels do not show an eye but hair, a brow or a hand.
+    costs[costs[:, 0] <= costs.min(1)] = 0
+    corrected = fine - shift * share
+    far = np.log1p(((corrected - tracked[:, None]) / _SIGMA) ** 2)
+    return corrected[(costs + far).argmin(1)]

@@ -1,0 +1,64 @@
+"""What every fit shares: its input, parameters, solver, state and stored pieces."""
+
+from mien.tracking.fitting.fit import (
+    HIDING_REGIONS,
+    Fit,
+    SequenceFit,
+    Subject,
+    Watch,
+    choose_keyframes,
+    fit_of,
+    nobody,
+    smoothness_of,
+    widen,
+)
+from mien.tracking.fitting.parameters import ParameterLayout, layout_of, pose_only
+from mien.tracking.fitting.resume import Keeper
+from mien.tracking.fitting.shot import Shot, has_enough_faces, lenses_of, shot_of
+from mien.tracking.fitting.solver import (
+    Bounds,
+    NormalEquations,
+    SharedEquations,
+    Smoothness,
+    joined,
+    joined_shared,
+    minimize_frames,
+    placed,
+    solve_arrow,
+    solve_chain,
+)
+from mien.tracking.fitting.views import CameraBatch, Views, batch_of
+
+__all__ = [
+    "Bounds",
+    "CameraBatch",
+    "Fit",
+    "HIDING_REGIONS",
+    "Keeper",
+    "NormalEquations",
+    "ParameterLayout",
+    "SequenceFit",
+    "SharedEquations",
+    "Shot",
+    "Smoothness",
+    "Subject",
+    "Views",
+    "Watch",
+    "batch_of",
+    "choose_keyframes",
+    "fit_of",
+    "has_enough_faces",
+    "joined",
+    "joined_shared",
+    "layout_of",
+    "lenses_of",
+    "minimize_frames",
+    "nobody",
+    "placed",
+    "pose_only",
+    "shot_of",
+    "smoothness_of",
+    "solve_arrow",
+    "solve_chain",
+    "widen",
+]

@@ -1,0 +1,162 @@
+"""A capture as input of a fit: detected landmarks, known or assumed cameras, and the frame of the fit."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.capture.capture import Capture
+from mien.errors import UserError
+from mien.rotation import invert_rigid
+from mien.tracking.fitting.views import CameraBatch, Views, batch_of
+from mien.tracking.settings import TrackingSettings
+
+_LEAST_FRAMES = 3
+_DEFAULT_FOCAL = 1.5
+"""Assumed focal length in larger sides of the source picture: between a phone's wide lens and a portrait lens."""
+_CROPPED_FOCAL = 2.2
+"""The same for a nearly square picture. No camera films squares, so the picture was cropped around a head."""
+_SQUARE = 1.1
+"""Ratio of sides below which a picture counts as square."""
+_FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+"""T_camera_head of a head that looks towards the camera, but is placed at the camera's centre."""
+_SWING = 0.3
+"""Largest ratio of squared motion over two frames to the sum of both squared single-frame motions that counts as a
+swing. The ratio is 0 for a swing, 0.5 for noise and 2 for steady motion."""
+_LEAST_RUN = 4
+"""Fewest frames in a row that swing. A blink is a single swing and is kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """The input of one sequence to a fit."""
+
+    views: Views
+    valid: Bool[Tensor, " t"]
+    """Timesteps in which at least one camera found a face. They are the rows of `views`."""
+    cameras: CameraBatch
+    """Cameras in the frame of the fit. In this frame a head that looks into the camera that found most faces has a
+    rotation of about zero, so axis-angle rotations stay far from half a turn in any calibrated world."""
+    fps: float
+    capture: Capture
+    T_world_fit: Float[Tensor, "4 4"] | None
+    """Transform from the frame of the fit to the calibrated world; None if they are the same."""
+
+    def cameras_in_world(self, fitted: CameraBatch) -> tuple[Camera, ...]:
+        """The cameras of the tracking: the calibrated ones, or those with the fitted focal length."""
+        if self.capture.calibration is not None:
+            return self.capture.calibration
+        like, size = torch.zeros(()), (self.capture.width, self.capture.height)
+        pairs = zip(fitted.K, fitted.viewmat, strict=True)
+        return tuple(Camera(K, viewmat, *size).to(like) for K, viewmat in pairs)
+
+
+def has_enough_faces(capture: Capture) -> bool:
+    """Whether a face was found often enough for tracking."""
+    return int(_seen(capture).any(1).sum()) >= _LEAST_FRAMES
+
+
+def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
+    """Make the input of a fit from a capture.
+
+    Raises:
+        UserError: The capture has several cameras without calibration, or too few timesteps with a face.
+    """
+    cameras = len(capture.camera_ids)
+    if cameras != 1 and capture.calibration is None:
+        raise UserError(
+            f"{capture.name}: has {cameras} cameras without calibration; capture each video on its own "
+            "(`mien create A.mp4 B.mp4`), or give the cameras' calibration"
+        )
+    detected = torch.from_numpy(np.asarray(capture.landmarks, dtype=np.float64))
+    seen = _seen(capture)
+    valid = seen.any(1)
+    found = int(valid.sum())
+    if found < _LEAST_FRAMES:
+        raise UserError(
+            f"{capture.name}: a face was found in {found} frames, tracking needs {_LEAST_FRAMES}; film longer"
+        )
+    detected = without_flicker(detected, seen)
+    row, camera = seen[valid].nonzero().unbind(1)
+    views = Views(detected[valid][row, camera], row, camera, torch.ones(len(row), dtype=torch.float64))
+    if capture.calibration is None:
+        batch, T_world_fit = batch_of((initial_camera(capture, settings),)), None
+    else:
+        batch = batch_of(capture.calibration)
+        T_world_fit = invert_rigid(batch.viewmat[int(seen.sum(0).argmax())]) @ _FACING
+        batch = CameraBatch(batch.K, batch.viewmat @ T_world_fit)
+    return Shot(views, valid, batch, capture.fps, capture, T_world_fit)
+
+
+def _seen(capture: Capture) -> Bool[Tensor, "t c"]:
+    """The pictures in which a face was found."""
+    finite = np.isfinite(np.asarray(capture.landmarks)).all((-1, -2))
+    return torch.from_numpy(np.asarray(capture.valid, dtype=bool) & finite)
+
+
+def lenses_of(captures: Sequence[Capture], settings: TrackingSettings) -> list[int | None]:
+    """The number of the unknown focal length of each capture; None if the focal length is known."""
+    lenses: list[int | None] = []
+    free = 0
+    for capture in captures:
+        if capture.calibration is not None or settings.focal is not None:
+            lenses.append(None)
+        else:
+            lenses.append(0 if settings.same_camera else free)
+            free += 1
+    return lenses
+
+
+def initial_camera(capture: Capture, settings: TrackingSettings) -> Camera:
+    """The camera of the captured pictures, with the given or an assumed focal length, in float64."""
+    focal_x, focal_y = _source_focal(capture) if settings.focal is None else (settings.focal, settings.focal)
+    x, y = (float(value) for value in capture.principal_point[0])
+    K = torch.tensor([[focal_x, 0, x], [0, focal_y, y], [0, 0, 1]], dtype=torch.float64)
+    return Camera(K, _FACING.clone(), capture.width, capture.height)
+
+
+def _source_focal(capture: Capture) -> tuple[float, float]:
+    """The assumed focal lengths along x and y, in pixels of the capture, which may be a scaled crop of the source."""
+    crop = capture.source.get("crop", {"width": capture.width, "height": capture.height})
+    sides = capture.source.get("picture_size", (crop["width"], crop["height"]))
+    assumed = (_CROPPED_FOCAL if max(sides) < _SQUARE * min(sides) else _DEFAULT_FOCAL) * float(max(sides))
+    return assumed * capture.width / crop["width"], assumed * capture.height / crop["height"]
+
+
+def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c"]) -> Float[Tensor, "t c l 2"]:
+    """Return the landmarks, with the mean of both answers wherever they swing for several frames.
+
+    Args:
+        landmarks: Landmarks in pixels; any value where not seen.
+        seen: Whether the camera found a face.
+    """
+    if len(landmarks) < _LEAST_RUN + 2:
+        return landmarks
+    steps = (landmarks[1:] - landmarks[:-1]).square().sum((-1, -2))
+    across = (landmarks[2:] - landmarks[:-2]).square().sum((-1, -2))
+    swings = torch.zeros_like(seen)
+    swings[1:-1] = across < _SWING * (steps[1:] + steps[:-1])  # False for NaN
+    swings[1:-1] &= seen[:-2] & seen[1:-1] & seen[2:]
+    runs = _of_runs(swings)
+    # The frames at both ends of a run swing too, but with only one of their neighbours.
+    linked = (runs[:-1] | runs[1:])[..., None, None]
+    forward = torch.where(linked, landmarks[1:] - landmarks[:-1], 0.0)
+    towards, neighbours = torch.zeros_like(landmarks), torch.zeros_like(landmarks[:, :, :1, :1])
+    towards[:-1] += forward
+    towards[1:] -= forward
+    neighbours[:-1] += linked
+    neighbours[1:] += linked
+    return landmarks + towards / (2 * neighbours.clamp_min(1))
+
+
+def _of_runs(swings: Bool[Tensor, "t c"]) -> Bool[Tensor, "t c"]:
+    """Which swings belong to a run of at least `_LEAST_RUN` frames."""
+    whole = swings.unfold(0, _LEAST_RUN, 1).all(-1)
+    kept = torch.zeros_like(swings)
+    for shift in range(_LEAST_RUN):
+        kept[shift : shift + len(whole)] |= whole
+    return kept

@@ -1,0 +1,187 @@
+"""The stages of tracking from landmarks. Each stage takes the fit so far and returns it refined."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mien.progress import progress_bar
+from mien.tracking.fitting import (
+    Fit,
+    Keeper,
+    SequenceFit,
+    Shot,
+    Smoothness,
+    Subject,
+    Watch,
+    choose_keyframes,
+    fit_of,
+    minimize_frames,
+    smoothness_of,
+    solve_chain,
+    widen,
+)
+from mien.tracking.landmarks.head_pose import fit_head_pose
+from mien.tracking.landmarks.model import LandmarkModel
+from mien.tracking.landmarks.shared_fit import fit_bias, fit_shared
+from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, unknown_subject
+from mien.tracking.settings import TrackingSettings
+
+_FRAME_ITERATIONS = 12
+_FRAMES_AT_ONCE = 512
+"""Number of timesteps fitted in one batch, which takes about 100 MB of memory."""
+_ROUNDS = 2
+_SEQUENCE_ITERATIONS = 10
+"""Largest number of iterations of the fit over time, in all rounds together."""
+_LINE_SEARCH = (1.0, 0.5, 0.25, 0.1)
+_COSTS = {"head pose": 10, "identity": 10, "frames": 140, "sequence": 100}
+"""Relative duration of each stage per timestep, for the progress bar, as in a clip of 15,000; multiples of ten."""
+
+
+def fit_landmarks(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    lenses: Sequence[int | None],
+    settings: TrackingSettings,
+    keeper: Keeper,
+    watch: Watch,
+) -> Fit:
+    """Fit all sequences of a subject to their landmarks.
+
+    The stages are the head pose of every timestep alone, identity and unknown focal lengths from keyframes
+    (`fit_shared`), every timestep alone, and all timesteps of each sequence together, smooth over time.
+
+    Args:
+        model: The face model reduced to its landmarks.
+        shots: The sequences.
+        lenses: Index of each sequence's unknown focal length (`lenses_of`).
+        settings: Settings of the whole tracking.
+        keeper: Keeps the pieces from which an interrupted fit of the same input resumes.
+        watch: Receives the progress.
+    """
+    subject = unknown_subject(model)
+    frames = sum(int(shot.valid.sum()) for shot in shots)
+    total, done = frames * sum(_COSTS.values()), 0
+    with progress_bar("Tracking", total=total) as advance:
+
+        def advance_by(stage: str, timesteps: int, share: int = 1) -> None:
+            nonlocal done
+            amount = timesteps * _COSTS[stage] // share
+            done += amount
+            advance(amount, status=stage)
+            watch(f"landmarks, {stage}", done / total)
+
+        def identify() -> dict[str, Tensor]:
+            starts = []
+            for shot in shots:
+                pose = fit_head_pose(model, shot.views, shot.cameras, subject, settings)
+                starts.append(SequenceFit(shot.cameras, widen(pose, model.layout)))
+                advance_by("head pose", len(pose))
+            watch("landmarks, identity", done / total, lambda: Fit(subject, tuple(starts)))
+            terms, keyframes = [], []
+            for shot, own in zip(shots, starts, strict=True):
+                chosen = choose_keyframes(own.state[:, :6], settings.keyframes)
+                terms.append(all_landmarks(model, shot.views, own, settings).at(chosen))
+                keyframes.append(replace(own, state=own.state[chosen]))
+            return fit_shared(terms, Fit(subject, tuple(keyframes)), lenses, settings).tensors()
+
+        known = fit_of(keeper.once("identity", identify))
+        advance_by("identity", frames)
+
+        terms, sequences = [], []
+        for number, (shot, key) in enumerate(zip(shots, known.sequences, strict=True)):
+            pose = fit_head_pose(model, shot.views, key.cameras, known.subject, settings)
+            own = SequenceFit(key.cameras, widen(pose, model.layout))
+            terms.append(all_landmarks(model, shot.views, own, settings))
+            advance_frames, name = partial(advance_by, "frames"), f"frames-{number}"
+            sequences.append(fit_frames(terms[-1], known.subject, own, advance_frames, keeper, name))
+
+        alone = Fit(known.subject, tuple(sequences))
+        watch("landmarks, sequence", done / total, lambda: alone)
+        smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
+                      for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
+        advance_one = partial(advance_by, "sequence", share=_SEQUENCE_ITERATIONS)
+        return fit_sequences(terms, alone, smoothness, advance_one, keeper)
+
+
+def fit_frames(
+    term: LandmarkTerm,
+    subject: Subject,
+    own: SequenceFit,
+    advance: Callable[[int], None] = lambda timesteps: None,
+    keeper: Keeper | None = None,
+    name: str = "frames",
+) -> SequenceFit:
+    """Fit pose, expression and eyes at every timestep alone. `advance` receives the number of finished timesteps."""
+    keeper, parts = keeper or Keeper(), []
+
+    def fitted(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
+        part = term.at(rows)
+        state = minimize_frames(
+            lambda state: part.equations(state, subject, own.cameras),
+            lambda state: part.cost(state, subject, own.cameras),
+            own.state[rows], term.model.layout.bounds, _FRAME_ITERATIONS,
+        )  # fmt: skip
+        return {"state": state}
+
+    for index, rows in enumerate(torch.arange(len(own.state)).split(_FRAMES_AT_ONCE)):
+        parts.append(keeper.once(f"{name}-{index}", partial(fitted, rows))["state"])
+        advance(len(rows))
+    return replace(own, state=torch.cat(parts))
+
+
+def fit_sequences(
+    terms: Sequence[LandmarkTerm],
+    fit: Fit,
+    smoothness: Sequence[Smoothness],
+    advance: Callable[[int], None] = lambda timesteps: None,
+    keeper: Keeper | None = None,
+) -> Fit:
+    """Fit all timesteps of each sequence together under its smoothness cost, in turn with the landmarks' bias.
+
+    `advance` receives the number of finished timesteps in each of the `_SEQUENCE_ITERATIONS` iterations.
+    """
+    keeper = keeper or Keeper()
+
+    def round_from(fit: Fit) -> dict[str, Tensor]:
+        fit = fit_bias(terms, fit)
+        parts = zip(terms, fit.sequences, smoothness, strict=True)
+        chains = tuple(_fit_chain(term, fit.subject, own, smooth, advance) for term, own, smooth in parts)
+        return replace(fit, sequences=chains).tensors()
+
+    for number in range(_ROUNDS):
+        fit = fit_of(keeper.once(f"sequence-{number}", partial(round_from, fit)))
+    return fit
+
+
+def _fit_chain(
+    term: LandmarkTerm,
+    subject: Subject,
+    own: SequenceFit,
+    smoothness: Smoothness,
+    advance: Callable[[int], None],
+) -> SequenceFit:
+    bounds, iterations = term.model.layout.bounds, _SEQUENCE_ITERATIONS // _ROUNDS
+
+    def cost(state: Float[Tensor, "v p"]) -> float:
+        return float(term.cost(state, subject, own.cameras).sum() + smoothness.cost(state))
+
+    def step_from(state: Float[Tensor, "v p"]) -> Float[Tensor, "v p"]:
+        equations = term.equations(state, subject, own.cameras)
+        held = bounds.held(state, equations.gradient + smoothness.gradient(state))
+        return solve_chain(equations, smoothness, state, held)
+
+    state, best = own.state, cost(own.state)
+    for done in range(iterations):
+        step = step_from(state)
+        candidates = (bounds.clip(state + fraction * step) for fraction in _LINE_SEARCH)
+        improved = next(((c, value) for c in candidates if (value := cost(c)) < best), None)
+        converged = improved is None or best - improved[1] < 1e-4 * best
+        state, best = improved or (state, best)
+        advance(len(state) * (iterations - done if converged else 1))
+        if converged:
+            break
+    return replace(own, state=state)

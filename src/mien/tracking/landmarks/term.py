@@ -1,0 +1,227 @@
+"""The landmark cost: robust distances between detected and projected landmarks, with priors on the parameters."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mien.rotation import matrix_from_axis_angle
+from mien.tracking.fitting import CameraBatch, NormalEquations, SequenceFit, SharedEquations, Subject, Views
+from mien.tracking.landmarks.detector_response import DetectorResponse
+from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_EYELIDS, RIGHT_IRIS, landmark_weights
+from mien.tracking.landmarks.model import LandmarkModel, Linearization
+from mien.tracking.settings import TrackingSettings
+
+_CHUNK = 48
+"""Number of pictures linearised at once, which takes about 100 MB of memory."""
+_PROJECTED = 512
+"""Number of pictures projected at once, which takes about as much memory."""
+_SIDEWAYS = 0.3
+"""Angle between the direction of the face and the camera at which a picture counts half, in radians."""
+
+
+def move_subject(subject: Subject, step: Float[Tensor, " s"], response: DetectorResponse) -> Subject:
+    """The subject with `shared` changed by a step."""
+    identity, person = step.split([len(subject.identity), len(subject.person)])
+    bias = subject.bias + response.of_person(person)
+    return replace(subject, identity=subject.identity + identity, person=subject.person + person, bias=bias)
+
+
+def unknown_subject(model: LandmarkModel) -> Subject:
+    """The subject before any fit: an average person."""
+    response = model.response
+    zeros = response.mean.new_zeros
+    return Subject(zeros(len(model.identity_basis)), response.mean, person=zeros(len(response.by_person)))
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkTerm:
+    """Landmark costs of the v timesteps of one sequence.
+
+    The cost of a timestep is the sum of t w_l rho(|r_l|^2 / sigma^2) over its pictures and their landmarks, plus the
+    prior's; t is the picture's trust. With rho(s) = c^2 s / (c^2 + s) (Geman and McClure) the pull of outliers fades.
+    """
+
+    model: LandmarkModel
+    views: Views
+    weights: Float[Tensor, " l"]
+    """Weights of the landmarks. They sum to the number of independent points that a picture's landmarks are worth."""
+    sigma: Float[Tensor, " c"]
+    """Expected distance in each camera, in pixels."""
+    outlier: float
+    """The c of rho: beyond this many sigmas a landmark hardly counts."""
+
+    def at(self, rows: Int[Tensor, " k"]) -> "LandmarkTerm":
+        """The same term over some of the timesteps."""
+        return replace(self, views=self.views.at(rows))
+
+    def robust(
+        self, residual: Float[Tensor, "n l 2"], pictures: Views
+    ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n l"]]:
+        """Robust costs of pictures with these residuals, and the weight of each landmark's squared residual."""
+        variance = self.sigma[pictures.camera][:, None] ** 2
+        squared = (residual**2).sum(-1) / variance
+        least = self.outlier**2
+        weights = self.weights * pictures.trust[:, None]
+        cost = (weights * least * squared / (least + squared)).sum(-1)
+        return cost, weights * (least / (least + squared)) ** 2 / variance
+
+    def _prior(self, state: Float[Tensor, "v p"]) -> tuple[Float[Tensor, " v"], Float[Tensor, "v p"]]:
+        pull = state @ self.model.layout.precision
+        return (state * pull).sum(-1), pull
+
+    def _offsets(
+        self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
+    ) -> Iterator[tuple[Float[Tensor, "m l 2"], Views]]:
+        """Yield the offsets from detected to projected landmarks, and their pictures, a bounded number at a time."""
+        for start in range(0, len(self.views.row), _PROJECTED):
+            pictures = self.views.some(slice(start, start + _PROJECTED))
+            # Landmarks of a timestep are posed once for all of its cameras.
+            seen, place = pictures.row.unique(return_inverse=True)
+            batch = cameras[pictures.camera]
+            projected = self.model.project(state[seen], subject.identity, subject.bias, batch, place)
+            yield projected - pictures.detected, pictures
+
+    def cost(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
+        """The cost of each timestep."""
+        of_pictures = torch.cat([self.robust(*part)[0] for part in self._offsets(state, subject, cameras)])
+        return self._prior(state)[0].index_add(0, self.views.row, of_pictures)
+
+    def residuals(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "n l"]:
+        """Distances between detected and projected landmarks in each picture, in pixels."""
+        return torch.cat([offsets.norm(dim=-1) for offsets, _ in self._offsets(state, subject, cameras)])
+
+    def linearizations(
+        self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch, with_identity: bool = False
+    ) -> "Iterator[WeightedLinearization]":
+        """Yield linearisations of all pictures, a bounded number at a time."""
+        for start in range(0, len(self.views.row), _CHUNK):
+            pictures = self.views.some(slice(start, start + _CHUNK))
+            seen, place = pictures.row.unique(return_inverse=True)
+            batch = cameras[pictures.camera]
+            at = self.model.linearize(state[seen], subject.identity, subject.bias, batch, place, with_identity)
+            residual = at.pixels - pictures.detected
+            cost, weights = self.robust(residual, pictures)
+            yield WeightedLinearization(at, pictures.row, residual, weights, cost)
+
+    def equations(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> NormalEquations:
+        """The normal equations of each timestep on its own, with the shared parameters fixed."""
+        equations = self._prior_equations(state)
+        for part in self.linearizations(state, subject, cameras):
+            part.add_to(equations)
+        return equations
+
+    def joint_equations(
+        self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
+    ) -> tuple[NormalEquations, SharedEquations]:
+        """The normal equations of each timestep and of the shared parameters.
+
+        The shared parameters are `Subject.shared`, then the logarithm of the focal length.
+        """
+        equations = self._prior_equations(state)
+        size = len(subject.shared) + 1
+        shared = SharedEquations(
+            state.new_zeros(*state.shape, size), state.new_zeros(size, size), state.new_zeros(size)
+        )
+        for part in self.linearizations(state, subject, cameras, with_identity=True):
+            part.add_to(equations)
+            part.add_to_shared(shared)
+        return equations, shared
+
+    def _prior_equations(self, state: Float[Tensor, "v p"]) -> NormalEquations:
+        cost, pull = self._prior(state)
+        return NormalEquations(cost, pull, self.model.layout.precision.repeat(len(state), 1, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedLinearization:
+    """A linearisation of n pictures with its residuals and their current robust weights."""
+
+    at: Linearization
+    row: Int[Tensor, " n"]
+    """The timestep of each picture."""
+    residual: Float[Tensor, "n l 2"]
+    weights: Float[Tensor, "n l"]
+    cost: Float[Tensor, " n"]
+
+    def _weighted(self, derivative: Float[Tensor, "n l 2 s"]) -> Float[Tensor, "n m s"]:
+        return (derivative * self.weights.sqrt()[:, :, None, None]).flatten(1, 2)
+
+    def add_to(self, equations: NormalEquations) -> None:
+        """Add cost, half gradient and half Hessian by the timesteps' own parameters, in place."""
+        jacobian = self._weighted(self.at.by_frame)
+        gradient = jacobian.mT @ self._weighted(self.residual[..., None])
+        equations.cost.index_add_(0, self.row, self.cost)
+        equations.gradient.index_add_(0, self.row, gradient[..., 0])
+        equations.hessian.index_add_(0, self.row, jacobian.mT @ jacobian)
+
+    def add_to_shared(self, equations: SharedEquations) -> None:
+        """Add the blocks of the shared parameters, in place."""
+        assert self.at.by_identity is not None
+        assert self.at.by_person is not None
+        derivatives = [self.at.by_identity, self.at.by_person, self.at.by_log_focal[..., None]]
+        shared = self._weighted(torch.cat(derivatives, dim=-1))
+        own = self._weighted(self.at.by_frame)
+        gradient = shared.mT @ self._weighted(self.residual[..., None])
+        equations.across.index_add_(0, self.row, own.mT @ shared)
+        equations.hessian.add_((shared.mT @ shared).sum(0))
+        equations.gradient.add_(gradient[..., 0].sum(0))
+
+    def bias_equations(self) -> tuple[Float[Tensor, "l 3 3"], Float[Tensor, "l 3"]]:
+        """Half Hessian and half gradient of every landmark's bias."""
+        weighted = self.at.by_bias * self.weights[:, :, None, None]
+        hessian = torch.einsum("nlxc,nlxd->lcd", weighted, self.at.by_bias)
+        return hessian, torch.einsum("nlxc,nlx->lc", weighted, self.residual)
+
+
+def landmark_term(
+    model: LandmarkModel,
+    views: Views,
+    weights: Float[Tensor, " l"],
+    state: Float[Tensor, "v p"],
+    cameras: CameraBatch,
+    settings: TrackingSettings,
+) -> LandmarkTerm:
+    """The landmark cost, with the expected error turned from metres into pixels at the median depth in each camera."""
+    towards, origin = cameras.viewmat[:, 2, :3], cameras.viewmat[:, 2, 3]
+    depth = (state[views.row, 3:6] * towards[views.camera]).sum(-1) + origin[views.camera]
+    sigma = torch.ones_like(origin)
+    for camera in views.camera.unique():
+        middle = depth[views.camera == camera].median()
+        sigma[camera] = settings.landmark_sigma * cameras.K[camera, 0, 0] / middle
+    weights = weights * (settings.independent_landmarks / weights.sum())
+    return LandmarkTerm(model, views, weights, sigma, settings.outlier)
+
+
+def all_landmarks(model: LandmarkModel, views: Views, own: SequenceFit, settings: TrackingSettings) -> LandmarkTerm:
+    """The cost of all landmarks at the depth of a fit. Its head poses determine the trust in each picture."""
+    views = replace(views, trust=trust_of(views, own.state, own.cameras))
+    return landmark_term(model, views, landmark_weights(settings.landmarks), own.state, own.cameras, settings)
+
+
+def quiet_landmarks(term: LandmarkTerm, share: float) -> LandmarkTerm:
+    """The term with a share of its weight, except for lips, lids and irises.
+
+    These keep their weight, because one texture cannot show both an open and a closed mouth.
+    """
+    kept = torch.full_like(term.weights, share)
+    kept[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS + LEFT_IRIS + RIGHT_IRIS)] = 1
+    return replace(term, weights=term.weights * kept)
+
+
+def trust_of(views: Views, state: Float[Tensor, "v p"], cameras: CameraBatch) -> Float[Tensor, " n"]:
+    """Weight of each picture's landmarks, 0..1. It is 1 for the most frontal picture of each timestep.
+
+    Args:
+        views: The pictures.
+        state: Parameters of the timesteps. The first six are the head's axis-angle rotation and translation (metres).
+        cameras: The cameras, in the frame of the state.
+    """
+    ahead = matrix_from_axis_angle(state[:, :3])[views.row, :, 2]
+    sight = cameras.centres[views.camera] - state[views.row, 3:6]
+    angle = ((ahead * sight).sum(-1) / sight.norm(dim=-1)).clamp(-1, 1).acos()
+    trust = 1 / (1 + (angle / _SIDEWAYS) ** 4)
+    best = torch.zeros_like(state[:, 0]).scatter_reduce(0, views.row, trust, "amax")
+    return trust / best[views.row]

@@ -1,0 +1,98 @@
+"""Pictures of the tracked model with its texture and light, and the difference of their colours from the capture's."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien import _native
+from mien.camera import Camera
+from mien.capture.capture import Capture
+from mien.face import FaceModel
+from mien.render.mesh import vertex_normals
+from mien.tracking.fitting import CameraBatch, batch_of
+from mien.tracking.pixels.pictures import Picture, Pictures
+from mien.tracking.pixels.surface import PosedSurface
+from mien.tracking.pixels.texture import Appearance, Sighting, texture_space
+from mien.tracking.tracking import Looks, Tracking
+
+_OUTLIER = 10.0
+"""Beyond this many standard deviations a pixel hardly counts for `Comparison.rms`."""
+_LEAST_PIXELS = 100.0
+"""Fewest pixels of a comparison. Fewer show nothing of a face."""
+_MARGIN, _LEAST_WINDOW = 3, 8
+"""Margin around a mesh and least size of a window, in pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """The part of a picture that a mesh may cover. A head leaves most of a picture empty."""
+
+    camera: Camera
+    """The camera of that part alone."""
+    rows: slice
+    columns: slice
+
+
+def window_of(camera: Camera, vertices: Float[Tensor, "v 3"]) -> Window:
+    """The window of a mesh in a picture. It is never smaller than 8 x 8 pixels."""
+    points, depth = camera.project(vertices)
+    points = points[depth > 0] if (depth > 0).any() else points.new_zeros(1, 2)
+    size = torch.tensor([camera.width, camera.height])
+    first = torch.minimum((points.amin(0).floor().long() - _MARGIN).clamp_min(0), size - _LEAST_WINDOW)
+    last = torch.minimum(points.amax(0).ceil().long() + _MARGIN, size).maximum(first + _LEAST_WINDOW)
+    (left, top), (right, bottom) = first.tolist(), last.tolist()
+    part = camera.cropped(float(left), float(top), right - left, bottom - top)
+    return Window(part, slice(top, bottom), slice(left, right))
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Comparison of a picture with the model's picture, in the part that the mesh may cover."""
+
+    window: Window
+
+    image: Float[Tensor, "h w 3"]
+    """The model's colours, 0..1, plus the smooth differences of light to the picture; NaN where not compared."""
+    difference: Float[Tensor, "h w"]
+    """Length of the difference of the three colours; NaN where not compared."""
+    rms: float
+    """Robust root mean square of the differences; NaN if too few pixels were compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelPictures:
+    """The model's pictures of one tracked capture."""
+
+    pictures: Pictures
+    cameras: CameraBatch
+    looks: Looks
+    surface: "_native.AlignSurface"
+    face_model: FaceModel
+
+    @torch.no_grad()
+    def compare(self, timestep: int, camera: int, vertices: Float[Tensor, "v 3"]) -> Comparison:
+        """Compare one picture with the model's. Several threads may call this at once."""
+        picture = self.pictures.picture(timestep, camera, self.cameras)
+        window = window_of(picture.camera, vertices)
+        part = window.rows, window.columns
+        picture = Picture(window.camera, picture.image[part].contiguous(), picture.mask[part].contiguous())
+        posed = PosedSurface(vertices.contiguous(), vertex_normals(vertices, self.face_model.faces), None)
+        view, residual = picture.camera, torch.empty_like(picture.image)
+        depth = float(view.project(vertices.mean(0, keepdim=True))[1])
+        radius = max(round(self.looks.light_extent * float(view.K[0, 0]) / max(depth, 1e-3)), 2)
+        seen = Sighting(posed, picture, self.looks.light.contiguous()).arguments()
+        cost, weight = _native.align_mesh(self.surface, *seen, radius, None, None, None, residual, None)
+        rms = self.looks.sigma * cost**0.5 if weight >= _LEAST_PIXELS else float("nan")
+        return Comparison(window, picture.image - residual, residual.norm(dim=-1), rms)
+
+
+def model_pictures(capture: Capture, tracking: Tracking, face_model: FaceModel) -> ModelPictures | None:
+    """The model's pictures of a tracked capture, or None if it was not fitted to pixels (`Tracking.looks`)."""
+    looks = tracking.looks
+    if looks is None:
+        return None
+    appearance = Appearance(looks.texture.contiguous(), looks.trust.contiguous(), looks.sigma)
+    surface = texture_space(face_model, looks.texture.shape[0]).native(appearance, _OUTLIER)
+    return ModelPictures(Pictures(capture, 1), batch_of(tracking.cameras), looks, surface, face_model)

@@ -1,0 +1,299 @@
+"""The photometric stage: it moves faces that were tracked from landmarks until one texture fits all pictures."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien.parallel import in_threads
+from mien.progress import progress_bar, say
+from mien.tracking.eyelids import place_lids
+from mien.tracking.fitting import (
+    Fit,
+    Keeper,
+    NormalEquations,
+    SequenceFit,
+    Shot,
+    Smoothness,
+    Subject,
+    Watch,
+    smoothness_of,
+    solve_chain,
+)
+from mien.tracking.landmarks import LandmarkModel, LandmarkTerm, all_landmarks, fit_bias, quiet_landmarks
+from mien.tracking.pixels.outline import outline_term
+from mien.tracking.pixels.pictures import Pictures
+from mien.tracking.pixels.shared import SharedPrior, step_shared
+from mien.tracking.pixels.surface import SurfaceModel, surface_model
+from mien.tracking.pixels.term import PhotometricTerm
+from mien.tracking.pixels.texture import (
+    PhotometricFit,
+    Sighting,
+    TextureSpace,
+    estimate_appearance,
+    even_light,
+    photometric_fit_of,
+    texture_space,
+    unknown_appearance,
+)
+from mien.tracking.settings import PhotometricSettings, TrackingSettings
+
+_DAMPING = 1e-3
+_WORSE = 1.02
+"""A step of a frame is undone if it multiplies the frame's cost by this factor or more."""
+_FRAMES_AT_ONCE = 256
+"""Number of timesteps whose equations are stored as one piece: a few seconds of work, about 10 MB."""
+_SHARED_COST, _LOOK_COST, _LIDS_PART = 100, 40, 4
+"""Costs for the progress bar. The first two are the durations of a step of identity and an estimate of the texture, in
+timesteps of a step of all frames. The third is how many times longer a step of all frames takes than the lids."""
+_LEAST_KEYFRAMES = 3
+"""Fewest keyframes for any number of cameras, because the mouth must be seen open and closed."""
+_LEAST_SHARE = 0.03
+"""Least weight of a frame in the texture, however far from the middle pose. It may be the only one to show an ear."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """Data and settings that all steps of one round share."""
+
+    model: SurfaceModel
+    space: TextureSpace
+    shots: Sequence[Shot]
+    landmarks: Sequence[LandmarkTerm]
+    settings: PhotometricSettings
+    size: int
+
+    @property
+    def keyframes(self) -> int:
+        """Number of keyframes of each sequence for the steps of the shared parameters."""
+        pictures = 2 * self.settings.keyframes // max(shot.capture.valid.shape[1] for shot in self.shots)
+        return min(self.settings.keyframes, max(pictures, _LEAST_KEYFRAMES))
+
+    def pictures(self, shot: Shot) -> Pictures:
+        """The pictures of a sequence at this round's size."""
+        return Pictures(shot.capture, max(round(min(shot.capture.width, shot.capture.height) / self.size), 1))
+
+    def light_radius(self, shot: Shot, own: SequenceFit) -> int:
+        """Radius in pixels over which a smooth difference counts as light."""
+        cameras = own.cameras
+        depth = (own.state[:, 3:6] @ cameras.viewmat[0, 2, :3] + cameras.viewmat[0, 2, 3]).median()
+        extent = self.settings.light_extent * float(cameras.K[0, 0, 0] / depth)
+        return max(round(extent / self.pictures(shot).shrink), 2)
+
+    def terms(self, at: PhotometricFit, independent_pixels: float) -> list[PhotometricTerm]:
+        """The cost of every sequence. All pixels of a picture are worth `independent_pixels` independent ones."""
+        surface = self.space.native(at.appearance, self.settings.outlier)
+        return [
+            PhotometricTerm(
+                self.model, marks, self.pictures(shot), shot.valid.nonzero()[:, 0], surface, light,
+                self.light_radius(shot, own), independent_pixels, at.appearance.sigma,
+            )
+            for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
+        ]  # fmt: skip
+
+    def look(self, at: PhotometricFit) -> PhotometricFit:
+        """Estimate texture and light again, from the present positions of the faces."""
+        sightings = [
+            self._sightings(shot, marks, own, at.fit.subject.identity, light)
+            for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
+        ]
+        radius = self.light_radius(self.shots[0], at.fit.sequences[0])
+        found, lights = estimate_appearance(self.space, sightings, at.appearance, self.settings.outlier, radius)
+        return replace(at, appearance=found, lights=tuple(lights))
+
+    def _sightings(
+        self,
+        shot: Shot,
+        landmarks: LandmarkTerm,
+        own: SequenceFit,
+        identity: Float[Tensor, " i"],
+        light: Float[Tensor, "9 3"],
+    ) -> list[Sighting]:
+        pictures, timesteps = self.pictures(shot), shot.valid.nonzero()[:, 0]
+        middle = own.state[:, :3].median(0).values
+        away = (own.state[:, :3] - middle).norm(dim=1) / self.settings.reference_angle
+        shares = 1 / (1 + away**4) + _LEAST_SHARE if len(own.cameras) == 1 else torch.ones_like(away)
+
+        def sight(row: int) -> list[Sighting]:
+            posed = self.model.pose(own.state[row], identity, derive=False)
+            cameras = landmarks.views.seen_by(row)
+            return [
+                Sighting(
+                    posed, pictures.picture(int(timesteps[row]), camera, own.cameras), light, float(shares[row])
+                )
+                for camera in cameras
+            ]  # fmt: skip
+
+        count = min(self.settings.texture_frames, len(own.state))
+        rows = torch.linspace(0, len(own.state) - 1, count).round().long().unique().tolist()
+        return [sighting for several in in_threads(sight, rows) for sighting in several]
+
+
+def refine_photometrically(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    lenses: Sequence[int | None],
+    fit: Fit,
+    settings: TrackingSettings,
+    keeper: Keeper,
+    watch: Watch,
+) -> PhotometricFit:
+    """Refine a fit to landmarks until the pictures agree with one texture that they all share.
+
+    Each round fits identity and unknown focal lengths to keyframes (from the second round on), then the albedo by
+    robust least squares per texel in turn with the light (spherical harmonics), then takes one Gauss-Newton step of all
+    timesteps of each sequence under their smoothness cost. Landmarks stay in the cost with less weight; irises, lids
+    and lips need them. At the end the lids are placed from the pictures (`place_lids`). The result is deterministic.
+
+    Args:
+        model: The face model reduced to its landmarks.
+        shots: The sequences.
+        lenses: Index of each sequence's unknown focal length (`lenses_of`).
+        fit: The fit to landmarks.
+        settings: Settings of the whole tracking.
+        keeper: Keeps the pieces from which an interrupted fit of the same input resumes.
+        watch: Receives the progress.
+    """
+    own_settings = settings.photometric
+    landmarks = [
+        quiet_landmarks(all_landmarks(model, shot.views, own, settings), own_settings.landmark_share)
+        for shot, own in zip(shots, fit.sequences, strict=True)
+    ]
+    surface = surface_model(model.face_model, model.layout)
+    space = texture_space(surface.face_model, own_settings.texture_size)
+    focals = torch.stack([own.cameras.K[0, 0, 0] for own in fit.sequences])
+    prior = SharedPrior(lenses, focals, own_settings.focal_sigma, settings.identity_weight)
+    at = PhotometricFit(
+        fit, unknown_appearance(space), tuple(even_light() for _ in shots),
+        tuple(torch.zeros(len(own.state), dtype=torch.bool) for own in fit.sequences),
+    )  # fmt: skip
+    rounds = [_Round(surface, space, shots, landmarks, own_settings, size) for size in own_settings.sizes]
+
+    outlines = [
+        outline_term(
+            surface, shot.capture, shot.valid.nonzero()[:, 0], shot.views,
+            own_settings.outline_weight if len(shot.cameras) == 1 else 0.0,  # Several cameras see depth without it.
+        )
+        for shot in shots
+    ]  # fmt: skip
+    frames = sum(len(own.state) for own in fit.sequences)
+    several = any(len(own.cameras) > 1 for own in fit.sequences)
+    shared_steps = own_settings.shared_steps_of_cameras if several else own_settings.shared_steps
+    total, done = len(rounds) * (_LOOK_COST + frames) + (len(rounds) - 1) * shared_steps * _SHARED_COST, 0
+    total += frames // _LIDS_PART
+
+    def step_identity(now: _Round, at: PhotometricFit) -> PhotometricFit:
+        at = now.look(at)
+        moved = step_shared(now.terms(at, own_settings.independent_pixels), outlines, at.fit, prior, now.keyframes)
+        return replace(at, fit=fit_bias(landmarks, moved))
+
+    with progress_bar("Fitting to pixels", total=total) as advance:
+
+        def advance_by(amount: int, status: str) -> None:
+            nonlocal done
+            done += amount
+            advance(amount, status=status)
+            watch(f"pixels, {status}", done / total)
+
+        def kept(name: str, status: str, make: Callable[[], PhotometricFit]) -> PhotometricFit:
+            found = photometric_fit_of(keeper.once(name, lambda: make().tensors()))
+            watch(f"pixels, {status}", done / total, lambda: found)
+            return found
+
+        for number, now in enumerate(rounds):
+            status = f"round {number + 1} of {len(rounds)}"
+            for step in range(shared_steps if number > 0 else 0):
+                at = kept(f"round-{number}-shared-{step}", f"{status}, identity", partial(step_identity, now, at))
+                advance_by(_SHARED_COST, f"{status}, identity")
+            at = kept(f"round-{number}-looks", f"{status}, texture and light", partial(now.look, at))
+            advance_by(_LOOK_COST, f"{status}, texture and light")
+            if not (at.appearance.trust > 0).any():
+                say(f"{surface.face_model.name}: pictures give its texture nothing, so faces are as landmarks put them")
+                return replace(at, fit=fit)
+            step_all = partial(_step_sequences, now, at, settings, keeper, f"step-{number}")
+            at = kept(f"round-{number}", status, partial(step_all, partial(advance_by, status=f"{status}, frames")))
+            keeper.drop(f"step-{number}")
+
+        def blink() -> PhotometricFit:
+            return replace(at, fit=place_lids(model, shots, at.fit, own_settings.lids))
+
+        at = kept("lids", "lids", blink)
+        advance_by(frames // _LIDS_PART, "lids")
+    return _with_residuals(rounds[0], rounds[0].look(at))
+
+
+def _with_residuals(now: _Round, at: PhotometricFit) -> PhotometricFit:
+    found = [
+        term.residuals(own.state, at.fit.subject, own.cameras).where(improved[:, None], torch.nan)
+        for term, own, improved in zip(
+            now.terms(at, now.settings.independent_pixels_of_frames), at.fit.sequences, at.improved, strict=True
+        )
+    ]
+    return replace(at, residuals=tuple(found))
+
+
+def _step_sequences(
+    now: _Round,
+    at: PhotometricFit,
+    settings: TrackingSettings,
+    keeper: Keeper,
+    name: str,
+    advance: Callable[[int], None],
+) -> PhotometricFit:
+    """Take one step of all timesteps of every sequence. Its pieces are kept under names that begin with `name`."""
+    sequences, improved = [], []
+    terms = now.terms(at, now.settings.independent_pixels_of_frames)
+    parts = zip(terms, now.shots, at.fit.sequences, at.improved, strict=True)
+    for number, (term, shot, own, before) in enumerate(parts):
+        smoothness = smoothness_of(term.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
+        state, better = _step(term, at.fit.subject, own, smoothness, keeper, f"{name}-{number}", advance)
+        sequences.append(replace(own, state=state))
+        improved.append(before | better)
+    return replace(at, fit=replace(at.fit, sequences=tuple(sequences)), improved=tuple(improved))
+
+
+def _equations(
+    term: PhotometricTerm,
+    subject: Subject,
+    own: SequenceFit,
+    keeper: Keeper,
+    name: str,
+    advance: Callable[[int], None],
+) -> NormalEquations:
+    """The equations of all timesteps, computed in pieces. Pieces that an interrupted fit has kept are read."""
+
+    def made(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
+        found = term.equations(own.state, rows, subject, own.cameras)
+        return {"cost": found.cost, "gradient": found.gradient, "hessian": found.hessian}
+
+    v, p = own.state.shape
+    whole = {"cost": own.state.new_empty(v), "gradient": own.state.new_empty(v, p),
+             "hessian": own.state.new_empty(v, p, p)}  # fmt: skip
+    for index, rows in enumerate(torch.arange(v).split(_FRAMES_AT_ONCE)):
+        for key, part in keeper.once(f"{name}-equations-{index}", partial(made, rows)).items():
+            whole[key][rows] = part
+        advance(len(rows))
+    return NormalEquations(**whole)
+
+
+def _step(
+    term: PhotometricTerm,
+    subject: Subject,
+    own: SequenceFit,
+    smoothness: Smoothness,
+    keeper: Keeper,
+    name: str,
+    advance: Callable[[int], None],
+) -> tuple[Float[Tensor, "v p"], Bool[Tensor, " v"]]:
+    """Move all timesteps by one Gauss-Newton step, except those that it makes worse; also returns which ones moved."""
+    bounds, state = term.layout.bounds, own.state
+    equations = _equations(term, subject, own, keeper, name, advance)
+    damping = torch.diag_embed(_DAMPING * equations.hessian.diagonal(dim1=1, dim2=2))
+    held = bounds.held(state, equations.gradient + smoothness.gradient(state))
+    damped = replace(equations, hessian=equations.hessian + damping)
+    candidate = bounds.clip(state + solve_chain(damped, smoothness, state, held))
+    better = term.costs(candidate, subject, own.cameras) < _WORSE * equations.cost
+    return torch.where(better[:, None], candidate, state), better

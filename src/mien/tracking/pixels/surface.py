@@ -1,0 +1,167 @@
+"""The surface of a face model posed in float32, with the derivatives of its vertices."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.face import FaceModel, FaceParams
+from mien.render.mesh import vertex_normals
+from mien.rotation import left_jacobian, matrix_from_axis_angle
+from mien.tracking.fitting import CameraBatch, ParameterLayout
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSurface:
+    """The surface at one timestep, in world space."""
+
+    vertices: Float[Tensor, "v 3"]
+    normals: Float[Tensor, "v 3"]
+    jacobian: Float[Tensor, "v 3 p"] | None
+    """Derivatives of the vertices by the per-frame parameters, then, if requested, by the identity. The latter ignore
+    that joints move with the identity, because joints hardly turn the parts that a photometric fit uses."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceModel:
+    """A face model and its layout of free parameters, with bases laid out for derivatives."""
+
+    face_model: FaceModel
+    exact: FaceModel
+    """The same face model in float64, for the chain of joints."""
+    layout: ParameterLayout
+    expression_basis: Float[Tensor, "v 3 e"]
+    """Basis of the expressions that the fit may move."""
+    identity_basis: Float[Tensor, "v 3 i"]
+
+    def pose(
+        self,
+        state: Float[Tensor, " p"],
+        identity: Float[Tensor, " i"],
+        offsets: Float[Tensor, "v 3"] | None = None,
+        *,
+        derive: bool = True,
+        derive_identity: bool = False,
+    ) -> PosedSurface:
+        """Vertices, normals and derivatives of one timestep. `state` and `identity` are float64."""
+        exact = self.layout.face_params(state[None], identity)
+        face = replace(exact.to(self.face_model.template), vertex_offsets=offsets)
+        shaped = self._shaped(face)
+        transforms = self.exact.joint_transforms(exact)[0, :, :3].float()
+        blended = (self.face_model.skinning_weights @ transforms.flatten(1)).reshape(-1, 3, 4)
+        turns = blended[..., :3]
+        in_head = (turns @ shaped[..., None])[..., 0] + blended[..., 3]
+        rotation = matrix_from_axis_angle(exact.head_rotation[0]).float()
+        turned = in_head @ rotation.T
+        vertices = turned + face.head_translation[0]
+        normals = vertex_normals(vertices, self.face_model.faces)
+        if not derive:
+            return PosedSurface(vertices, normals, None)
+
+        spin = left_jacobian(exact.head_rotation)[0].float()
+        by_rotation = torch.linalg.cross(spin.T[None].expand(len(turned), 3, 3), turned[:, None].expand(-1, 3, 3))
+        by_translation = torch.eye(3).expand(len(turned), 3, 3)
+        by_expression = self.expression_basis
+        by_joints, by_derived = self._by_joint_motion(exact, shaped)
+        parts = [_apply(rotation @ turns, by_expression), _rotate(rotation, by_joints)]
+        parts[0][:, :, self.layout.derived_column] += _rotate(rotation, by_derived)
+        if self.exact.pose_basis is not None and by_joints.shape[-1]:
+            parts[1] = parts[1] + _apply(rotation @ turns, self._pose_correctives(exact))
+        if derive_identity:
+            parts.append(_apply(rotation @ turns, self.identity_basis))
+        return PosedSurface(vertices, normals, torch.cat([by_rotation.mT, by_translation, *parts], dim=-1).contiguous())
+
+    def _shaped(self, face: FaceParams) -> Float[Tensor, "v 3"]:
+        model = self.face_model
+        shaped = model.template + self.identity_basis @ face.identity
+        shaped = shaped + self.expression_basis @ face.expression[0, self.layout.expression_index]
+        if face.vertex_offsets is not None:
+            shaped = shaped + face.vertex_offsets
+        if model.pose_basis is not None:
+            turned = matrix_from_axis_angle(face.joints) - torch.eye(3)
+            shaped = shaped + (turned.flatten() @ model.pose_basis.flatten(1)).reshape(-1, 3)
+        return shaped
+
+    def _by_joint_motion(
+        self, face: FaceParams, shaped: Float[Tensor, "v 3"]
+    ) -> tuple[Float[Tensor, "v 3 m"], Float[Tensor, "v 3 d"]]:
+        """Derivatives in the head frame by free joint angles, and by expressions that move a joint."""
+        free, derived = self.layout.joint_index, self.layout.derived_expression
+        angles = face.joints.flatten(1)
+        at = torch.cat([angles[0, free], face.expression[0, derived]])
+        if len(at) == 0:
+            return shaped.new_zeros(len(shaped), 3, 0), shaped.new_zeros(len(shaped), 3, 0)
+
+        def transforms(parameters: Float[Tensor, "n q"]) -> Tensor:
+            n = len(parameters)
+            moved = angles.expand(n, -1).index_copy(1, free, parameters[:, : len(free)])
+            expression = face.expression.expand(n, -1).index_copy(1, derived, parameters[:, len(free) :])
+            head = face.head_rotation.expand(n, -1), face.head_translation.expand(n, -1)
+            joints = moved.reshape(n, *face.joints.shape[1:])
+            return self.exact.joint_transforms(FaceParams(face.identity, expression, joints, *head))[:, :, :3]
+
+        motion = self._skinned(_derivatives(transforms, at).float(), shaped)
+        return motion[..., : len(free)], motion[..., len(free) :]
+
+    def _skinned(self, by_transforms: Float[Tensor, "n k 3 4"], shaped: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 n"]:
+        n, k = by_transforms.shape[:2]
+        points = torch.cat([shaped, shaped.new_ones(len(shaped), 1)], dim=1)
+        weighted = (self.face_model.skinning_weights[:, :, None] * points[:, None]).flatten(1)
+        return (weighted @ by_transforms.permute(1, 3, 2, 0).reshape(k * 4, 3 * n)).reshape(-1, 3, n)
+
+    def _pose_correctives(self, face: FaceParams) -> Float[Tensor, "v 3 m"]:
+        """Derivatives of the pose correctives, at rest, by the free joint angles."""
+        assert self.face_model.pose_basis is not None
+        angles = face.joints.flatten(1)
+        free = self.layout.joint_index
+
+        def turns(parameters: Float[Tensor, "n m"]) -> Tensor:
+            moved = angles.expand(len(parameters), -1).index_copy(1, free, parameters)
+            return matrix_from_axis_angle(moved.reshape(len(parameters), *face.joints.shape[1:])).flatten(1)
+
+        by_angle = _derivatives(turns, angles[0, free]).float()
+        basis = self.face_model.pose_basis
+        return (by_angle @ basis.flatten(1)).reshape(-1, *basis.shape[1:]).permute(1, 2, 0)
+
+
+def surface_model(face_model: FaceModel, layout: ParameterLayout) -> SurfaceModel:
+    """Make the surface model of a face model and a layout."""
+    model = face_model.to(torch.zeros(()))
+    return SurfaceModel(
+        model,
+        face_model.to(torch.zeros((), dtype=torch.float64)),
+        layout,
+        model.expression_basis[layout.expression_index].permute(1, 2, 0).contiguous(),
+        model.identity_basis.permute(1, 2, 0).contiguous(),
+    )
+
+
+def _apply(turns: Float[Tensor, "v 3 3"], basis: Float[Tensor, "v 3 n"]) -> Float[Tensor, "v 3 n"]:
+    """Multiply the basis by one matrix per vertex, as sums of long rows, because many small products are slow."""
+    out = turns[:, :, 0, None] * basis[:, None, 0]
+    out.addcmul_(turns[:, :, 1, None], basis[:, None, 1])
+    return out.addcmul_(turns[:, :, 2, None], basis[:, None, 2])
+
+
+def _rotate(rotation: Float[Tensor, "3 3"], vectors: Float[Tensor, "v 3 n"]) -> Float[Tensor, "v 3 n"]:
+    return torch.einsum("rc,vcn->vrn", rotation, vectors)
+
+
+def _derivatives(function: Callable[[Tensor], Tensor], at: Float[Tensor, " q"]) -> Float[Tensor, "q ..."]:
+    """Derivatives of a function by each parameter, by central differences. It takes a batch of parameter vectors."""
+    step = 1e-5 * torch.eye(len(at)).to(at)
+    return (function(at + step) - function(at - step)) / 2e-5
+
+
+def by_log_focal(vertices: Float[Tensor, "v 3"], cameras: CameraBatch, seen_by: list[int]) -> Float[Tensor, "v 3 1"]:
+    """Motion of vertices across the line of sight that looks like a change of the focal length, per log focal length.
+
+    It is zero if several cameras see the timestep.
+    """
+    if len(seen_by) != 1:
+        return torch.zeros(len(vertices), 3, 1)  # Several cameras are calibrated.
+    viewmat = cameras.viewmat[seen_by[0]].float()
+    across = vertices @ viewmat[:2, :3].T + viewmat[:2, 3]
+    return (across @ viewmat[:2, :3])[..., None]

@@ -1,0 +1,226 @@
+"""The subject's skin as a texture, and the light of each sequence, from pictures with roughly tracked faces."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien import _native
+from mien.camera import Camera
+from mien.face import FaceModel
+from mien.render.mesh import MeshFragments, rasterize_mesh
+from mien.tracking.fitting import HIDING_REGIONS, Fit, fit_of
+from mien.tracking.pixels.pictures import Picture
+from mien.tracking.pixels.surface import PosedSurface
+
+_LEAST_COSINE = 0.25
+"""Least cosine between the surface's normal and the direction to the camera."""
+_LEAST_WEIGHT = 0.05
+"""Least total weight of a texel's sightings (each the squared cosine) for the texel to be known."""
+_FIRST_SIGMA, _SIGMAS = 0.1, (0.01, 0.1)
+"""Expected colour difference before anything is known, and its bounds afterwards."""
+_ROUNDS = 3
+"""Number of rounds of albedo and light in turn."""
+_LIGHT_STIFFNESS = 0.02
+"""Weight of the prior that pulls the light towards an even one, relative to the evidence of the pictures."""
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """An albedo texture and the trust in each texel."""
+
+    albedo: Float[Tensor, "th tw 3"]
+    trust: Float[Tensor, "th tw"]
+    """Trust in each texel, 0..1: 0 if unknown, below 1 if the pictures contradict each other."""
+    sigma: float
+    """Expected colour difference between picture and prediction."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A posed surface in a picture under a light."""
+
+    posed: PosedSurface
+    picture: Picture
+    light: Float[Tensor, "9 3"]
+    share: float = 1.0
+    """Weight of the picture in the texture."""
+
+    def weighted(self) -> "Sighting":
+        """The sighting with its share multiplied into the mask."""
+        return replace(self, picture=replace(self.picture, mask=self.picture.mask * self.share))
+
+    def arguments(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The arguments for the native core."""
+        camera, picture = self.picture.camera, self.picture
+        posed = self.posed
+        return posed.vertices, posed.normals, camera.K, camera.viewmat, picture.image, picture.mask, self.light
+
+
+@dataclass(frozen=True, eq=False)
+class TextureSpace:
+    """The point of the surface that each texel shows."""
+
+    faces: Int[Tensor, "f 3"]
+    corners: Float[Tensor, "f 3 2"]
+    """Texture coordinates of every triangle's corners."""
+    used: Bool[Tensor, " f"]
+    fragments: MeshFragments
+
+    def native(self, appearance: Appearance, outlier: float) -> "_native.AlignSurface":
+        """The surface with an appearance, for the native core."""
+        return _native.AlignSurface(
+            self.faces, self.corners, self.used.to(torch.uint8), appearance.albedo, appearance.trust,
+            appearance.sigma, outlier, _LEAST_COSINE,
+        )  # fmt: skip
+
+
+def texture_space(face_model: FaceModel, size: int) -> TextureSpace:
+    """Rasterise the face model's texture coordinates into a texture with `size` texels along each side."""
+    corners = face_model.uv[face_model.uv_faces].contiguous()
+    flat = torch.stack([corners[..., 0] * size, (1 - corners[..., 1]) * size, torch.ones(corners.shape[:2])], dim=-1)
+    camera = Camera(torch.eye(3), torch.eye(4), size, size)
+    apart = torch.arange(3 * len(corners)).reshape(-1, 3)
+    fragments = rasterize_mesh(flat.reshape(-1, 3), apart, camera)
+    used = ~face_model.region_mask(*HIDING_REGIONS)
+    return TextureSpace(face_model.faces.contiguous(), corners, used, fragments)
+
+
+def even_light() -> Float[Tensor, "9 3"]:
+    """The light that leaves an albedo unchanged."""
+    light = torch.zeros(9, 3)
+    light[0] = math.sqrt(4 * math.pi)
+    return light
+
+
+def unknown_appearance(space: TextureSpace) -> Appearance:
+    """The appearance before any picture: no texel is known."""
+    size = space.fragments.face_index.shape
+    return Appearance(torch.zeros(*size, 3), torch.zeros(size), _FIRST_SIGMA)
+
+
+def estimate_appearance(
+    space: TextureSpace, sightings: Sequence[Sequence[Sighting]], start: Appearance, outlier: float, light_radius: int
+) -> tuple[Appearance, list[Float[Tensor, "9 3"]]]:
+    """Estimate the albedo in turn with the light of every sequence.
+
+    The albedo is a least squares fit for each texel, which is robust from the second round on.
+
+    Args:
+        space: The texels.
+        sightings: Sightings of each sequence, with the light known so far.
+        start: The appearance known so far. Its sigma scales the robust weights.
+        outlier: Outlier threshold in sigmas.
+        light_radius: Radius in pixels over which a smooth difference counts as light and is left out of the texture.
+    """
+    appearance, known = start, bool((start.trust > 0).any())
+    lights = [own[0].light for own in sightings]
+    for turn in range(_ROUNDS):
+        appearance = _bake(space, sightings, lights, appearance, outlier)
+        if not appearance.trust.any():
+            return appearance, lights
+        if turn == 0 and not known:
+            appearance = _one_color(appearance)
+        lights = [
+            _fit_light(space, own, light, appearance, outlier) for own, light in zip(sightings, lights, strict=True)
+        ]
+    even = [
+        [_without_smooth_residual(space, replace(one, light=light), appearance, outlier, light_radius) for one in own]
+        for own, light in zip(sightings, lights, strict=True)
+    ]
+    return _bake(space, even, lights, appearance, outlier), lights
+
+
+def _without_smooth_residual(
+    space: TextureSpace, sighting: Sighting, appearance: Appearance, outlier: float, radius: int
+) -> Sighting:
+    """The sighting without the part of its difference from the prediction that is smooth over `radius` pixels."""
+    smooth = torch.empty_like(sighting.picture.image)
+    surface = space.native(appearance, outlier)
+    _native.align_mesh(surface, *sighting.arguments(), radius, None, None, None, None, smooth)
+    return replace(sighting, picture=replace(sighting.picture, image=sighting.picture.image - smooth))
+
+
+def _bake(
+    space: TextureSpace,
+    sightings: Sequence[Sequence[Sighting]],
+    lights: Sequence[Float[Tensor, "9 3"]],
+    appearance: Appearance,
+    outlier: float,
+) -> Appearance:
+    size = space.fragments.face_index.shape
+    surface = space.native(appearance, outlier)
+    weight = torch.zeros(size)
+    squares, mixed, image = (torch.zeros(*size, 3) for _ in range(3))
+    for own, light in zip(sightings, lights, strict=True):
+        for sighting in own:
+            _native.bake_texture(
+                surface, *replace(sighting, light=light).weighted().arguments(), space.fragments.face_index,
+                space.fragments.barycentric, weight, squares, mixed, image,
+            )  # fmt: skip
+    known = weight > _LEAST_WEIGHT
+    albedo = mixed / squares.clamp_min(1e-6) * known[..., None]
+    variance = ((image - albedo * mixed).sum(-1) / weight.clamp_min(1e-6)).clamp_min(0)
+    sigma = float(variance[known].median().sqrt().clamp(*_SIGMAS)) if known.any() else appearance.sigma
+    trust = known * (sigma**2 / (0.5 * sigma**2 + variance)).clamp_max(1.0)
+    return Appearance(albedo, trust, sigma)
+
+
+def _one_color(appearance: Appearance) -> Appearance:
+    """The appearance with its median colour in all known texels. At the start, all variation counts as light."""
+    median = appearance.albedo[appearance.trust > 0].median(0).values
+    return replace(appearance, albedo=(appearance.trust > 0)[..., None] * median, sigma=_FIRST_SIGMA)
+
+
+def _fit_light(
+    space: TextureSpace,
+    sightings: Sequence[Sighting],
+    light: Float[Tensor, "9 3"],
+    appearance: Appearance,
+    outlier: float,
+) -> Float[Tensor, "9 3"]:
+    hessian, right = torch.zeros(3, 9, 9).double(), torch.zeros(3, 9).double()
+    surface = space.native(appearance, outlier)
+    for sighting in sightings:
+        _native.light_equations(surface, *replace(sighting, light=light).arguments(), hessian, right)
+    hessian = hessian + hessian.triu(1).mT
+    stiffness = _LIGHT_STIFFNESS * hessian.diagonal(dim1=1, dim2=2).amax(1)[:, None].expand(3, 9).clone() + 1e-9
+    hessian = hessian + torch.diag_embed(stiffness)
+    right = right + stiffness * even_light().T.double()
+    return torch.linalg.solve(hessian, right).T.float().contiguous()
+
+
+@dataclass(frozen=True, eq=False)
+class PhotometricFit:
+    """A fit to pixels with the texture and light that it found."""
+
+    fit: Fit
+    appearance: Appearance
+    lights: tuple[Float[Tensor, "9 3"], ...]
+    """Light of each sequence."""
+    improved: tuple[Bool[Tensor, " _"], ...]
+    """Timesteps of each sequence that the fit to pixels improved. The others keep their fit to landmarks."""
+    residuals: tuple[Float[Tensor, "_ _"], ...] = ()
+    """`PhotometricTerm.residuals` of each sequence; NaN where not improved."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything but the residuals as tensors by name, for a file."""
+        tensors = self.fit.tensors() | {"albedo": self.appearance.albedo, "trust": self.appearance.trust}
+        tensors["sigma"] = torch.tensor([self.appearance.sigma], dtype=torch.float64)
+        for index, (light, improved) in enumerate(zip(self.lights, self.improved, strict=True)):
+            tensors |= {f"light_{index}": light, f"improved_{index}": improved.to(torch.uint8)}
+        return tensors
+
+
+def photometric_fit_of(tensors: Mapping[str, Tensor]) -> PhotometricFit:
+    """The fit made of tensors by name (`PhotometricFit.tensors`)."""
+    fit = fit_of(tensors)
+    count = range(len(fit.sequences))
+    return PhotometricFit(
+        fit, Appearance(tensors["albedo"], tensors["trust"], float(tensors["sigma"])),
+        tuple(tensors[f"light_{index}"] for index in count),
+        tuple(tensors[f"improved_{index}"].bool() for index in count),
+    )  # fmt: skip

@@ -1,0 +1,104 @@
+"""Contact sheet of a tracking: evenly spread frames and frames that stand out, each with all its panels."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from mien.capture.capture import Capture
+from mien.face import FaceModel
+from mien.tracking.report.heat import draw_legend, write_text
+from mien.tracking.report.overlay import OverlayPainter, frontal_camera
+from mien.tracking.tracking import Tracking
+
+_EVEN, _MOST_FLAGGED, _MOST_ALONE = 8, 8, 4
+"""Largest numbers of evenly spread frames, of flagged frames, and of frames tracked from landmarks alone."""
+_TILE = 240
+"""Side of each tile, in pixels."""
+_STRIPS = 2
+"""Number of frames side by side."""
+_GAP = 4
+_PAPER = 255
+
+
+@dataclass(frozen=True)
+class SheetFrame:
+    """One frame on a contact sheet."""
+
+    timestep: int
+    camera: int
+    why: str = ""
+    """Why the frame stands out; empty for an evenly spread frame."""
+
+
+def sheet_frames(tracking: Tracking, flagged: Sequence[int], alone: Sequence[int]) -> list[SheetFrame]:
+    """The frames to show, in the order of time: evenly spread ones from the frontal camera, and ones that stand out.
+
+    Args:
+        tracking: The tracking. At least one of its frames has a face.
+        flagged: Timesteps that stand out. Those with the largest residuals are shown, each from its worst camera.
+        alone: Timesteps tracked from landmarks alone. If they are half of those with a face or more, none is shown.
+    """
+    frontal, valid = frontal_camera(tracking), tracking.valid.nonzero()[:, 0]
+    even = valid[torch.linspace(0, len(valid) - 1, min(_EVEN, len(valid))).round().long()].tolist()
+    chosen = {timestep: SheetFrame(timestep, frontal) for timestep in even}
+    if 2 * len(alone) < len(valid):
+        for timestep in alone[:: max(len(alone) // _MOST_ALONE, 1)][:_MOST_ALONE]:
+            chosen[timestep] = SheetFrame(timestep, _camera_of_face(tracking.residuals[timestep]), "landmarks only")
+    worst = tracking.residuals if tracking.pixel_residuals is None else tracking.pixel_residuals
+    size = worst.nan_to_num(-1).amax(1)
+    for timestep in worst_of_runs(flagged, size.numpy())[:_MOST_FLAGGED]:
+        chosen[timestep] = SheetFrame(timestep, int(worst[timestep].nan_to_num(-1).argmax()), "flagged")
+    return [chosen[timestep] for timestep in sorted(chosen)]
+
+
+def worst_of_runs(timesteps: Sequence[int], values: Float[np.ndarray, " t"]) -> list[int]:
+    """The timestep with the largest value of each run of neighbouring timesteps, the worst first."""
+    known = np.nan_to_num(values, nan=-np.inf)
+    runs = np.split(np.array(timesteps, dtype=np.int64), np.nonzero(np.diff(timesteps) > 1)[0] + 1)
+    worst = [int(run[known[run].argmax()]) for run in runs if len(run)]
+    return sorted(worst, key=lambda one: -known[one])
+
+
+def contact_sheet(
+    capture: Capture, tracking: Tracking, face_model: FaceModel, frames: Sequence[SheetFrame]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The frames as a grid of strips (see `strip`)."""
+    painter = OverlayPainter(capture, tracking, face_model)
+    strips = [strip(painter, capture, frame, _name(capture, frame)) for frame in frames]
+    columns = min(_STRIPS, len(strips))
+    strips += [np.full_like(strips[0], _PAPER)] * (-len(strips) % columns)
+    rows = [_joined(strips[first : first + columns], 1) for first in range(0, len(strips), columns)]
+    return _joined(rows, 0)
+
+
+def _name(capture: Capture, frame: SheetFrame) -> str:
+    camera = "" if len(capture.camera_ids) == 1 else f"{capture.camera_ids[frame.camera]} "
+    return f"{frame.timestep} {camera}{frame.why}".rstrip()
+
+
+def strip(painter: OverlayPainter, capture: Capture, frame: SheetFrame, name: str) -> UInt8[np.ndarray, "h w 3"]:
+    """A frame's picture and the mesh over it. If pixels were compared, also the model's picture and the heat map."""
+    image = np.asarray(capture.images[frame.timestep, frame.camera])
+    rows, columns = painter.head_box(frame.timestep, frame.camera)
+    panels = [image, *painter.panels(frame.timestep, frame.camera)[1:]]
+    tiles = [cv2.resize(panel[rows, columns], (_TILE, _TILE), interpolation=cv2.INTER_AREA) for panel in panels]
+    write_text(tiles[0], name, (6, 16), 0.45)
+    if len(tiles) > 2:
+        draw_legend(tiles[-1], 8)
+    return np.concatenate(tiles, axis=1)
+
+
+def _joined(pictures: Sequence[UInt8[np.ndarray, "_ _ 3"]], axis: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    shape = list(pictures[0].shape)
+    shape[axis] = _GAP
+    between = np.full(shape, _PAPER, np.uint8)
+    return np.concatenate([part for picture in pictures for part in (between, picture)][1:], axis=axis)
+
+
+def _camera_of_face(residuals: Float[torch.Tensor, " c"]) -> int:
+    """The first camera that found a face; the first of all if none did."""
+    return int(residuals.isfinite().int().argmax())

@@ -1,0 +1,221 @@
+"""The overlay video, which shows whether the tracked mesh fits the pictures."""
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from mien.camera import Camera
+from mien.capture.capture import Capture
+from mien.capture.video import write_video
+from mien.face import FaceModel
+from mien.parallel import stream_in_threads
+from mien.progress import track_progress
+from mien.render.mesh import Headlight, render_mesh
+from mien.tracking.pixels import model_pictures, window_of
+from mien.tracking.report.heat import dimmed, draw_legend, heat_map, write_text
+from mien.tracking.tracking import Tracking
+
+_REGION_COLORS = {
+    "lips": (0.95, 0.45, 0.5), "eyelids": (0.55, 0.75, 0.95), "eyes": (1.0, 1.0, 1.0), "irises": (0.2, 0.3, 0.7),
+    "teeth": (1.0, 1.0, 0.85), "mouth": (0.45, 0.1, 0.1), "brows": (0.6, 0.55, 0.4), "ears": (0.65, 0.9, 0.6),
+    "nose": (0.9, 0.85, 0.6), "tongue": (0.85, 0.55, 0.5),
+}  # fmt: skip
+_SKIN = (0.8, 0.78, 0.75)
+_MESH_OPACITY = 0.6
+_GREEN, _RED, _BLUE = (60, 255, 60), (255, 60, 40), (60, 160, 255)
+_SUBPIXEL_BITS = 4
+_GRID_WIDTH = 1920
+"""Largest width of a grid of pictures, in pixels."""
+_MOST_PICTURES = 3000
+_CRF, _PRESET = 21, "veryfast"
+"""Quality that is enough for viewing. Writing takes a quarter of the time of `write_video`'s defaults."""
+
+
+def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, every: int = 1) -> None:
+    """Write a video of `OverlayPainter.picture`.
+
+    If `every` is n, it shows every n-th timestep at 1/n of the frame rate, so it lasts as long as the capture. Several
+    cameras form a grid, in the order of the capture, which is scaled down to at most 1920 pixels across.
+    """
+    write_video(path, _pictures(capture, tracking, face_model, every), capture.fps / every, _CRF, _PRESET)
+
+
+def overlay_stride(timesteps: int) -> int:
+    """Stride between the timesteps that an overlay shows, so that a long clip has at most 3,000 pictures."""
+    return math.ceil(timesteps / _MOST_PICTURES)
+
+
+def draw_overlay(
+    capture: Capture, tracking: Tracking, face_model: FaceModel, timestep: int, camera_index: int = 0
+) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """One picture of the overlay video (`OverlayPainter.picture`)."""
+    return OverlayPainter(capture, tracking, face_model).picture(timestep, camera_index)
+
+
+class OverlayPainter:
+    """Draws a tracking over its capture. It is immutable, so several threads may use it at once."""
+
+    def __init__(self, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
+        self._capture, self._tracking, self._face_model = capture, tracking, face_model
+        self._colors = region_colors(face_model)
+        self._models = model_pictures(capture, tracking, face_model)
+
+    def picture(self, timestep: int, camera_index: int = 0) -> UInt8[np.ndarray, "h2 w2 3"]:
+        """The panels joined into one picture: two side by side, or four in a square."""
+        panels = self.panels(timestep, camera_index)
+        write_text(panels[0], self._caption(timestep, camera_index), (8, 20))
+        for panel, name in zip(panels[2:], ("model", "difference"), strict=False):
+            write_text(panel, name, (8, 20))
+        if len(panels) > 2:
+            draw_legend(panels[-1], 32)
+        rows = [np.concatenate(panels[row : row + 2], axis=1) for row in range(0, len(panels), 2)]
+        return np.concatenate(rows, axis=0)
+
+    @torch.no_grad()
+    def panels(self, timestep: int, camera_index: int = 0) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """The two or four panels of a picture, each of the capture's size.
+
+        The first shows detected (green) and mesh (red) landmarks and the neck line, the second the mesh. If the
+        tracking was fitted to pixels, the third shows the model's own picture and the fourth the difference of its
+        colours from the capture's.
+        """
+        image = np.asarray(self._capture.images[timestep, camera_index])
+        vertices = self._face_model(self._tracking.face[timestep])[0]
+        panels = [self._landmarks(image, vertices, timestep, camera_index), self._mesh(image, vertices, camera_index)]
+        if self._models is not None:
+            panels += self._model(image, vertices, timestep, camera_index)
+        return panels
+
+    @torch.no_grad()
+    def head_box(self, timestep: int, camera_index: int = 0) -> tuple[slice, slice]:
+        """Rows and columns of a square around the head, kept inside the picture."""
+        camera = self._tracking.cameras[camera_index]
+        window = window_of(camera, self._face_model(self._tracking.face[timestep])[0])
+        side = min(round(1.15 * max(window.camera.width, window.camera.height)), camera.width, camera.height)
+        middle = ((part.start + part.stop) // 2 for part in (window.rows, window.columns))
+        sizes = (camera.height, camera.width)
+        first = [min(max(at - side // 2, 0), size - side) for at, size in zip(middle, sizes, strict=True)]
+        return slice(first[0], first[0] + side), slice(first[1], first[1] + side)
+
+    def _landmarks(
+        self, image: UInt8[np.ndarray, "h w 3"], vertices: Float[torch.Tensor, "v 3"], timestep: int, camera_index: int
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        tracking, camera = self._tracking, self._tracking.cameras[camera_index]
+        marks = camera.project(self._face_model.landmark_positions(vertices, "mediapipe"))[0].numpy()
+        picture = image.copy()  # A capture read from disk is read-only.
+        detected = np.asarray(self._capture.landmarks[timestep, camera_index])
+        if np.isfinite(detected).all():
+            _draw_points(picture, detected, _GREEN)
+        _draw_points(picture, marks, _RED)
+        _draw_line(picture, tracking.neck_lines[timestep, camera_index].numpy(), camera)
+        return picture
+
+    def _caption(self, timestep: int, camera_index: int) -> str:
+        tracking = self._tracking
+        residual = float(tracking.residuals[timestep, camera_index])
+        missing = "no face found" if tracking.valid[timestep] else "no face, interpolated"
+        text = f"{timestep}: {residual:.2f} px" if np.isfinite(residual) else f"{timestep}: {missing}"
+        if tracking.pixel_residuals is not None and tracking.valid[timestep]:
+            colors = float(tracking.pixel_residuals[timestep, camera_index])
+            text += f", colours {100 * colors:.1f} %" if np.isfinite(colors) else ", landmarks only"
+        return text if len(tracking.cameras) == 1 else f"{self._capture.camera_ids[camera_index]} {text}"
+
+    def _mesh(
+        self, image: UInt8[np.ndarray, "h w 3"], vertices: Float[torch.Tensor, "v 3"], camera_index: int
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        window, faces = window_of(self._tracking.cameras[camera_index], vertices), self._face_model.faces
+        mesh, alpha = render_mesh(vertices, faces, window.camera, self._colors, light=Headlight())
+        drawn, picture = (255 * mesh.clamp_(0, 1)).to(torch.uint8).numpy(), image.copy()
+        part = picture[window.rows, window.columns]
+        blended = cv2.addWeighted(part, 1 - _MESH_OPACITY, drawn, _MESH_OPACITY, 0)
+        np.copyto(part, blended, where=alpha.numpy()[..., None] > 0)
+        return picture
+
+    def _model(
+        self, image: UInt8[np.ndarray, "h w 3"], vertices: Float[torch.Tensor, "v 3"], timestep: int, camera_index: int
+    ) -> list[UInt8[np.ndarray, "h w 3"]]:
+        assert self._models is not None
+        compared = self._models.compare(timestep, camera_index, vertices)
+        part = compared.window.rows, compared.window.columns
+        difference, behind = compared.difference.numpy(), dimmed(image)
+        known = np.isfinite(difference)[..., None]
+        own = (255 * compared.image.nan_to_num(0).clamp_(0, 1)).to(torch.uint8).numpy()
+        panels = [behind, behind.copy()]
+        for panel, drawn in zip(panels, (own, heat_map(difference)), strict=True):
+            np.copyto(panel[part], drawn, where=known)
+        return panels
+
+
+def frontal_camera(tracking: Tracking) -> int:
+    """The index of the camera that the tracked face looks at most directly."""
+    ahead = tracking.face.T_world_head[tracking.valid][:, :3, 2]
+    origins = tracking.face.head_translation[tracking.valid]
+    facing = [
+        torch.nn.functional.cosine_similarity(ahead, camera.position - origins, dim=1).median()
+        for camera in tracking.cameras
+    ]
+    return int(torch.stack(facing).argmax())
+
+
+def region_colors(face_model: FaceModel) -> Float[torch.Tensor, "f 3 3"]:
+    """Colours of the corners of every triangle, which tell lips, lids, irises, ears and other regions apart."""
+    palette = torch.tensor([_REGION_COLORS.get(name, _SKIN) for name in face_model.region_names])
+    return palette[face_model.face_regions.long()][:, None].expand(-1, 3, -1)
+
+
+def draw_overlay_grid(
+    capture: Capture, tracking: Tracking, face_model: FaceModel, timestep: int
+) -> UInt8[np.ndarray, "h w 3"]:
+    """One timestep of the overlay video: the pictures of all cameras in a roughly square grid."""
+    return _grid(OverlayPainter(capture, tracking, face_model), len(tracking.cameras), timestep)
+
+
+def _grid(painter: OverlayPainter, cameras: int, timestep: int) -> UInt8[np.ndarray, "h w 3"]:
+    if cameras == 1:
+        return painter.picture(timestep)
+    pictures = [painter.picture(timestep, index) for index in range(cameras)]
+    tall, wide = pictures[0].shape[:2]
+    columns = math.ceil(math.sqrt(cameras * tall / wide))
+    rows = math.ceil(cameras / columns)
+    scale = min(1.0, _GRID_WIDTH / (columns * wide))
+    # Video codecs need even sizes.
+    width, height = (max(2, round(side * scale / 2) * 2) for side in (wide, tall))
+    grid = np.zeros((rows * height, columns * width, 3), np.uint8)
+    for index, picture in enumerate(pictures):
+        row, column = divmod(index, columns)
+        tile = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        grid[row * height : (row + 1) * height, column * width : (column + 1) * width] = tile
+    return grid
+
+
+def _pictures(
+    capture: Capture, tracking: Tracking, face_model: FaceModel, every: int
+) -> Iterator[UInt8[np.ndarray, "h w2 3"]]:
+    painter, timesteps = OverlayPainter(capture, tracking, face_model), range(0, capture.timesteps, every)
+    pictures = stream_in_threads(partial(_grid, painter, len(tracking.cameras)), timesteps)
+    yield from track_progress(pictures, "Overlay", len(timesteps))
+
+
+def _draw_points(image: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "l 2"], color: tuple) -> None:
+    for x, y in _fixed_point(points):
+        cv2.circle(image, (int(x), int(y)), 1 << _SUBPIXEL_BITS, color, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _draw_line(image: UInt8[np.ndarray, "h w 3"], line: Float[np.ndarray, " 3"], camera: Camera) -> None:
+    a, b, d = (float(value) for value in line)
+    middle = np.array([camera.width / 2, camera.height / 2])
+    foot = middle - (np.array([a, b]) @ middle + d) * np.array([a, b])
+    reach = (camera.width + camera.height) * np.array([b, -a])
+    (x1, y1), (x2, y2) = _fixed_point(np.stack([foot - reach, foot + reach]))
+    cv2.line(image, (int(x1), int(y1)), (int(x2), int(y2)), _BLUE, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _fixed_point(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    """Points in OpenCV's fixed-point format, with pixel centres at whole numbers."""
+    return np.round(np.clip((points - 0.5) * (1 << _SUBPIXEL_BITS), -(2**28), 2**28)).astype(np.int32)

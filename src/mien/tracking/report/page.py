@@ -1,0 +1,159 @@
+"""The page report.html of a tracking: findings, figures, and pictures of typical frames and of those that stand out."""
+
+import base64
+import re
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mien.capture.capture import Capture
+from mien.face import FaceModel
+from mien.storage import write_atomically
+from mien.tracking.report.contact_sheet import contact_sheet, sheet_frames
+from mien.tracking.tracking import Tracking
+
+_STYLE = (
+    "body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:1100px;padding:0 1rem;color:#222;"
+    "background:#fff}"
+    "img,video{max-width:100%;height:auto}table{border-collapse:collapse}td,th{padding:.2rem .8rem .2rem 0;text-align:"
+    "left;font-weight:400}td{font-variant-numeric:tabular-nums}.odd{color:#a40000}"
+    ".sheet{width:min(94vw,1924px);max-width:none;margin-left:calc(50% - min(47vw,962px))}"
+    "@media(prefers-color-scheme:dark){body{background:#181818;color:#ddd}.odd{color:#ff8a80}}"
+)
+_JPEG_QUALITY = 85
+_SOME = 40
+"""Largest number of frames, or runs of frames, that a finding names."""
+_FOCAL_FROM = {
+    "calibrated": "as calibrated",
+    "given": "as given",
+    "assumed": "assumed, since faces hardly tell it (--tracking.focal says it, which makes head turns more exact)",
+}
+_WAYS = {
+    "landmarks": "Fitted to landmarks alone, as asked (schedule `landmarks`); pixels were not looked at.",
+    "fast": "Fitted to landmarks, then to pixels (schedule `fast`), which know better where the detector errs.",
+    "paper": "Fitted to landmarks, then to pixels (schedule `paper`), which know better where the detector errs.",
+}
+
+
+def write_report_page(
+    folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict[str, Any]
+) -> None:
+    """Write report.html into `folder`. Except for the overlay video, the page is complete in one file.
+
+    Args:
+        folder: Folder of the tracking, which has residuals.png already.
+        capture: The capture.
+        tracking: The tracking of the capture.
+        face_model: The face model of the tracking.
+        report: The result of `residual_report`.
+    """
+    frames = sheet_frames(tracking, report["flagged_frames"], report["landmarks_only_frames"])
+    sheet = contact_sheet(capture, tracking, face_model, frames)
+    plot = (folder / "residuals.png").read_bytes()
+    text = page_html(capture.name, tracking, report, _uri("png", plot), _uri("jpeg", _as_jpeg(sheet)))
+    write_atomically(folder / "report.html", lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def page_html(name: str, tracking: Tracking, report: dict[str, Any], plot: str, sheet: str) -> str:
+    """The page as html. `plot` and `sheet` are addresses of pictures."""
+    panels = "the picture, the tracked mesh over it"
+    if tracking.looks is not None:
+        panels += (", the model's own picture (its texture in the fitted light), and the difference of colours"
+                   " (black is none; grey parts, such as hair, eyes and mouth, are not compared)")  # fmt: skip
+    paragraphs = "".join(f'<p class="{kind}">{_with_code(text)}</p>' for kind, text in findings(tracking, report))
+    rows = "".join(f"<tr><th>{escape(what)}</th><td>{escape(value)}</td></tr>" for what, value in _figures(report))
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(name)}: tracking</title>'
+        f"<style>{_STYLE}</style></head><body><h1>{escape(name)}: how the face was tracked</h1>{paragraphs}"
+        f"<table>{rows}</table><h2>Frames</h2><p>Evenly spread frames, and those that stand out; of each "
+        f'{escape(panels)}.</p><img class="sheet" alt="contact sheet" src="{sheet}">'
+        f'<h2>Over time</h2><img alt="residuals over time" src="{plot}">'
+        '<h2>Overlay</h2><video controls preload="none" src="overlay.mp4"></video></body></html>\n'
+    )
+
+
+def _with_code(text: str) -> str:
+    """The text as html, with text between backticks as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
+
+
+def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]]:
+    """The main findings as pairs of class and text. The class is `odd` if the finding is a reason to look closer."""
+    schedule = str(tracking.settings.get("schedule", "landmarks"))
+    with_face = report["frames"] - len(report["frames_without_face"])
+    found = [("", _WAYS.get(schedule, f"Schedule `{schedule}`."))]
+    if schedule != "landmarks":
+        alone = report["landmarks_only_frames"]
+        if tracking.looks is None:
+            found = [("odd", f"Pictures gave the texture of {tracking.face_model} nothing (schedule `{schedule}`), so "
+                             "landmarks alone decided in all frames.")]  # fmt: skip
+        elif alone:
+            found.append(("odd", f"In {len(alone)} of {with_face} frames with a face pixels were no help, so landmarks "
+                                 f"alone decided: {named(alone)}."))  # fmt: skip
+        else:
+            found.append(("", f"Pixels took part in all {with_face} frames with a face."))
+    if report["flagged_frames"]:
+        flagged = report["flagged_frames"]
+        stand_out = "1 frame stands" if len(flagged) == 1 else f"{len(flagged)} frames stand"
+        found.append(("odd", f"{stand_out} out and should be looked at: {named(flagged)}."))
+    else:
+        found.append(("", "No frame stands out."))
+    if report["frames_without_face"]:
+        found.append(("odd", "No face was found, so that motion is interpolated, in frames "
+                             f"{named(report['frames_without_face'])}."))  # fmt: skip
+    return found
+
+
+def named(timesteps: Sequence[int]) -> str:
+    """Numbers of frames as text, with runs abbreviated: 3, 7-9, 12."""
+    runs: list[list[int]] = []
+    for timestep in timesteps:
+        if runs and timestep == runs[-1][1] + 1:
+            runs[-1][1] = timestep
+        else:
+            runs.append([timestep, timestep])
+    parts = [str(first) if first == last else f"{first}-{last}" for first, last in runs]
+    return ", ".join(parts[:_SOME]) + (", ..." if len(parts) > _SOME else "")
+
+
+def _figures(report: dict[str, Any]) -> list[tuple[str, str]]:
+    colors, iris = report["residual_colors"], report["iris_distance"]
+    rows = [
+        ("Frames", str(report["frames"])),
+        ("Landmarks, from where the detector saw them: median, 95 %, largest", _three(report["residual_px"], 1, "px")),
+    ]
+    if colors is not None:
+        rows.append(("Difference of colours: median, 95 %, largest", _three(colors, 100, "%")))
+    rows += [
+        ("Focal length", f"{report['focal_px']:.0f} px, {_FOCAL_FROM[report['focal_from']]}"),
+        ("Distance from the camera: median", _number(report["depth_m"]["median"], 1, "m")),
+        ("Jitter of landmarks: detected, fitted", f"{_number(report['jitter']['detected_px'], 1, 'px')}, "
+                                                  f"{_number(report['jitter']['fitted_px'], 1, 'px')}"),
+        ("Distance of the irises: mean, deviation", f"{_number(iris['mean_m'], 1000, 'mm')}, "
+                                                    f"{_number(iris['deviation_percent'], 1, '%')}"),
+    ]  # fmt: skip
+    return rows
+
+
+def _three(summary: dict[str, float | None], factor: int, unit: str) -> str:
+    return ", ".join(_number(summary[name], factor, unit) for name in ("median", "p95", "max"))
+
+
+def _number(value: float | None, factor: int, unit: str) -> str:
+    return "-" if value is None else f"{factor * value:.2f} {unit}"
+
+
+def _as_jpeg(image: np.ndarray) -> bytes:
+    done, encoded = cv2.imencode(
+        ".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    )
+    assert done, f"cannot encode a picture of shape {image.shape}"
+    return encoded.tobytes()
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -1,0 +1,235 @@
+"""The residual report: figures and a plot that show whether a tracking can be trusted."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.capture.capture import Capture
+from mien.face import FaceModel
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.storage import write_atomically, write_json
+from mien.tracking.landmarks import BROWS, LEFT_EYELIDS, LEFT_IRIS, LIPS, NOSE, OVAL, RIGHT_EYELIDS, RIGHT_IRIS
+from mien.tracking.report.contact_sheet import worst_of_runs
+from mien.tracking.report.overlay import frontal_camera
+from mien.tracking.report.page import findings, write_report_page
+from mien.tracking.tracking import Tracking
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_FORMAT, _VERSION = "mien.residual_report", 1
+_GROUPS = {
+    "oval": OVAL, "brows": BROWS, "nose": NOSE, "lips": LIPS, "eyelids": LEFT_EYELIDS + RIGHT_EYELIDS,
+    "irises": LEFT_IRIS + RIGHT_IRIS,
+}  # fmt: skip
+_NEAR_FRONTAL = 0.26
+"""Largest yaw of a frame that counts as frontal: 15 degrees, in radians."""
+_MOVED = 0.03
+"""Standard deviation above which a coefficient counts as used."""
+_CHUNK = 32
+_NAMED = 10
+"""Largest number of runs of flagged frames in which the plot names the worst frame."""
+_LEAST_COLOR = 0.005
+"""Least amount (0..1) by which a frame's colour residual must stand out to be flagged."""
+
+
+def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel) -> dict:
+    """Figures about a tracking: residuals, jitter, constancy of the iris distance, leaks of pose into expression.
+
+    `mesh_distance_px` is the distance from landmarks to the mesh itself; `residual_px` allows every landmark its static
+    offset. `iris_distance` is the distance of the detected irises in metres at the tracked depth, which should be
+    constant. With several cameras, jitter, irises, depth, pitch and yaw are those of the most frontal camera, and
+    `cameras` has the residuals of each camera.
+    """
+    valid, frontal = tracking.valid, frontal_camera(tracking)
+    marks = _landmarks(face_model, tracking)
+    detected = torch.from_numpy(np.asarray(capture.landmarks, dtype=np.float32))
+    distance = torch.stack(
+        [(camera.project(marks)[0] - detected[:, c]).norm(dim=-1) for c, camera in enumerate(tracking.cameras)], dim=1
+    )[tracking.residuals.isfinite()]
+    pixels, depth = tracking.cameras[frontal].project(marks)
+    seen = tracking.residuals[:, frontal].isfinite()
+    pitch, yaw, _ = seen_rotation(tracking, frontal).unbind(1)
+    iris = iris_distances(tracking, detected[:, frontal], depth, frontal)
+    return {
+        "frames": len(valid),
+        "frames_without_face": (~valid).nonzero()[:, 0].tolist(),
+        "flagged_frames": _flagged(tracking).nonzero()[:, 0].tolist(),
+        "landmarks_only_frames": _landmarks_only(tracking).nonzero()[:, 0].tolist(),
+        "residual_px": _summary(tracking.residuals),
+        "residual_colors": None if tracking.pixel_residuals is None else _summary(tracking.pixel_residuals),
+        "cameras": _of_cameras(capture, tracking),
+        "frontal_camera": capture.camera_ids[frontal],
+        "mesh_distance_px": {name: float(distance[:, list(group)].median()) for name, group in _GROUPS.items()},
+        "jitter": {
+            "detected_px": _jitter(detected[:, frontal], seen),
+            "fitted_px": _jitter(pixels, seen),
+            "fitted_m": _jitter(marks, valid),
+        },
+        "iris_distance": _constancy(iris[seen & (yaw.abs() < _NEAR_FRONTAL)]),
+        "focal_px": float(tracking.cameras[frontal].K[0, 0]),
+        "focal_from": _focal_from(capture, tracking),
+        "depth_m": _summary(_depth(tracking, frontal)[valid]),
+        "correlation_with_pitch": _correlations(tracking, face_model, pitch),
+        "correlation_with_yaw": _correlations(tracking, face_model, yaw),
+    }
+
+
+def seen_rotation(tracking: Tracking, camera: int) -> Float[Tensor, "t 3"]:
+    """Head rotations relative to a camera, axis-angle in radians. A head that looks straight into it has zero."""
+    facing = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    R_seen_world = facing @ tracking.cameras[camera].viewmat[:3, :3]
+    return axis_angle_from_matrix(R_seen_world @ matrix_from_axis_angle(tracking.face.head_rotation))
+
+
+def _focal_from(capture: Capture, tracking: Tracking) -> str:
+    if capture.calibration is not None:
+        return "calibrated"
+    return "assumed" if tracking.settings.get("focal") is None else "given"
+
+
+def _depth(tracking: Tracking, camera: int) -> Float[Tensor, " t"]:
+    return tracking.cameras[camera].project(tracking.face.head_translation)[1]
+
+
+def _of_cameras(capture: Capture, tracking: Tracking) -> dict[str, dict]:
+    rows = {}
+    for index, name in enumerate(capture.camera_ids):
+        found = tracking.residuals[:, index]
+        rows[name] = {"frames": int(found.isfinite().sum())}
+        if rows[name]["frames"]:
+            rows[name]["residual_px"] = _summary(found)
+    return rows
+
+
+def _timestep_residuals(tracking: Tracking) -> Float[Tensor, " t"]:
+    """Median residual over the cameras that found the face, in pixels; NaN if none did."""
+    return tracking.residuals.nanmedian(1).values
+
+
+def _flagged(tracking: Tracking) -> Bool[Tensor, " t"]:
+    """Frames with landmark or colour residuals that stand out."""
+    flagged = flagged_frames(_timestep_residuals(tracking))
+    if tracking.pixel_residuals is not None:
+        flagged |= flagged_frames(tracking.pixel_residuals.nanmedian(1).values, _LEAST_COLOR)
+    return flagged
+
+
+def _landmarks_only(tracking: Tracking) -> Bool[Tensor, " t"]:
+    """Frames with a face that were tracked from landmarks alone."""
+    if tracking.pixel_residuals is None:
+        return tracking.valid
+    return tracking.valid & tracking.pixel_residuals.isnan().all(1)
+
+
+def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> str:
+    """Write residuals.json, residuals.png and report.html into `folder` and return the main findings as text."""
+    report = residual_report(capture, tracking, face_model)
+    write_json(folder / "residuals.json", _FORMAT, _VERSION, report)
+    write_atomically(folder / "residuals.png", lambda path: _plot(path, capture, tracking, face_model, report))
+    write_report_page(folder, capture, tracking, face_model, report)
+    return " ".join(text for _, text in findings(tracking, report))
+
+
+def iris_distances(
+    tracking: Tracking, detected: Float[Tensor, "t l 2"], depth: Float[Tensor, "t l"], camera: int = 0
+) -> Float[Tensor, " t"]:
+    """Distance of the detected iris centres in metres, at the tracked depth, corrected for foreshortening by turns."""
+    right, left = RIGHT_IRIS[0], LEFT_IRIS[0]
+    apart = (detected[:, left] - detected[:, right]).norm(dim=-1)
+    focal = tracking.cameras[camera].K[0, 0]
+    across = matrix_from_axis_angle(seen_rotation(tracking, camera))[:, :2, 0].norm(dim=-1)
+    return apart * (depth[:, left] + depth[:, right]) / 2 / focal / across
+
+
+def flagged_frames(residuals: Float[Tensor, " t"], least: float = 0.1) -> Bool[Tensor, " t"]:
+    """Frames with a residual above median + 4 robust standard deviations + `least`. NaN is never flagged."""
+    known = residuals[residuals.isfinite()]
+    if len(known) == 0:
+        return torch.zeros_like(residuals, dtype=torch.bool)
+    median = known.median()
+    spread = 1.4826 * (known - median).abs().median()
+    return residuals > median + 4 * spread + least
+
+
+def _landmarks(face_model: FaceModel, tracking: Tracking) -> Float[Tensor, "t l 3"]:
+    with torch.no_grad():
+        parts = [tracking.face[start : start + _CHUNK] for start in range(0, len(tracking.face), _CHUNK)]
+        return torch.cat([face_model.landmark_positions(face_model(part), "mediapipe") for part in parts])
+
+
+def _jitter(points: Float[Tensor, "t l d"], valid: Bool[Tensor, " t"]) -> float | None:
+    """Median size of second differences over time, without the points of the face's outline, which slide."""
+    inner = [index for index in range(points.shape[1]) if index not in OVAL]
+    second = (points[2:] - 2 * points[1:-1] + points[:-2])[:, inner].norm(dim=-1)
+    known = second[valid[2:] & valid[1:-1] & valid[:-2]]
+    return float(known.median()) if known.numel() else None
+
+
+def _constancy(distances: Float[Tensor, " n"]) -> dict[str, float | None]:
+    if len(distances) < 2:
+        return {"mean_m": None, "deviation_percent": None}
+    return {"mean_m": float(distances.mean()), "deviation_percent": float(100 * distances.std() / distances.mean())}
+
+
+def _correlations(tracking: Tracking, face_model: FaceModel, angle: Float[Tensor, " t"]) -> dict[str, float]:
+    """Pearson's correlation of every expression coefficient in use with an angle."""
+    expression, angle = tracking.face.expression[tracking.valid], angle[tracking.valid]
+    moved = (expression.std(0) > _MOVED).nonzero()[:, 0].tolist()
+    return {face_model.expression_names[i]: float(torch.corrcoef(torch.stack([expression[:, i], angle]))[0, 1])
+            for i in moved}  # fmt: skip
+
+
+def _summary(values: Float[Tensor, "*n"]) -> dict[str, float | None]:
+    values = values[values.isfinite()].double()
+    if len(values) == 0:
+        return {"median": None, "p95": None, "max": None}
+    return {"median": float(values.median()), "p95": float(values.quantile(0.95)), "max": float(values.max())}
+
+
+def _plot(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict) -> None:
+    from matplotlib.figure import Figure  # It is slow to import and only needed here.
+
+    time = np.asarray(capture.timestamps)
+    frontal, residuals = frontal_camera(tracking), _timestep_residuals(tracking)
+    detected = torch.from_numpy(np.asarray(capture.landmarks[:, frontal], dtype=np.float32))
+    depth = tracking.cameras[frontal].project(_landmarks(face_model, tracking))[1]
+    iris = iris_distances(tracking, detected, depth, frontal)
+    figure = Figure(figsize=(9, 10), layout="constrained")
+    axes = figure.subplots(5, 1, sharex=True)
+    _plot_flagged(axes[0], time, residuals.numpy(), report["flagged_frames"], "landmarks, px")
+    if tracking.pixel_residuals is not None:
+        colors = 100 * tracking.pixel_residuals.nanmedian(1).values
+        _plot_flagged(axes[1], time, colors.numpy(), report["flagged_frames"], "colours, %")
+    else:
+        axes[1].text(0.5, 0.5, "pixels were not looked at", ha="center", transform=axes[1].transAxes)
+    axes[2].plot(time, seen_rotation(tracking, frontal).rad2deg().numpy(), label=["pitch", "yaw", "roll"])
+    axes[2].set_ylabel("head rotation, degrees")
+    axes[2].legend(loc="upper right")
+    axes[3].plot(time, _depth(tracking, frontal).numpy())
+    axes[3].set_ylabel("depth, m")
+    axes[4].plot(time, 1e3 * iris.numpy())
+    axes[4].set_ylabel("iris distance, mm")
+    axes[4].set_xlabel("time, s")
+    for axis in axes:
+        for missing in report["frames_without_face"]:
+            axis.axvspan(time[missing], time[min(missing + 1, len(time) - 1)], color="0.85")
+    figure.suptitle(f"{capture.name}: landmarks against the tracked {tracking.face_model} head")
+    figure.savefig(path, dpi=100)
+
+
+def _plot_flagged(axis: "Axes", time: np.ndarray, values: np.ndarray, flagged: list[int], label: str) -> None:
+    """Plot a curve, mark the flagged frames and name the worst of them."""
+    axis.plot(time, values)
+    axis.set_ylabel(label)
+    if not flagged:
+        return
+    axis.plot(time[flagged], values[flagged], "rx", label="flagged")
+    for timestep in worst_of_runs(flagged, values)[:_NAMED]:
+        axis.annotate(str(timestep), (time[timestep], values[timestep]), fontsize=8, color="tab:red",
+                      xytext=(3, 3), textcoords="offset points", annotation_clip=True)  # fmt: skip
+    axis.legend(loc="upper right")
