@@ -86,10 +86,10 @@ def assert_alike(expected: Tracking, found: Tracking) -> None:
     for name in ("residuals", "pixel_residuals"):
         one, other = getattr(expected, name), getattr(found, name)
         assert torch.equal(one.nan_to_num(-1), other.nan_to_num(-1)), name
-    assert expected.looks is not None
-    assert found.looks is not None
+    assert expected.appearance is not None
+    assert found.appearance is not None
     for name in ("texture", "trust", "light"):
-        assert torch.equal(getattr(expected.looks, name), getattr(found.looks, name)), name
+        assert torch.equal(getattr(expected.appearance, name), getattr(found.appearance, name)), name
     assert torch.equal(expected.cameras[0].K, found.cameras[0].K)
 
 

@@ -117,7 +117,7 @@ def test_an_interrupted_write_leaves_what_was_there(tmp_path: Path, monkeypatch:
 def test_an_interrupted_scoring_is_written_the_next_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scoring = Scoring(np.zeros((2, 1, 8, 8), np.uint8), np.zeros((2, 1, 4), np.int64))
     with monkeypatch.context() as patched:
-        patched.setattr("mien.tracking.scoring.write_arrays", _interrupt)
+        patched.setattr("mien.tracking.scoring_files.write_arrays", _interrupt)
         with pytest.raises(KeyboardInterrupt):
             write_scoring(tmp_path / "scoring", scoring)
     assert list(tmp_path.iterdir()) == []

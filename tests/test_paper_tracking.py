@@ -7,13 +7,14 @@ from typing import Literal
 import pytest
 import torch
 
+from mien.adam import Moments
 from mien.tracking import Tracking, TrackingSettings, track, track_subject
 from mien.tracking.descent import epochs
-from mien.tracking.descent.adam import Moments
+from mien.tracking.descent.adam import apply_adam
 from mien.tracking.descent.epochs import Descent
 from mien.tracking.descent.scene import first_state, paper_scene
-from mien.tracking.descent.terms import landmark_terms, prior_term, show
-from mien.tracking.fitting import Fit, Keeper, SequenceFit, layout_of, lenses_of, resume, shot_of, widen
+from mien.tracking.descent.terms import landmark_terms, prior_term, read_target
+from mien.tracking.fitting import Fit, SequenceFit, StageCache, layout_of, lenses_of, resume, shot_of, widen
 from mien.tracking.landmarks import all_landmarks, quiet_landmarks, reduce_face_model
 from mien.tracking.landmarks.term import unknown_subject
 from mien.tracking.settings import PaperSettings
@@ -81,24 +82,24 @@ def test_landmarks_cost_what_they_cost_other_schedules(case):
     fit = Fit(unknown_subject(model), (own,))
     scene = paper_scene(model, [shot], lenses_of([case.capture], settings), fit, settings)
     descent = Descent(scene, first_state(scene, fit, [None]))
-    shown = show(scene, 0, 3, 0)
+    target = read_target(scene, 0, 3, 0)
     term = quiet_landmarks(all_landmarks(model, shot.views, own, settings), settings.paper.landmark_share)
     expected = term.cost(own.state, fit.subject, own.cameras)[3]
     row = descent.state.frames[0][3]
-    found = landmark_terms(scene, shown, descent.moving(shown, ())[0]) + prior_term(scene, row)
+    found = landmark_terms(scene, target, descent.moving(target, ())[0]) + prior_term(scene, row)
     torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=0)
 
 
 def test_adam_is_that_of_torch():
     random = torch.Generator().manual_seed(0)
-    values, moments = torch.randn(5, generator=random), Moments.like(torch.zeros(5))
+    values, moments = torch.randn(5, generator=random), Moments.zeros(torch.zeros(5))
     expected = torch.nn.Parameter(values.clone())
     optimizer = torch.optim.Adam([expected], lr=0.1, eps=1e-12)
     for _ in range(4):
         gradient = torch.randn(5, generator=random)
         expected.grad = gradient.clone()
         optimizer.step()
-        moments.step(values, gradient, 0.1)
+        apply_adam(moments, values, gradient, 0.1)
     torch.testing.assert_close(values, expected.detach(), atol=1e-6, rtol=0)
 
 
@@ -111,15 +112,15 @@ def test_an_interrupted_fit_goes_on(
     settings = replace(LANDMARKS, schedule="paper", paper=short)
     expected = track_subject([case.capture], case.model, settings)[0]
     monkeypatch.setattr(resume, "_INTERVAL_SECONDS", 0.0)
-    offer, offers = Keeper.offer, []
+    offer, offers = StageCache.offer, []
 
-    def offer_then_stop(self: Keeper, name: str, make: Callable) -> None:
+    def offer_then_stop(self: StageCache, name: str, make: Callable) -> None:
         offer(self, name, make)
         offers.append(None)
         if len(offers) == interrupted_at:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(Keeper, "offer", offer_then_stop)
+    monkeypatch.setattr(StageCache, "offer", offer_then_stop)
     keep = tmp_path / "kept"
     with pytest.raises(KeyboardInterrupt):
         track_subject([case.capture], case.model, settings, keep)

@@ -11,10 +11,10 @@ from mien.camera import Camera
 from mien.render.mesh import Texture as MeshTexture
 from mien.render.mesh import interpolate, rasterize_mesh, render_mesh, sample_texture, shade, vertex_normals
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking.pixels import Appearance, even_light, texture_space
+from mien.tracking.pixels import SkinTexture, even_light, texture_space
 from mien.tracking.pixels.pictures import Picture
 from mien.tracking.pixels.surface import PosedSurface
-from mien.tracking.pixels.texture import Sighting, TextureSpace, estimate_appearance, unknown_appearance
+from mien.tracking.pixels.texture import Sighting, TextureSpace, estimate_appearance, unknown_texture
 from photometric_case import make_textured_model, smooth_noise
 
 SIZE, SIGMA, OUTLIER, LEAST_COSINE = 72, 0.07, 2.0, 0.25
@@ -46,9 +46,9 @@ def some_light() -> Tensor:
     return light
 
 
-def appearance(seed: int = 3) -> Appearance:
+def some_texture(seed: int = 3) -> SkinTexture:
     known = (SPACE.fragments.face_index >= 0).float()
-    return Appearance(smooth_noise(128, 128, 3.0, seed), known, SIGMA)
+    return SkinTexture(smooth_noise(128, 128, 3.0, seed), known, SIGMA)
 
 
 def sighting(seed: int = 5, parameters: int = 0) -> Sighting:
@@ -58,7 +58,7 @@ def sighting(seed: int = 5, parameters: int = 0) -> Sighting:
     return Sighting(posed(parameters), Picture(CAMERA, smooth_noise(SIZE, SIZE, 2.0, seed), mask), some_light())
 
 
-def reference(seen: Sighting, looks: Appearance) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def reference(seen: Sighting, skin: SkinTexture) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Cost, half gradient and half Hessian, residuals: plain PyTorch in float64, no high-pass filter."""
     vertices, normals = seen.posed.vertices, seen.posed.normals
     fragments = rasterize_mesh(vertices, MODEL.faces, CAMERA)
@@ -66,8 +66,8 @@ def reference(seen: Sighting, looks: Appearance) -> tuple[Tensor, Tensor, Tensor
     directions = torch.nn.functional.normalize(interpolate(fragments, normals, MODEL.faces), dim=-1)
     towards = torch.nn.functional.normalize(CAMERA.position - points, dim=-1)
     uv = interpolate(fragments, SPACE.corners, MODEL.faces)
-    trust = sample_texture(looks.trust[..., None], uv)
-    albedo = sample_texture(looks.albedo * looks.trust[..., None], uv) / trust.clamp_min(1e-9)
+    trust = sample_texture(skin.trust[..., None], uv)
+    albedo = sample_texture(skin.albedo * skin.trust[..., None], uv) / trust.clamp_min(1e-9)
     prediction = albedo * shade(directions, seen.light)
     weight = seen.picture.mask * trust[..., 0]
     counts = (fragments.face_index >= 0) & ((directions * towards).sum(-1) >= LEAST_COSINE) & (weight > 0)
@@ -96,15 +96,15 @@ def reference(seen: Sighting, looks: Appearance) -> tuple[Tensor, Tensor, Tensor
 
 
 def test_cost_gradient_and_hessian_are_those_of_the_pixels():
-    looks, seen = appearance(), sighting(parameters=5)
+    skin, seen = some_texture(), sighting(parameters=5)
     gradient, hessian, residual = torch.empty(5), torch.empty(5, 5), torch.empty(SIZE, SIZE, 3)
     surface = _native.AlignSurface(
-        SPACE.faces, SPACE.corners, SPACE.used.to(torch.uint8), looks.albedo, looks.trust, SIGMA, OUTLIER, LEAST_COSINE
+        SPACE.faces, SPACE.corners, SPACE.used.to(torch.uint8), skin.albedo, skin.trust, SIGMA, OUTLIER, LEAST_COSINE
     )
     cost, weight = _native.align_mesh(
         surface, *seen.arguments(), 0, seen.posed.jacobian, hessian, gradient, residual, None
     )
-    expected_cost, expected_gradient, expected_hessian, expected_residual = reference(seen, looks)
+    expected_cost, expected_gradient, expected_hessian, expected_residual = reference(seen, skin)
     assert weight > 100
     torch.testing.assert_close(residual.double(), expected_residual, atol=2e-5, rtol=0, equal_nan=True)
     assert cost == pytest.approx(float(expected_cost), rel=1e-4)
@@ -117,28 +117,26 @@ def test_cost_gradient_and_hessian_are_those_of_the_pixels():
 
 
 def test_one_step_undoes_a_small_shift():
-    looks = appearance()
+    skin = some_texture()
     true = posed(shift=(0.004, 0.003, -0.6))
-    texture = MeshTexture(looks.albedo, SPACE.corners)
+    texture = MeshTexture(skin.albedo, SPACE.corners)
     image, alpha = render_mesh(true.vertices, MODEL.faces, CAMERA, texture, light=some_light(), supersample=3)
     start = posed(3, shift=(0.0045, 0.0024, -0.6))
     start = PosedSurface(start.vertices, start.normals, torch.eye(3).expand(len(start.vertices), 3, 3).contiguous())
     seen = Sighting(start, Picture(CAMERA, image.contiguous(), (alpha > 0.99).float()), some_light())
     gradient, hessian = torch.empty(3), torch.empty(3, 3)
-    _native.align_mesh(
-        SPACE.native(looks, OUTLIER), *seen.arguments(), 0, start.jacobian, hessian, gradient, None, None
-    )
+    _native.align_mesh(SPACE.native(skin, OUTLIER), *seen.arguments(), 0, start.jacobian, hessian, gradient, None, None)
     step = -torch.linalg.solve(hessian[:2, :2], gradient[:2])
     assert (step - torch.tensor([-0.0005, 0.0006])).abs().max() < 0.0001
 
 
 def test_high_pass_leaves_out_a_smooth_light_but_not_texture():
-    looks, radius = appearance(), 6
+    skin, radius = some_texture(), 6
     still = posed()
-    texture = MeshTexture(looks.albedo, SPACE.corners)
+    texture = MeshTexture(skin.albedo, SPACE.corners)
     image, alpha = render_mesh(still.vertices, MODEL.faces, CAMERA, texture, supersample=3)
     ramp = torch.linspace(0.0, 0.3, SIZE)[None, :, None]
-    surface = SPACE.native(looks, 5.0)
+    surface = SPACE.native(skin, 5.0)
     mask = (alpha > 0.99).float()
 
     def costs(picture: Tensor) -> list[float]:
@@ -152,8 +150,8 @@ def test_high_pass_leaves_out_a_smooth_light_but_not_texture():
     assert rolled_high_passed > 0.3 * rolled
 
 
-def _pictures_under_light(light: Tensor, looks: Appearance) -> list[Sighting]:
-    texture = MeshTexture(looks.albedo, SPACE.corners)
+def _pictures_under_light(light: Tensor, skin: SkinTexture) -> list[Sighting]:
+    texture = MeshTexture(skin.albedo, SPACE.corners)
     out = []
     for yaw in (0.0, 0.7, -0.7, 0.35, -0.35):
         surface = posed(shift=(0.0, 0.0, -0.5), yaw=yaw)
@@ -163,9 +161,9 @@ def _pictures_under_light(light: Tensor, looks: Appearance) -> list[Sighting]:
 
 
 def test_albedo_times_light_gives_the_pictures_back():
-    looks = appearance()
-    sightings = _pictures_under_light(some_light(), looks)
-    found, (light,) = estimate_appearance(SPACE, [sightings], unknown_appearance(SPACE), 3.0, 0)
+    skin = some_texture()
+    sightings = _pictures_under_light(some_light(), skin)
+    found, (light,) = estimate_appearance(SPACE, [sightings], unknown_texture(SPACE), 3.0, 0)
     surface = SPACE.native(found, 5.0)
     for seen in sightings:
         residual = torch.empty(SIZE, SIZE, 3)
@@ -177,10 +175,10 @@ def test_albedo_times_light_gives_the_pictures_back():
 
 
 def test_light_is_found_where_the_albedo_is_known():
-    looks = appearance()
+    skin = some_texture()
     hessian, right = torch.zeros(3, 9, 9, dtype=torch.float64), torch.zeros(3, 9, dtype=torch.float64)
-    for seen in _pictures_under_light(some_light(), looks):
-        _native.light_equations(SPACE.native(looks, 1e4), *seen.arguments(), hessian, right)
+    for seen in _pictures_under_light(some_light(), skin):
+        _native.light_equations(SPACE.native(skin, 1e4), *seen.arguments(), hessian, right)
     hessian = hessian + hessian.triu(1).mT
     found = torch.linalg.solve(hessian, right).T
     normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
@@ -189,21 +187,19 @@ def test_light_is_found_where_the_albedo_is_known():
 
 
 def test_texels_that_no_picture_shows_are_not_trusted():
-    looks = appearance()
-    found, _ = estimate_appearance(
-        SPACE, [_pictures_under_light(even_light(), looks)], unknown_appearance(SPACE), 3.0, 0
-    )
+    skin = some_texture()
+    found, _ = estimate_appearance(SPACE, [_pictures_under_light(even_light(), skin)], unknown_texture(SPACE), 3.0, 0)
     behind = SPACE.fragments.face_index[:, 64:] >= 0
     assert float(found.trust[:, 64:][behind].mean()) < 0.2
     middle = found.trust[48:80, 24:40]
     assert float(middle.min()) > 0.5
-    assert (found.albedo - looks.albedo)[48:80, 24:40].abs().median() < 0.05
+    assert (found.albedo - skin.albedo)[48:80, 24:40].abs().median() < 0.05
 
 
 def test_bad_arrays_are_refused():
-    looks = appearance()
+    skin = some_texture()
     too_few = torch.zeros(3, 3)
-    surface = SPACE.native(looks, OUTLIER)
+    surface = SPACE.native(skin, OUTLIER)
     seen = sighting()
     with pytest.raises(IndexError):
         _native.align_mesh(surface, too_few, too_few, *seen.arguments()[2:], 0, None, None, None, None, None)

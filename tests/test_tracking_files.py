@@ -12,7 +12,7 @@ from damage import edit_json
 from mien.errors import UserError
 from mien.storage import read_tensors, write_tensors
 from mien.tracking import (
-    Looks,
+    Appearance,
     Scoring,
     Tracking,
     read_scoring,
@@ -40,13 +40,13 @@ def _tracking(offsets: bool = False, pixels: bool = False) -> Tracking:
         cameras=(still_camera().to(torch.zeros(())),), neck_lines=torch.tensor([0.0, -1.0, 300.0]).expand(4, 1, 3),
         residuals=torch.tensor([[0.5], [torch.nan], [0.7], [0.6]]),
         pixel_residuals=torch.tensor([[0.02], [torch.nan], [torch.nan], [0.03]]) if pixels else None,
-        looks=_looks(random) if pixels else None, settings={"focal": None, "keyframes": 20},
+        appearance=_looks(random) if pixels else None, settings={"focal": None, "keyframes": 20},
     )  # fmt: skip
 
 
-def _looks(random: torch.Generator) -> Looks:
+def _looks(random: torch.Generator) -> Appearance:
     texture, trust, light = (torch.rand(*shape, generator=random) for shape in ((8, 6, 3), (8, 6), (9, 3)))
-    return Looks(texture, trust, light, sigma=0.03, light_extent=0.012)
+    return Appearance(texture, trust, light, sigma=0.03, light_extent=0.012)
 
 
 @pytest.mark.parametrize("offsets", [False, True])
@@ -63,14 +63,14 @@ def test_round_trip(tmp_path, offsets):
     torch.testing.assert_close(again.residuals, tracking.residuals, equal_nan=True, atol=0, rtol=0)
     if not offsets:
         assert again.pixel_residuals is None
-        assert again.looks is None
+        assert again.appearance is None
     else:
         torch.testing.assert_close(again.pixel_residuals, tracking.pixel_residuals, equal_nan=True, atol=0, rtol=0)
-        assert again.looks is not None
-        assert tracking.looks is not None
+        assert again.appearance is not None
+        assert tracking.appearance is not None
         for name in ("texture", "trust", "light"):
-            assert torch.equal(getattr(again.looks, name), getattr(tracking.looks, name)), name
-        assert (again.looks.sigma, again.looks.light_extent) == (0.03, 0.012)
+            assert torch.equal(getattr(again.appearance, name), getattr(tracking.appearance, name)), name
+        assert (again.appearance.sigma, again.appearance.light_extent) == (0.03, 0.012)
     camera, expected = again.cameras[0], tracking.cameras[0]
     assert torch.equal(camera.K, expected.K)
     assert torch.equal(camera.viewmat, expected.viewmat)

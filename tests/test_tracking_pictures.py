@@ -12,7 +12,7 @@ from mien.parallel import stream_in_threads
 from mien.render.mesh import shade
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import (
-    Looks,
+    Appearance,
     Tracking,
     TrackingSettings,
     residual_report,
@@ -20,8 +20,8 @@ from mien.tracking import (
     write_overlay,
     write_residual_report,
 )
-from mien.tracking.pixels import Appearance, even_light, model_pictures, window_of
-from mien.tracking.pixels.outcome import looks_in_world, turn_light
+from mien.tracking.pixels import SkinTexture, even_light, model_pictures, window_of
+from mien.tracking.pixels.outcome import appearance_in_world, turn_light
 from mien.tracking.report.contact_sheet import contact_sheet, sheet_frames, worst_of_runs
 from mien.tracking.report.heat import heat_map
 from mien.tracking.report.overlay import OverlayPainter, overlay_stride
@@ -45,7 +45,7 @@ def truth(case: PhotometricCase) -> Tracking:
         face_model=case.model.name, face_model_hash="", face=case.face, valid=torch.ones(6, dtype=torch.bool),
         cameras=(case.camera,), neck_lines=torch.tensor([0.0, -1.0, 120.0]).expand(6, 1, 3),
         residuals=torch.full((6, 1), 0.5), pixel_residuals=torch.full((6, 1), 0.01),
-        looks=Looks(texture, torch.ones(256, 256), even_light(), sigma=0.02, light_extent=0.02),
+        appearance=Appearance(texture, torch.ones(256, 256), even_light(), sigma=0.02, light_extent=0.02),
         settings={"schedule": "fast"},
     )  # fmt: skip
 
@@ -85,8 +85,8 @@ def test_turned_light_falls_on_turned_normals_alike():
     )
     T_world_fit = torch.eye(4).double()
     T_world_fit[:3, :3] = R_world_fit
-    looks = looks_in_world(Appearance(torch.zeros(2, 2, 3), torch.ones(2, 2), 0.1), light, T_world_fit, 0.01)
-    torch.testing.assert_close(looks.light, turn_light(light, R_world_fit), atol=1e-5, rtol=0)
+    appearance = appearance_in_world(SkinTexture(torch.zeros(2, 2, 3), torch.ones(2, 2), 0.1), light, T_world_fit, 0.01)
+    torch.testing.assert_close(appearance.light, turn_light(light, R_world_fit), atol=1e-5, rtol=0)
 
 
 def test_heat_grows_with_the_difference():
@@ -109,7 +109,7 @@ def test_the_overlay_shows_where_colours_differ(case, truth, tmp_path):
 
 
 def test_without_looks_the_overlay_has_two_panels(case, truth):
-    painter = OverlayPainter(case.capture, replace(truth, looks=None, pixel_residuals=None), case.model)
+    painter = OverlayPainter(case.capture, replace(truth, appearance=None, pixel_residuals=None), case.model)
     assert painter.picture(0).shape == (SIZE, 2 * SIZE, 3)
 
 
@@ -145,18 +145,18 @@ def test_the_sheet_has_what_stands_out(case, truth):
     assert named([3, 7, 8, 9, 12]) == "3, 7-9, 12"
 
 
-@pytest.mark.parametrize(("schedule", "looks", "alone", "said"), [
+@pytest.mark.parametrize(("schedule", "appearance", "alone", "said"), [
     ("fast", True, 0, "Pixels took part in all 6 frames"),
     ("fast", True, 2, "In 2 of 6 frames with a face pixels were no help, so landmarks alone decided: 0-1."),
     ("fast", False, 6, "landmarks alone decided in all frames"),
     ("landmarks", False, 6, "landmarks alone, as asked"),
 ])  # fmt: skip
-def test_the_page_says_aloud_what_decided(case, truth, tmp_path, schedule, looks, alone, said):
+def test_the_page_says_aloud_what_decided(case, truth, tmp_path, schedule, appearance, alone, said):
     residuals = truth.pixel_residuals.clone()
     residuals[:alone] = torch.nan
     shown = replace(
-        truth, settings={"schedule": schedule}, looks=truth.looks if looks else None,
-        pixel_residuals=residuals if looks else None,
+        truth, settings={"schedule": schedule}, appearance=truth.appearance if appearance else None,
+        pixel_residuals=residuals if appearance else None,
     )  # fmt: skip
     told = write_residual_report(tmp_path, case.capture, shown, case.model)
     assert said in told
@@ -200,9 +200,9 @@ def test_calibrated_cameras_in_another_world_are_compared_too(case, tmp_path):
     found = [pictures.compare(3, index, vertices).rms for index in (0, 1)]
     assert found[0] == found[1]
     assert found[0] == pytest.approx(float(tracking.pixel_residuals[3, 0]), rel=0.3)
-    assert tracking.looks is not None
-    unturned = replace(tracking.looks, light=turn_light(tracking.looks.light, W_other[:3, :3].T))
-    wrong = model_pictures(capture, replace(tracking, looks=unturned), case.model)
+    assert tracking.appearance is not None
+    unturned = replace(tracking.appearance, light=turn_light(tracking.appearance.light, W_other[:3, :3].T))
+    wrong = model_pictures(capture, replace(tracking, appearance=unturned), case.model)
     assert wrong is not None
     assert wrong.compare(3, 0, vertices).rms > 1.02 * found[0]
     write_overlay(tmp_path / "overlay.mp4", capture, tracking, case.model, every=3)

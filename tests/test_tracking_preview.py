@@ -25,7 +25,7 @@ FAST = TrackingSettings(focal=FOCAL, photometric=PhotometricSettings(texture_siz
 def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float, int]]:
     """Stage, progress and height of every picture that is written."""
     monkeypatch.setattr(preview, "_INTERVAL_SECONDS", 0.0)
-    monkeypatch.setattr(preview, "_LARGEST_SHARE", 1e9)
+    monkeypatch.setattr(preview, "_MAX_SHARE", 1e9)
     shown, headed = [], Preview._headed
 
     def record(self: Preview, stage: str, progress: float) -> np.ndarray:

@@ -11,7 +11,7 @@ import torch
 from mien.capture import write_capture
 from mien.cli import main
 from mien.tracking import Tracking, TrackingSettings, track_subject
-from mien.tracking.fitting import Keeper
+from mien.tracking.fitting import StageCache
 from mien.tracking.landmarks import stages
 from mien.tracking.pixels import refine
 from mien.tracking.settings import PhotometricSettings
@@ -42,15 +42,15 @@ def expected(case: PhotometricCase) -> Tracking:
 
 def stopped_after(pieces: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the pieces that are written; after so many, the next one stops the program."""
-    write, names = Keeper._write, []
+    write, names = StageCache._write, []
 
-    def write_then_stop(self: Keeper, name: str, tensors: dict) -> None:
+    def write_then_stop(self: StageCache, name: str, tensors: dict) -> None:
         if len(names) == pieces:
             raise KeyboardInterrupt
         write(self, name, tensors)
         names.append(name)
 
-    monkeypatch.setattr(Keeper, "_write", write_then_stop)
+    monkeypatch.setattr(StageCache, "_write", write_then_stop)
     return names
 
 
@@ -77,7 +77,7 @@ SLOWLY = """
 import sys, time
 import mien.commands.stages.tracking as stage
 from mien.cli import main
-from mien.tracking.fitting import Keeper
+from mien.tracking.fitting import StageCache
 from photometric_case import make_textured_model
 
 def slowly(self, name, tensors):
@@ -85,7 +85,7 @@ def slowly(self, name, tensors):
     print(name, flush=True)
     time.sleep(0.3)
 
-write, Keeper._write = Keeper._write, slowly
+write, StageCache._write = StageCache._write, slowly
 stage.face_model_of = lambda choice: make_textured_model()
 sys.exit(main(sys.argv[1:]))
 """
@@ -134,13 +134,13 @@ def test_damaged_pieces_are_made_anew(case, expected, tmp_path, monkeypatch, cap
 
 
 def test_pieces_are_the_same_made_or_read(tmp_path):
-    keeper, odd = Keeper(tmp_path / "kept"), torch.arange(6.0).reshape(2, 3).T[1:]
-    made = keeper.once("odd", lambda: {"odd": odd})
-    read = keeper.once("odd", lambda: pytest.fail("it was kept"))
+    cache, odd = StageCache(tmp_path / "kept"), torch.arange(6.0).reshape(2, 3).T[1:]
+    made = cache.get_or_compute("odd", lambda: {"odd": odd})
+    read = cache.get_or_compute("odd", lambda: pytest.fail("it was kept"))
     assert torch.equal(made["odd"], read["odd"])
     assert made["odd"].stride() == read["odd"].stride()
-    keeper.drop("od")
-    assert keeper.read("odd") is None
-    assert Keeper(None).once("odd", lambda: {"odd": odd})["odd"].is_contiguous()
-    keeper.forget()
+    cache.drop("od")
+    assert cache.read("odd") is None
+    assert StageCache(None).get_or_compute("odd", lambda: {"odd": odd})["odd"].is_contiguous()
+    cache.forget()
     assert not (tmp_path / "kept").exists()

@@ -1,7 +1,7 @@
-"""Process frames in parallel, each in one thread."""
+"""Work on frames in parallel, each in one thread."""
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -15,7 +15,7 @@ _AHEAD = 2
 """Number of finished results that may wait, in addition to one for each thread."""
 
 
-def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+def map_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """The function's results for all items, in order. It uses up to MIEN_THREADS threads (by default, all cores)."""
     threads = min(thread_count(), len(items))
     before = torch.get_num_threads()
@@ -29,14 +29,23 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
         torch.set_num_threads(before)
 
 
-def stream_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
-    """Yield the results of `in_threads` one after another. Only a few more results than threads are in memory."""
-    with ThreadPoolExecutor(thread_count(), initializer=_prepare) as pool:
+def stream_in_threads(
+    function: Callable[[Item], Result], items: Iterable[Item], threads: int | None = None
+) -> Iterator[Result]:
+    """Yield the function's results for all items, in order.
+
+    Args:
+        function: The function.
+        items: The items. They are taken as they are needed: only a few more than threads are in memory.
+        threads: Number of threads. The default is `thread_count`.
+    """
+    threads = threads or thread_count()
+    with ThreadPoolExecutor(threads, initializer=_prepare) as pool:
         waiting: deque[Future[Result]] = deque()
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))
-                if len(waiting) > thread_count() + _AHEAD:
+                if len(waiting) > threads + _AHEAD:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from mien.tracking import TrackingSettings, track_subject
-from mien.tracking.fitting import Keeper
+from mien.tracking.fitting import StageCache
 from mien.tracking.settings import PhotometricSettings
 from photometric_case import make_photometric_case, make_textured_model
 
@@ -18,12 +18,12 @@ def write_pieces(folder: Path) -> None:
     """Every piece of a tracking, none dropped, and the capture that it is of (for this process's children alone)."""
     torch.set_num_threads(1)
     capture = make_photometric_case(_TIMESTEPS).capture
-    drop, forget = Keeper.drop, Keeper.forget
-    Keeper.drop = Keeper.forget = lambda *_: None  # type: ignore[method-assign, assignment]
+    drop, forget = StageCache.drop, StageCache.forget
+    StageCache.drop = StageCache.forget = lambda *_: None  # type: ignore[method-assign, assignment]
     try:
         track_subject([capture], make_textured_model(), SETTINGS, folder)
     finally:
-        Keeper.drop, Keeper.forget = drop, forget  # type: ignore[method-assign]
+        StageCache.drop, StageCache.forget = drop, forget  # type: ignore[method-assign]
     (folder / "capture.pickle").write_bytes(pickle.dumps(capture))
 
 

@@ -1,29 +1,11 @@
 """GaussianStore: all per-Gaussian tensors with their optimiser state, so that density control treats all alike."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
-
-@dataclass(eq=False)
-class Moments:
-    """Adam's state for one tensor."""
-
-    first: Tensor
-    """Running mean of the gradient."""
-    second: Tensor
-    """Running mean of the squared gradient."""
-    step: Float[Tensor, ""]
-    """Number of updates so far."""
-
-    @staticmethod
-    def zeros(like: Tensor) -> "Moments":
-        """The state before the first update of a tensor."""
-        # The step count stays on the CPU: numbers computed from it are needed there and must not wait for a GPU.
-        return Moments(torch.zeros_like(like), torch.zeros_like(like), torch.zeros((), dtype=like.dtype))
+from mien.adam import Moments
 
 
 class GaussianStore(nn.Module):

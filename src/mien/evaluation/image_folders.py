@@ -19,12 +19,12 @@ from mien.evaluation.scoring import (
     Scores,
     ScoreSettings,
     evenly_spread,
-    in_threads,
     mean_scores,
     perceptual_metric,
     score_pictures,
     worker_threads,
 )
+from mien.parallel import stream_in_threads
 from mien.progress import progress_bar, say
 from mien.storage import read_json, write_json
 from mien.tracking.scoring import head_crop
@@ -89,7 +89,7 @@ def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) 
 
     rows: list[Scores] = []
     with progress_bar("score", len(pairs.names)) as advance:
-        for row in in_threads(score, pairs.read(), worker_threads(settings.threads)):
+        for row in stream_in_threads(score, pairs.read(), worker_threads(settings.threads)):
             rows.append(row)
             advance()
     return {

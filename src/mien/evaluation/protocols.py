@@ -18,12 +18,12 @@ from mien.evaluation.scoring import (
     Scores,
     ScoreSettings,
     as_8_bit,
-    in_threads,
     mean_scores,
     perceptual_metric,
     score_pictures,
     worker_threads,
 )
+from mien.parallel import stream_in_threads
 from mien.progress import progress_bar
 
 AVATAR, AS_TRACKED, MEAN_FRAME, MESH = "avatar", "as_tracked", "mean_frame", "mesh"
@@ -95,7 +95,7 @@ def evaluate_frames(
 
     with progress_bar(title, len(frames), len(done)) as advance:
         jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines)
-        for frame, row, seconds in in_threads(score, jobs, worker_threads(settings.threads)):
+        for frame, row, seconds in stream_in_threads(score, jobs, worker_threads(settings.threads)):
             done[frame] = row, seconds
             if partial is not None:
                 partial.add(frame, row, seconds)

@@ -1,9 +1,7 @@
 """Figures of pictures against a target, computed alike for protocols and for pictures of other programs."""
 
 import os
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any, TypeVar
@@ -25,7 +23,6 @@ PIXELS = "8 bits a channel, rounded"
 """The scored pixels: those that a png file would hold, so that files of any program are scored alike."""
 
 Item = TypeVar("Item")
-Result = TypeVar("Result")
 Scores = Mapping[str, float]
 """`psnr`, `ssim`, `l1`, `perceptual`, and the same with the prefix `head_`."""
 
@@ -104,15 +101,3 @@ def worker_threads(threads: int) -> int:
     if threads > 0:
         return threads
     return asked_threads() or min(_MOST_THREADS, os.cpu_count() or 1)
-
-
-def in_threads(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """Yield results in order. At most two items per thread are prepared ahead, so that memory stays small."""
-    with ThreadPoolExecutor(threads) as pool:
-        waiting: deque[Future[Result]] = deque()
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) >= 2 * threads:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()

@@ -3,9 +3,8 @@
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ from jaxtyping import Float, UInt8
 from mien import exact
 from mien.camera import Camera
 from mien.face import FaceModel, load_face_model
+from mien.parallel import stream_in_threads
 from mien.synthetic.motion import head_motion
 from mien.synthetic.off_model import bend_off_model
 from mien.synthetic.painter import develop, draw, to_uint8, wall
@@ -21,11 +21,8 @@ from mien.synthetic.posing import HeadPoser, head_pose, landmark_positions, proj
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.rig import cameras_of
 from mien.synthetic.subject import Subject, build_subject, pose_subject
-from mien.threads import thread_count
 from mien.tracking import Tracking
 from mien.tracking.neck_line import fit_neck_lines
-
-_AHEAD = 2  # frames per thread that are drawn ahead of the requested one
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,18 +129,10 @@ class SyntheticScene:
         """Yield the pictures of some timesteps in order, drawn ahead by up to MIEN_THREADS threads."""
         assert self.subject is not None
         assert self.background is not None
-        threads = thread_count()
         before = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-                pending: list[Future[list[SyntheticFrame]]] = []
-                for timestep in timesteps:
-                    pending.append(pool.submit(self.timestep_frames, timestep, cameras))
-                    if len(pending) > threads * _AHEAD:
-                        yield pending.pop(0).result()
-                for future in pending:
-                    yield future.result()
+            yield from stream_in_threads(partial(self.timestep_frames, cameras=cameras), timesteps)
         finally:
             torch.set_num_threads(before)
 

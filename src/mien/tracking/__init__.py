@@ -17,16 +17,10 @@ if TYPE_CHECKING:
         write_overlay,
         write_residual_report,
     )
-    from mien.tracking.scoring import (
-        Scoring,
-        make_scoring,
-        read_scoring,
-        read_scoring_hash,
-        scoring_exists,
-        write_scoring,
-    )
+    from mien.tracking.scoring import Scoring, make_scoring
+    from mien.tracking.scoring_files import read_scoring, read_scoring_hash, scoring_exists, write_scoring
     from mien.tracking.settings import PaperSettings, PhotometricSettings, SmoothnessSettings, TrackingSettings
-    from mien.tracking.tracking import Looks, Tracking
+    from mien.tracking.tracking import Appearance, Tracking
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
@@ -43,21 +37,15 @@ else:
                 "write_overlay",
                 "write_residual_report",
             ],
-            "scoring": [
-                "Scoring",
-                "make_scoring",
-                "read_scoring",
-                "read_scoring_hash",
-                "scoring_exists",
-                "write_scoring",
-            ],
+            "scoring": ["Scoring", "make_scoring"],
+            "scoring_files": ["read_scoring", "read_scoring_hash", "scoring_exists", "write_scoring"],
             "settings": ["PaperSettings", "PhotometricSettings", "SmoothnessSettings", "TrackingSettings"],
-            "tracking": ["Looks", "Tracking"],
+            "tracking": ["Appearance", "Tracking"],
         },
     )
 
 __all__ = [
-    "Looks",
+    "Appearance",
     "PaperSettings",
     "PhotometricSettings",
     "Scoring",

@@ -14,13 +14,13 @@ from mien.inside import check_tree, is_one_line
 from mien.limits import LARGEST_NUMBER, camera_fault
 from mien.locks import read_beside_writers
 from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
-from mien.tracking.tracking import Looks, Tracking
+from mien.tracking.tracking import Appearance, Tracking
 
 _FORMAT, _VERSION = "mien.tracking", 1
 _JSON, _TENSORS = "tracking.json", "tracking.safetensors"
 _FACE = ("identity", "expression", "joints", "head_rotation", "head_translation", "vertex_offsets")
-_LOOKS = ("texture", "trust", "light")
-_OPTIONAL = ("vertex_offsets", "pixel_residuals", *_LOOKS)
+_APPEARANCE = ("texture", "trust", "light")
+_OPTIONAL = ("vertex_offsets", "pixel_residuals", *_APPEARANCE)
 _AXES = {
     "identity": "i", "expression": "te", "joints": "tj3", "head_rotation": "t3", "head_translation": "t3",
     "vertex_offsets": "v3", "valid": "t", "neck_lines": "tc3", "residuals": "tc", "camera_K": "c33",
@@ -43,8 +43,8 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
     }
     if tracking.pixel_residuals is not None:
         tensors["pixel_residuals"] = tracking.pixel_residuals
-    if tracking.looks is not None:
-        tensors |= {name: getattr(tracking.looks, name) for name in _LOOKS}
+    if tracking.appearance is not None:
+        tensors |= {name: getattr(tracking.appearance, name) for name in _APPEARANCE}
     write_tensors(path / _TENSORS, tensors)
     content = {
         "face_model": tracking.face_model,
@@ -53,7 +53,7 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
         "valid_timesteps": int(tracking.valid.sum()),
         "cameras": [{"width": camera.width, "height": camera.height} for camera in tracking.cameras],
         "residual": _residual_summary(tracking.residuals),
-        "looks": None if tracking.looks is None else _numbers_of(tracking.looks),
+        "looks": None if tracking.appearance is None else _numbers_of(tracking.appearance),
         "settings": tracking.settings,
         "tensors_sha256": file_digest(path / _TENSORS),
     }
@@ -87,7 +87,7 @@ def _read_tracking(path: Path) -> Tracking:
             neck_lines=tensors["neck_lines"],
             residuals=tensors["residuals"],
             pixel_residuals=tensors.get("pixel_residuals"),
-            looks=_read_looks(content.get("looks"), tensors),
+            appearance=_read_appearance(content.get("looks"), tensors),
             settings=_read_settings(content["settings"]),
         )
 
@@ -156,17 +156,17 @@ def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
             raise UserError(f"{path / _TENSORS}: {name!r} holds numbers that are not finite; {_REMEDY}")
 
 
-def _numbers_of(looks: Looks) -> dict[str, float]:
-    return {"sigma": looks.sigma, "light_extent": looks.light_extent}
+def _numbers_of(appearance: Appearance) -> dict[str, float]:
+    return {"sigma": appearance.sigma, "light_extent": appearance.light_extent}
 
 
-def _read_looks(numbers: dict[str, float] | None, tensors: dict[str, Tensor]) -> Looks | None:
+def _read_appearance(numbers: dict[str, float] | None, tensors: dict[str, Tensor]) -> Appearance | None:
     if numbers is None:
         return None
     sigma, light_extent = float(numbers["sigma"]), float(numbers["light_extent"])
     if not (0 <= sigma <= LARGEST_NUMBER and 0 <= light_extent <= LARGEST_NUMBER):
-        raise ValueError(f"looks {sigma:g}, {light_extent:g}")
-    return Looks(tensors["texture"], tensors["trust"], tensors["light"], sigma, light_extent)
+        raise ValueError(f"sigma {sigma:g} and light_extent {light_extent:g} are out of range")
+    return Appearance(tensors["texture"], tensors["trust"], tensors["light"], sigma, light_extent)
 
 
 def _residual_summary(residuals: Tensor) -> dict[str, float | None]:

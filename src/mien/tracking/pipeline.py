@@ -14,11 +14,11 @@ from mien.progress import say
 from mien.tracking.descent import fit_by_descent
 from mien.tracking.fitting import (
     Fit,
-    Keeper,
     Shot,
+    StageCache,
+    ignore_progress,
     layout_of,
     lenses_of,
-    nobody,
     shot_of,
 )
 from mien.tracking.landmarks import (
@@ -98,13 +98,13 @@ def _track_subject(
 ) -> list[Tracking]:
     if "mediapipe" not in face_model.landmarks:
         raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; calibrate them for it first")
-    shots, keeper = [shot_of(capture, settings) for capture in captures], Keeper(keep)
+    shots, cache = [shot_of(capture, settings) for capture in captures], StageCache(keep)
     with torch.no_grad():
         model = reduce_face_model(face_model, layout_of(face_model), _response(face_model, shots, settings))
         lenses = lenses_of(captures, settings)
-        watch = nobody if preview is None else Preview(preview, face_model, model, shots, settings)
+        watch = ignore_progress if preview is None else Preview(preview, face_model, model, shots, settings)
         try:
-            fit = fit_landmarks(model, shots, lenses, settings, keeper, watch)
+            fit = fit_landmarks(model, shots, lenses, settings, cache, watch)
         except torch.linalg.LinAlgError:
             names = ", ".join(capture.name for capture in captures)
             raise UserError(
@@ -112,10 +112,10 @@ def _track_subject(
             ) from None
         refined: PhotometricFit | None = None
         if settings.schedule == "fast" or (settings.schedule == "paper" and settings.paper.start == "fast"):
-            refined = refine_photometrically(model, shots, lenses, fit, settings, keeper, watch)
+            refined = refine_photometrically(model, shots, lenses, fit, settings, cache, watch)
         if settings.schedule == "paper":
             start = fit if refined is None else refined.fit
-            refined = fit_by_descent(model, shots, lenses, start, settings, keeper, watch, refined)
+            refined = fit_by_descent(model, shots, lenses, start, settings, cache, watch, refined)
         fit = _without_turn_habits(model, shots, fit if refined is None else refined.fit, settings)
         refined = None if refined is None else replace(refined, fit=fit)
         watch(DONE, 1.0, lambda: refined or fit)
@@ -123,9 +123,9 @@ def _track_subject(
             as_tracking(shot, face_model, model, fit.subject, own, settings)
             for shot, own in zip(shots, fit.sequences, strict=True)
         ]
-        if refined is not None and (refined.appearance.trust > 0).any():
+        if refined is not None and (refined.texture.trust > 0).any():
             trackings = with_pixels(trackings, shots, refined, face_model, settings)
-    keeper.forget()
+    cache.forget()
     return trackings
 
 

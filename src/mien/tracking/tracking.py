@@ -10,7 +10,7 @@ from mien.face import FaceParams
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class Appearance:
     """The subject's skin and the light of one sequence, from a fit to pixels."""
 
     texture: Float[Tensor, "th tw 3"]
@@ -51,7 +51,7 @@ class Tracking:
     pixel_residuals: Float[Tensor, "t c"] | None = None
     """Robust root mean square difference of colours (0..1) from the texture that all pictures share. NaN where
     landmarks alone determined the fit. None if there was no fit to pixels."""
-    looks: Looks | None = None
+    appearance: Appearance | None = None
     """Texture and light of the model. None if there was no fit to pixels or it found no texture."""
     settings: dict = field(default_factory=dict)
     """Settings of the tracking, for the report."""

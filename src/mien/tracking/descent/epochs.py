@@ -9,24 +9,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.parallel import in_threads
+from mien.adam import Moments
+from mien.parallel import map_in_threads
 from mien.progress import Advance
-from mien.tracking.descent.adam import Moments, RowStepper
+from mien.tracking.descent.adam import RowStepper, apply_adam
 from mien.tracking.descent.scene import PaperScene, PaperState
 from mien.tracking.descent.terms import (
     Moving,
-    Shown,
+    Target,
     color_term,
     landmark_terms,
-    posed,
+    pose_vertices,
     prior_term,
+    read_target,
     roughness_gradient,
     shared_terms,
-    show,
     smoothness_term,
     without_smooth_difference,
 )
-from mien.tracking.fitting import Keeper
+from mien.tracking.fitting import StageCache
 
 _PIECE = "descent"
 _RATES = {"lights": "light", "log_focals": "focal"}
@@ -66,9 +67,9 @@ class Descent:
         self._steppers: dict[tuple[int, int], RowStepper] = {}
         self._moments: dict[str, Moments] = {}
 
-    def resume(self, keeper: Keeper) -> None:
-        """Resume from the state that a keeper holds, if any."""
-        tensors = keeper.read(_PIECE)
+    def resume(self, cache: StageCache) -> None:
+        """Resume from the state that a cache holds, if any."""
+        tensors = cache.read(_PIECE)
         if tensors is None:
             return
         unpack_state(self.state, tensors)
@@ -83,11 +84,11 @@ class Descent:
                 stepper, whitening=tensors[f"rows/{name}/whitening"], moments=moments
             )
 
-    def offer(self, keeper: Keeper) -> None:
-        """Offer the present state to the keeper, which stores it if it is time."""
-        keeper.offer(_PIECE, lambda: pack(self.state, self._moments, self._steppers, self.lost, self.done))
+    def offer(self, cache: StageCache) -> None:
+        """Offer the present state to the cache, which stores it if it is time."""
+        cache.offer(_PIECE, lambda: pack(self.state, self._moments, self._steppers, self.lost, self.done))
 
-    def fit_epoch(self, epoch: int, advance: Advance, keeper: Keeper) -> None:
+    def fit_epoch(self, epoch: int, advance: Advance, cache: StageCache) -> None:
         """Take one step of every frame in random order. Each batch of frames also moves the shared parameters."""
         if self.done >= self.frames * (2 + epoch):
             return
@@ -110,13 +111,13 @@ class Descent:
                 texture_gradient, seen = torch.zeros_like(texture_gradient), 0
             advance(len(batch), status=f"epoch {epoch + 1}")
         self.done += self.frames
-        self.offer(keeper)
+        self.offer(cache)
 
     def _step_frames(self, batch: Sequence[_Place], scale: float) -> dict[str, Tensor]:
         """Move each frame's own parameters and return the summed gradients of the shared parameters."""
         weights, total = self.trusted(), {}
         for some in (batch[start : start + _AT_ONCE] for start in range(0, len(batch), _AT_ONCE)):
-            for place, gradients in zip(some, in_threads(partial(self._gradients, weights), some), strict=True):
+            for place, gradients in zip(some, map_in_threads(partial(self._gradients, weights), some), strict=True):
                 key = (place.sequence, place.row)
                 if key not in self._steppers:
                     self._steppers[key] = self.stepper(*key, past_only=False)
@@ -132,11 +133,11 @@ class Descent:
         names = ["row", "identity", "texture", "light"]
         names += ["offsets"] if self.scene.settings.offset_sigma > 0 else []
         names += ["log_focals"] if len(self.state.log_focals) else []
-        shown = show(self.scene, place.sequence, place.row, place.camera)
+        target = read_target(self.scene, place.sequence, place.row, place.camera)
         with torch.enable_grad():
-            moving, leaves = self.moving(shown, names)
-            shown = without_smooth_difference(self.scene, shown, moving, weights)
-            cost = self.frame_cost(shown, moving, weights, past_only=False)
+            moving, leaves = self.moving(target, names)
+            target = without_smooth_difference(self.scene, target, moving, weights)
+            cost = self.frame_cost(target, moving, weights, past_only=False)
             found = torch.autograd.grad(cost, list(leaves.values()), allow_unused=True)
         return {
             name: torch.zeros_like(leaf) if gradient is None else gradient
@@ -156,24 +157,24 @@ class Descent:
 
     def _step(self, name: str, value: Tensor, gradient: Tensor, rate: float) -> None:
         with torch.no_grad():
-            self._moments.setdefault(name, Moments.like(value)).step(value, gradient, rate)
+            apply_adam(self._moments.setdefault(name, Moments.zeros(value)), value, gradient, rate)
 
     def frame_cost(
-        self, shown: Shown, moving: Moving, weights: Float[Tensor, " f"], past_only: bool
+        self, target: Target, moving: Moving, weights: Float[Tensor, " f"], past_only: bool
     ) -> Float[Tensor, ""]:
         """The cost of a timestep in one picture: colours, landmarks, prior, and smoothness unless `past_only`."""
         scene = self.scene
-        vertices, _ = posed(scene, moving)
-        own, rows = scene.sequences[shown.sequence], self.state.frames[shown.sequence]
-        cost = color_term(scene, shown, moving, vertices, weights) + landmark_terms(scene, shown, moving)
+        vertices, _ = pose_vertices(scene, moving)
+        own, rows = scene.sequences[target.sequence], self.state.frames[target.sequence]
+        cost = color_term(scene, target, moving, vertices, weights) + landmark_terms(scene, target, moving)
         cost = cost + prior_term(scene, moving.row)
         # Smoothness with the past alone would continue steady motion against the pictures: heads drifted by degrees.
-        return cost if past_only else cost + smoothness_term(own, rows, shown.row, moving.row)
+        return cost if past_only else cost + smoothness_term(own, rows, target.row, moving.row)
 
-    def moving(self, shown: Shown, names: Sequence[str]) -> tuple[Moving, dict[str, Tensor]]:
+    def moving(self, target: Target, names: Sequence[str]) -> tuple[Moving, dict[str, Tensor]]:
         """The parameters for a picture, and those in `names` as leaves for gradients."""
         state = self.state
-        values = {"row": state.frames[shown.sequence][shown.row], "light": state.lights[shown.sequence]}
+        values = {"row": state.frames[target.sequence][target.row], "light": state.lights[target.sequence]}
         values |= {name: getattr(state, name) for name in ("identity", "offsets", "texture", "log_focals")}
         leaves = {name: values[name].detach().clone().requires_grad_() for name in names}
         return Moving(**(values | leaves)), leaves
@@ -190,7 +191,7 @@ class Descent:
         linked = torch.cat([torch.zeros(1), self.scene.sequences[sequence].smoothness.linked, torch.zeros(1)])
         around = linked[row : row + 3] * torch.tensor([0.0, 0.0, 0.0] if past_only else [1.0, 4.0, 1.0])
         whitening = self.scene.whitening(sequence, row, values, float(around.sum()))
-        return RowStepper(values, whitening, Moments.like(values), (layout.lower.float(), layout.upper.float()))
+        return RowStepper(values, whitening, Moments.zeros(values), (layout.lower.float(), layout.upper.float()))
 
     def cameras(self, sequence: int, row: int) -> list[int]:
         """The cameras that found a face at a timestep."""
@@ -198,7 +199,7 @@ class Descent:
 
     def trusted(self) -> Float[Tensor, " f"]:
         """Weight of the texels of each triangle, 0..1, by how frontally the triangle was seen."""
-        return self.scene.used * (self.state.sight / _GOOD_COSINE).clamp_max(1.0)
+        return self.scene.used * (self.state.visibility / _GOOD_COSINE).clamp_max(1.0)
 
 
 def pack(
@@ -213,7 +214,7 @@ def pack(
     every = {f"moments/{name}": own for name, own in moments.items()}
     every |= {f"rows/{sequence}/{row}": own.moments for (sequence, row), own in steppers.items()}
     for name, own in every.items():
-        tensors |= {f"{name}/first": own.first, f"{name}/second": own.second, f"{name}/count": torch.tensor(own.count)}
+        tensors |= {f"{name}/first": own.first, f"{name}/second": own.second, f"{name}/count": own.step.long()}
     return tensors | {f"rows/{sequence}/{row}/whitening": own.whitening for (sequence, row), own in steppers.items()}
 
 
@@ -229,7 +230,7 @@ def unpack_moments(tensors: dict[str, Tensor], prefix: str) -> dict[str, Moments
     return {
         name: Moments(
             tensors[f"{prefix}{name}/first"], tensors[f"{prefix}{name}/second"],
-            int(tensors[f"{prefix}{name}/count"]),
+            tensors[f"{prefix}{name}/count"].to(tensors[f"{prefix}{name}/first"].dtype),
         )
         for name in sorted(names)
     }  # fmt: skip

@@ -41,14 +41,14 @@ class PaperState:
     log_focals: Float[Tensor, " g"]
     frames: list[Float[Tensor, "_ p"]]
     """Parameters of each sequence: one row for each timestep with a face, so lengths differ."""
-    sight: Float[Tensor, " f"]
+    visibility: Float[Tensor, " f"]
     """Cosine between each triangle's normal and the direction to the camera in the frame that its texels are from."""
 
     def tensors(self) -> dict[str, Tensor]:
         """The parameters by name, for a file."""
         frames = {f"frames_{index}": rows for index, rows in enumerate(self.frames)}
-        names = ("identity", "offsets", "texture", "lights", "log_focals", "sight")
-        return {name: getattr(self, name) for name in names} | frames
+        names = ("identity", "offsets", "texture", "lights", "log_focals")
+        return {name: getattr(self, name) for name in names} | {"sight": self.visibility} | frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,7 @@ def paper_scene(
 
 def _trust(face_model: FaceModel, refined: PhotometricFit) -> Float[Tensor, " f"]:
     """Mean trust of each triangle's texels. It is small if pictures contradict each other, as at glasses."""
-    trust, count = refined.appearance.trust, len(face_model.faces)
+    trust, count = refined.texture.trust, len(face_model.faces)
     face_index = texture_space(face_model, len(trust)).fragments.face_index.long().flatten()
     face_index = torch.where(face_index < 0, count, face_index)
     texels = torch.bincount(face_index, minlength=count + 1)
@@ -172,16 +172,16 @@ def first_state(
         lights=torch.stack(lights),
         log_focals=torch.zeros(len({lens for lens in lenses if lens is not None})),
         frames=[own.state.float() for own in fit.sequences],
-        sight=torch.zeros(len(scene.mesh.faces)),
+        visibility=torch.zeros(len(scene.mesh.faces)),
     )
 
 
 def _first_texture(size: int, refined: PhotometricFit | None) -> Float[Tensor, "th tw 3"]:
     """The texture of the fit to pixels, with the median colour in unknown texels; grey if there is none."""
     texture = torch.full((size, size, 3), 0.5)
-    if refined is None or not (refined.appearance.trust > 0).any():
+    if refined is None or not (refined.texture.trust > 0).any():
         return texture
-    albedo, known = refined.appearance.albedo, refined.appearance.trust > 0
+    albedo, known = refined.texture.albedo, refined.texture.trust > 0
     filled = torch.where(known[..., None], albedo, albedo[known].median(0).values)
     planes = interpolate(filled.movedim(2, 0)[None], (size, size), mode="bilinear", antialias=True)
     return planes[0].movedim(0, 2).contiguous()

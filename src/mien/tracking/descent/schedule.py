@@ -2,16 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 
 from mien.progress import progress_bar
 from mien.tracking.descent.epochs import Descent
-from mien.tracking.descent.frames import fit_looks, fit_sequence, look_around, recentre
+from mien.tracking.descent.frames import fit_appearance, fit_sequence, measure_visibility, recentre
 from mien.tracking.descent.scene import PaperScene, PaperState, first_state, paper_scene
-from mien.tracking.fitting import Fit, Keeper, Shot, Watch
+from mien.tracking.fitting import Course, Fit, Shot, StageCache, Watch
 from mien.tracking.landmarks import LandmarkModel
-from mien.tracking.pixels import Appearance, PhotometricFit, texture_space
+from mien.tracking.pixels import PhotometricFit, SkinTexture, texture_space
 from mien.tracking.settings import TrackingSettings
 
 
@@ -21,7 +22,7 @@ def fit_by_descent(
     lenses: Sequence[int | None],
     fit: Fit,
     settings: TrackingSettings,
-    keeper: Keeper,
+    cache: StageCache,
     watch: Watch,
     refined: PhotometricFit | None = None,
 ) -> PhotometricFit:
@@ -36,38 +37,32 @@ def fit_by_descent(
         lenses: Index of each sequence's unknown focal length (`lenses_of`).
         fit: The fit to landmarks, or that of the schedule `fast`.
         settings: Settings of the whole tracking.
-        keeper: Keeps the state from which an interrupted fit of the same input resumes.
+        cache: Keeps the state from which an interrupted fit of the same input resumes.
         watch: Receives the progress.
         refined: `fit` with texture and light, if it was fitted to pixels.
     """
-    if refined is not None and not (refined.appearance.trust > 0).any():
+    if refined is not None and not (refined.texture.trust > 0).any():
         return refined  # The pictures show nothing to fit to.
     scene = paper_scene(model, shots, lenses, fit, settings, refined)
     descent = Descent(scene, first_state(scene, fit, lenses, refined))
-    descent.resume(keeper)
+    descent.resume(cache)
     if refined is not None:
         descent.done = max(descent.done, descent.frames)
     total = descent.frames * (1 + settings.paper.epochs)
-    done = min(descent.done, total)
 
     def outcome() -> PhotometricFit:
         return _as_photometric(scene, descent, fit, refined)
 
-    with torch.enable_grad(), progress_bar("Refining by descent", total, done) as advance:
-
-        def step(amount: int = 1, status: str = "") -> None:
-            nonlocal done
-            done += amount
-            advance(amount, status=status)
-            watch(f"pixels, {status}", done / total, outcome)
-
+    with torch.enable_grad(), progress_bar("Refining by descent", total, min(descent.done, total)) as bar:
+        course = Course("pixels", total, bar, watch, min(descent.done, total))
+        advance = partial(course.advance, current=outcome)
         for sequence in range(len(shots) if refined is None else 0):
-            fit_sequence(descent, sequence, step, keeper)
+            fit_sequence(descent, sequence, advance, cache)
         if descent.done == descent.frames:
-            look_around(descent) if refined is not None else recentre(descent)
-            fit_looks(descent)
+            measure_visibility(descent) if refined is not None else recentre(descent)
+            fit_appearance(descent)
         for epoch in range(settings.paper.epochs):
-            descent.fit_epoch(epoch, step, keeper)
+            descent.fit_epoch(epoch, advance, cache)
     return outcome()
 
 
@@ -81,7 +76,7 @@ def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: Phot
         improved = [own.clone() for own in refined.improved]
     for sequence, row in descent.lost:
         improved[sequence][row] = False
-    appearance = Appearance(state.texture, trust, scene.settings.color_epsilon)
+    appearance = SkinTexture(state.texture, trust, scene.settings.color_epsilon)
     return PhotometricFit(fit, appearance, tuple(state.lights), tuple(improved))
 
 

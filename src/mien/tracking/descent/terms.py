@@ -18,7 +18,7 @@ from mien.tracking.descent.scene import PaperScene, PaperState, SequenceScene
 from mien.tracking.fitting import CameraBatch, Smoothness
 from mien.tracking.landmarks import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
 
-GAPS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS, (13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
+_GAPS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS, (13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
 """Pairs of upper and lower landmarks. Their distances show how far eyes and mouth are open."""
 
 _BLUR_AT = 4.0
@@ -40,7 +40,7 @@ class Moving:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class Target:
     """A picture that the fit uses."""
 
     sequence: int
@@ -50,14 +50,14 @@ class Shown:
     mask: Float[Tensor, "h w"]
 
 
-def show(scene: PaperScene, sequence: int, row: int, camera: int) -> Shown:
+def read_target(scene: PaperScene, sequence: int, row: int, camera: int) -> Target:
     """Read a picture of a sequence."""
     own = scene.sequences[sequence]
     image = own.pictures.picture(int(own.timesteps[row]), camera, own.cameras).image
-    return Shown(sequence, row, camera, image, torch.ones(image.shape[:2]))
+    return Target(sequence, row, camera, image, torch.ones(image.shape[:2]))
 
 
-def posed(scene: PaperScene, moving: Moving) -> tuple[Float[Tensor, "v 3"], FaceParams]:
+def pose_vertices(scene: PaperScene, moving: Moving) -> tuple[Float[Tensor, "v 3"], FaceParams]:
     """Vertices in the frame of the fit, and the face parameters."""
     face = scene.layout.face_params(moving.row[None], moving.identity)
     face = replace(face, vertex_offsets=moving.offsets)
@@ -65,45 +65,47 @@ def posed(scene: PaperScene, moving: Moving) -> tuple[Float[Tensor, "v 3"], Face
 
 
 def color_term(
-    scene: PaperScene, shown: Shown, moving: Moving, vertices: Float[Tensor, "v 3"], weights: Float[Tensor, " f"]
+    scene: PaperScene, target: Target, moving: Moving, vertices: Float[Tensor, "v 3"], weights: Float[Tensor, " f"]
 ) -> Float[Tensor, ""]:
     """The colour difference between picture and rendering, over triangles with a weight.
 
     Shading has no gradient by the vertices. Otherwise light that a few spherical harmonics do not explain would turn
     heads.
     """
-    camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
-    height, width = shown.mask.shape
+    camera = scene.camera(target.sequence, target.camera, moving.log_focals)
+    height, width = target.mask.shape
     camera = camera.resized(width, height)
-    fragments = see(vertices, scene, camera)
+    fragments = rasterize_detached(vertices, scene, camera)
     mesh = replace(scene.mesh, face_weights=weights)
     return scene.settings.color_weight * mesh_loss(
         fragments, image_points(camera, vertices), vertex_normals(vertices.detach(), mesh.faces), mesh,
-        moving.texture, moving.light, (shown.image, shown.mask, scene.settings.color_epsilon),
+        moving.texture, moving.light, (target.image, target.mask, scene.settings.color_epsilon),
     )  # fmt: skip
 
 
 @torch.no_grad()
-def without_smooth_difference(scene: PaperScene, shown: Shown, moving: Moving, weights: Float[Tensor, " f"]) -> Shown:
+def without_smooth_difference(
+    scene: PaperScene, target: Target, moving: Moving, weights: Float[Tensor, " f"]
+) -> Target:
     """The picture minus its smooth difference from the rendering, which is light that the model does not explain."""
-    vertices, _ = posed(scene, moving)
-    height, width = shown.mask.shape
-    camera = scene.camera(shown.sequence, shown.camera, moving.log_focals).resized(width, height)
-    fragments, picture = see(vertices, scene, camera), torch.empty_like(shown.image)
+    vertices, _ = pose_vertices(scene, moving)
+    height, width = target.mask.shape
+    camera = scene.camera(target.sequence, target.camera, moving.log_focals).resized(width, height)
+    fragments, picture = rasterize_detached(vertices, scene, camera), torch.empty_like(target.image)
     mesh_loss(
         fragments, image_points(camera, vertices), vertex_normals(vertices, scene.mesh.faces),
         replace(scene.mesh, face_weights=weights), moving.texture, moving.light,
-        (shown.image, shown.mask, scene.settings.color_epsilon), picture,
+        (target.image, target.mask, scene.settings.color_epsilon), picture,
     )  # fmt: skip
     lit = torch.cat([weights, weights.new_zeros(1)])[fragments.face_index.long()][..., None]
-    difference = shown.image - picture
+    difference = target.image - picture
     # Outliers, such as hair that hides skin, say nothing about the light around them.
     lit = lit * (_LIGHT**2 / (_LIGHT**2 + difference.square().sum(-1, keepdim=True)))
     depth = float(camera.project(vertices.mean(0, keepdim=True))[1])
     sigma = max(scene.settings.light_extent * float(camera.K[0, 0]) / depth, 1.0)
     sums = _blurred(torch.cat([difference * lit, lit], dim=-1).numpy(), sigma)
     smooth = torch.from_numpy(sums[..., :3] / np.maximum(sums[..., 3:], 1e-3)) * (lit > 0)
-    return replace(shown, image=shown.image - smooth)
+    return replace(target, image=target.image - smooth)
 
 
 def _blurred(image: Float[np.ndarray, "h w c"], sigma: float) -> Float[np.ndarray, "h w c"]:
@@ -115,16 +117,16 @@ def _blurred(image: Float[np.ndarray, "h w c"], sigma: float) -> Float[np.ndarra
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def see(vertices: Float[Tensor, "v 3"], scene: PaperScene, camera: Camera) -> MeshFragments:
+def rasterize_detached(vertices: Float[Tensor, "v 3"], scene: PaperScene, camera: Camera) -> MeshFragments:
     """Rasterise the mesh in a camera, without gradients."""
     fixed = replace(camera, K=camera.K.detach())
     return rasterize_mesh(vertices.detach(), scene.mesh.faces, fixed)
 
 
-def landmark_terms(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Tensor, ""]:
+def landmark_terms(scene: PaperScene, target: Target, moving: Moving) -> Float[Tensor, ""]:
     """The cost of landmarks in all pictures of the timestep, and of the gaps between lids and between lips."""
-    own = scene.sequences[shown.sequence]
-    term, cameras = own.terms[shown.row], own.cameras_at(moving.log_focals)
+    own = scene.sequences[target.sequence]
+    term, cameras = own.terms[target.row], own.cameras_at(moving.log_focals)
     views = term.views
     # The effect of the offsets on landmarks is added to the bias, as `_as_fit` does at the end.
     moved = scene.landmarks.positions(moving.offsets, scene.mesh.faces).double()
@@ -132,7 +134,7 @@ def landmark_terms(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Ten
     state, identity = moving.row.double()[None], moving.identity.double()
     projected = term.model.project(state, identity, scene.bias + moved, cameras, views.row)
     residual = projected - views.detected
-    upper, lower = (torch.tensor(column) for column in zip(*GAPS, strict=True))
+    upper, lower = (torch.tensor(column) for column in zip(*_GAPS, strict=True))
     gap_weights = scene.settings.gap_weight * term.weights[upper]
     gaps = replace(term, weights=gap_weights).robust(residual[:, upper] - residual[:, lower], views)[0]
     return (term.robust(residual, views)[0] + gaps).sum().float()
@@ -183,11 +185,11 @@ def offset_term(scene: PaperScene, offsets: Float[Tensor, "v 3"]) -> Float[Tenso
 
 
 @torch.no_grad()
-def sight_of(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Tensor, " f"]:
+def visibility_of(scene: PaperScene, target: Target, moving: Moving) -> Float[Tensor, " f"]:
     """Cosine between each triangle's normal and the direction to the camera; 0 if the picture does not show it."""
-    vertices, _ = posed(scene, moving)
-    camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
-    visible = see(vertices, scene, camera.resized(*reversed(shown.mask.shape))).face_index
+    vertices, _ = pose_vertices(scene, moving)
+    camera = scene.camera(target.sequence, target.camera, moving.log_focals)
+    visible = rasterize_detached(vertices, scene, camera.resized(*reversed(target.mask.shape))).face_index
     corners = vertices[scene.mesh.faces]
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     cosine = cosine_similarity(normals, camera.position - corners.mean(1), dim=1)
@@ -198,14 +200,14 @@ def sight_of(scene: PaperScene, shown: Shown, moving: Moving) -> Float[Tensor, "
 
 
 @torch.no_grad()
-def guess_texture(scene: PaperScene, shown: Shown, moving: Moving, texture: Float[Tensor, "th tw 3"]) -> None:
+def guess_texture(scene: PaperScene, target: Target, moving: Moving, texture: Float[Tensor, "th tw 3"]) -> None:
     """Fill the texture with one skin colour: the median of the pixels that the mesh covers."""
-    vertices, _ = posed(scene, moving)
-    camera = scene.camera(shown.sequence, shown.camera, moving.log_focals)
-    visible = see(vertices, scene, camera.resized(*reversed(shown.mask.shape))).face_index
+    vertices, _ = pose_vertices(scene, moving)
+    camera = scene.camera(target.sequence, target.camera, moving.log_focals)
+    visible = rasterize_detached(vertices, scene, camera.resized(*reversed(target.mask.shape))).face_index
     used = torch.cat([scene.used, torch.zeros(1)])[visible.long()] > 0
     if used.any():
-        texture[:] = shown.image[used].median(0).values
+        texture[:] = target.image[used].median(0).values
 
 
 def roughness_gradient(scene: PaperScene, texture: Float[Tensor, "th tw 3"]) -> Float[Tensor, "th tw 3"]:

@@ -18,7 +18,7 @@ _EYE_COLORS, _EDGE_COLORS = 6, 8
 """Number of colours in each palette."""
 _ROUNDS = 20
 _SAMPLES = 20_000
-_LEAST_SAMPLES = 100
+_MIN_SAMPLES = 100
 _COLOR_SIGMA, _SKIN_SIGMA = 0.15, 0.15
 """Standard deviations of logarithms of colours. The first is about each colour of a palette. The second is that of
 plain skin on the lids, in addition to the spread of the skin around the eye."""
@@ -75,7 +75,7 @@ def learn_colors(crops: Sequence[EyeCrop]) -> EyeColors | None:
         np.concatenate([crop.colors[getattr(crop, name)] for crop in crops] or [np.zeros((0, 3), np.float32)])
         for name in ("inside", "beside")
     )
-    if min(len(inside), len(beside)) < _LEAST_SAMPLES:
+    if min(len(inside), len(beside)) < _MIN_SAMPLES:
         return None
     spread = float(np.median([crop.spread for crop in crops]))
     return EyeColors(_palette(inside, _EYE_COLORS), _palette(beside, _EDGE_COLORS), (spread**2 + _SKIN_SIGMA**2) ** 0.5)

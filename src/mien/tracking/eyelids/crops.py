@@ -12,19 +12,19 @@ from mien.camera import Camera
 from mien.render.mesh import rasterize_mesh
 from mien.tracking.eyelids.eyes import Eye
 
-_LARGEST = 40
+_MAX_WIDTH = 40
 """Largest width of an eyeball, in pixels. If it is wider, the picture is scaled down."""
-_SMALLEST = 20
+_MIN_WIDTH = 20
 """Smallest width of an eyeball, in pixels. Narrower eyeballs show too little and are skipped."""
 _SHARPER = 2
 """The mesh is drawn at this multiple of the picture's size, so that edges of lids can lie between pixels."""
 _MARGIN = 2
 """Margin around the eyeball, in pixels."""
-_LEAST_COSINE = 0.25
+_MIN_COSINE = 0.25
 """Smallest cosine between the normal of skin and the direction to the camera at which the skin's colour is used."""
 _RING, _SMOOTH = 0.3, 0.18
 """Width of the ring of skin around the eye, and sigma of the blur of its colour, in widths of the opening."""
-_LEAST_RING, _LEAST_OPENING = 12, 12
+_MIN_RING, _MIN_OPENING = 12, 12
 """Fewest pixels of the ring of skin, and of the opening of the eye. With fewer the eye is skipped."""
 _DARKEST = 0.03
 """Value added to colours before the logarithm, so that noise in dark pixels does not matter."""
@@ -78,7 +78,7 @@ def eye_crop(
     opening = uncovered.max(0) > 1 / 64
     difference, spread = _without_skin(_logarithms(image), opening, skin & inside_picture)
     kept = opening & ~hidden & inside_picture
-    if difference is None or kept.sum() < _LEAST_OPENING:
+    if difference is None or kept.sum() < _MIN_OPENING:
         return None
     open_now = uncovered[-1]
     kernel = np.ones((3, 3), np.uint8)
@@ -100,7 +100,7 @@ def _part(
     left, top = (points.amin(0).floor().long() - _MARGIN).tolist()
     right, bottom = (points.amax(0).ceil().long() + _MARGIN).tolist()
     width, height = right - left, bottom - top
-    if width < _SMALLEST or left >= camera.width or top >= camera.height or right <= 0 or bottom <= 0:
+    if width < _MIN_WIDTH or left >= camera.width or top >= camera.height or right <= 0 or bottom <= 0:
         return None
     part = picture[max(top, 0) : bottom, max(left, 0) : right]
     after = max(bottom - camera.height, 0), max(right - camera.width, 0)
@@ -108,8 +108,8 @@ def _part(
     known = np.pad(np.ones(part.shape[:2], np.uint8), pad)
     part = np.pad(part, (*pad, (0, 0)), mode="edge")
     view = camera.cropped(float(left), float(top), width, height)
-    if width > _LARGEST:
-        width, height = _LARGEST, max(round(height * _LARGEST / width), 1)
+    if width > _MAX_WIDTH:
+        width, height = _MAX_WIDTH, max(round(height * _MAX_WIDTH / width), 1)
         part = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA)
         known = cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST)
         view = view.resized(width, height)
@@ -132,7 +132,7 @@ def _around(
     normals = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     towards = view.position - triangles.mean(1)
     cosine = (normals * towards).sum(1) / (normals.norm(dim=1) * towards.norm(dim=1)).clamp_min(1e-20)
-    skin = (seen >= 0) & (eye.skin & (cosine > _LEAST_COSINE))[seen.clamp_min(0)]
+    skin = (seen >= 0) & (eye.skin & (cosine > _MIN_COSINE))[seen.clamp_min(0)]
     return skin.numpy(), (seen >= eye.lids).numpy()
 
 
@@ -154,7 +154,7 @@ def _without_skin(
         cv2.dilate(opening.astype(np.uint8), np.ones((size, size), np.uint8)) > 0 for size in (reach, 3)
     )  # fmt: skip
     ring = near & ~touching & skin
-    if ring.sum() < _LEAST_RING:
+    if ring.sum() < _MIN_RING:
         return None, 0.0
     middle = np.median(colors[ring], axis=0)
     away = np.abs(colors - middle).sum(-1)

@@ -16,7 +16,7 @@ _LIDS_REACH, _AROUND_REACH = 1.3, 3.5
 """Distances from an eyeball's centre that contain its lids, and everything that may hide it, in radii."""
 _STEPS = 64
 """Number of equal steps of a coefficient. Lids touch at the first step at which the least of the eyeball is seen."""
-_MOST_CLOSING = 1.25
+_MAX_CLOSING = 1.25
 """A coefficient closes an eye if the lids meet within this multiple of its upper bound."""
 _OTHERS_SHARE = 0.2
 """A coefficient is not an eye's own if it moves the other eye's lids by more than this share."""
@@ -88,7 +88,7 @@ def _coefficient(
 ) -> tuple[int, float] | None:
     """The free coefficient that closes an eye with the least motion elsewhere, and its upper bound; or None."""
     bounds = model.expression_bounds[layout.expression_index]
-    able = (closing * _MOST_CLOSING * bounds[:, 1] >= 1) & (of_other.abs() < _OTHERS_SHARE * closing)
+    able = (closing * _MAX_CLOSING * bounds[:, 1] >= 1) & (of_other.abs() < _OTHERS_SHARE * closing)
     if not able.any():
         return None
     moved = model.landmark_positions(model.expression_basis[layout.expression_index], "mediapipe")

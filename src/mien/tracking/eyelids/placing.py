@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.parallel import in_threads
+from mien.parallel import map_in_threads
 from mien.tracking.eyelids.colors import EyeColors, learn_colors
 from mien.tracking.eyelids.crops import EyeCrop, eye_crop
 from mien.tracking.eyelids.eyes import Eye, eyes_of
@@ -40,9 +40,9 @@ _FAR = 0.4
 """Wider standard deviation of the fit's lids, for the estimate of the usual offset between colours and fit."""
 _LEARNED_FROM = 100
 """Largest number of pictures that colours are learned from."""
-_LEAST_PICTURES = 10
+_MIN_PICTURES = 10
 """Fewest pictures that must show an eye for its lids to be placed."""
-_LEAST_FACING = 0.35
+_MIN_FACING = 0.35
 """Smallest cosine between an eye's direction and the direction to the camera."""
 
 
@@ -98,7 +98,7 @@ class _Sequence:
         positions: list[float],
     ) -> EyeCrop | None:
         middle = corners[0].mean(0)
-        capture, best, facing = self.shot.capture, None, _LEAST_FACING
+        capture, best, facing = self.shot.capture, None, _MIN_FACING
         for index in self.shot.views.seen_by(row):
             K, viewmat = self.own.cameras.K[index].float(), self.own.cameras.viewmat[index].float()
             camera = Camera(K, viewmat, capture.width, capture.height)
@@ -121,11 +121,11 @@ def _placed(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
         crops = sequence.crops(row, _POSITIONS.tolist())
         return [_costs(*pair) for pair in zip(crops, colors, strict=True)]
 
-    costs = in_threads(of_row, list(range(len(state))))
+    costs = map_in_threads(of_row, list(range(len(state))))
     for number, eye in enumerate(sequence.eyes):
         of_eye = [row[number] for row in costs]
         seen = np.array([cost is not None for cost in of_eye])
-        if seen.sum() >= _LEAST_PICTURES:
+        if seen.sum() >= _MIN_PICTURES:
             known = np.stack([cost for cost in of_eye if cost is not None])
             before = state[torch.from_numpy(seen), eye.column].numpy() / eye.closed
             state[torch.from_numpy(seen), eye.column] = torch.from_numpy(weighed(known, before, weight)) * eye.closed
@@ -140,7 +140,7 @@ def _learned(sequence: _Sequence) -> list[EyeColors | None]:
     """The colours of each eye, or None for an eye that is seen too little."""
     rows = torch.linspace(0, len(sequence.own.state) - 1, min(_LEARNED_FROM, len(sequence.own.state)))
     ends = [float(_POSITIONS[0])]
-    crops = in_threads(lambda row: sequence.crops(row, ends), rows.round().long().unique().tolist())
+    crops = map_in_threads(lambda row: sequence.crops(row, ends), rows.round().long().unique().tolist())
     return [
         learn_colors([crop for row in crops if (crop := row[number]) is not None])
         for number in range(len(sequence.eyes))

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mien.progress import Advance
 from mien.tracking.fitting.parameters import ParameterLayout
 from mien.tracking.fitting.solver import Smoothness
 from mien.tracking.fitting.views import CameraBatch
@@ -133,13 +134,37 @@ def widen(pose: Float[Tensor, "v 6"], layout: ParameterLayout) -> Float[Tensor, 
 class Watch(Protocol):
     """Receives the progress of a running fit."""
 
-    def __call__(self, stage: str, progress: float, look: Callable[[], object] | None = None) -> None:
+    def __call__(self, stage: str, progress: float, current: Callable[[], object] | None = None) -> None:
         """Receive the stage that runs, the share of its work that is done, and, if the fit changed, a way to get it.
 
-        `look` returns a `Fit` or a `PhotometricFit`. It may be called later, or never.
+        `current` returns a `Fit` or a `PhotometricFit`. It may be called later, or never.
         """
         ...
 
 
-def nobody(stage: str, progress: float, look: Callable[[], object] | None = None) -> None:
+def ignore_progress(stage: str, progress: float, current: Callable[[], object] | None = None) -> None:
     """Ignore the progress. This is the `Watch` of a fit that nobody watches."""
+
+
+@dataclass(eq=False)
+class Course:
+    """The progress of one kind of fit, reported to a progress bar and to a watch. Mutable."""
+
+    name: str
+    """Name of the fit, which begins the name of each stage."""
+    total: int
+    """Amount of work."""
+    bar: Advance
+    watch: Watch
+    done: int = 0
+    """Amount of work that is done."""
+
+    def advance(self, amount: int = 1, status: str = "", current: Callable[[], object] | None = None) -> None:
+        """Report that more work is done and which stage runs. `current` returns the fit, if it changed."""
+        self.done += amount
+        self.bar(amount, status=status)
+        self.show(status, current)
+
+    def show(self, status: str, current: Callable[[], object] | None = None) -> None:
+        """Tell the watch which stage runs, and how to get the fit."""
+        self.watch(f"{self.name}, {status}", self.done / self.total, current)

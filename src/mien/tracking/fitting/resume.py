@@ -17,7 +17,7 @@ _ENDING = ".safetensors"
 
 
 @dataclass(eq=False)
-class Keeper:
+class StageCache:
     """Keeps pieces of a fit by name in a folder of their own. Without a folder it keeps nothing. Mutable.
 
     A piece must depend on nothing but its name and the fit's input.
@@ -27,7 +27,7 @@ class Keeper:
     last: float = field(default_factory=time.monotonic)
     resumed: bool = False
 
-    def once(self, name: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+    def get_or_compute(self, name: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
         """Return the kept piece, or call `make` and keep its result."""
         found = self.read(name)
         if found is not None:

@@ -15,7 +15,7 @@ from mien.rotation import invert_rigid
 from mien.tracking.fitting.views import CameraBatch, Views, batch_of
 from mien.tracking.settings import TrackingSettings
 
-_LEAST_FRAMES = 3
+_MIN_FRAMES = 3
 _DEFAULT_FOCAL = 1.5
 """Assumed focal length in larger sides of the source picture: between a phone's wide lens and a portrait lens."""
 _CROPPED_FOCAL = 2.2
@@ -27,7 +27,7 @@ _FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 _SWING = 0.3
 """Largest ratio of squared motion over two frames to the sum of both squared single-frame motions that counts as a
 swing. The ratio is 0 for a swing, 0.5 for noise and 2 for steady motion."""
-_LEAST_RUN = 4
+_MIN_RUN = 4
 """Fewest frames in a row that swing. A blink is a single swing and is kept."""
 
 
@@ -57,7 +57,7 @@ class Shot:
 
 def has_enough_faces(capture: Capture) -> bool:
     """Whether a face was found often enough for tracking."""
-    return int(_seen(capture).any(1).sum()) >= _LEAST_FRAMES
+    return int(_seen(capture).any(1).sum()) >= _MIN_FRAMES
 
 
 def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
@@ -76,9 +76,9 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
     seen = _seen(capture)
     valid = seen.any(1)
     found = int(valid.sum())
-    if found < _LEAST_FRAMES:
+    if found < _MIN_FRAMES:
         raise UserError(
-            f"{capture.name}: a face was found in {found} frames, tracking needs {_LEAST_FRAMES}; film longer"
+            f"{capture.name}: a face was found in {found} frames, tracking needs {_MIN_FRAMES}; film longer"
         )
     detected = without_flicker(detected, seen)
     row, camera = seen[valid].nonzero().unbind(1)
@@ -134,7 +134,7 @@ def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c
         landmarks: Landmarks in pixels; any value where not seen.
         seen: Whether the camera found a face.
     """
-    if len(landmarks) < _LEAST_RUN + 2:
+    if len(landmarks) < _MIN_RUN + 2:
         return landmarks
     steps = (landmarks[1:] - landmarks[:-1]).square().sum((-1, -2))
     across = (landmarks[2:] - landmarks[:-2]).square().sum((-1, -2))
@@ -154,9 +154,9 @@ def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c
 
 
 def _of_runs(swings: Bool[Tensor, "t c"]) -> Bool[Tensor, "t c"]:
-    """Which swings belong to a run of at least `_LEAST_RUN` frames."""
-    whole = swings.unfold(0, _LEAST_RUN, 1).all(-1)
+    """Which swings belong to a run of at least `_MIN_RUN` frames."""
+    whole = swings.unfold(0, _MIN_RUN, 1).all(-1)
     kept = torch.zeros_like(swings)
-    for shift in range(_LEAST_RUN):
+    for shift in range(_MIN_RUN):
         kept[shift : shift + len(whole)] |= whole
     return kept

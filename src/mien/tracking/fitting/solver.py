@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-_DAMPING_START, _DAMPING_LEAST, _DAMPING_MOST = 1e-3, 1e-7, 1e7
+_START_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-7, 1e7
 _SEGMENT = 1024
 """Number of blocks of a chain whose factors are in memory at once: about 120 MB for pairs of frames with 60 parameters.
 """
@@ -68,7 +68,7 @@ def minimize_frames(
     Parameters held by a bound take no part in the step (a projected Newton step), and the result is clipped.
     """
     state = bounds.clip(start)
-    damping = state.new_full((len(state),), _DAMPING_START)
+    damping = state.new_full((len(state),), _START_DAMPING)
     for _ in range(iterations):
         equations = equations_at(state)
         held = bounds.held(state, equations.gradient)
@@ -76,7 +76,7 @@ def minimize_frames(
         candidate = bounds.clip(state + step)
         better = cost_at(candidate) < equations.cost
         state = torch.where(better[:, None], candidate, state)
-        damping = torch.where(better, damping / 5, damping * 8).clamp(_DAMPING_LEAST, _DAMPING_MOST)
+        damping = torch.where(better, damping / 5, damping * 8).clamp(_MIN_DAMPING, _MAX_DAMPING)
     return state
 
 
@@ -96,7 +96,7 @@ def hold(equations: NormalEquations, held: Bool[Tensor, "b p"]) -> NormalEquatio
     return NormalEquations(equations.cost, equations.gradient * moving, kept + torch.diag_embed(1 - moving))
 
 
-def joined(parts: Sequence[NormalEquations]) -> NormalEquations:
+def join_frames(parts: Sequence[NormalEquations]) -> NormalEquations:
     """The equations of all parts' frames in a row."""
     return NormalEquations(
         torch.cat([part.cost for part in parts]),
@@ -125,7 +125,7 @@ class SharedEquations:
         return SharedEquations(self.across, self.hessian + torch.diag(precision), self.gradient + precision * values)
 
 
-def joined_shared(parts: Sequence[SharedEquations]) -> SharedEquations:
+def join_shared(parts: Sequence[SharedEquations]) -> SharedEquations:
     """The blocks of all parts' frames in a row, with the shared ones summed."""
     return SharedEquations(
         torch.cat([part.across for part in parts]),
@@ -283,7 +283,7 @@ def _eliminate(
             side = right[index + 1] - coupling.T @ solved[:, -1]
 
 
-def placed(own: SharedEquations, lens: int | None, free: int) -> SharedEquations:
+def place_shared(own: SharedEquations, lens: int | None, free: int) -> SharedEquations:
     """A sequence's blocks (subject, focal length), placed among all focal lengths. A known one is dropped."""
     subject = len(own.gradient) - 1
     placing = own.gradient.new_zeros(subject + 1, subject + free)

@@ -17,7 +17,7 @@ from torch import Tensor
 from mien.face import FaceModel
 
 _COMMAND = "python -m mien.synthetic.detector_calibration"
-_LARGEST_TURN = 0.6
+_MAX_TURN = 0.6
 """Largest turn that was measured, in radians."""
 
 
@@ -40,7 +40,7 @@ class DetectorResponse:
 
     def of_turns(self, head_rotation: Float[Tensor, "b 3"]) -> Float[Tensor, "b l 3"]:
         """The part of the offsets that depends on how far the head turns away from the camera."""
-        turns = head_rotation[:, :2].clamp(-_LARGEST_TURN, _LARGEST_TURN)
+        turns = head_rotation[:, :2].clamp(-_MAX_TURN, _MAX_TURN)
         return (turns @ self.by_turn.flatten(1)).reshape(len(turns), *self.mean.shape)
 
     def of_person(self, person: Float[Tensor, " k"]) -> Float[Tensor, "l 3"]:

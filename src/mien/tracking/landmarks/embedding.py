@@ -26,7 +26,7 @@ _FACE_REGIONS = ("skin", "face", "lips", "eyelids", "brows", "nose", "scalp", "e
 _EYE_REGIONS = ("eyes", "irises")
 _SCALP_FRONT = 0.06
 """Landmarks may lie on the scalp only farther ahead of the head frame's origin than this, in metres."""
-_LEAST_SEEN = 0.25
+_MIN_SEEN = 0.25
 """Landmarks may lie on a triangle only if it is seen in at least this share of the pictures."""
 _WALL = (0.6, 0.6, 0.6)
 _SUBDIVISIONS = 12
@@ -200,7 +200,7 @@ def _allowed(model: FaceModel, regions: Sequence[str], seen: Float[Tensor, " f"]
     assert mask.any(), f"{model.name} has none of the regions {', '.join(regions)}"
     mask &= ~model.region_mask("scalp") | (model.template[model.faces].mean(1)[:, 2] > _SCALP_FRONT)
     # Hidden triangles, such as the inner side of a lid, may project nearer in every picture and still be wrong.
-    return mask & (seen >= _LEAST_SEEN)
+    return mask & (seen >= _MIN_SEEN)
 
 
 def _best_point(

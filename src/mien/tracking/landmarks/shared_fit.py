@@ -15,9 +15,9 @@ from mien.tracking.fitting import (
     SequenceFit,
     SharedEquations,
     Subject,
-    joined,
-    joined_shared,
-    placed,
+    join_frames,
+    join_shared,
+    place_shared,
     solve_arrow,
 )
 from mien.tracking.landmarks.detector_response import DetectorResponse
@@ -111,8 +111,8 @@ def _equations(
     for term, own, lens in zip(terms, fit.sequences, lenses, strict=True):
         own_frames, own_shared = term.joint_equations(own.state, fit.subject, own.cameras)
         frames.append(own_frames)
-        shared.append(placed(own_shared, lens, free))
-    return joined(frames), joined_shared(shared)
+        shared.append(place_shared(own_shared, lens, free))
+    return join_frames(frames), join_shared(shared)
 
 
 def _moved(

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from mien.progress import progress_bar
 from mien.tracking.fitting import (
+    Course,
     Fit,
-    Keeper,
     SequenceFit,
     Shot,
     Smoothness,
+    StageCache,
     Subject,
     Watch,
     choose_keyframes,
@@ -46,7 +47,7 @@ def fit_landmarks(
     shots: Sequence[Shot],
     lenses: Sequence[int | None],
     settings: TrackingSettings,
-    keeper: Keeper,
+    cache: StageCache,
     watch: Watch,
 ) -> Fit:
     """Fit all sequences of a subject to their landmarks.
@@ -59,52 +60,58 @@ def fit_landmarks(
         shots: The sequences.
         lenses: Index of each sequence's unknown focal length (`lenses_of`).
         settings: Settings of the whole tracking.
-        keeper: Keeps the pieces from which an interrupted fit of the same input resumes.
+        cache: Keeps the pieces from which an interrupted fit of the same input resumes.
         watch: Receives the progress.
     """
-    subject = unknown_subject(model)
     frames = sum(int(shot.valid.sum()) for shot in shots)
-    total, done = frames * sum(_COSTS.values()), 0
-    with progress_bar("Tracking", total=total) as advance:
-
-        def advance_by(stage: str, timesteps: int, share: int = 1) -> None:
-            nonlocal done
-            amount = timesteps * _COSTS[stage] // share
-            done += amount
-            advance(amount, status=stage)
-            watch(f"landmarks, {stage}", done / total)
-
-        def identify() -> dict[str, Tensor]:
-            starts = []
-            for shot in shots:
-                pose = fit_head_pose(model, shot.views, shot.cameras, subject, settings)
-                starts.append(SequenceFit(shot.cameras, widen(pose, model.layout)))
-                advance_by("head pose", len(pose))
-            watch("landmarks, identity", done / total, lambda: Fit(subject, tuple(starts)))
-            terms, keyframes = [], []
-            for shot, own in zip(shots, starts, strict=True):
-                chosen = choose_keyframes(own.state[:, :6], settings.keyframes)
-                terms.append(all_landmarks(model, shot.views, own, settings).at(chosen))
-                keyframes.append(replace(own, state=own.state[chosen]))
-            return fit_shared(terms, Fit(subject, tuple(keyframes)), lenses, settings).tensors()
-
-        known = fit_of(keeper.once("identity", identify))
-        advance_by("identity", frames)
+    total = frames * sum(_COSTS.values())
+    with progress_bar("Tracking", total=total) as bar:
+        course = Course("landmarks", total, bar, watch)
+        known = fit_of(cache.get_or_compute("identity", lambda: _identify(model, shots, lenses, settings, course)))
+        course.advance(frames * _COSTS["identity"], "identity")
 
         terms, sequences = [], []
         for number, (shot, key) in enumerate(zip(shots, known.sequences, strict=True)):
             pose = fit_head_pose(model, shot.views, key.cameras, known.subject, settings)
             own = SequenceFit(key.cameras, widen(pose, model.layout))
             terms.append(all_landmarks(model, shot.views, own, settings))
-            advance_frames, name = partial(advance_by, "frames"), f"frames-{number}"
-            sequences.append(fit_frames(terms[-1], known.subject, own, advance_frames, keeper, name))
+            advance_frames, name = partial(_advance, course, "frames", 1), f"frames-{number}"
+            sequences.append(fit_frames(terms[-1], known.subject, own, advance_frames, cache, name))
 
         alone = Fit(known.subject, tuple(sequences))
-        watch("landmarks, sequence", done / total, lambda: alone)
+        course.show("sequence", lambda: alone)
         smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
                       for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
-        advance_one = partial(advance_by, "sequence", share=_SEQUENCE_ITERATIONS)
-        return fit_sequences(terms, alone, smoothness, advance_one, keeper)
+        return fit_sequences(
+            terms, alone, smoothness, partial(_advance, course, "sequence", _SEQUENCE_ITERATIONS), cache
+        )
+
+
+def _advance(course: Course, stage: str, parts: int, timesteps: int) -> None:
+    """Report that one of the `parts` of a stage's work at some timesteps is done."""
+    course.advance(timesteps * _COSTS[stage] // parts, stage)
+
+
+def _identify(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    lenses: Sequence[int | None],
+    settings: TrackingSettings,
+    course: Course,
+) -> dict[str, Tensor]:
+    """Fit the head poses of all timesteps, then identity and unknown focal lengths to keyframes; the fit as tensors."""
+    subject, starts = unknown_subject(model), []
+    for shot in shots:
+        pose = fit_head_pose(model, shot.views, shot.cameras, subject, settings)
+        starts.append(SequenceFit(shot.cameras, widen(pose, model.layout)))
+        _advance(course, "head pose", 1, len(pose))
+    course.show("identity", lambda: Fit(subject, tuple(starts)))
+    terms, keyframes = [], []
+    for shot, own in zip(shots, starts, strict=True):
+        chosen = choose_keyframes(own.state[:, :6], settings.keyframes)
+        terms.append(all_landmarks(model, shot.views, own, settings).at(chosen))
+        keyframes.append(replace(own, state=own.state[chosen]))
+    return fit_shared(terms, Fit(subject, tuple(keyframes)), lenses, settings).tensors()
 
 
 def fit_frames(
@@ -112,11 +119,11 @@ def fit_frames(
     subject: Subject,
     own: SequenceFit,
     advance: Callable[[int], None] = lambda timesteps: None,
-    keeper: Keeper | None = None,
+    cache: StageCache | None = None,
     name: str = "frames",
 ) -> SequenceFit:
     """Fit pose, expression and eyes at every timestep alone. `advance` receives the number of finished timesteps."""
-    keeper, parts = keeper or Keeper(), []
+    cache, parts = cache or StageCache(), []
 
     def fitted(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
         part = term.at(rows)
@@ -128,7 +135,7 @@ def fit_frames(
         return {"state": state}
 
     for index, rows in enumerate(torch.arange(len(own.state)).split(_FRAMES_AT_ONCE)):
-        parts.append(keeper.once(f"{name}-{index}", partial(fitted, rows))["state"])
+        parts.append(cache.get_or_compute(f"{name}-{index}", partial(fitted, rows))["state"])
         advance(len(rows))
     return replace(own, state=torch.cat(parts))
 
@@ -138,13 +145,13 @@ def fit_sequences(
     fit: Fit,
     smoothness: Sequence[Smoothness],
     advance: Callable[[int], None] = lambda timesteps: None,
-    keeper: Keeper | None = None,
+    cache: StageCache | None = None,
 ) -> Fit:
     """Fit all timesteps of each sequence together under its smoothness cost, in turn with the landmarks' bias.
 
     `advance` receives the number of finished timesteps in each of the `_SEQUENCE_ITERATIONS` iterations.
     """
-    keeper = keeper or Keeper()
+    cache = cache or StageCache()
 
     def round_from(fit: Fit) -> dict[str, Tensor]:
         fit = fit_bias(terms, fit)
@@ -153,7 +160,7 @@ def fit_sequences(
         return replace(fit, sequences=chains).tensors()
 
     for number in range(_ROUNDS):
-        fit = fit_of(keeper.once(f"sequence-{number}", partial(round_from, fit)))
+        fit = fit_of(cache.get_or_compute(f"sequence-{number}", partial(round_from, fit)))
     return fit
 
 

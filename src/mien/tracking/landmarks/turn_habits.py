@@ -17,7 +17,7 @@ from torch import Tensor
 from mien.tracking.fitting import SequenceFit, Subject
 from mien.tracking.landmarks.term import LandmarkTerm
 
-_LEAST_TURN = 1e-4
+_MIN_TURN = 1e-4
 """Standard deviation of a rotation below which the head counts as still, in radians."""
 
 
@@ -47,4 +47,4 @@ def without_turn_habits(term: LandmarkTerm, subject: Subject, own: SequenceFit) 
 def _independent(turns: Float[Tensor, "v 2"]) -> Float[Tensor, "v q"]:
     """Orthonormal basis of the turns about their mean. It has fewer columns if the head hardly turns."""
     left, lengths, _ = torch.linalg.svd(turns - turns.mean(0), full_matrices=False)
-    return left[:, lengths > _LEAST_TURN * len(turns) ** 0.5]
+    return left[:, lengths > _MIN_TURN * len(turns) ** 0.5]

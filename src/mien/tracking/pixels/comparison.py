@@ -14,14 +14,14 @@ from mien.render.mesh import vertex_normals
 from mien.tracking.fitting import CameraBatch, batch_of
 from mien.tracking.pixels.pictures import Picture, Pictures
 from mien.tracking.pixels.surface import PosedSurface
-from mien.tracking.pixels.texture import Appearance, Sighting, texture_space
-from mien.tracking.tracking import Looks, Tracking
+from mien.tracking.pixels.texture import Sighting, SkinTexture, texture_space
+from mien.tracking.tracking import Appearance, Tracking
 
 _OUTLIER = 10.0
 """Beyond this many standard deviations a pixel hardly counts for `Comparison.rms`."""
-_LEAST_PIXELS = 100.0
+_MIN_PIXELS = 100.0
 """Fewest pixels of a comparison. Fewer show nothing of a face."""
-_MARGIN, _LEAST_WINDOW = 3, 8
+_MARGIN, _MIN_WINDOW = 3, 8
 """Margin around a mesh and least size of a window, in pixels."""
 
 
@@ -40,8 +40,8 @@ def window_of(camera: Camera, vertices: Float[Tensor, "v 3"]) -> Window:
     points, depth = camera.project(vertices)
     points = points[depth > 0] if (depth > 0).any() else points.new_zeros(1, 2)
     size = torch.tensor([camera.width, camera.height])
-    first = torch.minimum((points.amin(0).floor().long() - _MARGIN).clamp_min(0), size - _LEAST_WINDOW)
-    last = torch.minimum(points.amax(0).ceil().long() + _MARGIN, size).maximum(first + _LEAST_WINDOW)
+    first = torch.minimum((points.amin(0).floor().long() - _MARGIN).clamp_min(0), size - _MIN_WINDOW)
+    last = torch.minimum(points.amax(0).ceil().long() + _MARGIN, size).maximum(first + _MIN_WINDOW)
     (left, top), (right, bottom) = first.tolist(), last.tolist()
     part = camera.cropped(float(left), float(top), right - left, bottom - top)
     return Window(part, slice(top, bottom), slice(left, right))
@@ -67,7 +67,7 @@ class ModelPictures:
 
     pictures: Pictures
     cameras: CameraBatch
-    looks: Looks
+    appearance: Appearance
     surface: "_native.AlignSurface"
     face_model: FaceModel
 
@@ -81,18 +81,18 @@ class ModelPictures:
         posed = PosedSurface(vertices.contiguous(), vertex_normals(vertices, self.face_model.faces), None)
         view, residual = picture.camera, torch.empty_like(picture.image)
         depth = float(view.project(vertices.mean(0, keepdim=True))[1])
-        radius = max(round(self.looks.light_extent * float(view.K[0, 0]) / max(depth, 1e-3)), 2)
-        seen = Sighting(posed, picture, self.looks.light.contiguous()).arguments()
+        radius = max(round(self.appearance.light_extent * float(view.K[0, 0]) / max(depth, 1e-3)), 2)
+        seen = Sighting(posed, picture, self.appearance.light.contiguous()).arguments()
         cost, weight = _native.align_mesh(self.surface, *seen, radius, None, None, None, residual, None)
-        rms = self.looks.sigma * cost**0.5 if weight >= _LEAST_PIXELS else float("nan")
+        rms = self.appearance.sigma * cost**0.5 if weight >= _MIN_PIXELS else float("nan")
         return Comparison(window, picture.image - residual, residual.norm(dim=-1), rms)
 
 
 def model_pictures(capture: Capture, tracking: Tracking, face_model: FaceModel) -> ModelPictures | None:
-    """The model's pictures of a tracked capture, or None if it was not fitted to pixels (`Tracking.looks`)."""
-    looks = tracking.looks
-    if looks is None:
+    """The model's pictures of a tracked capture, or None if it was not fitted to pixels (`Tracking.appearance`)."""
+    appearance = tracking.appearance
+    if appearance is None:
         return None
-    appearance = Appearance(looks.texture.contiguous(), looks.trust.contiguous(), looks.sigma)
-    surface = texture_space(face_model, looks.texture.shape[0]).native(appearance, _OUTLIER)
-    return ModelPictures(Pictures(capture, 1), batch_of(tracking.cameras), looks, surface, face_model)
+    texture = SkinTexture(appearance.texture.contiguous(), appearance.trust.contiguous(), appearance.sigma)
+    surface = texture_space(face_model, len(texture.albedo)).native(texture, _OUTLIER)
+    return ModelPictures(Pictures(capture, 1), batch_of(tracking.cameras), appearance, surface, face_model)

@@ -8,14 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.face import FaceModel
-from mien.parallel import in_threads
+from mien.parallel import map_in_threads
 from mien.progress import say
 from mien.render.mesh import sh_basis
 from mien.tracking.fitting import Shot
 from mien.tracking.pixels.comparison import model_pictures
-from mien.tracking.pixels.texture import Appearance, PhotometricFit
+from mien.tracking.pixels.texture import PhotometricFit, SkinTexture
 from mien.tracking.settings import TrackingSettings
-from mien.tracking.tracking import Looks, Tracking
+from mien.tracking.tracking import Appearance, Tracking
 
 _SOME = 8
 """Largest number of frames that a message lists."""
@@ -28,10 +28,10 @@ def with_pixels(
     face_model: FaceModel,
     settings: TrackingSettings,
 ) -> list[Tracking]:
-    """The trackings with the results of the fit to pixels: looks and pixel residuals."""
+    """The trackings with the results of the fit to pixels: appearance and pixel residuals."""
     complete = []
     for index, (tracking, shot) in enumerate(zip(trackings, shots, strict=True)):
-        tracking = replace(tracking, looks=looks_of(refined, index, shot, settings))
+        tracking = replace(tracking, appearance=appearance_of(refined, index, shot, settings))
         found = refined.residuals[index] if refined.residuals else _residuals(tracking, shot, face_model)
         found = found.where(refined.improved[index][:, None], torch.nan)
         complete.append(_with_pixel_residuals(tracking, shot, found))
@@ -50,7 +50,7 @@ def _residuals(tracking: Tracking, shot: Shot, face_model: FaceModel) -> Float[T
         for camera in views.seen_by(row):
             found[row, camera] = pictures.compare(timesteps[row], camera, vertices).rms
 
-    in_threads(compare, list(range(len(found))))
+    map_in_threads(compare, list(range(len(found))))
     return found
 
 
@@ -65,19 +65,19 @@ def _with_pixel_residuals(tracking: Tracking, shot: Shot, found: Float[Tensor, "
     return replace(tracking, pixel_residuals=residuals)
 
 
-def looks_of(refined: PhotometricFit, sequence: int, shot: Shot, settings: TrackingSettings) -> Looks:
+def appearance_of(refined: PhotometricFit, sequence: int, shot: Shot, settings: TrackingSettings) -> Appearance:
     """The texture, and the light of one of the sequences."""
     extent = settings.photometric.light_extent if settings.schedule == "fast" else settings.paper.light_extent
-    return looks_in_world(refined.appearance, refined.lights[sequence], shot.T_world_fit, extent)
+    return appearance_in_world(refined.texture, refined.lights[sequence], shot.T_world_fit, extent)
 
 
-def looks_in_world(
-    appearance: Appearance, light: Float[Tensor, "9 3"], T_world_fit: Float[Tensor, "4 4"] | None, light_extent: float
-) -> Looks:
-    """The looks that a fit found, with the light turned from the frame of the fit to the world frame."""
+def appearance_in_world(
+    texture: SkinTexture, light: Float[Tensor, "9 3"], T_world_fit: Float[Tensor, "4 4"] | None, light_extent: float
+) -> Appearance:
+    """The appearance that a fit found, with the light turned from the frame of the fit to the world frame."""
     if T_world_fit is not None:
         light = turn_light(light, T_world_fit[:3, :3].to(light))
-    return Looks(appearance.albedo, appearance.trust, light, appearance.sigma, light_extent)
+    return Appearance(texture.albedo, texture.trust, light, texture.sigma, light_extent)
 
 
 def turn_light(light: Float[Tensor, "9 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "9 3"]:

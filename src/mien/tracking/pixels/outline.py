@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.parallel import in_threads
+from mien.parallel import map_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.render.mesh_gradients import mesh_edges
 from mien.tracking.fitting import CameraBatch, NormalEquations, SharedEquations, Subject, Views
@@ -90,7 +90,7 @@ class OutlineTerm:
                 hessian += self.weight * (slopes.T @ (weights[:, None] * slopes))
             return cost, gradient, hessian
 
-        parts = in_threads(of_row, rows.tolist())
+        parts = map_in_threads(of_row, rows.tolist())
         cost = torch.tensor([part[0] for part in parts]).double()
         gradient, hessian = torch.stack([part[1] for part in parts]), torch.stack([part[2] for part in parts])
         whole = NormalEquations(cost, gradient, hessian)

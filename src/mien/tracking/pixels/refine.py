@@ -8,23 +8,24 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.parallel import in_threads
+from mien.parallel import map_in_threads
 from mien.progress import progress_bar, say
 from mien.tracking.eyelids import place_lids
 from mien.tracking.fitting import (
+    Course,
     Fit,
-    Keeper,
     NormalEquations,
     SequenceFit,
     Shot,
     Smoothness,
+    StageCache,
     Subject,
     Watch,
     smoothness_of,
     solve_chain,
 )
 from mien.tracking.landmarks import LandmarkModel, LandmarkTerm, all_landmarks, fit_bias, quiet_landmarks
-from mien.tracking.pixels.outline import outline_term
+from mien.tracking.pixels.outline import OutlineTerm, outline_term
 from mien.tracking.pixels.pictures import Pictures
 from mien.tracking.pixels.shared import SharedPrior, step_shared
 from mien.tracking.pixels.surface import SurfaceModel, surface_model
@@ -37,7 +38,7 @@ from mien.tracking.pixels.texture import (
     even_light,
     photometric_fit_of,
     texture_space,
-    unknown_appearance,
+    unknown_texture,
 )
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
 
@@ -46,12 +47,12 @@ _WORSE = 1.02
 """A step of a frame is undone if it multiplies the frame's cost by this factor or more."""
 _FRAMES_AT_ONCE = 256
 """Number of timesteps whose equations are stored as one piece: a few seconds of work, about 10 MB."""
-_SHARED_COST, _LOOK_COST, _LIDS_PART = 100, 40, 4
-"""Costs for the progress bar. The first two are the durations of a step of identity and an estimate of the texture, in
-timesteps of a step of all frames. The third is how many times longer a step of all frames takes than the lids."""
-_LEAST_KEYFRAMES = 3
+_SHARED_COST, _APPEARANCE_COST, _LIDS_PART = 100, 40, 4
+"""Costs for the progress bar. The first two are the durations of a step of identity and an estimate of the
+appearance, in timesteps of a step of all frames. The third is how many times longer such a step takes than the lids."""
+_MIN_KEYFRAMES = 3
 """Fewest keyframes for any number of cameras, because the mouth must be seen open and closed."""
-_LEAST_SHARE = 0.03
+_MIN_SHARE = 0.03
 """Least weight of a frame in the texture, however far from the middle pose. It may be the only one to show an ear."""
 
 
@@ -63,6 +64,8 @@ class _Round:
     space: TextureSpace
     shots: Sequence[Shot]
     landmarks: Sequence[LandmarkTerm]
+    outlines: Sequence[OutlineTerm]
+    prior: SharedPrior
     settings: PhotometricSettings
     size: int
 
@@ -70,7 +73,7 @@ class _Round:
     def keyframes(self) -> int:
         """Number of keyframes of each sequence for the steps of the shared parameters."""
         pictures = 2 * self.settings.keyframes // max(shot.capture.valid.shape[1] for shot in self.shots)
-        return min(self.settings.keyframes, max(pictures, _LEAST_KEYFRAMES))
+        return min(self.settings.keyframes, max(pictures, _MIN_KEYFRAMES))
 
     def pictures(self, shot: Shot) -> Pictures:
         """The pictures of a sequence at this round's size."""
@@ -85,24 +88,31 @@ class _Round:
 
     def terms(self, at: PhotometricFit, independent_pixels: float) -> list[PhotometricTerm]:
         """The cost of every sequence. All pixels of a picture are worth `independent_pixels` independent ones."""
-        surface = self.space.native(at.appearance, self.settings.outlier)
+        surface = self.space.native(at.texture, self.settings.outlier)
         return [
             PhotometricTerm(
                 self.model, marks, self.pictures(shot), shot.valid.nonzero()[:, 0], surface, light,
-                self.light_radius(shot, own), independent_pixels, at.appearance.sigma,
+                self.light_radius(shot, own), independent_pixels, at.texture.sigma,
             )
             for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
         ]  # fmt: skip
 
-    def look(self, at: PhotometricFit) -> PhotometricFit:
+    def update_appearance(self, at: PhotometricFit) -> PhotometricFit:
         """Estimate texture and light again, from the present positions of the faces."""
         sightings = [
             self._sightings(shot, marks, own, at.fit.subject.identity, light)
             for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
         ]
         radius = self.light_radius(self.shots[0], at.fit.sequences[0])
-        found, lights = estimate_appearance(self.space, sightings, at.appearance, self.settings.outlier, radius)
-        return replace(at, appearance=found, lights=tuple(lights))
+        found, lights = estimate_appearance(self.space, sightings, at.texture, self.settings.outlier, radius)
+        return replace(at, texture=found, lights=tuple(lights))
+
+    def step_shared(self, at: PhotometricFit) -> PhotometricFit:
+        """Estimate texture and light again, then take one step of identity and unknown focal lengths."""
+        at = self.update_appearance(at)
+        terms = self.terms(at, self.settings.independent_pixels)
+        moved = step_shared(terms, self.outlines, at.fit, self.prior, self.keyframes)
+        return replace(at, fit=fit_bias(self.landmarks, moved))
 
     def _sightings(
         self,
@@ -115,7 +125,7 @@ class _Round:
         pictures, timesteps = self.pictures(shot), shot.valid.nonzero()[:, 0]
         middle = own.state[:, :3].median(0).values
         away = (own.state[:, :3] - middle).norm(dim=1) / self.settings.reference_angle
-        shares = 1 / (1 + away**4) + _LEAST_SHARE if len(own.cameras) == 1 else torch.ones_like(away)
+        shares = 1 / (1 + away**4) + _MIN_SHARE if len(own.cameras) == 1 else torch.ones_like(away)
 
         def sight(row: int) -> list[Sighting]:
             posed = self.model.pose(own.state[row], identity, derive=False)
@@ -129,7 +139,7 @@ class _Round:
 
         count = min(self.settings.texture_frames, len(own.state))
         rows = torch.linspace(0, len(own.state) - 1, count).round().long().unique().tolist()
-        return [sighting for several in in_threads(sight, rows) for sighting in several]
+        return [sighting for several in map_in_threads(sight, rows) for sighting in several]
 
 
 def refine_photometrically(
@@ -138,7 +148,7 @@ def refine_photometrically(
     lenses: Sequence[int | None],
     fit: Fit,
     settings: TrackingSettings,
-    keeper: Keeper,
+    cache: StageCache,
     watch: Watch,
 ) -> PhotometricFit:
     """Refine a fit to landmarks until the pictures agree with one texture that they all share.
@@ -154,9 +164,59 @@ def refine_photometrically(
         lenses: Index of each sequence's unknown focal length (`lenses_of`).
         fit: The fit to landmarks.
         settings: Settings of the whole tracking.
-        keeper: Keeps the pieces from which an interrupted fit of the same input resumes.
+        cache: Keeps the pieces from which an interrupted fit of the same input resumes.
         watch: Receives the progress.
     """
+    own_settings = settings.photometric
+    rounds = _rounds(model, shots, lenses, fit, settings)
+    at = PhotometricFit(
+        fit, unknown_texture(rounds[0].space), tuple(even_light() for _ in shots),
+        tuple(torch.zeros(len(own.state), dtype=torch.bool) for own in fit.sequences),
+    )  # fmt: skip
+    frames = sum(len(own.state) for own in fit.sequences)
+    several = any(len(own.cameras) > 1 for own in fit.sequences)
+    shared_steps = own_settings.shared_steps_of_cameras if several else own_settings.shared_steps
+    total = len(rounds) * (_APPEARANCE_COST + frames) + (len(rounds) - 1) * shared_steps * _SHARED_COST
+    total += frames // _LIDS_PART
+    with progress_bar("Fitting to pixels", total=total) as bar:
+        course = Course("pixels", total, bar, watch)
+        keep = partial(_keep, cache, course)
+        for number, now in enumerate(rounds):
+            status = f"round {number + 1} of {len(rounds)}"
+            for step in range(shared_steps if number > 0 else 0):
+                at = keep(f"round-{number}-shared-{step}", f"{status}, identity", partial(now.step_shared, at))
+                course.advance(_SHARED_COST, f"{status}, identity")
+            # The name of this piece is that of earlier releases, whose pieces stay readable.
+            at = keep(f"round-{number}-looks", f"{status}, texture and light", partial(now.update_appearance, at))
+            course.advance(_APPEARANCE_COST, f"{status}, texture and light")
+            if not (at.texture.trust > 0).any():
+                say(f"{model.face_model.name}: the pictures show none of its skin, so the fit to landmarks stays")
+                return replace(at, fit=fit)
+            advance = partial(course.advance, status=f"{status}, frames")
+            step_all = partial(_step_sequences, now, at, settings, cache, f"step-{number}", advance)
+            at = keep(f"round-{number}", status, step_all)
+            cache.drop(f"step-{number}")
+        at = keep("lids", "lids", lambda: replace(at, fit=place_lids(model, shots, at.fit, own_settings.lids)))
+        course.advance(frames // _LIDS_PART, "lids")
+    return _with_residuals(rounds[0], rounds[0].update_appearance(at))
+
+
+def _keep(
+    cache: StageCache, course: Course, name: str, status: str, compute: Callable[[], PhotometricFit]
+) -> PhotometricFit:
+    """Return the cached fit of that name, or compute it, and show it to the watch."""
+    found = photometric_fit_of(cache.get_or_compute(name, lambda: compute().tensors()))
+    course.show(status, lambda: found)
+    return found
+
+
+def _rounds(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    lenses: Sequence[int | None],
+    fit: Fit,
+    settings: TrackingSettings,
+) -> list[_Round]:
     own_settings = settings.photometric
     landmarks = [
         quiet_landmarks(all_landmarks(model, shot.views, own, settings), own_settings.landmark_share)
@@ -166,12 +226,6 @@ def refine_photometrically(
     space = texture_space(surface.face_model, own_settings.texture_size)
     focals = torch.stack([own.cameras.K[0, 0, 0] for own in fit.sequences])
     prior = SharedPrior(lenses, focals, own_settings.focal_sigma, settings.identity_weight)
-    at = PhotometricFit(
-        fit, unknown_appearance(space), tuple(even_light() for _ in shots),
-        tuple(torch.zeros(len(own.state), dtype=torch.bool) for own in fit.sequences),
-    )  # fmt: skip
-    rounds = [_Round(surface, space, shots, landmarks, own_settings, size) for size in own_settings.sizes]
-
     outlines = [
         outline_term(
             surface, shot.capture, shot.valid.nonzero()[:, 0], shot.views,
@@ -179,50 +233,9 @@ def refine_photometrically(
         )
         for shot in shots
     ]  # fmt: skip
-    frames = sum(len(own.state) for own in fit.sequences)
-    several = any(len(own.cameras) > 1 for own in fit.sequences)
-    shared_steps = own_settings.shared_steps_of_cameras if several else own_settings.shared_steps
-    total, done = len(rounds) * (_LOOK_COST + frames) + (len(rounds) - 1) * shared_steps * _SHARED_COST, 0
-    total += frames // _LIDS_PART
-
-    def step_identity(now: _Round, at: PhotometricFit) -> PhotometricFit:
-        at = now.look(at)
-        moved = step_shared(now.terms(at, own_settings.independent_pixels), outlines, at.fit, prior, now.keyframes)
-        return replace(at, fit=fit_bias(landmarks, moved))
-
-    with progress_bar("Fitting to pixels", total=total) as advance:
-
-        def advance_by(amount: int, status: str) -> None:
-            nonlocal done
-            done += amount
-            advance(amount, status=status)
-            watch(f"pixels, {status}", done / total)
-
-        def kept(name: str, status: str, make: Callable[[], PhotometricFit]) -> PhotometricFit:
-            found = photometric_fit_of(keeper.once(name, lambda: make().tensors()))
-            watch(f"pixels, {status}", done / total, lambda: found)
-            return found
-
-        for number, now in enumerate(rounds):
-            status = f"round {number + 1} of {len(rounds)}"
-            for step in range(shared_steps if number > 0 else 0):
-                at = kept(f"round-{number}-shared-{step}", f"{status}, identity", partial(step_identity, now, at))
-                advance_by(_SHARED_COST, f"{status}, identity")
-            at = kept(f"round-{number}-looks", f"{status}, texture and light", partial(now.look, at))
-            advance_by(_LOOK_COST, f"{status}, texture and light")
-            if not (at.appearance.trust > 0).any():
-                say(f"{surface.face_model.name}: pictures give its texture nothing, so faces are as landmarks put them")
-                return replace(at, fit=fit)
-            step_all = partial(_step_sequences, now, at, settings, keeper, f"step-{number}")
-            at = kept(f"round-{number}", status, partial(step_all, partial(advance_by, status=f"{status}, frames")))
-            keeper.drop(f"step-{number}")
-
-        def blink() -> PhotometricFit:
-            return replace(at, fit=place_lids(model, shots, at.fit, own_settings.lids))
-
-        at = kept("lids", "lids", blink)
-        advance_by(frames // _LIDS_PART, "lids")
-    return _with_residuals(rounds[0], rounds[0].look(at))
+    return [
+        _Round(surface, space, shots, landmarks, outlines, prior, own_settings, size) for size in own_settings.sizes
+    ]
 
 
 def _with_residuals(now: _Round, at: PhotometricFit) -> PhotometricFit:
@@ -239,7 +252,7 @@ def _step_sequences(
     now: _Round,
     at: PhotometricFit,
     settings: TrackingSettings,
-    keeper: Keeper,
+    cache: StageCache,
     name: str,
     advance: Callable[[int], None],
 ) -> PhotometricFit:
@@ -249,7 +262,7 @@ def _step_sequences(
     parts = zip(terms, now.shots, at.fit.sequences, at.improved, strict=True)
     for number, (term, shot, own, before) in enumerate(parts):
         smoothness = smoothness_of(term.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
-        state, better = _step(term, at.fit.subject, own, smoothness, keeper, f"{name}-{number}", advance)
+        state, better = _step(term, at.fit.subject, own, smoothness, cache, f"{name}-{number}", advance)
         sequences.append(replace(own, state=state))
         improved.append(before | better)
     return replace(at, fit=replace(at.fit, sequences=tuple(sequences)), improved=tuple(improved))
@@ -259,7 +272,7 @@ def _equations(
     term: PhotometricTerm,
     subject: Subject,
     own: SequenceFit,
-    keeper: Keeper,
+    cache: StageCache,
     name: str,
     advance: Callable[[int], None],
 ) -> NormalEquations:
@@ -273,7 +286,7 @@ def _equations(
     whole = {"cost": own.state.new_empty(v), "gradient": own.state.new_empty(v, p),
              "hessian": own.state.new_empty(v, p, p)}  # fmt: skip
     for index, rows in enumerate(torch.arange(v).split(_FRAMES_AT_ONCE)):
-        for key, part in keeper.once(f"{name}-equations-{index}", partial(made, rows)).items():
+        for key, part in cache.get_or_compute(f"{name}-equations-{index}", partial(made, rows)).items():
             whole[key][rows] = part
         advance(len(rows))
     return NormalEquations(**whole)
@@ -284,13 +297,13 @@ def _step(
     subject: Subject,
     own: SequenceFit,
     smoothness: Smoothness,
-    keeper: Keeper,
+    cache: StageCache,
     name: str,
     advance: Callable[[int], None],
 ) -> tuple[Float[Tensor, "v p"], Bool[Tensor, " v"]]:
     """Move all timesteps by one Gauss-Newton step, except those that it makes worse; also returns which ones moved."""
     bounds, state = term.layout.bounds, own.state
-    equations = _equations(term, subject, own, keeper, name, advance)
+    equations = _equations(term, subject, own, cache, name, advance)
     damping = torch.diag_embed(_DAMPING * equations.hessian.diagonal(dim1=1, dim2=2))
     held = bounds.held(state, equations.gradient + smoothness.gradient(state))
     damped = replace(equations, hessian=equations.hessian + damping)

@@ -8,7 +8,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.tracking.fitting import Fit, SequenceFit, choose_keyframes, joined, joined_shared, placed, solve_arrow
+from mien.tracking.fitting import (
+    Fit,
+    SequenceFit,
+    choose_keyframes,
+    join_frames,
+    join_shared,
+    place_shared,
+    solve_arrow,
+)
 from mien.tracking.landmarks import move_subject
 from mien.tracking.pixels.outline import OutlineTerm
 from mien.tracking.pixels.term import PhotometricTerm
@@ -57,13 +65,13 @@ def step_shared(
             more_frames, more_shared = outline.joint_equations(own.state, chosen, fit.subject, own.cameras)
             own_frames, own_shared = own_frames.plus(more_frames), own_shared.plus(more_shared)
         frames.append(own_frames)
-        shared.append(placed(own_shared, lens, prior.groups))
+        shared.append(place_shared(own_shared, lens, prior.groups))
     precision, values = _prior(fit, prior)
-    equations = joined(frames)
+    equations = join_frames(frames)
     state = torch.cat([own.state[chosen] for own, chosen in zip(fit.sequences, rows, strict=True)])
     held = bounds.held(state, equations.gradient)
     held[:, 6:] = True  # An expression that all frames share belongs to identity, but would drift here.
-    step, shared_step = solve_arrow(equations, joined_shared(shared).with_prior(precision, values), held, _DAMPING)
+    step, shared_step = solve_arrow(equations, join_shared(shared).with_prior(precision, values), held, _DAMPING)
     sequences = []
     steps = step.split([len(chosen) for chosen in rows])
     for own, own_step, chosen, lens in zip(fit.sequences, steps, rows, prior.lenses, strict=True):

@@ -7,14 +7,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien import _native
-from mien.parallel import in_threads
-from mien.tracking.fitting import CameraBatch, NormalEquations, ParameterLayout, SharedEquations, Subject, joined
+from mien.parallel import map_in_threads
+from mien.tracking.fitting import CameraBatch, NormalEquations, ParameterLayout, SharedEquations, Subject, join_frames
 from mien.tracking.landmarks import LandmarkTerm
 from mien.tracking.pixels.pictures import Pictures
 from mien.tracking.pixels.surface import PosedSurface, SurfaceModel, by_log_focal
 from mien.tracking.pixels.texture import Sighting
 
-_LEAST_PIXELS = 100.0
+_MIN_PIXELS = 100.0
 """Fewest pixels of a comparison. Fewer show nothing of a face."""
 
 
@@ -62,7 +62,7 @@ class PhotometricTerm:
             posed = self.model.pose(state[row], subject.identity, derive=False)
             return sum(self._align(posed, row, camera, cameras)[0] for camera in self.landmarks.views.seen_by(row))
 
-        pixels = torch.tensor(in_threads(of_row, list(range(len(state)))), dtype=torch.float64)
+        pixels = torch.tensor(map_in_threads(of_row, list(range(len(state)))), dtype=torch.float64)
         return self.landmarks.cost(state, subject, cameras) + self.weight * pixels
 
     def residuals(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "v c"]:
@@ -75,10 +75,10 @@ class PhotometricTerm:
                 picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
                 seen = Sighting(posed, picture, self.light).arguments()
                 cost, weight = _native.align_mesh(self.surface, *seen, self.light_radius, None, None, None, None, None)
-                if weight >= _LEAST_PIXELS:
+                if weight >= _MIN_PIXELS:
                     found[row, camera] = self.sigma * cost**0.5
 
-        in_threads(of_row, list(range(len(state))))
+        map_in_threads(of_row, list(range(len(state))))
         return found
 
     def joint_equations(
@@ -110,7 +110,7 @@ class PhotometricTerm:
                 self.weight * torch.stack([hessian for _, _, hessian in parts]).sum(0, keepdim=True),
             )
 
-        return joined(in_threads(of_row, rows.tolist()))
+        return join_frames(map_in_threads(of_row, rows.tolist()))
 
     def _align(
         self, posed: PosedSurface, row: int, camera: int, cameras: CameraBatch

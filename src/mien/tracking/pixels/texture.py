@@ -16,9 +16,9 @@ from mien.tracking.fitting import HIDING_REGIONS, Fit, fit_of
 from mien.tracking.pixels.pictures import Picture
 from mien.tracking.pixels.surface import PosedSurface
 
-_LEAST_COSINE = 0.25
+_MIN_COSINE = 0.25
 """Least cosine between the surface's normal and the direction to the camera."""
-_LEAST_WEIGHT = 0.05
+_MIN_WEIGHT = 0.05
 """Least total weight of a texel's sightings (each the squared cosine) for the texel to be known."""
 _FIRST_SIGMA, _SIGMAS = 0.1, (0.01, 0.1)
 """Expected colour difference before anything is known, and its bounds afterwards."""
@@ -29,7 +29,7 @@ _LIGHT_STIFFNESS = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Appearance:
+class SkinTexture:
     """An albedo texture and the trust in each texel."""
 
     albedo: Float[Tensor, "th tw 3"]
@@ -70,11 +70,11 @@ class TextureSpace:
     used: Bool[Tensor, " f"]
     fragments: MeshFragments
 
-    def native(self, appearance: Appearance, outlier: float) -> "_native.AlignSurface":
-        """The surface with an appearance, for the native core."""
+    def native(self, texture: SkinTexture, outlier: float) -> "_native.AlignSurface":
+        """The surface with a texture, for the native core."""
         return _native.AlignSurface(
-            self.faces, self.corners, self.used.to(torch.uint8), appearance.albedo, appearance.trust,
-            appearance.sigma, outlier, _LEAST_COSINE,
+            self.faces, self.corners, self.used.to(torch.uint8), texture.albedo, texture.trust,
+            texture.sigma, outlier, _MIN_COSINE,
         )  # fmt: skip
 
 
@@ -96,15 +96,15 @@ def even_light() -> Float[Tensor, "9 3"]:
     return light
 
 
-def unknown_appearance(space: TextureSpace) -> Appearance:
+def unknown_texture(space: TextureSpace) -> SkinTexture:
     """The appearance before any picture: no texel is known."""
     size = space.fragments.face_index.shape
-    return Appearance(torch.zeros(*size, 3), torch.zeros(size), _FIRST_SIGMA)
+    return SkinTexture(torch.zeros(*size, 3), torch.zeros(size), _FIRST_SIGMA)
 
 
 def estimate_appearance(
-    space: TextureSpace, sightings: Sequence[Sequence[Sighting]], start: Appearance, outlier: float, light_radius: int
-) -> tuple[Appearance, list[Float[Tensor, "9 3"]]]:
+    space: TextureSpace, sightings: Sequence[Sequence[Sighting]], start: SkinTexture, outlier: float, light_radius: int
+) -> tuple[SkinTexture, list[Float[Tensor, "9 3"]]]:
     """Estimate the albedo in turn with the light of every sequence.
 
     The albedo is a least squares fit for each texel, which is robust from the second round on.
@@ -116,30 +116,28 @@ def estimate_appearance(
         outlier: Outlier threshold in sigmas.
         light_radius: Radius in pixels over which a smooth difference counts as light and is left out of the texture.
     """
-    appearance, known = start, bool((start.trust > 0).any())
+    texture, known = start, bool((start.trust > 0).any())
     lights = [own[0].light for own in sightings]
     for turn in range(_ROUNDS):
-        appearance = _bake(space, sightings, lights, appearance, outlier)
-        if not appearance.trust.any():
-            return appearance, lights
+        texture = _bake(space, sightings, lights, texture, outlier)
+        if not texture.trust.any():
+            return texture, lights
         if turn == 0 and not known:
-            appearance = _one_color(appearance)
-        lights = [
-            _fit_light(space, own, light, appearance, outlier) for own, light in zip(sightings, lights, strict=True)
-        ]
+            texture = _one_color(texture)
+        lights = [_fit_light(space, own, light, texture, outlier) for own, light in zip(sightings, lights, strict=True)]
     even = [
-        [_without_smooth_residual(space, replace(one, light=light), appearance, outlier, light_radius) for one in own]
+        [_without_smooth_residual(space, replace(one, light=light), texture, outlier, light_radius) for one in own]
         for own, light in zip(sightings, lights, strict=True)
     ]
-    return _bake(space, even, lights, appearance, outlier), lights
+    return _bake(space, even, lights, texture, outlier), lights
 
 
 def _without_smooth_residual(
-    space: TextureSpace, sighting: Sighting, appearance: Appearance, outlier: float, radius: int
+    space: TextureSpace, sighting: Sighting, texture: SkinTexture, outlier: float, radius: int
 ) -> Sighting:
     """The sighting without the part of its difference from the prediction that is smooth over `radius` pixels."""
     smooth = torch.empty_like(sighting.picture.image)
-    surface = space.native(appearance, outlier)
+    surface = space.native(texture, outlier)
     _native.align_mesh(surface, *sighting.arguments(), radius, None, None, None, None, smooth)
     return replace(sighting, picture=replace(sighting.picture, image=sighting.picture.image - smooth))
 
@@ -148,11 +146,11 @@ def _bake(
     space: TextureSpace,
     sightings: Sequence[Sequence[Sighting]],
     lights: Sequence[Float[Tensor, "9 3"]],
-    appearance: Appearance,
+    texture: SkinTexture,
     outlier: float,
-) -> Appearance:
+) -> SkinTexture:
     size = space.fragments.face_index.shape
-    surface = space.native(appearance, outlier)
+    surface = space.native(texture, outlier)
     weight = torch.zeros(size)
     squares, mixed, image = (torch.zeros(*size, 3) for _ in range(3))
     for own, light in zip(sightings, lights, strict=True):
@@ -161,29 +159,29 @@ def _bake(
                 surface, *replace(sighting, light=light).weighted().arguments(), space.fragments.face_index,
                 space.fragments.barycentric, weight, squares, mixed, image,
             )  # fmt: skip
-    known = weight > _LEAST_WEIGHT
+    known = weight > _MIN_WEIGHT
     albedo = mixed / squares.clamp_min(1e-6) * known[..., None]
     variance = ((image - albedo * mixed).sum(-1) / weight.clamp_min(1e-6)).clamp_min(0)
-    sigma = float(variance[known].median().sqrt().clamp(*_SIGMAS)) if known.any() else appearance.sigma
+    sigma = float(variance[known].median().sqrt().clamp(*_SIGMAS)) if known.any() else texture.sigma
     trust = known * (sigma**2 / (0.5 * sigma**2 + variance)).clamp_max(1.0)
-    return Appearance(albedo, trust, sigma)
+    return SkinTexture(albedo, trust, sigma)
 
 
-def _one_color(appearance: Appearance) -> Appearance:
-    """The appearance with its median colour in all known texels. At the start, all variation counts as light."""
-    median = appearance.albedo[appearance.trust > 0].median(0).values
-    return replace(appearance, albedo=(appearance.trust > 0)[..., None] * median, sigma=_FIRST_SIGMA)
+def _one_color(texture: SkinTexture) -> SkinTexture:
+    """The texture with its median colour in all known texels. At the start, all variation counts as light."""
+    median = texture.albedo[texture.trust > 0].median(0).values
+    return replace(texture, albedo=(texture.trust > 0)[..., None] * median, sigma=_FIRST_SIGMA)
 
 
 def _fit_light(
     space: TextureSpace,
     sightings: Sequence[Sighting],
     light: Float[Tensor, "9 3"],
-    appearance: Appearance,
+    texture: SkinTexture,
     outlier: float,
 ) -> Float[Tensor, "9 3"]:
     hessian, right = torch.zeros(3, 9, 9).double(), torch.zeros(3, 9).double()
-    surface = space.native(appearance, outlier)
+    surface = space.native(texture, outlier)
     for sighting in sightings:
         _native.light_equations(surface, *replace(sighting, light=light).arguments(), hessian, right)
     hessian = hessian + hessian.triu(1).mT
@@ -198,7 +196,7 @@ class PhotometricFit:
     """A fit to pixels with the texture and light that it found."""
 
     fit: Fit
-    appearance: Appearance
+    texture: SkinTexture
     lights: tuple[Float[Tensor, "9 3"], ...]
     """Light of each sequence."""
     improved: tuple[Bool[Tensor, " _"], ...]
@@ -208,8 +206,8 @@ class PhotometricFit:
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything but the residuals as tensors by name, for a file."""
-        tensors = self.fit.tensors() | {"albedo": self.appearance.albedo, "trust": self.appearance.trust}
-        tensors["sigma"] = torch.tensor([self.appearance.sigma], dtype=torch.float64)
+        tensors = self.fit.tensors() | {"albedo": self.texture.albedo, "trust": self.texture.trust}
+        tensors["sigma"] = torch.tensor([self.texture.sigma], dtype=torch.float64)
         for index, (light, improved) in enumerate(zip(self.lights, self.improved, strict=True)):
             tensors |= {f"light_{index}": light, f"improved_{index}": improved.to(torch.uint8)}
         return tensors
@@ -220,7 +218,7 @@ def photometric_fit_of(tensors: Mapping[str, Tensor]) -> PhotometricFit:
     fit = fit_of(tensors)
     count = range(len(fit.sequences))
     return PhotometricFit(
-        fit, Appearance(tensors["albedo"], tensors["trust"], float(tensors["sigma"])),
+        fit, SkinTexture(tensors["albedo"], tensors["trust"], float(tensors["sigma"])),
         tuple(tensors[f"light_{index}"] for index in count),
         tuple(tensors[f"improved_{index}"].bool() for index in count),
     )  # fmt: skip

@@ -14,7 +14,7 @@ from mien.tracking.report.heat import draw_legend, write_text
 from mien.tracking.report.overlay import OverlayPainter, frontal_camera
 from mien.tracking.tracking import Tracking
 
-_EVEN, _MOST_FLAGGED, _MOST_ALONE = 8, 8, 4
+_EVEN, _MAX_FLAGGED, _MAX_ALONE = 8, 8, 4
 """Largest numbers of evenly spread frames, of flagged frames, and of frames tracked from landmarks alone."""
 _TILE = 240
 """Side of each tile, in pixels."""
@@ -46,11 +46,11 @@ def sheet_frames(tracking: Tracking, flagged: Sequence[int], alone: Sequence[int
     even = valid[torch.linspace(0, len(valid) - 1, min(_EVEN, len(valid))).round().long()].tolist()
     chosen = {timestep: SheetFrame(timestep, frontal) for timestep in even}
     if 2 * len(alone) < len(valid):
-        for timestep in alone[:: max(len(alone) // _MOST_ALONE, 1)][:_MOST_ALONE]:
+        for timestep in alone[:: max(len(alone) // _MAX_ALONE, 1)][:_MAX_ALONE]:
             chosen[timestep] = SheetFrame(timestep, _camera_of_face(tracking.residuals[timestep]), "landmarks only")
     worst = tracking.residuals if tracking.pixel_residuals is None else tracking.pixel_residuals
     size = worst.nan_to_num(-1).amax(1)
-    for timestep in worst_of_runs(flagged, size.numpy())[:_MOST_FLAGGED]:
+    for timestep in worst_of_runs(flagged, size.numpy())[:_MAX_FLAGGED]:
         chosen[timestep] = SheetFrame(timestep, int(worst[timestep].nan_to_num(-1).argmax()), "flagged")
     return [chosen[timestep] for timestep in sorted(chosen)]
 

@@ -32,7 +32,7 @@ _GREEN, _RED, _BLUE = (60, 255, 60), (255, 60, 40), (60, 160, 255)
 _SUBPIXEL_BITS = 4
 _GRID_WIDTH = 1920
 """Largest width of a grid of pictures, in pixels."""
-_MOST_PICTURES = 3000
+_MAX_PICTURES = 3000
 _CRF, _PRESET = 21, "veryfast"
 """Quality that is enough for viewing. Writing takes a quarter of the time of `write_video`'s defaults."""
 
@@ -48,7 +48,7 @@ def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: 
 
 def overlay_stride(timesteps: int) -> int:
     """Stride between the timesteps that an overlay shows, so that a long clip has at most 3,000 pictures."""
-    return math.ceil(timesteps / _MOST_PICTURES)
+    return math.ceil(timesteps / _MAX_PICTURES)
 
 
 def draw_overlay(

@@ -61,7 +61,7 @@ def write_report_page(
 def page_html(name: str, tracking: Tracking, report: dict[str, Any], plot: str, sheet: str) -> str:
     """The page as html. `plot` and `sheet` are addresses of pictures."""
     panels = "the picture, the tracked mesh over it"
-    if tracking.looks is not None:
+    if tracking.appearance is not None:
         panels += (", the model's own picture (its texture in the fitted light), and the difference of colours"
                    " (black is none; grey parts, such as hair, eyes and mouth, are not compared)")  # fmt: skip
     paragraphs = "".join(f'<p class="{kind}">{_with_code(text)}</p>' for kind, text in findings(tracking, report))
@@ -88,7 +88,7 @@ def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]
     found = [("", _WAYS.get(schedule, f"Schedule `{schedule}`."))]
     if schedule != "landmarks":
         alone = report["landmarks_only_frames"]
-        if tracking.looks is None:
+        if tracking.appearance is None:
             found = [("odd", f"Pictures gave the texture of {tracking.face_model} nothing (schedule `{schedule}`), so "
                              "landmarks alone decided in all frames.")]  # fmt: skip
         elif alone:

@@ -16,7 +16,7 @@ from mien.face import FaceModel
 from mien.storage import write_atomically
 from mien.tracking.fitting import Fit, SequenceFit, Shot
 from mien.tracking.landmarks import LandmarkModel, as_tracking
-from mien.tracking.pixels import PhotometricFit, looks_of, model_pictures
+from mien.tracking.pixels import PhotometricFit, appearance_of, model_pictures
 from mien.tracking.report.contact_sheet import SheetFrame, strip
 from mien.tracking.report.heat import write_text
 from mien.tracking.report.overlay import OverlayPainter, frontal_camera
@@ -25,11 +25,11 @@ from mien.tracking.tracking import Tracking
 
 DONE = "done"
 _INTERVAL_SECONDS = 3.0
-_LARGEST_SHARE = 0.1
+_MAX_SHARE = 0.1
 """Largest share of the time that the preview may take."""
 _CURVE_FRAMES, _STRIPS = 48, 3
 """Number of frames, over all sequences, with residuals in the curves, and number of frames shown as pictures."""
-_MOST_BYTES = 64 << 20
+_MAX_BYTES = 64 << 20
 """Largest size of the pictures that the preview keeps in memory, in bytes."""
 _WIDTH, _HEADER, _CURVE = 960, 48, 150
 _PANELS = (("picture", False), ("mesh", False), ("model", False), ("difference", True))
@@ -52,25 +52,25 @@ class Preview:
     ) -> None:
         self._path, self._face_model, self._model, self._settings = path, face_model, model, settings
         size = sum(shot.capture.images[0].nbytes for shot in shots) // len(shots)
-        count = max(min(_CURVE_FRAMES, _MOST_BYTES // size) // len(shots), 1)
+        count = max(min(_CURVE_FRAMES, _MAX_BYTES // size) // len(shots), 1)
         self._samples = [_Sample(shot, count) for shot in shots]
         self._began, self._due = time.monotonic(), 0.0
-        self._look: Callable[[], object] | None = None
+        self._current: Callable[[], object] | None = None
         self._body: UInt8[np.ndarray, "h w 3"] | None = None
         self._before: list[Float[np.ndarray, " n"]] = []
 
-    def __call__(self, stage: str, progress: float, look: Callable[[], object] | None = None) -> None:
+    def __call__(self, stage: str, progress: float, current: Callable[[], object] | None = None) -> None:
         """Write the page, unless it was written a moment ago. The end is always shown."""
-        self._look = look or self._look
+        self._current = current or self._current
         start = time.monotonic()
         if start < self._due and stage != DONE:
             return
-        if self._look is not None:
+        if self._current is not None:
             with torch.no_grad():
-                self._body, self._look = self._draw(self._look()), None
+                self._body, self._current = self._draw(self._current()), None
         self._write(self._headed(stage, progress), last=stage == DONE)
         now = time.monotonic()
-        self._due = now + max(_INTERVAL_SECONDS, (now - start) / _LARGEST_SHARE)
+        self._due = now + max(_INTERVAL_SECONDS, (now - start) / _MAX_SHARE)
 
     def _draw(self, fit: object) -> UInt8[np.ndarray, "h w 3"]:
         assert isinstance(fit, Fit | PhotometricFit)
@@ -83,8 +83,8 @@ class Preview:
             tracking = as_tracking(
                 sample.shot, self._face_model, self._model, own_fit.subject, part, self._settings
             )  # fmt: skip
-            if refined is not None and (refined.appearance.trust > 0).any():
-                tracking = replace(tracking, looks=looks_of(refined, index, sample.shot, self._settings))
+            if refined is not None and (refined.texture.trust > 0).any():
+                tracking = replace(tracking, appearance=appearance_of(refined, index, sample.shot, self._settings))
             capture = sample.shot.capture
             landmarks.append(tracking.residuals.nanmedian(1).values.numpy())
             colors.append(_color_residuals(capture, tracking, self._face_model))
@@ -178,7 +178,7 @@ def _plot(
             x, y = np.linspace(50, _WIDTH - 15, len(values)), _CURVE - 25 - (_CURVE - 50) * values / top
             points = np.stack([x, y], axis=1)[np.isfinite(values)]
             cv2.polylines(plot, [np.round(points).astype(np.int32)], False, color, 1, cv2.LINE_AA)
-        told = f"{names[index]}: {np.nanmedian(curves[index]):.2f} over all frames (grey: at the last look)"
+        told = f"{names[index]}: {np.nanmedian(curves[index]):.2f} over all frames (grey: when it was last drawn)"
         _text(plot, told, (50, 16), _COLORS[index])
         _text(plot, f"{top:.2f}", (5, 30), _INK)
         _text(plot, "0", (5, _CURVE - 22), _INK)

@@ -33,7 +33,7 @@ _MOVED = 0.03
 _CHUNK = 32
 _NAMED = 10
 """Largest number of runs of flagged frames in which the plot names the worst frame."""
-_LEAST_COLOR = 0.005
+_MIN_COLOR_STEP = 0.005
 """Least amount (0..1) by which a frame's colour residual must stand out to be flagged."""
 
 
@@ -115,7 +115,7 @@ def _flagged(tracking: Tracking) -> Bool[Tensor, " t"]:
     """Frames with landmark or colour residuals that stand out."""
     flagged = flagged_frames(_timestep_residuals(tracking))
     if tracking.pixel_residuals is not None:
-        flagged |= flagged_frames(tracking.pixel_residuals.nanmedian(1).values, _LEAST_COLOR)
+        flagged |= flagged_frames(tracking.pixel_residuals.nanmedian(1).values, _MIN_COLOR_STEP)
     return flagged
 
 
