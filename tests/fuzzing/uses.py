@@ -21,7 +21,6 @@ from mien.avatar.portable import make_portable
 from mien.errors import UserError
 from mien.evaluation import evaluate
 from mien.evaluation import read_metrics as read_figures
-from mien.evaluation.cameras import fitted
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.compare_report import comparison_html
 from mien.evaluation.compare_text import comparison_text
@@ -91,11 +90,11 @@ def use_training(root: Path, found: Any, dice: Random) -> None:
 
 def use_rendering(root: Path, found: Any, dice: Random) -> None:
     avatar, sequence = load_avatar(root / RUN), read_sequence(root / SEQUENCE)
-    camera = fitted(run_camera(root / RUN), 32, 32)
+    camera = run_camera(root / RUN).fitted(32, 32)
     face = sequence.tracking.face
     driven = drive(face, face[0], avatar.subject, avatar.face_model.expression_bounds, who=str(root / SEQUENCE))
     with torch.no_grad():
-        for each in (camera, fitted(sequence.tracking.cameras[0], 32, 32)):
+        for each in (camera, sequence.tracking.cameras[0].fitted(32, 32)):
             image = rasterize(avatar.pose(driven[0]).gaussians.timestep(0), each, torch.ones(3)).image
             assert image.isfinite().all(), "a picture that is not finite"
 
@@ -155,7 +154,7 @@ def use_cameras(root: Path, found: Any, dice: Random) -> None:
     gaussians = read_gaussians(root / "head.ply")
     for camera in found[:2]:
         for each in (
-            fitted(camera, 32, 32),
+            camera.fitted(32, 32),
             replace(camera, width=min(camera.width, 64), height=min(camera.height, 64)),
         ):
             assert rasterize(gaussians, each, torch.ones(3)).image.isfinite().all(), "a picture that is not finite"

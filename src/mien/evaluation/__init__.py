@@ -1,6 +1,5 @@
 """Evaluation: figures, videos and a report for a trained run, comparisons of runs, and driving avatars."""
 
-from mien.evaluation.cameras import orbit, turntable
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.driving import drive
 from mien.evaluation.evaluate import evaluate
@@ -14,8 +13,6 @@ __all__ = [
     "compare_runs",
     "drive",
     "evaluate",
-    "orbit",
     "read_metrics",
     "score_folders",
-    "turntable",
 ]
