@@ -9,7 +9,7 @@ import torch
 from mien.avatar import FaceTuning, GaussianAvatarsConfig
 from mien.capture import write_capture
 from mien.evaluation.experiment import Experiment
-from mien.evaluation.pictures import to_uint8
+from mien.pictures import to_uint8
 from mien.render import rasterize
 from mien.render.camera_paths import orbit
 from mien.tracking import write_scoring, write_tracking

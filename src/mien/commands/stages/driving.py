@@ -17,13 +17,13 @@ from mien.commands.stages.pictures import draw, view
 from mien.commands.stages.tracking import tracking_stage
 from mien.errors import UserError
 from mien.evaluation.driving import drive, face_of_motion
-from mien.evaluation.pictures import side_by_side
 from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
 from mien.face import FaceModel, FaceParams
 from mien.face.cache import cache_folder
 from mien.face.params import concatenate
 from mien.motion import read_blendshape_json, read_live_link_face
+from mien.pictures import side_by_side
 from mien.progress import say, track_progress
 from mien.storage import file_digest
 from mien.tracking import TrackingSettings
