@@ -18,19 +18,18 @@ from fuzzing.material import CONFIG, QUICK, RUN, SEQUENCE, SETTINGS
 from mien import cli
 from mien.avatar import load_avatar
 from mien.avatar.portable import make_portable
+from mien.driving import Motion, drive
 from mien.errors import UserError
 from mien.evaluation import evaluate
 from mien.evaluation import read_metrics as read_figures
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.compare_report import comparison_html
 from mien.evaluation.compare_text import comparison_text
-from mien.evaluation.driving import drive
 from mien.evaluation.partial import PartialScores
 from mien.export import in_world, write_ply
 from mien.export import read_ply as read_gaussians
 from mien.face import FaceModel
 from mien.face.flame import flame_face_model
-from mien.motion import Motion
 from mien.render import rasterize
 from mien.runtime import Avatar, write_portable
 from mien.training import read_sequence, train

@@ -16,8 +16,8 @@ from mien.avatar.avatar import Avatar
 from mien.camera import Camera
 from mien.capture import Capture, read_capture, read_capture_hash
 from mien.capture.video import write_video
+from mien.driving import drive
 from mien.errors import UserError
-from mien.evaluation.driving import drive
 from mien.evaluation.redetection import MEASURED_BY, FaceReader, Motion, motion, transfer_figures
 from mien.evaluation.scoring import evenly_spread
 from mien.evaluation.videos import labelled_row, same_size
