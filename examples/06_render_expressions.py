@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from mien.avatar import load_avatar
-from mien.evaluation import orbit
-from mien.render import rasterize
+from mien.render import orbit, rasterize
 from mien.training import run_camera
 from mien.workspace import open_workspace
 

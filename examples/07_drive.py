@@ -11,7 +11,7 @@ import torch
 
 from mien.avatar import load_avatar, neutral_of
 from mien.capture.video import write_video
-from mien.evaluation import drive
+from mien.driving import drive
 from mien.render import rasterize
 from mien.training import read_sequence, run_camera
 from mien.workspace import open_workspace

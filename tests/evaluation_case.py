@@ -9,9 +9,9 @@ from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
 from mien.camera import Camera, camera_from_fov
 from mien.capture.capture import Capture
 from mien.evaluation.experiment import Experiment, Frame
-from mien.evaluation.pictures import to_uint8
 from mien.face import FaceParams
 from mien.gaussians import sh_from_rgb
+from mien.pictures import to_uint8
 from mien.render import rasterize
 from mien.tracking import Scoring, Tracking
 from mien.training import Split, held_out

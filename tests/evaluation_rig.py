@@ -8,10 +8,10 @@ import torch
 
 from mien.avatar import FaceTuning, GaussianAvatarsConfig
 from mien.capture import write_capture
-from mien.evaluation.cameras import orbit
 from mien.evaluation.experiment import Experiment
-from mien.evaluation.pictures import to_uint8
+from mien.pictures import to_uint8
 from mien.render import rasterize
+from mien.render.camera_paths import orbit
 from mien.tracking import write_scoring, write_tracking
 from mien.training import TrainSettings, read_sequence, train
 from mien.training.sequence import Sequence

@@ -22,9 +22,9 @@ from mien.evaluation.compare_text import comparison_text
 from mien.evaluation.experiment import Experiment, Frame, head_box, spread_frames, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.pictures import to_uint8
 from mien.evaluation.protocols import evaluate_frames
 from mien.evaluation.videos import same_size, video_frames
+from mien.pictures import to_uint8
 from mien.storage import write_json
 from mien.training import TrainSettings
 

@@ -14,10 +14,10 @@ from mien.capture.video import probe_video
 from mien.commands.picture import PictureOptions
 from mien.commands.stages.pictures import draw
 from mien.errors import UserError
-from mien.evaluation.cameras import fitted, read_cameras, sway, write_cameras
 from mien.export.output import plan_output
 from mien.export.pictures import to_rgb, to_rgba, write_pictures
 from mien.gaussians import Gaussians, sh_from_rgb
+from mien.render.camera_paths import read_cameras, sway, write_cameras
 from mien.storage import write_json
 
 FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
@@ -127,11 +127,11 @@ def test_one_view_over_every_background() -> None:
 
 def test_other_shapes_keep_the_head_whole() -> None:
     camera = camera_from_fov(0.6, 100, 80, FACING)
-    wide = fitted(camera, 400, 160)
+    wide = camera.fitted(400, 160)
     corners = torch.tensor([[0.0, 0, -1], [0.1, 0.1, -1]])
     (old, _), (new, _) = camera.project(corners), wide.project(corners)
     torch.testing.assert_close(new - torch.tensor([200.0, 80.0]), 2 * (old - torch.tensor([50.0, 40.0])))
-    near = fitted(camera, 100, 80, zoom=2.0)
+    near = camera.fitted(100, 80, zoom=2.0)
     torch.testing.assert_close(near.project(corners)[0][0], old[0])
 
 

@@ -14,14 +14,13 @@ from fuzzing.material import tiny_flame
 from mien.avatar import load_avatar
 from mien.capture.crop import whole_picture
 from mien.capture.given import GivenMattes
+from mien.driving import drive, read_blendshape_json, read_live_link_face
 from mien.errors import UserError
-from mien.evaluation.driving import drive
 from mien.export import ply, read_ply
 from mien.face import FaceParams
 from mien.face.checks import check_face_params
 from mien.face.flame import read_flame
 from mien.face.loading import read_landmarks
-from mien.motion import read_blendshape_json, read_live_link_face
 from mien.picture_files import decode_png, png_fits
 from mien.render.validation import NotFiniteError
 from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors

@@ -9,10 +9,10 @@ import pytest
 from mien.capture import given
 from mien.capture.faces import LANDMARKS
 from mien.capture.given import read_landmarks
+from mien.driving import motion, read_blendshape_json, read_live_link_face
 from mien.errors import UserError
-from mien.evaluation.cameras import read_cameras
 from mien.evaluation.image_folders import read_crops
-from mien.motion import motion, read_blendshape_json, read_live_link_face
+from mien.render.camera_paths import read_cameras
 from mien.storage import write_arrays
 from test_motion import row, write, write_csv
 

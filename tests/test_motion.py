@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from mien.driving import ARKIT_NAMES, drive, face_of_motion, read_blendshape_json, read_live_link_face
+from mien.driving.live_link_face import EYES, HEAD
+from mien.driving.motion import LOOK_ANGLE
 from mien.errors import UserError
-from mien.evaluation.driving import drive, face_of_motion
-from mien.motion import ARKIT_NAMES, read_blendshape_json, read_live_link_face
-from mien.motion.live_link_face import EYES, HEAD
-from mien.motion.motion import LOOK_ANGLE
 from mien.rotation import matrix_from_axis_angle
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model

@@ -16,7 +16,7 @@ from mien.commands.options import MethodName
 from mien.commands.picture import LARGEST_SIDE
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
-LAZY_ROOMS = ["avatar", "capture", "export", "tracking", "training"]
+LAZY_ROOMS = ["avatar", "capture", "driving", "export", "tracking", "training"]
 SCRIPT = """
 import json, os, sys
 from mien.cli import main

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import safetensors.numpy
 
+from mien.driving import ARKIT_NAMES
 from mien.evaluation.image_folders import write_crops
-from mien.motion import ARKIT_NAMES
 
 
 def write_what_users_give(folder: Path, picture: np.ndarray) -> None:

@@ -53,6 +53,14 @@ class Camera:
         K[1, 2] -= top
         return replace(self, K=K, width=width, height=height)
 
+    def fitted(self, width: int, height: int, zoom: float = 1.0) -> "Camera":
+        """The same view in a picture of another shape: all of it is visible, centred, and magnified by `zoom`."""
+        scale = min(width / self.width, height / self.height) * zoom
+        K = self.K * self.K.new_tensor([[scale], [scale], [1.0]])
+        K[0, 2] += 0.5 * (width - scale * self.width)
+        K[1, 2] += 0.5 * (height - scale * self.height)
+        return replace(self, K=K, width=width, height=height)
+
     def project(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 2"], Float[Tensor, "*b"]]:
         """Pixel positions and depths of world-space points. Depth is the camera's z in metres, not positive behind it.
 

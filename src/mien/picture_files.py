@@ -7,6 +7,7 @@ import os
 import struct
 import tempfile
 import weakref
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.errors import UserError
-from mien.files import cannot_write
+from mien.files import cannot_write, write_atomically
 from mien.inside import open_to_read
 
 _KEPT = 256 << 20
@@ -128,6 +129,21 @@ def png_fits(data: bytes) -> bool:
         if kind == b"IEND":
             return True
     return False
+
+
+def encode_picture(picture: UInt8[np.ndarray, "h w *c"], ending: str = ".png", options: Sequence[int] = ()) -> bytes:
+    """The content of a picture file, for a grey, an RGB or an RGBA picture. `options` are those of `cv2.imencode`."""
+    if picture.ndim == 3:
+        picture = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA if picture.shape[2] == 4 else cv2.COLOR_RGB2BGR)
+    encoded, data = cv2.imencode(ending, picture, options)
+    assert encoded, f"cannot encode a picture of shape {picture.shape}"
+    return data.tobytes()
+
+
+def write_png(path: Path, picture: UInt8[np.ndarray, "h w *c"]) -> None:
+    """Write one grey, RGB or RGBA picture atomically."""
+    data = encode_picture(picture)
+    write_atomically(path, lambda aside: aside.write_bytes(data))
 
 
 def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndarray, "..."]:

@@ -16,16 +16,16 @@ from mien.capture.crop import whole_picture
 from mien.capture.given import GivenMattes, read_landmarks
 from mien.capture.source import FrameSelection, open_source, read_image
 from mien.capture.video import count_frames, probe_video, read_video_frames
+from mien.driving import read_blendshape_json, read_live_link_face
 from mien.errors import UserError
 from mien.evaluation import read_metrics as read_figures
-from mien.evaluation.cameras import read_cameras as read_camera_path
 from mien.evaluation.image_folders import read_crops as read_boxes
 from mien.evaluation.image_source import open_pictures, read_picture
 from mien.evaluation.partial import PartialScores
 from mien.export import read_ply as read_gaussians
 from mien.face import FaceParams, available_face_models, load_face_model
 from mien.face.flame import read_flame as read_flame_file
-from mien.motion import read_blendshape_json, read_live_link_face
+from mien.render.camera_paths import read_cameras as read_camera_path
 from mien.runtime import read_portable as read_mien
 from mien.storage import read_tensors
 from mien.tracking import read_scoring as read_masks

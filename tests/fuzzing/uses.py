@@ -18,20 +18,18 @@ from fuzzing.material import CONFIG, QUICK, RUN, SEQUENCE, SETTINGS
 from mien import cli
 from mien.avatar import load_avatar
 from mien.avatar.portable import make_portable
+from mien.driving import Motion, drive
 from mien.errors import UserError
 from mien.evaluation import evaluate
 from mien.evaluation import read_metrics as read_figures
-from mien.evaluation.cameras import fitted
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.compare_report import comparison_html
 from mien.evaluation.compare_text import comparison_text
-from mien.evaluation.driving import drive
 from mien.evaluation.partial import PartialScores
 from mien.export import in_world, write_ply
 from mien.export import read_ply as read_gaussians
 from mien.face import FaceModel
 from mien.face.flame import flame_face_model
-from mien.motion import Motion
 from mien.render import rasterize
 from mien.runtime import Avatar, write_portable
 from mien.training import read_sequence, train
@@ -91,11 +89,11 @@ def use_training(root: Path, found: Any, dice: Random) -> None:
 
 def use_rendering(root: Path, found: Any, dice: Random) -> None:
     avatar, sequence = load_avatar(root / RUN), read_sequence(root / SEQUENCE)
-    camera = fitted(run_camera(root / RUN), 32, 32)
+    camera = run_camera(root / RUN).fitted(32, 32)
     face = sequence.tracking.face
     driven = drive(face, face[0], avatar.subject, avatar.face_model.expression_bounds, who=str(root / SEQUENCE))
     with torch.no_grad():
-        for each in (camera, fitted(sequence.tracking.cameras[0], 32, 32)):
+        for each in (camera, sequence.tracking.cameras[0].fitted(32, 32)):
             image = rasterize(avatar.pose(driven[0]).gaussians.timestep(0), each, torch.ones(3)).image
             assert image.isfinite().all(), "a picture that is not finite"
 
@@ -155,7 +153,7 @@ def use_cameras(root: Path, found: Any, dice: Random) -> None:
     gaussians = read_gaussians(root / "head.ply")
     for camera in found[:2]:
         for each in (
-            fitted(camera, 32, 32),
+            camera.fitted(32, 32),
             replace(camera, width=min(camera.width, 64), height=min(camera.height, 64)),
         ):
             assert rasterize(gaussians, each, torch.ones(3)).image.isfinite().all(), "a picture that is not finite"

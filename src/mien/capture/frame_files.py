@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from mien.errors import UserError
 from mien.inside import open_new, open_to_change
-from mien.picture_files import decode_png, write_at
+from mien.picture_files import decode_png, encode_picture, write_at
 
 FRAMES, MATTES, CACHE = "frames", "mattes", "cache"
 STAGE = "`mien capture`"
@@ -169,8 +169,6 @@ def read_png(path: Path, shape: tuple[int, ...], expected_digest: int) -> UInt8[
 
 
 def _write_png(path: Path, picture: np.ndarray) -> None:
-    stored = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
-    written, data = cv2.imencode(".png", stored, _PNG_OPTIONS)
-    assert written
+    data = encode_picture(picture, options=_PNG_OPTIONS)
     with open_new(path) as file:
-        file.write(data.tobytes())
+        file.write(data)

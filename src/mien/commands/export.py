@@ -81,7 +81,7 @@ class Command:
     def _write_series(self, avatar, workspace: Workspace, series: str) -> None:
         from mien.commands.expression import with_expression
         from mien.commands.stages.driving import open_driver
-        from mien.evaluation.driving import drive
+        from mien.driving import drive
         from mien.progress import say, track_progress
 
         own = series in workspace.sequence_names()

@@ -130,7 +130,7 @@ class Command:
     def _given_cameras(self, workspace: Workspace, timesteps: int | None) -> "list[mien.camera.Camera] | None":
         """Cameras that do not depend on the avatar, one per frame, or None for a path around its head."""
         from mien.commands.stages.pictures import view
-        from mien.evaluation.cameras import read_cameras
+        from mien.render.camera_paths import read_cameras
         from mien.tracking import read_tracking
 
         if self.cameras is not None:
@@ -150,7 +150,7 @@ class Command:
         return cameras if timesteps is None else [cameras[i * len(cameras) // timesteps] for i in range(timesteps)]
 
     def _path(self, camera: "mien.camera.Camera", centre: "torch.Tensor", frames: int) -> "list[mien.camera.Camera]":
-        from mien.evaluation.cameras import sway, turntable
+        from mien.render.camera_paths import sway, turntable
 
         span, tilt = math.radians(self.span), math.radians(self.tilt)
         if self.path == "still" or self._is_still():

@@ -1,8 +1,6 @@
-"""Evaluation: figures, videos and a report for a trained run, comparisons of runs, and driving avatars."""
+"""Evaluation: figures, videos and a report for a trained run, and comparisons of runs."""
 
-from mien.evaluation.cameras import orbit, turntable
 from mien.evaluation.compare import compare_runs
-from mien.evaluation.driving import drive
 from mien.evaluation.evaluate import evaluate
 from mien.evaluation.image_folders import ImageFolders, score_folders
 from mien.evaluation.metrics_file import read_metrics
@@ -12,10 +10,7 @@ __all__ = [
     "EvaluationSettings",
     "ImageFolders",
     "compare_runs",
-    "drive",
     "evaluate",
-    "orbit",
     "read_metrics",
     "score_folders",
-    "turntable",
 ]

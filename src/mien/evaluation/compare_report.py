@@ -13,10 +13,10 @@ from mien.evaluation.compare import COLUMNS, Comparison, Row, Table, figure
 from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import Box, crop_to
-from mien.evaluation.pictures import HEAT_STOPS, data_uri, error_heat, shrunk, to_uint8
 from mien.evaluation.report_sections import frame_name
 from mien.evaluation.report_words import GLOSSARY
 from mien.evaluation.videos import HEAT_LIMIT
+from mien.pictures import error_heat, heat_gradient, picture_uri, shrink, to_uint8
 from mien.progress import track_progress
 from mien.storage import write_atomically
 
@@ -118,9 +118,8 @@ def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> str
         if not truths:
             truths = [_truth(experiment, frame, box) for frame, box in zip(frames, boxes, strict=True)]
             captions = [frame_name(experiment, frame) for frame in frames]
-    stops = ", ".join(f"rgb{stop}" for stop in HEAT_STOPS)
     scale = (
-        f'<span class="scale">Error 0 <i style="background:linear-gradient(90deg,{stops})"></i> '
+        f'<span class="scale">Error 0 <i style="background:{heat_gradient()}"></i> '
         f"{HEAT_LIMIT * 255:.0f} of 255 and more</span>"
     )
     grid = f'style="grid-template-columns:repeat({len(runs) + 1},minmax(0,280px))"'
@@ -150,4 +149,4 @@ def _truth(experiment: Experiment, frame: Frame, box: Box) -> str:
 
 
 def _img(picture: UInt8[np.ndarray, "_ _ 3"], what: str) -> str:
-    return f'<img alt="{what}" src="{data_uri(shrunk(picture, _PICTURE_SIZE))}">'
+    return f'<img alt="{what}" src="{picture_uri(shrink(picture, _PICTURE_SIZE))}">'

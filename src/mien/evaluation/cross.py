@@ -16,14 +16,14 @@ from mien.avatar.avatar import Avatar
 from mien.camera import Camera
 from mien.capture import Capture, read_capture, read_capture_hash
 from mien.capture.video import write_video
+from mien.driving import drive
 from mien.errors import UserError
-from mien.evaluation.driving import drive
-from mien.evaluation.pictures import to_uint8
 from mien.evaluation.redetection import MEASURED_BY, FaceReader, Motion, motion, transfer_figures
 from mien.evaluation.scoring import evenly_spread
 from mien.evaluation.videos import labelled_row, same_size
 from mien.face import FaceParams
 from mien.face.checks import check_face_params
+from mien.pictures import to_uint8
 from mien.progress import track_progress
 from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle

@@ -8,10 +8,10 @@ import torch
 
 from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
 from mien.evaluation.metrics import Box, crop_to
-from mien.evaluation.pictures import HEAT_STOPS, data_uri, error_heat, shrunk, to_uint8
 from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import AVATAR, MESH, Evaluation
 from mien.evaluation.videos import HEAT_LIMIT
+from mien.pictures import error_heat, heat_gradient, picture_uri, shrink, to_uint8
 from mien.render.mesh import render_mesh
 
 _PICTURE_SIZE = 400
@@ -29,9 +29,8 @@ def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
     names = {len(ranked) - 1: "best", middle: "median", 0: "worst"}
     box = head_box(experiment, [evaluation.frames[ranked[place]] for place in places])
     rows = [_comparison_row(experiment, evaluation, ranked[place], names.get(place, ""), box) for place in places]
-    stops = ", ".join(f"rgb{stop}" for stop in HEAT_STOPS)
     scale = (
-        f'<span class="scale">0 <i style="background:linear-gradient(90deg,{stops})"></i> '
+        f'<span class="scale">0 <i style="background:{heat_gradient()}"></i> '
         f"{HEAT_LIMIT * 255:.0f} of 255 and more</span>"
     )
     labels = f'<div class="labels"><span>Truth</span><span>Render</span><span>Error {scale}</span></div>'
@@ -151,7 +150,7 @@ def _overlay(experiment: Experiment, frame: Frame) -> str:
     vertices = face_model(sequence.tracking.face[frame.timestep])[0]
     mesh, alpha = render_mesh(vertices, face_model.faces, camera, supersample=2)
     blended = picture * (1 - 0.6 * alpha[..., None]) + 0.6 * alpha[..., None] * mesh
-    image = _image(shrunk(to_uint8(blended), _OVERLAY_SIZE), "tracked mesh over the frame")
+    image = _image(shrink(to_uint8(blended), _OVERLAY_SIZE), "tracked mesh over the frame")
     return f"<figure>{image}<figcaption>timestep {frame.timestep}</figcaption></figure>"
 
 
@@ -167,7 +166,7 @@ def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> str:
         "avatar": avatar_image(experiment, frame),
     }
     figures = (
-        f"<figure>{_image(shrunk(to_uint8(picture), _PICTURE_SIZE), name)}<figcaption>{name}</figcaption></figure>"
+        f"<figure>{_image(shrink(to_uint8(picture), _PICTURE_SIZE), name)}<figcaption>{name}</figcaption></figure>"
         for name, picture in pictures.items()
     )
     return f'<div class="strip">{"".join(figures)}</div>'
@@ -189,7 +188,7 @@ def _series(label: str, x: Sequence[int], y: Sequence[float], style: str) -> Ser
 
 
 def _image(picture: np.ndarray, what: str) -> str:
-    return f'<img alt="{escape(what)}" src="{data_uri(shrunk(picture, _PICTURE_SIZE))}">'
+    return f'<img alt="{escape(what)}" src="{picture_uri(shrink(picture, _PICTURE_SIZE))}">'
 
 
 def _card(title: str, content: str) -> str:

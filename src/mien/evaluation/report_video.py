@@ -1,9 +1,10 @@
 """Videos in report.html: small ones inside the page, large ones as links."""
 
-import base64
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+
+from mien.pictures import data_uri
 
 _EMBEDDED_BYTES = 6 << 20
 
@@ -12,8 +13,7 @@ def video_html(path: Path, page_folder: Path, note: str) -> str:
     """A video for the page: embedded if it is small, so that the page stays one file, or else linked."""
     link = path.relative_to(page_folder).as_posix()
     data = path.read_bytes()
-    embedded = f"data:video/mp4;base64,{base64.b64encode(data).decode('ascii')}"
-    source = embedded if len(data) <= _EMBEDDED_BYTES else link
+    source = data_uri("video/mp4", data) if len(data) <= _EMBEDDED_BYTES else link
     return (
         f'<video controls muted loop preload="metadata" src="{escape(source)}"></video>'
         f'<p class="note">{escape(note)}: <a href="{escape(link)}">{escape(link)}</a></p>'

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mien.evaluation.metrics import Box, crop_to, l1, psnr, ssim
 from mien.evaluation.perceptual import MINIMUM_SIZE, Backbone, PerceptualDistance, load_perceptual
-from mien.evaluation.pictures import to_uint8
+from mien.pictures import to_uint8
 from mien.threads import asked_threads
 
 METRICS = ("psnr", "ssim", "l1", "perceptual")

@@ -11,10 +11,10 @@ from mien.capture.video import write_video
 from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
 from mien.evaluation.metrics import Box, crop_to
-from mien.evaluation.pictures import WHITE, error_heat, shrunk, side_by_side, to_uint8
 from mien.evaluation.protocols import AVATAR, Evaluation
+from mien.picture_files import write_png
+from mien.pictures import WHITE, error_heat, shrink, side_by_side, to_uint8
 from mien.progress import track_progress
-from mien.storage import write_atomically
 
 HEAT_LIMIT = 0.25
 """Error, of a range of 1, that gets the brightest colour of heat maps."""
@@ -67,7 +67,7 @@ def labelled_row(panels: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.n
     """Pictures in a row, shrunk, each below a bar with its name."""
     named = []
     for name, panel in panels.items():
-        small = shrunk(panel, _LARGEST)
+        small = shrink(panel, _LARGEST)
         bar = np.full((_BAR, small.shape[1], 3), WHITE, np.uint8)
         cv2.putText(bar, name, (4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA)
         named.append(np.concatenate([bar, small]))
@@ -102,17 +102,11 @@ def write_scored_pictures(folder: Path, experiment: Experiment) -> None:
     for frame in track_progress(frames, f"pictures {folder.name}", len(frames)):
         name = picture_name(experiment, frame)
         crops[name] = experiment.crop(frame)
-        _write_png(folder / "truth" / f"{name}.png", to_uint8(target_image(experiment, frame)))
-        _write_png(folder / "rendering" / f"{name}.png", to_uint8(avatar_image(experiment, frame)))
+        write_png(folder / "truth" / f"{name}.png", to_uint8(target_image(experiment, frame)))
+        write_png(folder / "rendering" / f"{name}.png", to_uint8(avatar_image(experiment, frame)))
     write_crops(folder / "truth" / CROPS_NAME, crops)
 
 
 def picture_name(experiment: Experiment, frame: Frame) -> str:
     """File name of a frame, without its ending."""
     return f"{experiment.sequences[frame.sequence].name}_{experiment.camera_id(frame)}_{frame.timestep:06d}"
-
-
-def _write_png(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    encoded, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
-    assert encoded, f"cannot encode a picture of shape {image.shape}"
-    write_atomically(path, lambda aside: aside.write_bytes(data.tobytes()))

@@ -19,6 +19,7 @@ from mien.capture.video import write_video
 from mien.capture.video_file import create_video
 from mien.errors import UserError
 from mien.export.output import Output
+from mien.picture_files import write_png
 from mien.storage import cannot_write, write_atomically
 
 _ROWS = 512
@@ -45,14 +46,6 @@ def write_pictures(output: Output, pictures: Iterable[UInt8[np.ndarray, "h w _"]
                 write_png(output.path if output.kind == "still" else output.numbered(index), picture)
     except OSError as error:
         raise cannot_write(output.path, error) from None
-
-
-def write_png(path: Path, picture: UInt8[np.ndarray, "h w _"]) -> None:
-    """Write one RGB or RGBA picture atomically."""
-    swapped = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA if picture.shape[2] == 4 else cv2.COLOR_RGB2BGR)
-    done, encoded = cv2.imencode(".png", swapped)
-    assert done, f"cannot encode a picture of shape {picture.shape}"
-    write_atomically(path, lambda temporary: temporary.write_bytes(encoded.tobytes()))
 
 
 def to_rgb(image: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

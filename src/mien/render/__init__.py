@@ -1,5 +1,6 @@
-"""Pictures of Gaussians and of meshes, with gradients."""
+"""Pictures of Gaussians and of meshes, with gradients, and camera paths."""
 
+from mien.render.camera_paths import orbit, sway, turntable
 from mien.render.mesh import (
     Headlight,
     MeshFragments,
@@ -21,11 +22,14 @@ __all__ = [
     "MeshFragments",
     "Texture",
     "interpolate",
+    "orbit",
     "rasterize",
     "rasterize_mesh",
     "render_mesh",
     "sample_texture",
     "sh_basis",
     "shade",
+    "sway",
+    "turntable",
     "vertex_normals",
 ]

@@ -4,14 +4,13 @@ import hashlib
 import tempfile
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from mien.errors import UserError
 from mien.inside import check_tree, open_new, remove_tree
 from mien.limits import side
 from mien.locks import read_beside_writers
-from mien.picture_files import PictureStack, decode_png
+from mien.picture_files import PictureStack, decode_png, encode_picture
 from mien.storage import expect_whole, read_arrays, read_json, replace_folder, write_arrays, write_json
 from mien.tracking.scoring import Scoring
 
@@ -122,10 +121,8 @@ def _write_into(folder: Path, scoring: Scoring, capture_hash: str | None) -> Non
         file.parent.mkdir(parents=True, exist_ok=True)
         mask = np.array(scoring.masks[timestep, camera])
         digest.update(mask.tobytes())
-        encoded, data = cv2.imencode(".png", mask)
-        assert encoded
         with open_new(file) as opened:
-            opened.write(data.tobytes())
+            opened.write(encode_picture(mask))
     crops = scoring.crops.astype(np.int32)
     write_arrays(folder / "crops.safetensors", {"crops": crops})
     size = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width}

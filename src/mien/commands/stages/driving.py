@@ -1,47 +1,30 @@
 """From an avatar and a motion to pictures, as the command line runs it."""
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from mien.avatar import load_avatar, neutral_of
+from mien.avatar import load_avatar
 from mien.capture import CaptureSettings
 from mien.commands.options import check_driver
 from mien.commands.picture import PictureOptions
 from mien.commands.stages.capturing import capture_stage
 from mien.commands.stages.pictures import draw, view
 from mien.commands.stages.tracking import tracking_stage
-from mien.errors import UserError
-from mien.evaluation.driving import drive, face_of_motion
-from mien.evaluation.pictures import side_by_side
+from mien.driving import Driver, drive, read_recording, read_tracked_driver
 from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
-from mien.face import FaceModel, FaceParams
+from mien.face import FaceModel
 from mien.face.cache import cache_folder
-from mien.face.params import concatenate
-from mien.motion import read_blendshape_json, read_live_link_face
+from mien.pictures import side_by_side
 from mien.progress import say, track_progress
 from mien.storage import file_digest
 from mien.tracking import TrackingSettings
-from mien.training import read_sequence
 from mien.training.run import run_camera
 from mien.workspace import Workspace, open_workspace
-
-
-@dataclass(frozen=True, eq=False)
-class Driver:
-    """The driver of an avatar."""
-
-    face: FaceParams
-    at_rest: FaceParams
-    """The driver at rest, as one timestep."""
-    fps: float
-    pictures: Callable[[int], np.ndarray] | None
-    """Returns the driver's picture at a timestep. None if there are no pictures."""
 
 
 def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None) -> Driver:
@@ -59,18 +42,14 @@ def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: floa
     check_driver(by, sequence, fps)
     suffix = by.suffix.lower() if by.is_file() else ""
     if suffix in (".csv", ".json"):
-        motion = read_live_link_face(by, fps) if suffix == ".csv" else read_blendshape_json(by)
-        if motion.lost:
-            say(f"{by}: no face in {motion.lost} of {len(motion)} frames; they repeat the one before")
-        face, at_rest = face_of_motion(motion, face_model)
-        return Driver(face, at_rest, motion.fps, None)
+        return read_recording(by, face_model, fps)
     if by.is_file():
         workspace, names = _tracked_video(by, face_model.name)
         names = names if sequence is None else [workspace.pick_sequence(sequence)]
     else:
         workspace = open_workspace(by)
         names = [workspace.pick_sequence(sequence)]
-    return _driver_of([workspace.sequence_dir(name) for name in names])
+    return read_tracked_driver([workspace.sequence_dir(name) for name in names])
 
 
 def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
@@ -82,23 +61,6 @@ def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[s
     names = sorted(tracked, key=lambda name: (len(name), name))
     say(f"{video}: tracked in {workspace.root}, kept for the next time")
     return workspace, names
-
-
-def _driver_of(folders: list[Path]) -> Driver:
-    sequences = [read_sequence(folder) for folder in folders]
-    shapes = {(one.tracking.face.expression.shape[1], one.tracking.face.joints.shape[1]) for one in sequences}
-    if len(shapes) > 1 or not any(bool(one.tracking.valid.any()) for one in sequences):
-        told = ", ".join(map(str, folders))
-        raise UserError(f"{told}: no frame was tracked, or with several face models; track them again")
-    face = concatenate([one.tracking.face for one in sequences])
-    at_rest = neutral_of(concatenate([one.tracking.face[one.tracking.valid] for one in sequences]))
-    places = [(one, timestep) for one in sequences for timestep in range(one.capture.timesteps)]
-    return Driver(
-        face,
-        at_rest,
-        sequences[0].capture.fps,
-        lambda index: np.asarray(places[index][0].capture.images[places[index][1], 0]),
-    )
 
 
 @dataclass(frozen=True)

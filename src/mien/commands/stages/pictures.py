@@ -8,7 +8,6 @@ from jaxtyping import UInt8
 
 from mien.camera import Camera
 from mien.commands.picture import PictureOptions
-from mien.evaluation.cameras import fitted
 from mien.export.pictures import to_rgb, to_rgba
 from mien.gaussians import Gaussians
 from mien.progress import say
@@ -19,7 +18,7 @@ from mien.training import read_run_config
 
 def view(look: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
     """The camera for pictures of the chosen size."""
-    return fitted(camera, *look.shape(), zoom)
+    return camera.fitted(*look.shape(), zoom)
 
 
 @torch.no_grad()

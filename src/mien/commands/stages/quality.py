@@ -26,6 +26,7 @@ from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import EvaluationSettings
 from mien.face import load_face_model
 from mien.locks import WAIT, hold
+from mien.picture_files import write_png
 from mien.progress import say
 from mien.storage import read_json, replace_folder, write_atomically, write_json
 from mien.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
@@ -64,7 +65,7 @@ def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int
         content = {"rows": [row.as_json() for row in rows]}
         write_json(out / "quality.json", _FORMAT, _VERSION, json.loads(json.dumps(content)))
         write_atomically(out / "quality.md", lambda path: path.write_text(markdown_table(rows), encoding="utf-8"))
-        _write_png(out / "contact_sheet.png", np.concatenate(strips))
+        write_png(out / "contact_sheet.png", np.concatenate(strips))
     return rows
 
 
@@ -169,9 +170,3 @@ def _small(image: np.ndarray) -> np.ndarray:
     square = np.full((_SHEET_SIDE, _SHEET_SIDE, 3), 255, np.uint8)
     square[: size[1], : size[0]] = np.clip(np.rint(scaled * 255), 0, 255).astype(np.uint8)
     return square
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    written, data = cv2.imencode(".png", image[..., ::-1])
-    assert written
-    write_atomically(path, lambda aside: aside.write_bytes(data.tobytes()))

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from mien.capture.capture import Capture
 from mien.face import FaceModel
+from mien.pictures import picture_grid
 from mien.tracking.report.heat import draw_legend, write_text
 from mien.tracking.report.overlay import OverlayPainter, frontal_camera
 from mien.tracking.tracking import Tracking
@@ -20,8 +21,6 @@ _TILE = 240
 """Side of each tile, in pixels."""
 _STRIPS = 2
 """Number of frames side by side."""
-_GAP = 4
-_PAPER = 255
 
 
 @dataclass(frozen=True)
@@ -69,10 +68,7 @@ def contact_sheet(
     """The frames as a grid of strips (see `strip`)."""
     painter = OverlayPainter(capture, tracking, face_model)
     strips = [strip(painter, capture, frame, _name(capture, frame)) for frame in frames]
-    columns = min(_STRIPS, len(strips))
-    strips += [np.full_like(strips[0], _PAPER)] * (-len(strips) % columns)
-    rows = [_joined(strips[first : first + columns], 1) for first in range(0, len(strips), columns)]
-    return _joined(rows, 0)
+    return picture_grid(strips, min(_STRIPS, len(strips)))
 
 
 def _name(capture: Capture, frame: SheetFrame) -> str:
@@ -90,13 +86,6 @@ def strip(painter: OverlayPainter, capture: Capture, frame: SheetFrame, name: st
     if len(tiles) > 2:
         draw_legend(tiles[-1], 8)
     return np.concatenate(tiles, axis=1)
-
-
-def _joined(pictures: Sequence[UInt8[np.ndarray, "_ _ 3"]], axis: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    shape = list(pictures[0].shape)
-    shape[axis] = _GAP
-    between = np.full(shape, _PAPER, np.uint8)
-    return np.concatenate([part for picture in pictures for part in (between, picture)][1:], axis=axis)
 
 
 def _camera_of_face(residuals: Float[torch.Tensor, " c"]) -> int:

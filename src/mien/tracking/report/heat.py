@@ -4,6 +4,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mien.pictures import heat_colors
+
 _HOTTEST = 0.15
 """Length of the colour difference (each channel 0..1) that is drawn brightest."""
 _DIMMED = 0.35
@@ -14,8 +16,7 @@ _WHITE, _BLACK = (255, 255, 255), (0, 0, 0)
 
 def heat_map(difference: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """Differences in the colours of `inferno`. Black is no difference, or an unknown one (NaN)."""
-    levels = np.clip(np.nan_to_num(difference) * (255 / _HOTTEST), 0, 255).astype(np.uint8)
-    return _inferno(levels)
+    return heat_colors(difference, _HOTTEST)
 
 
 def dimmed(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -31,8 +32,8 @@ def draw_legend(picture: UInt8[np.ndarray, "h w 3"], top: int) -> None:
     if length < 32 or height < top + 64:
         return
     left = 3 * _MARGIN
-    bar = np.broadcast_to(np.linspace(0, 255, length).astype(np.uint8), (_BAR, length))
-    picture[top : top + _BAR, left : left + length] = _inferno(bar)
+    bar = np.broadcast_to(np.linspace(0, 255, length), (_BAR, length))
+    picture[top : top + _BAR, left : left + length] = heat_colors(bar, 255.0)
     cv2.rectangle(picture, (left - 1, top - 1), (left + length, top + _BAR), _WHITE, 1)
     write_text(picture, "0", (_MARGIN, top + _BAR), 0.4)
     write_text(picture, f"{100 * _HOTTEST:.0f} %", (left + length + _MARGIN, top + _BAR), 0.4)
@@ -45,7 +46,3 @@ def write_text(picture: UInt8[np.ndarray, "h w 3"], text: str, at: tuple[int, in
     rim = [(left + x, foot + y, _BLACK) for x in (-1, 0, 1) for y in (-1, 0, 1)]
     for x, y, color in (*rim, (left, foot, _WHITE)):
         cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)
-
-
-def _inferno(levels: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    return cv2.applyColorMap(np.ascontiguousarray(levels), cv2.COLORMAP_INFERNO)[..., ::-1]

@@ -1,17 +1,14 @@
 """The page report.html of a tracking: findings, figures, and pictures of typical frames and of those that stand out."""
 
-import base64
 import re
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-
 from mien.capture.capture import Capture
 from mien.face import FaceModel
+from mien.pictures import data_uri, picture_uri
 from mien.storage import write_atomically
 from mien.tracking.report.contact_sheet import contact_sheet, sheet_frames
 from mien.tracking.tracking import Tracking
@@ -54,7 +51,7 @@ def write_report_page(
     frames = sheet_frames(tracking, report["flagged_frames"], report["landmarks_only_frames"])
     sheet = contact_sheet(capture, tracking, face_model, frames)
     plot = (folder / "residuals.png").read_bytes()
-    text = page_html(capture.name, tracking, report, _uri("png", plot), _uri("jpeg", _as_jpeg(sheet)))
+    text = page_html(capture.name, tracking, report, data_uri("image/png", plot), picture_uri(sheet, _JPEG_QUALITY))
     write_atomically(folder / "report.html", lambda path: path.write_text(text, encoding="utf-8"))
 
 
@@ -145,15 +142,3 @@ def _three(summary: dict[str, float | None], factor: int, unit: str) -> str:
 
 def _number(value: float | None, factor: int, unit: str) -> str:
     return "-" if value is None else f"{factor * value:.2f} {unit}"
-
-
-def _as_jpeg(image: np.ndarray) -> bytes:
-    done, encoded = cv2.imencode(
-        ".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    )
-    assert done, f"cannot encode a picture of shape {image.shape}"
-    return encoded.tobytes()
-
-
-def _uri(kind: str, data: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -1,6 +1,5 @@
 """Preview of a running fit: a page, with a picture beside it, which is written again every few seconds."""
 
-import base64
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -13,6 +12,8 @@ from jaxtyping import Float, Int, UInt8
 
 from mien.capture.capture import Capture
 from mien.face import FaceModel
+from mien.picture_files import encode_picture
+from mien.pictures import data_uri
 from mien.storage import write_atomically
 from mien.tracking.fitting import Fit, SequenceFit, Shot
 from mien.tracking.landmarks import LandmarkModel, as_tracking
@@ -108,15 +109,14 @@ class Preview:
         return header if self._body is None else np.concatenate([header, self._body])
 
     def _write(self, picture: UInt8[np.ndarray, "h w 3"], last: bool) -> None:
-        done, png = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
-        assert done
+        png = encode_picture(picture)
         refresh = "" if last else f'<meta http-equiv="refresh" content="{_INTERVAL_SECONDS:.0f}">'
         page = (
             f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">{refresh}<title>Tracking</title></head>'
             '<body style="margin:0;background:#222"><img alt="the fit as it is now" style="max-width:100%" '
-            f'src="data:image/png;base64,{base64.b64encode(png.tobytes()).decode("ascii")}"></body></html>\n'
+            f'src="{data_uri("image/png", png)}"></body></html>\n'
         )
-        write_atomically(self._path.with_suffix(".png"), lambda path: path.write_bytes(png.tobytes()))
+        write_atomically(self._path.with_suffix(".png"), lambda path: path.write_bytes(png))
         write_atomically(self._path, lambda path: path.write_text(page, encoding="utf-8"))
 
 

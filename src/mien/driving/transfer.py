@@ -1,4 +1,4 @@
-"""Driving: one person's motion on another person's avatar."""
+"""The transfer of one person's motion to another person's avatar, relative to each one's face at rest."""
 
 from dataclasses import replace
 
@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.driving.motion import ARKIT_NAMES, Motion
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
-from mien.motion import ARKIT_NAMES, Motion
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 

@@ -8,10 +8,10 @@ import torch
 
 from mien.avatar import neutral_of
 from mien.camera import camera_from_fov
+from mien.driving import drive
 from mien.errors import UserError
-from mien.evaluation.cameras import orbit, turntable
-from mien.evaluation.driving import drive
 from mien.face import FaceParams
+from mien.render.camera_paths import orbit, turntable
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 

@@ -1,4 +1,4 @@
-"""Pictures for people: side by side, error heat maps, contact sheets. All are uint8 RGB arrays."""
+"""Pictures for people: side by side, in a grid, heat maps, inside HTML. All are uint8 RGB arrays."""
 
 import base64
 from collections.abc import Sequence
@@ -9,9 +9,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from mien.picture_files import encode_picture
+
 WHITE = 255
-HEAT_STOPS = ((0, 0, 4), (66, 10, 104), (147, 38, 103), (221, 81, 58), (252, 165, 10), (252, 255, 164))
-"""Colours of the heat scale from 0 to its limit: matplotlib's `inferno` at six even steps."""
+_HEAT_STOPS = 6
+"""Number of colours in the gradient of a heat scale."""
 
 
 def to_uint8(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -19,21 +21,24 @@ def to_uint8(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
 
 
-def heat_colors(values: Float[np.ndarray, "*s"]) -> UInt8[np.ndarray, "*s 3"]:
-    """Colours from black over red to pale yellow for values from 0 to 1, clamped."""
-    stops = np.array(HEAT_STOPS, dtype=np.float32)
-    position = np.clip(values, 0, 1).astype(np.float32) * (len(stops) - 1)
-    below = np.minimum(position.astype(np.int64), len(stops) - 2)
-    along = (position - below)[..., None]
-    return np.rint(stops[below] * (1 - along) + stops[below + 1] * along).astype(np.uint8)
+def heat_colors(values: Float[np.ndarray, "h w"], limit: float = 1.0) -> UInt8[np.ndarray, "h w 3"]:
+    """Colours of `inferno`, from black over red to pale yellow, for values from 0 to `limit`. NaN is black."""
+    levels = np.clip(np.nan_to_num(values) * (255 / limit), 0, 255).astype(np.uint8)
+    return cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+
+
+def heat_gradient() -> str:
+    """The colours of `heat_colors` from 0 to its limit, as a CSS gradient from left to right."""
+    stops = heat_colors(np.linspace(0, 1, _HEAT_STOPS)[None])[0].tolist()
+    return f"linear-gradient(90deg,{', '.join(f'rgb{tuple(stop)}' for stop in stops)})"
 
 
 def error_heat(
     image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], limit: float = 0.25
 ) -> UInt8[np.ndarray, "h w 3"]:
     """The mean absolute difference of the channels as a heat map. `limit` (0..1) and above get the brightest colour."""
-    difference = (image - target).abs().mean(-1) / limit
-    return heat_colors(difference.detach().cpu().numpy().astype(np.float32))
+    difference = (image - target).abs().mean(-1)
+    return heat_colors(difference.detach().cpu().numpy().astype(np.float32), limit)
 
 
 def side_by_side(images: Sequence[UInt8[np.ndarray, "_ _ 3"]], gap: int = 4) -> UInt8[np.ndarray, "h w 3"]:
@@ -46,10 +51,10 @@ def side_by_side(images: Sequence[UInt8[np.ndarray, "_ _ 3"]], gap: int = 4) -> 
     return np.concatenate(row[1:], axis=1)
 
 
-def contact_sheet(
+def picture_grid(
     images: Sequence[UInt8[np.ndarray, "_ _ 3"]], columns: int, gap: int = 4
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Pictures of one size in rows of `columns`. The last row is filled with white."""
+    """Pictures of one size in rows of `columns`, with white gaps of `gap` pixels. The last row is filled with white."""
     assert images, "no pictures"
     blank = np.full_like(images[0], WHITE)
     padded = [*images, *([blank] * (-len(images) % columns))]
@@ -59,8 +64,8 @@ def contact_sheet(
     return np.concatenate(stacked[1:], axis=0)
 
 
-def shrunk(image: UInt8[np.ndarray, "_ _ 3"], largest: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    """The picture with its longer side at most `largest` pixels, by area averaging. It is never enlarged."""
+def shrink(image: UInt8[np.ndarray, "_ _ 3"], largest: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Shrink a picture by area averaging until its longer side has at most `largest` pixels. It is never enlarged."""
     factor = largest / max(image.shape[:2])
     if factor >= 1:
         return image
@@ -68,13 +73,16 @@ def shrunk(image: UInt8[np.ndarray, "_ _ 3"], largest: int) -> UInt8[np.ndarray,
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def data_uri(image: UInt8[np.ndarray, "_ _ 3"], jpeg_quality: int | None = 90) -> str:
+def picture_uri(image: UInt8[np.ndarray, "_ _ 3"], jpeg_quality: int | None = 90) -> str:
     """The picture as a data URI for HTML: JPEG of the given quality, or lossless PNG if it is None."""
-    kind = "png" if jpeg_quality is None else "jpeg"
-    options = [] if jpeg_quality is None else [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
-    done, encoded = cv2.imencode(f".{kind}", np.ascontiguousarray(image[:, :, ::-1]), options)
-    assert done, f"cannot encode a picture of shape {image.shape}"
-    return f"data:image/{kind};base64,{base64.b64encode(encoded.tobytes()).decode('ascii')}"
+    if jpeg_quality is None:
+        return data_uri("image/png", encode_picture(image))
+    return data_uri("image/jpeg", encode_picture(image, ".jpeg", (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality)))
+
+
+def data_uri(media_type: str, data: bytes) -> str:
+    """The content of a file as a data URI for HTML."""
+    return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 def _scaled_to_height(image: UInt8[np.ndarray, "_ _ 3"], height: int) -> UInt8[np.ndarray, "_ _ 3"]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import torch
 
-from mien.evaluation.pictures import contact_sheet, data_uri, error_heat, heat_colors, shrunk, side_by_side, to_uint8
+from mien.pictures import error_heat, heat_colors, picture_grid, picture_uri, shrink, side_by_side, to_uint8
 
 
 def _flat(height: int, width: int, value: int) -> np.ndarray:
@@ -26,8 +26,8 @@ def test_side_by_side_scales_to_the_first() -> None:
     assert (joined[:, 10:] == 100).all()
 
 
-def test_contact_sheet_fills_the_last_row() -> None:
-    sheet = contact_sheet([_flat(4, 6, value) for value in (10, 20, 30)], columns=2, gap=1)
+def test_picture_grid_fills_the_last_row() -> None:
+    sheet = picture_grid([_flat(4, 6, value) for value in (10, 20, 30)], columns=2, gap=1)
     assert sheet.shape == (9, 13, 3)
     assert sheet[0, 7, 0] == 20
     assert sheet[5, 0, 0] == 30
@@ -38,16 +38,16 @@ def test_error_heat_rises_to_its_limit() -> None:
     target = torch.zeros(1, 4, 3)
     image = torch.tensor([0.0, 0.1, 0.2, 0.9])[None, :, None].expand(1, 4, 3)
     heat = error_heat(image, target, limit=0.2)
-    assert heat[0, 0].tolist() == heat_colors(np.zeros(1, np.float32))[0].tolist()
-    assert heat[0, 2].tolist() == heat[0, 3].tolist() == heat_colors(np.ones(1, np.float32))[0].tolist()
+    assert heat[0, 0].tolist() == heat_colors(np.zeros((1, 1), np.float32))[0, 0].tolist()
+    assert heat[0, 2].tolist() == heat[0, 3].tolist() == heat_colors(np.ones((1, 1), np.float32))[0, 0].tolist()
     brightness = heat.astype(int).sum(-1)[0]
     assert brightness[0] < brightness[1] < brightness[2]
 
 
-def test_data_uri_is_a_picture() -> None:
+def test_picture_uri_is_a_picture() -> None:
     picture = np.random.default_rng(0).integers(0, 255, (12, 9, 3)).astype(np.uint8)
     for quality in (None, 95):
-        head, body = data_uri(picture, quality).split(",")
+        head, body = picture_uri(picture, quality).split(",")
         assert head == f"data:image/{'png' if quality is None else 'jpeg'};base64"
         decoded = cv2.imdecode(np.frombuffer(base64.b64decode(body), np.uint8), cv2.IMREAD_COLOR_RGB)
         assert decoded is not None
@@ -56,6 +56,6 @@ def test_data_uri_is_a_picture() -> None:
             assert (decoded == picture).all()
 
 
-def test_shrunk_never_enlarges() -> None:
-    assert shrunk(_flat(100, 50, 3), 40).shape == (40, 20, 3)
-    assert shrunk(_flat(10, 5, 3), 40).shape == (10, 5, 3)
+def test_shrink_never_enlarges() -> None:
+    assert shrink(_flat(100, 50, 3), 40).shape == (40, 20, 3)
+    assert shrink(_flat(10, 5, 3), 40).shape == (10, 5, 3)

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from mien.driving.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, check_size, check_times, evenly, gaze_of, held
 from mien.errors import UserError
-from mien.motion.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, check_size, check_times, evenly, gaze_of, held
 from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
 
 _INDEX = {name: index for index, name in enumerate(ARKIT_NAMES)}

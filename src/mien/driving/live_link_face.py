@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mien.driving.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, check_size, check_times, evenly, gaze_of, held
 from mien.errors import UserError
-from mien.motion.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, check_size, check_times, evenly, gaze_of, held
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 HEAD = ("HeadYaw", "HeadPitch", "HeadRoll")

@@ -1,4 +1,4 @@
-"""Camera paths for pictures of avatars."""
+"""Camera paths around a head, and camera paths in files."""
 
 import math
 from collections.abc import Sequence
@@ -65,15 +65,6 @@ def sway(
         lifted = orbit(camera, centre, -raised, tuple(sideways.tolist()))
         views.append(orbit(lifted, centre, turned))
     return views
-
-
-def fitted(camera: Camera, width: int, height: int, zoom: float = 1.0) -> Camera:
-    """The same view in a picture of another shape: all of it is visible, centred, and magnified by `zoom`."""
-    scale = min(width / camera.width, height / camera.height) * zoom
-    K = camera.K * camera.K.new_tensor([[scale], [scale], [1.0]])
-    K[0, 2] += 0.5 * (width - scale * camera.width)
-    K[1, 2] += 0.5 * (height - scale * camera.height)
-    return replace(camera, K=K, width=width, height=height)
 
 
 def write_cameras(path: Path, cameras: Sequence[Camera]) -> None:

@@ -1,0 +1,35 @@
+"""What drives an avatar: tracked sequences, recordings of other programs, and the transfer from neutral to neutral."""
+
+from typing import TYPE_CHECKING
+
+from mien.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from mien.driving.blendshape_json import read_blendshape_json
+    from mien.driving.drivers import Driver, read_recording, read_tracked_driver
+    from mien.driving.live_link_face import read_live_link_face
+    from mien.driving.motion import ARKIT_NAMES, Motion
+    from mien.driving.transfer import drive, face_of_motion
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "blendshape_json": ["read_blendshape_json"],
+            "drivers": ["Driver", "read_recording", "read_tracked_driver"],
+            "live_link_face": ["read_live_link_face"],
+            "motion": ["ARKIT_NAMES", "Motion"],
+            "transfer": ["drive", "face_of_motion"],
+        },
+    )
+
+__all__ = [
+    "ARKIT_NAMES",
+    "Driver",
+    "Motion",
+    "drive",
+    "face_of_motion",
+    "read_blendshape_json",
+    "read_live_link_face",
+    "read_recording",
+    "read_tracked_driver",
+]

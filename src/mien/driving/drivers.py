@@ -1,0 +1,71 @@
+"""Drivers: the motion of a face, with the same face at rest, from tracked sequences or from recordings."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from mien.avatar import neutral_of
+from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.live_link_face import read_live_link_face
+from mien.driving.transfer import face_of_motion
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams
+from mien.face.params import concatenate
+from mien.progress import say
+from mien.training import read_sequence
+
+
+@dataclass(frozen=True, eq=False)
+class Driver:
+    """The driver of an avatar."""
+
+    face: FaceParams
+    at_rest: FaceParams
+    """The driver at rest, as one timestep."""
+    fps: float
+    pictures: Callable[[int], UInt8[np.ndarray, "h w 3"]] | None
+    """Returns the driver's picture at a timestep. None if there are no pictures."""
+
+
+def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) -> Driver:
+    """Read a driver from a recording of another program: a .csv of Live Link Face or a .json of blend shapes.
+
+    Args:
+        path: The file. Its ending decides its format.
+        face_model: The avatar's face model.
+        fps: Frame rate of the timecode in a csv.
+
+    Raises:
+        UserError: the file is damaged, or the face model has none of ARKit's expressions.
+    """
+    is_csv = path.suffix.lower() == ".csv"
+    motion = read_live_link_face(path, fps) if is_csv else read_blendshape_json(path)
+    if motion.lost:
+        say(f"{path}: no face in {motion.lost} of {len(motion)} frames; they repeat the one before")
+    face, at_rest = face_of_motion(motion, face_model)
+    return Driver(face, at_rest, motion.fps, None)
+
+
+def read_tracked_driver(folders: Sequence[Path]) -> Driver:
+    """Read a driver from the folders of tracked sequences of one person, one sequence after the other.
+
+    Raises:
+        UserError: no frame was tracked, the sequences were tracked with several face models, or a file is damaged.
+    """
+    sequences = [read_sequence(folder) for folder in folders]
+    shapes = {(one.tracking.face.expression.shape[1], one.tracking.face.joints.shape[1]) for one in sequences}
+    if len(shapes) > 1 or not any(bool(one.tracking.valid.any()) for one in sequences):
+        told = ", ".join(map(str, folders))
+        raise UserError(f"{told}: no frame was tracked, or with several face models; track them again")
+    face = concatenate([one.tracking.face for one in sequences])
+    at_rest = neutral_of(concatenate([one.tracking.face[one.tracking.valid] for one in sequences]))
+    places = [(one, timestep) for one in sequences for timestep in range(one.capture.timesteps)]
+
+    def picture(index: int) -> UInt8[np.ndarray, "h w 3"]:
+        sequence, timestep = places[index]
+        return np.asarray(sequence.capture.images[timestep, 0])
+
+    return Driver(face, at_rest, sequences[0].capture.fps, picture)
