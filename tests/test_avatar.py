@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from damage import edit_json
-from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, load_avatar, read_baked, write_avatar
+from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, load_avatar, write_avatar
 from mien.errors import UserError
 from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh, world_means
@@ -161,11 +161,6 @@ def test_face_models_that_may_not_be_passed_on_are_not(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("face_model*"))
     with pytest.raises(UserError, match="flame"):
         load_avatar(tmp_path)
-
-
-def test_missing_baked_avatar(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="missing"):
-        read_baked(tmp_path / "none.mien")
 
 
 def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_small_ones_duplicate_and_large_ones_split() -> None:
     store = make_store([0.001, 0.001, 0.004, 0.004])
     strategy = control(store)
     strategy.observe(pose(store), rendering([ABOVE, BELOW, ABOVE, BELOW]))
-    assert strategy.control(store, pose(store), Progress(0, 100), random)
+    assert strategy.adapt(store, pose(store), Progress(0, 100), random)
     # 0, 1 and 3 stay, a copy of 0, and two children that replace 2.
     assert store["face_index"].tolist() == [0, 1, 3, 0, 2, 2]
     assert torch.equal(store["means"][3], store["means"][0])
@@ -94,7 +94,7 @@ def test_gradient_is_the_mean_over_the_steps_that_showed_the_gaussian() -> None:
     strategy = control(store)
     strategy.observe(pose(store), rendering([ABOVE, ABOVE]))
     strategy.observe(pose(store), rendering([0.0, 0.0], radii=[0, 3]))
-    strategy.control(store, pose(store), Progress(0, 100), random)
+    strategy.adapt(store, pose(store), Progress(0, 100), random)
     assert store["face_index"].tolist() == [0, 1, 0]
 
 
@@ -105,11 +105,11 @@ def test_faint_and_huge_ones_go() -> None:
     early, late = make_store([1.0]), store
     strategy = control(store, settings)
     strategy.observe(pose(store), rendering([0.0] * 3))
-    strategy.control(late, pose(late), Progress(60, 100), random)
+    strategy.adapt(late, pose(late), Progress(60, 100), random)
     assert late["face_index"].tolist() == [1]
     strategy = control(early, settings)
     strategy.observe(pose(early), rendering([0.0]))
-    strategy.control(early, pose(early), Progress(10, 100), random)
+    strategy.adapt(early, pose(early), Progress(10, 100), random)
     assert len(early) == 1, "size is judged only after a reset that follows the start"
 
 
@@ -118,7 +118,7 @@ def test_an_avatar_keeps_one_gaussian_whatever_is_pruned() -> None:
     store.assign("opacity_logits", torch.logit(torch.tensor([0.1, 0.3, 0.2])))
     strategy = control(store, replace(EVERY_STEP, prune_opacity=0.9))
     strategy.observe(pose(store), rendering([0.0] * 3))
-    strategy.control(store, pose(store), Progress(0, 100), random)
+    strategy.adapt(store, pose(store), Progress(0, 100), random)
     assert store["face_index"].tolist() == [1]
 
 
@@ -129,7 +129,7 @@ def test_no_triangle_is_emptied() -> None:
     strategy = control(store, may_prune=never_empty_a_triangle)
     store.assign("opacity_logits", torch.logit(torch.tensor([0.001, 0.001, 0.001, 0.5, 0.001])))
     strategy.observe(pose(store), rendering([0.0] * 5))
-    strategy.control(store, pose(store), Progress(0, 100), random)
+    strategy.adapt(store, pose(store), Progress(0, 100), random)
     assert store["face_index"].tolist() == [7, 7, 8]
 
 
@@ -137,7 +137,7 @@ def test_growth_stops_at_the_limit_with_those_that_pull_most() -> None:
     store = make_store([0.001] * 4)
     strategy = control(store, replace(EVERY_STEP, max_gaussians=5))
     strategy.observe(pose(store), rendering([2e-5, 3e-5, 4e-5, 1e-6]))
-    strategy.control(store, pose(store), Progress(0, 100), random)
+    strategy.adapt(store, pose(store), Progress(0, 100), random)
     assert store["face_index"].tolist() == [0, 1, 2, 3, 2]
 
 
@@ -149,7 +149,7 @@ def test_rounds_and_resets_happen_at_their_fractions() -> None:
     for step in range(50):
         strategy.observe(pose(store), rendering([0.0]))
         before = float(store["opacity_logits"].detach().sigmoid())
-        if strategy.control(store, pose(store), Progress(step, 50), random):
+        if strategy.adapt(store, pose(store), Progress(step, 50), random):
             rounds.append(step + 1)
         after = float(store["opacity_logits"].detach().sigmoid())
         if after < before:
@@ -187,8 +187,8 @@ def test_refill_deletes_the_unseen_and_reaches_its_target() -> None:
     bright = Posed(replace(bright.gaussians, opacities=torch.tensor([0.05, 0.2, 0.05, 0.05, 0.3, 0.05])), {})
     strategy.observe(bright, rendering([0.0] * 6))
     strategy.observe(faint, rendering([0.0] * 6))
-    assert not strategy.control(store, faint, Progress(0, 100), random)
-    assert strategy.control(store, faint, Progress(9, 100), random)
+    assert not strategy.adapt(store, faint, Progress(0, 100), random)
+    assert strategy.adapt(store, faint, Progress(9, 100), random)
     assert len(store) == 10
     assert set(store["face_index"].tolist()) == {1, 4}
     distance = (store["means"].detach() - 3 * store["face_index"][:, None] - torch.arange(3.0)).abs()
@@ -201,7 +201,7 @@ def test_refill_survives_when_nothing_was_seen() -> None:
     described = RefillDensity(RefillSettings((0.0,), (5,)), refill=lambda store, parents, noise, fraction: {})
     strategy = density_strategy(described, store)
     strategy.observe(pose(store), rendering([0.0] * 3))
-    strategy.control(store, pose(store), Progress(0, 10), random)
+    strategy.adapt(store, pose(store), Progress(0, 10), random)
     assert len(store) == 5
 
 
@@ -209,7 +209,7 @@ def test_fixed_density_changes_nothing() -> None:
     store = make_store([0.001] * 3)
     strategy = density_strategy(FixedDensity(), store)
     strategy.observe(pose(store), rendering([1.0] * 3))
-    assert not strategy.control(store, pose(store), Progress(0, 1), random)
+    assert not strategy.adapt(store, pose(store), Progress(0, 1), random)
 
 
 def test_statistics_survive_a_checkpoint() -> None:

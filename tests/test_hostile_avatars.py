@@ -23,7 +23,7 @@ from mien.avatar import METHODS, Avatar, load_avatar, make_portable, write_avata
 from mien.errors import UserError
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.face.model import FaceModel
-from mien.runtime import model as portable
+from mien.runtime import baked as portable
 from mien.storage import file_digest, read_tensors, write_tensors
 from mien.training.checkpoint import checkpoint_files, resume
 from mien.training.trainer import start

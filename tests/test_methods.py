@@ -5,9 +5,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from mien import runtime
 from mien.avatar import (
     METHODS,
     TRAINED,
@@ -16,21 +18,18 @@ from mien.avatar import (
     Progress,
     load_avatar,
     make_portable,
-    pose_baked,
-    read_baked,
     write_avatar,
 )
 from mien.config import decode, encode
 from mien.progress import Advance
 from mien.render import rasterize
-from mien.runtime import write_portable
 from mien.training import TrainSettings
 from mien.training.checkpoint import resume, write_checkpoint
 from mien.training.density import density_strategy
 from mien.training.frames import FrameOrder, training_frames
 from mien.training.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
-from toy_scene import toy_camera, toy_sequence
+from toy_scene import runtime_face, toy_camera, toy_sequence
 
 SIZE = 32
 FIRST, LAST = slice(0, 5), slice(-5, None)
@@ -106,14 +105,15 @@ def test_baked_avatar_poses_as_the_avatar_does(method: str, tmp_path: Path) -> N
     _disturb(avatar)
     face = toy_sequence(5, SIZE)[1].tracking.face
     expected = avatar.pose(face).gaussians
-    write_portable(tmp_path / "toy.mien", make_portable(avatar, toy_camera(SIZE), "toy"))
-    got = pose_baked(read_baked(tmp_path / "toy.mien"), face)
-    for name in ("means", "scales", "opacities", "sh"):
-        ours, theirs = torch.broadcast_tensors(getattr(got, name), getattr(expected, name))
-        torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+    runtime.write_portable(tmp_path / "toy.mien", make_portable(avatar, toy_camera(SIZE), "toy"))
+    portable = runtime.load(tmp_path / "toy.mien")
     for index in range(len(face)):
-        pictures = [rasterize(g.timestep(index), toy_camera(SIZE), torch.ones(3)).image for g in (got, expected)]
-        torch.testing.assert_close(*pictures, atol=1e-3, rtol=0)
+        found, truth = runtime.pose(portable.portable.baked, runtime_face(face[index])), expected.timestep(index)
+        for name in ("means", "scales", "opacities", "sh"):
+            ours, theirs = getattr(found, name), getattr(truth, name).detach().numpy()
+            np.testing.assert_allclose(ours, theirs, atol=1e-5, rtol=1e-4, err_msg=name)
+        picture = rasterize(truth, toy_camera(SIZE), torch.ones(3)).image.detach().numpy()
+        np.testing.assert_allclose(portable.render(found)[0], picture, atol=1e-3, rtol=0)
 
 
 @method

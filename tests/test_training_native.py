@@ -11,7 +11,7 @@ from mien import _native
 from mien.avatar import Moments
 from mien.avatar.penalties import triangle_penalties, triangle_penalties_reference
 from mien.training.adam import Update, update_all, update_reference
-from mien.training.density import observe_reference
+from mien.training.density.gradient import observe_reference
 
 COUNTS = (0, 1, 15, 16, 4097)
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.capture import Capture
 from mien.face import FaceModel, FaceParams
+from mien.runtime import Face
 from mien.tracking import Tracking
 from mien.training import Sequence
 
@@ -55,6 +56,12 @@ def toy_face(timesteps: int) -> FaceParams:
         head_rotation=torch.stack([0.1 * time.sin(), 0.2 * time.cos(), still], dim=-1),
         head_translation=torch.stack([0.01 * time.cos(), 0.01 * time.sin(), still - 0.5], dim=-1),
     )
+
+
+def runtime_face(face: FaceParams) -> Face:
+    """One timestep as the runtime takes it."""
+    fields = (face.expression, face.joints, face.head_rotation, face.head_translation)
+    return Face(*(tensor[0].detach().numpy() for tensor in fields))
 
 
 def toy_camera(size: int) -> Camera:

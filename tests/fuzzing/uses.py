@@ -17,7 +17,6 @@ from fuzzing import content
 from fuzzing.material import CONFIG, QUICK, RUN, SEQUENCE, SETTINGS
 from mien import cli
 from mien.avatar import load_avatar
-from mien.avatar.portable import make_portable
 from mien.driving import Motion, drive
 from mien.errors import UserError
 from mien.evaluation import evaluate

@@ -6,7 +6,7 @@ from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mien.avatar.avatar import Avatar, ParameterGroup, Posed, move_avatar, network_group, neutral_of, store_group
-    from mien.avatar.baked import BakedAvatar, pose_baked
+    from mien.avatar.baking import as_array, bake_rig, make_portable
     from mien.avatar.density import DensityControl, FixedDensity, GradientDensity, RefillDensity
     from mien.avatar.files import load_avatar, write_avatar
     from mien.avatar.gaussian_avatars import GaussianAvatars
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from mien.avatar.methods import METHODS, Method, method_named, method_of
     from mien.avatar.mono_gaussian_avatar import MonoGaussianAvatar
     from mien.avatar.mono_gaussian_avatar_settings import MonoGaussianAvatarConfig
-    from mien.avatar.portable import make_portable, read_baked
     from mien.avatar.schedules import TRAINED, Progress, Rate
     from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, Photometric, RefillSettings
     from mien.avatar.store import GaussianStore, Moments
@@ -33,7 +32,7 @@ else:
                 "neutral_of",
                 "store_group",
             ],
-            "baked": ["BakedAvatar", "pose_baked"],
+            "baking": ["as_array", "bake_rig", "make_portable"],
             "density": ["DensityControl", "FixedDensity", "GradientDensity", "RefillDensity"],
             "files": ["load_avatar", "write_avatar"],
             "gaussian_avatars": ["GaussianAvatars"],
@@ -43,7 +42,6 @@ else:
             "methods": ["METHODS", "Method", "method_named", "method_of"],
             "mono_gaussian_avatar": ["MonoGaussianAvatar"],
             "mono_gaussian_avatar_settings": ["MonoGaussianAvatarConfig"],
-            "portable": ["make_portable", "read_baked"],
             "schedules": ["TRAINED", "Progress", "Rate"],
             "settings": ["FaceTuning", "GradientSettings", "MethodConfig", "Photometric", "RefillSettings"],
             "store": ["GaussianStore", "Moments"],
@@ -54,7 +52,6 @@ __all__ = [
     "METHODS",
     "TRAINED",
     "Avatar",
-    "BakedAvatar",
     "DensityControl",
     "FaceTuning",
     "FixedDensity",
@@ -77,6 +74,8 @@ __all__ = [
     "Rate",
     "RefillDensity",
     "RefillSettings",
+    "as_array",
+    "bake_rig",
     "load_avatar",
     "make_portable",
     "method_named",
@@ -84,8 +83,6 @@ __all__ = [
     "move_avatar",
     "network_group",
     "neutral_of",
-    "pose_baked",
-    "read_baked",
     "store_group",
     "write_avatar",
 ]

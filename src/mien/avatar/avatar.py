@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mien.avatar.baked import BakedAvatar
 from mien.avatar.density import DensityControl
 from mien.avatar.schedules import TRAINED, Progress, Rate
 from mien.avatar.settings import MethodConfig
@@ -18,6 +17,7 @@ from mien.avatar.store import GaussianStore, Moments
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
+from mien.runtime.baked import BakedAvatar
 
 _CALM_SHARE = 0.1
 """Share of the timesteps that are used to estimate the expression at rest."""
@@ -93,7 +93,7 @@ class Avatar(nn.Module, ABC):
 
     @abstractmethod
     def bake(self) -> BakedAvatar:
-        """The avatar in a form that works without this class, for files, the web and game engines."""
+        """The avatar as a record of `mien.runtime`, which works without torch and this class: for files and engines."""
 
 
 def move_avatar(avatar: Avatar, like: Tensor) -> None:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar
 from mien.avatar.methods import method_named, method_of
-from mien.avatar.portable import as_numpy
 from mien.config import decode, encode, for_loading
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
@@ -121,7 +120,7 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{source}: does not fit its settings ({reason}); train it again") from None
-    fault = baked_fault(as_numpy(avatar.bake()))
+    fault = baked_fault(avatar.bake())
     if fault is not None:
         raise UserError(f"{source}: cannot be posed ({fault}); train it again")
 

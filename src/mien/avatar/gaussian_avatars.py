@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar, ParameterGroup, Posed, store_group
-from mien.avatar.baked import Attributes, MeshBound, bake_rig
+from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.density import GradientDensity
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
 from mien.avatar.penalties import triangle_penalties
@@ -20,6 +20,7 @@ from mien.avatar.schedules import TRAINED, Progress, Rate
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
 from mien.render.rendering import Rendering
+from mien.runtime.baked import Attributes, MeshBound
 
 
 class GaussianAvatars(Avatar):
@@ -87,12 +88,16 @@ class GaussianAvatars(Avatar):
 
     def bake(self) -> MeshBound:
         """The mesh of this subject and the raw values of all Gaussians."""
-        store = {name: self.store[name].detach() for name in self.store.names()}
-        attributes = Attributes(
-            store["quats"], store["log_scales"], store["opacity_logits"], self._active_sh(TRAINED).detach()
+        store = {name: as_array(self.store[name]) for name in self.store.names()}
+        sh = as_array(self._active_sh(TRAINED))
+        return MeshBound(
+            rig=bake_rig(self.face_model, self.subject),
+            faces=as_array(self.face_model.faces),
+            face_index=store["face_index"],
+            means=store["means"],
+            attributes=Attributes(store["quats"], store["log_scales"], store["opacity_logits"], sh),
+            sh_frame=self._sh_frame,
         )
-        rig = bake_rig(self.face_model, self.subject)
-        return MeshBound(rig, self.face_model.faces, store["face_index"], store["means"], attributes, self._sh_frame)
 
     @property
     def _sh_frame(self) -> Literal["world", "head"]:

@@ -7,13 +7,14 @@ appended to the expression vector, because nothing else would move the gaze; the
 length unit of the encoding; and the opacity to prune by. The perceptual loss is not implemented yet.
 """
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from mien.avatar.activation import sigmoid
 from mien.avatar.avatar import Avatar, ParameterGroup, Posed, network_group, store_group
-from mien.avatar.baked import AttributeNetwork, Attributes, Static
+from mien.avatar.baking import as_array
 from mien.avatar.density import GradientDensity
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.headgas_settings import HeadGasConfig
@@ -22,6 +23,7 @@ from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
+from mien.runtime.baked import AttributeNetwork, Attributes, Static
 
 _CHUNK = 512
 
@@ -90,24 +92,23 @@ class HeadGas(Avatar):
 
     def bake(self) -> Static:
         """Static points, with the bases of the features and the network."""
-        store = {name: self.store[name].detach() for name in self.store.names()}
-        n = len(self.store)
-        bases = store["feature_bases"].permute(2, 0, 1)
+        store = {name: as_array(self.store[name]) for name in self.store.names()}
+        layers = [layer for layer in self.network if isinstance(layer, nn.Linear)]
+        bases = self.store["feature_bases"].permute(2, 0, 1)
         e = self.subject.expression.shape[1]
-        first, last = self.network[0], self._last_layer
-        assert isinstance(first, nn.Linear)
         network = AttributeNetwork(
             input="features",
-            base=torch.cat([store["neutral_features"], self._encoding()], dim=-1),
-            basis=bases[:e],
-            joint_basis=bases[e:],
-            weights=(first.weight.detach(), last.weight.detach()),
-            biases=(first.bias.detach(), last.bias.detach()),
+            base=np.concatenate([store["neutral_features"], as_array(self._encoding())], axis=1),
+            basis=as_array(bases[:e]),
+            joint_basis=as_array(bases[e:]),
+            weights=tuple(as_array(layer.weight) for layer in layers),
+            biases=tuple(as_array(layer.bias) for layer in layers),
             activation="leaky_relu",
             outputs=("sh", "opacity_logits"),
         )
-        none = store["means"].new_zeros(n)
-        attributes = Attributes(store["quats"], store["log_scales"], none, none.new_zeros(n, self._coefficients, 3))
+        n = len(self.store)
+        none, no_sh = np.zeros(n, np.float32), np.zeros((n, self._coefficients, 3), np.float32)
+        attributes = Attributes(store["quats"], store["log_scales"], none, no_sh)
         names, free = self.face_model.expression_names, self.face_model.free_joint_names
         return Static(store["means"], attributes, names, free, network=network)
 

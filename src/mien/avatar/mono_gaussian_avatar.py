@@ -13,13 +13,14 @@ learned background.
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.avatar.activation import sigmoid
 from mien.avatar.avatar import Avatar, ParameterGroup, Posed, network_group, store_group
-from mien.avatar.baked import AttributeNetwork, Attributes, BlendSkinned, bake_rig
+from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.density import RefillDensity
 from mien.avatar.mono_gaussian_avatar_settings import MonoGaussianAvatarConfig
 from mien.avatar.mono_networks import (
@@ -37,6 +38,7 @@ from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.rendering import Rendering
 from mien.rotation import matrix_from_axis_angle
+from mien.runtime.baked import AttributeNetwork, Attributes, BlendSkinned
 
 # The schedules below use the paper's epochs divided by 100.
 _GROWTH = (
@@ -146,10 +148,10 @@ class MonoGaussianAvatar(Avatar):
         weights, biases = self.change.flattened()
         rig = replace(
             bake_rig(self.face_model, self.subject),
-            template=points["rest"],
-            expression_basis=points["expression"].permute(2, 0, 1).contiguous(),
-            skinning_weights=points["weights"],
-            pose_basis=points["pose"].permute(2, 0, 1).contiguous(),
+            template=as_array(points["rest"]),
+            expression_basis=as_array(points["expression"].permute(2, 0, 1)),
+            skinning_weights=as_array(points["weights"]),
+            pose_basis=as_array(points["pose"].permute(2, 0, 1)),
         )
         # The network takes the motion from the canonical position, but the runtime gives the motion from the rest
         # position. They differ by a constant for each point. Both enter linearly, so the constant uses the same columns
@@ -157,16 +159,21 @@ class MonoGaussianAvatar(Avatar):
         first = weights[0] / LENGTH_UNIT
         network = AttributeNetwork(
             input="displacement",
-            base=points["rest"] - points["canonical"],
-            basis=rig.template.new_zeros(0, len(self.store), 0),
-            weights=(torch.cat([first, first], dim=1), *weights[1:]),
-            biases=tuple(biases),
+            base=as_array(points["rest"] - points["canonical"]),
+            basis=np.zeros((0, len(self.store), 0), np.float32),
+            weights=tuple(as_array(weight) for weight in (torch.cat([first, first], dim=1), *weights[1:])),
+            biases=tuple(as_array(bias) for bias in biases),
             activation="relu",
             outputs=ATTRIBUTES,
         )
         return BlendSkinned(
             rig=rig,
-            attributes=Attributes(raw["quats"], raw["log_scales"], raw["opacity_logits"][..., 0], raw["sh"][:, None]),
+            attributes=Attributes(
+                as_array(raw["quats"]),
+                as_array(raw["log_scales"]),
+                as_array(raw["opacity_logits"][..., 0]),
+                as_array(raw["sh"][:, None]),
+            ),
             scale_activation="sigmoid",
             scale_gain=self.config.scale_gain,
             scale_offset=rendering_radius(1.0),

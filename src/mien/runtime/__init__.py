@@ -6,16 +6,35 @@ image, alpha = avatar.render(avatar.pose({"jawOpen": 0.6}), avatar.camera.resize
 """
 
 from mien.runtime.avatar import Avatar, load, render
+from mien.runtime.baked import (
+    AttributeNetwork,
+    Attributes,
+    BakedAvatar,
+    BlendSkinned,
+    Camera,
+    LinearBases,
+    MeshBound,
+    PortableAvatar,
+    Rig,
+    Static,
+)
 from mien.runtime.file import read_portable, write_portable
-from mien.runtime.model import Camera, PortableAvatar
 from mien.runtime.posing import Face, Gaussians, pose
 
 __all__ = [
+    "AttributeNetwork",
+    "Attributes",
     "Avatar",
+    "BakedAvatar",
+    "BlendSkinned",
     "Camera",
     "Face",
     "Gaussians",
+    "LinearBases",
+    "MeshBound",
     "PortableAvatar",
+    "Rig",
+    "Static",
     "load",
     "pose",
     "read_portable",

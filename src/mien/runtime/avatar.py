@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from mien import _native
+from mien.runtime.baked import Camera, PortableAvatar
 from mien.runtime.file import read_portable
-from mien.runtime.model import Camera, PortableAvatar
 from mien.runtime.posing import Face, Gaussians, pose
 from mien.runtime.rotation import compose_rigid
 from mien.threads import asked_threads

@@ -9,10 +9,10 @@ import numpy as np
 from mien.errors import UserError
 from mien.inside import is_one_line
 from mien.limits import LARGEST_NUMBER, are_indices, camera_fault, is_moderate, skeleton_fault
-from mien.runtime.model import (
+from mien.runtime.baked import (
     AttributeNetwork,
     Attributes,
-    Baked,
+    BakedAvatar,
     BlendSkinned,
     LinearBases,
     MeshBound,
@@ -37,7 +37,7 @@ def check(avatar: PortableAvatar, where: str) -> None:
         raise UserError(f"{where}: {reason}; export it again with `mien export`")
 
 
-def baked_fault(baked: Baked) -> str | None:
+def baked_fault(baked: BakedAvatar) -> str | None:
     """The reason why a baked avatar cannot be posed, or None if it can."""
     return next(_baked_faults(baked), None)
 
@@ -64,14 +64,14 @@ def _faults(avatar: PortableAvatar) -> Iterator[str]:
         yield "a name in it is not in one line"
 
 
-def _names(baked: Baked) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _names(baked: BakedAvatar) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The names of the expressions and of the free joints."""
     if isinstance(baked, Static):
         return baked.expression_names, baked.joint_names
     return baked.rig.expression_names, _free_names(baked.rig)
 
 
-def _baked_faults(baked: Baked) -> Iterator[str]:
+def _baked_faults(baked: BakedAvatar) -> Iterator[str]:
     yield from _number_faults(baked)
     names, free = _names(baked)
     attributes, n = baked.attributes, len(baked.attributes.quats)

@@ -1,7 +1,7 @@
 """The .mien file: one safetensors file with metadata that gives its arrays their meaning (docs/avatar_file.md).
 
 The metadata has one entry, `mien`, a json text: `format` = "mien.baked", `version`, `sha256` of content and arrays, and
-`content`: the nested classes of `mien.runtime.model`, each with its `kind`. Arrays are objects {"tensor": NAME}.
+`content`: the nested classes of `mien.runtime.baked`, each with its `kind`. Arrays are objects {"tensor": NAME}.
 """
 
 import hashlib
@@ -19,8 +19,8 @@ from mien.bounded import parse_json
 from mien.config import decode
 from mien.errors import UserError
 from mien.files import check_writable, expect_whole, read_safetensors, write_arrays
+from mien.runtime.baked import PortableAvatar
 from mien.runtime.checks import check
-from mien.runtime.model import PortableAvatar
 
 FORMAT, VERSION = "mien.baked", 1
 ENDING = ".mien"

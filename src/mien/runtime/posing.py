@@ -1,4 +1,4 @@
-"""Posing in numpy: the Gaussians for face parameters, like `mien.avatar.pose_baked` in torch, for one timestep."""
+"""Posing without torch: the Gaussians of a baked avatar for one timestep. This is the reference for other runtimes."""
 
 from dataclasses import dataclass, fields
 from weakref import WeakKeyDictionary
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mien import _native
-from mien.runtime.model import AttributeNetwork, Attributes, Baked, BlendSkinned, LinearBases, MeshBound, Rig
+from mien.runtime.baked import AttributeNetwork, Attributes, BakedAvatar, BlendSkinned, LinearBases, MeshBound, Rig
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * coefficient."""
@@ -55,7 +55,7 @@ class Gaussians:
         return len(self.means)
 
 
-def pose(baked: Baked, face: Face) -> Gaussians:
+def pose(baked: BakedAvatar, face: Face) -> Gaussians:
     """The Gaussians of a face."""
     if isinstance(baked, MeshBound):
         return _pose_mesh_bound(baked, face)

@@ -183,7 +183,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     state.density.observe(posed, rendering)
     state.adam.step(groups, progress)
     random = partial(density_random, settings, state.step)
-    state.density.control(avatar.gaussian_store(), posed, progress, random)
+    state.density.adapt(avatar.gaussian_store(), posed, progress, random)
 
     state.step += 1
     elapsed = time.perf_counter() - began

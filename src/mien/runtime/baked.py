@@ -1,4 +1,10 @@
-"""The content of a .mien file as numpy arrays. `mien.avatar.baked` has the same classes and fields with tensors.
+"""Baked avatars: the records that `mien.avatar.Avatar.bake` returns and that .mien files hold, as numpy arrays.
+
+They are a small closed family, so that exporters, the web and game engines read them without knowing the method. The
+Gaussians' centres move with a mesh (`MeshBound`), move by their own blend directions and skinning weights
+(`BlendSkinned`), or do not move at all (`Static`). Their attributes are constant, or depend on the expression linearly
+(`LinearBases`) or through a small network (`AttributeNetwork`). `mien.runtime.posing` is the reference implementation
+of posing. Files hold the names of these classes and of their fields, so neither can change.
 
 Letters in shapes mean the same in the whole file: n Gaussians, m points of the rig, f triangles, e expressions, k
 joints, j free joints, p pose correctives (9 per free joint), s SH coefficients per channel.
@@ -13,10 +19,10 @@ from jaxtyping import Float32, Int32
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """m points of one person, in the head frame, that move with expression and joints. Identity is applied."""
+    """m points of one person that move like a face model's vertices (`FaceModel.head_vertices`), identity applied."""
 
     template: Float32[np.ndarray, "m 3"]
-    """Rest positions in metres."""
+    """Rest positions in the head frame, in metres."""
     expression_names: tuple[str, ...]
     expression_basis: Float32[np.ndarray, "e m 3"]
     joint_names: tuple[str, ...]
@@ -52,57 +58,76 @@ class LinearBases:
 
 @dataclass(frozen=True, eq=False)
 class AttributeNetwork:
-    """A small network, the same for all Gaussians. Its outputs are added to the raw values."""
+    """A small network, the same for all Gaussians. Its outputs are added to the raw values.
+
+    Its input is a row of `base` with an addition. With `features`, two sums are added to the first w columns: `basis`
+    weighted by the expression, and `joint_basis` weighted by the free joints. With `displacement`, the centre's motion
+    from the rig's template is appended, in metres.
+    """
 
     input: Literal["features", "displacement"]
     base: Float32[np.ndarray, "n _"]
     basis: Float32[np.ndarray, "_ n _"]
+    """[e, n, w]. With `displacement` it has no entries."""
     weights: tuple[Float32[np.ndarray, "_ _"], ...]
+    """Weights of each layer, [out, in]."""
     biases: tuple[Float32[np.ndarray, " _"], ...]
     activation: Literal["relu", "leaky_relu", "softplus"]
+    """Activation between layers. The slope of leaky_relu is 0.01."""
     outputs: tuple[str, ...]
+    """Names out of quats, log_scales, opacity_logits and sh, in the order of the last layer's columns."""
     joint_basis: Float32[np.ndarray, "_ n _"] | None = None
+    """[3 j, n, w]: for each free joint, the change per radian of each component of its axis-angle vector."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshBound:
-    """Gaussians in the frames of a mesh's triangles (method: gaussian_avatars)."""
+    """Gaussians in the frames of a mesh's triangles."""
 
     rig: Rig
+    """The mesh's vertices."""
     faces: Int32[np.ndarray, "f 3"]
     face_index: Int32[np.ndarray, " n"]
+    """Index into `faces` for each Gaussian."""
     means: Float32[np.ndarray, "n 3"]
+    """Centres in the triangle's frame and units, like the scales and rotations in `attributes`."""
     attributes: Attributes
     sh_frame: Literal["world", "head"]
+    """Frame of the view direction for spherical harmonics."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlendSkinned:
-    """Gaussians that each have their own blend directions and skinning weights (method: mono_gaussian_avatar)."""
+    """Gaussians that each have their own blend directions and skinning weights."""
 
     rig: Rig
+    """The Gaussians' own centres."""
     attributes: Attributes
     scale_activation: Literal["exp", "sigmoid"] = "exp"
     scale_gain: float = 1.0
+    """With `sigmoid`: scale = gain * sigmoid(raw) + offset, in metres."""
     scale_offset: float = 0.0
     colour_activation: Literal["sh", "sigmoid"] = "sh"
+    """With `sigmoid`: the only SH coefficient is the logit of the colour."""
     bases: LinearBases | None = None
     network: AttributeNetwork | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Static:
-    """Gaussians that do not move in the head frame (method: headgas)."""
+    """Gaussians that do not move in the head frame."""
 
     means: Float32[np.ndarray, "n 3"]
+    """Centres in the head frame, in metres."""
     attributes: Attributes
     expression_names: tuple[str, ...]
     joint_names: tuple[str, ...] = ()
+    """Free joints, in the order of the network's `joint_basis`."""
     bases: LinearBases | None = None
     network: AttributeNetwork | None = None
 
 
-Baked = MeshBound | BlendSkinned | Static
+BakedAvatar = MeshBound | BlendSkinned | Static
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +181,7 @@ class About:
 class PortableAvatar:
     """Everything that a program needs to pose and show an avatar."""
 
-    baked: Baked
+    baked: BakedAvatar
     expression_names: tuple[str, ...]
     expression_bounds: Float32[np.ndarray, "e 2"]
     """Range of each expression that the face model can show. Equal bounds mean that the expression does nothing."""

@@ -1,0 +1,28 @@
+"""Density control: when and where Gaussians are added and removed. Each strategy is one file, which tells its loop.
+
+| a method's `density()` returns | strategy |
+|---|---|
+| `GradientDensity` | `gradient.py`: duplicates, splits and prunes Gaussians, and resets opacities |
+| `RefillDensity` | `refill.py`: prunes Gaussians that no view has shown, then refills up to a target |
+| `FixedDensity` | `strategy.py`: changes nothing |
+
+Strategies see a `GaussianStore`, the posed Gaussians, the rendering, and the method's hooks (`mien.avatar.density`),
+but never the method. They keep statistics with one entry per Gaussian, which checkpoints save.
+"""
+
+from mien.avatar import DensityControl, FixedDensity, GaussianStore, GradientDensity, RefillDensity
+from mien.training.density.gradient import GradientStrategy
+from mien.training.density.refill import RefillStrategy
+from mien.training.density.strategy import DensityStrategy, FixedStrategy
+
+__all__ = ["DensityStrategy", "FixedStrategy", "GradientStrategy", "RefillStrategy", "density_strategy"]
+
+
+def density_strategy(density: DensityControl, store: GaussianStore) -> DensityStrategy:
+    """The strategy that a method's description asks for."""
+    if isinstance(density, GradientDensity):
+        return GradientStrategy(density, len(store), store[store.names()[0]].device)
+    if isinstance(density, RefillDensity):
+        return RefillStrategy(density, len(store), store[store.names()[0]].device)
+    assert isinstance(density, FixedDensity)
+    return FixedStrategy()

@@ -1,0 +1,152 @@
+"""Density control by gradients (3D Gaussian Splatting, Kerbl et al. 2023, section 5).
+
+The loop, with the names of `GradientSettings`:
+
+1. In every step, after the backward pass, `observe` adds up the length of the gradient by each Gaussian's centre in
+   normalised device coordinates, counts the views that show the Gaussian, and notes its largest radius on screen and
+   its highest opacity.
+2. After `rounds` steps, evenly spread from `start` to `stop`, `adapt` runs a round:
+   - Prune (`_to_prune`): a Gaussian goes if its opacity is below `prune_opacity`. From the first opacity reset after
+     `start`, it also goes if it is larger than `prune_size`, or than `prune_radius` on screen. The method says which
+     opacity counts (`judged_opacities`) and can forbid prunes (`may_prune`). One Gaussian always stays.
+   - Grow (`_to_grow`): of the others, those grow whose mean gradient over the views that show them reaches
+     `grow_gradient`, strongest first, until there are `max_gaussians`. If such a Gaussian is larger than `split_size`,
+     two children from the method's hook `split` replace it. If it is smaller, a copy is added.
+   - The statistics start again.
+3. After the steps at `opacity_resets`, opacities above `reset_opacity` are lowered to it, if the method has such a
+   tensor (`opacity_logits`).
+
+The optimiser's state: Gaussians that stay keep their moments, and copies and children start with zero moments. A reset
+clears the moments of all opacities. The number of updates, which is one count per tensor, goes on.
+"""
+
+from functools import lru_cache
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien import _native
+from mien.arrays import unpacked
+from mien.avatar import GaussianStore, GradientDensity, Posed, Progress
+from mien.render.rendering import Rendering
+from mien.training.density.strategy import DensityStrategy, Random
+
+
+class GradientStrategy(DensityStrategy):
+    """Duplicates small and splits large Gaussians with strong gradients, prunes faint ones, and resets opacities."""
+
+    def __init__(self, density: GradientDensity, gaussians: int, device: torch.device):
+        self._density = density
+        self._device = device
+        self._restart(gaussians)
+
+    def observe(self, posed: Posed, rendering: Rendering) -> None:
+        """Add up the gradients of the centres in normalised device coordinates, for visible Gaussians."""
+        gradient = rendering.means2d_offset.grad
+        assert gradient is not None, "observe() needs the gradients of a backward pass"
+        height, width = rendering.image.shape[-3:-1]
+        # Scale pixels to normalised device coordinates, which span -1..1: the unit of the thresholds.
+        scale, opacities = (width / 2, height / 2), posed.gaussians.opacities.detach().reshape(-1)
+        statistics = (self._gradient_sums, self._views, self._largest_radii, self._highest_opacities)
+        if gradient.device.type == "cpu" and gradient.dtype == torch.float32:
+            arrays = unpacked(gradient, rendering.radii, opacities, *statistics)
+            _native.observe_view(scale, *arrays)
+        else:
+            observe_reference(gradient, rendering.radii, opacities, scale, *statistics)
+
+    def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
+        """Add and prune Gaussians in rounds, and reset opacities at their times."""
+        settings = self._density.settings
+        done = progress.step + 1
+        changed = done in _round_steps(settings.start, settings.stop, settings.rounds, progress.steps)
+        if changed:
+            self._grow_and_prune(store, posed, progress, random())
+            self._restart(len(store))
+        name = self._density.opacity_logits
+        if name is not None and done in {max(1, round(time * progress.steps)) for time in settings.opacity_resets}:
+            ceiling = torch.logit(torch.tensor(settings.reset_opacity))
+            store.assign(name, store[name].detach().clamp_max(float(ceiling)))
+        return changed
+
+    def state(self) -> dict[str, Tensor]:
+        """The statistics since the last round, under the names that checkpoints have always used."""
+        return {
+            "pull": self._gradient_sums,
+            "seen": self._views,
+            "radius": self._largest_radii,
+            "opacity": self._highest_opacities,
+        }
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore what `state` returned."""
+        self._gradient_sums, self._views, self._largest_radii, self._highest_opacities = (
+            state[name].to(self._device, copy=True) for name in ("pull", "seen", "radius", "opacity")
+        )
+
+    def _restart(self, gaussians: int) -> None:
+        self._gradient_sums = torch.zeros(gaussians, device=self._device)
+        self._views = torch.zeros(gaussians, device=self._device)
+        self._largest_radii = torch.zeros(gaussians, dtype=torch.int32, device=self._device)
+        self._highest_opacities = torch.zeros(gaussians, device=self._device)
+
+    def _grow_and_prune(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> None:
+        settings = self._density.settings
+        sizes = posed.gaussians.scales.detach().reshape(len(store), 3).amax(-1)
+        prune = self._density.may_prune(store, self._to_prune(store, sizes, progress))
+        if bool(prune.all()):
+            # Without any Gaussian there are no gradients to grow by, so keep the one that was most visible.
+            prune[self._highest_opacities.argmax()] = False
+        grow = self._to_grow(~prune, budget=settings.max_gaussians - int((~prune).sum()))
+        split = grow & (sizes > settings.split_size)
+        parents = (grow & ~split).nonzero()[:, 0]
+        store.append(parents)
+        # Both children of a split replace their parent.
+        parents = split.nonzero()[:, 0].repeat(2)
+        noise = torch.randn(len(parents), 3, generator=random).to(sizes)
+        store.append(parents, self._density.split(store, parents, noise))
+        kept = torch.ones(len(store), dtype=torch.bool, device=prune.device)
+        kept[: len(prune)] = ~(prune | split)
+        store.select(kept)
+
+    def _to_prune(self, store: GaussianStore, sizes: Float[Tensor, " n"], progress: Progress) -> Bool[Tensor, " n"]:
+        settings = self._density.settings
+        prune = self._density.judged_opacities(store, self._highest_opacities) < settings.prune_opacity
+        later_resets = [time for time in settings.opacity_resets if time > settings.start]
+        if later_resets and progress.fraction > min(later_resets):
+            prune = prune | (sizes > settings.prune_size)
+            if settings.prune_radius > 0:
+                prune = prune | (self._largest_radii > settings.prune_radius)
+        return prune
+
+    def _to_grow(self, candidates: Bool[Tensor, " n"], budget: int) -> Bool[Tensor, " n"]:
+        """Gaussians above the threshold, or those with the largest gradients if the budget allows fewer."""
+        gradients = torch.where(candidates, self._gradient_sums / self._views.clamp_min(1), -1.0)
+        grow = gradients >= self._density.settings.grow_gradient
+        if int(grow.sum()) > budget:
+            strongest = gradients.argsort(descending=True, stable=True)[: max(budget, 0)]
+            grow = torch.zeros_like(grow).index_fill(0, strongest, True)
+        return grow
+
+
+def observe_reference(
+    gradient: Float[Tensor, "n 2"],
+    radii: Int[Tensor, " n"],
+    opacities: Float[Tensor, " n"],
+    scale: tuple[float, float],
+    *statistics: Tensor,
+) -> None:
+    """`_native.observe_view` in plain PyTorch: add a step to sums, views, largest radii and highest opacities."""
+    gradient_sums, views, largest_radii, highest_opacities = statistics
+    # Culled Gaussians have no gradient, so the sum needs no mask.
+    gradient_sums += torch.hypot(gradient[:, 0] * scale[0], gradient[:, 1] * scale[1])
+    views += radii > 0
+    torch.maximum(largest_radii, radii, out=largest_radii)
+    torch.maximum(highest_opacities, opacities, out=highest_opacities)
+
+
+@lru_cache
+def _round_steps(start: float, stop: float, rounds: int, steps: int) -> frozenset[int]:
+    """The numbers of steps after which the rounds happen, evenly from `start` to `stop` (fractions of the run)."""
+    gaps = max(rounds - 1, 1)
+    return frozenset(max(1, round((start + (stop - start) * index / gaps) * steps)) for index in range(rounds))

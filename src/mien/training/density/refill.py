@@ -1,0 +1,70 @@
+"""Density control by prune and refill (MonoGaussianAvatar, SIGGRAPH 2024; PointAvatar, CVPR 2023).
+
+The loop, with the names of `RefillSettings`:
+
+1. In every step, after the backward pass, `observe` notes the highest opacity that each Gaussian has had.
+2. After the steps at `times`, `adapt` runs a round:
+   - Prune: a Gaussian goes if its opacity stayed below `prune_opacity` in all views since the last round. The method
+     can judge by another opacity (`judged_opacities`) and can forbid prunes (`may_prune`). One Gaussian always stays.
+   - Refill: if fewer Gaussians are left than the round's target, children of random survivors are added up to it. The
+     method's hook `refill` says in what they differ from their parents.
+   - The statistics start again.
+
+The optimiser's state: survivors keep their moments, and children start with zero moments. The number of updates, which
+is one count per tensor, goes on.
+"""
+
+import torch
+from torch import Tensor
+
+from mien.avatar import GaussianStore, Posed, Progress, RefillDensity
+from mien.render.rendering import Rendering
+from mien.training.density.strategy import DensityStrategy, Random
+
+
+class RefillStrategy(DensityStrategy):
+    """Deletes Gaussians that no view has shown, then refills up to the target with children of random survivors."""
+
+    def __init__(self, density: RefillDensity, gaussians: int, device: torch.device):
+        self._density = density
+        self._highest_opacities = torch.zeros(gaussians, device=device)
+
+    def observe(self, posed: Posed, rendering: Rendering) -> None:
+        """Update each Gaussian's highest opacity."""
+        torch.maximum(
+            self._highest_opacities, posed.gaussians.opacities.detach().reshape(-1), out=self._highest_opacities
+        )
+
+    def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
+        """Prune and refill at the times of the rounds."""
+        settings = self._density.settings
+        due = [
+            target
+            for time, target in zip(settings.times, settings.targets, strict=True)
+            if max(1, round(time * progress.steps)) == progress.step + 1
+        ]
+        if not due:
+            return False
+        unseen = self._density.judged_opacities(store, self._highest_opacities) < settings.prune_opacity
+        kept = ~self._density.may_prune(store, unseen)
+        if not bool(kept.any()):
+            # Without any Gaussian there is no parent for a refill, so keep the one that was most visible.
+            kept[self._highest_opacities.argmax()] = True
+        store.select(kept)
+        missing = due[-1] - len(store)
+        if missing > 0:
+            generator = random()
+            parents = torch.randint(len(store), (missing,), generator=generator)
+            noise = torch.rand(missing, 3, generator=generator).to(self._highest_opacities) - 0.5
+            parents = parents.to(noise.device)
+            store.append(parents, self._density.refill(store, parents, noise, progress.fraction))
+        self._highest_opacities = torch.zeros(len(store), device=self._highest_opacities.device)
+        return True
+
+    def state(self) -> dict[str, Tensor]:
+        """The statistics since the last round."""
+        return {"opacity": self._highest_opacities}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore what `state` returned."""
+        self._highest_opacities = state["opacity"].to(self._highest_opacities, copy=True)

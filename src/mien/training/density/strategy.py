@@ -1,0 +1,54 @@
+"""The interface of density control, and the strategy that never changes anything."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from mien.avatar import GaussianStore, Posed, Progress
+from mien.render.rendering import Rendering
+
+Random = Callable[[], torch.Generator]
+"""Creates the generator for a step's random numbers. Few steps need one."""
+
+
+class DensityStrategy(ABC):
+    """Observes every step, and changes the store in some of them."""
+
+    @abstractmethod
+    def observe(self, posed: Posed, rendering: Rendering) -> None:
+        """Update the statistics after a step's backward pass. `posed` holds one timestep."""
+
+    @abstractmethod
+    def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
+        """Add and remove Gaussians if it is time for that. Called after the optimiser's step.
+
+        Returns whether the number or the order of the Gaussians may have changed.
+        """
+
+    @abstractmethod
+    def state(self) -> dict[str, Tensor]:
+        """Tensors that a checkpoint has to save."""
+
+    @abstractmethod
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore what `state` returned."""
+
+
+class FixedStrategy(DensityStrategy):
+    """Never changes the store."""
+
+    def observe(self, posed: Posed, rendering: Rendering) -> None:
+        """Do nothing."""
+
+    def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
+        """Return False, because the store never changes."""
+        return False
+
+    def state(self) -> dict[str, Tensor]:
+        """An empty dict."""
+        return {}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Do nothing."""
