@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <iterator>
 #include <limits>
 #include <stdexcept>
 #include <string>
@@ -102,10 +103,51 @@ void check_indices(const A& indices, int64_t count, const char* message, int64_t
   if (bits >> 63) throw std::out_of_range(message);
 }
 
-// Item `index` of a tuple whose length was checked.
+// Arguments that belong together, as Python passes them: a tuple, usually the named one that `bind_group` makes. `T`
+// names the group (kName) and its fields (kFields), and its constructor reads them.
 template <typename T>
-T item(const nb::tuple& tuple, size_t index, const char* name) {
-  T value;
-  if (nb::try_cast<T>(tuple[index], value, false)) return value;
-  throw nb::type_error((std::string(name) + ": not the array that belongs there").c_str());
+struct Group {
+  nb::tuple items;
+
+  // Reads all fields, in the order of kFields. Errors name the field that does not fit.
+  template <typename... Fields>
+  void read(Fields&... fields) const {
+    static_assert(sizeof...(Fields) == std::size(T::kFields));
+    if (items.size() != sizeof...(Fields)) {
+      throw nb::type_error((std::string(T::kName) + " has " + std::to_string(sizeof...(Fields)) + " items, not " +
+                            std::to_string(items.size()))
+                               .c_str());
+    }
+    size_t index = 0;
+    (read_field(index++, fields), ...);
+  }
+
+ private:
+  template <typename Field>
+  void read_field(size_t index, Field& field) const {
+    if (nb::try_cast<Field>(items[index], field)) return;
+    throw nb::type_error((std::string(T::kName) + "." + T::kFields[index] + " has the wrong type or shape").c_str());
+  }
+};
+
+namespace nanobind::detail {
+template <typename T>
+struct type_caster<Group<T>> {
+  NB_TYPE_CASTER(Group<T>, const_name(T::kName))
+
+  bool from_python(handle source, uint32_t, cleanup_list*) noexcept {
+    if (!PyTuple_Check(source.ptr())) return false;
+    value.items = nb::borrow<nb::tuple>(source);
+    return true;
+  }
+};
+}  // namespace nanobind::detail
+
+// Defines the named tuple that Python passes as a `Group<T>`.
+template <typename T>
+void bind_group(nb::module_& module) {
+  nb::list fields;
+  for (const char* field : T::kFields) fields.append(field);
+  const nb::object named_tuple = nb::module_::import_("collections").attr("namedtuple");
+  module.attr(T::kName) = named_tuple(T::kName, fields, nb::arg("module") = module.attr("__name__"));
 }

@@ -8,6 +8,7 @@
 
 #include "arrays.h"
 #include "face.h"
+#include "face_arrays.h"
 #include "pool.h"
 
 namespace nb = nanobind;
@@ -43,71 +44,51 @@ mien::FaceModelData make_model(const In<-1, -1, 3>& expression_basis, const std:
                                skinning_weights.data());
 }
 
-// The arrays of all timesteps; `pose(b)` are those of one.
-struct Batch {
-  const mien::FaceModelData& model;
-  const In<-1, 3>&rest, &joint_rest;
-  const In<-1, -1>& expression;
-  const In<-1, -1, 3>& joints;
-  const std::optional<In<-1, 3>>&head_rotation, &head_translation;
-
-  size_t size() const { return expression.shape(0); }
-  void check() const {
-    const size_t b = size();
-    require(rest.shape(0) == static_cast<size_t>(model.vertices) &&
-                joint_rest.shape(0) == static_cast<size_t>(model.joints) &&
-                expression.shape(1) == static_cast<size_t>(model.expressions) && joints.shape(0) == b &&
-                joints.shape(1) == static_cast<size_t>(model.free_joints) &&
-                head_rotation.has_value() == head_translation.has_value() &&
-                (!head_rotation || (head_rotation->shape(0) == b && head_translation->shape(0) == b)),
-            "the arrays do not fit the face model");
-  }
-  mien::FacePose pose(size_t b) const {
-    return {rest.data(),
-            joint_rest.data(),
-            expression.data() + b * model.expressions,
-            joints.data() + b * 3 * model.free_joints,
-            head_rotation ? head_rotation->data() + 3 * b : nullptr,
-            head_translation ? head_translation->data() + 3 * b : nullptr};
-  }
-};
-
-void forward(const mien::FaceModelData& model, const In<-1, 3>& rest, const In<-1, 3>& joint_rest,
-             const In<-1, -1>& expression, const In<-1, -1, 3>& joints, const std::optional<In<-1, 3>>& head_rotation,
-             const std::optional<In<-1, 3>>& head_translation, const Out<-1, -1, 3>& shaped,
+void forward(const mien::FaceModelData& model, const Group<FaceArrays>& group, const Out<-1, -1, 3>& shaped,
              const Out<-1, -1, 3>& vertices) {
-  const Batch batch{model, rest, joint_rest, expression, joints, head_rotation, head_translation};
-  batch.check();
+  const FaceArrays face(model, group);
   const size_t floats = 3 * static_cast<size_t>(model.vertices);
-  require(has_shape(shaped, batch.size(), model.vertices, 3) && same_shape(vertices, shaped), "the outputs do not fit");
+  require(has_shape(shaped, face.size(), model.vertices, 3) && same_shape(vertices, shaped), "the outputs do not fit");
   const nb::gil_scoped_release release;
-  mien::parallel_for(static_cast<int64_t>(batch.size()), [&](int64_t b) {
-    mien::pose_face(model, batch.pose(b), shaped.data() + b * floats, vertices.data() + b * floats);
+  mien::parallel_for(static_cast<int64_t>(face.size()), [&](int64_t b) {
+    mien::pose_face(model, face.pose(b), shaped.data() + b * floats, vertices.data() + b * floats);
   });
 }
 
-void backward(const mien::FaceModelData& model, const In<-1, 3>& rest, const In<-1, 3>& joint_rest,
-              const In<-1, -1>& expression, const In<-1, -1, 3>& joints, const std::optional<In<-1, 3>>& head_rotation,
-              const std::optional<In<-1, 3>>& head_translation, const In<-1, -1, 3>& shaped,
-              const In<-1, -1, 3>& grad_vertices, const Out<-1, -1, 3>& grad_rest,
-              const Out<-1, -1, 3>& grad_joint_rest, const Out<-1, -1>& grad_expression,
-              const Out<-1, -1, 3>& grad_joints, const Out<-1, 3>& grad_head_rotation,
-              const Out<-1, 3>& grad_head_translation) {
-  const Batch batch{model, rest, joint_rest, expression, joints, head_rotation, head_translation};
-  batch.check();
-  const size_t b = batch.size(), floats = 3 * static_cast<size_t>(model.vertices);
+// Gradients of b timesteps, one of each per timestep.
+struct FaceGradientArrays : FaceArrayNames {
+  Out<-1, -1, 3> rest, joint_rest;
+  Out<-1, -1> expression;
+  Out<-1, -1, 3> joints;
+  Out<-1, 3> head_rotation, head_translation;
+
+  explicit FaceGradientArrays(const Group<FaceGradientArrays>& group) {
+    group.read(rest, joint_rest, expression, joints, head_rotation, head_translation);
+  }
+  mien::FaceGradients of(size_t b) const {
+    return {rest.data() + b * 3 * rest.shape(1),
+            joint_rest.data() + b * 3 * joint_rest.shape(1),
+            expression.data() + b * expression.shape(1),
+            joints.data() + b * 3 * joints.shape(1),
+            head_rotation.data() + 3 * b,
+            head_translation.data() + 3 * b};
+  }
+};
+
+void backward(const mien::FaceModelData& model, const Group<FaceArrays>& group, const In<-1, -1, 3>& shaped,
+              const In<-1, -1, 3>& grad_vertices, const Group<FaceGradientArrays>& gradient_group) {
+  const FaceArrays face(model, group);
+  const FaceGradientArrays gradients(gradient_group);
+  const size_t b = face.size(), floats = 3 * static_cast<size_t>(model.vertices);
   require(has_shape(shaped, b, model.vertices, 3) && same_shape(grad_vertices, shaped) &&
-              same_shape(grad_rest, shaped) && has_shape(grad_joint_rest, b, model.joints, 3) &&
-              same_shape(grad_expression, expression) && same_shape(grad_joints, joints) &&
-              has_shape(grad_head_rotation, b, 3) && has_shape(grad_head_translation, b, 3),
+              same_shape(gradients.rest, shaped) && has_shape(gradients.joint_rest, b, model.joints, 3) &&
+              same_shape(gradients.expression, face.expression) && same_shape(gradients.joints, face.joints) &&
+              has_shape(gradients.head_rotation, b, 3) && has_shape(gradients.head_translation, b, 3),
           "a gradient must have the shape of its array");
   const nb::gil_scoped_release release;
   mien::parallel_for(static_cast<int64_t>(b), [&](int64_t i) {
-    mien::pose_face_backward(
-        model, batch.pose(i), shaped.data() + i * floats, grad_vertices.data() + i * floats,
-        {grad_rest.data() + i * floats, grad_joint_rest.data() + i * 3 * model.joints,
-         grad_expression.data() + i * model.expressions, grad_joints.data() + i * 3 * model.free_joints,
-         grad_head_rotation.data() + 3 * i, grad_head_translation.data() + 3 * i});
+    mien::pose_face_backward(model, face.pose(i), shaped.data() + i * floats, grad_vertices.data() + i * floats,
+                             gradients.of(i));
   });
 }
 
@@ -162,13 +143,11 @@ void bind_face(nb::module_& module) {
   nb::class_<mien::FaceModelData>(module, "FaceModelData", "A face model's constants, compressed.");
   module.def("make_face_model", &make_model, "expression_basis"_a, "pose_basis"_a.none(), "rotation_basis"_a,
              "translation_basis"_a, "skinning_weights"_a, "parents"_a, "is_free"_a);
-  module.def("pose_face", &forward, "model"_a, "rest"_a, "joint_rest"_a, "expression"_a, "joints"_a,
-             "head_rotation"_a.none(), "head_translation"_a.none(), "shaped"_a, "vertices"_a,
+  bind_group<FaceArrays>(module);
+  module.def("pose_face", &forward, "model"_a, "face"_a, "shaped"_a, "vertices"_a,
              "Fills the vertices of b timesteps, and those before the joints.");
-  module.def("pose_face_backward", &backward, "model"_a, "rest"_a, "joint_rest"_a, "expression"_a, "joints"_a,
-             "head_rotation"_a.none(), "head_translation"_a.none(), "shaped"_a, "grad_vertices"_a, "grad_rest"_a,
-             "grad_joint_rest"_a, "grad_expression"_a, "grad_joints"_a, "grad_head_rotation"_a,
-             "grad_head_translation"_a, "Fills the gradients, one of each a timestep.");
+  module.def("pose_face_backward", &backward, "model"_a, "face"_a, "shaped"_a, "grad_vertices"_a, "gradients"_a,
+             "Fills the gradients, one of each per timestep.");
   module.def("head_poses", &head_poses, "rotation"_a.noconvert(), "translation"_a.noconvert(),
              "transforms"_a.noconvert(), "Fills T_world_head of b timesteps.");
   module.def("compose_rigid", &compose_rigid, "first"_a, "second"_a, "out"_a);

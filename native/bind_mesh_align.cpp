@@ -21,15 +21,12 @@ using Points = Array<const float, nb::shape<-1, 3>>;
 using Faces = Array<const int64_t, nb::shape<-1, 3>>;
 using Picture = Array<const float, nb::shape<-1, -1, 3>>;
 using Plane = Array<const float, nb::ndim<2>>;
-using Matrix3 = Array<const float, nb::shape<3, 3>>;
-using Matrix4 = Array<const float, nb::shape<4, 4>>;
-using Light = Array<const float, nb::shape<9, 3>>;
 
 // What stays the same over the frames of a sequence, checked once.
 class AlignSurface {
  public:
-  AlignSurface(const Faces& faces, Array<const float, nb::shape<-1, 3, 2>> uv, Array<const uint8_t, nb::ndim<1>> used,
-               Picture albedo, Plane trust, float sigma, float outlier, float least_cosine)
+  AlignSurface(const Faces& faces, In<-1, 3, 2> uv, Array<const uint8_t, nb::ndim<1>> used, Picture albedo, Plane trust,
+               float sigma, float outlier, float least_cosine)
       : faces_(faces.data(), faces.data() + faces.size()),
         uv_(std::move(uv)),
         used_(std::move(used)),
@@ -37,7 +34,8 @@ class AlignSurface {
         trust_(std::move(trust)),
         options_{sigma, outlier, least_cosine} {
     const int face_count = checked_length(faces.shape(0), "triangles");
-    require(uv_.shape(0) == faces.shape(0) && used_.shape(0) == faces.shape(0), "uv and used must have a row a face");
+    require(uv_.shape(0) == faces.shape(0) && used_.shape(0) == faces.shape(0),
+            "uv and used must have one row per face");
     require(has_shape(albedo_, trust_.shape(0), trust_.shape(1), 3) && trust_.size() > 0,
             "albedo and trust must be of one texture");
     const PictureSize texture = picture_size(trust_);
@@ -57,7 +55,7 @@ class AlignSurface {
 
  private:
   std::vector<int64_t> faces_;  // its own, so that nobody changes what was checked
-  Array<const float, nb::shape<-1, 3, 2>> uv_;
+  In<-1, 3, 2> uv_;
   Array<const uint8_t, nb::ndim<1>> used_;
   Picture albedo_;
   Plane trust_;
@@ -66,87 +64,120 @@ class AlignSurface {
   int64_t vertices_ = 0;  // that the faces name
 };
 
-mien::AlignFrame frame_of(const Points& vertices, const Points& normals, const Matrix3& K, const Matrix4& viewmat,
-                          const Picture& image, const Plane& mask, const Light& light) {
-  const PictureSize size = picture_size(image);
-  require(normals.shape(0) == vertices.shape(0), "normals must have a row a vertex");
-  require(has_shape(mask, size.height, size.width), "image and mask must be of one picture");
-  return {{K.data(), viewmat.data(), size.width, size.height}, normals.data(), image.data(), mask.data(), light.data()};
-}
+// A posed surface in a picture under a light.
+struct Sighting {
+  static constexpr char kName[] = "SightingArrays";
+  static constexpr const char* kFields[] = {"vertices", "normals", "K", "viewmat", "image", "mask", "light"};
+  Points vertices, normals;
+  In<3, 3> K;
+  In<4, 4> viewmat;
+  Picture image;
+  Plane mask;
+  In<9, 3> light;
+  PictureSize size;
 
-std::pair<double, double> align_mesh(const AlignSurface& surface, const Points& vertices, const Points& normals,
-                                     const Matrix3& K, const Matrix4& viewmat, const Picture& image, const Plane& mask,
-                                     const Light& light, int high_pass,
-                                     const std::optional<Array<const float, nb::shape<-1, 3, -1>>>& jacobian,
-                                     const std::optional<Array<float, nb::ndim<2>>>& hessian,
-                                     const std::optional<Array<float, nb::ndim<1>>>& gradient,
-                                     const std::optional<Array<float, nb::shape<-1, -1, 3>>>& residual,
-                                     const std::optional<Array<float, nb::shape<-1, -1, 3>>>& smooth) {
-  const bool derive = jacobian.has_value();
-  require(derive == hessian.has_value() && derive == gradient.has_value(),
-          "jacobian, hessian and gradient go together");
-  const int parameters = derive ? checked_length(jacobian->shape(2), "parameters") : 0;
-  require(!derive || (jacobian->shape(0) == vertices.shape(0) && has_shape(*hessian, parameters, parameters) &&
-                      has_shape(*gradient, parameters)),
-          "jacobian, hessian and gradient must agree on vertices and parameters");
-  require((!residual || same_shape(*residual, image)) && (!smooth || same_shape(*smooth, image)),
+  explicit Sighting(const Group<Sighting>& group) {
+    group.read(vertices, normals, K, viewmat, image, mask, light);
+    size = picture_size(image);
+    require(normals.shape(0) == vertices.shape(0), "normals must have one row per vertex");
+    require(has_shape(mask, size.height, size.width), "image and mask must be of one picture");
+  }
+  mien::AlignFrame frame() const {
+    return {
+        {K.data(), viewmat.data(), size.width, size.height}, normals.data(), image.data(), mask.data(), light.data()};
+  }
+};
+
+// The Jacobian of the vertices, and the normal equations to be filled.
+struct Derivatives {
+  static constexpr char kName[] = "AlignDerivatives";
+  static constexpr const char* kFields[] = {"jacobian", "hessian", "gradient"};
+  In<-1, 3, -1> jacobian;
+  Out<-1, -1> hessian;
+  Out<-1> gradient;
+  int parameters;
+
+  Derivatives(const Group<Derivatives>& group, const Points& vertices) {
+    group.read(jacobian, hessian, gradient);
+    parameters = checked_length(jacobian.shape(2), "parameters");
+    require(jacobian.shape(0) == vertices.shape(0) && has_shape(hessian, parameters, parameters) &&
+                has_shape(gradient, parameters),
+            "jacobian, hessian and gradient must agree on vertices and parameters");
+  }
+};
+
+std::pair<double, double> align_mesh(const AlignSurface& surface, const Group<Sighting>& sighting_group, int high_pass,
+                                     const std::optional<Group<Derivatives>>& derivative_group,
+                                     const std::optional<Out<-1, -1, 3>>& residual,
+                                     const std::optional<Out<-1, -1, 3>>& smooth) {
+  const Sighting sighting(sighting_group);
+  std::optional<Derivatives> derivatives;
+  if (derivative_group) derivatives.emplace(*derivative_group, sighting.vertices);
+  require((!residual || same_shape(*residual, sighting.image)) && (!smooth || same_shape(*smooth, sighting.image)),
           "residual and smooth must be of the picture's size");
-  require(high_pass >= 0, "high_pass is a number of pixels, or 0");
-  const mien::Mesh mesh = surface.mesh(vertices);
-  const mien::AlignFrame frame = frame_of(vertices, normals, K, viewmat, image, mask, light);
-  const mien::AlignBuffers out{derive ? hessian->data() : nullptr, derive ? gradient->data() : nullptr,
+  require(high_pass >= 0, "high_pass must be a number of pixels, or 0");
+  const mien::Mesh mesh = surface.mesh(sighting.vertices);
+  const mien::AlignBuffers out{derivatives ? derivatives->hessian.data() : nullptr,
+                               derivatives ? derivatives->gradient.data() : nullptr,
                                residual ? residual->data() : nullptr, smooth ? smooth->data() : nullptr};
   const nb::gil_scoped_release release;
-  const mien::AlignResult result = mien::align_mesh(mesh, surface.surface(), frame, surface.options(), {high_pass},
-                                                    derive ? jacobian->data() : nullptr, parameters, out);
+  const mien::AlignResult result = mien::align_mesh(mesh, surface.surface(), sighting.frame(), surface.options(),
+                                                    {high_pass}, derivatives ? derivatives->jacobian.data() : nullptr,
+                                                    derivatives ? derivatives->parameters : 0, out);
   return {result.cost, result.weight};
 }
 
-void bake_texture(const AlignSurface& surface, const Points& vertices, const Points& normals, const Matrix3& K,
-                  const Matrix4& viewmat, const Picture& image, const Plane& mask, const Light& light,
+// Sums over sightings, for each texel.
+struct TextureSums {
+  static constexpr char kName[] = "TextureSums";
+  static constexpr const char* kFields[] = {"weight", "squares", "mixed", "image_squares"};
+  Out<-1, -1> weight;
+  Out<-1, -1, 3> squares, mixed, image_squares;
+
+  TextureSums(const Group<TextureSums>& group, int rows, int columns) {
+    group.read(weight, squares, mixed, image_squares);
+    require(has_shape(weight, rows, columns) && has_shape(squares, rows, columns, 3) && same_shape(mixed, squares) &&
+                same_shape(image_squares, squares),
+            "sums must be of the texture's size");
+  }
+};
+
+void bake_texture(const AlignSurface& surface, const Group<Sighting>& sighting_group,
                   const Array<const int32_t, nb::ndim<2>>& texel_face, const Picture& texel_barycentric,
-                  const Array<float, nb::ndim<2>>& weight, const Array<float, nb::ndim<3>>& squares,
-                  const Array<float, nb::ndim<3>>& mixed, const Array<float, nb::ndim<3>>& image_squares) {
+                  const Group<TextureSums>& sum_group) {
   const mien::TexturedSurface& textured = surface.surface();
   const int rows = textured.texture_height, columns = textured.texture_width;
-  const mien::Mesh mesh = surface.mesh(vertices);
-  require(has_shape(texel_face, rows, columns) && has_shape(texel_barycentric, rows, columns, 3) &&
-              has_shape(weight, rows, columns) && has_shape(squares, rows, columns, 3) && same_shape(mixed, squares) &&
-              same_shape(image_squares, squares),
-          "texels and sums must be of the texture's size");
-  const mien::AlignFrame frame = frame_of(vertices, normals, K, viewmat, image, mask, light);
+  const Sighting sighting(sighting_group);
+  const TextureSums sums(sum_group, rows, columns);
+  const mien::Mesh mesh = surface.mesh(sighting.vertices);
+  require(has_shape(texel_face, rows, columns) && has_shape(texel_barycentric, rows, columns, 3),
+          "texels must be of the texture's size");
   const nb::gil_scoped_release release;
   check_indices(texel_face, mesh.face_count, "the texels name a triangle that does not exist", -1);
-  mien::bake_texture(mesh, textured, frame, surface.options(), {texel_face.data(), texel_barycentric.data()},
-                     {weight.data(), squares.data(), mixed.data(), image_squares.data()});
+  mien::bake_texture(mesh, textured, sighting.frame(), surface.options(), {texel_face.data(), texel_barycentric.data()},
+                     {sums.weight.data(), sums.squares.data(), sums.mixed.data(), sums.image_squares.data()});
 }
 
-void light_equations(const AlignSurface& surface, const Points& vertices, const Points& normals, const Matrix3& K,
-                     const Matrix4& viewmat, const Picture& image, const Plane& mask, const Light& light,
+void light_equations(const AlignSurface& surface, const Group<Sighting>& sighting_group,
                      const Array<double, nb::shape<3, 9, 9>>& hessian, const Array<double, nb::shape<3, 9>>& right) {
-  const mien::Mesh mesh = surface.mesh(vertices);
-  const mien::AlignFrame frame = frame_of(vertices, normals, K, viewmat, image, mask, light);
+  const Sighting sighting(sighting_group);
+  const mien::Mesh mesh = surface.mesh(sighting.vertices);
   const nb::gil_scoped_release release;
-  mien::light_equations(mesh, surface.surface(), frame, surface.options(), hessian.data(), right.data());
+  mien::light_equations(mesh, surface.surface(), sighting.frame(), surface.options(), hessian.data(), right.data());
 }
 
 }  // namespace
 
 void bind_mesh_align(nb::module_& module) {
+  bind_group<Sighting>(module);
+  bind_group<Derivatives>(module);
+  bind_group<TextureSums>(module);
   nb::class_<AlignSurface>(module, "AlignSurface")
-      .def(nb::init<const Faces&, Array<const float, nb::shape<-1, 3, 2>>, Array<const uint8_t, nb::ndim<1>>, Picture,
-                    Plane, float, float, float>(),
-           "faces"_a.noconvert(), "uv"_a.noconvert(), "used"_a.noconvert(), "albedo"_a.noconvert(),
-           "trust"_a.noconvert(), "sigma"_a, "outlier"_a, "least_cosine"_a);
-  module.def("align_mesh", &align_mesh, "surface"_a, "vertices"_a.noconvert(), "normals"_a.noconvert(),
-             "K"_a.noconvert(), "viewmat"_a.noconvert(), "image"_a.noconvert(), "mask"_a.noconvert(),
-             "light"_a.noconvert(), "high_pass"_a, "jacobian"_a.none(), "hessian"_a.none(), "gradient"_a.none(),
+      .def(nb::init<const Faces&, In<-1, 3, 2>, Array<const uint8_t, nb::ndim<1>>, Picture, Plane, float, float,
+                    float>(),
+           "faces"_a, "uv"_a, "used"_a, "albedo"_a, "trust"_a, "sigma"_a, "outlier"_a, "least_cosine"_a);
+  module.def("align_mesh", &align_mesh, "surface"_a, "sighting"_a, "high_pass"_a, "derivatives"_a.none(),
              "residual"_a.none(), "smooth"_a.none());
-  module.def("bake_texture", &bake_texture, "surface"_a, "vertices"_a.noconvert(), "normals"_a.noconvert(),
-             "K"_a.noconvert(), "viewmat"_a.noconvert(), "image"_a.noconvert(), "mask"_a.noconvert(),
-             "light"_a.noconvert(), "texel_face"_a.noconvert(), "texel_barycentric"_a.noconvert(),
-             "weight"_a.noconvert(), "squares"_a.noconvert(), "mixed"_a.noconvert(), "image_squares"_a.noconvert());
-  module.def("light_equations", &light_equations, "surface"_a, "vertices"_a.noconvert(), "normals"_a.noconvert(),
-             "K"_a.noconvert(), "viewmat"_a.noconvert(), "image"_a.noconvert(), "mask"_a.noconvert(),
-             "light"_a.noconvert(), "hessian"_a.noconvert(), "right"_a.noconvert());
+  module.def("bake_texture", &bake_texture, "surface"_a, "sighting"_a, "texel_face"_a, "texel_barycentric"_a, "sums"_a);
+  module.def("light_equations", &light_equations, "surface"_a, "sighting"_a, "hessian"_a, "right"_a);
 }

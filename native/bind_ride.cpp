@@ -9,6 +9,7 @@
 #include "activation.h"
 #include "arrays.h"
 #include "face.h"
+#include "face_arrays.h"
 #include "memory.h"
 #include "rig.h"
 
@@ -21,14 +22,16 @@ namespace {
 struct Ride {
   // Whose it is: not read, and maybe gone. Another model at the same place would have to be of the same sizes.
   const void *model, *topology;
+  bool in_head;
   int vertex_count;
   size_t face_count;
   mien::Recycled<float> shaped, vertices;
   mien::Recycled<mien::TriangleFrame> frames;
 
-  Ride(const mien::FaceModelData& model, const mien::RigTopology& topology)
+  Ride(const mien::FaceModelData& model, const mien::RigTopology& topology, bool in_head)
       : model(&model),
         topology(&topology),
+        in_head(in_head),
         vertex_count(model.vertices),
         face_count(topology.faces.size() / 3),
         shaped(3 * static_cast<size_t>(vertex_count)),
@@ -40,119 +43,154 @@ struct Ride {
   }
 };
 
-// The inputs of both passes.
-struct Rider {
-  const mien::FaceModelData& model;
-  const mien::RigTopology& topology;
-  const In<-1, 3>&rest, &joint_rest;
-  const In<1, -1>& expression;
-  const In<1, -1, 3>& joints;
-  const In<1, 3>&head_rotation, &head_translation;
-  bool in_head;
-  const In<-1, 3>& means;
-  const In<-1, 4>& quats;
-  const In<-1, 3>& log_scales;
-  const In<-1>& opacity_logits;
+// Gaussians in units of their triangles: values, or gradients of them.
+template <typename T>
+struct LocalGaussians {
+  static constexpr char kName[] = "LocalGaussians";
+  static constexpr const char* kFields[] = {"means", "quats", "log_scales", "opacity_logits"};
+  Array<T, nb::shape<-1, 3>> means;
+  Array<T, nb::shape<-1, 4>> quats;
+  Array<T, nb::shape<-1, 3>> log_scales;
+  Array<T, nb::shape<-1>> opacity_logits;
 
-  size_t count() const { return topology.face_index.size(); }
-  void check() const {
-    const auto same = [](size_t length, auto other) { return length == static_cast<size_t>(other); };
-    require(same(rest.shape(0), model.vertices) && same(joint_rest.shape(0), model.joints) &&
-                same(expression.shape(1), model.expressions) && same(joints.shape(1), model.free_joints) &&
-                topology.vertex_count == model.vertices,
-            "the arrays do not fit the face model");
-    require(means.shape(0) == count() && quats.shape(0) == count() && log_scales.shape(0) == count() &&
-                opacity_logits.shape(0) == count(),
-            "one row of every parameter a Gaussian");
-  }
-  mien::FacePose pose() const {
-    return {rest.data(),
-            joint_rest.data(),
-            expression.data(),
-            joints.data(),
-            in_head ? nullptr : head_rotation.data(),
-            in_head ? nullptr : head_translation.data()};
-  }
-  mien::RigArrays rig(const Ride& ride) const {
-    return mien::rig_arrays(topology, ride.vertices.data(), means.data(), quats.data(), log_scales.data());
+  LocalGaussians(const Group<LocalGaussians>& group, size_t count) {
+    group.read(means, quats, log_scales, opacity_logits);
+    require(means.shape(0) == count && quats.shape(0) == count && log_scales.shape(0) == count &&
+                opacity_logits.shape(0) == count,
+            "parameters and their gradients must have one row per Gaussian");
   }
 };
 
-Ride forward(const mien::FaceModelData& model, const mien::RigTopology& topology, const In<-1, 3>& rest,
-             const In<-1, 3>& joint_rest, const In<1, -1>& expression, const In<1, -1, 3>& joints,
-             const In<1, 3>& head_rotation, const In<1, 3>& head_translation, bool in_head, const In<-1, 3>& means,
-             const In<-1, 4>& quats, const In<-1, 3>& log_scales, const In<-1>& opacity_logits,
-             const Out<1, -1, 3>& world_means, const Out<1, -1, 4>& world_quats, const Out<1, -1, 3>& world_scales,
-             const Out<-1>& opacities, const Out<1, 4, 4>& head_pose) {
-  const Rider rider{model,   topology, rest,  joint_rest, expression,    joints, head_rotation, head_translation,
-                    in_head, means,    quats, log_scales, opacity_logits};
-  rider.check();
-  const size_t count = rider.count();
-  require(world_means.shape(1) == count && world_quats.shape(1) == count && world_scales.shape(1) == count &&
-              opacities.shape(0) == count,
-          "the outputs do not fit");
+// The same in world space or in the head frame, and that frame's pose, which may be missing.
+template <typename T>
+struct PosedGaussians {
+  static constexpr char kName[] = "PosedGaussians";
+  static constexpr const char* kFields[] = {"means", "quats", "scales", "opacities", "head_pose"};
+  Array<T, nb::shape<1, -1, 3>> means;
+  Array<T, nb::shape<1, -1, 4>> quats;
+  Array<T, nb::shape<1, -1, 3>> scales;
+  Array<T, nb::shape<-1>> opacities;
+  std::optional<Array<T, nb::shape<1, 4, 4>>> head_pose;
+
+  PosedGaussians(const Group<PosedGaussians>& group, size_t count) {
+    group.read(means, quats, scales, opacities, head_pose);
+    require(
+        means.shape(1) == count && quats.shape(1) == count && scales.shape(1) == count && opacities.shape(0) == count,
+        "posed Gaussians and their gradients must have one row per Gaussian");
+  }
+};
+
+// Gradients of the face parameters.
+struct FaceParameterGradients {
+  static constexpr char kName[] = "FaceParameterGradients";
+  static constexpr const char* kFields[] = {"expression", "joints", "head_rotation", "head_translation"};
+  Out<1, -1> expression;
+  Out<1, -1, 3> joints;
+  Out<1, 3> head_rotation, head_translation;
+
+  FaceParameterGradients(const Group<FaceParameterGradients>& group, const FaceArrays& face) {
+    group.read(expression, joints, head_rotation, head_translation);
+    require(same_shape(expression, face.expression) && same_shape(joints, face.joints),
+            "a gradient must have the shape of its array");
+  }
+};
+
+// The inputs of both passes.
+struct Rider {
+  const mien::RigTopology& topology;
+  bool in_head;
+  FaceArrays face;
+  LocalGaussians<const float> local;
+
+  Rider(const mien::FaceModelData& model, const mien::RigTopology& topology, bool in_head,
+        const Group<FaceArrays>& face_group, const Group<LocalGaussians<const float>>& local_group)
+      : topology(topology), in_head(in_head), face(model, face_group), local(local_group, topology.face_index.size()) {
+    require(face.size() == 1 && face.head_rotation.has_value() && topology.vertex_count == model.vertices,
+            "the arrays do not fit the face model");
+  }
+  size_t count() const { return topology.face_index.size(); }
+  mien::FacePose pose() const {
+    mien::FacePose pose = face.pose(0);
+    if (in_head) pose.head_rotation = pose.head_translation = nullptr;
+    return pose;
+  }
+  mien::RigArrays rig(const Ride& ride) const {
+    return mien::rig_arrays(topology, ride.vertices.data(), local.means.data(), local.quats.data(),
+                            local.log_scales.data());
+  }
+};
+
+Ride forward(const mien::FaceModelData& model, const mien::RigTopology& topology, bool in_head,
+             const Group<FaceArrays>& face_group, const Group<LocalGaussians<const float>>& local_group,
+             const Group<PosedGaussians<float>>& posed_group) {
+  const Rider rider(model, topology, in_head, face_group, local_group);
+  const PosedGaussians<float> posed(posed_group, rider.count());
+  require(!in_head || posed.head_pose.has_value(), "the outputs do not fit");
   const nb::gil_scoped_release release;
-  Ride ride(model, topology);
+  Ride ride(model, topology, in_head);
   mien::pose_face(model, rider.pose(), ride.shaped.data(), ride.vertices.data());
-  mien::rig_forward(rider.rig(ride), ride.frames.data(), {world_means.data(), world_quats.data(), world_scales.data()});
-  mien::sigmoid(opacity_logits.data(), static_cast<int64_t>(count), opacities.data());
-  if (in_head) mien::head_pose(head_rotation.data(), head_translation.data(), head_pose.data());
+  mien::rig_forward(rider.rig(ride), ride.frames.data(), {posed.means.data(), posed.quats.data(), posed.scales.data()});
+  mien::sigmoid(rider.local.opacity_logits.data(), static_cast<int64_t>(rider.count()), posed.opacities.data());
+  if (in_head) {
+    mien::head_pose(rider.face.head_rotation->data(), rider.face.head_translation->data(), posed.head_pose->data());
+  }
   return ride;
 }
 
-void backward(const Ride& ride, const mien::FaceModelData& model, const mien::RigTopology& topology,
-              const In<-1, 3>& rest, const In<-1, 3>& joint_rest, const In<1, -1>& expression,
-              const In<1, -1, 3>& joints, const In<1, 3>& head_rotation, const In<1, 3>& head_translation, bool in_head,
-              const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1, 3>& log_scales, const In<-1>& opacity_logits,
-              const In<1, -1, 3>& world_scales, const In<-1>& opacities, const In<1, -1, 3>& by_means,
-              const In<1, -1, 4>& by_quats, const In<1, -1, 3>& by_scales, const In<-1>& by_opacities,
-              const std::optional<In<1, 4, 4>>& by_head_pose, const Out<-1, 3>& grad_means,
-              const Out<-1, 4>& grad_quats, const Out<-1, 3>& grad_log_scales, const Out<-1>& grad_logits,
-              const std::optional<Out<1, -1>>& grad_expression, const std::optional<Out<1, -1, 3>>& grad_joints,
-              const std::optional<Out<1, 3>>& grad_rotation, const std::optional<Out<1, 3>>& grad_translation) {
-  const Rider rider{model,   topology, rest,  joint_rest, expression,    joints, head_rotation, head_translation,
-                    in_head, means,    quats, log_scales, opacity_logits};
-  rider.check();
-  require(ride.is_of(model, topology), "the ride is another model's or another topology's");
-  const size_t count = rider.count(), floats = 3 * static_cast<size_t>(model.vertices);
-  for (const size_t length : {world_scales.shape(1), opacities.shape(0), by_means.shape(1), by_quats.shape(1),
-                              by_scales.shape(1), by_opacities.shape(0), grad_means.shape(0), grad_quats.shape(0),
-                              grad_log_scales.shape(0), grad_logits.shape(0)})
-    require(length == count, "one row of every gradient a Gaussian");
-  const bool face = grad_expression.has_value();
-  require(!face || (grad_joints && grad_rotation && grad_translation && same_shape(*grad_expression, expression) &&
-                    same_shape(*grad_joints, joints)),
-          "a gradient must have the shape of its array");
-  const nb::gil_scoped_release release;
-  std::optional<mien::Recycled<float>> by_vertices, by_rest;
-  if (face) by_vertices.emplace(floats), by_rest.emplace(floats + 3 * static_cast<size_t>(model.joints));
-  mien::rig_backward(topology, rider.rig(ride), ride.frames.data(), world_scales.data(),
-                     {by_means.data(), by_quats.data(), by_scales.data(), false, grad_means.data(), grad_quats.data(),
-                      grad_log_scales.data(), face ? by_vertices->data() : nullptr});
-  mien::sigmoid_backward(opacities.data(), by_opacities.data(), static_cast<int64_t>(count), grad_logits.data());
-  if (!face) return;
-  mien::pose_face_backward(model, rider.pose(), ride.shaped.data(), by_vertices->data(),
-                           {by_rest->data(), by_rest->data() + floats, grad_expression->data(), grad_joints->data(),
-                            grad_rotation->data(), grad_translation->data()});
-  if (!in_head) return;
-  for (int i = 0; i < 3; ++i) grad_rotation->data()[i] = grad_translation->data()[i] = 0;
+// Fills the gradients of the face from those of its vertices and, in the head frame, from that of its pose.
+void face_backward(const mien::FaceModelData& model, const Ride& ride, const Rider& rider, const float* by_vertices,
+                   const std::optional<In<1, 4, 4>>& by_head_pose, const FaceParameterGradients& gradients) {
+  const size_t floats = 3 * static_cast<size_t>(model.vertices);
+  mien::Recycled<float> by_rest(floats + 3 * static_cast<size_t>(model.joints));
+  float *rotation = gradients.head_rotation.data(), *translation = gradients.head_translation.data();
+  mien::pose_face_backward(model, rider.pose(), ride.shaped.data(), by_vertices,
+                           {by_rest.data(), by_rest.data() + floats, gradients.expression.data(),
+                            gradients.joints.data(), rotation, translation});
+  if (!ride.in_head) return;
+  for (int i = 0; i < 3; ++i) rotation[i] = translation[i] = 0;
   if (!by_head_pose) return;
-  mien::head_pose_backward(head_rotation.data(), by_head_pose->data(), grad_rotation->data());
-  for (int row = 0; row < 3; ++row) grad_translation->data()[row] = by_head_pose->data()[4 * row + 3];
+  mien::head_pose_backward(rider.face.head_rotation->data(), by_head_pose->data(), rotation);
+  for (int row = 0; row < 3; ++row) translation[row] = by_head_pose->data()[4 * row + 3];
+}
+
+void backward(const Ride& ride, const mien::FaceModelData& model, const mien::RigTopology& topology,
+              const Group<FaceArrays>& face_group, const Group<LocalGaussians<const float>>& local_group,
+              const In<1, -1, 3>& scales, const In<-1>& opacities,
+              const Group<PosedGaussians<const float>>& by_posed_group,
+              const Group<LocalGaussians<float>>& local_gradient_group,
+              const std::optional<Group<FaceParameterGradients>>& face_gradient_group) {
+  const Rider rider(model, topology, ride.in_head, face_group, local_group);
+  require(ride.is_of(model, topology), "the ride belongs to another model or topology");
+  const size_t count = rider.count();
+  const PosedGaussians<const float> by_posed(by_posed_group, count);
+  const LocalGaussians<float> by_local(local_gradient_group, count);
+  std::optional<FaceParameterGradients> by_face;
+  if (face_gradient_group) by_face.emplace(*face_gradient_group, rider.face);
+  require(scales.shape(1) == count && opacities.shape(0) == count,
+          "posed Gaussians and their gradients must have one row per Gaussian");
+  const nb::gil_scoped_release release;
+  std::optional<mien::Recycled<float>> by_vertices;
+  if (by_face) by_vertices.emplace(3 * static_cast<size_t>(model.vertices));
+  mien::rig_backward(
+      topology, rider.rig(ride), ride.frames.data(), scales.data(),
+      {by_posed.means.data(), by_posed.quats.data(), by_posed.scales.data(), false, by_local.means.data(),
+       by_local.quats.data(), by_local.log_scales.data(), by_face ? by_vertices->data() : nullptr});
+  mien::sigmoid_backward(opacities.data(), by_posed.opacities.data(), static_cast<int64_t>(count),
+                         by_local.opacity_logits.data());
+  if (by_face) face_backward(model, ride, rider, by_vertices->data(), by_posed.head_pose, *by_face);
 }
 
 }  // namespace
 
 void bind_ride(nb::module_& module) {
   nb::class_<Ride>(module, "Ride", "What `ride_backward` needs of `ride`.");
-  module.def("ride", &forward, "model"_a, "topology"_a, "rest"_a, "joint_rest"_a, "expression"_a, "joints"_a,
-             "head_rotation"_a, "head_translation"_a, "in_head"_a, "means"_a, "quats"_a, "log_scales"_a,
-             "opacity_logits"_a, "world_means"_a, "world_quats"_a, "world_scales"_a, "opacities"_a, "head_pose"_a,
-             "Fills the Gaussians in world space; or in the head frame, and that frame's pose.");
-  module.def("ride_backward", &backward, "ride"_a, "model"_a, "topology"_a, "rest"_a, "joint_rest"_a, "expression"_a,
-             "joints"_a, "head_rotation"_a, "head_translation"_a, "in_head"_a, "means"_a, "quats"_a, "log_scales"_a,
-             "opacity_logits"_a, "world_scales"_a, "opacities"_a, "by_means"_a, "by_quats"_a, "by_scales"_a,
-             "by_opacities"_a, "by_head_pose"_a.none(), "grad_means"_a, "grad_quats"_a, "grad_log_scales"_a,
-             "grad_logits"_a, "grad_expression"_a.none(), "grad_joints"_a.none(), "grad_rotation"_a.none(),
-             "grad_translation"_a.none(), "Fills the gradients; those of the face only if they are given.");
+  bind_group<LocalGaussians<float>>(module);
+  bind_group<PosedGaussians<float>>(module);
+  bind_group<FaceParameterGradients>(module);
+  module.def("ride", &forward, "model"_a, "topology"_a, "in_head"_a, "face"_a, "local"_a, "posed"_a,
+             "Fills the Gaussians in world space; or with `in_head` in the head frame, and that frame's pose.");
+  module.def("ride_backward", &backward, "ride"_a, "model"_a, "topology"_a, "face"_a, "local"_a, "scales"_a,
+             "opacities"_a, "by_posed"_a, "by_local"_a, "by_face"_a.none(),
+             "Fills the gradients, from the scales and opacities that `ride` filled; those of the face only if they "
+             "are given.");
 }

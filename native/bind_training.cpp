@@ -24,19 +24,16 @@ using Radii = Array<const int32_t, nb::ndim<1>>;
 
 // One tensor's arrays, which stay alive while this does.
 struct AdamArrays {
-  Array<float> values, first, second;
+  static constexpr char kName[] = "AdamTask";
+  static constexpr const char* kFields[] = {"values", "gradient", "first", "second", "steps", "rate"};
+  Array<float> values;
   Array<const float> gradient;
+  Array<float> first, second;
   Array<float, nb::shape<>> steps;
   double rate = 0;
 
-  explicit AdamArrays(const nb::tuple& task) {
-    require(task.size() == 6, "a task is (values, gradient, first, second, steps, rate)");
-    values = item<Array<float>>(task, 0, "values");
-    gradient = item<Array<const float>>(task, 1, "gradient");
-    first = item<Array<float>>(task, 2, "first");
-    second = item<Array<float>>(task, 3, "second");
-    steps = item<Array<float, nb::shape<>>>(task, 4, "steps");
-    if (!nb::try_cast(task[5], rate)) throw nb::type_error("a rate is a number");
+  explicit AdamArrays(const Group<AdamArrays>& group) {
+    group.read(values, gradient, first, second, steps, rate);
     require(same_shape(gradient, values) && same_shape(first, values) && same_shape(second, values),
             "gradient and moments must have the shape of the values");
   }
@@ -52,8 +49,8 @@ struct AdamArrays {
   }
 };
 
-void adam_update(const std::vector<nb::tuple>& arguments) {
-  const std::vector<AdamArrays> arrays(arguments.begin(), arguments.end());
+void adam_update(const std::vector<Group<AdamArrays>>& groups) {
+  const std::vector<AdamArrays> arrays(groups.begin(), groups.end());
   std::vector<mien::AdamTask> tasks;
   tasks.reserve(arrays.size());
   for (const AdamArrays& own : arrays) tasks.push_back(own.step());
@@ -105,8 +102,9 @@ double mean_squared_difference(const Array<const float>& image, const Array<cons
 }  // namespace
 
 void bind_training(nb::module_& module) {
+  bind_group<AdamArrays>(module);
   module.def("adam_update", &adam_update, "tasks"_a,
-             "Each task: values, gradient, first and second moments, the number of steps, which grows by one; rate.");
+             "Makes one step of Adam with every tensor. The number of steps grows by one.");
   module.def("triangle_penalties", &triangle_penalties, "thresholds"_a, "weights"_a, "means"_a, "log_scales"_a,
              "radii"_a, "grad_means"_a, "grad_log_scales"_a, "position"_a, "scale"_a,
              "Fills the position and the scale penalty, and their gradients.");

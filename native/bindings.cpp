@@ -5,7 +5,6 @@ void bind_activation(nanobind::module_& module);
 void bind_face(nanobind::module_& module);
 void bind_memory(nanobind::module_& module);
 void bind_mesh(nanobind::module_& module);
-void bind_mesh_gradients(nanobind::module_& module);
 void bind_mesh_align(nanobind::module_& module);
 void bind_photometric(nanobind::module_& module);
 void bind_rig(nanobind::module_& module);
@@ -20,7 +19,6 @@ NB_MODULE(_native, module) {
   bind_face(module);
   bind_memory(module);
   bind_mesh(module);
-  bind_mesh_gradients(module);
   bind_mesh_align(module);
   bind_photometric(module);
   bind_rig(module);

@@ -35,21 +35,26 @@ def call(name: str, **changes: Any) -> Any:
     return getattr(_native, name)(*given)
 
 
-def wide_splats(count: int, width: int = WIDEST, height: int = 1) -> list[Any]:
+def wide_splats(count: int, width: int = WIDEST, height: int = 1) -> _native.RasterizeView:
     """Gaussians as wide as the picture: each touches all of its tiles."""
     means = np.zeros((count, 3), F32)
     means[:, 2] = np.linspace(1, 2, count)
     quats = np.tile(np.array([1, 0, 0, 0], F32), (count, 1))
-    gaussians = [means, quats, np.full((count, 3), 3, F32), np.full(count, 0.5, F32), np.zeros((count, 1, 3), F32)]
+    scales, opacities = np.full((count, 3), 3, F32), np.full(count, 0.5, F32)
+    gaussians = _native.GaussianArrays(means, quats, scales, opacities, np.zeros((count, 1, 3), F32))
     K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], F32)
     pictures = [np.zeros((height, width, 3), F32), np.zeros((height, width), F32), np.zeros(count, I32)]
-    return [*gaussians, np.ones(3, F32), np.eye(4, dtype=F32), K, *pictures]
+    return _native.RasterizeView(gaussians, np.ones(3, F32), np.eye(4, dtype=F32), K, *pictures)
+
+
+def draw(view: Any) -> None:
+    _native.rasterize_views([view], False)
 
 
 def picture_of_small_scene() -> bytes:
-    view = arguments("rasterize_forward", seed=7)
-    _native.rasterize_forward(*view)
-    return view[8].tobytes() + view[9].tobytes()
+    view = arguments("rasterize_views", seed=7)[0][0]
+    draw(view)
+    return view.image.tobytes() + view.alpha.tobytes()
 
 
 def with_room(megabytes: float, body: Callable[[], Any]) -> Any:
@@ -69,7 +74,7 @@ def memory_that_is_not_there() -> str:
     scene, expected, failed = wide_splats(3000), picture_of_small_scene(), 0
     for megabytes in (0, 1, 4, 9, 20, 50, 90, 200, 300, 500):
         try:
-            with_room(megabytes, lambda: _native.rasterize_views([tuple(scene)], True))
+            with_room(megabytes, lambda: _native.rasterize_views([scene], True))
         except MemoryError:
             failed += 1
         assert picture_of_small_scene() == expected
@@ -79,7 +84,7 @@ def memory_that_is_not_there() -> str:
 def memory_for_several_views() -> None:
     """Views side by side: each is drawn by a thread of its own, where an exception would end the process."""
     _native.set_thread_count(3)
-    views = [tuple(wide_splats(2000, width=WIDEST // 2)) for _ in range(3)]
+    views = [wide_splats(2000, width=WIDEST // 2) for _ in range(3)]
     with_room(30, lambda: _native.rasterize_views(views, False))
 
 
@@ -98,7 +103,7 @@ def threads_that_cannot_be_had() -> str:
 
 def a_ride_of_another_model() -> None:
     mine, others = arguments("ride_backward", 1), arguments("ride_backward", 5)
-    assert len(mine[3]) != len(others[3])
+    assert len(mine[3].rest) != len(others[3].rest)
     _native.ride_backward(others[0], *mine[1:])
 
 
@@ -109,10 +114,11 @@ def surface_of_faces(vertex: int) -> Any:
 
 def other_coefficients() -> None:
     """A backward pass with more of them than the forward pass had."""
-    ((frame, *task), *_) = arguments("rasterize_views_backward", 3)[0]
-    more = np.zeros((len(task[0]), 16, 3), F32)
-    assert task[4].shape != more.shape
-    _native.rasterize_views_backward([(frame, *task[:4], more, *task[5:13], more.copy(), *task[14:])])
+    (task, *_) = arguments("rasterize_views_backward", 3)[0]
+    more = np.zeros((len(task.gaussians.means), 16, 3), F32)
+    assert task.gaussians.sh.shape != more.shape
+    gaussians, gradients = task.gaussians._replace(sh=more), task.grad_gaussians._replace(sh=more.copy())
+    _native.rasterize_views_backward([task._replace(gaussians=gaussians, grad_gaussians=gradients)])
 
 
 def faces_changed_after_the_check() -> str:
@@ -120,18 +126,20 @@ def faces_changed_after_the_check() -> str:
     rng = np.random.default_rng(0)
     surface = _native.AlignSurface(*made)
     made[0][:] = 2**40
-    seen = arguments("align_mesh", 3)[1:9]
+    seen, high_pass = arguments("align_mesh", 3)[1:3]
     v = 41
     vertices = rng.standard_normal((v, 3)).astype(F32)
-    _native.align_mesh(surface, vertices, vertices, *seen[2:], *[None] * 5)
+    seen = seen._replace(vertices=vertices, normals=vertices)
+    _native.align_mesh(surface, seen, high_pass, None, None, None)
     return "its own copy"
 
 
 def high_pass_of(radius: int) -> bytes:
     given = arguments("align_mesh", 3)
-    given[8], given[12], given[13] = radius, np.zeros_like(given[5]), np.zeros_like(given[5])
+    image = given[1].image
+    given[2], given[4], given[5] = radius, np.zeros_like(image), np.zeros_like(image)
     _native.align_mesh(*given)
-    return given[12].tobytes() + given[13].tobytes()
+    return given[4].tobytes() + given[5].tobytes()
 
 
 def largest_high_pass() -> str:
@@ -152,24 +160,37 @@ def unaligned() -> None:
 
 def edges_with(first: int, second: int) -> None:
     given = arguments("antialias")
-    given[6][0] = first, second
+    given[3].faces[0] = first, second
     _native.antialias(*given)
 
 
 def one_frame_twice() -> str:
     (task,) = arguments("rasterize_views_backward", 3)[0][:1]
-    again = (*task[:10], *(np.zeros_like(array) for array in task[10:]))
+    gradients = _native.GaussianArrays(*(np.zeros_like(array) for array in task.grad_gaussians))
+    again = type(task)(*task[:6], gradients, *(np.zeros_like(array) for array in task[7:]))
     _native.set_thread_count(3)
     for _ in range(20):
         _native.rasterize_views_backward([task, again])
-        assert all(np.array_equal(a, b) for a, b in zip(task[10:], again[10:], strict=True))
+        pairs = zip((*task[6], *task[7:]), (*again[6], *again[7:]), strict=True)
+        assert all(np.array_equal(one, other) for one, other in pairs)
     return "one after the other"
 
 
 def picture_without_rows() -> None:
-    scene = wide_splats(40, 640, 1)
-    scene[8], scene[9] = np.zeros((0, 640, 3), F32), np.zeros((0, 640), F32)
-    _native.rasterize_forward(*scene)
+    draw(wide_splats(40, 640, 1)._replace(image=np.zeros((0, 640, 3), F32), alpha=np.zeros((0, 640), F32)))
+
+
+def group_with(name: str, place: int, **changes: Any) -> Any:
+    """A valid call with some fields of the group at a place replaced."""
+    given = arguments(name)
+    given[place] = given[place]._replace(**changes)
+    return getattr(_native, name)(*given)
+
+
+def backward_with(**changes: Any) -> None:
+    """A valid backward pass with some fields of its first view replaced."""
+    task, *_ = arguments("rasterize_views_backward")[0]
+    _native.rasterize_views_backward([task._replace(**changes)])
 
 
 def adam(place: int, value: Any) -> None:
@@ -178,11 +199,16 @@ def adam(place: int, value: Any) -> None:
 
 
 CASES: dict[str, Callable[[], Any]] = {
-    "short tuple": lambda: _native.rasterize_forward(np.zeros((1, 3), F32)),
-    "no tuple": lambda: _native.rasterize_forward(),
-    "short tuple of views": lambda: _native.rasterize_views([tuple(wide_splats(1, 64)[:-1])], True),
-    "short tuple backward": lambda: _native.rasterize_views_backward([()]),
-    "no frame": lambda: _native.rasterize_views_backward([(None, *arguments("rasterize_views_backward")[0][0][1:])]),
+    "short view": lambda: _native.rasterize_views([wide_splats(1, 64)[:-1]], True),
+    "short group in a view": lambda: draw(wide_splats(1, 64)._replace(gaussians=(np.zeros((1, 3), F32),))),
+    "group of other types": lambda: group_with("pose_face", 1, joint_rest=np.zeros((3, 3), np.float64)),
+    "group without an array": lambda: group_with("ride", 4, log_scales=None),
+    "group of a group": lambda: group_with("antialias", 0, depth=arguments("antialias")[0]),
+    "list for a group": lambda: call("pose_face", _1=list(arguments("pose_face")[1])),
+    "no group": lambda: call("pose_face", _1=None),
+    "empty view backward": lambda: _native.rasterize_views_backward([()]),
+    "no frame": lambda: backward_with(frame=None),
+    "number for a frame": lambda: backward_with(frame=3),
     "one frame twice": one_frame_twice,
     "other coefficients": other_coefficients,
     "another model's ride": a_ride_of_another_model,
@@ -194,7 +220,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "edge with the largest triangle": lambda: edges_with(0, MOST),
     "edge with a triangle below none": lambda: edges_with(0, -2),
     "largest high_pass": largest_high_pass,
-    "negative high_pass": lambda: call("align_mesh", _8=-1),
+    "negative high_pass": lambda: call("align_mesh", _2=-1),
     "box beyond the largest integer": lambda: call("photometric_loss", _0=(1, 1, MOST, MOST)),
     "box at the largest integer": lambda: call("photometric_loss", _0=(MOST, 0, MOST, 1)),
     "parent of no joint": lambda: call("make_face_model", _5=[-5] * len(arguments("make_face_model")[5])),
@@ -202,7 +228,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "topology of fewer vertices": lambda: call("make_rig_topology", _0=1),
     "negative fragment": lambda: call("interpolate_mesh", _0=np.full_like(arguments("interpolate_mesh")[0], -2)),
     "picture of no rows": picture_without_rows,
-    "picture too wide": lambda: _native.rasterize_forward(*wide_splats(1, WIDEST + 1)),
+    "picture too wide": lambda: draw(wide_splats(1, WIDEST + 1)),
     "too many pixels": large_picture,
     "lengths beyond 32 bits": lambda: _native.box_of_nonzero(np.zeros((2**32 + 1, 0), F32)),
     "products beyond 64 bits": lambda: _native.interpolate_mesh(
@@ -210,12 +236,12 @@ CASES: dict[str, Callable[[], Any]] = {
         np.zeros((0, 3), I64), np.zeros((0, 1, 1), F32),
     ),
     "unaligned": unaligned,
-    "copies are not written": lambda: call("pose_face", _7=arguments("pose_face")[7].astype(np.float64)),
-    "strided": lambda: call("pose_face", _1=np.repeat(arguments("pose_face")[1], 2, 1)[:, ::2]),
+    "copies are not written": lambda: call("pose_face", _3=arguments("pose_face")[3].astype(np.float64)),
+    "strided": lambda: group_with("pose_face", 1, rest=np.repeat(arguments("pose_face")[1].rest, 2, 1)[:, ::2]),
     "adam by addresses": lambda: adam(0, 4096),
     "adam of other sizes": lambda: adam(1, np.zeros(1, F32)),
     "adam of many steps": lambda: adam(4, np.zeros(2, F32)),
-    "too many pairs": lambda: _native.rasterize_forward(*wide_splats(70_000)),
+    "too many pairs": lambda: draw(wide_splats(70_000)),
     "too many threads": lambda: _native.set_thread_count(100_000),
     "negative threads": lambda: _native.set_thread_count(-3),
     "memory that is not there": memory_that_is_not_there,

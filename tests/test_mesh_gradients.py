@@ -260,11 +260,14 @@ def test_silhouette_gradient_of_a_head_is_that_of_its_area(size: int):
 
 def test_native_operations_refuse_what_does_not_belong_together(scene: Scene):
     wrong = torch.zeros(len(scene.points) + 1, 3, dtype=torch.float64)
-    with pytest.raises(ValueError, match="sizes"):
+    with pytest.raises(ValueError, match="shape"):
         _native.barycentric_backward(
-            scene.fragments.face_index, scene.fragments.barycentric, scene.fragments.depth, scene.points,
-            scene.faces, torch.zeros(36, 40, 3), wrong,
-        )  # fmt: skip
+            _native.Fragments(scene.fragments.face_index, scene.fragments.barycentric, scene.fragments.depth),
+            scene.points,
+            scene.faces,
+            torch.zeros(36, 40, 3),
+            wrong,
+        )
     with pytest.raises(IndexError, match="vertex"):
         antialias(torch.zeros(36, 40, 1), scene.fragments, scene.points[:5], scene.faces, scene.edges)
 

@@ -101,9 +101,9 @@ def test_cost_gradient_and_hessian_are_those_of_the_pixels():
     surface = _native.AlignSurface(
         SPACE.faces, SPACE.corners, SPACE.used.to(torch.uint8), skin.albedo, skin.trust, SIGMA, OUTLIER, LEAST_COSINE
     )
-    cost, weight = _native.align_mesh(
-        surface, *seen.arguments(), 0, seen.posed.jacobian, hessian, gradient, residual, None
-    )
+    assert seen.posed.jacobian is not None
+    derivatives = _native.AlignDerivatives(seen.posed.jacobian, hessian, gradient)
+    cost, weight = _native.align_mesh(surface, seen.arrays(), 0, derivatives, residual, None)
     expected_cost, expected_gradient, expected_hessian, expected_residual = reference(seen, skin)
     assert weight > 100
     torch.testing.assert_close(residual.double(), expected_residual, atol=2e-5, rtol=0, equal_nan=True)
@@ -125,7 +125,9 @@ def test_one_step_undoes_a_small_shift():
     start = PosedSurface(start.vertices, start.normals, torch.eye(3).expand(len(start.vertices), 3, 3).contiguous())
     seen = Sighting(start, Picture(CAMERA, image.contiguous(), (alpha > 0.99).float()), some_light())
     gradient, hessian = torch.empty(3), torch.empty(3, 3)
-    _native.align_mesh(SPACE.native(skin, OUTLIER), *seen.arguments(), 0, start.jacobian, hessian, gradient, None, None)
+    assert start.jacobian is not None
+    derivatives = _native.AlignDerivatives(start.jacobian, hessian, gradient)
+    _native.align_mesh(SPACE.native(skin, OUTLIER), seen.arrays(), 0, derivatives, None, None)
     step = -torch.linalg.solve(hessian[:2, :2], gradient[:2])
     assert (step - torch.tensor([-0.0005, 0.0006])).abs().max() < 0.0001
 
@@ -142,7 +144,7 @@ def test_high_pass_leaves_out_a_smooth_light_but_not_texture():
     def costs(picture: Tensor) -> list[float]:
         seen = Sighting(still, Picture(CAMERA, picture.contiguous(), mask), even_light())
         radii = (0, radius)
-        return [_native.align_mesh(surface, *seen.arguments(), r, None, None, None, None, None)[0] for r in radii]
+        return [_native.align_mesh(surface, seen.arrays(), r, None, None, None)[0] for r in radii]
 
     plain, high_passed = costs(image + ramp)
     assert high_passed < 0.05 * plain
@@ -168,7 +170,7 @@ def test_albedo_times_light_gives_the_pictures_back():
     for seen in sightings:
         residual = torch.empty(SIZE, SIZE, 3)
         seen = Sighting(seen.posed, seen.picture, light)
-        _native.align_mesh(surface, *seen.arguments(), 0, None, None, None, residual, None)
+        _native.align_mesh(surface, seen.arrays(), 0, None, residual, None)
         known = residual[~residual.isnan().any(-1)]
         assert len(known) > 300
         assert known.abs().median() < 0.01
@@ -178,7 +180,7 @@ def test_light_is_found_where_the_albedo_is_known():
     skin = some_texture()
     hessian, right = torch.zeros(3, 9, 9, dtype=torch.float64), torch.zeros(3, 9, dtype=torch.float64)
     for seen in _pictures_under_light(some_light(), skin):
-        _native.light_equations(SPACE.native(skin, 1e4), *seen.arguments(), hessian, right)
+        _native.light_equations(SPACE.native(skin, 1e4), seen.arrays(), hessian, right)
     hessian = hessian + hessian.triu(1).mT
     found = torch.linalg.solve(hessian, right).T
     normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
@@ -200,15 +202,13 @@ def test_bad_arrays_are_refused():
     skin = some_texture()
     too_few = torch.zeros(3, 3)
     surface = SPACE.native(skin, OUTLIER)
-    seen = sighting()
+    seen = sighting().arrays()
     with pytest.raises(IndexError):
-        _native.align_mesh(surface, too_few, too_few, *seen.arguments()[2:], 0, None, None, None, None, None)
+        _native.align_mesh(surface, seen._replace(vertices=too_few, normals=too_few), 0, None, None, None)
     with pytest.raises(ValueError, match="mask"):
-        _native.align_mesh(
-            surface, *seen.arguments()[:5], torch.zeros(5, 5), seen.light, 0, None, None, None, None, None
-        )
-    with pytest.raises(ValueError, match="go together"):
-        _native.align_mesh(surface, *seen.arguments(), 0, posed(2).jacobian, None, None, None, None)
+        _native.align_mesh(surface, seen._replace(mask=torch.zeros(5, 5)), 0, None, None, None)
+    with pytest.raises(TypeError, match="AlignDerivatives.hessian"):
+        _native.align_mesh(surface, seen, 0, (posed(2).jacobian, None, torch.empty(2)), None, None)  # pyright: ignore[reportArgumentType]
 
 
 def test_even_light_leaves_albedo_as_it_is():

@@ -1,38 +1,46 @@
-"""What native/bind_*.cpp defines. Arrays are contiguous, on the CPU, float32 unless said otherwise."""
+"""What native/bind_*.cpp defines. Arrays are contiguous, on the CPU, and float32 unless a comment says otherwise.
+
+Arguments that belong together are passed as one named tuple. Errors name its field: `FaceArrays.rest has the wrong type
+or shape`. The same tuple can hold values, or gradients of them; a function's comment says which of its tuples it fills.
+"""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 Tensor = torch.Tensor | np.ndarray
 
-# native/bind_mesh.cpp; faces, corners: int64; face_index: int32
+# native/bind_mesh.cpp; faces, corners: int64
+
+class Fragments(NamedTuple):
+    face_index: Tensor
+    """int32, -1 where there is no triangle."""
+    barycentric: Tensor
+    depth: Tensor
+
+class MeshEdges(NamedTuple):
+    """The edges of a mesh, int32: two vertices, one or two triangles, and the vertex opposite in the first of these."""
+
+    vertices: Tensor
+    faces: Tensor
+    """The second is -1 if there is none."""
+    opposite: Tensor
+
 def rasterize_mesh(
-    vertices: Tensor,
-    faces: Tensor,
-    K: Tensor,
-    viewmat: Tensor,
-    cull_backfaces: bool,
-    face_index: Tensor,
-    barycentric: Tensor,
-    depth: Tensor,
-) -> None: ...
+    vertices: Tensor, faces: Tensor, K: Tensor, viewmat: Tensor, cull_backfaces: bool, fragments: Fragments
+) -> None:
+    """Fills `fragments`."""
+
 def interpolate_mesh(
     face_index: Tensor, barycentric: Tensor, attributes: Tensor, corners: Tensor, out: Tensor
 ) -> None: ...
 
-# native/bind_mesh_gradients.cpp; gradients of points and light: float64; edges: int32. All are added to but those of
-# barycentrics, uv and images, which are written.
+# Gradients of points and light are float64. All gradients are added to, except those of barycentrics, uv and images,
+# which are written.
 def barycentric_backward(
-    face_index: Tensor,
-    barycentric: Tensor,
-    depth: Tensor,
-    points: Tensor,
-    faces: Tensor,
-    grad_barycentric: Tensor,
-    grad_points: Tensor,
+    fragments: Fragments, points: Tensor, faces: Tensor, grad_barycentric: Tensor, grad_points: Tensor
 ) -> None: ...
 def interpolate_mesh_backward(
     face_index: Tensor,
@@ -48,77 +56,97 @@ def sample_texture_backward(
     texture: Tensor, uv: Tensor, grad_out: Tensor, grad_texture: Tensor | None, grad_uv: Tensor | None
 ) -> None: ...
 def antialias(
-    face_index: Tensor,
-    barycentric: Tensor,
-    depth: Tensor,
-    points: Tensor,
-    faces: Tensor,
-    edge_vertices: Tensor,
-    edge_faces: Tensor,
-    opposite: Tensor,
-    image: Tensor,
-    out: Tensor,
+    fragments: Fragments, points: Tensor, faces: Tensor, edges: MeshEdges, image: Tensor, out: Tensor
 ) -> None: ...
 def antialias_backward(
-    face_index: Tensor,
-    barycentric: Tensor,
-    depth: Tensor,
+    fragments: Fragments,
     points: Tensor,
     faces: Tensor,
-    edge_vertices: Tensor,
-    edge_faces: Tensor,
-    opposite: Tensor,
+    edges: MeshEdges,
     image: Tensor,
     grad_out: Tensor,
     grad_image: Tensor,
     grad_points: Tensor,
 ) -> None: ...
+
+class LitSurface(NamedTuple):
+    normals: Tensor
+    uv: Tensor
+    face_weights: Tensor
+    texture: Tensor
+    light: Tensor
+
+class LossTarget(NamedTuple):
+    image: Tensor
+    mask: Tensor
+    epsilon: float
+
+class LossGradients(NamedTuple):
+    points: Tensor
+    normals: Tensor
+    texture: Tensor
+    light: Tensor
+
 def mesh_loss(
-    face_index: Tensor,
-    barycentric: Tensor,
-    depth: Tensor,
+    fragments: Fragments,
     points: Tensor,
     faces: Tensor,
-    edge_vertices: Tensor,
-    edge_faces: Tensor,
-    opposite: Tensor,
-    normals: Tensor,
-    uv: Tensor,
-    face_weights: Tensor,
-    texture: Tensor,
-    light: Tensor,
-    target: Tensor,
-    mask: Tensor,
-    epsilon: float,
+    edges: MeshEdges,
+    surface: LitSurface,
+    target: LossTarget,
     picture: Tensor | None,
-    grad_points: Tensor,
-    grad_normals: Tensor,
-    grad_texture: Tensor,
-    grad_light: Tensor,
-) -> tuple[float, float]: ...
+    gradients: LossGradients,
+) -> tuple[float, float]:
+    """Fills `picture`, adds to `gradients`, and returns the sum of the loss and of the weights."""
 
-# native/bind_photometric.cpp; box: left, top, width, height; pictures: image, target (float32 or uint8), what is drawn
-# or None, gradient or None, loss (of no axes)
-def photometric_loss(box: tuple[int, int, int, int], weights: tuple[float, float], *pictures: Any) -> None: ...
+# native/bind_photometric.cpp; box: left, top, width, height
+def photometric_loss(
+    box: tuple[int, int, int, int],
+    weights: tuple[float, float],
+    image: Tensor,
+    target: Tensor,
+    drawn: Tensor | None,
+    gradient: Tensor | None,
+    loss: Tensor,
+) -> None:
+    """Fills `gradient` and `loss` (of no axes). `target` is float32 or uint8."""
 
-# native/bind_rasterize.cpp; radii: int32
+# native/bind_rasterize.cpp
 class RasterizeFrame: ...
 
-def rasterize_forward(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh: Tensor,
-    background: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    image: Tensor,
-    alpha: Tensor,
-    radii: Tensor,
-) -> RasterizeFrame | None: ...
-def rasterize_views(views: list[tuple[Any, ...]], differentiable: bool) -> list[RasterizeFrame | None]: ...
-def rasterize_views_backward(views: list[tuple[Any, ...]]) -> None: ...
+class GaussianArrays(NamedTuple):
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+
+class RasterizeView(NamedTuple):
+    gaussians: GaussianArrays
+    background: Tensor
+    viewmat: Tensor
+    K: Tensor
+    image: Tensor
+    """This and the next two are filled."""
+    alpha: Tensor
+    radii: Tensor
+    """int32."""
+
+class RasterizeGradients(NamedTuple):
+    frame: RasterizeFrame
+    gaussians: GaussianArrays
+    image: Tensor
+    alpha: Tensor
+    grad_image: Tensor
+    grad_alpha: Tensor | None
+    grad_gaussians: GaussianArrays
+    """This and the next three are filled."""
+    grad_means2d: Tensor
+    grad_viewmat: Tensor
+    grad_K: Tensor
+
+def rasterize_views(views: Sequence[RasterizeView], differentiable: bool) -> list[RasterizeFrame | None]: ...
+def rasterize_views_backward(views: Sequence[RasterizeGradients]) -> None: ...
 def thread_count() -> int: ...
 def set_thread_count(count: int) -> None: ...
 def rasterize_isa() -> str: ...
@@ -130,18 +158,20 @@ def recycled(shape: Sequence[int]) -> torch.Tensor: ...
 # native/bind_rig.cpp; faces, face_index: int64; b timesteps first in vertices, frames and what is in world space
 TRIANGLE_FRAME_FLOATS: int
 
+class LocalShapes(NamedTuple):
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+
+class WorldShapes(NamedTuple):
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+
 def rig_forward(
-    vertices: Tensor,
-    faces: Tensor,
-    face_index: Tensor,
-    local_means: Tensor,
-    local_quats: Tensor,
-    log_scales: Tensor,
-    frames: Tensor,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-) -> None: ...
+    vertices: Tensor, faces: Tensor, face_index: Tensor, local: LocalShapes, frames: Tensor, world: WorldShapes
+) -> None:
+    """Fills `frames` and `world`."""
 
 class RigTopology: ...
 
@@ -149,37 +179,114 @@ def make_rig_topology(vertex_count: int, faces: Tensor, face_index: Tensor) -> R
 def rig_backward(
     topology: RigTopology,
     vertices: Tensor,
-    local_means: Tensor,
-    local_quats: Tensor,
-    log_scales: Tensor,
+    local: LocalShapes,
     frames: Tensor,
     scales: Tensor,
-    grad_means: Tensor,
-    grad_quats: Tensor,
-    grad_scales: Tensor,
-    grad_local_means: Tensor,
-    grad_local_quats: Tensor,
-    grad_log_scales: Tensor,
+    by_world: WorldShapes,
+    gradients: LocalShapes,
     grad_vertices: Tensor | None,
-) -> None: ...
+) -> None:
+    """Fills `gradients` and `grad_vertices` from `by_world`, the gradients of the Gaussians in world space."""
 
-# native/bind_ride.cpp; one timestep. What `ride_backward` takes is what `ride` took, and the gradients
+# native/bind_ride.cpp; one timestep
 class Ride: ...
 
-def ride(model: FaceModelData, topology: RigTopology, *arrays: Any) -> Ride: ...
-def ride_backward(ride: Ride, model: FaceModelData, topology: RigTopology, *arrays: Any) -> None: ...
+class LocalGaussians(NamedTuple):
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
 
-# native/bind_training.cpp; radii, radius: int32; a task: values, gradient, first, second, steps (of no axes), rate; the
-# penalties' arrays: means, log_scales, radii, grad_means, grad_log_scales, position, scale (the last two of no axes); a
-# view's arrays: grad_means2d, radii, opacities, then the statistics pull, seen, radius, opacity
-def adam_update(tasks: Sequence[tuple[Any, Any, Any, Any, Any, float]]) -> None: ...
-def triangle_penalties(thresholds: tuple[float, float], weights: tuple[float, float], *arrays: Any) -> None: ...
-def observe_view(scale: tuple[float, float], *arrays: Any) -> None: ...
+class PosedGaussians(NamedTuple):
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    head_pose: Tensor | None
+
+class FaceParameterGradients(NamedTuple):
+    expression: Tensor
+    joints: Tensor
+    head_rotation: Tensor
+    head_translation: Tensor
+
+def ride(
+    model: FaceModelData,
+    topology: RigTopology,
+    in_head: bool,
+    face: FaceArrays,
+    local: LocalGaussians,
+    posed: PosedGaussians,
+) -> Ride:
+    """Fills `posed`."""
+
+def ride_backward(
+    ride: Ride,
+    model: FaceModelData,
+    topology: RigTopology,
+    face: FaceArrays,
+    local: LocalGaussians,
+    scales: Tensor,
+    opacities: Tensor,
+    by_posed: PosedGaussians,
+    by_local: LocalGaussians,
+    by_face: FaceParameterGradients | None,
+) -> None:
+    """Fills the gradients `by_local` and `by_face` from `by_posed`, the gradients of the posed Gaussians."""
+
+# native/bind_training.cpp
+class AdamTask(NamedTuple):
+    """One tensor. All of its arrays except the gradient are updated."""
+
+    values: Tensor
+    gradient: Tensor
+    first: Tensor
+    second: Tensor
+    steps: Tensor
+    """Of no axes."""
+    rate: float
+
+def adam_update(tasks: Sequence[AdamTask | tuple[Any, Any, Any, Any, Any, float]]) -> None: ...
+def triangle_penalties(
+    thresholds: tuple[float, float],
+    weights: tuple[float, float],
+    means: Tensor,
+    log_scales: Tensor,
+    radii: Tensor,
+    grad_means: Tensor,
+    grad_log_scales: Tensor,
+    position: Tensor,
+    scale: Tensor,
+) -> None:
+    """Fills the last four. `radii` is int32; `position` and `scale` have no axes."""
+
+def observe_view(
+    scale: tuple[float, float],
+    grad_means2d: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    pull: Tensor,
+    seen: Tensor,
+    radius: Tensor,
+    opacity: Tensor,
+) -> None:
+    """Updates the last four. `radii` and `radius` are int32."""
+
 def mean_squared_difference(image: Tensor, target: Tensor) -> float: ...
 def box_of_nonzero(values: Tensor) -> tuple[int, int, int, int]: ...
 
-# native/bind_face.cpp; b timesteps first in all but rest and joint_rest
+# native/bind_face.cpp; b timesteps first
 class FaceModelData: ...
+
+class FaceArrays(NamedTuple):
+    """The first two have no timesteps, unless they are gradients. Without a head, vertices are in the head frame."""
+
+    rest: Tensor
+    joint_rest: Tensor
+    expression: Tensor
+    joints: Tensor
+    head_rotation: Tensor | None
+    head_translation: Tensor | None
 
 def make_face_model(
     expression_basis: Tensor,
@@ -196,34 +303,13 @@ def compose_rigid(first: Tensor, second: Tensor, out: Tensor) -> None: ...
 def compose_rigid_backward(
     first: Tensor, second: Tensor, gradient: Tensor, grad_first: Tensor, grad_second: Tensor
 ) -> None: ...
-def pose_face(
-    model: FaceModelData,
-    rest: Tensor,
-    joint_rest: Tensor,
-    expression: Tensor,
-    joints: Tensor,
-    head_rotation: Tensor | None,
-    head_translation: Tensor | None,
-    shaped: Tensor,
-    vertices: Tensor,
-) -> None: ...
+def pose_face(model: FaceModelData, face: FaceArrays, shaped: Tensor, vertices: Tensor) -> None:
+    """Fills `vertices`, and `shaped`, the vertices before the joints."""
+
 def pose_face_backward(
-    model: FaceModelData,
-    rest: Tensor,
-    joint_rest: Tensor,
-    expression: Tensor,
-    joints: Tensor,
-    head_rotation: Tensor | None,
-    head_translation: Tensor | None,
-    shaped: Tensor,
-    grad_vertices: Tensor,
-    grad_rest: Tensor,
-    grad_joint_rest: Tensor,
-    grad_expression: Tensor,
-    grad_joints: Tensor,
-    grad_head_rotation: Tensor,
-    grad_head_translation: Tensor,
-) -> None: ...
+    model: FaceModelData, face: FaceArrays, shaped: Tensor, grad_vertices: Tensor, gradients: FaceArrays
+) -> None:
+    """Fills all of `gradients`, one of each per timestep."""
 
 # native/bind_mesh_align.cpp; faces: int64; used: uint8; texel_face: int32; light_equations' sums: float64
 class AlignSurface:
@@ -239,50 +325,44 @@ class AlignSurface:
         least_cosine: float,
     ) -> None: ...
 
+class SightingArrays(NamedTuple):
+    vertices: Tensor
+    normals: Tensor
+    K: Tensor
+    viewmat: Tensor
+    image: Tensor
+    mask: Tensor
+    light: Tensor
+
+class AlignDerivatives(NamedTuple):
+    jacobian: Tensor
+    """Of the vertices in the parameters."""
+    hessian: Tensor
+    """This and the next are filled."""
+    gradient: Tensor
+
+class TextureSums(NamedTuple):
+    weight: Tensor
+    squares: Tensor
+    mixed: Tensor
+    image_squares: Tensor
+
 def align_mesh(
     surface: AlignSurface,
-    vertices: Tensor,
-    normals: Tensor,
-    K: Tensor,
-    viewmat: Tensor,
-    image: Tensor,
-    mask: Tensor,
-    light: Tensor,
+    sighting: SightingArrays,
     high_pass: int,
-    jacobian: Tensor | None,
-    hessian: Tensor | None,
-    gradient: Tensor | None,
+    derivatives: AlignDerivatives | None,
     residual: Tensor | None,
     smooth: Tensor | None,
-) -> tuple[float, float]: ...
+) -> tuple[float, float]:
+    """Returns cost and weight, and fills what is given of the last two."""
+
 def bake_texture(
-    surface: AlignSurface,
-    vertices: Tensor,
-    normals: Tensor,
-    K: Tensor,
-    viewmat: Tensor,
-    image: Tensor,
-    mask: Tensor,
-    light: Tensor,
-    texel_face: Tensor,
-    texel_barycentric: Tensor,
-    weight: Tensor,
-    squares: Tensor,
-    mixed: Tensor,
-    image_squares: Tensor,
-) -> None: ...
-def light_equations(
-    surface: AlignSurface,
-    vertices: Tensor,
-    normals: Tensor,
-    K: Tensor,
-    viewmat: Tensor,
-    image: Tensor,
-    mask: Tensor,
-    light: Tensor,
-    hessian: Tensor,
-    right: Tensor,
-) -> None: ...
+    surface: AlignSurface, sighting: SightingArrays, texel_face: Tensor, texel_barycentric: Tensor, sums: TextureSums
+) -> None:
+    """Adds to `sums`."""
+
+def light_equations(surface: AlignSurface, sighting: SightingArrays, hessian: Tensor, right: Tensor) -> None: ...
 
 # native/bind_activation.cpp; any shape
 def sigmoid(values: Tensor, out: Tensor) -> None: ...

@@ -61,24 +61,24 @@ def make_face_model(native: Any, rng: Rng, sizes: Sizes | None = None) -> Argume
     return [normal(rng, e, v, 3), pose_basis, *bases, weights, parents, [False] + [True] * j]
 
 
-def posing(native: Any, rng: Rng) -> tuple[Any, list[Any], Sizes, int]:
-    """A model and the inputs of one to three timesteps."""
+def posing(native: Any, rng: Rng) -> tuple[Any, Any, Sizes, int]:
+    """A model, the inputs of one to three timesteps, and the sizes of both."""
     sizes = v, e, j = sizes_of_face(rng)
     b = int(rng.integers(1, 4))
     head = [normal(rng, b, 3), normal(rng, b, 3)] if rng.random() < 0.7 else [None, None]
     inputs = [normal(rng, v, 3), normal(rng, j + 1, 3), normal(rng, b, e), normal(rng, b, j, 3), *head]
-    return native.make_face_model(*make_face_model(native, rng, sizes)), inputs, sizes, b
+    return native.make_face_model(*make_face_model(native, rng, sizes)), native.FaceArrays(*inputs), sizes, b
 
 
 def pose_face(native: Any, rng: Rng) -> Arguments:
-    model, inputs, (v, _, _), b = posing(native, rng)
-    return [model, *inputs, empty(b, v, 3), empty(b, v, 3)]
+    model, face, (v, _, _), b = posing(native, rng)
+    return [model, face, empty(b, v, 3), empty(b, v, 3)]
 
 
 def pose_face_backward(native: Any, rng: Rng) -> Arguments:
-    model, inputs, (v, e, j), b = posing(native, rng)
+    model, face, (v, e, j), b = posing(native, rng)
     outputs = [empty(b, v, 3), empty(b, j + 1, 3), empty(b, e), empty(b, j, 3), empty(b, 3), empty(b, 3)]
-    return [model, *inputs, normal(rng, b, v, 3), normal(rng, b, v, 3), *outputs]
+    return [model, face, normal(rng, b, v, 3), normal(rng, b, v, 3), native.FaceArrays(*outputs)]
 
 
 def head_poses(native: Any, rng: Rng) -> Arguments:
@@ -118,7 +118,8 @@ def world(n: int, b: int) -> list[np.ndarray]:
 def rig_forward(native: Any, rng: Rng) -> Arguments:
     b, v = int(rng.integers(1, 3)), few(rng) + 2
     faces, face_index, local = rig(rng, v)
-    return [normal(rng, b, v, 3), faces, face_index, *local, empty(b, len(faces), FRAME), *world(len(face_index), b)]
+    outputs = empty(b, len(faces), FRAME), native.WorldShapes(*world(len(face_index), b))
+    return [normal(rng, b, v, 3), faces, face_index, native.LocalShapes(*local), *outputs]
 
 
 def make_rig_topology(native: Any, rng: Rng) -> Arguments:
@@ -128,13 +129,12 @@ def make_rig_topology(native: Any, rng: Rng) -> Arguments:
 
 
 def rig_backward(native: Any, rng: Rng) -> Arguments:
-    vertices, faces, face_index, *rest = rig_forward(native, rng)
-    native.rig_forward(vertices, faces, face_index, *rest)
-    *local, frames, _, _, scales = rest
+    vertices, faces, face_index, local, frames, posed = rig_forward(native, rng)
+    native.rig_forward(vertices, faces, face_index, local, frames, posed)
     topology = native.make_rig_topology(vertices.shape[1], faces, face_index)
-    by_world = [normal(rng, *array.shape) for array in world(len(face_index), len(vertices))]
-    outputs = [empty(*array.shape) for array in local] + [empty(*vertices.shape)]
-    return [topology, vertices, *local, frames, scales, *by_world, *outputs]
+    by_world = native.WorldShapes(*(normal(rng, *array.shape) for array in posed))
+    outputs = native.LocalShapes(*(empty(*array.shape) for array in local)), empty(*vertices.shape)
+    return [topology, vertices, local, frames, posed.scales, by_world, *outputs]
 
 
 def ride(native: Any, rng: Rng) -> Arguments:
@@ -142,51 +142,50 @@ def ride(native: Any, rng: Rng) -> Arguments:
     model = native.make_face_model(*make_face_model(native, rng, sizes))
     faces, face_index, local = rig(rng, v)
     topology, n = native.make_rig_topology(v, faces, face_index), len(face_index)
-    face = [normal(rng, v, 3), normal(rng, j + 1, 3), normal(rng, 1, e), normal(rng, 1, j, 3)]
-    head = [normal(rng, 1, 3), normal(rng, 1, 3), bool(rng.random() < 0.5)]
-    return [model, topology, *face, *head, *local, normal(rng, n), *world(n, 1), empty(n), empty(1, 4, 4)]
+    parameters = normal(rng, 1, e), normal(rng, 1, j, 3), normal(rng, 1, 3), normal(rng, 1, 3)
+    face = native.FaceArrays(normal(rng, v, 3), normal(rng, j + 1, 3), *parameters)
+    posed = native.PosedGaussians(*world(n, 1), empty(n), empty(1, 4, 4))
+    return [model, topology, bool(rng.random() < 0.5), face, native.LocalGaussians(*local, normal(rng, n)), posed]
 
 
 def ride_backward(native: Any, rng: Rng) -> Arguments:
-    arguments = ride(native, rng)
-    own = native.ride(*arguments)
-    *inputs, _, _, scales, opacities, _ = arguments
-    n = len(opacities)
-    by_world = [normal(rng, *array.shape) for array in world(n, 1)] + [normal(rng, n), normal(rng, 1, 4, 4)]
-    local = [empty(*array.shape) for array in inputs[9:13]]
-    face = [empty(*array.shape) for array in inputs[4:8]] if rng.random() < 0.7 else [None] * 4
-    return [own, *inputs, scales, opacities, *by_world, *local, *face]
+    model, topology, in_head, face, local, posed = ride(native, rng)
+    own = native.ride(model, topology, in_head, face, local, posed)
+    by_posed = native.PosedGaussians(*(normal(rng, *array.shape) for array in posed))
+    by_local = native.LocalGaussians(*(empty(*array.shape) for array in local))
+    by_face = native.FaceParameterGradients(*(empty(*array.shape) for array in face[2:]))
+    moved = by_face if rng.random() < 0.7 else None
+    return [own, model, topology, face, local, posed.scales, posed.opacities, by_posed, by_local, moved]
 
 
 # Pictures of Gaussians
 
 
-def view(rng: Rng, height: int, width: int) -> tuple[Any, ...]:
+def view(native: Any, rng: Rng, height: int, width: int) -> Any:
     n, k = int(rng.choice([0, 1, 5, 17, 300])), int(rng.choice([1, 4, 9, 16]))
     scales = np.exp(normal(rng, n, 3) - 3).astype(F32)
     shapes = normal(rng, n, 3, scale=0.5), normal(rng, n, 4), scales
-    gaussians = *shapes, rng.random(n).astype(F32), normal(rng, n, k, 3)
+    gaussians = native.GaussianArrays(*shapes, rng.random(n).astype(F32), normal(rng, n, k, 3))
     K, viewmat = camera(rng, height, width)
     out = empty(height, width, 3), empty(height, width), empty(n, dtype=I32)
-    return *gaussians, np.ones(3, F32), viewmat, K, *out
-
-
-def rasterize_forward(native: Any, rng: Rng) -> Arguments:
-    return list(view(rng, *picture(rng)))
+    return native.RasterizeView(gaussians, np.ones(3, F32), viewmat, K, *out)
 
 
 def rasterize_views(native: Any, rng: Rng) -> Arguments:
-    return [[view(rng, *picture(rng)) for _ in range(int(rng.integers(1, 3)))], bool(rng.random() < 0.7)]
+    views = [view(native, rng, *picture(rng)) for _ in range(int(rng.integers(1, 3)))]
+    return [views, bool(rng.random() < 0.7)]
 
 
 def rasterize_views_backward(native: Any, rng: Rng) -> Arguments:
     views, _ = rasterize_views(native, rng)
     tasks = []
     for own, frame in zip(views, native.rasterize_views(views, True), strict=True):
-        gaussians, (image, alpha, _) = list(own[:5]), own[8:]
-        by_alpha = normal(rng, *alpha.shape) if rng.random() < 0.5 else None
-        gradients = [empty(*array.shape) for array in gaussians] + [empty(len(own[0]), 2), empty(4, 4), empty(3, 3)]
-        tasks.append((frame, *gaussians, image, alpha, normal(rng, *image.shape), by_alpha, *gradients))
+        known = frame, own.gaussians, own.image, own.alpha
+        by_alpha = normal(rng, *own.alpha.shape) if rng.random() < 0.5 else None
+        gradients = native.GaussianArrays(*(empty(*array.shape) for array in own.gaussians))
+        of_view = empty(len(gradients.means), 2), empty(4, 4), empty(3, 3)
+        by_image = normal(rng, *own.image.shape)
+        tasks.append(native.RasterizeGradients(*known, by_image, by_alpha, gradients, *of_view))
     return [tasks]
 
 
@@ -204,10 +203,10 @@ def photometric_loss(native: Any, rng: Rng) -> Arguments:
 
 
 def adam_update(native: Any, rng: Rng) -> Arguments:
-    def task() -> tuple[Any, ...]:
+    def task() -> Any:
         shape = few(rng), int(rng.integers(1, 4))
         moments = normal(rng, *shape), np.abs(normal(rng, *shape)), np.array(rng.integers(0, 9), F32)
-        return normal(rng, *shape), normal(rng, *shape), *moments, 0.01
+        return native.AdamTask(normal(rng, *shape), normal(rng, *shape), *moments, 0.01)
 
     return [[task() for _ in range(int(rng.integers(1, 3)))]]
 
@@ -240,7 +239,7 @@ BASELINES: dict[str, Baseline] = {
         compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,
         align_mesh, bake_texture, light_equations, rig_forward, make_rig_topology, rig_backward, ride, ride_backward,
-        rasterize_forward, rasterize_views, rasterize_views_backward, photometric_loss, adam_update,
+        rasterize_views, rasterize_views_backward, photometric_loss, adam_update,
         triangle_penalties, observe_view, mean_squared_difference, box_of_nonzero,
     )
 } | {

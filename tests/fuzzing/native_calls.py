@@ -55,9 +55,10 @@ def load(path: str) -> Any:
 
 
 def bound_names(native: Any) -> set[str]:
-    """Everything that can be called, less the classes that only functions make."""
+    """Everything that can be called, less the classes that only functions make, and less the named tuples."""
     made = {"FaceModelData", "RigTopology", "Ride", "RasterizeFrame"}
-    return {name for name in dir(native) if not name.startswith("_") and callable(getattr(native, name))} - made
+    named = {name: getattr(native, name) for name in dir(native) if not name.startswith("_")}
+    return {name for name, one in named.items() if callable(one) and not hasattr(one, "_fields")} - made
 
 
 # Arguments are lists, tuples and what is in them; a place in them is a path of indices.
@@ -77,12 +78,19 @@ def at(value: Any, path: tuple[int, ...]) -> Any:
     return value
 
 
+def like(value: Any, items: list[Any]) -> Any:
+    """The items as a list, a tuple, or the same named tuple if they are as many."""
+    if hasattr(value, "_fields"):
+        return type(value)(*items) if len(items) == len(value) else tuple(items)
+    return type(value)(items)
+
+
 def put(value: Any, path: tuple[int, ...], new: Any) -> Any:
     if not path:
         return new
     items = list(value)
     items[path[0]] = put(items[path[0]], path[1:], new)
-    return type(value)(items)
+    return like(value, items)
 
 
 def other_shape(rng: Rng, array: np.ndarray) -> np.ndarray:
@@ -182,7 +190,7 @@ def changed(rng: Rng, value: Any) -> Any:
             items = items[:index]
         else:
             items[index] = items[int(rng.integers(0, len(items)))]
-        return type(value)(items)
+        return like(value, items)
     if isinstance(value, str):
         return str(rng.choice(["", "avx2", "sse4", "x" * 1000, "a\0b", "\u00fc"]))
     if isinstance(value, int | float):
@@ -214,7 +222,8 @@ def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
             alike = [own for own in places(stranger) if isinstance(at(stranger, own), type(value))]
             new = at(stranger, alike[int(rng.integers(0, len(alike)))]) if alike else None
             if not alike or rng.random() < 0.1:
-                new = type(value).__new__(type(value)) if type(value).__module__ == "_native" else None
+                own = type(value).__module__ == "_native" and not isinstance(value, tuple)
+                new = type(value).__new__(type(value)) if own else None
         else:
             new = rng.choice(np.array([None, object(), "x", b"x", 1, 0.5, {}, np.float32(1)], object))
         arguments = put(arguments, path, new)

@@ -46,25 +46,26 @@ def camera(rng: Rng, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 def rasterize_mesh(native: Any, rng: Rng) -> Arguments:
     h, w = picture(rng)
     v, f = few(rng) + 2, few(rng)
-    fragments = empty(h, w, dtype=I32), empty(h, w, 3), empty(h, w)
-    return [normal(rng, v, 3), below(rng, v, f, 3), *camera(rng, h, w), bool(rng.random() < 0.5), *fragments]
+    fragments = native.Fragments(empty(h, w, dtype=I32), empty(h, w, 3), empty(h, w))
+    return [normal(rng, v, 3), below(rng, v, f, 3), *camera(rng, h, w), bool(rng.random() < 0.5), fragments]
 
 
-def fragments(native: Any, rng: Rng) -> tuple[list[Any], np.ndarray, np.ndarray]:
-    """face_index, barycentric and depth of a drawn mesh; its image points; its faces."""
-    vertices, faces, K, viewmat, _, *out = rasterize_mesh(native, rng)
-    native.rasterize_mesh(vertices, faces, K, viewmat, False, *out)
+def fragments(native: Any, rng: Rng) -> tuple[Any, np.ndarray, np.ndarray]:
+    """A drawn mesh, its image points, and its faces."""
+    vertices, faces, K, viewmat, _, out = rasterize_mesh(native, rng)
+    native.rasterize_mesh(vertices, faces, K, viewmat, False, out)
     points = (vertices @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
     return out, np.ascontiguousarray(points, F32), faces
 
 
-def edges(rng: Rng, points: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
-    """edge_vertices, edge_faces and opposite: all edges of all faces, half of them with a second triangle."""
+def edges(native: Any, rng: Rng, faces: np.ndarray) -> Any:
+    """All edges of all faces, half of them with a second triangle."""
     vertices = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(I32)
     opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]]).astype(I32)
     own = np.tile(np.arange(len(faces), dtype=I32), 3)
     other = np.where(rng.random(len(own)) < 0.5, -1, below(rng, len(faces), len(own), dtype=I32))
-    return [np.ascontiguousarray(array) for array in (vertices, np.stack([own, other], 1), opposite)]
+    arrays = vertices, np.stack([own, other], 1), opposite
+    return native.MeshEdges(*(np.ascontiguousarray(array) for array in arrays))
 
 
 def interpolate_mesh(native: Any, rng: Rng) -> Arguments:
@@ -81,7 +82,7 @@ def interpolate_mesh_backward(native: Any, rng: Rng) -> Arguments:
 
 def barycentric_backward(native: Any, rng: Rng) -> Arguments:
     out, points, faces = fragments(native, rng)
-    return [*out, points, faces, normal(rng, *out[1].shape), empty(*points.shape, dtype=F64)]
+    return [out, points, faces, normal(rng, *out.barycentric.shape), empty(*points.shape, dtype=F64)]
 
 
 def sample_texture(native: Any, rng: Rng) -> Arguments:
@@ -96,22 +97,23 @@ def sample_texture_backward(native: Any, rng: Rng) -> Arguments:
 
 def antialias(native: Any, rng: Rng) -> Arguments:
     out, points, faces = fragments(native, rng)
-    shape = *out[0].shape, int(rng.integers(1, 4))
-    return [*out, points, faces, *edges(rng, points, faces), normal(rng, *shape), empty(*shape)]
+    shape = *out.face_index.shape, int(rng.integers(1, 4))
+    return [out, points, faces, edges(native, rng, faces), normal(rng, *shape), empty(*shape)]
 
 
 def antialias_backward(native: Any, rng: Rng) -> Arguments:
     *inputs, image, out = antialias(native, rng)
-    return [*inputs, image, normal(rng, *out.shape), out, empty(*inputs[3].shape, dtype=F64)]
+    return [*inputs, image, normal(rng, *out.shape), out, empty(*inputs[1].shape, dtype=F64)]
 
 
 def mesh_loss(native: Any, rng: Rng) -> Arguments:
     out, points, faces = fragments(native, rng)
-    size, texture, f = out[0].shape, normal(rng, few(rng), few(rng), 3), len(faces)
+    size, texture, f = out.face_index.shape, normal(rng, few(rng), few(rng), 3), len(faces)
     surface = [normal(rng, *points.shape), normal(rng, f, 3, 2), np.abs(normal(rng, f)), texture, normal(rng, 9, 3)]
-    target = [normal(rng, *size, 3), np.abs(normal(rng, *size)), 0.1, empty(*size, 3)]
+    target = native.LossTarget(normal(rng, *size, 3), np.abs(normal(rng, *size)), 0.1)
     gradients = [empty(*points.shape, dtype=F64), empty(*points.shape), empty(*texture.shape), empty(9, 3, dtype=F64)]
-    return [*out, points, faces, *edges(rng, points, faces), *surface, *target, *gradients]
+    drawn = native.LitSurface(*surface), target, empty(*size, 3), native.LossGradients(*gradients)
+    return [out, points, faces, edges(native, rng, faces), *drawn]
 
 
 def align_surface(native: Any, rng: Rng, v: int = 0) -> Arguments:
@@ -122,29 +124,30 @@ def align_surface(native: Any, rng: Rng, v: int = 0) -> Arguments:
     return [faces, uv, used, np.abs(normal(rng, *texture, 3)), np.abs(normal(rng, *texture)), 0.1, 3.0, 0.05]
 
 
-def sighting(native: Any, rng: Rng) -> tuple[Any, list[Any], tuple[int, ...], Arguments]:
-    """A surface, and a picture of it: vertices, normals, K, viewmat, image, mask, light."""
+def sighting(native: Any, rng: Rng) -> tuple[Any, Any, tuple[int, ...], Arguments]:
+    """A surface, a picture of it, the texture's size, and the arguments that the surface was made of."""
     v, (h, w) = few(rng) + 2, picture(rng)
     made = align_surface(native, rng, v)
     light = normal(rng, 9, 3)
     seen = [normal(rng, v, 3), normal(rng, v, 3), *camera(rng, h, w), normal(rng, h, w, 3), np.ones((h, w), F32), light]
-    return native.AlignSurface(*made), seen, made[4].shape, made
+    return native.AlignSurface(*made), native.SightingArrays(*seen), made[4].shape, made
 
 
 def align_mesh(native: Any, rng: Rng) -> Arguments:
     surface, seen, _, _ = sighting(native, rng)
-    p, out = int(rng.integers(1, 6)), [empty(*seen[4].shape), empty(*seen[4].shape)]
-    derivatives = [normal(rng, len(seen[0]), 3, p), empty(p, p), empty(p)] if rng.random() < 0.7 else [None] * 3
-    outputs = [one if rng.random() < 0.7 else None for one in out]
-    return [surface, *seen, int(rng.integers(0, 9)), *derivatives, *outputs]
+    p, out = int(rng.integers(1, 6)), [empty(*seen.image.shape), empty(*seen.image.shape)]
+    derivatives = native.AlignDerivatives(normal(rng, len(seen.vertices), 3, p), empty(p, p), empty(p))
+    outputs = [one if rng.random() < 0.7 else None for one in (derivatives, *out)]
+    return [surface, seen, int(rng.integers(0, 9)), *outputs]
 
 
 def bake_texture(native: Any, rng: Rng) -> Arguments:
     surface, seen, texture, (faces, *_) = sighting(native, rng)
     texels = [below(rng, len(faces) + 1, *texture, dtype=I32) - I32(1), normal(rng, *texture, 3)]
-    return [surface, *seen, *texels, empty(*texture), *(empty(*texture, 3) for _ in range(3))]
+    sums = native.TextureSums(empty(*texture), *(empty(*texture, 3) for _ in range(3)))
+    return [surface, seen, *texels, sums]
 
 
 def light_equations(native: Any, rng: Rng) -> Arguments:
     surface, seen, _, _ = sighting(native, rng)
-    return [surface, *seen, empty(3, 9, 9, dtype=F64), empty(3, 9, dtype=F64)]
+    return [surface, seen, empty(3, 9, 9, dtype=F64), empty(3, 9, dtype=F64)]

@@ -58,8 +58,9 @@ class _Ride(torch.autograd.Function):
         means, quats, scales = (torch.empty(1, count, width) for width in (3, 4, 3))
         opacities, head_pose = torch.empty(count), torch.empty(1, 4, 4)
         known = unpacked(*arrays)
-        outputs = unpacked(means, quats, scales, opacities, head_pose)
-        ctx.ride = _native.ride(data, topology, *known[:6], in_head, *known[6:], *outputs)
+        face, local = _native.FaceArrays(*known[:6]), _native.LocalGaussians(*known[6:])
+        posed = _native.PosedGaussians(*unpacked(means, quats, scales, opacities, head_pose))
+        ctx.ride = _native.ride(data, topology, in_head, face, local, posed)
         ctx.data, ctx.topology, ctx.in_head = data, topology, in_head
         ctx.save_for_backward(*arrays, scales, opacities)
         return (means, quats, scales, opacities, head_pose) if in_head else (means, quats, scales, opacities)
@@ -71,11 +72,19 @@ class _Ride(torch.autograd.Function):
         moves_face = any(ctx.needs_input_grad[5:9])
         of_face = [torch.empty_like(tensor) if moves_face else None for tensor in saved[2:6]]
         of_gaussians = [torch.empty_like(tensor) for tensor in saved[6:]]
-        known = unpacked(
-            *saved, scales.detach(), opacities.detach(), *(gradient.contiguous() for gradient in gradients)
-        )
+        by_posed = unpacked(*(gradient.contiguous() for gradient in gradients))
         if not ctx.in_head:
-            known.append(None)
-        results = unpacked(*of_gaussians, *of_face)
-        _native.ride_backward(ctx.ride, ctx.data, ctx.topology, *known[:6], ctx.in_head, *known[6:], *results)
+            by_posed.append(None)
+        known = unpacked(*saved, scales.detach(), opacities.detach())
+        _native.ride_backward(
+            ctx.ride,
+            ctx.data,
+            ctx.topology,
+            _native.FaceArrays(*known[:6]),
+            _native.LocalGaussians(*known[6:10]),
+            *known[10:],
+            _native.PosedGaussians(*by_posed),
+            _native.LocalGaussians(*unpacked(*of_gaussians)),
+            _native.FaceParameterGradients(*unpacked(*of_face)) if moves_face else None,
+        )
         return None, None, None, None, None, *of_face, *of_gaussians

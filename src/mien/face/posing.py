@@ -130,7 +130,7 @@ class _PoseVertices(torch.autograd.Function):
         assert joints is not None
         shaped, vertices = (rest.new_empty(len(expression), *rest.shape) for _ in range(2))
         arrays = (rest, joint_rest, expression, joints, rotation, translation)
-        _native.pose_face(data, *unpacked(*arrays, shaped, vertices))
+        _native.pose_face(data, _native.FaceArrays(*unpacked(*arrays)), *unpacked(shaped, vertices))
         ctx.data = data
         ctx.save_for_backward(*arrays, shaped)
         return vertices
@@ -144,11 +144,14 @@ class _PoseVertices(torch.autograd.Function):
         grad_rest, grad_joint_rest = rest.new_empty(b, *rest.shape), rest.new_empty(b, *joint_rest.shape)
         grad_expression, grad_joints = torch.empty_like(expression), torch.empty_like(joints)
         grad_head = rest.new_empty(b, 3), rest.new_empty(b, 3)
+        known = unpacked(*(None if array is None else array.detach() for array in arrays))
+        found = unpacked(grad_rest, grad_joint_rest, grad_expression, grad_joints, *grad_head)
         _native.pose_face_backward(
             ctx.data,
-            *unpacked(*(None if array is None else array.detach() for array in (*arrays, shaped))),
-            *unpacked(grad_vertices.contiguous(), grad_rest, grad_joint_rest, grad_expression, grad_joints, *grad_head),
-        )  # fmt: skip
+            _native.FaceArrays(*known),
+            *unpacked(shaped.detach(), grad_vertices.contiguous()),
+            _native.FaceArrays(*found),
+        )
         needs = ctx.needs_input_grad
         return (
             None,

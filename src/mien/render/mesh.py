@@ -70,9 +70,7 @@ def rasterize_mesh(
         _plain(camera.K),
         _plain(camera.viewmat),
         cull_backfaces,
-        fragments.face_index,
-        fragments.barycentric,
-        fragments.depth,
+        _native.Fragments(fragments.face_index, fragments.barycentric, fragments.depth),
     )
     return fragments
 

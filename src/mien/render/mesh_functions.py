@@ -35,7 +35,8 @@ class _Barycentrics(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor):
         face_index, barycentric, depth, points, faces = ctx.saved_tensors
         grad_points = torch.zeros(points.shape, dtype=torch.float64)
-        _native.barycentric_backward(face_index, barycentric, depth, points, faces, grad.contiguous(), grad_points)
+        fragments = _native.Fragments(face_index, barycentric, depth)
+        _native.barycentric_backward(fragments, points, faces, grad.contiguous(), grad_points)
         return None, grad_points.float(), None, None, None
 
 
@@ -89,22 +90,23 @@ class _Antialias(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, points: Tensor, *mesh: Tensor):
-        face_index, barycentric, depth, faces, *edges = mesh
+        *fragments, faces, edge_vertices, edge_faces, opposite = mesh
         image, points = image.detach().contiguous(), points.detach()
         out = torch.empty_like(image)
-        _native.antialias(face_index, barycentric, depth, points, faces, edges[0], edges[1], edges[2], image, out)
+        edges = _native.MeshEdges(edge_vertices, edge_faces, opposite)
+        _native.antialias(_native.Fragments(*fragments), points, faces, edges, image, out)
         ctx.save_for_backward(image, points, *mesh)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor):
-        image, points, face_index, barycentric, depth, faces, *edges = ctx.saved_tensors
+        image, points, *fragments, faces, edge_vertices, edge_faces, opposite = ctx.saved_tensors
         grad_image, grad_points = torch.empty_like(image), torch.zeros(points.shape, dtype=torch.float64)
+        edges = _native.MeshEdges(edge_vertices, edge_faces, opposite)
         _native.antialias_backward(
-            face_index, barycentric, depth, points, faces, edges[0], edges[1], edges[2], image, grad.contiguous(),
-            grad_image, grad_points,
-        )  # fmt: skip
+            _native.Fragments(*fragments), points, faces, edges, image, grad.contiguous(), grad_image, grad_points
+        )
         return grad_image, grad_points.float(), *([None] * (len(ctx.saved_tensors) - 2))
 
 
@@ -118,15 +120,19 @@ class _MeshLoss(torch.autograd.Function):
     ):  # fmt: skip
         tensors = [tensor.detach().contiguous() for tensor in (points, normals, texture, light)]
         face_index, barycentric, depth, faces, edge_vertices, edge_faces, opposite, uv, face_weights = mesh
-        image, mask, epsilon = target
         grad_points = torch.zeros(points.shape, dtype=torch.float64)
         grad_normals, grad_texture = torch.zeros(normals.shape), torch.zeros(texture.shape)
         grad_light = torch.zeros(9, 3, dtype=torch.float64)
         total, weight = _native.mesh_loss(
-            face_index, barycentric, depth, tensors[0], faces, edge_vertices, edge_faces, opposite, tensors[1], uv,
-            face_weights, tensors[2], tensors[3], image, mask, epsilon, picture, grad_points, grad_normals,
-            grad_texture, grad_light,
-        )  # fmt: skip
+            _native.Fragments(face_index, barycentric, depth),
+            tensors[0],
+            faces,
+            _native.MeshEdges(edge_vertices, edge_faces, opposite),
+            _native.LitSurface(tensors[1], uv, face_weights, tensors[2], tensors[3]),
+            _native.LossTarget(*target),
+            picture,
+            _native.LossGradients(grad_points, grad_normals, grad_texture, grad_light),
+        )
         weight = max(weight, 1.0)
         ctx.weight = weight
         ctx.save_for_backward(grad_points.float(), grad_normals, grad_texture, grad_light.float())

@@ -70,7 +70,8 @@ class _Rasterize(torch.autograd.Function):
             kept += own[:5]
             count = len(own[0])
             view = (recycled(*size, 3), recycled(*size), torch.empty(count, dtype=torch.int32))
-            tasks.append(tuple(unpacked(*own, *view)))
+            gaussians = _native.GaussianArrays(*unpacked(*own[:5]))
+            tasks.append(_native.RasterizeView(gaussians, *unpacked(*own[5:], *view)))
             outputs += view
         try:
             ctx.frames = _native.rasterize_views(tasks, any(ctx.needs_input_grad))
@@ -98,10 +99,16 @@ class _Rasterize(torch.autograd.Function):
             grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
             grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
             found = [torch.empty_like(t) for t in own]
-            found += [torch.empty(len(own[0]), 2), torch.empty(4, 4), torch.empty(3, 3)]
-            known = (*own, image, alpha, grad_image)
-            tasks.append((frame, *unpacked(*known, grad_alpha, *found)))
-            views.append((grad_image, alpha, *found))
+            of_view = [torch.empty(len(own[0]), 2), torch.empty(4, 4), torch.empty(3, 3)]
+            task = _native.RasterizeGradients(
+                frame,
+                _native.GaussianArrays(*unpacked(*own)),
+                *unpacked(image, alpha, grad_image, grad_alpha),
+                _native.GaussianArrays(*unpacked(*found)),
+                *unpacked(*of_view),
+            )
+            tasks.append(task)
+            views.append((grad_image, alpha, *found, *of_view))
         _native.rasterize_views_backward(tasks)
         result: list[Tensor | None] = [None]
         for index, (grad_image, alpha, *found) in enumerate(views):

@@ -127,8 +127,9 @@ def render(
             camera.K,
         )
     )  # fmt: skip
-    frame = _native.rasterize_forward(means, quats, scales, opacities, sh, colour, view, K, image, alpha, radii)
-    if frame is None:
+    arrays = _native.GaussianArrays(means, quats, scales, opacities, sh)
+    task = _native.RasterizeView(arrays, colour, view, K, image, alpha, radii)
+    if _native.rasterize_views([task], differentiable=False) == [None]:
         raise ValueError("render: NaN or infinity in the Gaussians, the camera or the background")
     return image, alpha
 

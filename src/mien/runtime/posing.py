@@ -93,10 +93,8 @@ def rig_points(rig: Rig, face: Face, in_world: bool = False) -> Float32[np.ndarr
         )
     head = (_batch(face.head_rotation), _batch(face.head_translation)) if in_world else (None, None)
     shaped, points = (np.empty((1, *rig.template.shape), np.float32) for _ in range(2))
-    _native.pose_face(
-        compiled, rig.template, rig.joint_template, _batch(face.expression), _batch(face.joints), *head,
-        shaped=shaped, vertices=points,
-    )  # fmt: skip
+    arrays = _native.FaceArrays(rig.template, rig.joint_template, _batch(face.expression), _batch(face.joints), *head)
+    _native.pose_face(compiled, arrays, shaped=shaped, vertices=points)
     return points[0]
 
 
@@ -116,9 +114,13 @@ def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
     frames = np.empty((1, len(baked.faces), _native.TRIANGLE_FRAME_FLOATS), np.float32)
     means, quats, scales = (np.empty((1, n, width), np.float32) for width in (3, 4, 3))
     _native.rig_forward(
-        np.ascontiguousarray(vertices[None]), baked.faces.astype(np.int64), baked.face_index.astype(np.int64),
-        baked.means, raw.quats, raw.log_scales, frames=frames, means=means, quats=quats, scales=scales,
-    )  # fmt: skip
+        np.ascontiguousarray(vertices[None]),
+        baked.faces.astype(np.int64),
+        baked.face_index.astype(np.int64),
+        _native.LocalShapes(baked.means, raw.quats, raw.log_scales),
+        frames=frames,
+        world=_native.WorldShapes(means, quats, scales),
+    )
     T_world_local = pose if in_head else None
     return _contiguous(means[0], quats[0], scales[0], sigmoid(raw.opacity_logits), raw.sh, T_world_local)
 

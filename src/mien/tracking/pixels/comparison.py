@@ -82,8 +82,8 @@ class ModelPictures:
         view, residual = picture.camera, torch.empty_like(picture.image)
         depth = float(view.project(vertices.mean(0, keepdim=True))[1])
         radius = max(round(self.appearance.light_extent * float(view.K[0, 0]) / max(depth, 1e-3)), 2)
-        seen = Sighting(posed, picture, self.appearance.light.contiguous()).arguments()
-        cost, weight = _native.align_mesh(self.surface, *seen, radius, None, None, None, residual, None)
+        seen = Sighting(posed, picture, self.appearance.light.contiguous()).arrays()
+        cost, weight = _native.align_mesh(self.surface, seen, radius, None, residual, None)
         rms = self.appearance.sigma * cost**0.5 if weight >= _MIN_PIXELS else float("nan")
         return Comparison(window, picture.image - residual, residual.norm(dim=-1), rms)
 

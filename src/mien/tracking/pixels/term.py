@@ -73,8 +73,8 @@ class PhotometricTerm:
             posed = self.model.pose(state[row], subject.identity, derive=False)
             for camera in self.landmarks.views.seen_by(row):
                 picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
-                seen = Sighting(posed, picture, self.light).arguments()
-                cost, weight = _native.align_mesh(self.surface, *seen, self.light_radius, None, None, None, None, None)
+                seen = Sighting(posed, picture, self.light).arrays()
+                cost, weight = _native.align_mesh(self.surface, seen, self.light_radius, None, None, None)
                 if weight >= _MIN_PIXELS:
                     found[row, camera] = self.sigma * cost**0.5
 
@@ -118,8 +118,9 @@ class PhotometricTerm:
         """Cost of one picture, half its gradient and half its Hessian. Both are empty without a Jacobian."""
         size = 0 if posed.jacobian is None else posed.jacobian.shape[2]
         gradient, hessian = torch.empty(size), torch.empty(size, size)
-        derivatives = (None, None, None) if posed.jacobian is None else (posed.jacobian, hessian, gradient)
+        jacobian = posed.jacobian
+        derivatives = None if jacobian is None else _native.AlignDerivatives(jacobian, hessian, gradient)
         picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
-        sighting = Sighting(posed, picture, self.light)
-        cost, _ = _native.align_mesh(self.surface, *sighting.arguments(), self.light_radius, *derivatives, None, None)
+        seen = Sighting(posed, picture, self.light).arrays()
+        cost, _ = _native.align_mesh(self.surface, seen, self.light_radius, derivatives, None, None)
         return cost, gradient.double(), hessian.double()

@@ -53,11 +53,12 @@ class Sighting:
         """The sighting with its share multiplied into the mask."""
         return replace(self, picture=replace(self.picture, mask=self.picture.mask * self.share))
 
-    def arguments(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The arguments for the native core."""
+    def arrays(self) -> "_native.SightingArrays":
+        """The sighting in the form in which the native core takes it."""
         camera, picture = self.picture.camera, self.picture
-        posed = self.posed
-        return posed.vertices, posed.normals, camera.K, camera.viewmat, picture.image, picture.mask, self.light
+        return _native.SightingArrays(
+            self.posed.vertices, self.posed.normals, camera.K, camera.viewmat, picture.image, picture.mask, self.light
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +139,7 @@ def _without_smooth_residual(
     """The sighting without the part of its difference from the prediction that is smooth over `radius` pixels."""
     smooth = torch.empty_like(sighting.picture.image)
     surface = space.native(texture, outlier)
-    _native.align_mesh(surface, *sighting.arguments(), radius, None, None, None, None, smooth)
+    _native.align_mesh(surface, sighting.arrays(), radius, None, None, smooth)
     return replace(sighting, picture=replace(sighting.picture, image=sighting.picture.image - smooth))
 
 
@@ -153,12 +154,11 @@ def _bake(
     surface = space.native(texture, outlier)
     weight = torch.zeros(size)
     squares, mixed, image = (torch.zeros(*size, 3) for _ in range(3))
+    sums = _native.TextureSums(weight, squares, mixed, image)
     for own, light in zip(sightings, lights, strict=True):
         for sighting in own:
-            _native.bake_texture(
-                surface, *replace(sighting, light=light).weighted().arguments(), space.fragments.face_index,
-                space.fragments.barycentric, weight, squares, mixed, image,
-            )  # fmt: skip
+            seen = replace(sighting, light=light).weighted().arrays()
+            _native.bake_texture(surface, seen, space.fragments.face_index, space.fragments.barycentric, sums)
     known = weight > _MIN_WEIGHT
     albedo = mixed / squares.clamp_min(1e-6) * known[..., None]
     variance = ((image - albedo * mixed).sum(-1) / weight.clamp_min(1e-6)).clamp_min(0)
@@ -183,7 +183,7 @@ def _fit_light(
     hessian, right = torch.zeros(3, 9, 9).double(), torch.zeros(3, 9).double()
     surface = space.native(texture, outlier)
     for sighting in sightings:
-        _native.light_equations(surface, *replace(sighting, light=light).arguments(), hessian, right)
+        _native.light_equations(surface, replace(sighting, light=light).arrays(), hessian, right)
     hessian = hessian + hessian.triu(1).mT
     stiffness = _LIGHT_STIFFNESS * hessian.diagonal(dim1=1, dim2=2).amax(1)[:, None].expand(3, 9).clone() + 1e-9
     hessian = hessian + torch.diag_embed(stiffness)
