@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mien.capture.given import _read_matte
-from mien.capture.picture import LARGEST_PICTURE, announced_size, decode_picture
+from mien.capture.picture import MAX_PICTURE_PIXELS, announced_size, decode_picture
 from mien.capture.source import read_image
 from mien.errors import UserError
 from mien.evaluation.image_source import read_picture
@@ -102,9 +102,9 @@ def test_a_picture_of_thousands_of_scans_is_not_decoded(tmp_path: Path) -> None:
 
 def test_the_largest_picture_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    path.write_bytes(png(LARGEST_PICTURE // 256, 256, 256))
+    path.write_bytes(png(MAX_PICTURE_PIXELS // 256, 256, 256))
     assert decode_picture(path, cv2.IMREAD_GRAYSCALE) is not None
-    path.write_bytes(png(LARGEST_PICTURE // 256 + 1, 256, 256))
+    path.write_bytes(png(MAX_PICTURE_PIXELS // 256 + 1, 256, 256))
     with pytest.raises(UserError, match="more than the 67,108,864"):
         decode_picture(path, cv2.IMREAD_GRAYSCALE)
 

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import mien
+from mien.bounded import MAX_SIDE
 from mien.errors import UserError
 from mien.help_text import without_details
 from mien.terminal import drop_output, open_closed_streams, printable, show, tell
@@ -44,8 +45,8 @@ EXIT_INTERRUPTED = 130
 EXIT_CLOSED_PIPE = 141
 """Exit code of a program that the system ends because nobody reads its output any more (`mien ... | head -1`)."""
 EXIT_TERMINATED = 143
-_OPENCVS_LIMIT, _MOST_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS", 8192 * 8192
-"""Same number as `mien.capture.picture.LARGEST_PICTURE`. OpenCV reads this variable when it is imported."""
+_OPENCVS_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
+"""OpenCV reads this variable when it is imported."""
 _USERS_ERRNOS = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG}
 )
@@ -135,7 +136,7 @@ def _run(name: str, rest: list[str]) -> int:
 
     from mien.commands.options import settings_groups, with_settings
 
-    os.environ.setdefault(_OPENCVS_LIMIT, str(_MOST_PIXELS))
+    os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
     options, more = module.Command, ""
     if "--help-all" in rest:

@@ -62,8 +62,8 @@ def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
         if name == "kind":
             continue
         if name not in known:
-            near = difflib.get_close_matches(name[:_LONGEST_SHOWN], known, 1)
-            raise UserError(no_such_setting(f"{where}.{name[:_LONGEST_SHOWN]}", owner, near, known))
+            near = difflib.get_close_matches(name[:_MAX_SHOWN], known, 1)
+            raise UserError(no_such_setting(f"{where}.{name[:_MAX_SHOWN]}", owner, near, known))
         place, value = f"{where}.{name}", getattr(base, name)
         if is_dataclass(value):
             changed[name] = overlay(value, change, place, owner)
@@ -176,7 +176,7 @@ def _in_short(value: Any) -> str:
     if shape is not None:
         return f"{value.dtype} {tuple(shape)}"
     text = repr(value)
-    return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "..."
+    return text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "..."
 
 
-_LONGEST_SHOWN = 80
+_MAX_SHOWN = 80

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-LARGEST_SIDE = 8192
-"""Largest width or height of a picture, in pixels."""
-LARGEST_NUMBER = 1e6
-"""Largest magnitude of lengths in metres, angles in radians, raw values and weights. Mien writes far smaller
-numbers."""
-LARGEST_FOCAL = 1e7
+from mien.bounded import MAX_SIDE
+
+MAX_NUMBER = 1e6
+"""Largest magnitude of lengths in metres, coordinates in pixels, angles in radians, raw values and weights. Mien writes
+far smaller numbers."""
+MAX_FOCAL = 1e7
 """Largest focal length, in pixels."""
 _RIGID = 1e-2
 """Tolerance for the last rows of K and viewmat, and for the deviation of R R^T from the identity."""
@@ -37,12 +37,12 @@ def side(value: object) -> int:
     Raises:
         ValueError: it cannot.
     """
-    return whole(value, 1, LARGEST_SIDE)
+    return whole(value, 1, MAX_SIDE)
 
 
 def is_moderate(array: np.ndarray) -> bool:
-    """Whether all numbers are finite and at most `LARGEST_NUMBER` in magnitude."""
-    return array.size == 0 or bool(np.abs(array).max() <= LARGEST_NUMBER)
+    """Whether all numbers are finite and at most `MAX_NUMBER` in magnitude."""
+    return array.size == 0 or bool(np.abs(array).max() <= MAX_NUMBER)
 
 
 def are_indices(array: np.ndarray, count: int) -> bool:
@@ -63,22 +63,22 @@ def camera_fault(K: Any, viewmat: Any, width: object, height: object) -> str | N
         try:
             side(value)
         except ValueError:
-            return f"{width!r:.40}x{height!r:.40} pixels, not whole numbers from 1 to {LARGEST_SIDE}"
+            return f"{width!r:.40}x{height!r:.40} pixels, not whole numbers from 1 to {MAX_SIDE}"
     K, viewmat = (np.asarray(matrix, np.float64) for matrix in (K, viewmat))
     if K.shape != (3, 3) or viewmat.shape != (4, 4):
         return "K must be 3x3 and viewmat 4x4 numbers"
     if not (np.isfinite(K).all() and np.isfinite(viewmat).all()):
         return "K and viewmat must be finite numbers"
-    if np.abs(K).max() > LARGEST_FOCAL or min(K[0, 0], K[1, 1]) < 1 / LARGEST_FOCAL:
-        return f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}, not above 0 and to {LARGEST_FOCAL:g} pixels"
+    if np.abs(K).max() > MAX_FOCAL or min(K[0, 0], K[1, 1]) < 1 / MAX_FOCAL:
+        return f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}, not above 0 and to {MAX_FOCAL:g} pixels"
     if np.abs(K[2] - (0, 0, 1)).max() > _RIGID:
         return "the last row of K must be 0 0 1"
     turned = viewmat[:3, :3]
     rigid = np.abs(turned).max() <= 2 and np.abs(_product(turned) - np.eye(3)).max() <= _RIGID
     if not rigid or np.linalg.det(turned) < 0 or np.abs(viewmat[3] - (0, 0, 0, 1)).max() > _RIGID:
         return "viewmat is no rotation and translation (world to camera, OpenCV axes)"
-    if np.abs(viewmat[:3, 3]).max() > LARGEST_NUMBER:
-        return f"it is more than {LARGEST_NUMBER:g} metres away"
+    if np.abs(viewmat[:3, 3]).max() > MAX_NUMBER:
+        return f"it is more than {MAX_NUMBER:g} metres away"
     return None
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from mien.errors import UserError
 
-_LONGEST_SHOWN = 60
+_MAX_SHOWN = 60
 """Number of characters of a value that a message shows."""
 
 
@@ -129,7 +129,7 @@ def shown(value: Any) -> str:
         text = " ".join(shown(item) for item in value) or "(nothing)"
     else:
         text = _short(value) if isinstance(value, float) else str(value)
-    return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "..."
+    return text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "..."
 
 
 def marks_of(hint: Any) -> tuple[Any, ...]:

@@ -3,13 +3,13 @@
 import numpy as np
 from jaxtyping import Float, UInt8
 
-_REACH = 3
+_CUT_REACH = 3
 """Frames on either side of a cut that must all differ. After a flash, the picture from before it comes back."""
-_NEIGHBOURS = 4
+_CUT_NEIGHBOURS = 4
 """Frames on either side of a cut in which the picture may change only a little: motion lasts longer than a cut."""
-_SMALLEST = 0.05
+_MIN_CHANGE = 0.05
 """Smallest change at a cut, as a fraction of the mean brightness."""
-_CONTRAST = 3.0
+_MIN_CONTRAST = 3.0
 """Factor by which the change at a cut exceeds the changes beside it."""
 _BLOCKS = (3, 4)
 """Rows and columns of blocks. The change is that of the quarter that changes most, as the head may be small."""
@@ -25,18 +25,20 @@ def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"]) -> list[int]:
     pictures /= np.maximum(pictures.mean(axis=(1, 2, 3), keepdims=True), 1.0)
     changes = np.array([_difference(*pair) for pair in zip(pictures[:-1], pictures[1:], strict=True)])
     cuts = []
-    for index in np.flatnonzero(changes > _SMALLEST).tolist():
-        beside = np.concatenate([changes[max(index - _NEIGHBOURS, 0) : index], changes[index + 1 :][:_NEIGHBOURS]])
+    for index in np.flatnonzero(changes > _MIN_CHANGE).tolist():
+        beside = np.concatenate(
+            [changes[max(index - _CUT_NEIGHBOURS, 0) : index], changes[index + 1 :][:_CUT_NEIGHBOURS]]
+        )
         # The largest neighbour may be the other half of a cut that passes through a blended frame.
         loudest = np.sort(beside)[-2] if len(beside) > 1 else 0.0
-        if changes[index] > _CONTRAST * loudest and _parted(pictures, index + 1) > 0.5 * changes[index]:
+        if changes[index] > _MIN_CONTRAST * loudest and _parted(pictures, index + 1) > 0.5 * changes[index]:
             cuts.append(index + 1)
     return cuts
 
 
 def _parted(pictures: Float[np.ndarray, "t h w 3"], start: int) -> float:
     """Return the smallest difference between a frame shortly before `start` and one shortly after it."""
-    before, after = pictures[max(start - _REACH, 0) : start], pictures[start : start + _REACH]
+    before, after = pictures[max(start - _CUT_REACH, 0) : start], pictures[start : start + _CUT_REACH]
     return min(_difference(one, other) for one in before for other in after)
 
 

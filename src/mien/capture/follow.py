@@ -8,9 +8,9 @@ from mien.capture.faces import LandmarkDetector
 from mien.capture.people import Person
 from mien.capture.survey import Survey
 
-_ASTRAY = 0.6
+_MAX_DISTANCE = 0.6
 """Largest distance between the centres of landmarks and of the followed face, as a part of the face's longer side."""
-_MEMORY = 12
+_MAX_AGE = 12
 """Frames for which the last landmarks predict the face's position if the survey did not find it."""
 
 
@@ -43,7 +43,7 @@ class LandmarkFollower:
         """Return the box where the face should be: the survey's, or else that of the last landmarks if recent."""
         if np.isfinite(self._boxes[timestep, 0]):
             return self._boxes[timestep]
-        if self._last is None or abs(timestep - self._last[0]) > _MEMORY:
+        if self._last is None or abs(timestep - self._last[0]) > _MAX_AGE:
             return None
         return _box(self._last[1])
 
@@ -54,7 +54,7 @@ class LandmarkFollower:
         centres = np.array([_centre(_box(face)) for face in faces])
         distances = np.linalg.norm(centres - _centre(expected), axis=1)
         best = int(np.argmin(distances))
-        if distances[best] > _ASTRAY * (expected[2:] - expected[:2]).max():
+        if distances[best] > _MAX_DISTANCE * (expected[2:] - expected[:2]).max():
             return None
         to_others = np.linalg.norm(centres[best] - (others[:, :2] + others[:, 2:]) / 2, axis=1)
         # Missing faces are NaN, which never compares as smaller.

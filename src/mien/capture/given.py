@@ -15,11 +15,10 @@ from mien.capture.faces import LANDMARKS
 from mien.capture.picture import decode_picture
 from mien.capture.source import FrameSelection, FrameSource, list_images, open_source
 from mien.errors import UserError
+from mien.limits import MAX_NUMBER
 from mien.storage import read_arrays
 
-_FARTHEST = 1e6
-"""Largest coordinate of a landmark, in pixels."""
-_SHOWN = 40
+_MAX_SHOWN = 40
 """Characters of a csv cell that a message shows."""
 
 
@@ -51,9 +50,9 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
     if landmarks.dtype.kind not in "iuf":
         raise UserError(f"{path}: `landmarks` is {landmarks.dtype}; write numbers, pixels, as float32")
     landmarks = landmarks.astype(np.float64)
-    if (np.abs(landmarks) > _FARTHEST).any():
+    if (np.abs(landmarks) > MAX_NUMBER).any():
         raise UserError(
-            f"{path}: has numbers that are infinite or beyond {_FARTHEST:g} pixels; write nan where there is no face"
+            f"{path}: has numbers that are infinite or beyond {MAX_NUMBER:g} pixels; write nan where there is no face"
         )
     landmarks[~np.isfinite(landmarks).all(axis=(1, 2))] = np.nan
     return landmarks
@@ -89,7 +88,7 @@ def _number(path: Path, line: int, cell: str) -> float:
     try:
         return float(cell) if cell.strip() else np.nan
     except ValueError:
-        shown = repr(cell if len(cell) <= _SHOWN else f"{cell[:_SHOWN]}...")
+        shown = repr(cell if len(cell) <= _MAX_SHOWN else f"{cell[:_MAX_SHOWN]}...")
         raise UserError(f"{path}: line {line}: {shown} is no number; write pixels, or nan for no face") from None
 
 

@@ -19,7 +19,7 @@ from mien.progress import say
 
 CAMERA_ID = "0"
 _RATE_TOLERANCE = 0.01
-_VARIABLE_RATE = 1.5
+_MAX_INTERVAL_RATIO = 1.5
 """Ratio of the longest to the median time between frames from which a clip's rate is called variable."""
 
 
@@ -98,7 +98,7 @@ def _pace(name: str, timestamps: Float[np.ndarray, " t"]) -> dict[str, Any]:
         return {"frame_interval_ms": None, "variable_frame_rate": False}
     intervals = 1000 * np.diff(timestamps)
     least, usual, most = (round(float(value), 2) for value in (intervals.min(), np.median(intervals), intervals.max()))
-    is_variable = most > _VARIABLE_RATE * usual or least * _VARIABLE_RATE < usual
+    is_variable = most > _MAX_INTERVAL_RATIO * usual or least * _MAX_INTERVAL_RATIO < usual
     if is_variable:
         say(f"{name}: frames {least:g} to {most:g} ms apart (variable rate); all are kept, each with its own time")
     return {

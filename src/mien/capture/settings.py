@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from mien.bounded import MAX_SIDE
 from mien.errors import UserError
 
-_SMALLEST_SIZE, _LARGEST_SIZE = 32, 8192
+_MIN_SIZE = 32
 
 
 @dataclass(frozen=True)
@@ -43,10 +44,8 @@ class CaptureSettings:
 
     def check(self) -> None:
         """Raise a UserError for the first value that is not allowed."""
-        _require(
-            self.size >= _SMALLEST_SIZE, "size", self.size, f"too small; give {_SMALLEST_SIZE} or more, better 512"
-        )
-        _require(self.size <= _LARGEST_SIZE, "size", self.size, f"too large; give {_LARGEST_SIZE} or less")
+        _require(self.size >= _MIN_SIZE, "size", self.size, f"too small; give {_MIN_SIZE} or more, better 512")
+        _require(self.size <= MAX_SIDE, "size", self.size, f"too large; give {MAX_SIDE} or less")
         _require(_is_at_least(self.start, 0), "start", self.start, "give the seconds to skip, 0 or more")
         later = self.end == 0 or _is_at_least(self.end, self.start) and self.end > self.start
         _require(later, "end", self.end, f"give a second after --capture.start ({self.start:g}), or 0 for all")

@@ -10,13 +10,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int64, UInt8
 
-from mien.capture.faces import FaceFinder
+from mien.capture.faces import MAX_FACES, FaceFinder
 from mien.capture.source import FrameSource, SourceFrame
 from mien.progress import Advance, progress_bar
 from mien.storage import expect_whole, read_arrays, write_arrays
 
-MOST_FACES = 4
-"""Number of faces in a frame that are kept, the largest first."""
 SURVEY_SIZE = 512
 """Longest side in pixels of the pictures in which faces are searched. The detectors see at most 192 pixels."""
 _CHUNK = 1000
@@ -88,8 +86,8 @@ def _read(path: Path) -> Survey:
     arrays = read_arrays(path)
     t, side = len(arrays.get("numbers", ())), _THUMBNAIL[::-1]
     kinds = {
-        "numbers": ((t,), np.int64), "timestamps": ((t,), np.float64), "boxes": ((t, MOST_FACES, 4), np.float64),
-        "looks": ((t, MOST_FACES, 3 * _LOOK**2), np.float64), "thumbnails": ((t, *side, 3), np.uint8),
+        "numbers": ((t,), np.int64), "timestamps": ((t,), np.float64), "boxes": ((t, MAX_FACES, 4), np.float64),
+        "looks": ((t, MAX_FACES, 3 * _LOOK**2), np.float64), "thumbnails": ((t, *side, 3), np.uint8),
         "picture_size": ((2,), np.int64),
     }  # fmt: skip
     with expect_whole(path, "delete its folder and run `mien capture` again"):
@@ -131,8 +129,8 @@ def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advan
     for frame in stream:
         image = frame.picture()
         found = find(frame.number, image)
-        largest = np.argsort(-np.prod(found[:, 2:] - found[:, :2], axis=1))[:MOST_FACES]
-        boxes = np.full((MOST_FACES, 4), np.nan)
+        largest = np.argsort(-np.prod(found[:, 2:] - found[:, :2], axis=1))[:MAX_FACES]
+        boxes = np.full((MAX_FACES, 4), np.nan)
         boxes[: len(largest)] = found[largest]
         looks = np.stack([_look(image, box) for box in boxes])
         thumbnail = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 
-_WIDEST_TURN = 1.0
+_MAX_ANGLE = 1.0
 """Largest angle of a joint in either direction, in radians."""
 
 
@@ -32,8 +32,8 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
         except ValueError:
             raise UserError(f"--set {assignment}: {text!r} is no number; write for example --set {name}=0.6") from None
         if name in angles:
-            if math.isnan(value) or abs(value) > _WIDEST_TURN:
-                raise UserError(f"--set {assignment}: {name} goes from -{_WIDEST_TURN:g} to {_WIDEST_TURN:g} radians")
+            if math.isnan(value) or abs(value) > _MAX_ANGLE:
+                raise UserError(f"--set {assignment}: {name} goes from -{_MAX_ANGLE:g} to {_MAX_ANGLE:g} radians")
             joints[:, angles.index(name)] = value
             continue
         index = model.expression_names.index(name)
