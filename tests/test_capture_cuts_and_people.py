@@ -9,10 +9,10 @@ import pytest
 from capture_helpers import face_picture, tree_bytes
 from mien.capture import CaptureSettings, capture_video, capture_video_parts, read_capture
 from mien.capture.crop import Crop
-from mien.capture.cuts import find_cuts
 from mien.capture.faces import MAX_FACES, LandmarkDetector
-from mien.capture.follow import LandmarkFollower
+from mien.capture.parts import find_cuts
 from mien.capture.people import choose_person
+from mien.capture.process import LandmarkFollower
 from mien.capture.survey import Survey
 from mien.capture.video import write_video
 from mien.commands.stages.capturing import capture_stage

@@ -192,15 +192,15 @@ def test_what_is_held_out_follows_the_file(workspace: Path, choices: Any, capsys
     ("content", "words"),
     [
         ("", "cannot be read as json"),
-        ("[]", "holds no object"),
+        ("[]", "is not an object"),
         ('{"method": {"sh_degree": NaN}}', "it holds the number NaN"),
-        ('{"method": {"sh_degree": 1, "sh_degree": 2}}', "'sh_degree' stands there twice"),
+        ('{"method": {"sh_degree": 1, "sh_degree": 2}}', "it holds 'sh_degree' twice"),
         ('{"format": "mien.capture"}', "has format 'mien.capture' version 1; give a run's config.json"),
         ('{"version": 2}', "version 2"),
         ('{"methods": {}}', "methods: a file of settings has no such setting; did you mean method?"),
         ('{"method": {"kind": "nerf"}}', "method.kind nerf: give the name of a method: gaussian_avatars"),
         ('{"method": {"kind": []}}', "method.kind (nothing): give the name of a method"),
-        ('{"method": 3}', "method is no object of settings"),
+        ('{"method": 3}', "method is not an object of settings"),
         ('{"settings": {"stepps": 3}}', "settings.stepps: a run has no such setting; did you mean steps? there are"),
         ('{"settings": {"kind": "GaussianAvatarsConfig"}}', "settings.kind 'GaussianAvatarsConfig': give 'TrainSett"),
         ('{"settings": {"steps": "many"}}', "settings.steps 'many': give a whole number"),
@@ -255,7 +255,7 @@ def test_paths_that_are_no_file_are_refused(workspace: Path, capsys: pytest.Capt
         (workspace / "gone.json", "gone.json: no such file"),
         (workspace / "runs" / "a", f"is a folder; give {workspace / 'runs' / 'a' / 'config.json'}"),
         (workspace / "runs", "is a folder; give a file"),
-        (Path("/dev/null"), "is no ordinary file"),
+        (Path("/dev/null"), "is not an ordinary file"),
     ):
         assert words in complaint(capsys, ["train", str(workspace), "--config", str(path)])
     assert "is a folder" in complaint(capsys, ["train", str(workspace), "--config="])

@@ -26,7 +26,7 @@ _MAX_SHOWN = 40
 
 
 class NotOrdinaryError(ValueError):
-    """A path is not an ordinary file, but a folder, a pipe, a device or a socket, or a link that may not be followed."""
+    """A path is not an ordinary file, but a folder, a pipe, a device or a socket, or a link that is not followed."""
 
 
 def parse_json(text: str, *, unique_names: bool = False, any_size: bool = False, constants: bool = False) -> Any:
@@ -93,7 +93,7 @@ def open_handle(path: Path, flags: int, *, follow_link: bool) -> int:
         follow_link: whether the path itself may be a link.
 
     Raises:
-        NotOrdinaryError: it is a folder, a pipe, a device or a socket, or a link that may not be followed.
+        NotOrdinaryError: it is a folder, a pipe, a device or a socket, or a link that is not followed.
         OSError: it is missing or cannot be opened.
     """
     try:

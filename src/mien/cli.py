@@ -18,7 +18,6 @@ from pathlib import Path
 import mien
 from mien.bounded import MAX_SIDE
 from mien.errors import UserError
-from mien.help_text import without_details
 from mien.terminal import drop_output, open_closed_streams, printable, show, tell
 from mien.threads import asked_threads
 
@@ -134,6 +133,7 @@ def _crash() -> int:
 def _run(name: str, rest: list[str]) -> int:
     import tyro
 
+    from mien.commands.help_text import without_details
     from mien.commands.options import settings_groups, with_settings
 
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))

@@ -1,4 +1,4 @@
-"""One crop for a whole clip. The crop does not follow the head, so the frames still come from one fixed camera."""
+"""Step 3: choose one crop for a whole part. It does not follow the head, so the frames come from one fixed camera."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Convert decoded video frames to what an sRGB screen shows: matrix and range, HDR, pixel aspect, rotation."""
+"""Step 1: convert decoded video frames to what an sRGB screen shows (matrix, range, HDR, pixel aspect, rotation)."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Faces in pictures: boxes of all faces, to choose the crop, and landmarks, to follow one of them."""
+"""Find faces in pictures: boxes of all faces (step 2, to choose the crop) and landmarks (step 4)."""
 
 from types import TracebackType
 from typing import Any

@@ -1,4 +1,4 @@
-"""Frames on disk: lossless PNGs, and beside them the decoded pixels as raw files for memory maps."""
+"""Step 4: write frames as lossless PNGs, and beside them the decoded pixels as raw files for memory maps."""
 
 import hashlib
 import math

@@ -1,8 +1,9 @@
-"""Read mattes and landmarks that were made elsewhere, and check them against their source."""
+"""Step 1: read the clean plate, mattes and landmarks that the user gives, and check them against their source."""
 
 import csv
 import io
 import itertools
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -13,13 +14,90 @@ from mien.bounded import open_ordinary
 from mien.capture.crop import Crop, whole_picture
 from mien.capture.faces import LANDMARKS
 from mien.capture.picture import decode_picture
-from mien.capture.source import FrameSelection, FrameSource, list_images, open_source
+from mien.capture.settings import CaptureSettings
+from mien.capture.source import FrameSelection, FrameSource, list_images, open_source, read_image
 from mien.errors import UserError
 from mien.limits import MAX_NUMBER
 from mien.storage import read_arrays
 
 _MAX_SHOWN = 40
 """Characters of a csv cell that a message shows."""
+
+
+class GivenMattes:
+    """Mattes of a source's frames, read once and in order."""
+
+    def __init__(self, path: Path, picture_size: tuple[int, int]) -> None:
+        self._path = path
+        self._size = picture_size
+        self._files = list_images(path) if path.is_dir() else None
+        whole = FrameSelection()
+        self._stream = iter(()) if self._files else open_source(path, whole, 25.0).frames()
+
+    def check(self, number: int) -> None:
+        """Read one matte, to find mistakes before anything that takes long.
+
+        Nothing can be read from this object afterwards.
+
+        Raises:
+            UserError: it is missing, damaged or of another size than the picture.
+        """
+        self.matte(number, whole_picture(*self._size, max(self._size)))
+
+    def matte(self, number: int, crop: Crop) -> UInt8[np.ndarray, "h w"]:
+        """Return the matte of the source's frame `number`, cropped like its picture. Numbers must increase.
+
+        Raises:
+            UserError: it is missing, damaged or of another size than the picture.
+        """
+        if self._files:
+            if number >= len(self._files):
+                raise UserError(f"{self._path}: ends before its frame {number}; give a matte for each frame")
+            name, matte = self._files[number], _read_matte(self._files[number])
+        else:
+            frame = next(itertools.dropwhile(lambda frame: frame.number < number, self._stream), None)
+            if frame is None:
+                raise UserError(f"{self._path}: ends before its frame {number}; give a matte for each frame")
+            name, matte = self._path, frame.picture()[..., 1]
+        if matte.shape[::-1] != self._size:
+            raise UserError(
+                f"{name}: is {matte.shape[1]}x{matte.shape[0]}, the source's pictures are "
+                f"{self._size[0]}x{self._size[1]}; give mattes of that size"
+            )
+        return crop.apply(matte)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenInputs:
+    """Clean plate, mattes and landmarks that the user gave with the source video."""
+
+    plate: UInt8[np.ndarray, "h w 3"] | None = None
+    mattes: GivenMattes | None = None
+    landmarks: Float[np.ndarray, "n l 2"] | None = None
+    """Positions in pixels of the source's pictures, a row for each frame of the source."""
+
+
+def read_given(settings: CaptureSettings, frames: FrameSource) -> GivenInputs:
+    """Read and check what the user gave besides the source, before anything that takes long."""
+    if settings.clean_plate is None and settings.mattes is None and settings.landmarks is None:
+        return GivenInputs()
+    first = next(frames.frames())
+    height, width = first.picture().shape[:2]
+    plate, mattes, landmarks = None, None, None
+    if settings.clean_plate is not None:
+        plate = read_image(settings.clean_plate)
+        if plate.shape[:2] != (height, width):
+            raise UserError(
+                f"--capture.clean-plate {settings.clean_plate}: is {plate.shape[1]}x{plate.shape[0]}, the video's "
+                f"pictures are {width}x{height}; give a picture by the same camera in the same mode"
+            )
+    if settings.mattes is not None:
+        check_mattes(settings.mattes, frames)
+        GivenMattes(settings.mattes, (width, height)).check(first.number)
+        mattes = GivenMattes(settings.mattes, (width, height))
+    if settings.landmarks is not None:
+        landmarks = read_landmarks(settings.landmarks, frames.count())
+    return GivenInputs(plate, mattes, landmarks)
 
 
 def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]:
@@ -90,49 +168,6 @@ def _number(path: Path, line: int, cell: str) -> float:
     except ValueError:
         shown = repr(cell if len(cell) <= _MAX_SHOWN else f"{cell[:_MAX_SHOWN]}...")
         raise UserError(f"{path}: line {line}: {shown} is no number; write pixels, or nan for no face") from None
-
-
-class GivenMattes:
-    """Mattes of a source's frames, read once and in order."""
-
-    def __init__(self, path: Path, picture_size: tuple[int, int]) -> None:
-        self._path = path
-        self._size = picture_size
-        self._files = list_images(path) if path.is_dir() else None
-        whole = FrameSelection()
-        self._stream = iter(()) if self._files else open_source(path, whole, 25.0).frames()
-
-    def check(self, number: int) -> None:
-        """Read one matte, to find mistakes before anything that takes long.
-
-        Nothing can be read from this object afterwards.
-
-        Raises:
-            UserError: it is missing, damaged or of another size than the picture.
-        """
-        self.matte(number, whole_picture(*self._size, max(self._size)))
-
-    def matte(self, number: int, crop: Crop) -> UInt8[np.ndarray, "h w"]:
-        """Return the matte of the source's frame `number`, cropped like its picture. Numbers must increase.
-
-        Raises:
-            UserError: it is missing, damaged or of another size than the picture.
-        """
-        if self._files:
-            if number >= len(self._files):
-                raise UserError(f"{self._path}: ends before its frame {number}; give a matte for each frame")
-            name, matte = self._files[number], _read_matte(self._files[number])
-        else:
-            frame = next(itertools.dropwhile(lambda frame: frame.number < number, self._stream), None)
-            if frame is None:
-                raise UserError(f"{self._path}: ends before its frame {number}; give a matte for each frame")
-            name, matte = self._path, frame.picture()[..., 1]
-        if matte.shape[::-1] != self._size:
-            raise UserError(
-                f"{name}: is {matte.shape[1]}x{matte.shape[0]}, the source's pictures are "
-                f"{self._size[0]}x{self._size[1]}; give mattes of that size"
-            )
-        return crop.apply(matte)
 
 
 def check_mattes(path: Path, source: FrameSource) -> None:

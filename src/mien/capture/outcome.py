@@ -1,4 +1,4 @@
-"""Finish a capture: write the results of all frames beside them."""
+"""Step 5: finish a capture, by writing the results of all frames beside them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +9,12 @@ from jaxtyping import Float
 
 from mien.capture.faces import second_difference_jitter
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
-from mien.capture.parts import no_face
-from mien.capture.process import Chunk, Part
+from mien.capture.parts import Part
+from mien.capture.process import Chunk
 from mien.capture.quality import quality_report, relative_quality
 from mien.capture.source import FrameSource
 from mien.capture.store import CaptureData, finish_capture
+from mien.capture.survey import no_face
 from mien.inside import remove_tree
 from mien.progress import say
 

@@ -1,4 +1,4 @@
-"""Choose the person to capture: of all faces in a part of a video, the faces of one person."""
+"""Step 3: choose the person to capture, among all faces in a part of a video."""
 
 import math
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ def choose_person(survey: Survey) -> Person:
         return Person(boxes, others)
     areas = np.square(_sizes(survey.boxes))
     lasting.sort(key=lambda track: -_weight([track], areas))
-    people = [_gather(track, lasting, areas, survey.looks) for track in lasting[:_MAX_CANDIDATES]]
+    people = [_gather(track, lasting, areas, survey.colours) for track in lasting[:_MAX_CANDIDATES]]
     accepted = max(people, key=lambda tracks: _weight(tracks, areas))
     for track in accepted:
         for frame, place in track.entries:
@@ -133,21 +133,21 @@ def _weight(tracks: list[_Track], areas: Float[np.ndarray, "t f"]) -> float:
     return float(sum(areas[entry] for track in tracks for entry in track.entries))
 
 
-def _gather(first: _Track, tracks: list[_Track], areas: np.ndarray, looks: np.ndarray) -> list[_Track]:
+def _gather(first: _Track, tracks: list[_Track], areas: np.ndarray, colours: np.ndarray) -> list[_Track]:
     """Return all tracks that can be of the same person as the first one, the heaviest first."""
     accepted = [first]
     for track in tracks:
-        if track is not first and _is_same_person(accepted, track, areas, looks):
+        if track is not first and _is_same_person(accepted, track, areas, colours):
             accepted.append(track)
     return accepted
 
 
-def _is_same_person(accepted: list[_Track], track: _Track, areas: np.ndarray, looks: np.ndarray) -> bool:
+def _is_same_person(accepted: list[_Track], track: _Track, areas: np.ndarray, colours: np.ndarray) -> bool:
     frames = track.frames()
     if any(frames & other.frames() for other in accepted):
         return False
     now = tuple(np.array(track.entries).T)
     before = tuple(np.array([entry for other in accepted for entry in other.entries]).T)
     ratio = math.sqrt(float(np.median(areas[now])) / float(np.median(areas[before])))
-    change = np.abs(np.median(looks[now], axis=0) - np.median(looks[before], axis=0)).mean()
+    change = np.abs(np.median(colours[now], axis=0) - np.median(colours[before], axis=0)).mean()
     return bool(1 / _MAX_SIZE_RATIO <= ratio <= _MAX_SIZE_RATIO and change <= _MAX_COLOUR_CHANGE)

@@ -1,4 +1,4 @@
-"""The only module that reads pictures from users: it checks their size before memory is allocated.
+"""Step 1: read picture files of users. No other module does. Their size is checked before memory is allocated.
 
 A picture of 0.9 MB may unpack to 8.5 GB. Its first bytes announce its size. Only the five formats whose headers are
 read here are decoded at all, whatever the file's name says.

@@ -1,4 +1,4 @@
-"""Mattes with a clean plate: the person is what differs from the empty scene, near the segmentation mask."""
+"""Step 4, mattes with a clean plate: the person is what differs from the empty scene, near the segmentation mask."""
 
 import cv2
 import numpy as np

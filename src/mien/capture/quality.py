@@ -1,4 +1,4 @@
-"""Measure how sharp and how well lit the face is in every frame."""
+"""Step 4: measure how sharp and how well lit the face is in every frame."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""Captures on disk: `capture.json`, `landmarks.safetensors`, `frames/`, `mattes/` and a `cache/`."""
+"""Write and read captures on disk: `capture.json`, `landmarks.safetensors`, `frames/`, `mattes/` and a `cache/`."""
 
 import hashlib
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The only module that opens and creates video files.
+"""Step 1: open video files, and create them. No other module does.
 
 FFmpeg does not treat every name as a file: `take:1.mp4` is an address to it, `%03d.png` is a series of files, and a
 playlist makes it open the files in the list. So it never gets a name here. It reads and writes a file that Python has

@@ -10,11 +10,11 @@ import tyro
 
 from mien.avatar import METHODS, MethodConfig
 from mien.commands.config_file import ConfigFile, read_config_file
+from mien.commands.help_text import subclass_with
 from mien.commands.settings_options import applied, check_names, leaves, options_type
 from mien.config import overlay
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
-from mien.help_text import subclass_with
 from mien.training import DIALS, PRESETS, Split, TrainSettings
 from mien.workspace import open_workspace
 
