@@ -24,7 +24,8 @@ from mien.avatar import (
     RefillSettings,
 )
 from mien.cli import main
-from mien.commands.settings_options import field_docs, leaves
+from mien.commands.help_text import field_docs
+from mien.commands.settings_options import leaves
 from mien.commands.stages import training
 from mien.errors import UserError
 from mien.ranges import FRACTION, NotBelow, Range, check_ranges

@@ -133,7 +133,7 @@ def _crash() -> int:
 def _run(name: str, rest: list[str]) -> int:
     import tyro
 
-    from mien.commands.help_text import without_details
+    from mien.commands.help_text import readable, without_details
     from mien.commands.options import settings_groups, with_settings
 
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
@@ -141,9 +141,10 @@ def _run(name: str, rest: list[str]) -> int:
     options, more = module.Command, ""
     if "--help-all" in rest:
         rest = ["--help" if argument == "--help-all" else argument for argument in rest]
-        options = with_settings(module.Command, rest)
+        options = readable(with_settings(module.Command, rest))
     elif "-h" in rest or "--help" in rest:
         options, groups = without_details(module.Command)
+        options = readable(options)
         further, words = settings_groups(module.Command, rest)
         names = ", ".join(f"--{group}.*" for group in groups + further)
         more = f"More options ({names}), for those who compare and tune: mien {name}{words} --help-all" if names else ""
