@@ -53,9 +53,7 @@ def test_a_huge_picture_is_refused_with_its_size(tmp_path: Path, name: str) -> N
     path = tmp_path / name
     path.write_bytes(HUGE[name] + b"IEND\xaeB`\x82")
     for read in (read_image, read_picture, _read_matte):
-        with pytest.raises(
-            UserError, match="has 30000x30000 pixels, and a picture may have at most 67,108,864"
-        ) as error:
+        with pytest.raises(UserError, match="has 30000x30000 pixels, .* at most 67,108,864") as error:
             read(path)
         assert str(error.value).startswith(f"{path}: ")
 

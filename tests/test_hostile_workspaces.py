@@ -318,7 +318,7 @@ def test_capture_numbers_that_cannot_be(name: str, value: float, workspace: Path
     arrays[name] = np.array(arrays[name])
     arrays[name].flat[-1] = value
     write_arrays(folder / "landmarks.safetensors", arrays)
-    with pytest.raises(UserError, match=f"{name} holds numbers that cannot be"):
+    with pytest.raises(UserError, match=f"{name} holds impossible numbers"):
         read_capture(folder)
 
 
@@ -499,9 +499,9 @@ def test_metrics_as_they_were_written_are_compared(workspace: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        (b'{"__metadata__": [1]}', "metadata is no object"),
-        (b'{"__metadata__": "x"}', "metadata is no object"),
-        (b"[]", "metadata is no object"),
+        (b'{"__metadata__": [1]}', "metadata is not an object"),
+        (b'{"__metadata__": "x"}', "metadata is not an object"),
+        (b"[]", "metadata is not an object"),
         (b"[" * 3000, "too deep"),
         (b'{"a": ' + b"9" * 400 + b"}", "400 digits"),
         (b'{"a": {"dtype": "F32", "shape": [1000000000000], "data_offsets": [0, 4000000000000]}}', "damaged"),
@@ -539,7 +539,7 @@ def test_a_chosen_number_of_parts_is_not_counted_to(
     began = time.monotonic()
     assert main(["capture", str(tmp_path / "clip.mp4"), "--out", str(workspace)]) == 2
     assert time.monotonic() - began < 30
-    assert "holds a capture of something else" in capsys.readouterr().err
+    assert "holds a capture of another source" in capsys.readouterr().err
 
 
 def test_json_is_written_as_it_is_read(tmp_path: Path) -> None:

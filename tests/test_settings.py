@@ -128,7 +128,7 @@ def test_face_tuning_has_two_options_that_agree(line: str, choices: Any) -> None
         ("--method.sh-degree 4", "--method.sh-degree 4: give a number from 0 to 3"),
         ("--method.sh-degree 1.5", "--method.sh-degree"),
         ("--method.sh-frame upside-down", "world"),
-        ("--method.scale-weight nan", "--method.scale-weight nan: give 0 or a number above it"),
+        ("--method.scale-weight nan", "--method.scale-weight nan: give a number from 0 to 1e+09"),
         ("--method.means-rate.start -1", "--method.means-rate.start -1: give a number from 0 to 100"),
         ("--method.means-rate.end 0", "--method.means-rate.end 0: give a number from 1e-12 to 100"),
         (

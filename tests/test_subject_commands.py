@@ -85,8 +85,8 @@ def test_a_third_clip_gives_all_a_new_identity(
     assert main(["capture", str(clips["three"]), *arguments]) == 0
     assert main(["track", str(workspace), *TRACKING]) == 0
     shown = capsys.readouterr().err
-    assert "three came new: all 3 sequences are tracked again" in shown
-    assert "Trained on the tracking before this one: gaussian_avatars" in shown
+    assert "three added: all 3 sequences are tracked again" in shown
+    assert "Trained on the previous tracking: gaussian_avatars" in shown
     assert torch.equal(_identity(workspace, "one"), _identity(workspace, "three"))
     assert not torch.equal(_identity(workspace, "one"), before)
 

@@ -22,16 +22,16 @@ from mien.terminal import drop_output, open_closed_streams, printable, show, tel
 from mien.threads import asked_threads
 
 COMMANDS = {
-    "create": "video in, avatar, report and metrics out: all stages in one command",
+    "create": "video -> avatar, report and metrics: all stages in one command",
     "capture": "a video (or a folder of pictures) -> frames, mattes, landmarks",
     "track": "capture -> face parameters, cameras, overlay video",
     "train": "captures + trackings -> an avatar, by the method of your choice",
     "evaluate": "avatar -> metrics.json and report.html on held-out frames",
-    "render": "avatar -> a still or a film along a camera path, at any expression",
-    "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> film",
+    "render": "avatar -> a still or a video along a camera path, at any expression",
+    "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
     "export": "avatar -> .mien (runs without torch), or .ply at one or many expressions",
     "face-models": "list the face models and bake them ahead of time",
-    "bench": "timings of this machine; quality over reference captures with known truth",
+    "bench": "speed of this machine; quality on reference captures with known truth",
     "demo": "the whole path on a synthetic head, in minutes: start here",
 }
 """Name -> summary. `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command`.
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_CLOSED_PIPE
     except OSError as error:
         with contextlib.suppress(OSError):
-            _complain(f"standard output: cannot be written ({error.strerror}); mend that and run it again")
+            _complain(f"standard output: cannot be written ({error.strerror}); correct that and run the command again")
         return EXIT_USER_ERROR
     finally:
         drop_output()
@@ -84,16 +84,17 @@ def _main(arguments: list[str]) -> int:
     except UserError as error:
         return _complain(str(error))
     except KeyboardInterrupt:
-        tell("mien: stopped; the same command goes on where it was, or begins anew")
+        tell("mien: stopped; the same command continues where it stopped, or starts again")
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         raise
     except MemoryError as error:
-        return _complain(f"not enough memory ({error}); close other programs, or ask for a smaller size")
+        cause = f" ({error})" if str(error) else ""
+        return _complain(f"not enough memory{cause}; close other programs, or ask for a smaller size")
     except OSError as error:
         if error.errno not in _USERS_ERRNOS:
             return _crash()
-        return _complain(f"{error.filename or 'a file'}: {error.strerror}; mend that and run the same command again")
+        return _complain(f"{error.filename or 'a file'}: {error.strerror}; correct that and run the same command again")
     except Exception:
         return _crash()
 
@@ -147,7 +148,7 @@ def _run(name: str, rest: list[str]) -> int:
         options = readable(options)
         further, words = settings_groups(module.Command, rest)
         names = ", ".join(f"--{group}.*" for group in groups + further)
-        more = f"More options ({names}), for those who compare and tune: mien {name}{words} --help-all" if names else ""
+        more = f"More options ({names}): mien {name}{words} --help-all" if names else ""
     else:
         options = with_settings(module.Command, rest)
     complaints = io.StringIO()

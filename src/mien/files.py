@@ -269,17 +269,17 @@ def _check_safetensors(path: Path) -> None:
     with open_ordinary(path) as file:
         whole = os.fstat(file.fileno()).st_size
         if whole > _MAX_TENSORS_BYTES:
-            raise ValueError(f"{whole} bytes are too many")
+            raise ValueError(f"it has {whole:,} bytes, and {_MAX_TENSORS_BYTES:,} are the most")
         size = int.from_bytes(file.read(8), "little")
         if not 2 <= size <= min(_MAX_HEADER_BYTES, whole - 8):
             raise ValueError("its header does not fit into the file")
         header = parse_json(file.read(size).decode("utf-8"))
         metadata = header.pop("__metadata__", {}) if isinstance(header, dict) else None
         if not isinstance(header, dict) or not isinstance(metadata, dict):
-            raise ValueError("its header or metadata is no object")
+            raise ValueError("its header or metadata is not an object")
         stored = metadata.get(_CHECKSUM)
         if stored is not None and stored != _tensor_checksum(header, iter(partial(file.read, _PIECE), b"")):
-            raise ValueError("it is not what was written")
+            raise ValueError("its content differs from what was written")
 
 
 def _tensor_checksum(header: Mapping[str, Any], body: Iterable[bytes | memoryview]) -> str:

@@ -290,7 +290,7 @@ def _state(folder: Path) -> object:
 def _warn_of_no_locks(file: Path) -> None:
     if "warned" not in _once:
         _once.add("warned")
-        say(f"warning: {file.parent}: its file system has no locks; run one command at a time on what lies there")
+        say(f"warning: {file.parent}: its file system has no locks; run only one command at a time there")
 
 
 def _let_children_forget() -> None:

@@ -73,9 +73,9 @@ class ToLoad:
 
 FRACTION = Range(0, 1)
 """Range of a share, an opacity, or a time as a fraction of the run."""
-POSITIVE = Range(1e-9, 1e9, words=f"a number above 0, {1e9:g} at most")
+POSITIVE = Range(1e-9, 1e9, words=f"a number above 0, at most {1e9:g}")
 """Range of a length or a scale."""
-NOT_NEGATIVE = Range(0, 1e9, words=f"0 or a number above it, {1e9:g} at most")
+NOT_NEGATIVE = Range(0, 1e9)
 """Range of a weight that may be switched off."""
 COUNT = Range(1, 100_000)
 COUNT_OR_NONE = Range(0, 100_000)

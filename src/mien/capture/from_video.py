@@ -206,7 +206,7 @@ def _check_place(out: Path, job: _Job) -> None:
         say(f"{out}: the capture in it is damaged or of another version; it is made again")
     elif source.get("content_hash") != job.frames.content_hash:
         raise UserError(
-            f"{out}: holds a capture of something else ({source.get('file', 'not made from a video')}); choose another "
+            f"{out}: holds a capture of another source ({source.get('file', 'not made from a video')}); choose another "
             "name with --name, or add --replace to `mien capture`"
         )
 

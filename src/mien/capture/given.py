@@ -88,8 +88,8 @@ def read_given(settings: CaptureSettings, frames: FrameSource) -> GivenInputs:
         plate = read_image(settings.clean_plate)
         if plate.shape[:2] != (height, width):
             raise UserError(
-                f"--capture.clean-plate {settings.clean_plate}: is {plate.shape[1]}x{plate.shape[0]}, the video's "
-                f"pictures are {width}x{height}; give a picture by the same camera in the same mode"
+                f"--capture.clean-plate {settings.clean_plate}: is {plate.shape[1]}x{plate.shape[0]}, but the video's "
+                f"pictures are {width}x{height}; give a picture from the same camera in the same mode"
             )
     if settings.mattes is not None:
         check_mattes(settings.mattes, frames)
@@ -114,7 +114,7 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
     if path.suffix == ".safetensors":
         landmarks = read_arrays(path).get("landmarks")
         if landmarks is None:
-            raise UserError(f"{path}: has no array `landmarks`; write [{source_frames}, {LANDMARKS}, 2] pixels as that")
+            raise UserError(f"{path}: has no array `landmarks`; write one of [{source_frames}, {LANDMARKS}, 2] pixels")
     elif path.suffix == ".csv":
         landmarks = _read_csv(path, source_frames)
     else:
@@ -167,7 +167,7 @@ def _number(path: Path, line: int, cell: str) -> float:
         return float(cell) if cell.strip() else np.nan
     except ValueError:
         shown = repr(cell if len(cell) <= _MAX_SHOWN else f"{cell[:_MAX_SHOWN]}...")
-        raise UserError(f"{path}: line {line}: {shown} is no number; write pixels, or nan for no face") from None
+        raise UserError(f"{path}: line {line}: {shown} is not a number; write pixels, or nan for no face") from None
 
 
 def check_mattes(path: Path, source: FrameSource) -> None:

@@ -86,7 +86,7 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     if not found and short:
         raise UserError(
             f"{path}: cuts {len(cuts)} times, and shows a face in no part of {settings.shortest_part:g} s or more; "
-            "give a smaller --capture.shortest-part, or --capture.no-cuts to take it as one"
+            "give a smaller --capture.shortest-part, or --capture.no-cuts to keep the video whole"
         )
     if not found:
         raise no_face(path, len(survey.timestamps))
@@ -128,7 +128,7 @@ def _tell_people(path: Path, part: Part) -> None:
     if not crowded.any():
         return
     alone = int((crowded & ~part.person.seen).sum())
-    gone = f"; in {alone} of them the followed one is away, and they are left out" if alone else ""
+    gone = f"; the followed face is missing in {alone} of them, which are left out" if alone else ""
     say(
         f"warning: {path}: several faces in {int(crowded.sum())} of {part.timesteps} frames; "
         f"the one that fills the picture most is followed{gone}"

@@ -177,7 +177,7 @@ class PartProcessor:
                 done += 1
             writer.flush()
         if done < count:
-            raise UserError(f"{self._path}: gave fewer frames when it was read again; is it still being written?")
+            raise UserError(f"{self._path}: has fewer frames than before; wait until it is complete, then run it again")
         span = slice(start, start + count)
         return Chunk(landmarks, quality, writer.digests[FRAMES][span], writer.digests[MATTES][span])
 

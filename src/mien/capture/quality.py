@@ -91,13 +91,13 @@ def quality_report(name: str, quality: FrameQuality) -> dict[str, Any]:
     is_dark, is_overexposed = brightness < _MIN_BRIGHTNESS, clipped > _MAX_CLIPPED
     if is_dark:
         say(
-            f"warning: {name}: the face is dark (mean level {brightness:.0%}); the avatar will be noisy, better record "
-            "it again with more light on the face"
+            f"warning: {name}: the face is dark (mean level {brightness:.0%}); the avatar will be noisy; record the "
+            "video again with more light on the face"
         )
     if is_overexposed:
         say(
-            f"warning: {name}: the face is over-exposed ({clipped:.0%} of it is white); what is white has no detail, "
-            "better record it again with less exposure"
+            f"warning: {name}: the face is over-exposed ({clipped:.0%} of it is white); white parts have no detail; "
+            "record the video again with less exposure"
         )
     if blurred:
         say(

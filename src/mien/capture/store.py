@@ -169,7 +169,9 @@ def check_replaceable(path: Path) -> None:
         raise UserError(f"{path}: is a file; choose a folder for the capture")
     foreign = sorted(entry.name for entry in path.iterdir() if entry.name not in _OWN_NAMES) if path.is_dir() else []
     if foreign:
-        raise UserError(f"{path}: holds something that is no capture ({foreign[0]}); choose an empty or a new folder")
+        raise UserError(
+            f"{path}: holds something that is not part of a capture ({foreign[0]}); choose an empty or a new folder"
+        )
 
 
 def finish_capture(
@@ -266,7 +268,7 @@ def _calibration(path: Path, arrays: dict[str, np.ndarray], width: int, height: 
     for K, viewmat in zip(arrays["K"], arrays["viewmat"], strict=True):
         fault = camera_fault(K, viewmat, width, height)
         if fault is not None:
-            raise UserError(f"{path}: a camera is none ({fault}); {REMEDY}")
+            raise UserError(f"{path}: a camera is not valid ({fault}); {REMEDY}")
     pairs = zip(arrays["K"].astype(np.float32), arrays["viewmat"].astype(np.float32), strict=True)
     return tuple(Camera(torch.from_numpy(K), torch.from_numpy(viewmat), width, height) for K, viewmat in pairs)
 
@@ -300,7 +302,7 @@ def _check_numbers(path: Path, arrays: dict[str, np.ndarray]) -> None:
             near[name] = not np.isinf(arrays[name]).any()
     for name, sound in near.items():
         if not sound:
-            raise UserError(f"{path}: {name} holds numbers that cannot be; {REMEDY}")
+            raise UserError(f"{path}: {name} holds impossible numbers; {REMEDY}")
 
 
 def _check_arrays(path: Path, arrays: dict[str, np.ndarray], timesteps: int, cameras: int) -> None:

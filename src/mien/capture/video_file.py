@@ -22,7 +22,7 @@ from mien.errors import UserError
 
 MAX_FRAME_PIXELS = 8192 * 4608
 """Largest number of pixels of a video's pictures: 8K of every kind. A decoder holds up to 17 pictures at a time."""
-TOO_MANY_PIXELS = f"more than the {MAX_FRAME_PIXELS:,} pixels (8192x4608) that mien takes of a video"
+TOO_MANY_PIXELS = f"more than the {MAX_FRAME_PIXELS:,} pixels (8192x4608) that a video may have"
 _VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 _CONTAINERS = (
     "mov", "matroska", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "flv", "live_flv", "asf", "ogg", "mxf", "gxf",
@@ -68,7 +68,7 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     if not path.exists():
         raise UserError(f"{path}: no such file; check the path")
     if not path.is_file():
-        raise UserError(f"{path}: is no file; name a video file")
+        raise UserError(f"{path}: is not a file; give a video file")
     if path.stat().st_size == 0:
         raise UserError(f"{path}: is empty; copy or record it again")
     try:

@@ -164,7 +164,7 @@ class Command:
 
 def _check_seconds(seconds: float) -> None:
     if not 0 < seconds < math.inf:
-        raise UserError(f"--seconds {seconds:g}: give a positive number; each row is measured for as long")
+        raise UserError(f"--seconds {seconds:g}: give a positive number; each row is measured for that long")
 
 
 def _gpu(name: DeviceName) -> "torch.Tensor | None":

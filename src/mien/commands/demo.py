@@ -32,7 +32,7 @@ class Command:
 
         TrainOptions(preset=self.preset, steps=self.steps).settings()
         if self.seconds and not 0 < self.seconds <= _MAX_SECONDS:
-            raise UserError(f"--seconds {self.seconds:g}: give up to {_MAX_SECONDS:g}, or leave it out")
+            raise UserError(f"--seconds {self.seconds:g}: give a number above 0, at most {_MAX_SECONDS:g}")
         check_writable(self.out, folder=True)
 
     def run(self) -> None:

@@ -30,7 +30,7 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
         try:
             value = float(text)
         except ValueError:
-            raise UserError(f"--set {assignment}: {text!r} is no number; write for example --set {name}=0.6") from None
+            raise UserError(f"--set {assignment}: {text!r} is not a number; write --set {name}=0.6") from None
         if name in angles:
             if math.isnan(value) or abs(value) > _MAX_ANGLE:
                 raise UserError(f"--set {assignment}: {name} goes from -{_MAX_ANGLE:g} to {_MAX_ANGLE:g} radians")
@@ -41,7 +41,7 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
         if lower == upper:
             raise UserError(f"--set {assignment}: {name} does nothing with the face model {model.name!r}; leave it out")
         if math.isnan(value) or not lower <= value <= upper:
-            unit = "the full expression" if model.expression_sigmas is None else "much, 0 the mean face"
+            unit = "the full expression" if model.expression_sigmas is None else "strong, and 0 is the mean face"
             raise UserError(f"--set {assignment}: {name} goes from {lower:g} to {upper:g}; 1 is {unit}")
         expression[:, index] = value
     return replace(face, expression=expression, joints=joints.reshape(face.joints.shape))

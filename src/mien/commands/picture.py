@@ -40,8 +40,11 @@ class PictureOptions:
 
         wide, high = self.shape()
         if not (_MIN_SIDE <= wide <= MAX_SIDE and _MIN_SIDE <= high <= MAX_SIDE):
-            given = f"--size {self.size}" if wide == high == self.size else f"--width {wide} --height {high}"
-            raise UserError(f"{given}: pictures are {_MIN_SIDE}..{MAX_SIDE} pixels wide and high")
+            is_square = wide == high == self.size
+            given = (
+                f"--size {self.size}: give a number" if is_square else f"--width {wide} --height {high}: give numbers"
+            )
+            raise UserError(f"{given} from {_MIN_SIDE} to {MAX_SIDE}")
         self.colour()
         return plan_output(out, frames, self.background == "transparent")
 

@@ -89,7 +89,9 @@ def _driver_of(folders: list[Path]) -> Driver:
     shapes = {(one.tracking.face.expression.shape[1], one.tracking.face.joints.shape[1]) for one in sequences}
     if len(shapes) > 1 or not any(bool(one.tracking.valid.any()) for one in sequences):
         told = ", ".join(map(str, folders))
-        raise UserError(f"{told}: no frame was tracked, or with several face models; track them again")
+        raise UserError(
+            f"{told}: no frame was tracked, or they were tracked with several face models; track them again"
+        )
     face = concatenate([one.tracking.face for one in sequences])
     at_rest = neutral_of(concatenate([one.tracking.face[one.tracking.valid] for one in sequences]))
     places = [(one, timestep) for one in sequences for timestep in range(one.capture.timesteps)]

@@ -58,7 +58,7 @@ def _add(path: Path, name: str, shareable: bool) -> FaceModel:
     digest, known = file_digest(path), added_from(name)
     other = f"add this one under another: mien face-models --add {path} --name NAME"
     if is_built_in(name):
-        raise UserError(f"{path}: {name!r} is the name of a face model of mien's own; {other}")
+        raise UserError(f"{path}: {name!r} is the name of one of mien's own face models; {other}")
     if known is not None and known["sha256"] != digest:
         raise UserError(f"{path}: another file has the name {name!r}, {known['path']}; {other}")
     if known is None:

@@ -68,7 +68,7 @@ def doubled_videos(videos: Sequence[Path], names: Sequence[str], held_out: Seque
             trained = other if outside == [name] else name
             yield f"{name} and {other} are the same video: {outside[0]} is held out, but {trained} trains on its frames"
         else:
-            yield f"{name} and {other} are the same video, which counts twice and shows nothing more"
+            yield f"{name} and {other} are the same video, which then counts twice and adds nothing"
 
 
 def _same_content(first: Path, second: Path) -> bool:

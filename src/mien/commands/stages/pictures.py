@@ -36,6 +36,6 @@ def warn_of_white(options: PictureOptions, run_dir: Path) -> None:
     """Warn if transparent pictures are asked for but the run was trained over white."""
     if options.background == "transparent" and read_run_config(run_dir)["settings"].get("background") == "white":
         say(
-            "this avatar was trained over white, and bright skin and outlines may let light through; "
-            "`mien train --background random` makes one that does not"
+            "warning: this avatar was trained over white, so bright skin and outlines may be partly transparent; "
+            "`mien train --background random` avoids that"
         )
