@@ -109,7 +109,7 @@ def test_a_third_clip_gives_all_a_new_identity(
         ([], "no video"),
         (["{clip}", "{gone}"], "no such video"),
         (["{clip}", "{clip}"], "two videos would both be the sequence 'clip'"),
-        (["{clip}", "--name", "a", "b"], "2 names for 1 videos"),
+        (["{clip}", "--name", "a", "b"], "2 names, but the number of videos is 1"),
         (["{clip}", "--face-model", "any"], "no face model 'any'"),
         (["{clip}", "--out", "{clip}"], "is a file, but a folder"),
         (["{clip}", "--run", "a/b"], "cannot be the name of a folder"),

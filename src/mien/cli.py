@@ -7,6 +7,7 @@ import importlib
 import inspect
 import io
 import os
+import re
 import shlex
 import signal
 import sys
@@ -51,6 +52,19 @@ _USERS_ERRNOS = frozenset(
 )
 """Errors that mien cannot prevent: the disk is full, read-only, protected or broken."""
 _USELESS = ("For full helptext", "Argument helptext")
+_REWORDED = (
+    (r"^Error parsing (\S+): invalid literal for int\(\) with base 10: ", r"\1: give a whole number instead of "),
+    (r"^Error parsing (\S+): could not convert string to float: ", r"\1: give a number instead of "),
+    (r"^Error parsing (\S+): no type matching (.+?) could be .*? from \[(.*?)\].*", r"\1: give \2 instead of \3"),
+    (r"^invalid choice (.*) for argument '(.+?)'\. Expected one of \((.*?),?\)", r"\2: give one of \3 instead of \1"),
+    (r"^Missing value for argument '(.+?)'\. Expected .* values", r"\1: give it a value"),
+    (r"^Missing from mien [\w -]+: ", "missing: "),
+    (r"^Unrecognized options: ", "unknown: "),
+    (r"^Expected one of \{(.*)\}", r"give one of \1"),
+    (r"^Available subcommands: ", "there are: "),
+    (r"^Perhaps you meant: ", "did you mean "),
+)
+"""Beginnings of tyro's complaints, and what mien says instead."""
 _INDENT_OF_DESCRIPTION = 8
 """Number of spaces before an option's description in tyro's messages. Option names have fewer."""
 
@@ -199,7 +213,14 @@ def _in_one_line(box: str) -> str:
         elif len(inner) - len(inner.lstrip()) < _INDENT_OF_DESCRIPTION:
             comma = inner.startswith(" ") and parts[-1] and not parts[-1].endswith(":")
             parts[-1] = f"{parts[-1]}{',' if comma else ''} {text}".strip()
-    return "; ".join(part.rstrip(".") for part in parts if part and not part.startswith(_USELESS))
+    return "; ".join(_reworded(part.rstrip(".")) for part in parts if part and not part.startswith(_USELESS))
+
+
+def _reworded(complaint: str) -> str:
+    """A complaint of tyro in the words of mien's own messages: the option, its value, and what to give."""
+    for pattern, words in _REWORDED:
+        complaint = re.sub(pattern, words, complaint)
+    return complaint
 
 
 def _check_instruction_set() -> None:

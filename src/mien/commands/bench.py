@@ -132,7 +132,7 @@ class Quality:
     def check(self) -> None:
         """Check that the number of steps is not negative."""
         if self.steps < 0:
-            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for each capture's own")
+            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for each capture's own number")
 
     def run(self) -> None:
         """Run every capture through all stages, then print the table."""

@@ -66,6 +66,6 @@ def _check_name(name: str, model: FaceModel, assignment: str) -> None:
     # Compare in lower case, so that `jawopen` is as near to jawOpen as possible.
     folded = {known.lower(): known for known in (*names, *angles)}
     near = [folded[match] for match in difflib.get_close_matches(name.lower(), folded, 3, 0.6)]
-    every = f"there are: {', '.join(names)}; and joints by radians: {', '.join(angles)}"
+    every = f"there are: {', '.join(names)}; and joint angles in radians: {', '.join(angles)}"
     hint = f"did you mean {' or '.join(near)}?" if near else every
     raise UserError(f"--set {assignment}: no expression {name!r}; {hint}")

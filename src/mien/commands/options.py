@@ -81,7 +81,7 @@ class TrainOptions:
         """
         check_device(self.device)
         if self.steps < 0:
-            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's")
+            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's number")
         preset = PRESETS[self.preset].settings
         settings = replace(
             preset if self.training is None else applied(preset, self.training),
