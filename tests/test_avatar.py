@@ -169,5 +169,5 @@ def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 0xFF
     path.write_bytes(content)
-    with pytest.raises(UserError, match=r"avatar\.safetensors: .*not what was written"):
+    with pytest.raises(UserError, match=r"avatar\.safetensors: .*differs from what was written"):
         load_avatar(tmp_path)

@@ -9,11 +9,11 @@ import pytest
 from capture_helpers import face_picture, tree_bytes
 from mien.capture import CaptureSettings, capture_video, capture_video_parts, read_capture
 from mien.capture.crop import Crop
-from mien.capture.cuts import find_cuts
-from mien.capture.faces import LandmarkDetector
-from mien.capture.follow import LandmarkFollower
+from mien.capture.faces import MAX_FACES, LandmarkDetector
+from mien.capture.parts import find_cuts
 from mien.capture.people import choose_person
-from mien.capture.survey import MOST_FACES, Survey
+from mien.capture.process import LandmarkFollower
+from mien.capture.survey import Survey
 from mien.capture.video import write_video
 from mien.commands.stages.capturing import capture_stage
 from mien.errors import UserError
@@ -117,7 +117,7 @@ def test_flashes_motion_and_light_are_no_cuts(test_data):
 def survey_of(frames: list[list[tuple[float, float, float, float]]]) -> Survey:
     """Faces as (centre x, centre y, side, colour), at 25 frames a second."""
     count = len(frames)
-    boxes, looks = np.full((count, MOST_FACES, 4), np.nan), np.full((count, MOST_FACES, 27), np.nan)
+    boxes, looks = np.full((count, MAX_FACES, 4), np.nan), np.full((count, MAX_FACES, 27), np.nan)
     for frame, faces in enumerate(frames):
         for place, (x, y, side, colour) in enumerate(faces):
             boxes[frame, place] = [x - side / 2, y - side / 2, x + side / 2, y + side / 2]

@@ -209,7 +209,7 @@ def test_a_clip_is_trimmed_at_both_ends(face_clip, tmp_path):
     assert capture.timesteps == 6
     assert capture.source["first_frame"] == 2
     np.testing.assert_allclose(capture.timestamps, np.arange(6) / 25, atol=1e-6)
-    with pytest.raises(UserError, match=r"--capture.end 0.04: give a second after --capture.start \(0.08\)"):
+    with pytest.raises(UserError, match=r"--capture.end 0.04: give a time after --capture.start \(0.08\)"):
         capture_video(face_clip[0], tmp_path / "other", CaptureSettings(start=0.08, end=0.04))
 
 
@@ -224,7 +224,7 @@ def test_bad_requests_are_refused(face_clip, tmp_path):
         (empty, tmp_path / "out", settings, "holds no images"),
         (face_clip[0], blocked, settings, "is a file"),
         (face_clip[0], blocked / "out", settings, "cannot be written"),
-        (face_clip[0], face_clip[0].parent, settings, "holds something that is no capture"),
+        (face_clip[0], face_clip[0].parent, settings, "holds something that is not part of a capture"),
         (face_clip[0], tmp_path / "out", replace(settings, start=60.0), "no frame after 60 s"),
         (face_clip[0], tmp_path / "out", replace(settings, stride=0), "--capture.stride 0: give 1 for every frame"),
         (face_clip[0], tmp_path / "out", replace(settings, size=4), "--capture.size 4: too small"),

@@ -52,7 +52,7 @@ def test_given_landmarks_and_mattes_are_taken_as_they_are(test_data, tmp_path):
     with pytest.raises(UserError, match=r"expected \[4, 478, 2\]"):
         read_landmarks(tmp_path / "points.csv", 4)
     cv2.imwrite(str(tmp_path / "plate.png"), matte[:100])
-    with pytest.raises(UserError, match="plate.png: is 160x100, the video's pictures are 160x160"):
+    with pytest.raises(UserError, match="plate.png: is 160x100, but the video's pictures are 160x160"):
         capture_video_parts(clip, tmp_path / "other", CaptureSettings(clean_plate=tmp_path / "plate.png"))
     assert not (tmp_path / "other").exists()
 
@@ -90,7 +90,7 @@ def test_places_are_respected(test_data, tmp_path, capsys):
     write_video(other, iter([face] * 4), 25.0)
     sequences, settings = tmp_path / "ws" / "sequences", CaptureSettings(crop="none")
     capture_video_parts(one, sequences, settings, "take")
-    with pytest.raises(UserError, match=r"holds a capture of something else \(one.mp4\).* --name, or add --replace"):
+    with pytest.raises(UserError, match=r"holds a capture of another source \(one.mp4\).* --name, or add --replace"):
         capture_video_parts(other, sequences, settings, "take")
     (capture,) = capture_video_parts(other, sequences, settings, "take", replace=True)
     assert capture.timesteps == 4

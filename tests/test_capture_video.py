@@ -109,7 +109,7 @@ def test_bad_videos_are_named(tmp_path):
         truncated: "cannot be read as a video .* incomplete[?] copy it again",
         sound: "no video stream",
         tmp_path / "missing.mp4": "no such file",
-        tmp_path: "is no file",
+        tmp_path: "is not a file",
     }
     for path, message in cases.items():
         with pytest.raises(UserError, match=message) as error:

@@ -128,7 +128,7 @@ def test_damaged_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_options_are_checked_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["create", str(tmp_path / "none.mp4"), "--out", str(tmp_path / "out")]
-    assert "invalid choice 'nerf'" in complaint(capsys, *arguments, "--method", "nerf")
+    assert "instead of 'nerf'" in complaint(capsys, *arguments, "--method", "nerf")
     assert "--steps -3" in complaint(capsys, *arguments, "--steps", "-3")
 
 

@@ -92,5 +92,5 @@ def test_the_rate_of_a_csv_can_be_given(tmp_path: Path) -> None:
     for by, fps in ((take, -1.0), (take, float("nan")), (tmp_path, 25.0)):
         with pytest.raises(UserError, match="--fps"):
             open_driver(by, None, model, fps)
-    with pytest.raises(UserError, match=r"--sequence a: .*a\.csv has none to choose from"):
+    with pytest.raises(UserError, match=r"--sequence a: .*a\.csv has no sequences"):
         open_driver(take, "a", model)

@@ -90,7 +90,7 @@ def test_it_is_posed_by_number_on_the_command_line(model):
         ("jaw_x=2", "from -1 to 1 radians"),
         ("jaw_w=0.1", "did you mean jaw_"),
         ("expression_003=4", "-3 to 3; 1 is much"),
-        ("smile=1", "there are: expression_000.*joints by radians: neck_x"),
+        ("smile=1", "there are: expression_000.*joint angles in radians: neck_x"),
     ):
         with pytest.raises(UserError, match=message):
             with_expression(face, model, (assignment,))

@@ -46,7 +46,7 @@ def test_a_pipe_is_no_recording_and_no_ply(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for read in (read_live_link_face, read_blendshape_json, read_ply):
-        with pytest.raises(UserError, match="pipe.* no ordinary file"):
+        with pytest.raises(UserError, match="pipe.* not an ordinary file"):
             read(pipe)
 
 

@@ -133,7 +133,7 @@ def test_landmarks_that_are_no_pixels(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(f"{cells},{DIGITS}\n{cells},1\n")
     refused(lambda path: read_landmarks(path, 2), tmp_path / "a.csv", "infinite or beyond")
     (tmp_path / "a.csv").write_text(f"{cells},1\n{cells},{'x' * 3000}\n")
-    refused(lambda path: read_landmarks(path, 2), tmp_path / "a.csv", r"'x{40}\.\.\.' is no number")
+    refused(lambda path: read_landmarks(path, 2), tmp_path / "a.csv", r"'x{40}\.\.\.' is not a number")
 
 
 def test_only_as_many_landmarks_as_frames_are_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -112,7 +112,7 @@ def test_no_command_follows_a_link(
     place: str, workspace: Path, victim: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     put(workspace / place, victim / "notes" if "." in place else victim)
-    run_all(workspace, tmp_path / "out", capsys, f"{workspace / place}: a link")
+    run_all(workspace, tmp_path / "out", capsys, f"{workspace / place}: is a link")
 
 
 def test_links_are_found_wherever_they_are(made: Path, tmp_path: Path, victim: Path) -> None:
@@ -130,8 +130,8 @@ def test_a_pipe_is_not_waited_for(workspace: Path, tmp_path: Path, capsys: pytes
     place, began = workspace / "runs/toy/config.json", time.monotonic()
     place.unlink()
     os.mkfifo(place)
-    run_all(workspace, tmp_path / "out", capsys, f"{place}: no ordinary file")
-    with pytest.raises(UserError, match="no ordinary file"):
+    run_all(workspace, tmp_path / "out", capsys, f"{place}: is not an ordinary file")
+    with pytest.raises(UserError, match="not an ordinary file"):
         read_run_config(workspace / "runs/toy")
     assert time.monotonic() - began < 60
 
@@ -173,7 +173,7 @@ def test_a_cache_is_not_written_through_links_nor_second_names(workspace: Path, 
     for make in (lambda: raw.symlink_to(victim / "frames.u8"), lambda: os.link(victim / "frames.u8", raw)):
         raw.unlink()
         make()
-        with pytest.raises(UserError, match="a link|also lies elsewhere"):
+        with pytest.raises(UserError, match="is a link|has another name elsewhere"):
             CacheWriter(layout)
 
 
@@ -195,7 +195,7 @@ def test_partial_figures_are_not_written_through_links_nor_second_names(tmp_path
         path.unlink(missing_ok=True)
         make(path)
         partial = PartialScores(path, "0123")
-        with pytest.raises(UserError, match="a link|also lies elsewhere"):
+        with pytest.raises(UserError, match="is a link|has another name elsewhere"):
             partial.add(Frame(0, 0, 0), {}, 0.0)
         assert partial.read() == {}
         assert not path.is_symlink()
@@ -272,7 +272,7 @@ def test_a_deep_tree_is_told(tmp_path: Path) -> None:
         os.close(place)
         place = below
     os.close(place)
-    with pytest.raises(UserError, match="cannot be looked through"):
+    with pytest.raises(UserError, match="cannot be searched"):
         check_tree(tmp_path)
 
 
@@ -318,7 +318,7 @@ def test_capture_numbers_that_cannot_be(name: str, value: float, workspace: Path
     arrays[name] = np.array(arrays[name])
     arrays[name].flat[-1] = value
     write_arrays(folder / "landmarks.safetensors", arrays)
-    with pytest.raises(UserError, match=f"{name} holds numbers that cannot be"):
+    with pytest.raises(UserError, match=f"{name} holds impossible numbers"):
         read_capture(folder)
 
 
@@ -499,9 +499,9 @@ def test_metrics_as_they_were_written_are_compared(workspace: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        (b'{"__metadata__": [1]}', "metadata is no object"),
-        (b'{"__metadata__": "x"}', "metadata is no object"),
-        (b"[]", "metadata is no object"),
+        (b'{"__metadata__": [1]}', "metadata is not an object"),
+        (b'{"__metadata__": "x"}', "metadata is not an object"),
+        (b"[]", "metadata is not an object"),
         (b"[" * 3000, "too deep"),
         (b'{"a": ' + b"9" * 400 + b"}", "400 digits"),
         (b'{"a": {"dtype": "F32", "shape": [1000000000000], "data_offsets": [0, 4000000000000]}}', "damaged"),
@@ -539,7 +539,7 @@ def test_a_chosen_number_of_parts_is_not_counted_to(
     began = time.monotonic()
     assert main(["capture", str(tmp_path / "clip.mp4"), "--out", str(workspace)]) == 2
     assert time.monotonic() - began < 30
-    assert "holds a capture of something else" in capsys.readouterr().err
+    assert "holds a capture of another source" in capsys.readouterr().err
 
 
 def test_json_is_written_as_it_is_read(tmp_path: Path) -> None:

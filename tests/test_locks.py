@@ -25,8 +25,7 @@ from mien.capture import read_capture, write_capture
 from mien.cli import main
 from mien.errors import CannotWriteError, UserError
 from mien.files import replace_folder
-from mien.lock_holder import read_holder
-from mien.locks import BeingWrittenError, check_free, hold, holder_of, lock_file, read_beside_writers
+from mien.locks import BeingWrittenError, check_free, hold, holder_of, lock_file, read_beside_writers, read_holder
 from mien.tracking import read_tracking, write_tracking
 from mien.tracking.files import _TENSORS
 from toy_scene import toy_face_model, toy_tracking

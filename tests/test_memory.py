@@ -29,7 +29,7 @@ MIB = 1 << 20
 @pytest.fixture
 def tiny_limit(monkeypatch: pytest.MonkeyPatch) -> int:
     """What may be held is a mebibyte."""
-    monkeypatch.setattr(picture_files, "_KEPT", MIB)
+    monkeypatch.setattr(picture_files, "_MAX_KEPT_BYTES", MIB)
     return MIB
 
 
@@ -102,7 +102,7 @@ def test_few_pictures_stay_in_memory_and_many_are_the_same(tmp_path: Path, monke
     pictures = np.random.default_rng(0).integers(0, 256, (3, 2, 20, 31), dtype=np.uint8)
     arrays = []
     for kept in (1 << 20, 100):
-        monkeypatch.setattr(picture_files, "_KEPT", kept)
+        monkeypatch.setattr(picture_files, "_MAX_KEPT_BYTES", kept)
         stack = PictureStack(pictures.shape, tmp_path)
         for timestep, camera in ((2, 1), (0, 0), (1, 1), (0, 1), (1, 0), (2, 0)):
             stack.write(timestep, camera, pictures[timestep, camera])

@@ -38,7 +38,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 ODD = [
     ("rendr W --out a.png", "did you mean render?"),
     ("render W --out ''", "argument 3 after render is empty"),
-    ("render W --out a.png --width 0", "--width 0 --height 512: pictures are 16..8192"),
+    ("render W --out a.png --width 0", "--width 0 --height 512: give numbers from 16 to 8192"),
     ("render W --out a.png --width 8193", "--width 8193 --height 512"),
     ("render W --out a.png --height -1", "--height -1"),
     ("render W --out a.png --size 1e3", "--size"),
@@ -53,12 +53,12 @@ ODD = [
     ("render W --out a.png --background #12", "--background #12"),
     ("render W --out a.mp4 --frames 0", "--frames 0: give 1 or more"),
     ("render W --out a.mp4 --fps nan", "--fps nan"),
-    ("render W --out a.mp4 --zoom 0", "--zoom 0: give 0.01..100"),
+    ("render W --out a.mp4 --zoom 0", "--zoom 0: give a number from 0.01 to 100"),
     ("render W --out a.mp4 --span inf", "--span inf"),
     ("render W --out a.mp4 --path loop", "'loop'"),
     ("render W --out a.png --set drop=nan", "--set drop=nan: drop goes from 0 to 1"),
     ("render W --out a.png --set drop=1e300", "--set drop=1e300"),
-    ("render W --out a.png --set drop=0,5", "'0,5' is no number"),
+    ("render W --out a.png --set drop=0,5", "'0,5' is not a number"),
     ("render W --out a.png --set drop 0.5", "--set drop 0.5: write drop=0.5"),
     ("render W --out a.png --set drop", "--set drop: write drop=0.6"),
     ("render W --out a.png --set dorp=1", "did you mean drop?"),
@@ -66,10 +66,10 @@ ODD = [
     ("render W --out a.png --sequence a/b", "no sequence 'a/b'; there are: clip"),
     ("render W --out a.png --cameras none.json", "none.json: no such file"),
     ("render W --out a.png --cameras empty.json", "cannot be read as json"),
-    ("render W --out a.png --cameras cameras.json", "viewmat is no rotation"),
+    ("render W --out a.png --cameras cameras.json", "viewmat is not a rotation"),
     ("render W/runs/toy --out a.png", "did you mean W --run toy?"),
     ("render 'not there' --out a.png", "--out 'not there'`"),
-    ("render text.txt --out a.png", "text.txt: a file; name"),
+    ("render text.txt --out a.png", "text.txt: is a file; give"),
     ("drive W --by none.csv --out a.mp4", "none.csv: no such file or folder"),
     ("drive W --by empty.csv --out a.mp4", "empty.csv: has no frames"),
     ("drive W --by bytes.csv --out a.mp4", "bytes.csv: cannot be read as csv"),
@@ -79,7 +79,7 @@ ODD = [
     ("drive W --by text.txt --out a.mp4", "text.txt: cannot be read as a video"),
     ("drive W --by folder.png --out a.mp4", "not a mien workspace"),
     ("drive W --by W --out a.png", "one picture"),
-    ("drive W --by W --out a.mp4 --fps 30", "--fps 30: only the timecode of a .csv"),
+    ("drive W --by W --out a.mp4 --fps 30", "--fps 30: is for the timecode of a .csv"),
     ("drive W --by empty.csv --out a.mp4 --fps 0", "--fps 0"),
     ("drive W --by list.json --out a.mp4 --sequence clip", "--sequence clip"),
     ("export W --out a.obj", "cannot write .obj; use .ply or .mien"),
@@ -100,10 +100,10 @@ ODD = [
     ("track W --tracking.photometric.focal-sigma 0", "--tracking.photometric.focal-sigma 0: give a number above 0"),
     ("track W --tracking.paper.shrink 0", "--tracking.paper.shrink 0"),
     ("track W --tracking.paper.epochs -1", "--tracking.paper.epochs -1"),
-    ("track W --tracking.paper.rates.focal nan", "--tracking.paper.rates.focal nan: give 0 or a number above it"),
+    ("track W --tracking.paper.rates.focal nan", "--tracking.paper.rates.focal nan: give a number from 0 to 1e+09"),
     ("track W --tracking.smoothness.rotation -1", "--tracking.smoothness.rotation -1: give a number above 0, or inf"),
     ("capture empty.mp4 --out text.txt", "is a file, but a folder"),
-    ("capture /dev/null --out new", "/dev/null: is no file"),
+    ("capture /dev/null --out new", "/dev/null: is not a file"),
     ("create empty.mp4 --out new --capture.size 0", "--capture.size 0"),
     ("create empty.mp4 --out new --capture.landmarks none.csv", "--capture.landmarks none.csv: no such file"),
     ("demo --out text.txt", "text.txt: is a file"),
@@ -142,7 +142,7 @@ def test_the_same_video_twice_is_warned_of(place: Path) -> None:
     videos[1].write_bytes(videos[0].read_bytes())
     names = ["a", "b", "c"]
     assert list(doubled_videos(videos, names, ())) == [
-        "a and b are the same video, which counts twice and shows nothing more"
+        "a and b are the same video, which then counts twice and adds nothing"
     ]
     (warning,) = doubled_videos(videos, names, ("b-1",))
     assert warning == "a and b are the same video: b is held out, but a trains on its frames"

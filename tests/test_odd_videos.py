@@ -17,7 +17,7 @@ from capture_helpers import write_gradient_video
 from mien.capture.display import Display
 from mien.capture.source import FrameSelection, open_source
 from mien.capture.video import count_frames, probe_video, read_video_frames, write_video
-from mien.capture.video_file import LARGEST_FRAME
+from mien.capture.video_file import MAX_FRAME_PIXELS
 from mien.cli import main
 from mien.errors import UserError
 from mien.export.output import plan_output
@@ -296,4 +296,4 @@ def test_pixels_that_are_not_square_count_as_they_are_shown() -> None:
     with pytest.raises(UserError, match=r"clip: is shown with 5760000x480 pixels, more than the 37,748,736"):
         Display("clip", 9000.0).show(av.VideoFrame(640, 480, "yuv420p"))
     assert Display("clip", 9000.0, 512).show(av.VideoFrame(640, 480, "yuv420p")).shape == (1, 512, 3)
-    assert LARGEST_FRAME == 37_748_736
+    assert MAX_FRAME_PIXELS == 37_748_736

@@ -24,7 +24,8 @@ from mien.avatar import (
     RefillSettings,
 )
 from mien.cli import main
-from mien.commands.settings_options import field_docs, leaves
+from mien.commands.help_text import field_docs
+from mien.commands.settings_options import leaves
 from mien.commands.stages import training
 from mien.errors import UserError
 from mien.ranges import FRACTION, NotBelow, Range, check_ranges
@@ -127,7 +128,7 @@ def test_face_tuning_has_two_options_that_agree(line: str, choices: Any) -> None
         ("--method.sh-degree 4", "--method.sh-degree 4: give a number from 0 to 3"),
         ("--method.sh-degree 1.5", "--method.sh-degree"),
         ("--method.sh-frame upside-down", "world"),
-        ("--method.scale-weight nan", "--method.scale-weight nan: give 0 or a number above it"),
+        ("--method.scale-weight nan", "--method.scale-weight nan: give a number from 0 to 1e+09"),
         ("--method.means-rate.start -1", "--method.means-rate.start -1: give a number from 0 to 100"),
         ("--method.means-rate.end 0", "--method.means-rate.end 0: give a number from 1e-12 to 100"),
         (
@@ -192,15 +193,15 @@ def test_what_is_held_out_follows_the_file(workspace: Path, choices: Any, capsys
     ("content", "words"),
     [
         ("", "cannot be read as json"),
-        ("[]", "holds no object"),
+        ("[]", "is not an object"),
         ('{"method": {"sh_degree": NaN}}', "it holds the number NaN"),
-        ('{"method": {"sh_degree": 1, "sh_degree": 2}}', "'sh_degree' stands there twice"),
+        ('{"method": {"sh_degree": 1, "sh_degree": 2}}', "it holds 'sh_degree' twice"),
         ('{"format": "mien.capture"}', "has format 'mien.capture' version 1; give a run's config.json"),
         ('{"version": 2}', "version 2"),
         ('{"methods": {}}', "methods: a file of settings has no such setting; did you mean method?"),
         ('{"method": {"kind": "nerf"}}', "method.kind nerf: give the name of a method: gaussian_avatars"),
         ('{"method": {"kind": []}}', "method.kind (nothing): give the name of a method"),
-        ('{"method": 3}', "method is no object of settings"),
+        ('{"method": 3}', "method is not an object of settings"),
         ('{"settings": {"stepps": 3}}', "settings.stepps: a run has no such setting; did you mean steps? there are"),
         ('{"settings": {"kind": "GaussianAvatarsConfig"}}', "settings.kind 'GaussianAvatarsConfig': give 'TrainSett"),
         ('{"settings": {"steps": "many"}}', "settings.steps 'many': give a whole number"),
@@ -255,7 +256,7 @@ def test_paths_that_are_no_file_are_refused(workspace: Path, capsys: pytest.Capt
         (workspace / "gone.json", "gone.json: no such file"),
         (workspace / "runs" / "a", f"is a folder; give {workspace / 'runs' / 'a' / 'config.json'}"),
         (workspace / "runs", "is a folder; give a file"),
-        (Path("/dev/null"), "is no ordinary file"),
+        (Path("/dev/null"), "is not an ordinary file"),
     ):
         assert words in complaint(capsys, ["train", str(workspace), "--config", str(path)])
     assert "is a folder" in complaint(capsys, ["train", str(workspace), "--config="])

@@ -9,11 +9,9 @@ from typing import get_args
 
 import pytest
 
-from mien import limits
 from mien.avatar import METHODS
 from mien.cli import COMMANDS
 from mien.commands.options import MethodName
-from mien.commands.picture import LARGEST_SIDE
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
 LAZY_ROOMS = ["avatar", "capture", "driving", "export", "tracking", "training"]
@@ -108,7 +106,6 @@ def test_wrong_values_and_paths_import_nothing_heavy(tmp_path: Path) -> None:
 
 def test_what_is_written_twice_to_keep_options_light_agrees() -> None:
     assert get_args(MethodName) == tuple(METHODS)
-    assert LARGEST_SIDE == limits.LARGEST_SIDE
 
 
 @pytest.mark.parametrize("room", LAZY_ROOMS)

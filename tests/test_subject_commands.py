@@ -85,8 +85,8 @@ def test_a_third_clip_gives_all_a_new_identity(
     assert main(["capture", str(clips["three"]), *arguments]) == 0
     assert main(["track", str(workspace), *TRACKING]) == 0
     shown = capsys.readouterr().err
-    assert "three came new: all 3 sequences are tracked again" in shown
-    assert "Trained on the tracking before this one: gaussian_avatars" in shown
+    assert "three added: all 3 sequences are tracked again" in shown
+    assert "Trained on the previous tracking: gaussian_avatars" in shown
     assert torch.equal(_identity(workspace, "one"), _identity(workspace, "three"))
     assert not torch.equal(_identity(workspace, "one"), before)
 
@@ -109,7 +109,7 @@ def test_a_third_clip_gives_all_a_new_identity(
         ([], "no video"),
         (["{clip}", "{gone}"], "no such video"),
         (["{clip}", "{clip}"], "two videos would both be the sequence 'clip'"),
-        (["{clip}", "--name", "a", "b"], "2 names for 1 videos"),
+        (["{clip}", "--name", "a", "b"], "2 names, but the number of videos is 1"),
         (["{clip}", "--face-model", "any"], "no face model 'any'"),
         (["{clip}", "--out", "{clip}"], "is a file, but a folder"),
         (["{clip}", "--run", "a/b"], "cannot be the name of a folder"),

@@ -15,7 +15,7 @@ from mien.commands.stages.names import sequence_name
 from mien.errors import UserError
 from mien.progress import progress_bar, say
 from mien.terminal import plain_name, printable, show
-from mien.threads import MOST_THREADS, asked_threads, thread_count
+from mien.threads import MAX_THREADS, asked_threads, thread_count
 
 NASTY = "\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\udcff.mp4"
 SHOWN = r"\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\xff.mp4"
@@ -174,7 +174,7 @@ def test_threads_that_cannot_be_are_told(
 
 
 def test_threads_that_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    for text in ("1", "7", str(MOST_THREADS), " 2 "):
+    for text in ("1", "7", str(MAX_THREADS), " 2 "):
         monkeypatch.setenv("MIEN_THREADS", text)
         assert asked_threads() == thread_count() == int(text)
     monkeypatch.setenv("MIEN_THREADS", "")

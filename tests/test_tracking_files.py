@@ -116,7 +116,7 @@ def test_damage(tmp_path):
     tensors, text = tmp_path / "tracking.safetensors", (tmp_path / "tracking.json").read_text()
     whole = tensors.read_bytes()
     tensors.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    with pytest.raises(UserError, match="is not what was written"):
+    with pytest.raises(UserError, match="differs from what was written"):
         read_tracking(tmp_path)
     tensors.write_bytes(whole[:100])
     with pytest.raises(UserError, match="damaged"):

@@ -72,7 +72,7 @@ def test_choices_that_lead_nowhere(added, tmp_path, capsys):
         (str(tmp_path / "none.npz"), "no such file"),
         (str(tmp_path), "neither the name"),
         (str(other), r"another file has the name 'my_head', .*My Head\.npz; .* --name NAME"),
-        (str(write_npz(tmp_path / "anny.npz", {"weights": np.zeros(3)})), "of mien's own"),
+        (str(write_npz(tmp_path / "anny.npz", {"weights": np.zeros(3)})), "one of mien's own"),
         (str(write_npz(tmp_path / "x.npz", {"weights": np.zeros(3)})), "has no 'v_template'"),
     ):
         with pytest.raises(UserError, match=message):

@@ -9,7 +9,7 @@ from torch.utils.dlpack import to_dlpack
 
 from mien import _native
 
-_LARGE = 1 << 18
+_MIN_RECYCLED = 1 << 18
 """Smallest number of elements for which memory is recycled. Smaller blocks come back from the allocator without fresh
 pages."""
 
@@ -19,7 +19,7 @@ def recycled(*shape: int) -> Tensor:
 
     The kernel clears fresh pages, and at 2048x2048 that takes longer than drawing the picture.
     """
-    if math.prod(shape) < _LARGE:
+    if math.prod(shape) < _MIN_RECYCLED:
         return torch.empty(shape)
     return _native.recycled(shape)
 

@@ -7,6 +7,7 @@ import importlib
 import inspect
 import io
 import os
+import re
 import shlex
 import signal
 import sys
@@ -16,22 +17,22 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import mien
+from mien.bounded import MAX_SIDE
 from mien.errors import UserError
-from mien.help_text import without_details
 from mien.terminal import drop_output, open_closed_streams, printable, show, tell
 from mien.threads import asked_threads
 
 COMMANDS = {
-    "create": "video in, avatar, report and metrics out: all stages in one command",
+    "create": "video -> avatar, report and metrics: all stages in one command",
     "capture": "a video (or a folder of pictures) -> frames, mattes, landmarks",
     "track": "capture -> face parameters, cameras, overlay video",
     "train": "captures + trackings -> an avatar, by the method of your choice",
     "evaluate": "avatar -> metrics.json and report.html on held-out frames",
-    "render": "avatar -> a still or a film along a camera path, at any expression",
-    "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> film",
+    "render": "avatar -> a still or a video along a camera path, at any expression",
+    "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
     "export": "avatar -> .mien (runs without torch), or .ply at one or many expressions",
     "face-models": "list the face models and bake them ahead of time",
-    "bench": "timings of this machine; quality over reference captures with known truth",
+    "bench": "speed of this machine; quality on reference captures with known truth",
     "demo": "the whole path on a synthetic head, in minutes: start here",
 }
 """Name -> summary. `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command`.
@@ -44,13 +45,26 @@ EXIT_INTERRUPTED = 130
 EXIT_CLOSED_PIPE = 141
 """Exit code of a program that the system ends because nobody reads its output any more (`mien ... | head -1`)."""
 EXIT_TERMINATED = 143
-_OPENCVS_LIMIT, _MOST_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS", 8192 * 8192
-"""Same number as `mien.capture.picture.LARGEST_PICTURE`. OpenCV reads this variable when it is imported."""
+_OPENCVS_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
+"""OpenCV reads this variable when it is imported."""
 _USERS_ERRNOS = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG}
 )
 """Errors that mien cannot prevent: the disk is full, read-only, protected or broken."""
 _USELESS = ("For full helptext", "Argument helptext")
+_REWORDED = (
+    (r"^Error parsing (\S+): invalid literal for int\(\) with base 10: ", r"\1: give a whole number instead of "),
+    (r"^Error parsing (\S+): could not convert string to float: ", r"\1: give a number instead of "),
+    (r"^Error parsing (\S+): no type matching (.+?) could be .*? from \[(.*?)\].*", r"\1: give \2 instead of \3"),
+    (r"^invalid choice (.*) for argument '(.+?)'\. Expected one of \((.*?),?\)", r"\2: give one of \3 instead of \1"),
+    (r"^Missing value for argument '(.+?)'\. Expected .* values", r"\1: give it a value"),
+    (r"^Missing from mien [\w -]+: ", "missing: "),
+    (r"^Unrecognized options: ", "unknown: "),
+    (r"^Expected one of \{(.*)\}", r"give one of \1"),
+    (r"^Available subcommands: ", "there are: "),
+    (r"^Perhaps you meant: ", "did you mean "),
+)
+"""Beginnings of tyro's complaints, and what mien says instead."""
 _INDENT_OF_DESCRIPTION = 8
 """Number of spaces before an option's description in tyro's messages. Option names have fewer."""
 
@@ -72,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_CLOSED_PIPE
     except OSError as error:
         with contextlib.suppress(OSError):
-            _complain(f"standard output: cannot be written ({error.strerror}); mend that and run it again")
+            _complain(f"standard output: cannot be written ({error.strerror}); correct that and run the command again")
         return EXIT_USER_ERROR
     finally:
         drop_output()
@@ -84,16 +98,17 @@ def _main(arguments: list[str]) -> int:
     except UserError as error:
         return _complain(str(error))
     except KeyboardInterrupt:
-        tell("mien: stopped; the same command goes on where it was, or begins anew")
+        tell("mien: stopped; the same command continues where it stopped, or starts again")
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         raise
     except MemoryError as error:
-        return _complain(f"not enough memory ({error}); close other programs, or ask for a smaller size")
+        cause = f" ({error})" if str(error) else ""
+        return _complain(f"not enough memory{cause}; close other programs, or ask for a smaller size")
     except OSError as error:
         if error.errno not in _USERS_ERRNOS:
             return _crash()
-        return _complain(f"{error.filename or 'a file'}: {error.strerror}; mend that and run the same command again")
+        return _complain(f"{error.filename or 'a file'}: {error.strerror}; correct that and run the same command again")
     except Exception:
         return _crash()
 
@@ -133,19 +148,21 @@ def _crash() -> int:
 def _run(name: str, rest: list[str]) -> int:
     import tyro
 
+    from mien.commands.help_text import readable, without_details
     from mien.commands.options import settings_groups, with_settings
 
-    os.environ.setdefault(_OPENCVS_LIMIT, str(_MOST_PIXELS))
+    os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
     options, more = module.Command, ""
     if "--help-all" in rest:
         rest = ["--help" if argument == "--help-all" else argument for argument in rest]
-        options = with_settings(module.Command, rest)
+        options = readable(with_settings(module.Command, rest))
     elif "-h" in rest or "--help" in rest:
         options, groups = without_details(module.Command)
+        options = readable(options)
         further, words = settings_groups(module.Command, rest)
         names = ", ".join(f"--{group}.*" for group in groups + further)
-        more = f"More options ({names}), for those who compare and tune: mien {name}{words} --help-all" if names else ""
+        more = f"More options ({names}): mien {name}{words} --help-all" if names else ""
     else:
         options = with_settings(module.Command, rest)
     complaints = io.StringIO()
@@ -196,7 +213,14 @@ def _in_one_line(box: str) -> str:
         elif len(inner) - len(inner.lstrip()) < _INDENT_OF_DESCRIPTION:
             comma = inner.startswith(" ") and parts[-1] and not parts[-1].endswith(":")
             parts[-1] = f"{parts[-1]}{',' if comma else ''} {text}".strip()
-    return "; ".join(part.rstrip(".") for part in parts if part and not part.startswith(_USELESS))
+    return "; ".join(_reworded(part.rstrip(".")) for part in parts if part and not part.startswith(_USELESS))
+
+
+def _reworded(complaint: str) -> str:
+    """A complaint of tyro in the words of mien's own messages: the option, its value, and what to give."""
+    for pattern, words in _REWORDED:
+        complaint = re.sub(pattern, words, complaint)
+    return complaint
 
 
 def _check_instruction_set() -> None:

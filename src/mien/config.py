@@ -62,8 +62,8 @@ def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
         if name == "kind":
             continue
         if name not in known:
-            near = difflib.get_close_matches(name[:_LONGEST_SHOWN], known, 1)
-            raise UserError(no_such_setting(f"{where}.{name[:_LONGEST_SHOWN]}", owner, near, known))
+            near = difflib.get_close_matches(name[:_MAX_SHOWN], known, 1)
+            raise UserError(no_such_setting(f"{where}.{name[:_MAX_SHOWN]}", owner, near, known))
         place, value = f"{where}.{name}", getattr(base, name)
         if is_dataclass(value):
             changed[name] = overlay(value, change, place, owner)
@@ -101,7 +101,7 @@ def _in_words(hint: Any) -> str:
     if origin in (Union, types.UnionType):
         return " or ".join(_in_words(part) for part in parts)
     plain = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", type(None): "null"}
-    return plain.get(hint, f"a {hint}")
+    return plain.get(hint, f"a {getattr(hint, '__name__', hint)}")
 
 
 def _decode(hint: Any, value: Any, where: str) -> Any:
@@ -121,7 +121,7 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
         items = get_args(hint)
         kinds = [items[0]] * len(value) if len(items) == 2 and items[1] is Ellipsis else items
         if len(kinds) != len(value):
-            raise UserError(f"{where}: {len(value)} entries instead of {len(kinds)}")
+            raise UserError(f"{where}: has {len(value)} entries instead of {len(kinds)}")
         return tuple(_decode(kind, item, where) for kind, item in zip(kinds, value, strict=True))
     if origin is dict and isinstance(value, dict):
         return {key: _decode(get_args(hint)[1], item, where) for key, item in value.items()}
@@ -137,7 +137,7 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
     alike = isinstance(value, bool) == (hint is bool)
     if origin is None and isinstance(hint, type) and isinstance(value, hint) and alike:
         return value
-    raise UserError(f"{where}: {_in_short(value)} is not a {hint}")
+    raise UserError(f"{where}: {_in_short(value)} is not {_in_words(hint)}")
 
 
 def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
@@ -150,7 +150,7 @@ def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
         name for name, f in known.items() if name not in value and f.default is MISSING and f.default_factory is MISSING
     ]
     if unknown or missing:
-        raise UserError(f"{where}: unknown {_in_short(sorted(unknown))}, missing {_in_short(missing)}")
+        raise UserError(f"{where}: has unknown entries {_in_short(sorted(unknown))} and lacks {_in_short(missing)}")
     return hint(**{name: _decode(hints[name], value[name], f"{where}.{name}") for name in known if name in value})
 
 
@@ -167,7 +167,7 @@ def _decode_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
             return _decode(option, value, where)
         except UserError:
             continue
-    raise UserError(f"{where}: {_in_short(value)} is none of {options}")
+    raise UserError(f"{where}: {_in_short(value)} is not {' or '.join(map(_in_words, options))}")
 
 
 def _in_short(value: Any) -> str:
@@ -176,7 +176,7 @@ def _in_short(value: Any) -> str:
     if shape is not None:
         return f"{value.dtype} {tuple(shape)}"
     text = repr(value)
-    return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "..."
+    return text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "..."
 
 
-_LONGEST_SHOWN = 80
+_MAX_SHOWN = 80

@@ -23,9 +23,9 @@ def check_device(name: DeviceName) -> None:
     """
     if name == "cuda" and find_spec("gsplat") is None:
         raise UserError(
-            "--device cuda: needs a CUDA GPU and gsplat, which is not installed; where there is such a GPU, install it "
-            "with `.venv/bin/uv pip install 'gsplat>=1.5'` (it compiles its kernels at first use and needs the CUDA "
-            f"toolkit's nvcc for that), {_OR_CPU}"
+            "--device cuda: needs a CUDA GPU and gsplat, which is not installed; if there is such a GPU, install "
+            "gsplat with `.venv/bin/uv pip install 'gsplat>=1.5'` (it compiles its kernels at first use, with the CUDA "
+            f"toolkit's nvcc), {_OR_CPU}"
         )
 
 
@@ -40,14 +40,14 @@ def choose_device(name: DeviceName) -> "torch.device":
     if name == "cpu":
         return torch.device("cpu")
     if name == "auto" and not (torch.cuda.is_available() and find_spec("gsplat") is not None):
-        say("--device auto: no CUDA GPU that torch finds, or no gsplat; using the processor")
+        say("--device auto: torch finds no CUDA GPU, or gsplat is not installed; using the processor")
         return torch.device("cpu")
     check_device(name)
     if not torch.cuda.is_available():
         built = "is built without CUDA" if torch.version.cuda is None else f"(CUDA {torch.version.cuda}) finds no GPU"
         raise UserError(
-            f"--device cuda: torch {torch.__version__} {built}; see that `nvidia-smi` lists a GPU and that its driver "
-            f"is new enough, {_OR_CPU}"
+            f"--device cuda: torch {torch.__version__} {built}; check that `nvidia-smi` lists a GPU and that its "
+            f"driver is new enough, {_OR_CPU}"
         )
     say(f"{torch.cuda.get_device_name()}: gsplat compiles its kernels at first use, which takes some minutes, once")
     return torch.device("cuda")

@@ -30,12 +30,12 @@ _CHECKSUM = "checksum"
 _ANY_STAGE = "the stage that writes it"
 _AT_CURRENT_FOLDER, _EXCHANGE = -100, 2
 """AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
-_LARGEST_JSON = 32 << 20
+_MAX_JSON_BYTES = 32 << 20
 """Largest json file that is read, in bytes. The largest that mien writes has some megabytes. Empty lists take twenty
 times the size of their text in memory."""
-_LARGEST_HEADER = 8 << 20
+_MAX_HEADER_BYTES = 8 << 20
 """Largest header of a safetensors file, in bytes. Headers that mien writes have some kilobytes."""
-_LARGEST_TENSORS = 1 << 30
+_MAX_TENSORS_BYTES = 1 << 30
 """Largest safetensors file that is read, in bytes. The largest that mien writes has some hundred megabytes."""
 _PIECE = 1 << 20
 """Number of bytes that are hashed at a time."""
@@ -60,7 +60,7 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
     if there and not folder and path.is_dir():
         raise UserError(f"{path}: is a folder, but a file is to be written there; give the name of a file")
     if there and not folder and not path.is_file():
-        raise UserError(f"{path}: is no ordinary file; give the name of a file to write")
+        raise UserError(f"{path}: is not an ordinary file; give the name of a file to write")
     nearest = path if there and folder else path.parent
     while not nearest.exists() and nearest != nearest.parent:
         if nearest.is_symlink():
@@ -172,7 +172,7 @@ def read_json(
         UserError: the file is missing, is not json, has another format or version, or was changed after it was written.
     """
     try:
-        content = parse_json(read_bytes(path, _LARGEST_JSON).decode("utf-8"))
+        content = parse_json(read_bytes(path, _MAX_JSON_BYTES).decode("utf-8"))
     except FileNotFoundError:
         asked = remedy if remedy and stage == _ANY_STAGE else f"run {stage} again"
         raise UserError(f"{path}: missing; {asked}") from None
@@ -268,18 +268,18 @@ def _check_safetensors(path: Path) -> None:
     """Check a file against the checksum that `write_safetensors` stored. Files of other programs have none."""
     with open_ordinary(path) as file:
         whole = os.fstat(file.fileno()).st_size
-        if whole > _LARGEST_TENSORS:
-            raise ValueError(f"{whole} bytes are too many")
+        if whole > _MAX_TENSORS_BYTES:
+            raise ValueError(f"it has {whole:,} bytes, and {_MAX_TENSORS_BYTES:,} are the most")
         size = int.from_bytes(file.read(8), "little")
-        if not 2 <= size <= min(_LARGEST_HEADER, whole - 8):
+        if not 2 <= size <= min(_MAX_HEADER_BYTES, whole - 8):
             raise ValueError("its header does not fit into the file")
         header = parse_json(file.read(size).decode("utf-8"))
         metadata = header.pop("__metadata__", {}) if isinstance(header, dict) else None
         if not isinstance(header, dict) or not isinstance(metadata, dict):
-            raise ValueError("its header or metadata is no object")
+            raise ValueError("its header or metadata is not an object")
         stored = metadata.get(_CHECKSUM)
         if stored is not None and stored != _tensor_checksum(header, iter(partial(file.read, _PIECE), b"")):
-            raise ValueError("it is not what was written")
+            raise ValueError("its content differs from what was written")
 
 
 def _tensor_checksum(header: Mapping[str, Any], body: Iterable[bytes | memoryview]) -> str:

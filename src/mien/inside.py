@@ -8,20 +8,17 @@ well, so that nothing is ever written through a link or through a second name of
 
 import os
 import shutil
-import stat
 import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
+from mien.bounded import NotOrdinaryError, open_handle
 from mien.errors import UserError
 
-_MOST_BYTES_OF_NAME = 255
+_MAX_NAME_BYTES = 255
 _NOT_IN_NAMES = frozenset({"Cc", "Cs", "Zl", "Zp"})
 """Unicode categories: control characters, halves of surrogate pairs, line and paragraph separators."""
-_NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
-_NO_WAIT = getattr(os, "O_NONBLOCK", 0)
-"""Without this flag, opening a pipe waits for a process that writes into it."""
 
 
 def is_one_line(text: object) -> bool:
@@ -33,7 +30,7 @@ def is_plain_name(name: object) -> bool:
     """Whether it is a name that a file or folder can have, and that does not lead to another folder."""
     if not (isinstance(name, str) and is_one_line(name)):
         return False
-    return name not in ("", ".", "..") and not set(name) & {"/", "\\"} and len(name.encode()) <= _MOST_BYTES_OF_NAME
+    return name not in ("", ".", "..") and not set(name) & {"/", "\\"} and len(name.encode()) <= _MAX_NAME_BYTES
 
 
 def inside(folder: Path, name: object) -> Path:
@@ -78,7 +75,7 @@ def open_to_read(path: Path) -> IO[bytes]:
         UserError: it is a link, a folder, a pipe or a device.
         OSError: it is missing or cannot be read.
     """
-    return os.fdopen(_opened(path, os.O_RDONLY, alone=False), "rb")
+    return os.fdopen(_open(path, os.O_RDONLY, alone=False), "rb")
 
 
 def open_to_change(path: Path) -> int:
@@ -88,7 +85,7 @@ def open_to_change(path: Path) -> int:
         UserError: it is a link, is not a file, or has a second name, which may be outside the folder.
         OSError: it cannot be written.
     """
-    return _opened(path, os.O_RDWR | os.O_CREAT, alone=True)
+    return _open(path, os.O_RDWR | os.O_CREAT, alone=True)
 
 
 def open_to_append(path: Path) -> IO[str]:
@@ -98,7 +95,7 @@ def open_to_append(path: Path) -> IO[str]:
         UserError: as for `open_to_change`.
         OSError: it cannot be written.
     """
-    return os.fdopen(_opened(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, alone=True), "a", encoding="utf-8")
+    return os.fdopen(_open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, alone=True), "a", encoding="utf-8")
 
 
 def open_new(path: Path) -> IO[bytes]:
@@ -108,7 +105,7 @@ def open_new(path: Path) -> IO[bytes]:
         OSError: it cannot be written.
     """
     path.unlink(missing_ok=True)
-    return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | _NO_FOLLOW, 0o644), "w+b")
+    return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644), "w+b")
 
 
 def remove_tree(path: Path) -> None:
@@ -148,26 +145,27 @@ def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
         except (FileNotFoundError, NotADirectoryError):
             continue
         except OSError as error:
-            raise UserError(f"{folder}: cannot be looked through ({error.strerror}); check what is in it") from None
+            raise UserError(
+                f"{folder}: cannot be searched ({error.strerror}); check its folders and their permissions"
+            ) from None
 
 
-def _opened(path: Path, flags: int, *, alone: bool) -> int:
-    if path.is_symlink():
-        raise UserError(_refusal(path, link=True))
-    file = os.open(path, flags | _NO_FOLLOW | _NO_WAIT, 0o644)
-    status = os.fstat(file)
-    if stat.S_ISREG(status.st_mode) and (status.st_nlink == 1 or not alone):
-        return file
-    os.close(file)
-    if stat.S_ISREG(status.st_mode):
-        raise UserError(f"{path}: the same file also lies elsewhere; delete it here, or copy its folder")
-    raise UserError(_refusal(path, link=False))
+def _open(path: Path, flags: int, *, alone: bool) -> int:
+    """The descriptor of a file. With `alone`, the file must have no second name."""
+    try:
+        handle = open_handle(path, flags, follow_link=False)
+    except NotOrdinaryError:
+        raise UserError(_refusal(path, path.is_symlink())) from None
+    if alone and os.fstat(handle).st_nlink != 1:
+        os.close(handle)
+        raise UserError(f"{path}: the same file has another name elsewhere; delete it here, or copy its folder")
+    return handle
 
 
 def _refusal(path: Path, link: bool) -> str:
     if link:
         return (
-            f"{path}: a link, which is not followed inside a workspace: it may lead anywhere; put what it leads to in "
-            "its place, or move the whole workspace and link to that"
+            f"{path}: is a link, and links inside a workspace are not followed, because they may lead anywhere; "
+            "replace it by what it leads to, or move the whole workspace and link to that"
         )
-    return f"{path}: no ordinary file or folder, as everything inside a workspace has to be; delete it"
+    return f"{path}: is not an ordinary file or folder, and a workspace may hold nothing else; delete it"

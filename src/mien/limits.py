@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-LARGEST_SIDE = 8192
-"""Largest width or height of a picture, in pixels."""
-LARGEST_NUMBER = 1e6
-"""Largest magnitude of lengths in metres, angles in radians, raw values and weights. Mien writes far smaller
-numbers."""
-LARGEST_FOCAL = 1e7
+from mien.bounded import MAX_SIDE
+
+MAX_NUMBER = 1e6
+"""Largest magnitude of lengths in metres, coordinates in pixels, angles in radians, raw values and weights. Mien writes
+far smaller numbers."""
+MAX_FOCAL = 1e7
 """Largest focal length, in pixels."""
 _RIGID = 1e-2
 """Tolerance for the last rows of K and viewmat, and for the deviation of R R^T from the identity."""
@@ -27,7 +27,7 @@ def whole(value: object, low: int, high: int) -> int:
         ValueError: it is not.
     """
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise ValueError(f"{value!r:.40} is no whole number from {low} to {high}")
+        raise ValueError(f"{value!r:.40} is not a whole number from {low} to {high}")
     return value
 
 
@@ -37,12 +37,12 @@ def side(value: object) -> int:
     Raises:
         ValueError: it cannot.
     """
-    return whole(value, 1, LARGEST_SIDE)
+    return whole(value, 1, MAX_SIDE)
 
 
 def is_moderate(array: np.ndarray) -> bool:
-    """Whether all numbers are finite and at most `LARGEST_NUMBER` in magnitude."""
-    return array.size == 0 or bool(np.abs(array).max() <= LARGEST_NUMBER)
+    """Whether all numbers are finite and at most `MAX_NUMBER` in magnitude."""
+    return array.size == 0 or bool(np.abs(array).max() <= MAX_NUMBER)
 
 
 def are_indices(array: np.ndarray, count: int) -> bool:
@@ -63,22 +63,22 @@ def camera_fault(K: Any, viewmat: Any, width: object, height: object) -> str | N
         try:
             side(value)
         except ValueError:
-            return f"{width!r:.40}x{height!r:.40} pixels, not whole numbers from 1 to {LARGEST_SIDE}"
+            return f"{width!r:.40}x{height!r:.40} pixels, not whole numbers from 1 to {MAX_SIDE}"
     K, viewmat = (np.asarray(matrix, np.float64) for matrix in (K, viewmat))
     if K.shape != (3, 3) or viewmat.shape != (4, 4):
         return "K must be 3x3 and viewmat 4x4 numbers"
     if not (np.isfinite(K).all() and np.isfinite(viewmat).all()):
         return "K and viewmat must be finite numbers"
-    if np.abs(K).max() > LARGEST_FOCAL or min(K[0, 0], K[1, 1]) < 1 / LARGEST_FOCAL:
-        return f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}, not above 0 and to {LARGEST_FOCAL:g} pixels"
+    if np.abs(K).max() > MAX_FOCAL or min(K[0, 0], K[1, 1]) < 1 / MAX_FOCAL:
+        return f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}, which must be above 0 and at most {MAX_FOCAL:g} pixels"
     if np.abs(K[2] - (0, 0, 1)).max() > _RIGID:
         return "the last row of K must be 0 0 1"
     turned = viewmat[:3, :3]
     rigid = np.abs(turned).max() <= 2 and np.abs(_product(turned) - np.eye(3)).max() <= _RIGID
     if not rigid or np.linalg.det(turned) < 0 or np.abs(viewmat[3] - (0, 0, 0, 1)).max() > _RIGID:
-        return "viewmat is no rotation and translation (world to camera, OpenCV axes)"
-    if np.abs(viewmat[:3, 3]).max() > LARGEST_NUMBER:
-        return f"it is more than {LARGEST_NUMBER:g} metres away"
+        return "viewmat is not a rotation and translation (world to camera, OpenCV axes)"
+    if np.abs(viewmat[:3, 3]).max() > MAX_NUMBER:
+        return f"it is more than {MAX_NUMBER:g} metres away"
     return None
 
 
@@ -92,9 +92,9 @@ def skeleton_fault(names: Sequence[Any], parents: Sequence[Any], free: Sequence[
     if not (len(names) == len(parents) == len(free)) or not names:
         return f"{len(names)} joint names, {len(parents)} parents and {len(free)} marks of free joints"
     if not all(isinstance(name, str) for name in names) or not all(isinstance(mark, bool) for mark in free):
-        return "joint names that are no texts, or marks that are not true or false"
+        return "joint names that are not texts, or marks that are not true or false"
     if not all(isinstance(parent, int) and not isinstance(parent, bool) for parent in parents):
-        return "parents of joints that are no whole numbers"
+        return "parents of joints that are not whole numbers"
     if any(not -1 <= parent < index for index, parent in enumerate(parents)):
         return "a joint comes before its parent"
     return None

@@ -9,8 +9,7 @@ The file is removed with the lock. That is safe, because it is removed only whil
 that gets a lock checks that the file still has its name, and starts again if not. After a kill the file stays,
 unlocked, and the next process uses it.
 
-The file may come from a stranger together with the workspace: no link is followed, and its content is not trusted
-(`mien.lock_holder`).
+The file may come from a stranger together with the workspace: no link is followed, and its content is not trusted.
 
 docs/conventions.md, "Two commands at once", lists which command holds which locks. Readers use `read_beside_writers`.
 """
@@ -18,24 +17,28 @@ docs/conventions.md, "Two commands at once", lists which command holds which loc
 import errno
 import fcntl
 import hashlib
+import json
 import os
-import stat
+import shlex
+import socket
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from mien.bounded import NotOrdinaryError, open_handle, parse_json
 from mien.errors import CannotWriteError, UserError
 from mien.files import cannot_write
-from mien.lock_holder import read_holder, sign
 from mien.progress import say
 
 Result = TypeVar("Result")
 
 WAIT, AGAIN = "wait until it is done, or end it", "try again when it is done"
 """Remedies for writers and for readers."""
-_LONGEST_NAME = 240
+_MAX_NAME_BYTES = 240
 """Longest name of a lock file, in bytes. File systems allow 255."""
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
 _REMOVED = frozenset({errno.ENOENT, errno.ESTALE})
@@ -49,6 +52,12 @@ moment, a process that was killed and is about to end, or a process that is abou
 _NAMELESS = "which has not left its name"
 _PAUSES_SECONDS = (0.0, 0.02, 0.05, 0.1)
 """Pauses before a reader reads again files that a writer changed in the meantime."""
+
+_BEGINNING = b'{"format": "mien.lock"'
+"""First bytes of every lock file of mien."""
+_MAX_SIGNATURE_BYTES = 4096
+_MAX_SHOWN = {"host": 60, "since": 30, "command": 200}
+"""Most characters that are shown of each entry about a holder."""
 
 _ours: dict[int, tuple[int, int]] = {}
 """Open lock files of this process -> their device and number."""
@@ -140,7 +149,7 @@ def lock_file(place: Path) -> Path:
     """The path of a place's lock file, a hidden file beside the place."""
     place = Path(os.path.abspath(place))  # noqa: PTH100 (`resolve` would follow a link in the place of a folder)
     name = f".{place.name}.lock"
-    if len(os.fsencode(name)) > _LONGEST_NAME:
+    if len(os.fsencode(name)) > _MAX_NAME_BYTES:
         name = f".{hashlib.sha256(os.fsencode(place.name)).hexdigest()[:32]}.lock"
     return place.with_name(name)
 
@@ -174,7 +183,7 @@ def _acquire(place: Path, file: Path, remedy: str) -> int | None:
             handle = _open_own(file)
             locked = _try_lock(handle)
             if locked and _is_named(handle, file):
-                sign(handle, file)
+                _sign(handle, file)
                 _ours[handle] = _identity(os.fstat(handle))
                 return handle
             holder = None if locked else read_holder(handle)
@@ -240,17 +249,13 @@ def _open(file: Path, flags: int) -> int:
         UserError: the path is not a plain file with a single name.
         OSError: it cannot be opened.
     """
-    remedy = "it takes the place of a lock file; remove it"
     try:
-        handle = os.open(file, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
-            raise UserError(f"{file}: is no ordinary file; {remedy}") from None
-        raise
-    status = os.fstat(handle)
-    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+        handle = open_handle(file, flags, follow_link=False)
+    except NotOrdinaryError:
+        raise UserError(f"{file}: is not an ordinary file, but has the name of a lock file; remove it") from None
+    if os.fstat(handle).st_nlink > 1:
         os.close(handle)
-        raise UserError(f"{file}: is no ordinary file, or has a second name; {remedy}")
+        raise UserError(f"{file}: has a second name, which no lock file has; remove it")
     return handle
 
 
@@ -285,7 +290,7 @@ def _state(folder: Path) -> object:
 def _warn_of_no_locks(file: Path) -> None:
     if "warned" not in _once:
         _once.add("warned")
-        say(f"warning: {file.parent}: its file system has no locks; run one command at a time on what lies there")
+        say(f"warning: {file.parent}: its file system has no locks; run only one command at a time there")
 
 
 def _let_children_forget() -> None:
@@ -300,3 +305,66 @@ def _forget() -> None:
         with suppress(OSError):
             os.close(handle)
     _ours.clear()
+
+
+def _sign(handle: int, file: Path) -> None:
+    """Write into an open lock file that this process holds it, with pid, host, time and command line.
+
+    Raises:
+        UserError: the file is not a lock file of mien. It stays as it is.
+    """
+    found = os.pread(handle, len(_BEGINNING), 0)
+    if found != _BEGINNING[: len(found)]:
+        raise UserError(f"{file}: has the name of a lock file, but mien did not write it; move it away")
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]) if sys.argv else "python"
+    about = {
+        "format": "mien.lock",
+        "pid": os.getpid(),
+        "host": socket.gethostname()[: _MAX_SHOWN["host"]],
+        "since": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
+        "command": command[: _MAX_SHOWN["command"] + 1],
+    }
+    text = json.dumps(about).encode()
+    with suppress(OSError):  # a full disk, or another user's file: the lock holds even without a signature
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, text, 0)
+
+
+def read_holder(handle: int) -> str | None:
+    """The holder of an open lock file, described in one line. The content of the file is not trusted.
+
+    The result is None if the file names no process, or one that has ended: the holder has not signed yet.
+    """
+    about = _parsed(os.pread(handle, _MAX_SIGNATURE_BYTES, 0))
+    if about is None or not _may_live(about):
+        return None
+    words = {name: _shown(about.get(name), longest) for name, longest in _MAX_SHOWN.items()}
+    return f"process {about['pid']} on {words['host']}, since {words['since']}: {words['command']}"
+
+
+def _parsed(text: bytes) -> dict[str, Any] | None:
+    try:
+        about = parse_json(text.decode())
+    except ValueError:
+        return None
+    pid = about.get("pid") if isinstance(about, dict) else None
+    return about if isinstance(pid, int) and 0 < pid < 1 << 31 else None
+
+
+def _may_live(about: dict[str, Any]) -> bool:
+    """False if the holder is a process of this machine that has ended."""
+    if about.get("host") != socket.gethostname()[: _MAX_SHOWN["host"]]:
+        return True
+    try:
+        os.kill(about["pid"], 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # the process belongs to another user
+        return True
+    return True
+
+
+def _shown(text: object, longest: int) -> str:
+    """Untrusted text for a terminal: one line, without control characters, of limited length."""
+    plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text)[: longest + 1])
+    return plain if len(plain) <= longest else plain[:longest] + "..."

@@ -19,10 +19,10 @@ from mien.errors import UserError
 from mien.files import cannot_write, write_atomically
 from mien.inside import open_to_read
 
-_KEPT = 256 << 20
+_MAX_KEPT_BYTES = 256 << 20
 """Number of bytes that a map hands out before it gives its pages back, and largest stack that is held in memory."""
 _PNG_SIGNATURE, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
-_PNG_HEADERS = 1 << 16
+_MAX_PNG_HEADER_BYTES = 1 << 16
 """Most bytes of a PNG file besides those of its pixels."""
 _DONT_NEED = getattr(mmap, "MADV_DONTNEED", None)
 """None if the system has no such call (Windows)."""
@@ -54,7 +54,7 @@ class PictureMap(np.memmap):
         found = super().__getitem__(index)
         if isinstance(found, np.ndarray) and self._tally is not None:
             self._tally.handed_out += found.nbytes
-            if self._tally.handed_out > _KEPT:
+            if self._tally.handed_out > _MAX_KEPT_BYTES:
                 self._tally.handed_out = 0
                 self._give_back()
         return found
@@ -88,7 +88,7 @@ class PictureStack:
         """
         self._shape, self._folder = shape, folder or Path(tempfile.gettempdir())
         self._file = None
-        if math.prod(shape) <= _KEPT:
+        if math.prod(shape) <= _MAX_KEPT_BYTES:
             self._array = np.zeros(shape, np.uint8)
             return
         try:
@@ -160,7 +160,7 @@ def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndar
     try:
         with open_to_read(path) as file:
             # A PNG of noise is a little larger than its pixels; a file that is much longer counts as damaged.
-            most = 2 * math.prod(shape) + _PNG_HEADERS
+            most = 2 * math.prod(shape) + _MAX_PNG_HEADER_BYTES
             data = file.read(min(most, os.fstat(file.fileno()).st_size))
     except FileNotFoundError:
         raise UserError(f"{path}: missing; {remedy}") from None

@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from mien.errors import UserError
 
-_LONGEST_SHOWN = 60
+_MAX_SHOWN = 60
 """Number of characters of a value that a message shows."""
 
 
@@ -73,9 +73,9 @@ class ToLoad:
 
 FRACTION = Range(0, 1)
 """Range of a share, an opacity, or a time as a fraction of the run."""
-POSITIVE = Range(1e-9, 1e9, words=f"a number above 0, {1e9:g} at most")
+POSITIVE = Range(1e-9, 1e9, words=f"a number above 0, at most {1e9:g}")
 """Range of a length or a scale."""
-NOT_NEGATIVE = Range(0, 1e9, words=f"0 or a number above it, {1e9:g} at most")
+NOT_NEGATIVE = Range(0, 1e9)
 """Range of a weight that may be switched off."""
 COUNT = Range(1, 100_000)
 COUNT_OR_NONE = Range(0, 100_000)
@@ -129,7 +129,7 @@ def shown(value: Any) -> str:
         text = " ".join(shown(item) for item in value) or "(nothing)"
     else:
         text = _short(value) if isinstance(value, float) else str(value)
-    return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "..."
+    return text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "..."
 
 
 def marks_of(hint: Any) -> tuple[Any, ...]:

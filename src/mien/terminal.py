@@ -52,7 +52,9 @@ def show(text: str, *, styled: bool = False) -> None:
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise UserError(f"standard output: cannot be written ({error.strerror}); mend that and run it again") from None
+        raise UserError(
+            f"standard output: cannot be written ({error.strerror}); correct that and run the command again"
+        ) from None
 
 
 def tell(message: str) -> None:

@@ -73,7 +73,7 @@ def open_workspace(root: Path) -> Workspace:
     """
     workspace = Workspace(root)
     if root.is_file():
-        raise UserError(f"{root}: a file; name the workspace's folder (a video becomes one by `mien create`)")
+        raise UserError(f"{root}: is a file; give the folder of a workspace (`mien create` makes one from a video)")
     if not root.is_dir():
         raise UserError(
             f"{root}: no such folder; make a workspace with `mien create VIDEO --out {shlex.quote(str(root))}`"
@@ -81,12 +81,12 @@ def open_workspace(root: Path) -> Workspace:
     check_subtrees(root, *_FOLDERS)
     if not workspace.sequence_names() and not workspace.run_names():
         _check_first_captures(workspace)
-        told = f"{root}: not a mien workspace (no sequences/NAME/capture, no runs/NAME)"
+        told = f"{root}: is not a mien workspace (no sequences/NAME/capture, no runs/NAME)"
         whole = root.resolve()
         bare = sorted(path.name for path in root.glob("sequences/[!.]*") if path.is_dir())
         if bare:
             raise UserError(
-                f"{root}: the capture of {', '.join(bare)} is gone; make it again from its video: "
+                f"{root}: the capture of {', '.join(bare)} is missing; make it again from its video: "
                 f"{shlex.join(['mien', 'capture', 'VIDEO', '--out', str(root), '--name', bare[0]])}"
             )
         if whole.parent.name == "runs" and whole.name in Workspace(whole.parent.parent).run_names():
@@ -122,7 +122,7 @@ def check_new_workspace(root: Path) -> None:
     for folder in (whole, *whole.parents):
         outer = Workspace(folder.parent)
         if folder.name in _FOLDERS and (outer.sequence_names() or outer.run_names()):
-            raise UserError(f"{root}: lies inside the workspace {folder.parent}; name that, or a folder beside it")
+            raise UserError(f"{root}: is inside the workspace {folder.parent}; give that folder, or one beside it")
 
 
 def _pick(kind: str, name: str | None, names: list[str], root: Path, option: str) -> str:
@@ -133,7 +133,7 @@ def _pick(kind: str, name: str | None, names: list[str], root: Path, option: str
         raise UserError(f"{root}: there is no {kind} yet; make one with `{remedy} {shlex.quote(str(root))}`")
     listed = ", ".join(names)
     if name is None:
-        raise UserError(f"{root}: which {kind}? There are: {listed}; name one with {option} NAME")
+        raise UserError(f"{root}: has several {kind}s ({listed}); choose one with {option} NAME")
     if name not in names:
         raise UserError(f"{root}: no {kind} {name!r}; there are: {listed}")
     return name

@@ -15,7 +15,7 @@ from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.checks import check_face_params
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.inside import check_subtrees, check_tree
-from mien.limits import LARGEST_NUMBER
+from mien.limits import MAX_NUMBER
 from mien.locks import read_beside_writers
 from mien.runtime.checks import baked_fault
 from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
@@ -133,8 +133,8 @@ def _misfit(own: dict[str, Tensor], state: dict[str, Tensor], gaussians: int) ->
         found = state[name]
         if found.dtype != tensor.dtype or found.shape[1:] != tensor.shape[1:] or found.ndim != tensor.ndim:
             return f"{name!r} is {found.dtype} {list(found.shape)}"
-        if found.is_floating_point() and not (found.numel() == 0 or bool(found.abs().max() <= LARGEST_NUMBER)):
-            return f"{name!r} holds NaN or numbers beyond {LARGEST_NUMBER:g}"
+        if found.is_floating_point() and not (found.numel() == 0 or bool(found.abs().max() <= MAX_NUMBER)):
+            return f"{name!r} holds NaN or numbers beyond {MAX_NUMBER:g}"
         # Baking narrows indices to 32 bits: what is larger would come round to one that exists.
         if (
             found.dtype == torch.int64

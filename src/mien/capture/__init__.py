@@ -1,4 +1,19 @@
-"""Capture: turn a video of a head into frames, mattes and landmarks."""
+"""Capture: turn a video of a head into frames, mattes and landmarks.
+
+`from_video` runs five steps. Each has its file, and the helpers that it needs:
+
+1. `source` opens a video file or a folder of pictures and selects its frames. Helpers: `video` reads and writes frames,
+   `video_file` opens video files safely, `display` and `tone` convert their pictures to sRGB, `picture` reads picture
+   files safely, and `given` reads what the user gives besides (clean plate, mattes, landmarks).
+2. `survey` is the first pass: it finds all faces in every frame (`faces`, MediaPipe) and checks that they are upright.
+3. `parts` splits the video at cuts, and chooses for each part the person to follow (`people`) and one crop (`crop`).
+4. `process` is the second pass: it crops each frame, finds the person's landmarks, makes the matte (`matte`, `plate`),
+   measures blur and light (`quality`), and writes the pictures (`frame_files`).
+5. `outcome` writes the results of all frames beside the pictures and moves the folder to its place.
+
+`capture` has the class `Capture`, `store` writes and reads it, and `cache` has its decoded frames. `settings` has the
+settings, and `quiet_mediapipe` loads MediaPipe without its messages.
+"""
 
 from typing import TYPE_CHECKING
 

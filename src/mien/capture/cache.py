@@ -3,7 +3,6 @@
 import hashlib
 import itertools
 import os
-import shutil
 import tempfile
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,7 +13,7 @@ import numpy as np
 
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, CacheWriter, FrameLayout, read_png
 from mien.errors import CannotWriteError, UserError
-from mien.inside import drop_if_shared
+from mien.inside import drop_if_shared, remove_tree
 from mien.locks import BeingWrittenError, hold
 from mien.picture_files import map_pictures
 from mien.progress import progress_bar
@@ -22,7 +21,7 @@ from mien.storage import read_json, write_json
 
 _FORMAT, _VERSION = "mien.capture_cache", 1
 _THREADS = 2
-_IN_FLIGHT = 16
+_MAX_QUEUED = 16
 _SCRATCH_PREFIX, _ASIDE_PREFIX = "mien-capture-", ".making-"
 
 
@@ -47,7 +46,7 @@ def map_frames(layout: FrameLayout, capture_hash: str, digests: dict[str, np.nda
     images, mattes = (map_pictures(found.raw(kind), found.shape(kind)) for kind in (FRAMES, MATTES))
     if found is not layout:
         # The maps keep the pages of a scratch folder alive. Nothing else needs its file names.
-        shutil.rmtree(found.folder, ignore_errors=True)
+        remove_tree(found.folder)
     return images, mattes
 
 
@@ -107,7 +106,7 @@ def _rebuild(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarr
         try:
             _decode_all(layout, scratch, digests)
         except BaseException as error:
-            shutil.rmtree(scratch.folder, ignore_errors=True)
+            remove_tree(scratch.folder)
             if isinstance(error, OSError):
                 raise CannotWriteError(
                     f"{layout.folder}: no room for the decoded frames ({error.strerror}); free some disk space", error
@@ -119,7 +118,7 @@ def _rebuild(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarr
 def _replace_cache(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
     cache = layout.folder / CACHE
     for left in cache.glob(f"{_ASIDE_PREFIX}*"):  # left by a process that was killed
-        shutil.rmtree(left, ignore_errors=True)
+        remove_tree(left)
     for old in (cache / "stamp.json", layout.raw(FRAMES), layout.raw(MATTES)):  # the disk may have no room for both
         old.unlink(missing_ok=True)
     aside = replace(layout, folder=Path(tempfile.mkdtemp(dir=cache, prefix=_ASIDE_PREFIX)))
@@ -128,7 +127,7 @@ def _replace_cache(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
         for kind in (FRAMES, MATTES):
             aside.raw(kind).replace(layout.raw(kind))
     finally:
-        shutil.rmtree(aside.folder, ignore_errors=True)
+        remove_tree(aside.folder)
 
 
 def _read_first(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
@@ -158,7 +157,7 @@ def _decode_all(source: FrameLayout, target: FrameLayout, digests: dict[str, np.
         with progress_bar(f"decode {source.folder.name}", total) as advance:
             for kind, timestep, camera in everything:
                 pending.append(threads.submit(decode, kind, timestep, camera))
-                if len(pending) >= _IN_FLIGHT:
+                if len(pending) >= _MAX_QUEUED:
                     pending.popleft().result()
                     advance()
             while pending:

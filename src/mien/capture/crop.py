@@ -1,4 +1,4 @@
-"""One crop for a whole clip. The crop does not follow the head, so the frames still come from one fixed camera."""
+"""Step 3: choose one crop for a whole part. It does not follow the head, so the frames come from one fixed camera."""
 
 from dataclasses import dataclass
 
@@ -12,9 +12,9 @@ _MARGIN = 1.5
 """Room around all positions of the face for hair, neck and shoulders, in face boxes (eyebrows to chin)."""
 _OUTLIERS = 1.0
 """Percent of the frames at either end that may lie outside, so that a false detection does not decide the crop."""
-_SQUARISH = 1.25
+_MAX_ASPECT = 1.25
 """A picture counts as a head crop already, and is kept whole, if its aspect ratio is at most this..."""
-_MOSTLY_HEAD = 0.7
+_MIN_HEAD_SHARE = 0.7
 """...and the chosen crop would take at least this part of its shorter side."""
 
 
@@ -69,7 +69,7 @@ def choose_crop(boxes: Float[np.ndarray, "t 4"], width: int, height: int, size: 
     face = float(np.median(np.maximum(pixels[:, 2] - pixels[:, 0], pixels[:, 3] - pixels[:, 1])))
     wanted = max(right - left, bottom - top) + _MARGIN * face
     shorter, longer = min(width, height), max(width, height)
-    if longer <= _SQUARISH * shorter and wanted >= _MOSTLY_HEAD * shorter:
+    if longer <= _MAX_ASPECT * shorter and wanted >= _MIN_HEAD_SHARE * shorter:
         return whole_picture(width, height, size)
     side = min(round(wanted), shorter)
     crop_left = int(np.clip(round((left + right - side) / 2), 0, width - side))

@@ -1,4 +1,4 @@
-"""Convert decoded video frames to what an sRGB screen shows: matrix and range, HDR, pixel aspect, rotation."""
+"""Step 1: convert decoded video frames to what an sRGB screen shows (matrix, range, HDR, pixel aspect, rotation)."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
 from jaxtyping import UInt8
 
 from mien.capture.tone import HLG, PQ, ToneMapper
-from mien.capture.video_file import LARGEST_FRAME, TOO_MANY_PIXELS
+from mien.capture.video_file import MAX_FRAME_PIXELS, TOO_MANY_PIXELS
 from mien.errors import UserError
 
 ACCURATE = Interpolation.BICUBIC | Interpolation.FULL_CHR_H_INT | Interpolation.ACCURATE_RND
@@ -73,7 +73,7 @@ class Display:
             self._stored_size = stored
             self._matrix = _display_matrix(frame)
             self._size = _display_size(*stored, self._pixel_aspect, self._longest_side)
-            if self._size[0] * self._size[1] > LARGEST_FRAME:
+            if self._size[0] * self._size[1] > MAX_FRAME_PIXELS:
                 shown = f"{self._size[0]}x{self._size[1]}"
                 raise UserError(f"{self._name}: is shown with {shown} pixels, {TOO_MANY_PIXELS}; make it smaller")
         elif abs(stored[0] / stored[1] / (self._stored_size[0] / self._stored_size[1]) - 1) > _ASPECT_TOLERANCE:

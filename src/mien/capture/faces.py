@@ -1,4 +1,4 @@
-"""Faces in pictures: boxes of all faces, to choose the crop, and landmarks, to follow one of them."""
+"""Find faces in pictures: boxes of all faces (step 2, to choose the crop) and landmarks (step 4)."""
 
 from types import TracebackType
 from typing import Any
@@ -10,7 +10,8 @@ from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
 
 LANDMARKS = 478
 """Points of MediaPipe's face mesh with irises."""
-_MOST_FACES = 4
+MAX_FACES = 4
+"""Most faces of a frame that are kept, the largest first."""
 _DETECTION_CONFIDENCE = 0.5
 
 
@@ -68,7 +69,7 @@ class LandmarkDetector:
     def __enter__(self) -> "LandmarkDetector":
         module = load_solution("face_mesh")
         with quiet_mediapipe():
-            self._mesh = module.FaceMesh(max_num_faces=_MOST_FACES if self._several_faces else 1, refine_landmarks=True)
+            self._mesh = module.FaceMesh(max_num_faces=MAX_FACES if self._several_faces else 1, refine_landmarks=True)
             # The graph starts in its own threads and prints warnings. It has started when it has processed a picture.
             self._mesh.process(np.zeros((64, 64, 3), np.uint8))
         self._has_seen_face = False

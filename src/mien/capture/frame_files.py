@@ -1,4 +1,4 @@
-"""Frames on disk: lossless PNGs, and beside them the decoded pixels as raw files for memory maps."""
+"""Step 4: write frames as lossless PNGs, and beside them the decoded pixels as raw files for memory maps."""
 
 import hashlib
 import math
@@ -28,7 +28,7 @@ _PNG_OPTIONS = (
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
 )
 """These options take half the time of OpenCV's default for level 1 and make smaller files."""
-_IN_FLIGHT = 8
+_MAX_QUEUED = 8
 """Largest number of timesteps that wait to be written. It bounds the memory."""
 
 MakeFrames = Callable[[], tuple[np.ndarray, np.ndarray]]
@@ -128,7 +128,7 @@ class FrameWriter:
         Raises:
             OSError: an earlier timestep could not be written.
         """
-        while len(self._pending) >= _IN_FLIGHT:
+        while len(self._pending) >= _MAX_QUEUED:
             self._pending.popleft().result()
         self._pending.append(self._thread.submit(self._write, timestep, make))
 

@@ -1,4 +1,4 @@
-"""Turn a video into captures: crop the head out of every frame, find its landmarks and make its matte.
+"""Turn a video into captures. This file runs the five steps that the docstring of `mien.capture` lists.
 
 Only a few frames are in memory at a time.
 """
@@ -9,21 +9,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 
 from mien.capture.capture import Capture
-from mien.capture.finished import read_finished, read_source
 from mien.capture.frame_files import FrameLayout
-from mien.capture.given import GivenMattes, check_mattes, read_landmarks
+from mien.capture.given import GivenInputs, read_given
 from mien.capture.outcome import CAMERA_ID, Origin, finish_part
-from mien.capture.parts import find_parts, whole_part
-from mien.capture.process import Means, Part, Reel, process_part
+from mien.capture.parts import Part, find_parts, whole_part
+from mien.capture.process import Reel, process_part
 from mien.capture.settings import CaptureSettings
-from mien.capture.source import FrameSelection, FrameSource, open_source, read_image
-from mien.capture.store import JSON_NAME, check_replaceable, partial_folder, read_capture
-from mien.capture.survey import Survey, survey_source
-from mien.capture.upright import check_upright
+from mien.capture.source import FrameSelection, FrameSource, open_source
+from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, partial_folder, read_capture
+from mien.capture.survey import Survey, check_upright, survey_source
 from mien.errors import UserError
 from mien.inside import check_tree, has_other_names, remove_tree
 from mien.locks import hold
@@ -66,8 +65,8 @@ def capture_video(
     Raises:
         UserError: the source is no video or shows no face, or a folder cannot be written, is damaged or being written.
     """
-    job = _job(source, settings or CaptureSettings(), name, replace)
-    capture = read_finished(out, _part_key(job, 1, 1), tell=False)
+    job = _open_job(source, settings or CaptureSettings(), name, replace)
+    capture = _read_finished(out, _part_key(job, 1, 1), tell=False)
     if capture is not None:
         return capture
     with hold(out):
@@ -76,16 +75,16 @@ def capture_video(
 
 def _capture_whole(out: Path, job: _Job) -> Capture:
     # Another process may have finished it before this one got the lock.
-    capture = read_finished(out, _part_key(job, 1, 1))
+    capture = _read_finished(out, _part_key(job, 1, 1))
     if capture is not None:
         return capture
     _check_place(out, job)
     scratch = partial_folder(out).with_suffix(".survey")
     with _tidy(out, scratch) as survey_folder:
-        means = _means(job)
-        survey = _survey(job, survey_folder, means)
+        given = read_given(job.settings, job.frames)
+        survey = _run_survey(job, survey_folder, given)
         part = whole_part(survey, job.settings, job.frames.path, job.name)
-        _process(job, Reel(job.frames), part, (1, 1), means, out)
+        _process(job, Reel(job.frames), part, (1, 1), given, out)
     return read_capture(out)
 
 
@@ -113,7 +112,7 @@ def capture_video_parts(
     Raises:
         UserError: the source is no video or shows no face, or a folder cannot be written, is damaged or being written.
     """
-    job = _job(source, settings or CaptureSettings(), name, replace)
+    job = _open_job(source, settings or CaptureSettings(), name, replace)
     finished = _read_finished_parts(sequences, job, tell=False)
     if finished:
         return finished
@@ -127,22 +126,22 @@ def _capture_parts(sequences: Path, job: _Job) -> list[Capture]:
     if finished:
         return finished
     for first in (job.name, f"{job.name}-1"):
-        _check_place(_place(sequences, first), job)
-    with _tidy(_place(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
-        means = _means(job)
-        survey = _survey(job, survey_folder, means)
+        _check_place(_capture_dir(sequences, first), job)
+    with _tidy(_capture_dir(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
+        given = read_given(job.settings, job.frames)
+        survey = _run_survey(job, survey_folder, given)
         parts = find_parts(survey, job.settings, job.frames.path, job.name)
         with hold(*(sequences / part.name for part in parts if part.name != job.name)):
             for part in parts:
-                _check_place(_place(sequences, part.name), job)
+                _check_place(_capture_dir(sequences, part.name), job)
             reel = Reel(job.frames)
             for number, part in enumerate(parts, 1):
-                _process(job, reel, part, (number, len(parts)), means, _place(sequences, part.name))
+                _process(job, reel, part, (number, len(parts)), given, _capture_dir(sequences, part.name))
     _tell_leftovers(sequences, job, {part.name for part in parts})
-    return [read_capture(_place(sequences, part.name)) for part in parts]
+    return [read_capture(_capture_dir(sequences, part.name)) for part in parts]
 
 
-def _job(source: Path, settings: CaptureSettings, name: str | None, replace_others: bool) -> _Job:
+def _open_job(source: Path, settings: CaptureSettings, name: str | None, replace_others: bool) -> _Job:
     settings.check()
     selection = FrameSelection(settings.start, settings.end, settings.stride, settings.max_frames)
     frames = open_source(source, selection, settings.fps, settings.turn // 90)
@@ -167,23 +166,23 @@ def _part_key(job: _Job, number: int, count: int) -> str:
     return f"{job.key}-{number}-{count}"
 
 
-def _place(sequences: Path, name: str) -> Path:
+def _capture_dir(sequences: Path, name: str) -> Path:
     return sequences / name / "capture"
 
 
 def _read_finished_parts(sequences: Path, job: _Job, tell: bool = True) -> list[Capture]:
     """Return all parts if all of them are finished, else an empty list."""
-    whole = read_finished(_place(sequences, job.name), _part_key(job, 1, 1), tell)
+    whole = _read_finished(_capture_dir(sequences, job.name), _part_key(job, 1, 1), tell)
     if whole is not None:
         return [whole]
-    source = read_source(_place(sequences, f"{job.name}-1")) or {}
+    source = _read_source(_capture_dir(sequences, f"{job.name}-1")) or {}
     part = source.get("part")
     count = part.get("count") if isinstance(part, dict) else None
     if not isinstance(count, int):
         return []
     found: list[Capture] = []
     for number in range(1, count + 1):
-        capture = read_finished(_place(sequences, f"{job.name}-{number}"), _part_key(job, number, count), tell)
+        capture = _read_finished(_capture_dir(sequences, f"{job.name}-{number}"), _part_key(job, number, count), tell)
         if capture is None:
             return []
         found.append(capture)
@@ -202,12 +201,12 @@ def _check_place(out: Path, job: _Job) -> None:
         raise cannot_write(out, error) from None
     if job.replace or not (out / JSON_NAME).exists():
         return
-    source = read_source(out)
+    source = _read_source(out)
     if source is None:
         say(f"{out}: the capture in it is damaged or of another version; it is made again")
     elif source.get("content_hash") != job.frames.content_hash:
         raise UserError(
-            f"{out}: holds a capture of something else ({source.get('file', 'not made from a video')}); choose another "
+            f"{out}: holds a capture of another source ({source.get('file', 'not made from a video')}); choose another "
             "name with --name, or add --replace to `mien capture`"
         )
 
@@ -255,55 +254,53 @@ def _leads_out(work: Path) -> bool:
         return True
 
 
-def _means(job: _Job) -> Means:
-    """Read and check what the user gave besides the source, before anything that takes long."""
-    settings, frames = job.settings, job.frames
-    if settings.clean_plate is None and settings.mattes is None and settings.landmarks is None:
-        return Means()
-    first = next(frames.frames())
-    height, width = first.picture().shape[:2]
-    plate, mattes, landmarks = None, None, None
-    if settings.clean_plate is not None:
-        plate = read_image(settings.clean_plate)
-        if plate.shape[:2] != (height, width):
-            raise UserError(
-                f"--capture.clean-plate {settings.clean_plate}: is {plate.shape[1]}x{plate.shape[0]}, the video's "
-                f"pictures are {width}x{height}; give a picture by the same camera in the same mode"
-            )
-    if settings.mattes is not None:
-        check_mattes(settings.mattes, frames)
-        GivenMattes(settings.mattes, (width, height)).check(first.number)
-        mattes = GivenMattes(settings.mattes, (width, height))
-    if settings.landmarks is not None:
-        landmarks = read_landmarks(settings.landmarks, frames.count())
-    return Means(plate, mattes, landmarks)
-
-
-def _survey(job: _Job, folder: Path, means: Means) -> Survey:
+def _run_survey(job: _Job, folder: Path, given: GivenInputs) -> Survey:
     if job.frames.hdr:
         say(f"{job.frames.path}: HDR video ({job.frames.hdr}); its pictures are tone-mapped to sRGB")
-    survey = survey_source(job.frames, _prepare(folder, job.key), means.landmarks)
-    if means.landmarks is None:
+    survey = survey_source(job.frames, _prepare(folder, job.key), given.landmarks)
+    if given.landmarks is None:
         check_upright(job.frames, survey, job.settings.turn)
     return survey
 
 
-def _process(job: _Job, reel: Reel, part: Part, place: tuple[int, int], means: Means, out: Path) -> None:
+def _process(job: _Job, reel: Reel, part: Part, place: tuple[int, int], given: GivenInputs, out: Path) -> None:
     """Capture one part, unless that has been done."""
     key = _part_key(job, *place)
-    if read_finished(out, key) is not None:
+    if _read_finished(out, key) is not None:
         return
     work = _prepare(partial_folder(out), key)
     layout = FrameLayout(work, (CAMERA_ID,), part.timesteps, part.crop.height, part.crop.width)
-    chunks = process_part(reel, part, means, layout, work / _CHUNKS)
+    chunks = process_part(reel, part, given, layout, work / _CHUNKS)
     finish_part(layout, out, chunks, part, Origin(job.frames, key, job.name, place), (_STATE, _CHUNKS))
 
 
 def _tell_leftovers(sequences: Path, job: _Job, names: set[str]) -> None:
     """Warn about sequences that an earlier capture of the same video left under other names."""
     for path in sorted(sequences.glob(f"*/capture/{JSON_NAME}")):
-        source = read_source(path.parent) or {}
+        source = _read_source(path.parent) or {}
         part = source.get("part")
         is_ours = isinstance(part, dict) and part.get("of") == job.name
         if is_ours and path.parent.parent.name not in names:
             say(f"warning: {path.parent.parent}: left from an earlier capture of {job.name}; delete it unless needed")
+
+
+def _read_source(out: Path) -> dict[str, Any] | None:
+    """Return the `source` entry of the capture in a folder, or None if there is no readable capture."""
+    try:
+        source = read_json(out / JSON_NAME, FORMAT, VERSION).get("source")
+    except UserError:
+        return None
+    return source if isinstance(source, dict) else None
+
+
+def _read_finished(out: Path, key: str, tell: bool = True) -> Capture | None:
+    """Return the capture in a folder if it has this `key` and is intact. `tell` reports a damaged one."""
+    source = _read_source(out)
+    if source is None or source.get("key") != key:
+        return None
+    try:
+        return read_capture(out)
+    except UserError as error:
+        if tell:
+            say(f"{str(error).split('; ')[0]}; it is captured again")
+        return None

@@ -1,8 +1,9 @@
-"""Read mattes and landmarks that were made elsewhere, and check them against their source."""
+"""Step 1: read the clean plate, mattes and landmarks that the user gives, and check them against their source."""
 
 import csv
 import io
 import itertools
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -13,84 +14,14 @@ from mien.bounded import open_ordinary
 from mien.capture.crop import Crop, whole_picture
 from mien.capture.faces import LANDMARKS
 from mien.capture.picture import decode_picture
-from mien.capture.source import FrameSelection, FrameSource, list_images, open_source
+from mien.capture.settings import CaptureSettings
+from mien.capture.source import FrameSelection, FrameSource, list_images, open_source, read_image
 from mien.errors import UserError
+from mien.limits import MAX_NUMBER
 from mien.storage import read_arrays
 
-_FARTHEST = 1e6
-"""Largest coordinate of a landmark, in pixels."""
-_SHOWN = 40
+_MAX_SHOWN = 40
 """Characters of a csv cell that a message shows."""
-
-
-def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]:
-    """Read landmarks in pixels of the source's pictures as displayed, a row for each frame; NaN for no face.
-
-    Args:
-        path: a .safetensors file with `landmarks` [n, 478, 2], or a .csv file with n lines of x0, y0, x1, y1, ... (956
-            numbers; empty or nan means no face; a first line of column names is skipped).
-        source_frames: the number of frames in the source, n.
-
-    Raises:
-        UserError: the file is missing, damaged or of another shape.
-    """
-    if path.suffix == ".safetensors":
-        landmarks = read_arrays(path).get("landmarks")
-        if landmarks is None:
-            raise UserError(f"{path}: has no array `landmarks`; write [{source_frames}, {LANDMARKS}, 2] pixels as that")
-    elif path.suffix == ".csv":
-        landmarks = _read_csv(path, source_frames)
-    else:
-        raise UserError(f"--capture.landmarks {path}: cannot be read; give a .csv or .safetensors file")
-    expected = (source_frames, LANDMARKS, 2)
-    if landmarks.shape != expected:
-        raise UserError(
-            f"{path}: has landmarks of shape {list(landmarks.shape)}, expected {list(expected)}: "
-            "a row for each frame of the source"
-        )
-    if landmarks.dtype.kind not in "iuf":
-        raise UserError(f"{path}: `landmarks` is {landmarks.dtype}; write numbers, pixels, as float32")
-    landmarks = landmarks.astype(np.float64)
-    if (np.abs(landmarks) > _FARTHEST).any():
-        raise UserError(
-            f"{path}: has numbers that are infinite or beyond {_FARTHEST:g} pixels; write nan where there is no face"
-        )
-    landmarks[~np.isfinite(landmarks).all(axis=(1, 2))] = np.nan
-    return landmarks
-
-
-def _read_csv(path: Path, most: int) -> np.ndarray:
-    """Read the rows of the file.
-
-    At most one row beyond `most` is read, which is enough to see that there are too many.
-    """
-    rows: list[np.ndarray] = []
-    try:
-        with io.TextIOWrapper(open_ordinary(path), encoding="utf-8", newline="") as file:
-            for number, line in enumerate(csv.reader(file), 1):
-                if number == 1 and any(_is_name(cell) for cell in line):
-                    continue
-                if len(line) not in (0, 2 * LANDMARKS):
-                    raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {2 * LANDMARKS}")
-                numbers = [_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS)
-                rows.append(np.array(numbers))
-                if len(rows) > most:
-                    break
-    except (OSError, ValueError, csv.Error) as error:
-        raise UserError(f"{path}: cannot be read as csv ({error}); write it again") from None
-    return np.array(rows).reshape(len(rows), LANDMARKS, 2)
-
-
-def _is_name(cell: str) -> bool:
-    return cell.strip()[:1].isalpha() and cell.strip().lower() != "nan"
-
-
-def _number(path: Path, line: int, cell: str) -> float:
-    try:
-        return float(cell) if cell.strip() else np.nan
-    except ValueError:
-        shown = repr(cell if len(cell) <= _SHOWN else f"{cell[:_SHOWN]}...")
-        raise UserError(f"{path}: line {line}: {shown} is no number; write pixels, or nan for no face") from None
 
 
 class GivenMattes:
@@ -134,6 +65,109 @@ class GivenMattes:
                 f"{self._size[0]}x{self._size[1]}; give mattes of that size"
             )
         return crop.apply(matte)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenInputs:
+    """Clean plate, mattes and landmarks that the user gave with the source video."""
+
+    plate: UInt8[np.ndarray, "h w 3"] | None = None
+    mattes: GivenMattes | None = None
+    landmarks: Float[np.ndarray, "n l 2"] | None = None
+    """Positions in pixels of the source's pictures, a row for each frame of the source."""
+
+
+def read_given(settings: CaptureSettings, frames: FrameSource) -> GivenInputs:
+    """Read and check what the user gave besides the source, before anything that takes long."""
+    if settings.clean_plate is None and settings.mattes is None and settings.landmarks is None:
+        return GivenInputs()
+    first = next(frames.frames())
+    height, width = first.picture().shape[:2]
+    plate, mattes, landmarks = None, None, None
+    if settings.clean_plate is not None:
+        plate = read_image(settings.clean_plate)
+        if plate.shape[:2] != (height, width):
+            raise UserError(
+                f"--capture.clean-plate {settings.clean_plate}: is {plate.shape[1]}x{plate.shape[0]}, but the video's "
+                f"pictures are {width}x{height}; give a picture from the same camera in the same mode"
+            )
+    if settings.mattes is not None:
+        check_mattes(settings.mattes, frames)
+        GivenMattes(settings.mattes, (width, height)).check(first.number)
+        mattes = GivenMattes(settings.mattes, (width, height))
+    if settings.landmarks is not None:
+        landmarks = read_landmarks(settings.landmarks, frames.count())
+    return GivenInputs(plate, mattes, landmarks)
+
+
+def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]:
+    """Read landmarks in pixels of the source's pictures as displayed, a row for each frame; NaN for no face.
+
+    Args:
+        path: a .safetensors file with `landmarks` [n, 478, 2], or a .csv file with n lines of x0, y0, x1, y1, ... (956
+            numbers; empty or nan means no face; a first line of column names is skipped).
+        source_frames: the number of frames in the source, n.
+
+    Raises:
+        UserError: the file is missing, damaged or of another shape.
+    """
+    if path.suffix == ".safetensors":
+        landmarks = read_arrays(path).get("landmarks")
+        if landmarks is None:
+            raise UserError(f"{path}: has no array `landmarks`; write one of [{source_frames}, {LANDMARKS}, 2] pixels")
+    elif path.suffix == ".csv":
+        landmarks = _read_csv(path, source_frames)
+    else:
+        raise UserError(f"--capture.landmarks {path}: cannot be read; give a .csv or .safetensors file")
+    expected = (source_frames, LANDMARKS, 2)
+    if landmarks.shape != expected:
+        raise UserError(
+            f"{path}: has landmarks of shape {list(landmarks.shape)}, expected {list(expected)}: "
+            "a row for each frame of the source"
+        )
+    if landmarks.dtype.kind not in "iuf":
+        raise UserError(f"{path}: `landmarks` is {landmarks.dtype}; write numbers, pixels, as float32")
+    landmarks = landmarks.astype(np.float64)
+    if (np.abs(landmarks) > MAX_NUMBER).any():
+        raise UserError(
+            f"{path}: has numbers that are infinite or beyond {MAX_NUMBER:g} pixels; write nan where there is no face"
+        )
+    landmarks[~np.isfinite(landmarks).all(axis=(1, 2))] = np.nan
+    return landmarks
+
+
+def _read_csv(path: Path, most: int) -> np.ndarray:
+    """Read the rows of the file.
+
+    At most one row beyond `most` is read, which is enough to see that there are too many.
+    """
+    rows: list[np.ndarray] = []
+    try:
+        with io.TextIOWrapper(open_ordinary(path), encoding="utf-8", newline="") as file:
+            for number, line in enumerate(csv.reader(file), 1):
+                if number == 1 and any(_is_name(cell) for cell in line):
+                    continue
+                if len(line) not in (0, 2 * LANDMARKS):
+                    raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {2 * LANDMARKS}")
+                numbers = [_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS)
+                rows.append(np.array(numbers))
+                if len(rows) > most:
+                    break
+    except (OSError, ValueError, csv.Error) as error:
+        raise UserError(f"{path}: cannot be read as csv ({error}); write it again") from None
+    return np.array(rows).reshape(len(rows), LANDMARKS, 2)
+
+
+def _is_name(cell: str) -> bool:
+    return cell.strip()[:1].isalpha() and cell.strip().lower() != "nan"
+
+
+def _number(path: Path, line: int, cell: str) -> float:
+    try:
+        return float(cell) if cell.strip() else np.nan
+    except ValueError:
+        shown = repr(cell if len(cell) <= _MAX_SHOWN else f"{cell[:_MAX_SHOWN]}...")
+        raise UserError(f"{path}: line {line}: {shown} is not a number; write pixels, or nan for no face") from None
 
 
 def check_mattes(path: Path, source: FrameSource) -> None:

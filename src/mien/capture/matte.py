@@ -1,11 +1,21 @@
-"""Mattes: MediaPipe's selfie segmentation at 256x256, stabilised over time and refined at the picture's full size."""
+"""Step 4, mattes: made by segmentation, made with a clean plate, or read from files that were made elsewhere.
 
+The segmentation is MediaPipe's at 256x256, stabilised over time and refined at the picture's full size.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 from types import TracebackType
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mien.capture.crop import Crop
+from mien.capture.given import GivenMattes
+from mien.capture.plate import plate_matte
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
 
 _MODEL_SIZE = 256
@@ -117,3 +127,62 @@ def _affine_fit(
     slope /= determinant[..., None]
     offset = mean_values - np.einsum("hwc,hwc->hw", slope, mean_guide)
     return mean(slope), mean(offset)
+
+
+MakeMatte = Callable[[], UInt8[np.ndarray, "h w"]]
+"""Computes a matte; the caller chooses when and on which thread."""
+
+
+class Matting(ABC):
+    """Makes the mattes of consecutive cropped pictures."""
+
+    @abstractmethod
+    def warm_up(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Process a picture that only prepares the state for the next ones."""
+
+    @abstractmethod
+    def prepare(self, number: int, image: UInt8[np.ndarray, "h w 3"]) -> MakeMatte:
+        """Return a function that makes the matte of the next picture, which is the source's frame `number`."""
+
+
+class SegmentedMattes(Matting):
+    """The network's mask, refined to the picture's size by `refine(picture, mask)`."""
+
+    def __init__(self, segmenter: Segmenter, refine: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+        self._segmenter = segmenter
+        self._refine = refine
+
+    def warm_up(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Update the state that stabilises the next masks."""
+        self._segmenter.segment(image)
+
+    def prepare(self, number: int, image: UInt8[np.ndarray, "h w 3"]) -> MakeMatte:
+        """Segment now and refine later."""
+        return partial(self._refine, image, self._segmenter.segment(image))
+
+
+class ReadMattes(Matting):
+    """Mattes that are read from files."""
+
+    def __init__(self, mattes: GivenMattes, crop: Crop) -> None:
+        self._mattes = mattes
+        self._crop = crop
+
+    def warm_up(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Do nothing: there is no state."""
+
+    def prepare(self, number: int, image: UInt8[np.ndarray, "h w 3"]) -> MakeMatte:
+        """Read the matte now."""
+        matte = self._mattes.matte(number, self._crop)
+        return lambda: matte
+
+
+def choose_matting(
+    stack: ExitStack, crop: Crop, plate: UInt8[np.ndarray, "h w 3"] | None, mattes: GivenMattes | None
+) -> Matting:
+    """Return the matting that the user's inputs allow. `stack` closes whatever is opened."""
+    if mattes is not None:
+        return ReadMattes(mattes, crop)
+    segmenter = stack.enter_context(Segmenter())
+    refine = refine_matte if plate is None else partial(plate_matte, plate=crop.apply(plate))
+    return SegmentedMattes(segmenter, refine)

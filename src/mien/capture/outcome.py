@@ -1,4 +1,4 @@
-"""Finish a capture: write the results of all frames beside them."""
+"""Step 5: finish a capture, by writing the results of all frames beside them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,17 +9,18 @@ from jaxtyping import Float
 
 from mien.capture.faces import second_difference_jitter
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
-from mien.capture.parts import no_face
-from mien.capture.process import Chunk, Part
+from mien.capture.parts import Part
+from mien.capture.process import Chunk
 from mien.capture.quality import quality_report, relative_quality
 from mien.capture.source import FrameSource
 from mien.capture.store import CaptureData, finish_capture
+from mien.capture.survey import no_face
 from mien.inside import remove_tree
 from mien.progress import say
 
 CAMERA_ID = "0"
 _RATE_TOLERANCE = 0.01
-_VARIABLE_RATE = 1.5
+_MAX_INTERVAL_RATIO = 1.5
 """Ratio of the longest to the median time between frames from which a clip's rate is called variable."""
 
 
@@ -98,7 +99,7 @@ def _pace(name: str, timestamps: Float[np.ndarray, " t"]) -> dict[str, Any]:
         return {"frame_interval_ms": None, "variable_frame_rate": False}
     intervals = 1000 * np.diff(timestamps)
     least, usual, most = (round(float(value), 2) for value in (intervals.min(), np.median(intervals), intervals.max()))
-    is_variable = most > _VARIABLE_RATE * usual or least * _VARIABLE_RATE < usual
+    is_variable = most > _MAX_INTERVAL_RATIO * usual or least * _MAX_INTERVAL_RATIO < usual
     if is_variable:
         say(f"{name}: frames {least:g} to {most:g} ms apart (variable rate); all are kept, each with its own time")
     return {

@@ -1,17 +1,47 @@
-"""Choose the parts of a video that become captures: one for each shot, with its own person and crop."""
+"""Step 3: choose the parts of a video that become captures, one for each shot, with its own person and crop."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from mien.capture.crop import Crop, choose_crop, whole_picture
-from mien.capture.cuts import find_cuts
 from mien.capture.people import Person, choose_person
-from mien.capture.process import Part
 from mien.capture.settings import CaptureSettings
-from mien.capture.survey import Survey, slice_survey
+from mien.capture.survey import Survey, no_face, slice_survey
 from mien.errors import UserError
 from mien.progress import say
+
+_CUT_REACH = 3
+"""Frames on either side of a cut that must all differ. After a flash, the picture from before it comes back."""
+_CUT_NEIGHBOURS = 4
+"""Frames on either side of a cut in which the picture may change only a little: motion lasts longer than a cut."""
+_MIN_CHANGE = 0.05
+"""Smallest change at a cut, as a fraction of the mean brightness."""
+_MIN_CONTRAST = 3.0
+"""Factor by which the change at a cut exceeds the changes beside it."""
+_BLOCKS = (3, 4)
+"""Rows and columns of blocks. The change is that of the quarter that changes most, as the head may be small."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Consecutive frames of a source that become one capture."""
+
+    name: str
+    """Name of the sequence."""
+    start: int
+    """Index of its first frame, among the frames taken."""
+    survey: Survey
+    """Survey of the part's frames only."""
+    person: Person
+    crop: Crop
+
+    @property
+    def timesteps(self) -> int:
+        """The number of frames."""
+        return len(self.survey.timestamps)
 
 
 def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str) -> Part:
@@ -56,7 +86,7 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     if not found and short:
         raise UserError(
             f"{path}: cuts {len(cuts)} times, and shows a face in no part of {settings.shortest_part:g} s or more; "
-            "give a smaller --capture.shortest-part, or --capture.no-cuts to take it as one"
+            "give a smaller --capture.shortest-part, or --capture.no-cuts to keep the video whole"
         )
     if not found:
         raise no_face(path, len(survey.timestamps))
@@ -68,11 +98,6 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     for part in parts:
         _tell_people(path, part)
     return parts
-
-
-def no_face(path: Path, frames: int) -> UserError:
-    """Return the error for a video in which no face was found."""
-    return UserError(f"{path}: no face found in any of its {frames} frames; give a video in which one is seen clearly")
 
 
 def _named(parts: list[Part], name: str) -> list[Part]:
@@ -103,7 +128,7 @@ def _tell_people(path: Path, part: Part) -> None:
     if not crowded.any():
         return
     alone = int((crowded & ~part.person.seen).sum())
-    gone = f"; in {alone} of them the followed one is away, and they are left out" if alone else ""
+    gone = f"; the followed face is missing in {alone} of them, which are left out" if alone else ""
     say(
         f"warning: {path}: several faces in {int(crowded.sum())} of {part.timesteps} frames; "
         f"the one that fills the picture most is followed{gone}"
@@ -114,3 +139,38 @@ def _times(survey: Survey, frames: list[int]) -> str:
     """List the times of up to five frames, for messages."""
     listed = ", ".join(f"{survey.timestamps[frame]:.1f}" for frame in frames[:5])
     return f"{listed}{', ...' if len(frames) > 5 else ''} s"
+
+
+def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"]) -> list[int]:
+    """Return the numbers of the frames that begin a new shot; 0 is not among them.
+
+    A cut is a change that is much larger than the changes beside it, and that the next frames do not undo. Thumbnails
+    are divided by their mean before they are compared, so that switching on a light is no cut.
+    """
+    pictures = thumbnails.astype(np.float32)
+    pictures /= np.maximum(pictures.mean(axis=(1, 2, 3), keepdims=True), 1.0)
+    changes = np.array([_difference(*pair) for pair in zip(pictures[:-1], pictures[1:], strict=True)])
+    cuts = []
+    for index in np.flatnonzero(changes > _MIN_CHANGE).tolist():
+        beside = np.concatenate(
+            [changes[max(index - _CUT_NEIGHBOURS, 0) : index], changes[index + 1 :][:_CUT_NEIGHBOURS]]
+        )
+        # The largest neighbour may be the other half of a cut that passes through a blended frame.
+        loudest = np.sort(beside)[-2] if len(beside) > 1 else 0.0
+        if changes[index] > _MIN_CONTRAST * loudest and _parted(pictures, index + 1) > 0.5 * changes[index]:
+            cuts.append(index + 1)
+    return cuts
+
+
+def _parted(pictures: Float[np.ndarray, "t h w 3"], start: int) -> float:
+    """Return the smallest difference between a frame shortly before `start` and one shortly after it."""
+    before, after = pictures[max(start - _CUT_REACH, 0) : start], pictures[start : start + _CUT_REACH]
+    return min(_difference(one, other) for one in before for other in after)
+
+
+def _difference(one: Float[np.ndarray, "h w 3"], other: Float[np.ndarray, "h w 3"]) -> float:
+    rows, columns = _BLOCKS
+    height, width = one.shape[0] // rows, one.shape[1] // columns
+    difference = np.abs(one - other).mean(axis=-1)[: rows * height, : columns * width]
+    blocks = np.sort(difference.reshape(rows, height, columns, width).mean(axis=(1, 3)).ravel())
+    return float(blocks[-(rows * columns // 4) :].mean())

@@ -1,4 +1,4 @@
-"""Choose the person to capture: of all faces in a part of a video, the faces of one person."""
+"""Step 3: choose the person to capture, among all faces in a part of a video."""
 
 import math
 from dataclasses import dataclass
@@ -8,19 +8,19 @@ from jaxtyping import Bool, Float
 
 from mien.capture.survey import Survey
 
-_REACH = 0.6
+_MAX_MOVE = 0.6
 """A face moves by at most this many of its sides from one frame to the next..."""
-_GROWTH = 1.6
+_MAX_GROWTH = 1.6
 """...and grows or shrinks by at most this factor."""
-_PATIENCE = 1.0
+_MAX_GAP_SECONDS = 1.0
 """Seconds without detection after which a face that comes back starts a new track."""
-_SIZE_RANGE = 2.5
+_MAX_SIZE_RATIO = 2.5
 """The same person's face is larger or smaller by at most this factor when it comes back..."""
-_LOOK_RANGE = 0.12
+_MAX_COLOUR_CHANGE = 0.12
 """...and its mean colours (0..1) differ by at most this."""
-_CANDIDATES = 8
+_MAX_CANDIDATES = 8
 """Number of tracks that are considered: those that fill the picture most."""
-_PASSING = 3
+_MIN_TRACK_FRAMES = 3
 """Frames below which a track counts as a false detection, in clips of at least as many frames."""
 
 
@@ -63,7 +63,7 @@ def choose_person(survey: Survey) -> Person:
     """
     tracks = _link(survey)
     boxes, others = np.full((len(survey.boxes), 4), np.nan), survey.boxes.copy()
-    lasting = [track for track in tracks if len(track.entries) >= min(_PASSING, len(survey.boxes))] or tracks
+    lasting = [track for track in tracks if len(track.entries) >= min(_MIN_TRACK_FRAMES, len(survey.boxes))] or tracks
     for track in tracks:
         if track not in lasting:
             frames, places = zip(*track.entries, strict=True)
@@ -72,7 +72,7 @@ def choose_person(survey: Survey) -> Person:
         return Person(boxes, others)
     areas = np.square(_sizes(survey.boxes))
     lasting.sort(key=lambda track: -_weight([track], areas))
-    people = [_gather(track, lasting, areas, survey.looks) for track in lasting[:_CANDIDATES]]
+    people = [_gather(track, lasting, areas, survey.colours) for track in lasting[:_MAX_CANDIDATES]]
     accepted = max(people, key=lambda tracks: _weight(tracks, areas))
     for track in accepted:
         for frame, place in track.entries:
@@ -96,12 +96,14 @@ def _link(survey: Survey) -> list[_Track]:
     open_tracks: list[_Track] = []
     for frame, (seconds, boxes) in enumerate(zip(survey.timestamps, survey.boxes, strict=True)):
         places = np.flatnonzero(np.isfinite(boxes[:, 0])).tolist()
-        open_tracks = [track for track in open_tracks if seconds - survey.timestamps[track.entries[-1][0]] <= _PATIENCE]
+        open_tracks = [
+            track for track in open_tracks if seconds - survey.timestamps[track.entries[-1][0]] <= _MAX_GAP_SECONDS
+        ]
         pairs = sorted(
             (frame - track.entries[-1][0], distance, index, place)
             for index, track in enumerate(open_tracks)
             for place in places
-            if (distance := _distance(survey.boxes[track.entries[-1]], boxes[place])) <= _REACH
+            if (distance := _distance(survey.boxes[track.entries[-1]], boxes[place])) <= _MAX_MOVE
         )
         taken: set[int] = set()
         for *_, index, place in pairs:
@@ -120,7 +122,7 @@ def _link(survey: Survey) -> list[_Track]:
 def _distance(before: Float[np.ndarray, " 4"], now: Float[np.ndarray, " 4"]) -> float:
     """Distance between two faces in units of their side; infinite if their sizes differ too much."""
     size_before, size_now = (max(math.sqrt(max((b[2] - b[0]) * (b[3] - b[1]), 0)), 1e-6) for b in (before, now))
-    if not 1 / _GROWTH <= size_now / size_before <= _GROWTH:
+    if not 1 / _MAX_GROWTH <= size_now / size_before <= _MAX_GROWTH:
         return float("inf")
     centres = (before[:2] + before[2:] - now[:2] - now[2:]) / 2
     return float(np.abs(centres).max()) / max(size_before, size_now)
@@ -131,21 +133,21 @@ def _weight(tracks: list[_Track], areas: Float[np.ndarray, "t f"]) -> float:
     return float(sum(areas[entry] for track in tracks for entry in track.entries))
 
 
-def _gather(first: _Track, tracks: list[_Track], areas: np.ndarray, looks: np.ndarray) -> list[_Track]:
+def _gather(first: _Track, tracks: list[_Track], areas: np.ndarray, colours: np.ndarray) -> list[_Track]:
     """Return all tracks that can be of the same person as the first one, the heaviest first."""
     accepted = [first]
     for track in tracks:
-        if track is not first and _is_same_person(accepted, track, areas, looks):
+        if track is not first and _is_same_person(accepted, track, areas, colours):
             accepted.append(track)
     return accepted
 
 
-def _is_same_person(accepted: list[_Track], track: _Track, areas: np.ndarray, looks: np.ndarray) -> bool:
+def _is_same_person(accepted: list[_Track], track: _Track, areas: np.ndarray, colours: np.ndarray) -> bool:
     frames = track.frames()
     if any(frames & other.frames() for other in accepted):
         return False
     now = tuple(np.array(track.entries).T)
     before = tuple(np.array([entry for other in accepted for entry in other.entries]).T)
     ratio = math.sqrt(float(np.median(areas[now])) / float(np.median(areas[before])))
-    change = np.abs(np.median(looks[now], axis=0) - np.median(looks[before], axis=0)).mean()
-    return bool(1 / _SIZE_RANGE <= ratio <= _SIZE_RANGE and change <= _LOOK_RANGE)
+    change = np.abs(np.median(colours[now], axis=0) - np.median(colours[before], axis=0)).mean()
+    return bool(1 / _MAX_SIZE_RATIO <= ratio <= _MAX_SIZE_RATIO and change <= _MAX_COLOUR_CHANGE)

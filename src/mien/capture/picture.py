@@ -1,4 +1,4 @@
-"""The only module that reads pictures from users: it checks their size before memory is allocated.
+"""Step 1: read picture files of users. No other module does. Their size is checked before memory is allocated.
 
 A picture of 0.9 MB may unpack to 8.5 GB. Its first bytes announce its size. Only the five formats whose headers are
 read here are decoded at all, whatever the file's name says.
@@ -11,14 +11,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mien.bounded import MAX_SIDE
 from mien.errors import UserError
 from mien.picture_files import png_fits
 
-LARGEST_PICTURE = 8192 * 8192
+MAX_PICTURE_PIXELS = MAX_SIDE**2
 """Largest number of pixels of a picture, which is also the most that mien renders."""
-_LARGEST_FILE = 8 * LARGEST_PICTURE + (64 << 20)
+_MAX_FILE_BYTES = 8 * MAX_PICTURE_PIXELS + (64 << 20)
 """Largest file in bytes: an uncompressed picture of that size with four 16-bit channels, and metadata."""
-_MOST_SCANS = 200
+_MAX_SCANS = 200
 """Most scans of a JPEG. Cameras and editors write one to fourteen, and each costs a pass over the whole picture."""
 _NO_FRAMES = (0xC4, 0xC8, 0xCC)
 """Markers between 0xC0 and 0xCF that start no JPEG frame."""
@@ -31,13 +32,13 @@ def decode_picture(path: Path, flags: int) -> np.ndarray | None:
     """Decode a picture file with OpenCV's `flags`. None if it is no picture, or a damaged one.
 
     Raises:
-        UserError: it has more pixels than `LARGEST_PICTURE`, or its file is larger than that of any such picture.
+        UserError: it has more pixels than `MAX_PICTURE_PIXELS`, or its file is larger than that of any such picture.
     """
     try:
         size = path.stat().st_size
-        if size > _LARGEST_FILE:
+        if size > _MAX_FILE_BYTES:
             raise UserError(
-                f"{path}: has {size:,} bytes, more than a picture that mien reads ({_LARGEST_FILE:,}); make it smaller"
+                f"{path}: has {size:,} bytes, and a picture may have at most {_MAX_FILE_BYTES:,}; make it smaller"
             )
         data = path.read_bytes() if path.is_file() else b""
     except OSError:
@@ -46,10 +47,10 @@ def decode_picture(path: Path, flags: int) -> np.ndarray | None:
     if announced is None:
         return None
     width, height = announced
-    if width * height > LARGEST_PICTURE:
+    if width * height > MAX_PICTURE_PIXELS:
         raise UserError(
-            f"{path}: has {width}x{height} pixels, more than the {LARGEST_PICTURE:,} (8192x8192) that mien takes of a "
-            "picture; make it smaller"
+            f"{path}: has {width}x{height} pixels, and a picture may have at most {MAX_PICTURE_PIXELS:,} "
+            f"({MAX_SIDE}x{MAX_SIDE}); make it smaller"
         )
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -96,7 +97,7 @@ def _webp(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg(data: bytes) -> tuple[int, int] | None:
-    if data.count(b"\xff\xda") > _MOST_SCANS:
+    if data.count(b"\xff\xda") > _MAX_SCANS:
         return None
     place = 2
     while data[place] == 0xFF:

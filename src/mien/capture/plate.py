@@ -1,4 +1,4 @@
-"""Mattes with a clean plate: the person is what differs from the empty scene, near the segmentation mask."""
+"""Step 4, mattes with a clean plate: the person is what differs from the empty scene, near the segmentation mask."""
 
 import cv2
 import numpy as np
@@ -12,12 +12,12 @@ _HALO = 1 / 12
 """...and outside it, for hair that the mask misses."""
 _LEVELS = (2.5, 7.0)
 """Colour differences that become 0 and 1, in standard deviations of the background's noise..."""
-_LEAST_NOISE = 0.008
+_MIN_NOISE = 0.008
 """...which is at least this (colours are 0..1)."""
 _SHADOW, _DARKEST_SHADOW = 0.35, 0.5
 """Weight of a difference that only darkens, down to half: it may be the person's shadow on the wall."""
 _SHIFT_SIZE = 256
-_MOST_SHIFT = 8.0
+_MAX_SHIFT = 8.0
 """Largest shift of the camera in pixels at that size."""
 _SHIFT_GAIN = 0.9
 """A shift is accepted if it brings the background's difference below this part of its former value."""
@@ -47,7 +47,7 @@ def plate_matte(
     core = ~_grow(soft < _SURE_PERSON, _CORE * longer)
     background = soft <= _SURE_BACKGROUND if near.all() else ~near
     picture, scene = image.astype(np.float32) / 255, plate.astype(np.float32) / 255
-    noise = _LEAST_NOISE
+    noise = _MIN_NOISE
     if background.any():
         scene = _match(picture, scene, background)
         noise = max(noise, float(np.sqrt(np.mean(np.square(_difference(picture, scene)[background])))))
@@ -98,7 +98,7 @@ def _shift(picture: np.ndarray, scene: np.ndarray, background: np.ndarray) -> Fl
         prepared.append((grey * known).astype(np.float32))
     window = cv2.createHanningWindow(size, cv2.CV_32F)
     (x, y), _ = cv2.phaseCorrelate(prepared[0], prepared[1], window)
-    if max(abs(x), abs(y)) > _MOST_SHIFT:
+    if max(abs(x), abs(y)) > _MAX_SHIFT:
         return np.zeros(2)
     return np.array([x * width / size[0], y * height / size[1]])
 

@@ -1,4 +1,4 @@
-"""The second pass over a source: crop every frame of a part, find its landmarks, make its matte, write both."""
+"""Step 4, the second pass over the source: crop each frame, find its landmarks, make its matte, and write both."""
 
 import itertools
 from collections import deque
@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float, UInt8, UInt64
 
 from mien.capture.crop import Crop
 from mien.capture.faces import LANDMARKS, LandmarkDetector
-from mien.capture.follow import LandmarkFollower
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout, FrameWriter
-from mien.capture.given import GivenMattes
-from mien.capture.matting import MakeMatte, choose_matting
+from mien.capture.given import GivenInputs
+from mien.capture.matte import MakeMatte, choose_matting
+from mien.capture.parts import Part
 from mien.capture.people import Person
 from mien.capture.quality import MEASURES, measure_face
 from mien.capture.source import FrameSource, SourceFrame
@@ -29,6 +29,10 @@ _CHUNK = 256
 """Frames after which progress is saved. Detectors start again at each chunk, even if nothing is interrupted."""
 _LEAD_IN = 8
 """Frames before a chunk that set up the detectors' state. After four of them, results differ by 0.05 px."""
+_MAX_DISTANCE = 0.6
+"""Largest distance between the centres of landmarks and of the followed face, as a part of the face's longer side."""
+_MAX_AGE = 12
+"""Frames for which the last landmarks predict the face's position if the survey did not find it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,35 +50,6 @@ class Chunk:
     def valid(self) -> Bool[np.ndarray, " t"]:
         """Frames in which a face was found."""
         return np.isfinite(self.landmarks[:, 0, 0])
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """Consecutive frames of a source that become one capture."""
-
-    name: str
-    """Name of the sequence."""
-    start: int
-    """Index of its first frame, among the frames taken."""
-    survey: Survey
-    """Survey of the part's frames only."""
-    person: Person
-    crop: Crop
-
-    @property
-    def timesteps(self) -> int:
-        """The number of frames."""
-        return len(self.survey.timestamps)
-
-
-@dataclass(frozen=True, eq=False)
-class Means:
-    """Clean plate, mattes and landmarks that the user gave with the source video."""
-
-    plate: UInt8[np.ndarray, "h w 3"] | None = None
-    mattes: GivenMattes | None = None
-    landmarks: Float[np.ndarray, "n l 2"] | None = None
-    """Positions in pixels of the source's pictures, a row for each frame of the source."""
 
 
 class Reel:
@@ -95,12 +70,71 @@ class Reel:
             yield frame
 
 
+class LandmarkFollower:
+    """Picks the landmarks of the person that the survey follows, frame by frame."""
+
+    def __init__(self, detector: LandmarkDetector, survey: Survey, person: Person, crop: Crop) -> None:
+        self._detector = detector
+        size = np.tile(survey.picture_size, 2)
+        self._boxes = _to_crop(person.boxes * size, crop)
+        self._others = _to_crop(person.others * size, crop)
+        self._is_alone = not person.crowded.any()
+        self._last: tuple[int, np.ndarray] | None = None
+
+    def find(self, timestep: int, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "l 2"] | None:
+        """Return the person's landmarks in the next picture, in pixels, or None if the face is not found."""
+        faces = self._detector.detect(image)
+        expected = self._expected(timestep)
+        if expected is None:
+            # The two detectors differ. If the clip never shows anybody else, any face that is detected here is the
+            # person.
+            chosen = faces[0] if self._is_alone and len(faces) else None
+        else:
+            chosen = self._nearest(faces, expected, self._others[timestep])
+        if chosen is not None:
+            self._last = timestep, chosen
+        return chosen
+
+    def _expected(self, timestep: int) -> Float[np.ndarray, " 4"] | None:
+        """Return the box where the face should be: the survey's, or else that of the last landmarks if recent."""
+        if np.isfinite(self._boxes[timestep, 0]):
+            return self._boxes[timestep]
+        if self._last is None or abs(timestep - self._last[0]) > _MAX_AGE:
+            return None
+        return _box(self._last[1])
+
+    @staticmethod
+    def _nearest(faces: np.ndarray, expected: np.ndarray, others: np.ndarray) -> Float[np.ndarray, "l 2"] | None:
+        if not len(faces):
+            return None
+        centres = np.array([_centre(_box(face)) for face in faces])
+        distances = np.linalg.norm(centres - _centre(expected), axis=1)
+        best = int(np.argmin(distances))
+        if distances[best] > _MAX_DISTANCE * (expected[2:] - expected[:2]).max():
+            return None
+        to_others = np.linalg.norm(centres[best] - (others[:, :2] + others[:, 2:]) / 2, axis=1)
+        # Missing faces are NaN, which never compares as smaller.
+        return None if (to_others < distances[best]).any() else faces[best]
+
+
+def _to_crop(boxes: Float[np.ndarray, "*b 4"], crop: Crop) -> Float[np.ndarray, "*b 4"]:
+    return crop.to_output(boxes.reshape(-1, 2, 2)).reshape(boxes.shape)
+
+
+def _box(landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " 4"]:
+    return np.concatenate([landmarks.min(axis=0), landmarks.max(axis=0)])
+
+
+def _centre(box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 2"]:
+    return (box[:2] + box[2:]) / 2
+
+
 class PartProcessor:
     """Processes the frames of one part in order, a chunk at a time."""
 
-    def __init__(self, reel: Reel, part: Part, means: Means, done: int) -> None:
+    def __init__(self, reel: Reel, part: Part, given: GivenInputs, done: int) -> None:
         """Prepare to process the part, skipping its first `done` frames."""
-        self._path, self._part, self._means = reel.path, part, means
+        self._path, self._part, self._given = reel.path, part, given
         begin = done - _LEAD_IN if done >= _LEAD_IN else 0
         left = part.timesteps - begin
         self._stream = itertools.islice(reel.from_frame(part.start + begin), left)
@@ -123,17 +157,17 @@ class PartProcessor:
         done = 0
         with ExitStack() as stack:
             follower = None
-            if self._means.landmarks is None:
+            if self._given.landmarks is None:
                 detector = stack.enter_context(LandmarkDetector(bool(part.person.crowded.any())))
                 follower = LandmarkFollower(detector, part.survey, part.person, part.crop)
-            matting = choose_matting(stack, part.crop, self._means.plate, self._means.mattes)
+            matting = choose_matting(stack, part.crop, self._given.plate, self._given.mattes)
             for timestep, image in self._recent:
                 if follower is not None:
                     follower.find(timestep, image)
-                matting.look(image)
+                matting.warm_up(image)
             for index, (number, image) in enumerate(itertools.islice(self._pictures, count)):
                 timestep = start + index
-                found = self._given(timestep, number) if follower is None else follower.find(timestep, image)
+                found = self._given_landmarks(timestep, number) if follower is None else follower.find(timestep, image)
                 if found is not None:
                     landmarks[index] = found
                 make = partial(_finish, image, matting.prepare(number, image), landmarks[index], quality[index])
@@ -143,17 +177,17 @@ class PartProcessor:
                 done += 1
             writer.flush()
         if done < count:
-            raise UserError(f"{self._path}: gave fewer frames when it was read again; is it still being written?")
+            raise UserError(f"{self._path}: has fewer frames than before; wait until it is complete, then run it again")
         span = slice(start, start + count)
         return Chunk(landmarks, quality, writer.digests[FRAMES][span], writer.digests[MATTES][span])
 
     def _cropped(self, frame: SourceFrame) -> tuple[int, np.ndarray]:
         return frame.number, self._part.crop.apply(frame.picture())
 
-    def _given(self, timestep: int, number: int) -> Float[np.ndarray, "l 2"] | None:
+    def _given_landmarks(self, timestep: int, number: int) -> Float[np.ndarray, "l 2"] | None:
         """Return the user's landmarks, or None if the followed person is not seen."""
-        assert self._means.landmarks is not None
-        return self._part.crop.to_output(self._means.landmarks[number]) if self._part.person.seen[timestep] else None
+        assert self._given.landmarks is not None
+        return self._part.crop.to_output(self._given.landmarks[number]) if self._part.person.seen[timestep] else None
 
 
 def _read(path: Path) -> Chunk:
@@ -178,7 +212,7 @@ def _read(path: Path) -> Chunk:
         return Chunk(**arrays)
 
 
-def process_part(reel: Reel, part: Part, means: Means, layout: FrameLayout, memory: Path) -> list[Chunk]:
+def process_part(reel: Reel, part: Part, given: GivenInputs, layout: FrameLayout, memory: Path) -> list[Chunk]:
     """Process all frames of a part. Chunks that an interrupted call left in the folder `memory` are kept.
 
     Raises:
@@ -191,7 +225,7 @@ def process_part(reel: Reel, part: Part, means: Means, layout: FrameLayout, memo
     done = sum(len(chunk.valid) for chunk in chunks)
     if done == layout.timesteps:
         return chunks
-    processor = PartProcessor(reel, part, means, done)
+    processor = PartProcessor(reel, part, given, done)
     with FrameWriter(layout) as writer, progress_bar(f"capture {part.name}", layout.timesteps, done) as advance:
         for start, path in itertools.islice(paths.items(), len(chunks), None):
             chunk = processor.process(start, min(_CHUNK, layout.timesteps - start), writer, advance)

@@ -1,4 +1,4 @@
-"""Measure how sharp and how well lit the face is in every frame."""
+"""Step 4: measure how sharp and how well lit the face is in every frame."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,18 +11,18 @@ from mien.progress import say
 
 _SIDE = 192
 """Side in pixels to which the face is scaled, so that its distance hardly matters."""
-_BLURRED = 0.65
+_MIN_SHARPNESS = 0.65
 """Part of the clip's median sharpness below which a frame counts as blurred. A motion by 4 % of the face's width causes
 that, or by 5 pixels in a face of 130. Turned heads and closed eyes stay above it (docs/log.md)."""
 _DIRECTIONS = 4
 """Directions in which detail is measured: across, down and both diagonals. Motion removes it only along itself."""
 MEASURES = _DIRECTIONS + 2
 """Number of values that `measure_face` returns."""
-_WHITE_LEVEL = 250
+_CLIPPED_LEVEL = 250
 """Level (of 255) from which a channel counts as clipped."""
-_DARK = 0.18
+_MIN_BRIGHTNESS = 0.18
 """Mean level of the face (0..1, sRGB) below which a clip counts as dark."""
-_CLIPPED = 0.1
+_MAX_CLIPPED = 0.1
 """Clipped part of the face above which a clip counts as over-exposed."""
 
 
@@ -40,7 +40,7 @@ class FrameQuality:
     @property
     def blurred(self) -> Bool[np.ndarray, "t c"]:
         """Frames to leave out of training and of everything else that needs sharp ones."""
-        return self.sharpness < _BLURRED  # NaN compares as not blurred
+        return self.sharpness < _MIN_SHARPNESS  # NaN compares as not blurred
 
 
 def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " m"]:
@@ -54,7 +54,7 @@ def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray,
     if right - left < 2 or bottom - top < 2:
         return np.full(MEASURES, np.nan)
     face = image[top:bottom, left:right]
-    clipped = float((face.max(axis=-1) >= _WHITE_LEVEL).mean())
+    clipped = float((face.max(axis=-1) >= _CLIPPED_LEVEL).mean())
     return np.array([*_detail(face), float(face.mean()) / 255, clipped])
 
 
@@ -88,16 +88,16 @@ def quality_report(name: str, quality: FrameQuality) -> dict[str, Any]:
         float(np.median(values[seen])) if seen.any() else 0.0 for values in (quality.brightness, quality.clipped)
     )
     blurred = np.flatnonzero(quality.blurred.any(axis=1)).tolist()
-    is_dark, is_overexposed = brightness < _DARK, clipped > _CLIPPED
+    is_dark, is_overexposed = brightness < _MIN_BRIGHTNESS, clipped > _MAX_CLIPPED
     if is_dark:
         say(
-            f"warning: {name}: the face is dark (mean level {brightness:.0%}); the avatar will be noisy, better record "
-            "it again with more light on the face"
+            f"warning: {name}: the face is dark (mean level {brightness:.0%}); the avatar will be noisy; record the "
+            "video again with more light on the face"
         )
     if is_overexposed:
         say(
-            f"warning: {name}: the face is over-exposed ({clipped:.0%} of it is white); what is white has no detail, "
-            "better record it again with less exposure"
+            f"warning: {name}: the face is over-exposed ({clipped:.0%} of it is white); white parts have no detail; "
+            "record the video again with less exposure"
         )
     if blurred:
         say(

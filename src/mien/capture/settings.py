@@ -5,14 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from mien.bounded import MAX_SIDE
 from mien.errors import UserError
 
-_SMALLEST_SIZE, _LARGEST_SIZE = 32, 8192
+_MIN_SIZE = 32
 
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """Settings that control how a video becomes a capture."""
+    """Settings of the capture: how a video becomes frames, mattes and landmarks."""
 
     size: int = 512
     """Longest side of the captured frames in pixels. Smaller sources are not enlarged."""
@@ -31,28 +32,27 @@ class CaptureSettings:
     fps: float = 25.0
     """Frame rate of a folder of pictures, in frames per second. Videos have their own."""
     cuts: bool = True
-    """Split the video at cuts to another shot, into NAME-1, NAME-2, ... With --capture.no-cuts it stays one capture."""
+    """By default, the video is split at cuts to another shot, into NAME-1, NAME-2, ... --capture.no-cuts keeps
+    it whole."""
     shortest_part: float = 1.0
     """Shortest shot to keep in a video with cuts, in seconds. Shorter shots are left out."""
     clean_plate: Path | None = None
     """A picture of the scene without the person, from the same camera in the same place. It gives better mattes."""
     mattes: Path | None = None
-    """Mattes made elsewhere: a video or a folder of pictures, white = person, one for each frame of the source."""
+    """Mattes made elsewhere: a video or a folder of pictures, one for each frame of the source. White is the person."""
     landmarks: Path | None = None
     """Landmarks made elsewhere, a row for each frame of the source: .csv or .safetensors (docs/conventions.md)."""
 
     def check(self) -> None:
         """Raise a UserError for the first value that is not allowed."""
-        _require(
-            self.size >= _SMALLEST_SIZE, "size", self.size, f"too small; give {_SMALLEST_SIZE} or more, better 512"
-        )
-        _require(self.size <= _LARGEST_SIZE, "size", self.size, f"too large; give {_LARGEST_SIZE} or less")
+        _require(self.size >= _MIN_SIZE, "size", self.size, f"too small; give {_MIN_SIZE} or more, better 512")
+        _require(self.size <= MAX_SIDE, "size", self.size, f"too large; give {MAX_SIDE} or less")
         _require(_is_at_least(self.start, 0), "start", self.start, "give the seconds to skip, 0 or more")
         later = self.end == 0 or _is_at_least(self.end, self.start) and self.end > self.start
-        _require(later, "end", self.end, f"give a second after --capture.start ({self.start:g}), or 0 for all")
+        _require(later, "end", self.end, f"give a time after --capture.start ({self.start:g}), or 0 for all")
         _require(self.stride >= 1, "stride", self.stride, "give 1 for every frame, 2 for every second one, ...")
         _require(self.max_frames >= 0, "max-frames", self.max_frames, "give 0 for all frames, or a positive number")
-        _require(_is_at_least(self.fps, 0) and self.fps > 0, "fps", self.fps, "give frames a second, above 0")
+        _require(_is_at_least(self.fps, 0) and self.fps > 0, "fps", self.fps, "give frames per second, above 0")
         _require(_is_at_least(self.shortest_part, 0), "shortest-part", self.shortest_part, "give seconds, 0 or more")
         if self.mattes is not None and self.clean_plate is not None:
             raise UserError("--capture.mattes and --capture.clean-plate: give one of them; ready mattes need no plate")

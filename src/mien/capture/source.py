@@ -1,4 +1,4 @@
-"""Sources of frames, video files and folders of images, and the selection of frames from them."""
+"""Step 1: open a source of frames, a video file or a folder of images, and select frames from it."""
 
 import hashlib
 import os

@@ -1,4 +1,4 @@
-"""Captures on disk: `capture.json`, `landmarks.safetensors`, `frames/`, `mattes/` and a `cache/`."""
+"""Write and read captures on disk: `capture.json`, `landmarks.safetensors`, `frames/`, `mattes/` and a `cache/`."""
 
 import hashlib
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, STAGE, Frame
 from mien.capture.quality import FrameQuality
 from mien.errors import UserError
 from mien.inside import check_tree, is_one_line, is_plain_name, remove_tree
-from mien.limits import LARGEST_NUMBER, camera_fault, side
+from mien.limits import MAX_NUMBER, camera_fault, side
 from mien.locks import read_beside_writers
 from mien.progress import progress_bar
 from mien.storage import (
@@ -46,9 +46,9 @@ _CALIBRATION_ARRAYS = {"K": ("c33", np.float64), "viewmat": ("c44", np.float64)}
 """Additional arrays if the cameras are calibrated."""
 _QUALITY_ARRAYS = {"sharpness": ("tc", np.float32), "brightness": ("tc", np.float32), "clipped": ("tc", np.float32)}
 """Additional arrays if the faces were measured."""
-_SLOWEST, _FASTEST = 1e-3, 1e5
+_MIN_FPS, _MAX_FPS = 1e-3, 1e5
 """Range of frame rates, in frames per second."""
-_LONGEST = 1e7
+_MAX_SECONDS = 1e7
 """Longest time from the first frame to the last, in seconds."""
 _OPTIONAL_ARRAYS = (_CALIBRATION_ARRAYS, _QUALITY_ARRAYS)
 
@@ -169,7 +169,9 @@ def check_replaceable(path: Path) -> None:
         raise UserError(f"{path}: is a file; choose a folder for the capture")
     foreign = sorted(entry.name for entry in path.iterdir() if entry.name not in _OWN_NAMES) if path.is_dir() else []
     if foreign:
-        raise UserError(f"{path}: holds something that is no capture ({foreign[0]}); choose an empty or a new folder")
+        raise UserError(
+            f"{path}: holds something that is not part of a capture ({foreign[0]}); choose an empty or a new folder"
+        )
 
 
 def finish_capture(
@@ -238,7 +240,7 @@ def _checked(
     if not (
         (isinstance(camera_ids, list) and camera_ids and all(map(is_file_name, camera_ids)))
         and (len(set(camera_ids)) == len(camera_ids) and _is_count(timesteps))
-        and (isinstance(fps, int | float) and _SLOWEST <= fps <= _FASTEST)
+        and (isinstance(fps, int | float) and _MIN_FPS <= fps <= _MAX_FPS)
         and (isinstance(name, str) and is_one_line(name) and isinstance(source, dict))
     ):
         raise UserError(f"{path / JSON_NAME}: has missing or wrong entries; {REMEDY}")
@@ -266,7 +268,7 @@ def _calibration(path: Path, arrays: dict[str, np.ndarray], width: int, height: 
     for K, viewmat in zip(arrays["K"], arrays["viewmat"], strict=True):
         fault = camera_fault(K, viewmat, width, height)
         if fault is not None:
-            raise UserError(f"{path}: a camera is none ({fault}); {REMEDY}")
+            raise UserError(f"{path}: a camera is not valid ({fault}); {REMEDY}")
     pairs = zip(arrays["K"].astype(np.float32), arrays["viewmat"].astype(np.float32), strict=True)
     return tuple(Camera(torch.from_numpy(K), torch.from_numpy(viewmat), width, height) for K, viewmat in pairs)
 
@@ -288,17 +290,19 @@ def _check_numbers(path: Path, arrays: dict[str, np.ndarray]) -> None:
     times, valid = arrays["timestamps"], arrays["valid"]
     with np.errstate(invalid="ignore"):
         near = {
-            "timestamps": np.isfinite(times).all() and bool((np.diff(times) >= 0).all()) and np.ptp(times) < _LONGEST,
+            "timestamps": np.isfinite(times).all()
+            and bool((np.diff(times) >= 0).all())
+            and np.ptp(times) < _MAX_SECONDS,
             "landmarks": not np.isnan(arrays["landmarks"][valid]).any(),
             "principal_point": np.isfinite(arrays["principal_point"]).all(),
         }
         for name in ("landmarks", "principal_point"):
-            near[name] = near[name] and not (np.abs(arrays[name]) > LARGEST_NUMBER).any()
+            near[name] = near[name] and not (np.abs(arrays[name]) > MAX_NUMBER).any()
         for name in arrays.keys() & _QUALITY_ARRAYS.keys():
             near[name] = not np.isinf(arrays[name]).any()
     for name, sound in near.items():
         if not sound:
-            raise UserError(f"{path}: {name} holds numbers that cannot be; {REMEDY}")
+            raise UserError(f"{path}: {name} holds impossible numbers; {REMEDY}")
 
 
 def _check_arrays(path: Path, arrays: dict[str, np.ndarray], timesteps: int, cameras: int) -> None:

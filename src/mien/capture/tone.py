@@ -1,4 +1,4 @@
-"""Convert HDR video to sRGB: PQ or HLG light and BT.2020 colours are mapped to 0..255 by one fixed curve.
+"""Step 1: convert HDR video to sRGB. PQ or HLG light and BT.2020 colours are mapped to 0..255 by one fixed curve.
 
 The curve is the same for every frame and every clip, so a face keeps its colours when the scene around it changes:
 

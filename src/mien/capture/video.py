@@ -1,4 +1,4 @@
-"""Read and write video files one frame at a time (PyAV; no system ffmpeg)."""
+"""Step 1: read video files one frame at a time, and write them, with PyAV (no system ffmpeg)."""
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator

@@ -1,4 +1,4 @@
-"""The only module that opens and creates video files.
+"""Step 1: open video files, and create them. No other module does.
 
 FFmpeg does not treat every name as a file: `take:1.mp4` is an address to it, `%03d.png` is a series of files, and a
 playlist makes it open the files in the list. So it never gets a name here. It reads and writes a file that Python has
@@ -20,9 +20,9 @@ from av.video.stream import VideoStream
 
 from mien.errors import UserError
 
-LARGEST_FRAME = 8192 * 4608
+MAX_FRAME_PIXELS = 8192 * 4608
 """Largest number of pixels of a video's pictures: 8K of every kind. A decoder holds up to 17 pictures at a time."""
-TOO_MANY_PIXELS = f"more than the {LARGEST_FRAME:,} pixels (8192x4608) that mien takes of a video"
+TOO_MANY_PIXELS = f"more than the {MAX_FRAME_PIXELS:,} pixels (8192x4608) that a video may have"
 _VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 _CONTAINERS = (
     "mov", "matroska", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "flv", "live_flv", "asf", "ogg", "mxf", "gxf",
@@ -63,12 +63,12 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 
     Raises:
         UserError: the file is missing, is no video, has a container or codec that is not supported, or has pictures of
-            more than `LARGEST_FRAME` pixels.
+            more than `MAX_FRAME_PIXELS` pixels.
     """
     if not path.exists():
         raise UserError(f"{path}: no such file; check the path")
     if not path.is_file():
-        raise UserError(f"{path}: is no file; name a video file")
+        raise UserError(f"{path}: is not a file; give a video file")
     if path.stat().st_size == 0:
         raise UserError(f"{path}: is empty; copy or record it again")
     try:
@@ -82,7 +82,7 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
                 "r",
                 # FFmpeg does not report a size that it refuses. Somewhat larger sizes are let through here, so that the
                 # message can name them.
-                options={"max_pixels": str(4 * LARGEST_FRAME)},
+                options={"max_pixels": str(4 * MAX_FRAME_PIXELS)},
                 container_options={"format_whitelist": ",".join(_CONTAINERS), "protocol_whitelist": "none"},
                 buffer_size=_BUFFER,
                 **_ANY_TITLE,
@@ -92,7 +92,7 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         with container:
             stream = _moving_pictures(path, container)
             _check_size(path, stream.codec_context.width, stream.codec_context.height)
-            stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}
+            stream.codec_context.options = {"max_pixels": str(MAX_FRAME_PIXELS)}
             yield container, stream
 
 
@@ -108,7 +108,7 @@ def create_video(path: Path) -> Iterator[OutputContainer]:
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
-    if width * height > LARGEST_FRAME:
+    if width * height > MAX_FRAME_PIXELS:
         raise UserError(f"{path}: its pictures have {width}x{height} pixels, {TOO_MANY_PIXELS}; make it smaller")
 
 

@@ -132,7 +132,7 @@ class Quality:
     def check(self) -> None:
         """Check that the number of steps is not negative."""
         if self.steps < 0:
-            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for each capture's own")
+            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for each capture's own number")
 
     def run(self) -> None:
         """Run every capture through all stages, then print the table."""
@@ -164,7 +164,7 @@ class Command:
 
 def _check_seconds(seconds: float) -> None:
     if not 0 < seconds < math.inf:
-        raise UserError(f"--seconds {seconds:g}: give a positive number; each row is measured for as long")
+        raise UserError(f"--seconds {seconds:g}: give a positive number; each row is measured for that long")
 
 
 def _gpu(name: DeviceName) -> "torch.Tensor | None":

@@ -1,12 +1,12 @@
 """`--config FILE.json`: settings from a file, such as a run's config.json. The file may hold only some settings."""
 
 import difflib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mien.avatar import METHODS
+from mien.bounded import parse_json, read_bytes
 from mien.config import no_such_setting
 from mien.errors import UserError
 from mien.ranges import shown
@@ -15,7 +15,7 @@ _FORMAT, _VERSION = "mien.run", 1
 _TAKEN = ("method", "settings")
 _NOT_TAKEN = ("format", "version", "checksum", "data", "mien", "command_line")
 """Other entries of a run's config.json: what it was trained on, by which version, with which command."""
-_LARGEST = 16 << 20
+_MAX_BYTES = 16 << 20
 """Largest file that is read, in bytes. A run's config.json has some kilobytes."""
 
 
@@ -54,7 +54,7 @@ def read_config_file(path: Path) -> ConfigFile:
     parts = {name: content.get(name, {}) for name in _TAKEN}
     for name, part in parts.items():
         if not isinstance(part, dict):
-            raise UserError(f"{path}: {name} is no object of settings; give {{...}}")
+            raise UserError(f"{path}: {name} is not an object of settings; give {{...}}")
     method = parts["method"].get("kind")
     if method is not None and (not isinstance(method, str) or method not in METHODS):
         raise UserError(f"{path}: method.kind {shown(method)}: give the name of a method: {', '.join(METHODS)}")
@@ -74,27 +74,12 @@ def _read(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise UserError(f"--config {path}: no such file; give a json file, such as DIR/runs/NAME/config.json")
     if not path.is_file():
-        raise UserError(f"--config {path}: is no ordinary file; give a json file")
+        raise UserError(f"--config {path}: is not an ordinary file; give a json file")
     try:
-        if path.stat().st_size > _LARGEST:
-            raise ValueError(f"{path.stat().st_size} bytes are too many")
-        text = path.read_text(encoding="utf-8-sig")  # editors on Windows write a byte order mark
-        content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_each_once)
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"--config {path}: cannot be read as json ({error}); mend it or give another file") from None
+        text = read_bytes(path, _MAX_BYTES).decode("utf-8-sig")  # editors on Windows write a byte order mark
+        content = parse_json(text, unique_names=True, any_size=True)
+    except (OSError, ValueError) as error:
+        raise UserError(f"--config {path}: cannot be read as json ({error}); correct it or give another file") from None
     if not isinstance(content, dict):
-        raise UserError(f'--config {path}: holds no object; give {{"method": {{...}}, "settings": {{...}}}}')
-    return content
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"it holds the number {name}")
-
-
-def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content = dict(pairs)
-    if len(content) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{shown(twice)!r} stands there twice")
+        raise UserError(f'--config {path}: is not an object; give {{"method": {{...}}, "settings": {{...}}}}')
     return content

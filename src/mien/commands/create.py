@@ -35,7 +35,8 @@ class Command:
     preview: bool = False
     """Show the fit of the face while it runs, in OUT/tracking_preview.html (for a browser)."""
     overlay: Literal["auto", "all", "none"] = "auto"
-    """Frames in overlay.mp4: all of them, every n-th one of long clips, at most 3,000 (auto), or none."""
+    """Frames in overlay.mp4: every frame (all), every n-th frame of long clips, at most 3,000 (auto), or no overlay
+    (none)."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)

@@ -7,7 +7,7 @@ from mien.commands.create import Command as Create
 from mien.commands.options import PresetName, TrainOptions
 from mien.errors import UserError
 
-_LONGEST = 600.0
+_MAX_SECONDS = 600.0
 """Longest video in seconds. Synthetic heads are drawn frame by frame."""
 
 
@@ -31,8 +31,8 @@ class Command:
         from mien.files import check_writable
 
         TrainOptions(preset=self.preset, steps=self.steps).settings()
-        if self.seconds and not 0 < self.seconds <= _LONGEST:
-            raise UserError(f"--seconds {self.seconds:g}: give up to {_LONGEST:g}, or leave it out")
+        if self.seconds and not 0 < self.seconds <= _MAX_SECONDS:
+            raise UserError(f"--seconds {self.seconds:g}: give a number above 0, at most {_MAX_SECONDS:g}")
         check_writable(self.out, folder=True)
 
     def run(self) -> None:

@@ -27,7 +27,7 @@ class Command:
     sequence: str | None = None
     """Name of the driver's sequence (default: the only one)."""
     head_pose: bool = True
-    """Let the head follow the driver's head. With --no-head-pose the head stays still and only the face moves."""
+    """By default, the head follows the driver's head. With --no-head-pose it stays still, and only the face moves."""
     alone: bool = False
     """Show only the avatar, without the driver's pictures beside it."""
     fps: float | None = None

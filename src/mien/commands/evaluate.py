@@ -20,7 +20,9 @@ class Command:
     """Score a run on its held-out frames, compare runs, or score pictures that another program made.
 
     mien evaluate DIR [--run NAME]: metrics.json, report.html and side-by-side videos in DIR/runs/NAME.
+
     mien evaluate DIR [DIR ...] --compare: one table over all evaluated runs, and compare.html.
+
     mien evaluate --images PRED --truth TRUTH: the same figures for pictures of any origin.
     """
 
@@ -33,7 +35,7 @@ class Command:
     pictures: bool = False
     """Also write every scored picture and its truth as png, so that other programs can be scored on them."""
     perceptual: bool = True
-    """Compute ST-LPIPS, which takes most of the time. --no-perceptual leaves it out."""
+    """By default, ST-LPIPS is computed, which takes most of the time. --no-perceptual leaves it out."""
     perceptual_frames: int = 32
     """Largest number of frames, evenly spread, on which ST-LPIPS is computed. 0 means all frames."""
     compare: bool = False
@@ -62,7 +64,7 @@ class Command:
         elif not self.workspaces:
             raise UserError("nothing to evaluate; give a workspace folder, or --images PRED --truth TRUTH")
         elif len(self.workspaces) > 1 and not self.compare:
-            raise UserError(f"{len(self.workspaces)} workspaces: give one, or --compare their runs")
+            raise UserError(f"{len(self.workspaces)} workspaces: give one, or add --compare to compare their runs")
         for folder in self.workspaces:
             workspace = open_workspace(folder)
             if not self.compare or self.run_name is not None:
@@ -106,7 +108,7 @@ class Command:
             raise UserError("--images and --truth score folders of pictures; leave the workspace and --compare out")
         for path in (self.images, self.truth):
             if not path.exists():
-                raise UserError(f"{path}: no such folder; name a folder of pictures, or a video")
+                raise UserError(f"{path}: no such folder; give a folder of pictures, or a video")
 
     def _score_images(self, images: Path, truth: Path) -> None:
         from mien.evaluation.image_folders import ImageFolders, score_folders, write_scores

@@ -7,7 +7,7 @@ from dataclasses import replace
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 
-_WIDEST_TURN = 1.0
+_MAX_ANGLE = 1.0
 """Largest angle of a joint in either direction, in radians."""
 
 
@@ -30,10 +30,10 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
         try:
             value = float(text)
         except ValueError:
-            raise UserError(f"--set {assignment}: {text!r} is no number; write for example --set {name}=0.6") from None
+            raise UserError(f"--set {assignment}: {text!r} is not a number; write --set {name}=0.6") from None
         if name in angles:
-            if math.isnan(value) or abs(value) > _WIDEST_TURN:
-                raise UserError(f"--set {assignment}: {name} goes from -{_WIDEST_TURN:g} to {_WIDEST_TURN:g} radians")
+            if math.isnan(value) or abs(value) > _MAX_ANGLE:
+                raise UserError(f"--set {assignment}: {name} goes from -{_MAX_ANGLE:g} to {_MAX_ANGLE:g} radians")
             joints[:, angles.index(name)] = value
             continue
         index = model.expression_names.index(name)
@@ -41,7 +41,7 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
         if lower == upper:
             raise UserError(f"--set {assignment}: {name} does nothing with the face model {model.name!r}; leave it out")
         if math.isnan(value) or not lower <= value <= upper:
-            unit = "the full expression" if model.expression_sigmas is None else "much, 0 the mean face"
+            unit = "the full expression" if model.expression_sigmas is None else "strong, and 0 is the mean face"
             raise UserError(f"--set {assignment}: {name} goes from {lower:g} to {upper:g}; 1 is {unit}")
         expression[:, index] = value
     return replace(face, expression=expression, joints=joints.reshape(face.joints.shape))
@@ -66,6 +66,6 @@ def _check_name(name: str, model: FaceModel, assignment: str) -> None:
     # Compare in lower case, so that `jawopen` is as near to jawOpen as possible.
     folded = {known.lower(): known for known in (*names, *angles)}
     near = [folded[match] for match in difflib.get_close_matches(name.lower(), folded, 3, 0.6)]
-    every = f"there are: {', '.join(names)}; and joints by radians: {', '.join(angles)}"
+    every = f"there are: {', '.join(names)}; and joint angles in radians: {', '.join(angles)}"
     hint = f"did you mean {' or '.join(near)}?" if near else every
     raise UserError(f"--set {assignment}: no expression {name!r}; {hint}")

@@ -10,11 +10,11 @@ import tyro
 
 from mien.avatar import METHODS, MethodConfig
 from mien.commands.config_file import ConfigFile, read_config_file
+from mien.commands.help_text import subclass_with
 from mien.commands.settings_options import applied, check_names, leaves, options_type
 from mien.config import overlay
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
-from mien.help_text import subclass_with
 from mien.training import DIALS, PRESETS, Split, TrainSettings
 from mien.workspace import open_workspace
 
@@ -39,16 +39,16 @@ class TrainOptions:
     """A .json with settings, for example the config.json of a run to repeat (docs/settings.md). Options override the
     file, and the file overrides the preset."""
     preset: PresetName = "standard"
-    """draft takes minutes; standard gives the figures of docs/results.md."""
+    """How thorough the training is. draft takes minutes; standard gives the figures of docs/results.md."""
     split: Split = "blocks"
-    """Frames held out for scoring: every fifth block of 10 frames, the last 20 % (tail), or nothing (none)."""
+    """Frames held out for scoring: every fifth block of 10 frames (blocks), the last 20 % (tail), or nothing (none)."""
     background: Literal["white", "random"] = "white"
     """Background of the training pictures. random suits transparent renderings (no white in skin and outlines) and
     costs 0.1 to 0.4 dB."""
     steps: int = 0
     """Number of optimiser steps, over which all schedules stretch. 0 means the preset's number."""
     seed: int = 0
-    """Equal seed, data and settings give equal bytes."""
+    """Seed of the random numbers. The same seed, data and settings give the same bytes."""
     hold_out: tuple[str, ...] = ()
     """Whole sequences that are scored but not trained on."""
     hold_out_cameras: tuple[str, ...] = ()
@@ -57,8 +57,8 @@ class TrainOptions:
     """Device for training. cpu: always the same bytes; cuda: an NVIDIA GPU, through gsplat (docs/using.md says how to
     install it); auto: a GPU if there is one. A run may resume on another device."""
     face_tuning: bool = True
-    """Let training correct the tracking. Held-out frames get interpolated corrections. --no-face-tuning keeps the
-    tracking as it is."""
+    """By default, training corrects the tracking, and held-out frames get interpolated corrections. --no-face-tuning
+    keeps the tracking as it is."""
     training: _IN_DETAIL = None
     """The other settings of the run."""
     method_settings: _IN_DETAIL = None
@@ -81,7 +81,7 @@ class TrainOptions:
         """
         check_device(self.device)
         if self.steps < 0:
-            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's")
+            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's number")
         preset = PRESETS[self.preset].settings
         settings = replace(
             preset if self.training is None else applied(preset, self.training),
@@ -160,7 +160,7 @@ def _with_defaults(method: str | None, preset: str, file: ConfigFile | None, arg
     if file and file.method and method and file.method != method:
         raise UserError(
             f"--config {file.path}: has settings of {file.method}, but --method asks for {method}; leave --method out, "
-            'or give a file that has "settings" alone'
+            'or give a file that has only "settings"'
         )
     name = method or (file.method if file else None) or TrainOptions.method
     settings, config = PRESETS[preset].settings, PRESETS[preset].config(name)
@@ -201,10 +201,10 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
     """
     suffix = by.suffix.lower() if by.is_file() else ""
     if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
-        raise UserError(f"--fps {fps:g}: only the timecode of a .csv has one to give, above 0 and up to 1000")
+        raise UserError(f"--fps {fps:g}: is for the timecode of a .csv; give a number above 0, at most 1000")
     if not by.exists():
         raise UserError(f"{by}: no such file or folder; give a workspace, a video, a csv of Live Link Face, or a json")
     if suffix in (".csv", ".json") and sequence is not None:
-        raise UserError(f"--sequence {sequence}: {by} has none to choose from; leave it out")
+        raise UserError(f"--sequence {sequence}: {by} has no sequences; leave --sequence out")
     if not by.is_file():
         open_workspace(by).pick_sequence(sequence)

@@ -5,15 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mien.bounded import MAX_SIDE
 from mien.errors import UserError
 
 if TYPE_CHECKING:
     import mien.export.output
 
-LARGEST_SIDE = 8192
-"""Largest width or height in pixels, the same as `mien.limits.LARGEST_SIDE`."""
 _NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "green": (0.0, 1.0, 0.0)}
-_SMALLEST_SIDE = 16
+_MIN_SIDE = 16
 _HEX = re.compile(r"#?([0-9a-fA-F]{6})")
 
 
@@ -40,9 +39,12 @@ class PictureOptions:
         from mien.export.output import plan_output
 
         wide, high = self.shape()
-        if not (_SMALLEST_SIDE <= wide <= LARGEST_SIDE and _SMALLEST_SIDE <= high <= LARGEST_SIDE):
-            given = f"--size {self.size}" if wide == high == self.size else f"--width {wide} --height {high}"
-            raise UserError(f"{given}: pictures are {_SMALLEST_SIDE}..{LARGEST_SIDE} pixels wide and high")
+        if not (_MIN_SIDE <= wide <= MAX_SIDE and _MIN_SIDE <= high <= MAX_SIDE):
+            is_square = wide == high == self.size
+            given = (
+                f"--size {self.size}: give a number" if is_square else f"--width {wide} --height {high}: give numbers"
+            )
+            raise UserError(f"{given} from {_MIN_SIDE} to {MAX_SIDE}")
         self.colour()
         return plan_output(out, frames, self.background == "transparent")
 

@@ -113,13 +113,13 @@ class Command:
         if self.frames < 1:
             raise UserError(f"--frames {self.frames}: give 1 or more")
         if not 0 < self.fps <= 1000:
-            raise UserError(f"--fps {self.fps:g}: give more than 0 and up to 1000")
+            raise UserError(f"--fps {self.fps:g}: give a number above 0, at most 1000")
         if not 0.01 <= self.zoom <= 100:
-            raise UserError(f"--zoom {self.zoom:g}: give 0.01..100")
+            raise UserError(f"--zoom {self.zoom:g}: give a number from 0.01 to 100")
         if not math.isfinite(self.span):
-            raise UserError(f"--span {self.span:g}: give degrees")
+            raise UserError(f"--span {self.span:g}: give a number of degrees")
         if not abs(self.tilt) < 180:
-            raise UserError(f"--tilt {self.tilt:g}: give degrees, below 180")
+            raise UserError(f"--tilt {self.tilt:g}: give degrees between -180 and 180")
 
     def _is_still(self) -> bool:
         return self.out.suffix.lower() == ".png" and "%" not in self.out.name
@@ -136,9 +136,11 @@ class Command:
         if self.cameras is not None:
             cameras = read_cameras(self.cameras)
             if timesteps is not None and len(cameras) < timesteps:
-                raise UserError(f"{self.cameras}: {len(cameras)} cameras, {timesteps} timesteps; give one for each")
+                raise UserError(
+                    f"{self.cameras}: has {len(cameras)} cameras for {timesteps} timesteps; give one for each"
+                )
             if any((c.width, c.height) != (cameras[0].width, cameras[0].height) for c in cameras):
-                raise UserError(f"{self.cameras}: cameras of different sizes; give them one size, or render one by one")
+                raise UserError(f"{self.cameras}: has cameras of different sizes; give all the same size")
             return cameras[:timesteps]
         if self.path != "captured":
             return None

@@ -5,16 +5,14 @@ for the help. Options are listed under a heading for each group of settings. All
 heading.
 """
 
-import ast
 import difflib
 import inspect
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
-from functools import cache
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from mien.avatar import Rate
+from mien.commands.help_text import field_docs
 from mien.config import no_such_setting
 from mien.errors import UserError
 from mien.ranges import Range, range_of
@@ -132,21 +130,6 @@ def _near(option: str, known: Sequence[str]) -> list[str]:
     lasts = {name: name.rpartition(".")[2] for name in names}
     near = difflib.get_close_matches(option.rpartition(".")[2], set(lasts.values()), 3)
     return difflib.get_close_matches(option, sorted(name for name in names if lasts[name] in near), 1, 0.5)
-
-
-@cache
-def field_docs(kind: type) -> Mapping[str, str]:
-    """The string below each field of a dataclass, by the field's name."""
-    found: dict[str, str] = {}
-    for base in reversed([base for base in kind.__mro__ if is_dataclass(base)]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
-        assert isinstance(body, ast.ClassDef)
-        for before, after in zip(body.body, body.body[1:], strict=False):
-            if not isinstance(before, ast.AnnAssign) or not isinstance(before.target, ast.Name):
-                continue
-            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-                found[before.target.id] = inspect.cleandoc(str(after.value.value))
-    return found
 
 
 def _replaced(settings: Any, values: Mapping[str, Any]) -> Any:

@@ -11,14 +11,24 @@ A frame without a face repeats the frame before it.
 """
 
 import difflib
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mien.driving.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, check_size, check_times, evenly, gaze_of, held
+from mien.bounded import parse_json
 from mien.errors import UserError
+from mien.driving.motion import (
+    ARKIT_NAMES,
+    LARGEST,
+    SMALLEST,
+    Motion,
+    check_times,
+    evenly,
+    gaze_of,
+    held,
+    open_recording,
+)
 from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
 
 _INDEX = {name: index for index, name in enumerate(ARKIT_NAMES)}
@@ -41,9 +51,9 @@ def read_blendshape_json(path: Path) -> Motion:
             times do not increase. The message names the frame.
     """
     try:
-        check_size(path)
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, MemoryError) as error:
+        with open_recording(path) as file:
+            content = parse_json(file.read().decode("utf-8"), any_size=True, constants=True)
+    except (OSError, ValueError, MemoryError) as error:
         raise UserError(f"{path}: cannot be read as json ({error}); give frames of blend shapes") from None
     frames = [content] if isinstance(content, dict) else content
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):

@@ -8,14 +8,25 @@ takes, against the eyeLook coefficients; those of the head are assumed to be the
 """
 
 import csv
+import io
 import math
 import re
 from pathlib import Path
 
 import numpy as np
 
-from mien.driving.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, check_size, check_times, evenly, gaze_of, held
 from mien.errors import UserError
+from mien.driving.motion import (
+    ARKIT_NAMES,
+    LARGEST,
+    SMALLEST,
+    Motion,
+    check_times,
+    evenly,
+    gaze_of,
+    held,
+    open_recording,
+)
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 HEAD = ("HeadYaw", "HeadPitch", "HeadRoll")
@@ -80,8 +91,7 @@ _SIDES = ("Left", "Right")
 def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The header, and all further rows that are not empty, with their line numbers."""
     try:
-        check_size(path)
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with io.TextIOWrapper(open_recording(path), encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file)
             rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:

@@ -1,14 +1,16 @@
 """Motion of a driver's face over time, in ARKit's terms, from any recorder."""
 
 import math
-import stat
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from jaxtyping import Float, Float32
 
+from mien.bounded import NotOrdinaryError, open_ordinary
 from mien.errors import UserError
 
 ARKIT_NAMES = (
@@ -85,17 +87,21 @@ def evenly(seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]) -> 
     return 1 / step, np.stack([np.interp(even, seconds, column) for column in rows.T], axis=1)
 
 
-def check_size(path: Path) -> None:
-    """Refuse a recording that is too large for the memory, or that would never end, before it is opened.
+def open_recording(path: Path) -> IO[bytes]:
+    """Open a recording for reading. One that is too large for the memory, or that would never end, is refused.
 
     Raises:
         UserError: The file has more than `LARGEST_FILE` bytes, or is a pipe, a device or a folder.
         OSError: The file is missing.
     """
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise UserError(f"{path}: is no ordinary file; copy it to one")
-    if path.stat().st_size > LARGEST_FILE:
+    try:
+        file = open_ordinary(path)
+    except NotOrdinaryError:
+        raise UserError(f"{path}: is not an ordinary file; copy it to one") from None
+    if os.fstat(file.fileno()).st_size > LARGEST_FILE:
+        file.close()
         raise UserError(f"{path}: has more than {LARGEST_FILE:,} bytes; cut it into shorter recordings")
+    return file
 
 
 def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -> None:

@@ -2,13 +2,13 @@
 
 import atexit
 import os
-import shutil
 import tempfile
 from functools import lru_cache
 from pathlib import Path
 
 from mien.errors import UserError
 from mien.files import check_writable
+from mien.inside import remove_tree
 from mien.progress import say
 
 
@@ -33,7 +33,7 @@ def cache_folder() -> Path:
 @lru_cache(maxsize=1)
 def _temporary_folder(reason: str) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="mien-cache-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    atexit.register(remove_tree, folder)
     say(f"{reason}: face models are baked into {folder} for this command alone; MIEN_CACHE names a folder to keep them")
     return folder
 

@@ -9,7 +9,7 @@ from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.inside import is_one_line
-from mien.limits import LARGEST_NUMBER, skeleton_fault
+from mien.limits import MAX_NUMBER, skeleton_fault
 
 _AXES = {
     "template": "v3", "faces": "f3", "uv": "u2", "uv_faces": "f3", "face_regions": "f", "identity_basis": "iv3",
@@ -63,7 +63,7 @@ def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: st
         if tensor.dtype != torch.float32:
             raise UserError(f"{where}: {name} is {tensor.dtype}, not torch.float32; {remedy}")
         if not _is_moderate(tensor):
-            raise UserError(f"{where}: {name} holds NaN or numbers beyond {LARGEST_NUMBER:g}; {remedy}")
+            raise UserError(f"{where}: {name} holds NaN or numbers beyond {MAX_NUMBER:g}; {remedy}")
 
 
 def _faults(model: FaceModel) -> Iterator[str]:
@@ -90,7 +90,7 @@ def _faults(model: FaceModel) -> Iterator[str]:
             yield f"{name} has the shape {list(shape)}, which does not fit the others"
             return
         if name not in _INDICES and not _is_moderate(tensor):
-            yield f"{name} holds NaN or numbers beyond {LARGEST_NUMBER:g}"
+            yield f"{name} holds NaN or numbers beyond {MAX_NUMBER:g}"
     sizes["r"] = len(model.region_names)
     if not sizes["v"] or not sizes["f"]:
         yield "it has no vertices or no triangles"
@@ -101,4 +101,4 @@ def _faults(model: FaceModel) -> Iterator[str]:
 
 
 def _is_moderate(tensor: Tensor) -> bool:
-    return tensor.numel() == 0 or bool(tensor.abs().max() <= LARGEST_NUMBER)
+    return tensor.numel() == 0 or bool(tensor.abs().max() <= MAX_NUMBER)

@@ -8,7 +8,7 @@ import numpy as np
 
 from mien.errors import UserError
 from mien.inside import is_one_line
-from mien.limits import LARGEST_NUMBER, are_indices, camera_fault, is_moderate, skeleton_fault
+from mien.limits import MAX_NUMBER, are_indices, camera_fault, is_moderate, skeleton_fault
 from mien.runtime.baked import (
     AttributeNetwork,
     Attributes,
@@ -93,7 +93,7 @@ def _baked_faults(baked: BakedAvatar) -> Iterator[str]:
     if isinstance(baked, BlendSkinned) and len(baked.rig.template) != n:
         yield f"{len(baked.rig.template)} points, but {n} Gaussians"
     if isinstance(baked, BlendSkinned):
-        if max(abs(baked.scale_gain), abs(baked.scale_offset)) > LARGEST_NUMBER:
+        if max(abs(baked.scale_gain), abs(baked.scale_offset)) > MAX_NUMBER:
             yield f"scales of {baked.scale_gain:g} metres"
         if baked.colour_activation == "sigmoid" and attributes.sh.shape[1] != 1:
             yield "a colour of several SH coefficients"
@@ -108,7 +108,7 @@ def _baked_faults(baked: BakedAvatar) -> Iterator[str]:
 def _number_faults(value: Any) -> Iterator[str]:
     for name, array in _arrays(value, ""):
         if array.dtype.kind == "f" and not is_moderate(array):
-            yield f"{name} holds NaN, infinity or a number beyond {LARGEST_NUMBER:g}"
+            yield f"{name} holds NaN, infinity or a number beyond {MAX_NUMBER:g}"
 
 
 def _bases_faults(bases: LinearBases, attributes: Attributes, e: int, mean_moves: bool) -> Iterator[str]:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from mien.capture.faces import LANDMARKS, LandmarkDetector
 from mien.capture.video import write_video
 from mien.errors import UserError
 from mien.face.loading import face_model_edition
+from mien.inside import remove_tree
 from mien.progress import progress_bar, say
 from mien.storage import read_json, write_json
 from mien.synthetic.recipe import SyntheticRecipe
@@ -153,7 +153,7 @@ def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
     }
     write_json(folder / _JSON, FORMAT, VERSION, content)
     del images, mattes
-    shutil.rmtree(folder / _WORK)
+    remove_tree(folder / _WORK)
     return content_hash
 
 
@@ -176,7 +176,7 @@ class _Pictures:
         except UserError:
             kept = False
         if not kept:
-            shutil.rmtree(self.folder, ignore_errors=True)
+            remove_tree(self.folder)
             self.folder.mkdir(parents=True)
             for name in ("frames.u8", "mattes.u8"):
                 (self.folder / name).touch()

@@ -11,7 +11,7 @@ from mien.capture import Capture
 from mien.errors import UserError
 from mien.face import FaceParams
 from mien.inside import check_tree, is_one_line
-from mien.limits import LARGEST_NUMBER, camera_fault
+from mien.limits import MAX_NUMBER, camera_fault
 from mien.locks import read_beside_writers
 from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.tracking.tracking import Appearance, Tracking
@@ -145,8 +145,8 @@ def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
         floats = name != "valid"
         if tensors[name].dtype != (torch.float32 if floats else torch.uint8):
             raise UserError(f"{path / _TENSORS}: {name!r} is {tensors[name].dtype}; {_REMEDY}")
-        if floats and (tensors[name].abs() > LARGEST_NUMBER).any():
-            raise UserError(f"{path / _TENSORS}: {name!r} holds numbers beyond {LARGEST_NUMBER:g}; {_REMEDY}")
+        if floats and (tensors[name].abs() > MAX_NUMBER).any():
+            raise UserError(f"{path / _TENSORS}: {name!r} holds numbers beyond {MAX_NUMBER:g}; {_REMEDY}")
         finite = tensors[name].isfinite()
         if name == "pixel_residuals":
             finite |= tensors[name].isnan()
@@ -164,7 +164,7 @@ def _read_appearance(numbers: dict[str, float] | None, tensors: dict[str, Tensor
     if numbers is None:
         return None
     sigma, light_extent = float(numbers["sigma"]), float(numbers["light_extent"])
-    if not (0 <= sigma <= LARGEST_NUMBER and 0 <= light_extent <= LARGEST_NUMBER):
+    if not (0 <= sigma <= MAX_NUMBER and 0 <= light_extent <= MAX_NUMBER):
         raise ValueError(f"sigma {sigma:g} and light_extent {light_extent:g} are out of range")
     return Appearance(tensors["texture"], tensors["trust"], tensors["light"], sigma, light_extent)
 

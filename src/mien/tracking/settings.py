@@ -149,14 +149,14 @@ class PaperSettings:
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """The tracking of a capture."""
+    """Settings of the tracking."""
 
     focal: float | None = None
     """Focal length in pixels of the capture's pictures, if known. The default is 1.5 times the larger side of the
     source picture, or 2.2 times the side of a square picture, which must be a crop. The fit changes the default only a
     little, because landmarks of a face hardly determine it. Calibrated cameras keep their own."""
     same_camera: bool = False
-    """Whether all sequences were filmed with the same camera and zoom, so that they share one focal length."""
+    """State that all sequences were filmed with the same camera and zoom, so that they share one focal length."""
     landmarks: LandmarkSet = "mediapipe"
     """The landmarks that count: all 478 of MediaPipe, or, as in GaussianAvatars, the 68 of 300-W without their 17
     contour points. Irises always count, for the gaze."""

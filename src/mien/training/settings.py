@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from mien.bounded import MAX_SIDE
 from mien.devices import DeviceName
 from mien.errors import UserError
 from mien.ranges import Range, check_ranges
@@ -23,7 +24,7 @@ class TrainSettings:
     background: Literal["white", "random"] = "white"
     """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
     which can show as white needles in new poses. It costs 0.1 to 0.4 dB compared with white."""
-    resolution: Annotated[int, Range(16, 8192, or_zero=True)] = 0
+    resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
     """Seed of all random numbers. The same seed, settings and data give the same bytes on a CPU."""

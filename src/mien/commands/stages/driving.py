@@ -79,20 +79,20 @@ def drive_stage(
     run_dir: Path, by: Path, out: Path, options: DriveOptions | None = None, picture: PictureOptions | None = None
 ) -> None:
     """Render a run's avatar as it follows a driver. Pictures of the driver are beside it, unless `alone` is set."""
-    options, look = options or DriveOptions(), picture or PictureOptions()
+    options, picture = options or DriveOptions(), picture or PictureOptions()
     # The number of frames is known only after tracking, but a video or numbered pictures take any number.
-    output = look.plan(out, 2)
+    output = picture.plan(out, 2)
     avatar = load_avatar(run_dir)
     driver = open_driver(by, options.sequence, avatar.face_model, options.fps)
     bounds = avatar.face_model.expression_bounds
     driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, options.head_pose, str(by))
     if output.kind == "sequence":
         plan_output(out, len(driven), output.transparent)
-    camera = view(look, run_camera(run_dir))
+    camera = view(picture, run_camera(run_dir))
     beside = None if options.alone or output.transparent else driver.pictures
 
     def frame(timestep: int) -> np.ndarray:
-        shown = draw(look, avatar.pose(driven[timestep]).gaussians.detach().timestep(0), camera)
+        shown = draw(picture, avatar.pose(driven[timestep]).gaussians.detach().timestep(0), camera)
         if beside is None:
             return shown
         theirs = beside(timestep)

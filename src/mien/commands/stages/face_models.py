@@ -55,9 +55,9 @@ def add_face_model_stage(path: Path, name: str | None = None, shareable: bool = 
 
 def _add(path: Path, name: str, shareable: bool) -> FaceModel:
     digest, known = file_digest(path), added_from(name)
-    other = f"add this one under another: mien face-models --add {path} --name NAME"
+    other = f"add this one under another name: mien face-models --add {path} --name NAME"
     if is_built_in(name):
-        raise UserError(f"{path}: {name!r} is the name of a face model of mien's own; {other}")
+        raise UserError(f"{path}: {name!r} is the name of one of mien's own face models; {other}")
     if known is not None and known["sha256"] != digest:
         raise UserError(f"{path}: another file has the name {name!r}, {known['path']}; {other}")
     if known is None:

@@ -45,7 +45,9 @@ def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
         if not video.exists():
             raise UserError(f"{video}: no such video or folder of pictures; check the path")
     if names and len(names) != len(videos):
-        raise UserError(f"--name {' '.join(names)}: {len(names)} names for {len(videos)} videos; give one for each")
+        raise UserError(
+            f"--name {' '.join(names)}: {len(names)} names, but the number of videos is {len(videos)}; give one name for each"
+        )
     found = [sequence_name(video, name) for video, name in zip(videos, names or [None] * len(videos), strict=True)]
     twice = [name for name, count in Counter(found).items() if count > 1]
     if twice:
@@ -68,7 +70,7 @@ def doubled_videos(videos: Sequence[Path], names: Sequence[str], held_out: Seque
             trained = other if outside == [name] else name
             yield f"{name} and {other} are the same video: {outside[0]} is held out, but {trained} trains on its frames"
         else:
-            yield f"{name} and {other} are the same video, which counts twice and shows nothing more"
+            yield f"{name} and {other} are the same video, which then counts twice and adds nothing"
 
 
 def _same_content(first: Path, second: Path) -> bool:

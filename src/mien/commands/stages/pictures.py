@@ -16,25 +16,25 @@ from mien.render.validation import drawable
 from mien.training import read_run_config
 
 
-def view(look: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
+def view(options: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
     """The camera for pictures of the chosen size."""
-    return camera.fitted(*look.shape(), zoom)
+    return camera.fitted(*options.shape(), zoom)
 
 
 @torch.no_grad()
-def draw(look: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8[np.ndarray, "h w _"]:
+def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8[np.ndarray, "h w _"]:
     """The picture as RGB over the background, or as RGBA with straight colours."""
-    background = torch.tensor(look.colour()).to(gaussians.means)
+    background = torch.tensor(options.colour()).to(gaussians.means)
     with drawable("the avatar posed like this", "choose another pose or camera, or train it again"):
         rendering = rasterize(gaussians, camera, background)
     image, alpha = (tensor.float().cpu().numpy() for tensor in (rendering.image, rendering.alpha))
-    return to_rgba(image, alpha) if look.background == "transparent" else to_rgb(image)
+    return to_rgba(image, alpha) if options.background == "transparent" else to_rgb(image)
 
 
-def warn_of_white(look: PictureOptions, run_dir: Path) -> None:
+def warn_of_white(options: PictureOptions, run_dir: Path) -> None:
     """Warn if transparent pictures are asked for but the run was trained over white."""
-    if look.background == "transparent" and read_run_config(run_dir)["settings"].get("background") == "white":
+    if options.background == "transparent" and read_run_config(run_dir)["settings"].get("background") == "white":
         say(
-            "this avatar was trained over white, and bright skin and outlines may let light through; "
-            "`mien train --background random` makes one that does not"
+            "warning: this avatar was trained over white, so bright skin and outlines may be partly transparent; "
+            "`mien train --background random` avoids that"
         )

@@ -25,6 +25,7 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import EvaluationSettings
 from mien.face import load_face_model
+from mien.inside import remove_tree
 from mien.locks import WAIT, hold
 from mien.picture_files import write_png
 from mien.progress import say
@@ -113,7 +114,7 @@ def _capture(workspace: Workspace, drawn: Path, name: str) -> None:
         return
     aside = target.with_name(".capture.partial")
     with hold(workspace.sequence_dir(name)):
-        shutil.rmtree(aside, ignore_errors=True)
+        remove_tree(aside)
         shutil.copytree(drawn / "capture", aside)
         replace_folder(target, aside)
 

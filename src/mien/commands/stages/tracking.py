@@ -107,7 +107,7 @@ def _write_what_follows(
         capture_hash = read_capture_hash(folder / "capture")
         if not scoring_exists(folder / "scoring", capture_hash):
             if scoring_exists(folder / "scoring"):
-                say(f"{name}: the pictures changed, so the scoring mask is made anew")
+                say(f"{name}: the pictures changed, so the scoring mask is made again")
             capture = read_capture(folder / "capture")
             check_tracking_of(capture, tracking, folder / "tracking")
             scoring = make_scoring(capture, tracking, face_model, scratch=folder)
@@ -150,7 +150,7 @@ def _current_trackings(
     if not tell:
         return None
     added = [name for name in missing if name not in together]
-    reason = f"{', '.join(added)} came new" if added else "captures or settings changed"
+    reason = f"{', '.join(added)} added" if added else "captures or settings changed"
     say(f"{reason}: all {len(names)} sequences are tracked again, so that they share one identity" if len(names) > 1
         else "Captures or settings changed since the sequence was tracked: tracking again")  # fmt: skip
     return None
@@ -167,14 +167,14 @@ def _track(
     captures = {name: read_capture(workspace.sequence_dir(name) / "capture") for name in names}
     usable = {name: capture for name, capture in captures.items() if has_enough_faces(capture)} or captures
     for name in captures.keys() - usable.keys():
-        say(f"{name}: left out, there are too few faces in it")
+        say(f"{name}: left out, because too few of its frames show a face")
     keep = workspace.root / "sequences" / f".tracking-{fingerprint}"
     for other in workspace.root.glob("sequences/.tracking-*"):
         if other != keep and other.is_dir():
             remove_tree(other)  # kept for other captures or settings
     page = workspace.root / "tracking_preview.html" if preview else None
     if page is not None:
-        say(f"Open {page} in a browser: it is renewed while the fit goes on")
+        say(f"Open {page} in a browser to watch the fit")
     tracked = track_subject(list(usable.values()), face_model, settings, keep, page)
     trackings = {}
     for name, tracking in zip(usable, tracked, strict=True):
@@ -195,8 +195,8 @@ def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking])
                 outdated.append(run)
     if outdated:
         say(
-            f"Trained on the tracking before this one: {', '.join(outdated)}. Such a run can be rendered as ever, but "
-            "not resumed or scored; train anew under another name (--run NAME), or delete its folder first"
+            f"Trained on the previous tracking: {', '.join(outdated)}. Such a run can still be rendered, but neither "
+            "resumed nor scored; train again under another name (--run NAME), or delete its folder first"
         )
 
 
