@@ -12,9 +12,9 @@ from mien.render.mesh import shade, vertex_normals
 from mien.rotation import matrix_from_axis_angle
 from mien.synthetic import RECIPES, SyntheticScene, synthesize, write_synthetic_video
 from mien.synthetic.light import studio_lighting
-from mien.synthetic.motion import head_motion
+from mien.synthetic.motion import generate_motion
 from mien.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
-from mien.synthetic.shading import turned
+from mien.synthetic.shading import turn_light
 from mien.tracking.neck_line import bottom_vertices
 
 SMALL = replace(RECIPES["demo"], width=192, height=192, seconds=0.6, fps=10.0, texture_size=256, noise=0.0)
@@ -54,7 +54,7 @@ def test_light_on_a_turned_head_is_that_of_the_room():
     normals = random.standard_normal((50, 3))
     normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32)
     expected = shade(torch.from_numpy(normals @ turn.T), torch.from_numpy(lighting.sh_light)).clamp_min(0)
-    np.testing.assert_allclose(turned(lighting, turn).irradiance(normals), expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(turn_light(lighting, turn).irradiance(normals), expected, rtol=0, atol=1e-5)
 
 
 def test_recipe_and_seed_decide_every_byte(scene):
@@ -148,7 +148,7 @@ def test_motion_is_bounded_smooth_and_blinks():
     closed = face.expression[:, scene.model.expression_names.index("eyeBlinkLeft")] > 0.8
     blinks = int((closed[1:] & ~closed[:-1]).sum())
     assert 2 <= blinks <= 9
-    assert torch.equal(head_motion(scene.model, scene.identity, recipe, 5).expression, face.expression)
+    assert torch.equal(generate_motion(scene.model, scene.identity, recipe, 5).expression, face.expression)
 
 
 def test_shoulders_hold_still_while_the_head_turns():

@@ -20,8 +20,8 @@ from mien.synthetic import (
     truth_of,
     write_synthetic_capture,
 )
+from mien.synthetic.captures import _Pictures, hash_scene, inputs_hash, read_synthetic_hash, scene_key
 from mien.synthetic.signature import TOLERANCES, signature_distance, signature_of
-from mien.synthetic.writing import _Pictures, hash_scene, inputs_hash, read_synthetic_hash, scene_key
 from reference_signatures import drawn_signatures, stored_signatures
 
 KEYS = {
