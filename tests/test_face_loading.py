@@ -140,7 +140,7 @@ def test_without_a_home_folder_models_are_baked_for_this_process(home, bakes, mo
     assert load_face_model("small").content_hash == load_face_model("small").content_hash
     assert len(bakes) == 1
     said = capsys.readouterr().err
-    assert said.count("MIEN_CACHE names a folder to keep them") == 1
+    assert said.count("set MIEN_CACHE to keep them") == 1
     assert ("there is no home folder" if home is None else "/proc/nowhere/.cache/mien cannot be written to") in said
     (folder,) = tmp_path.glob("mien-cache-*")
     assert loading._is_baked("small", loading._SOURCES["small"])

@@ -169,14 +169,14 @@ FAULTS = {
         lambda a: _with(a, kintree_table=np.array([[-1, 0, 0, 0, 1], [0, 1, 2, 3, 4]])), "body models .* give a head"
     ),
     "other vertices": (lambda a: _with(a, weights=a["weights"][1:]), r"'weights' is float64 \[4172 5\].*\[4173 5\]"),
-    "millimetres": (lambda a: _with(a, v_template=1000 * a["v_template"]), "has to be in metres"),
+    "millimetres": (lambda a: _with(a, v_template=1000 * a["v_template"]), "a head in metres with y upwards is 0.1 to"),
     "mirrored": (lambda a: _with(a, v_template=a["v_template"] * [-1, 1, 1]), "[+]x to the subject's left"),
     "not finite": (lambda a: _with(a, posedirs=np.full_like(a["posedirs"], np.nan)), "'posedirs'.*not finite"),
     "no split": (lambda a: _without(a, "identities"), "64 directions.*add a number 'identities'"),
-    "no expression": (lambda a: _with(a, identities=np.array(64)), "no expression"),
-    "an index": (lambda a: _with(a, f=a["f"] + 1), "'f' names vertex 4173 of 4173"),
+    "no expression": (lambda a: _with(a, identities=np.array(64)), "leaves none for identity or expression"),
+    "an index": (lambda a: _with(a, f=a["f"] + 1), "'f' has the index 4173, but only 4173 entries exist"),
     "weights": (lambda a: _with(a, weights=2 * a["weights"]), "'weights' of a vertex do not add up to 1"),
-    "texture": (lambda a: _with(a, vt=np.zeros((4, 2)), ft=a["f"][1:]), "no texture coordinates"),
+    "texture": (lambda a: _with(a, vt=np.zeros((4, 2)), ft=a["f"][1:]), "not texture coordinates"),
 }  # fmt: skip
 
 

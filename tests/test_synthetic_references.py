@@ -82,7 +82,7 @@ def test_another_recipe_has_another_signature():
 
 
 def test_an_unknown_reference_names_those_there_are():
-    with pytest.raises(UserError, match="choose of: mono-short, mono-long, ring-16"):
+    with pytest.raises(UserError, match="choose one of: mono-short, mono-long, ring-16"):
         reference_named("mono")
 
 

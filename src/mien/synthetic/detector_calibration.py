@@ -90,7 +90,7 @@ def fit_response(people: Sequence[Sightings], components: int = _COMPONENTS) -> 
     people = [person for person in people if len(person.R_seen) >= _MIN_PICTURES]
     if len(people) < 2 * _FOLDS:
         raise UserError(
-            f"the detector found {len(people)} people, {2 * _FOLDS} are needed: draw more, and look at the pictures"
+            f"the detector found {len(people)} people, but {2 * _FOLDS} are needed: draw more, and check the pictures"
         )
     offsets = [_offsets(person, person.across) for person in people]
     habits = torch.zeros(0)
@@ -176,7 +176,7 @@ def main(name: tyro.conf.Positional[str] = "anny", people: int = 200) -> None:
     deviation = 1e3 * float(response.by_person.square().sum(0).mean().sqrt())
     say(
         f"{response_path(name)}: mean offset {1e3 * float(response.mean.norm(dim=1).mean()):.2f} mm; people differ by "
-        f"{deviation:.2f} mm along each axis, of which components of others leave {1e3 * response.rest_sigma:.2f} mm"
+        f"{deviation:.2f} mm along each axis; components of other people leave {1e3 * response.rest_sigma:.2f} mm of it"
     )
 
 

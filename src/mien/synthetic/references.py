@@ -68,7 +68,7 @@ def reference_named(name: str) -> ReferenceCapture:
         UserError: there is none of that name.
     """
     if name not in REFERENCES:
-        raise UserError(f"there is no reference capture {name!r}; choose of: {', '.join(REFERENCES)}")
+        raise UserError(f"there is no reference capture {name!r}; choose one of: {', '.join(REFERENCES)}")
     return REFERENCES[name]
 
 
