@@ -28,3 +28,11 @@ def flip_or_cut(data: bytes, dice: random.Random) -> bytes:
     else:
         changed[start : start + 8] = dice.randbytes(len(changed[start : start + 8]) or 1)
     return bytes(changed)
+
+
+def nested(depth: int) -> list[Any]:
+    """Return empty lists inside each other, this deep."""
+    inner: list[Any] = []
+    for _ in range(depth):
+        inner = [inner]
+    return inner

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 import train_toy
-from damage import edit_json
+from damage import edit_json, nested
 from mien import runtime
 from mien.avatar import METHODS, Avatar, load_avatar, make_portable, write_avatar
 from mien.errors import UserError
@@ -318,13 +318,6 @@ PORTABLES: dict[str, tuple[str, Edit]] = {
     "lines": ("gaussian_avatars", lambda c, a: c["about"].update(name="a\x1b[2Jb")),
     "deep": ("gaussian_avatars", lambda c, a: c["about"].update(name=nested(400))),
 }  # fmt: skip
-
-
-def nested(depth: int) -> list[Any]:
-    inner: list[Any] = []
-    for _ in range(depth):
-        inner = [inner]
-    return inner
 
 
 @pytest.mark.parametrize("name", PORTABLES)

@@ -1,16 +1,14 @@
 """Long clips in bounded memory: each test fails where all of a sequence's pictures are held at once."""
 
-import gc
-import tracemalloc
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from bounded_memory import MIB, allocating_at_most
 from capture_helpers import random_capture
 from mien import picture_files
 from mien.capture import read_capture, write_capture
@@ -21,8 +19,6 @@ from needs import NO_PROC
 from small_face_model import make_small_face_model
 from test_tracking_scoring import _tracking, _upright
 from tracking_case import capture_of, make_tracking_case
-
-MIB = 1 << 20
 
 
 @pytest.fixture
@@ -39,19 +35,6 @@ def mapped_bytes() -> int:
         pytest.skip(NO_PROC)
     line = next(line for line in status.read_text().splitlines() if line.startswith("RssFile"))
     return int(line.split()[1]) << 10
-
-
-@contextmanager
-def allocating_at_most(limit: int) -> Iterator[None]:
-    """Of what numpy and Python ask for."""
-    gc.collect()
-    tracemalloc.start()
-    try:
-        yield
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < limit, f"{peak / MIB:.0f} MiB"
 
 
 def largest_share(pictures: np.ndarray, look: Callable[[np.ndarray], object]) -> int:

@@ -10,6 +10,7 @@ from torch.nn.functional import conv2d, interpolate
 from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.training.photometric import Box, photometric_loss, photometric_loss_reference, ssim, ssim_map
+from rasterize_scenes import relative_error
 
 WHOLE_AND_PARTS = [
     (64, 48, None),
@@ -47,10 +48,6 @@ def exact(image: Tensor, target: Tensor, weights: tuple[float, float], box: Box 
     image = image.double().requires_grad_()
     loss = photometric_loss_reference(image, target.double(), *weights, box)
     return loss.detach(), torch.autograd.grad(loss, image)[0]
-
-
-def relative_error(value: Tensor, expected: Tensor) -> float:
-    return float((value.double() - expected).norm() / expected.norm().clamp_min(1e-12))
 
 
 @pytest.mark.parametrize(("height", "width", "box"), WHOLE_AND_PARTS)

@@ -7,6 +7,7 @@ import numpy as np
 
 import train_toy
 from mien.capture import write_capture
+from mien.evaluation import EvaluationSettings, evaluate
 from mien.tracking import Scoring, write_scoring, write_tracking
 from mien.training import read_sequence, train
 from toy_scene import toy_sequence
@@ -22,3 +23,10 @@ def write_toy_workspace(root: Path, timesteps: int = 5) -> None:
     write_scoring(folder / "scoring", Scoring(sequence.scoring, crops))
     settings = replace(train_toy.SETTINGS, split="tail")
     train([read_sequence(folder)], face_model, train_toy.CONFIG, settings, root / "runs" / "toy")
+
+
+def write_evaluated_workspace(root: Path) -> Path:
+    """Write the toy workspace with the figures of its run, and return its folder."""
+    write_toy_workspace(root)
+    evaluate(root / "runs/toy", [root / "sequences/clip"], EvaluationSettings(perceptual=False, video_frames=0))
+    return root
