@@ -1,4 +1,4 @@
-"""Valid calls of the native functions on meshes, and what every baseline is made of."""
+"""Make valid calls of the native functions on meshes, and the parts of all baselines."""
 
 from collections.abc import Callable
 from typing import Any
@@ -28,7 +28,7 @@ def few(rng: Rng) -> int:
 
 
 def picture(rng: Rng) -> tuple[int, int]:
-    """Height and width."""
+    """Return height and width of a picture."""
     return int(rng.choice([1, 3, 8, 33, 64])), int(rng.choice([6, 7, 16, 31, 65]))
 
 
@@ -36,7 +36,7 @@ VIEW = np.diag([1, -1, -1, 1]).astype(F32)
 
 
 def camera(rng: Rng, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """K and viewmat of a camera 3 units before the origin."""
+    """Return K and viewmat of a camera 3 units in front of the origin."""
     focal = float(width)
     viewmat = VIEW.copy()
     viewmat[2, 3] = 3
@@ -51,7 +51,7 @@ def rasterize_mesh(native: Any, rng: Rng) -> Arguments:
 
 
 def fragments(native: Any, rng: Rng) -> tuple[list[Any], np.ndarray, np.ndarray]:
-    """face_index, barycentric and depth of a drawn mesh; its image points; its faces."""
+    """Return face_index, barycentric and depth of a drawn mesh, its image points and its faces."""
     vertices, faces, K, viewmat, _, *out = rasterize_mesh(native, rng)
     native.rasterize_mesh(vertices, faces, K, viewmat, False, *out)
     points = (vertices @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
@@ -59,7 +59,7 @@ def fragments(native: Any, rng: Rng) -> tuple[list[Any], np.ndarray, np.ndarray]
 
 
 def edges(rng: Rng, points: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
-    """edge_vertices, edge_faces and opposite: all edges of all faces, half of them with a second triangle."""
+    """Return edge_vertices, edge_faces and opposite for all edges of all faces; half of them have a second triangle."""
     vertices = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(I32)
     opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]]).astype(I32)
     own = np.tile(np.arange(len(faces), dtype=I32), 3)
@@ -123,7 +123,7 @@ def align_surface(native: Any, rng: Rng, v: int = 0) -> Arguments:
 
 
 def sighting(native: Any, rng: Rng) -> tuple[Any, list[Any], tuple[int, ...], Arguments]:
-    """A surface, and a picture of it: vertices, normals, K, viewmat, image, mask, light."""
+    """Return a surface and a picture of it: vertices, normals, K, viewmat, image, mask, light."""
     v, (h, w) = few(rng) + 2, picture(rng)
     made = align_surface(native, rng, v)
     light = normal(rng, 9, 3)
