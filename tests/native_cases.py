@@ -1,6 +1,6 @@
-"""Calls that must be refused, and what must hold after one, in a process of their own: `test_native_calls.py` runs it.
+"""Calls that must be refused, and what must hold after them. `test_native_calls.py` runs this file in another process.
 
-Prints a line of JSON for each case: its name and what came of it. Ends early where the core crashes.
+It prints a line of JSON for each case, with its name and outcome. If the core crashes, the output ends early.
 """
 
 import json
@@ -28,7 +28,7 @@ def arguments(name: str, seed: int = 0) -> list[Any]:
 
 
 def call(name: str, **changes: Any) -> Any:
-    """A valid call with some arguments replaced, by position (`_3`)."""
+    """Make a valid call with some arguments replaced, by position (`_3`)."""
     given = arguments(name)
     for place, value in changes.items():
         given[int(place[1:])] = value
@@ -36,7 +36,7 @@ def call(name: str, **changes: Any) -> Any:
 
 
 def wide_splats(count: int, width: int = WIDEST, height: int = 1) -> list[Any]:
-    """Gaussians as wide as the picture: each touches all of its tiles."""
+    """Return the arguments of a call with Gaussians as wide as the picture. Each of them touches all tiles."""
     means = np.zeros((count, 3), F32)
     means[:, 2] = np.linspace(1, 2, count)
     quats = np.tile(np.array([1, 0, 0, 0], F32), (count, 1))
@@ -53,7 +53,7 @@ def picture_of_small_scene() -> bytes:
 
 
 def with_room(megabytes: float, body: Callable[[], Any]) -> Any:
-    """Calls it where so much more address space can be had."""
+    """Call `body` with at most this much more address space."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + int(megabytes * 2**20), before[1]))
@@ -64,7 +64,10 @@ def with_room(megabytes: float, body: Callable[[], Any]) -> Any:
 
 
 def memory_that_is_not_there() -> str:
-    """Fails at different places of a forward pass, on every thread; after each the same call gives the same bytes."""
+    """Run out of memory at different places of a forward pass, on every thread.
+
+    Later calls still give the same bytes.
+    """
     _native.set_thread_count(3)
     scene, expected, failed = wide_splats(3000), picture_of_small_scene(), 0
     for megabytes in (0, 1, 4, 9, 20, 50, 90, 200, 300, 500):
@@ -77,7 +80,10 @@ def memory_that_is_not_there() -> str:
 
 
 def memory_for_several_views() -> None:
-    """Views side by side: each is drawn by a thread of its own, where an exception would end the process."""
+    """Run out of memory in views that threads draw side by side.
+
+    An exception in such a thread would end the process.
+    """
     _native.set_thread_count(3)
     views = [tuple(wide_splats(2000, width=WIDEST // 2)) for _ in range(3)]
     with_room(30, lambda: _native.rasterize_views(views, False))
@@ -108,7 +114,7 @@ def surface_of_faces(vertex: int) -> Any:
 
 
 def other_coefficients() -> None:
-    """A backward pass with more of them than the forward pass had."""
+    """Run a backward pass with more coefficients than the forward pass had."""
     ((frame, *task), *_) = arguments("rasterize_views_backward", 3)[0]
     more = np.zeros((len(task[0]), 16, 3), F32)
     assert task[4].shape != more.shape
@@ -139,7 +145,7 @@ def largest_high_pass() -> str:
 
 
 def large_picture() -> None:
-    """More than 2^31 pixels, in a file of holes that takes no memory."""
+    """Pass a picture of more than 2^31 pixels, in a sparse file that takes no memory."""
     with tempfile.TemporaryFile() as file:
         file.truncate(4 * 65536 * 32769)
         _native.box_of_nonzero(np.memmap(file, F32, "r+", shape=(32769, 65536)))

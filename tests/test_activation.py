@@ -1,4 +1,4 @@
-"""The native sigmoid against torch's."""
+"""The native sigmoid agrees with torch's."""
 
 from collections.abc import Iterator
 

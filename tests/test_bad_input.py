@@ -1,4 +1,4 @@
-"""Bad input, by what is bad about it; docs/bad_input.md lists for every command which test shows what happens."""
+"""Bad input is refused in one line. docs/bad_input.md lists for every command which test shows this."""
 
 import errno
 import re
@@ -44,7 +44,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def small_disk(size: int) -> Iterator[None]:
-    """No file can grow beyond so many bytes, as on a disk that is full."""
+    """Limit the size of every file, as a full disk would."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -59,7 +59,7 @@ def write_toy_video(folder: Path) -> None:
 
 
 def write_toy_pictures(path: Path, count: int) -> None:
-    """As `mien render` and `mien drive` do."""
+    """Write pictures as `mien render` and `mien drive` do."""
     noise = np.random.default_rng(0).integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
     write_pictures(plan_output(path, count), list(noise), 25.0)
 

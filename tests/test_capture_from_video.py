@@ -1,4 +1,4 @@
-"""Video to capture: the whole way, on a scanned face's texture and on footage."""
+"""A video becomes a capture, with the texture of a scanned face and with real footage."""
 
 import json
 import subprocess
@@ -236,7 +236,7 @@ def test_bad_requests_are_refused(face_clip, tmp_path):
 
 
 def test_detectors_say_nothing(face_clip, tmp_path):
-    """Their native code writes to the file descriptor, so another process has to listen."""
+    """Detectors print nothing. Their native code writes to the file descriptor, so another process has to listen."""
     code = (
         "import sys, pathlib; from mien.capture import capture_video, CaptureSettings;"
         "capture_video(pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), CaptureSettings(size=64, max_frames=3))"

@@ -1,4 +1,4 @@
-"""Captures on disk: round trip, cache, damage."""
+"""Captures on disk survive a round trip, keep a cache, and report damage."""
 
 import dataclasses
 import os

@@ -1,4 +1,4 @@
-"""Reading and writing video files."""
+"""Video files are read and written with their colours and times."""
 
 import av
 import numpy as np
@@ -22,7 +22,10 @@ def test_written_frames_are_read_back(tmp_path):
 
 
 def test_colours_keep_their_level(tmp_path):
-    """Wrong matrices or ranges shift whole colours, which a mean over a picture would hide."""
+    """Colours keep their level.
+
+    Wrong matrices or ranges shift whole colours, which a mean over a picture would hide.
+    """
     colours = np.array([[200, 30, 40], [30, 180, 60], [20, 60, 220], [128, 128, 128], [255, 255, 255], [0, 0, 0]])
     for colour in colours.astype(np.uint8):
         path = tmp_path / "colour.mp4"

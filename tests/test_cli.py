@@ -1,4 +1,4 @@
-"""The command line: help, exit codes and one-line messages; a real run lies in test_end_to_end.py."""
+"""The command line has help, exit codes and one-line messages. A real run is in test_end_to_end.py."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ from mien.cli import COMMANDS, main
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run a command that must fail by the user's mistake; returns its one line."""
+    """Run a command that must fail by the user's mistake, and return its one line."""
     assert main(arguments) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
     assert len(lines) == 1, lines
@@ -153,7 +153,10 @@ def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_a_terminated_command_removes_what_is_unfinished(tmp_path: Path) -> None:
-    """As after Ctrl-C; by default a signal would end the process on the spot."""
+    """A terminated command removes unfinished files, as after Ctrl-C.
+
+    By default a signal would end the process at once.
+    """
     program = f"""
 import os, signal, sys, types
 from dataclasses import dataclass

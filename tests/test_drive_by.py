@@ -1,4 +1,4 @@
-"""Drivers of every kind, as `mien drive --by` opens them."""
+"""`mien drive --by` opens drivers of every kind."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,12 +20,12 @@ from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
 
 PARTS = {"clip-1": 3, "clip-2": 4, "clip-10": 2}
-"""Timesteps of the parts that a video with cuts falls into; by letters, clip-10 would come second."""
+"""Timesteps of the parts of a video with cuts. There are so many that by letters clip-10 would come second."""
 
 
 @pytest.fixture
 def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A video whose capture and tracking are given: each part has its own grey and its own head pose."""
+    """Return a video whose capture and tracking are given. Each part has its own grey and its own head pose."""
 
     def capture_stage(workspace: Workspace, *_: object) -> list[str]:
         for number, (name, timesteps) in enumerate(PARTS.items(), 1):

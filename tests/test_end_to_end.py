@@ -1,4 +1,4 @@
-"""The demo itself, shortened: video, capture, tracking, training, report; then every way to use the avatar."""
+"""A short version of the demo runs: video, capture, tracking, training, report; then every use of the avatar."""
 
 import json
 from pathlib import Path

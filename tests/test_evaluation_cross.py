@@ -1,4 +1,4 @@
-"""Cross-reenactment: the measures on made-up landmarks, and the protocol from folders with a made-up detector."""
+"""Cross-reenactment is measured on made-up landmarks, and from folders with a made-up detector."""
 
 import json
 from dataclasses import replace
@@ -71,7 +71,7 @@ def test_figures_of_perfect_still_and_opposite_avatars() -> None:
 
 
 class _MadeUpReader:
-    """Landmarks that turn with the brightness of the picture; no face in pictures that are all white."""
+    """Detector whose landmarks turn with the brightness of the picture. It finds no face in white pictures."""
 
     def __enter__(self) -> "_MadeUpReader":
         return self
@@ -87,7 +87,7 @@ class _MadeUpReader:
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A run, and another workspace's sequence with two cameras."""
+    """Return a run, and a sequence of another workspace with two cameras."""
     root = tmp_path_factory.mktemp("cross")
     experiment = make_experiment(timesteps=20)
     own = write_sequence(root / "anna", experiment, experiment.sequences[0])

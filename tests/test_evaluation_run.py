@@ -1,4 +1,4 @@
-"""From a run's folder to metrics.json and report.html, through the files that the stages before write."""
+"""A run's folder becomes metrics.json and report.html, through the files that the earlier stages write."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ STEPS = 30
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A sequence and a run that was trained on it for a few steps."""
+    """Return a sequence, and a run that was trained on it for a few steps."""
     root = tmp_path_factory.mktemp("workspace")
     folder, run_dir = root / "sequences" / "clip", root / "runs" / "first"
     experiment = make_experiment()

@@ -1,4 +1,4 @@
-"""The scripts in examples/ and the page docs/api.md run as they stand, on little data."""
+"""The scripts in examples/ and the code in docs/api.md run as they are, on little data."""
 
 import os
 import re

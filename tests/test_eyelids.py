@@ -1,4 +1,4 @@
-"""Lids put where pictures have them."""
+"""Lids are put where pictures show them."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def still() -> np.ndarray:
 
 
 def blinks() -> np.ndarray:
-    """Both eyes for three frames, the left one alone for one."""
+    """Return lids that blink: both eyes for three frames, and the left one alone for one frame."""
     lids = still()
     lids[7:10] = np.array([0.6, 1.0, 0.7])[:, None]
     lids[16, 1] = 1.0

@@ -1,4 +1,4 @@
-"""The anny head: does everything move as an anatomist would expect?"""
+"""The anny head moves as an anatomist would expect."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def model() -> FaceModel:
 
 
 def posed(model: FaceModel, identity: Tensor | None = None, **values: float | tuple[float, float, float]) -> FaceParams:
-    """A face by names of expressions (a number) and joints (an axis-angle)."""
+    """Return a face with these expressions (a number each) and joints (an axis-angle each), by name."""
     face = model.neutral()
     for name, value in values.items():
         if isinstance(value, tuple):

@@ -1,4 +1,4 @@
-"""Baked face models on disk: whatever happens to the files, loading gives the model."""
+"""Loading gives the face model, whatever happens to the baked files on disk."""
 
 import json
 import subprocess
@@ -17,7 +17,7 @@ from small_face_model import make_small_face_model
 
 @pytest.fixture
 def bakes(monkeypatch, tmp_path):
-    """A source that bakes a small model; counts how often. The cache is a fresh folder."""
+    """Return a source that bakes a small model and counts how often. The cache is a fresh folder."""
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path))
     counts = []
 

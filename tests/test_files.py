@@ -1,4 +1,4 @@
-"""Whether a path can be written is known before any work; long names; arrays without torch."""
+"""A path that cannot be written is reported before any work; long names work; arrays are stored without torch."""
 
 import os
 import subprocess

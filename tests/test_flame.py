@@ -1,4 +1,4 @@
-"""Head models of users in FLAME's schema: read from any of its files, posed as FLAME poses, refused in clear words."""
+"""Head models in FLAME's schema are read from any of its files, posed as FLAME poses, and refused in clear words."""
 
 import os
 import pickle
@@ -38,7 +38,7 @@ def model(arrays, tmp_path_factory) -> FaceModel:
 
 @pytest.mark.parametrize("moved", ["nothing", "root", "neck", "jaw", "eyes", "identity", "expression", "all"])
 def test_poses_as_flame_does(moved, arrays, model):
-    """Jaw, eyes and correctives are FLAME's own; its root and neck are the head's pose and the neck's, turned round."""
+    """Jaw, eyes and correctives move as in FLAME; its root and neck become the head's pose and an inverse neck."""
     random = np.random.default_rng(1)
     columns = arrays["shapedirs"].shape[2]
     identities = len(model.identity_basis)

@@ -1,4 +1,4 @@
-"""What the fuzzers found once: each is refused where it is read, in one line that names the file."""
+"""Every former finding of the fuzzers is refused when it is read, in one line that names the file."""
 
 import os
 from dataclasses import replace
@@ -43,7 +43,7 @@ def still(timesteps: int = 1) -> FaceParams:
 
 
 def test_a_pipe_is_no_recording_and_no_ply(tmp_path: Path) -> None:
-    """Opening a pipe waits for who writes into it; a device never ends."""
+    """A pipe is not a recording or a .ply. Opening a pipe would wait for a writer, and a device never ends."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for read in (read_live_link_face, read_blendshape_json, read_ply):
@@ -132,7 +132,7 @@ def test_an_avatar_of_no_method_names_its_file(run: Path, tmp_path: Path) -> Non
 
 
 def seal(folder: Path) -> None:
-    """Make the json vouch for the tensors beside it again."""
+    """Update the hash in the json after a change of the tensors."""
     content = read_json(folder / "avatar.json", "mien.avatar", 1)
     digest = file_digest(folder / "avatar.safetensors")
     write_json(folder / "avatar.json", "mien.avatar", 1, {**content, "tensors_sha256": digest})
@@ -213,7 +213,10 @@ def test_divergence_names_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_png_chunk_that_is_longer_than_its_file() -> None:
-    """A decoder takes memory for the length that a chunk announces: 4 GB for a picture of 8x8 pixels."""
+    """A PNG chunk that is longer than its file is refused.
+
+    A decoder would allocate the 4 GB that the chunk announces.
+    """
     data = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
     assert png_fits(data)
     assert png_fits(data + b"whatever other programs add")

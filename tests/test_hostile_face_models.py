@@ -1,4 +1,4 @@
-"""Face models that somebody hands in to do harm: refused in one line, quickly, before they take memory."""
+"""Hostile face models are refused in one line, quickly, before they take memory."""
 
 import pickle
 import struct
@@ -70,7 +70,7 @@ def test_a_pickle_takes_no_more_than_its_own_size(name: str, tmp_path: Path, mon
 
 
 def test_arrays_that_repeat_or_unpack_one_text_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Many names for one array would be many arrays; a sparse matrix may be dense in memory only."""
+    """Arrays that repeat or unpack one text count in full, such as many names for one array, or a sparse matrix."""
     monkeypatch.setattr(inert_pickle, "MAX_MODEL_BYTES", 8 * MIB)
     path = tmp_path / "a.pkl"
     one = np.zeros(MIB // 8)
@@ -158,7 +158,10 @@ def test_odd_members_of_an_archive_are_told(name: str, tmp_path: Path) -> None:
 
 
 def test_a_bomb_is_refused_by_its_header(tmp_path: Path) -> None:
-    """50 KB that would unpack to 50 MB, of which the limit is told, and not one byte unpacked."""
+    """A bomb is refused by its header: 50 KB that would unpack to 50 MB.
+
+    Nothing is unpacked, and the limit is reported.
+    """
     path = write_members(tmp_path / "a.npz", ("v_template.npy", header("<f8", (6_500_000,)) + bytes(52_000_000)))
     assert path.stat().st_size < 100_000
     limit = npz.MAX_MODEL_BYTES

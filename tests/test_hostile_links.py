@@ -64,7 +64,7 @@ def workspace(made: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def victim(tmp_path: Path) -> Iterator[Path]:
-    """The user's own folder, which has to be as it was."""
+    """Return a folder of the user that must not change."""
     folder = tmp_path / "home"
     (folder / "deep").mkdir(parents=True)
     for name in ("frames.u8", "000000.png", "deep/a.txt", "notes"):
@@ -101,7 +101,7 @@ def test_no_command_follows_a_link(
 
 
 def test_links_are_found_wherever_they_are(made: Path, tmp_path: Path, victim: Path) -> None:
-    """By the two doors that every command goes through."""
+    """Links are found wherever they are, by both functions that every command calls first."""
     for number, place in enumerate((*FOLDERS, *FILES)):
         received = shutil.copytree(made, tmp_path / str(number), copy_function=os.link)
         put(received / place, victim / "notes" if place in FILES else victim)
@@ -128,7 +128,10 @@ def test_the_workspace_itself_may_be_reached_by_a_link(workspace: Path, tmp_path
 
 
 def test_the_library_follows_no_link_either(workspace: Path, victim: Path) -> None:
-    """Functions check for themselves: no command has checked the workspace for their caller."""
+    """Library functions follow no link either.
+
+    They check for themselves, since no command has checked the workspace.
+    """
     clip, run = workspace / "sequences/clip", workspace / "runs/toy"
     for place, read in (
         (clip / "capture/cache", lambda: read_capture(clip / "capture")),
@@ -228,7 +231,7 @@ def test_names_in_files_stay_in_their_folder(workspace: Path, victim: Path) -> N
 
 
 def test_a_deep_tree_is_told(tmp_path: Path) -> None:
-    """Deeper than a path can be."""
+    """A tree that is deeper than a path can be is reported."""
     top = os.open(tmp_path, os.O_RDONLY)
     place = top
     for _ in range(30):

@@ -1,4 +1,4 @@
-"""Motion, landmarks and crops that users hand in: gaps, huge numbers and huge files are told in time."""
+"""Gaps, huge numbers and huge files in motion, landmarks and crops are reported in time."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ def refused(read, path: Path, words: str) -> None:
 
 
 def test_a_gap_in_a_csv_is_told_with_its_line(tmp_path: Path) -> None:
-    """A year between two rows would be filled with two billion moments."""
+    """A gap in a csv is reported with its line. A year between two rows would be filled with two billion moments."""
     path = tmp_path / "a.csv"
     start = [row("0:00:00:00.0"), row("0:00:00:01.0"), row("0:00:00:02.0")]
     refused(read_live_link_face, write_csv(path, *start, row("8760:00:00:00.0")), "line 5: comes 31,536,000 s after")
@@ -36,7 +36,7 @@ def test_a_gap_in_a_csv_is_told_with_its_line(tmp_path: Path) -> None:
 
 
 def test_many_gaps_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """None is long, but together they are."""
+    """Many gaps are reported that are not long by themselves, but are long together."""
     monkeypatch.setattr(motion, "MOST_MOMENTS", 5_000)
     start = [row(f"0:00:00:0{frame}.0") for frame in range(6)]
     later = [row(f"0:{minute:02d}:00:00.0") for minute in range(1, 5)]

@@ -1,4 +1,4 @@
-"""A workspace from a stranger is refused if its files hold what cannot be.
+"""A stranger's workspace is refused if its files hold what cannot be.
 
 Every file here has the right checksum, or none, since whoever makes a file can make its checksum.
 """
@@ -43,7 +43,7 @@ def workspace(made: Path, tmp_path: Path) -> Path:
 
 
 def test_partial_figures_of_other_kinds_are_dropped(workspace: Path) -> None:
-    """Behind the right first line stands whatever a stranger wants."""
+    """Partial figures with impossible content are dropped, although their first line is right."""
     run, clip = workspace / "runs/toy", workspace / "sequences/clip"
     settings = EvaluationSettings(perceptual=False, video_frames=0)
     fingerprint = next(iter(read_json_content(run / "metrics.json")["fingerprints"].values()))
@@ -102,7 +102,7 @@ def test_capture_numbers_that_cannot_be(name: str, value: float, workspace: Path
 
 
 def test_a_picture_larger_than_it_should_be_is_not_decoded(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its header claims 30,000 x 30,000 pixels, which would take gigabytes."""
+    """A picture larger than it should be is not decoded. Its header claims 30,000 x 30,000 pixels."""
     folder = workspace / "sequences/clip"
     decoded: list[object] = []
     monkeypatch.setattr("mien.picture_files.cv2.imdecode", lambda *arguments: decoded.append(arguments))
@@ -308,7 +308,7 @@ def test_a_huge_safetensors_file_is_not_read(tmp_path: Path) -> None:
 def test_a_chosen_number_of_parts_is_not_counted_to(
     workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The part that a capture says it is of so many others: they are looked for one after the other."""
+    """A capture may claim to be part of 10^12 parts. The command does not look for each of them."""
     write_gradient_video(tmp_path / "clip.mp4")
     for name in ("clip", "clip-1"):
         capture = workspace / "sequences" / name / "capture"
@@ -322,7 +322,7 @@ def test_a_chosen_number_of_parts_is_not_counted_to(
 
 
 def test_json_is_written_as_it_is_read(tmp_path: Path) -> None:
-    """The checksum of what holds tuples, numbers as keys and large whole numbers."""
+    """Tuples, numeric keys and large whole numbers have the same checksum when json is written and read."""
     content = {"a": (1, 2.5, [2**63 - 1]), "b": {"1": None}}
     write_json(tmp_path / "a.json", "x", 1, {**content, "b": {1: None}})
     assert read_json(tmp_path / "a.json", "x", 1)["a"] == [1, 2.5, [2**63 - 1]]

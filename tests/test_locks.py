@@ -32,7 +32,7 @@ def other() -> Iterator[Holder]:
 
 @pytest.fixture
 def mortal() -> Iterator[Holder]:
-    """For a test that kills it."""
+    """Return a process that holds locks, for a test that kills it."""
     holder = Holder()
     yield holder
     holder.kill()
@@ -88,7 +88,7 @@ def test_the_lock_of_a_killed_process_is_free_at_once(mortal: Holder, tmp_path: 
 
 
 def test_children_do_not_keep_the_lock_of_a_parent_that_has_died(tmp_path: Path) -> None:
-    """Neither one made by fork, nor a program that was started, nor the end of a forked child's own context."""
+    """Children do not keep the lock of a dead parent: no fork, no started program, no fork's own context."""
     script = """
 import os, subprocess, sys, time
 from pathlib import Path
@@ -184,7 +184,10 @@ def test_what_a_holder_says_is_not_trusted(text: str, tmp_path: Path, monkeypatc
 def test_the_name_of_a_dead_process_is_not_told(
     mortal: Holder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A new holder that has not signed yet leaves the name of the one that was killed for a moment."""
+    """The name of a dead process is not reported.
+
+    A new holder that has not signed yet leaves the old name for a moment.
+    """
     monkeypatch.setattr(locks, "_PATIENCE_SECONDS", 0.05)
     with mortal.holding(tmp_path / "r"):
         mortal.kill()
@@ -229,7 +232,7 @@ def test_a_place_that_cannot_be_written(number: int, tmp_path: Path, monkeypatch
 
 
 def test_a_lock_whose_file_was_removed_is_not_taken_for_the_new_one(tmp_path: Path) -> None:
-    """Threads that take and release one lock all the time are never inside together."""
+    """A lock whose file was removed is not taken for the new one. Threads that lock in turns never hold it together."""
     inside, most = [0], [0]
 
     def visit() -> None:

@@ -1,4 +1,4 @@
-"""Long clips in bounded memory: each test fails where all of a sequence's pictures are held at once."""
+"""Long clips take bounded memory: each test fails if all of a sequence's pictures are held at once."""
 
 import weakref
 from collections.abc import Callable
@@ -23,13 +23,13 @@ from tracking_case import capture_of, make_tracking_case
 
 @pytest.fixture
 def tiny_limit(monkeypatch: pytest.MonkeyPatch) -> int:
-    """What may be held is a mebibyte."""
+    """Limit the memory of mapped pictures to a mebibyte."""
     monkeypatch.setattr(picture_files, "_KEPT", MIB)
     return MIB
 
 
 def mapped_bytes() -> int:
-    """File pages in this process's share of the memory."""
+    """Return the bytes of file pages in this process's memory."""
     status = Path("/proc/self/status")
     if not status.is_file():
         pytest.skip(NO_PROC)
@@ -38,7 +38,7 @@ def mapped_bytes() -> int:
 
 
 def largest_share(pictures: np.ndarray, look: Callable[[np.ndarray], object]) -> int:
-    """How far the mapped pages grow while every picture is looked at."""
+    """Return the growth of the mapped pages while every picture is read."""
     before = mapped_bytes()
     most = 0
     for index in np.ndindex(pictures.shape[:2]):
@@ -96,7 +96,7 @@ def test_few_pictures_stay_in_memory_and_many_are_the_same(tmp_path: Path, monke
 
 
 def test_tracking_looks_at_a_bounded_number_of_frames_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And finds the same."""
+    """Tracking reads a bounded number of frames at once, and finds the same result."""
     case = make_tracking_case(timesteps=24)
     model = make_small_face_model()
     expected = track(case.capture, model)

@@ -1,4 +1,4 @@
-"""The mesh rasterizer: coverage, perspective, depth order, near plane, and the pictures made from it."""
+"""The mesh rasterizer handles coverage, perspective, depth order and the near plane, and its pictures are right."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,12 +28,12 @@ from mien.render.mesh import (
 
 
 def pixel_camera(width: int = 16, height: int = 12) -> Camera:
-    """At depth 1, world x and y are pixels."""
+    """Return a camera for which world x and y at depth 1 are pixels."""
     return Camera(torch.eye(3), torch.eye(4), width, height)
 
 
 def at_depth(pixels: Sequence[tuple[float, float, float]]) -> Tensor:
-    """World points of (x, y, depth) for `pixel_camera`."""
+    """Return the world points of (x, y, depth) for `pixel_camera`."""
     points = torch.tensor(pixels, dtype=torch.float32)
     return torch.cat([points[:, :2] * points[:, 2:], points[:, 2:]], dim=-1)
 
@@ -45,7 +45,7 @@ def random_mesh(seed: int = 0, faces: int = 60) -> tuple[Tensor, Tensor]:
 
 
 def camera_at(position: list[float], fov_x: float, size: int) -> Camera:
-    """A square camera that looks at the origin."""
+    """Return a square camera that looks at the origin."""
     viewmat = look_at(torch.tensor(position), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     return camera_from_fov(fov_x, size, size, viewmat)
 

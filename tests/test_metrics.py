@@ -1,4 +1,4 @@
-"""Metrics against hand-computed values, a slow second implementation of SSIM, and a published ST-LPIPS figure."""
+"""Metrics agree with values computed by hand, a slow second implementation of SSIM, and a published ST-LPIPS figure."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""MonoGaussianAvatar's formulas."""
+"""MonoGaussianAvatar follows its formulas."""
 
 from dataclasses import replace
 
@@ -68,7 +68,7 @@ def test_canonical_face_leaves_points_at_their_canonical_places() -> None:
 
 
 class Perfect(torch.nn.Module):
-    """A deformation network that knows the face model's vertices."""
+    """Deformation network that knows the face model's vertices."""
 
     def __init__(self, face_model: FaceModel) -> None:
         super().__init__()
@@ -82,7 +82,7 @@ class Perfect(torch.nn.Module):
 
 
 def perfect_avatar() -> MonoGaussianAvatar:
-    """An avatar whose points are the canonical mesh's vertices."""
+    """Return an avatar whose points are the canonical mesh's vertices."""
     avatar = new_avatar(face_model=with_pose_correctives())
     vertices = avatar.face_model.head_vertices(avatar.canonical_face())[0]
     avatar.store.resize(len(vertices))

@@ -1,4 +1,4 @@
-"""Motion of other programs: Live Link Face's csv and blend shapes as json, good and bad, and what the avatar does."""
+"""Motion of other programs, as Live Link Face's csv or as json of blend shapes, is read, refused and applied."""
 
 import json
 import math
@@ -72,11 +72,11 @@ REAL_LOOKS = (
     ((0, 0, 0.4733, 0.3900), (0, 0.5690, 0, 0.3827), (-0.3425, -0.1774, 0.0601), (-0.2848, -0.1774, 0.0503)),
     ((0.2948, 0.0970, 0, 0), (0.2953, 0.0095, 0, 0), (-0.0057, 0.1804, -0.0010), (0.0583, 0.1804, 0.0106)),
 )
-"""Rounded rows of real takes, in which both ways to tell the gaze are filled."""
+"""Rounded rows of real takes that give the gaze both as coefficients and as angles."""
 
 
 def test_angles_have_the_signs_of_real_takes(tmp_path: Path) -> None:
-    """Yaw to the right, pitch down: the angles beside real eyeLook coefficients say the same as these."""
+    """Angles have the signs of real takes: yaw to the right and pitch down agree with the eyeLook coefficients."""
     columns = ("EyeLookDown", "EyeLookIn", "EyeLookOut", "EyeLookUp")
     for left, right, left_angles, right_angles in REAL_LOOKS:
         looks, angles = {}, {}
@@ -92,7 +92,7 @@ def test_angles_have_the_signs_of_real_takes(tmp_path: Path) -> None:
 
 
 def test_head_angles_are_unreals(tmp_path: Path) -> None:
-    """Yaw to the subject's right, pitch down, roll to the left shoulder: +x left, +y up, +z ahead."""
+    """Head angles follow Unreal: yaw to the subject's right, pitch down, roll to the left shoulder."""
     turns = {"HeadYaw": 0.3, "HeadPitch": 0.2, "HeadRoll": 0.1}
     rotation = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", **turns))).head_rotation[0]
     turned = matrix_from_axis_angle(torch.from_numpy(rotation)).numpy()

@@ -1,4 +1,4 @@
-"""The fused L1 + SSIM loss against its plain PyTorch reference."""
+"""The fused L1 + SSIM loss agrees with its plain PyTorch reference."""
 
 from collections.abc import Iterator
 
@@ -36,7 +36,7 @@ def smooth_picture(height: int, width: int, seed: int) -> Tensor:
 
 
 def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A noisy picture and another one; both have a white part, where SSIM's variances vanish."""
+    """Return a noisy picture and another one. Both have a white part, in which SSIM's variances vanish."""
     noise = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(2))
     image, target = smooth_picture(height, width, 0) + 0.05 * noise, smooth_picture(height, width, 1)
     image[: height // 3], target[: height // 3] = 1, 1
@@ -44,7 +44,7 @@ def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 def exact(image: Tensor, target: Tensor, weights: tuple[float, float], box: Box | None) -> tuple[Tensor, Tensor]:
-    """Value and gradient in float64."""
+    """Return value and gradient in float64."""
     image = image.double().requires_grad_()
     loss = photometric_loss_reference(image, target.double(), *weights, box)
     return loss.detach(), torch.autograd.grad(loss, image)[0]
@@ -99,7 +99,7 @@ def test_equal_pictures_lose_nothing():
 
 
 def test_ssim_follows_its_formula():
-    """One pixel by hand: a 2D window in one piece, statistics about the means."""
+    """SSIM follows its formula at one pixel by hand: a 2D window in one piece, and statistics about the means."""
     image, target = (picture.double() for picture in pair(30, 30))
     distances = torch.arange(11).double() - 5
     window = (-(distances[:, None] ** 2 + distances**2) / 4.5).exp()

@@ -1,4 +1,4 @@
-"""The table of docs/reproducibility.md: nothing where bytes are the same, and the right amount where they are not."""
+"""The table of docs/reproducibility.md shows no difference for equal bytes, and the right amount otherwise."""
 
 import importlib.util
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The native rasterizer against the float64 reference, forward and backward; the reference against differences."""
+"""The native rasterizer agrees with the float64 reference, forward and backward, and the reference with differences."""
 
 import os
 import subprocess
@@ -62,7 +62,7 @@ def test_counts(count: int, backend: Backend, monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_pixels_that_end_early(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Many opaque layers: transmittance runs out, and alpha is clamped at 0.999."""
+    """Pixels end early under many opaque layers, when transmittance runs out, and alpha is clamped at 0.999."""
     scene = random_scene(5, count=600, width=40, height=40)
     scene.gaussians.scales.mul_(4)
     scene.gaussians.opacities.clamp_(min=0.9).mul_(1.2).clamp_(max=1.0)
@@ -79,7 +79,7 @@ def test_splats_larger_than_the_picture(backend: Backend, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_needles(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Long and thin: the covariance's determinant cancels if it is computed carelessly."""
+    """Needles are drawn, although the covariance's determinant cancels if it is computed carelessly."""
     scene = random_scene(7, count=60, width=100, height=100)
     scene.gaussians.scales.copy_(torch.tensor([0.5, 1e-4, 1e-4]))
     assert_matches_reference(scene, monkeypatch, backend)
@@ -136,7 +136,7 @@ def test_reference_gradients_match_finite_differences() -> None:
 
 
 def test_the_environment_chooses_the_level() -> None:
-    """`MIEN_ISA` names one; what is not there is told with those that are."""
+    """`MIEN_ISA` chooses the instruction set. If it does not exist, the message lists those that do."""
     ask = [sys.executable, "-c", "from mien import _native; print(_native.rasterize_isa())"]
     for name in ISAS:
         if _native.set_rasterize_isa(name):

@@ -1,4 +1,4 @@
-"""What `rasterize` promises besides the right colours: batches, frames, edge cases and clear refusals."""
+"""`rasterize` keeps its contract besides the colours: batches, frames, edge cases and clear refusals."""
 
 import multiprocessing
 import sys
@@ -21,7 +21,7 @@ BACKENDS = ["native", "reference", GSPLAT]
 
 
 def one_gaussian(depth: float = 1.0, opacity: float = 0.8, scale: float = 0.02) -> Gaussians:
-    """An orange ball on the optical axis."""
+    """Return an orange ball on the optical axis."""
     return Gaussians(
         means=torch.tensor([[0.0, 0.0, float(depth)]]),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -256,7 +256,7 @@ def _render_in_child(queue: "multiprocessing.Queue[list[float]]") -> None:
 
 
 def test_a_forked_child_renders() -> None:
-    """Threads do not survive a fork; the pool must notice."""
+    """A forked child renders. Threads do not survive a fork, so the pool must notice it."""
     _native.set_thread_count(2)
     scene = random_scene(0)
     expected = rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist()

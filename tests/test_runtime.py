@@ -1,4 +1,4 @@
-"""Avatars without torch: the same pictures, no torch import, files that say when they are damaged."""
+"""Avatars without torch draw the same pictures, do not import torch, and report damaged files."""
 
 import json
 import subprocess
@@ -25,7 +25,7 @@ method = pytest.mark.parametrize("method", METHODS)
 
 
 def new_avatar(method: str, **config: object) -> Avatar:
-    """An avatar of the toy head whose parameters are all away from where they start."""
+    """Return an avatar of the toy head whose parameters all differ from their initial values."""
     face_model, sequence = toy_sequence(5, SIZE)
     torch.manual_seed(0)
     settings = replace(METHODS[method].config(), **config)  # type: ignore[arg-type]
@@ -138,7 +138,7 @@ def test_both_sides_have_the_same_classes() -> None:
 
 @pytest.mark.parametrize("seed", range(30))
 def test_damaged_files_are_told(seed: int, tmp_path: Path) -> None:
-    """Cut short or with a bit flipped anywhere: one line."""
+    """Files that are cut short, or have a bit flipped anywhere, are reported in one line."""
     path = tmp_path / "a.mien"
     export(new_avatar("gaussian_avatars"), path)
     random, content = np.random.default_rng(seed), bytearray(path.read_bytes())
@@ -155,7 +155,7 @@ def test_damaged_files_are_told(seed: int, tmp_path: Path) -> None:
 
 
 def test_files_with_other_content_are_told(tmp_path: Path) -> None:
-    """Written by someone else's program: the checksum is right, what is inside is not."""
+    """Files with other content are reported, although another program wrote a right checksum."""
     path = tmp_path / "a.mien"
     whole = export(new_avatar("gaussian_avatars"), path).portable
     bound = whole.baked

@@ -31,7 +31,7 @@ EVERYTHING: list[Any] = [*CONFIGS, TrainSettings(), RefillSettings((0.1, 0.2), (
 
 
 def numbers(settings: Any, path: str = "") -> Iterator[tuple[str, Any, Any, Any]]:
-    """Dotted name, owner, hint and value of every field that holds numbers."""
+    """Yield dotted name, owner, hint and value of every field that holds numbers."""
     hints = get_type_hints(type(settings), include_extras=True)
     for field in fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
@@ -42,7 +42,7 @@ def numbers(settings: Any, path: str = "") -> Iterator[tuple[str, Any, Any, Any]
 
 
 def changed(settings: Any, path: str, value: Any) -> Any:
-    """Settings with another value of a dotted name."""
+    """Return settings with another value of a dotted name."""
     name, _, rest = path.partition(".")
     return replace(settings, **{name: changed(getattr(settings, name), rest, value) if rest else value})
 

@@ -1,4 +1,4 @@
-"""Settings of methods and runs: by option, by file, in which order, and what is refused before any work."""
+"""Settings of methods and runs come from options and files in a known order, and wrong ones are refused before work."""
 
 import json
 from dataclasses import dataclass, fields, replace
@@ -30,7 +30,7 @@ Choices = tuple[MethodConfig, TrainSettings]
 
 @pytest.fixture
 def workspace(tmp_path: Path) -> Path:
-    """A tracked sequence, which `mien train` checks before any work."""
+    """Return a workspace with a tracked sequence, which `mien train` checks before any work."""
     for name in ("capture/capture.json", "tracking/tracking.json"):
         path = tmp_path / "w" / "sequences" / "clip" / name
         path.parent.mkdir(parents=True)
@@ -40,7 +40,7 @@ def workspace(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def choices(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The settings that `mien train` uses with some options."""
+    """Return a function that gives the settings that `mien train` uses with some options."""
     asked: list[Choices] = []
 
     def remember(workspace: object, names: object, run: object, method: MethodConfig, settings: TrainSettings) -> None:
@@ -60,7 +60,7 @@ def choices(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def complaint(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
-    """The one line about a command that must fail by the user's mistake."""
+    """Run a command that must fail by the user's mistake, and return its one line."""
     assert main(words) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
     return line
@@ -334,7 +334,7 @@ def test_presets_are_the_same_for_all_methods() -> None:
 
 @dataclass(frozen=True)
 class Dust:
-    """How dust settles."""
+    """Settings of dust."""
 
     grains: Annotated[int, Range(1, 10)] = 3
     """Number of grains."""
@@ -349,7 +349,7 @@ class ToyConfig(MethodConfig):
     shines: bool = False
     """Whether the toy shines."""
     dust: Dust = Dust()
-    """How dust settles on it."""
+    """Settings of the dust on the toy."""
 
 
 def test_settings_of_an_added_method_appear_by_themselves(

@@ -1,4 +1,4 @@
-"""Synthetic captures: the same bytes from the same seed, and a truth that is true."""
+"""Synthetic captures have the same bytes for the same seed, and their truth is true."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def plain():
 
 
 def test_heads_are_posed_as_the_face_model_poses_them(scene):
-    """The same vertices, normals and landmarks as by matrix products and by the native core, to a micrometre."""
+    """Heads are posed as the face model poses them: vertices, normals and landmarks agree to a micrometre."""
     face = replace(scene.face[3], joints=scene.face[3].joints + 0.2)
     found = HeadPoser(scene.model, scene.identity)(face)
     for expected in (scene.model.head_vertices(face)[0], scene.model.head_vertices_reference(face)[0]):
@@ -91,7 +91,7 @@ def test_capture_and_truth_keep_their_contracts(monkeypatch):
 
 
 def test_landmarks_are_the_projected_mesh(plain):
-    """Pictures and parameters agree: irises are dark or coloured where the truth puts them, beside white."""
+    """Landmarks are those of the projected mesh: irises are dark or coloured at the true place, beside white."""
     open_eyed = int((plain.face.expression[:, plain.model.expression_names.index("eyeBlinkLeft")] < 0.05).nonzero()[0])
     big = SyntheticScene(replace(PLAIN, width=512, height=512), seed=3)
     image, marks = big.frame(open_eyed).image.astype(float), big.landmarks()[open_eyed]
@@ -109,7 +109,7 @@ def test_landmarks_are_the_projected_mesh(plain):
 
 
 def test_matte_is_the_coverage(scene):
-    """Where the matte is 0 the wall is seen unchanged; where it is 255 no wall is."""
+    """The matte is the coverage: the wall is unchanged where it is 0, and invisible where it is 255."""
     frame = scene.frame(3)
     darker = SyntheticScene(SMALL, seed=3)
     darker.__dict__["subject"] = scene.subject  # the same person, not built again
@@ -130,7 +130,7 @@ def test_the_face_model_lies_inside_the_matte(scene):
 
 
 def test_hair_and_glasses_are_not_the_face_models(scene, plain):
-    """They cover pixels that the same head without them leaves free."""
+    """Hair and glasses cover pixels that the same head without them leaves free."""
     assert (scene.frame(0).matte.astype(int) - plain.frame(0).matte).clip(0).sum() > 255 * 300
     assert torch.equal(scene.vertices(0), plain.vertices(0))
 
@@ -175,7 +175,7 @@ def test_video_is_written_frame_by_frame(tmp_path, scene):
 
 
 def test_a_detector_finds_the_face():
-    """MediaPipe, which has only seen people, finds the head in every frame, and its landmarks where the truth is."""
+    """MediaPipe, which was trained on people, finds the head in every frame, and its landmarks near the truth."""
     mediapipe = pytest.importorskip("mediapipe")
     clip = SyntheticScene(replace(RECIPES["demo"], width=384, height=384, fps=1.0, texture_size=512), seed=1)
     truth = clip.landmarks()

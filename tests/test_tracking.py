@@ -1,4 +1,4 @@
-"""Tracking recovers what was projected: pose, expression, eyes; smooth without lag; gaps and bad input handled."""
+"""Tracking recovers the projected pose, expression and eyes, smooth without lag, also with gaps and bad input."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def test_recovers_the_truth(tracked):
 
 
 def test_a_few_landmarks_will_do():
-    """300-W's without their contour, and irises: what the others show does not count."""
+    """A few landmarks are enough: 300-W's without their contour, and the irises."""
     case = make_tracking_case(timesteps=20)
     settings = replace(KNOWN_FOCAL, landmarks="ibug51")
     counted = landmark_weights("ibug51") > 0
@@ -100,7 +100,7 @@ def test_expression_stays_in_bounds():
 
 
 def _still_then_turn(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """True yaw, tracked yaw and tracked landmarks (metres) of a head that keeps still, then turns 0.4 rad in 0.3 s."""
+    """Return true yaw, tracked yaw and tracked landmarks (metres) of a head that rests, then turns 0.4 rad in 0.3 s."""
     case = make_tracking_case(timesteps=50, noise=0)
     face = case.face[0]
     yaw = 0.2 * torch.tanh((torch.arange(50, dtype=torch.float64) - 33) / 2.0)
@@ -192,7 +192,7 @@ def test_report_flags_a_bad_frame(tracked):
 
 
 def test_anny_lips_and_lids_part():
-    """The embedding tells upper from lower lip and lid, without which no mouth would open in a tracking."""
+    """The embedding tells the upper from the lower lip and lid. Otherwise no mouth would open in a tracking."""
     model = load_face_model("anny")
     face = model.neutral(3)
     expression = face.expression.clone()
@@ -210,7 +210,7 @@ def test_anny_lips_and_lids_part():
 
 
 def test_settings_that_a_schedule_does_not_use_do_not_count():
-    """A tracking by pixels is current whatever was asked of the other schedule."""
+    """Settings that a schedule does not use do not count: a tracking by pixels stays current if others change."""
     paper, sizes = PaperSettings(epochs=2), PhotometricSettings(sizes=(64,))
     asked = TrackingSettings(paper=paper, photometric=sizes)
     assert asked.in_effect() == TrackingSettings(photometric=sizes)

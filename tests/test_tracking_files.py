@@ -1,4 +1,4 @@
-"""Trackings and scoring masks on disk: round trips, damage, and that a scoring mask never changes."""
+"""Trackings and scoring masks survive round trips, report damage, and a scoring mask never changes."""
 
 import hashlib
 import json
@@ -80,7 +80,7 @@ def test_round_trip(tmp_path, offsets):
 
 
 def _rewrite(folder, change) -> None:
-    """Change the tensors and keep the json in step: what is then found wrong is the content, not the hash."""
+    """Change the tensors and keep the json in step, so that the content is found to be wrong, not the hash."""
     import hashlib
 
     file = folder / "tracking.safetensors"
@@ -184,7 +184,7 @@ def test_scoring_of_other_pictures_is_refused(tmp_path):
 
 
 def test_the_hash_of_a_scoring_is_over_masks_and_crops(tmp_path):
-    """Figures of other runs name it, so that it must not change."""
+    """The hash of a scoring covers masks and crops. Figures of other runs name it, so it must not change."""
     write_scoring(tmp_path / "s", _scoring())
     digest = hashlib.sha256(_scoring().masks.tobytes() + _scoring().crops.astype(np.int32).tobytes()).hexdigest()
     assert read_scoring_hash(tmp_path / "s") == digest

@@ -1,4 +1,4 @@
-"""The parts of tracking: derivatives, solvers, weights, gaps."""
+"""The parts of tracking are right: derivatives, solvers, weights, gaps."""
 
 from dataclasses import replace
 

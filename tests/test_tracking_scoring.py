@@ -1,4 +1,4 @@
-"""The neck line and the scoring mask: what stays of a picture, and what goes."""
+"""The neck line and the scoring mask decide which parts of a picture are scored."""
 
 from dataclasses import replace
 

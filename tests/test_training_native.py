@@ -1,4 +1,4 @@
-"""The native parts of a training step against their plain PyTorch twins."""
+"""The native parts of a training step agree with their plain PyTorch twins."""
 
 from collections.abc import Iterator
 
@@ -22,7 +22,7 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
-    """Standard normal numbers."""
+    """Return standard normal numbers."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 

@@ -1,4 +1,4 @@
-"""Splits, frame order, targets, the optimiser and the face track."""
+"""Splits, frame order, targets, the optimiser and the face track do their parts of training."""
 
 from dataclasses import replace
 

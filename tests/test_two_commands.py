@@ -1,4 +1,4 @@
-"""Two commands on one workspace: one works, and the other says whom it waits for, also when both start at once."""
+"""One of two commands on a workspace works, and the other names it, even if both start at once."""
 
 import json
 import os
@@ -26,7 +26,7 @@ def other() -> Iterator[Holder]:
 
 @pytest.fixture
 def mortal() -> Iterator[Holder]:
-    """For a test that kills it."""
+    """Return a process that holds locks, for a test that kills it."""
     holder = Holder()
     yield holder
     holder.kill()
@@ -42,7 +42,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def studio(cache: Path, both: Pair, tmp_path_factory: pytest.TempPathFactory) -> Studio:
-    """Captured, tracked, with a run that was trained and evaluated without anybody beside."""
+    """Return a workspace with a run that was trained and evaluated alone."""
     made = toy_studio(tmp_path_factory.mktemp("studio") / "it", cache)
     assert main(["create", str(made.video), "--out", str(made.root), "--run", "alone", *made.look]) == 0
     return made
@@ -50,13 +50,13 @@ def studio(cache: Path, both: Pair, tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.fixture(scope="module")
 def both(cache: Path) -> Iterator[Pair]:
-    """Begun before anything else, since they import for some seconds."""
+    """Start two processes before anything else, since their imports take some seconds."""
     with pair(cache) as processes:
         yield processes
 
 
 def commands_that_write(studio: Studio, folder: Path) -> dict[str, tuple[Path, list[str]]]:
-    """Place that a command writes, and the command."""
+    """Return commands by name, each with the place that it writes."""
     root, video, runs = studio.root, str(studio.video), studio.root / "runs"
     clip = studio.root / "sequences" / "clip"
     return {
@@ -154,7 +154,7 @@ def test_the_command_after_a_kill_goes_on_at_once(
 
 
 def assert_same_run(studio: Studio, name: str) -> None:
-    """The run has the bytes of the one that was trained alone."""
+    """Check that the run has the bytes of the one that was trained alone."""
     alone, run = studio.root / "runs" / "alone", studio.root / "runs" / name
     for file in ("avatar/avatar.safetensors", "avatar/avatar.json", "face_track.safetensors"):
         assert (run / file).read_bytes() == (alone / file).read_bytes(), f"{name}: {file} differs"
@@ -163,7 +163,7 @@ def assert_same_run(studio: Studio, name: str) -> None:
 
 
 def assert_apart(outcomes: list[Outcome], name: str) -> bool:
-    """Nobody worked while the other did; who was told was told whom to wait for. Whether somebody was."""
+    """Check that only one command worked at a time, and that the other named it. Return whether one had to."""
     intervals = sorted((began, ended, what) for one in outcomes for what, began, ended in one.worked)
     for before, after in zip(intervals, intervals[1:], strict=False):
         assert before[1] <= after[0], f"{name}: {before[2]} and {after[2]} at once"
@@ -202,7 +202,7 @@ def test_two_captures_of_one_video(studio: Studio, both: Pair, tmp_path: Path) -
 
 
 def test_create_beside_evaluate(studio: Studio, both: Pair) -> None:
-    """On a finished run without figures; every third round on one that `create` has to train first."""
+    """`create` beside `evaluate` works on a finished run without figures, and on a run that has to be trained first."""
     runs, told, figures = studio.root / "runs", 0, []
     for index in range(ROUNDS):
         name, run = f"e{index}", runs / f"e{index}"

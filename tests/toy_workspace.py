@@ -1,4 +1,4 @@
-"""A workspace on disk around the toy head: one sequence, one run."""
+"""Write a workspace around the toy head to disk: one sequence, one run."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,7 @@ from toy_scene import toy_sequence
 
 
 def write_toy_workspace(root: Path, timesteps: int = 5) -> None:
-    """`root/sequences/clip` and `root/runs/toy`, as `mien create` would leave them; the last fifth is held out."""
+    """Write `root/sequences/clip` and `root/runs/toy` as `mien create` leaves them. The last fifth is held out."""
     face_model, sequence = toy_sequence(timesteps, 32)
     folder = root / "sequences" / "clip"
     write_capture(folder / "capture", sequence.capture)

@@ -188,7 +188,7 @@ def make_material_aside(material: Path) -> None:
 
 
 def _aside(work: Callable[[], Any]) -> Any:
-    """Run `work` in another process and return its result. This process stays without threads, so that it forks safely."""
+    """Run `work` in another process and return its result. This process starts no threads, so that it forks safely."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:

@@ -41,7 +41,7 @@ class Place:
 
 
 def faulty_file(place: Place, dice: Random) -> str:
-    """Damage a file without repair, replace it by something else, or make a fault of its format with correct checksums."""
+    """Damage a file, put something else in its place, or make a fault of its format with correct checksums."""
     chance = dice.random()
     if chance < 0.12:
         place.file.write_bytes(flip_or_cut(place.file.read_bytes(), dice))

@@ -111,7 +111,7 @@ TARGETS = {target.name: target for target in _all()}
 
 
 def spread(total: int, names: list[str] | None = None) -> list[tuple[str, int]]:
-    """Divide cases among the targets by their weights. Names and numbers are mixed, so that any part holds all targets."""
+    """Divide cases among the targets by their weights. They are mixed, so that any part of them holds all targets."""
     chosen = [TARGETS[name] for name in names] if names else list(TARGETS.values())
     share = total / sum(target.weight for target in chosen)
     places = []

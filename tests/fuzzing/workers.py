@@ -28,7 +28,7 @@ _GROWN = 400.0
 def run_cases(
     cases: list[str], folder: Path, material: Path, until: float | None = None, **limits: float
 ) -> Iterator[Result]:
-    """Yield results in order. No case starts after `until`, a time of `time.monotonic`; `limits` are those of `Bench`."""
+    """Yield results in order. No case starts after `until` (`time.monotonic`); `limits` are those of `Bench`."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen(64)
