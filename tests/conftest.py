@@ -41,7 +41,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if item.get_closest_marker("gpu") and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason=NO_GPU))
     if hasattr(config, "workerinput"):
-        # Workers take whole files in this order: what is long comes first, so that all of them end at about one time.
+        # Workers take whole files in this order. Long ones come first, so that all workers end at about the same time.
         slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
         items.sort(key=lambda item: -slow[item.path])
 

@@ -21,7 +21,7 @@ def flip_or_cut(data: bytes, dice: random.Random) -> bytes:
     if kind == "cut":
         return data[: dice.randrange(len(data))]
     changed = bytearray(data)
-    # Headers are where a reader can go astray, so half of the damage goes there.
+    # Readers fail most easily on headers, so half of the damage is there.
     start = dice.randrange(min(len(data), 256) if dice.random() < 0.5 else len(data)) if data else 0
     if kind == "bit":
         changed[start] ^= 1 << dice.randrange(8)

@@ -63,7 +63,7 @@ def _paint(avatar: GaussianAvatars) -> None:
     rgb = (middle / middle.abs().max() * 0.5 + 0.5).clamp(0.05, 0.95)
     with torch.no_grad():
         store["opacity_logits"].fill_(4.0)
-        # Thin along the triangle's normal, so that the outline is the mesh's.
+        # Gaussians are thin along the triangle's normal, so that the outline is the mesh's.
         store["log_scales"].copy_(torch.tensor([-1.1, -4.0, -1.1]))
         store["sh_constant"].copy_(sh_from_rgb(rgb)[:, None])
 

@@ -31,7 +31,7 @@ def flame_like(anny: FaceModel) -> dict[str, np.ndarray]:
     posedirs[1, 2, 1] = residual / np.sin(angle)
     eyes = anny.pose_basis.double().numpy().reshape(3, 3, 3, -1, 3)[1:, :, :, order]  # type: ignore[union-attr]
     posedirs[2:] = eyes
-    # A neck that twists its skin a little, so that a transposed rotation shows.
+    # The neck twists its skin a little, so that a transposed rotation is noticed.
     posedirs[0, 0, 2] = 0.01 * weights[:, :1] * weights[:, 1:2] * np.array([1.0, 0.3, 0.2])
     expression = _expression_basis(anny, order)
     identity = anny.identity_basis.double().numpy()[:IDENTITIES, order]
@@ -125,7 +125,7 @@ def _joints(anny: FaceModel, order: np.ndarray, template: np.ndarray) -> tuple[n
     rigid = (template - hinge) @ (opened - np.eye(3)).T
     moved = anny.expression_basis[_jaw_open(anny)].double().numpy()[order]
     jaw = np.clip((moved * rigid).sum(1) / np.maximum((rigid * rigid).sum(1), 1e-9), 0, 1)
-    jaw *= theirs[:, 0]  # neck and eyes stay theirs
+    jaw *= theirs[:, 0]  # neck and eyes keep their weights
     weights = np.stack([theirs[:, 1], theirs[:, 0] - jaw, jaw, theirs[:, 3], theirs[:, 4]], axis=1)
     return weights, jaw, hinge, (moved - jaw[:, None] * rigid) * (theirs[:, 0] > 0.999)[:, None]
 
@@ -174,7 +174,7 @@ def posed_as_flame(
     posed = shaped + arrays["posedirs"].astype(np.float64) @ (turns[1:] - np.eye(3)).ravel()
     chain: list[tuple[np.ndarray, np.ndarray]] = []
     for joint, parent in enumerate((-1, 0, 1, 1, 1)):
-        # x -> R x + t, about the joint, then what the parent does.
+        # x -> R x + t, about the joint, then the parent's motion.
         rotation, offset = turns[joint], joints[joint] - turns[joint] @ joints[joint]
         if parent >= 0:
             above, beside = chain[parent]

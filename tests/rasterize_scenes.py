@@ -111,11 +111,11 @@ def gradients(
     loss(rendering).backward()
     found = {}
     for name, tensor in [*tensors.items(), ("means2d", rendering.means2d_offset)]:
-        if name == "K" and backend == "gsplat":  # has no gradient of the intrinsics
+        if name == "K" and backend == "gsplat":  # gsplat has no gradient of the intrinsics
             continue
         assert tensor.grad is not None, name
         found[name] = tensor.grad.cpu()
-    # What no back end reads: the last row of transforms, the constant entries of K.
+    # No back end reads the last row of transforms or the constant entries of K.
     found["T_world_local"][3] = found["viewmat"][3] = 0
     if "K" in found:
         found["K"][2] = found["K"][0, 1] = found["K"][1, 0] = 0
@@ -154,7 +154,7 @@ def assert_matches_reference(scene: Scene, monkeypatch: pytest.MonkeyPatch, back
     assert torch.equal(found.radii > 0, expected.radii > 0)
     assert ((found.radii - expected.radii).abs() <= 1).all()  # rounded up from 3 sigma
     errors = {name: relative_error(value, expected_gradients[name]) for name, value in found_gradients.items()}
-    # What shines through is 1 - alpha: float32 rounds that to 1e-7, however little it is.
+    # The transmittance is 1 - alpha, which float32 rounds to 1e-7, however small it is.
     errors["background"] = min(
         errors["background"],
         float((found_gradients["background"] - expected_gradients["background"]).abs().max()) * 1e2,

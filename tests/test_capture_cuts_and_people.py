@@ -55,7 +55,7 @@ def test_each_long_shot_becomes_a_sequence(shots, tmp_path, capsys, monkeypatch)
     assert second.timestamps[0] == 0
     assert (first.source["first_frame"], second.source["first_frame"]) == (0, 38)
     assert first.source["crop"] != second.source["crop"]
-    # Whatever would work again, is not called.
+    # Functions that would work again are not called.
     monkeypatch.setattr("mien.capture.from_video.survey_source", None)
     assert capture_stage(workspace, shots, None, settings) == ["clip-1", "clip-2"]
 

@@ -70,7 +70,7 @@ def test_face_is_foreground_and_corners_are_not(face_capture):
 def test_captured_again_it_is_read_back(face_clip, face_capture, monkeypatch):
     path, capture = face_capture
     before = tree_bytes(path)
-    monkeypatch.setattr("mien.capture.from_video.survey_source", None)  # any work would call it
+    monkeypatch.setattr("mien.capture.from_video.survey_source", None)  # any work would call this function
     assert_same_capture(capture, capture_video(face_clip[0], path, CaptureSettings(size=200)))
     assert tree_bytes(path) == before
 
@@ -185,7 +185,7 @@ def test_a_video_that_lies_on_its_side_is_told_and_turned(test_data, tmp_path, c
     upright = [np.pad(face_picture(test_data, 160), ((20, 20), (60, 60), (0, 0)), mode="edge")] * 6
     path = tmp_path / "lying.mp4"
     write_video(path, iter([np.ascontiguousarray(np.rot90(picture, turn // 90)) for picture in upright]), 25, crf=8)
-    with suppress(UserError):  # of a face on its side, landmarks may or may not be found
+    with suppress(UserError):  # a face on its side may or may not be detected
         capture_video(path, tmp_path / "capture")
     assert f"the face seems to lie {lies}; if it does, add --capture.turn {turn}" in capsys.readouterr().err
     capture = capture_video(path, tmp_path / "turned", CaptureSettings(turn=turn, crop="none"))

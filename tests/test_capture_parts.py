@@ -80,8 +80,8 @@ def test_guided_filter_steps_where_the_picture_does():
     filtered = guided_filter(guide, soft, radius=8, epsilon=1e-4)
     steps = np.diff(filtered, axis=1)[8:-8]
     assert (steps.argmax(axis=1) == 39).all()
-    assert steps.max(axis=1).min() > 0.4  # 0.1 in what was put in
-    # Where the values follow the guide exactly, they pass unchanged.
+    assert steps.max(axis=1).min() > 0.4  # the input deviates by 0.1
+    # Values that follow the guide exactly pass unchanged.
     linear = guide @ np.array([0.3, 0.2, 0.1], np.float32)
     np.testing.assert_allclose(guided_filter(guide, linear, 8, 1e-4)[:, 44:], linear[:, 44:], atol=5e-3)
 

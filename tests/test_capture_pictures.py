@@ -192,6 +192,6 @@ def test_a_clip_of_a_telephone_is_captured(test_data, tmp_path, capsys):
     assert capture.images.shape == (8, 1, *upright.shape)
     assert capture.valid.all()
     np.testing.assert_allclose(capture.timestamps, np.array(ticks) / 600, atol=1e-4)
-    # Highlights are pressed together; below, colours come back.
+    # Highlights are compressed; darker colours are restored.
     ordinary = upright.max(axis=-1) < 200
     assert np.abs(capture.images[4, 0].astype(int) - upright)[ordinary].mean() < 3

@@ -114,7 +114,7 @@ def test_three_scenes_become_three_sequences(
         assert capture.timesteps == 11
         assert capture.valid.all()
         assert (capture.source["first_frame"], capture.timestamps[0]) == (11 * part, 0)
-        # No picture of the scene beside it: the corners of the crop show this scene's wall alone.
+        # No picture belongs to the next scene: the corners of the crop show only this scene's wall.
         corners = capture.images[:, 0, 2:8, 2:8].reshape(11, -1)
         assert np.ptp(np.median(corners, axis=1)) < 6
         assert np.nanmax(misses(folder / "capture", truth[11 * part : 11 * (part + 1)])) < 5
@@ -123,7 +123,7 @@ def test_three_scenes_become_three_sequences(
 @pytest.mark.slow
 def test_a_clip_with_cuts_becomes_an_avatar(three_scenes: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     arguments = ["create", str(three_scenes[0]), "--out", str(tmp_path / "out"), "--capture.size", "128"]
-    # Scenes tracked together by their pixels lie in test_subject_commands.
+    # test_subject_commands tracks several scenes together by their pixels.
     arguments += ["--tracking.schedule", "landmarks", "--tracking.keyframes", "6"]
     assert main([*arguments, "--steps", "20", "--preset", "draft", "--hold-out", "scenes-2"]) == 0
     run = tmp_path / "out/runs/gaussian_avatars"

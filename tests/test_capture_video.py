@@ -14,7 +14,7 @@ def test_written_frames_are_read_back(tmp_path):
     pictures = write_gradient_video(path, frames=5, width=64, height=48, fps=29.97)
     times, frames = zip(*read_video_frames(path), strict=True)
     np.testing.assert_allclose(times, np.arange(5) / 29.97, atol=1e-9)
-    # Chroma has half the resolution: a mean of two levels is what a smooth picture loses.
+    # Chroma has half the resolution, which costs a smooth picture about two levels on average.
     assert np.abs(np.stack(frames).astype(int) - pictures).mean() < 2
     info = probe_video(path)
     assert info.frames == 5

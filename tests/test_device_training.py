@@ -82,7 +82,7 @@ def test_plain_pytorch_trains_as_the_native_core_does(scene: Scene, request: pyt
     plain = train_some(scene, torch.zeros((), dtype=torch.float64))
     assert plain.avatar.gaussian_store()["means"].dtype == torch.float64
     assert plain.curves["gaussians"] == native.curves["gaussians"]
-    assert len(set(native.curves["gaussians"])) > 1  # density control was at work
+    assert len(set(native.curves["gaussians"])) > 1  # density control has run
     assert_alike(plain, native)
     assert native.curves["loss"][-1] < native.curves["loss"][0]
 
@@ -124,7 +124,7 @@ def test_a_gpu_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 def test_a_run_goes_on_elsewhere(scene: Scene, tmp_path: Path, no_gpu: None) -> None:
     face_model, sequence = scene
     train([sequence], face_model, train_toy.CONFIG, replace(SETTINGS, device="auto"), tmp_path / "run", no_bar)
-    # The run is finished: with another device it is the same run, and is only loaded.
+    # The run is finished. On another device it is the same run, and is only loaded.
     again = train([sequence], face_model, train_toy.CONFIG, SETTINGS, tmp_path / "run", no_bar)
     assert len(again.gaussian_store()) > 0
 

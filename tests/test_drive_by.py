@@ -62,7 +62,7 @@ def test_a_video_with_cuts_drives_part_after_part(video: Path) -> None:
     torch.testing.assert_close(driver.face.head_rotation[:, 0], 0.01 * torch.tensor(numbers))
     assert driver.pictures is not None
     assert [int(driver.pictures(index)[0, 0, 0]) for index in range(9)] == [10 * number for number in numbers]
-    # One person at rest for all parts: where the head mostly is.
+    # All parts share one neutral face, with the head where it mostly is.
     assert float(driver.at_rest.head_rotation[0, 0]) == pytest.approx(0.02)
 
 

@@ -55,7 +55,7 @@ def test_the_collar_has_no_steps(model):
     edge = bottom_vertices(model)
     points = model.template[edge]
     distance = torch.cdist(points, points).fill_diagonal_(torch.inf)
-    # Each vertex lies between its two neighbours: a step would be a corner.
+    # Each vertex lies between its two neighbours. A step would be a corner.
     first, second = (points[index] for index in distance.topk(2, largest=False).indices.T)
     straightness = torch.nn.functional.cosine_similarity(first - points, second - points, dim=1)
     assert straightness.max() < -0.9

@@ -200,13 +200,13 @@ def test_an_archive_with_objects_is_refused(arrays, tmp_path):
 def test_regions_by_landmarks_are_about_the_true_ones(model):
     found, truth = with_regions_by_landmarks(model), true_regions(load_face_model("anny"))
     names = np.array(found.region_names)[found.face_regions.numpy()]
-    # Many of what has clear borders; the others only have to be there.
+    # Regions with clear borders have many triangles; the others only have to exist.
     bounds = {"lips": 0.7, "eyes": 0.9, "ears": 0.8, "neck": 0.8, "eye_sockets": 0.8, "eyelids": 0.6, "mouth": 0.5,
               "scalp": 0.6, "nose": 0.5, "brows": 0.15, "irises": 0.5, "skin": 0.55}  # fmt: skip
     for name, bound in bounds.items():
         here, there = names == name, truth == name
         assert (here & there).sum() >= bound * (here | there).sum(), name
-    # No part of what a fit to pixels looks at is inside of the mouth or behind the eyes.
+    # A fit to pixels uses nothing inside of the mouth or behind the eyes.
     assert not np.isin(names[np.isin(truth, ["eye_sockets"])], ["skin", "lips"]).any()
 
 

@@ -64,7 +64,7 @@ def test_a_pickle_takes_no_more_than_its_own_size(name: str, tmp_path: Path, mon
     path = tmp_path / "a.pkl"
     path.write_bytes(PICKLES[name])
     if len(PICKLES[name]) > 10_000:
-        # What the checks of types cost for each opcode is not what is tested.
+        # The cost of the type checks for each opcode is not tested.
         monkeypatch.setattr(inert_pickle, "_MAX_OPCODES", 2_000)
     refused(path, r"is not a pickle, or is damaged|has no 'v_template'|not named arrays")
 

@@ -215,7 +215,7 @@ def test_a_file_system_without_locks_is_warned_of_once(
 @pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES])
 def test_a_place_that_cannot_be_written(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     original = os.open
-    lock_file(tmp_path / "theirs").touch()  # another user's, left by a kill
+    lock_file(tmp_path / "theirs").touch()  # left by another user's killed process
 
     def read_only(path: Any, flags: int, *rest: Any) -> int:
         if flags & (os.O_CREAT | os.O_RDWR):

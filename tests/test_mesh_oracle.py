@@ -76,7 +76,7 @@ def test_gradients_of_a_head_agree_with_deodr(colored: bool):
     assert np.abs(drawn.detach().numpy() - expected_image).mean() < 0.01
     by_points = torch.autograd.grad((drawn * smooth_weights()).sum(), points)[0]
     by_pixel = (by_points[:, :2] * points.detach()[:, 2:]).double().numpy()
-    # The other scheme blends every outline over the pixel outside of it: pictures differ there, gradients a little.
+    # The other scheme blends every outline over the pixel outside of it. Pictures differ there, and gradients a little.
     assert (by_pixel * expected).sum() / np.linalg.norm(by_pixel) / np.linalg.norm(expected) > 0.95
     if not colored:
         x, y = ((points.detach()[:, :2] / points.detach()[:, 2:]).double().numpy() - SIZE / 2).T / SIZE

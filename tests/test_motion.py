@@ -85,7 +85,7 @@ def test_angles_have_the_signs_of_real_takes(tmp_path: Path) -> None:
             angles |= {f"{side}Eye{name}": value for name, value in zip(("Yaw", "Pitch", "Roll"), turns, strict=True)}
         by_looks = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", **looks))).eyes[0]
         by_angles = read_live_link_face(write_csv(tmp_path / "b.csv", row("0:0:0:0", **angles))).eyes[0]
-        # Where the eyes are straight ahead is a matter of calibration: up to 7 degrees on these takes.
+        # The calibration decides where the eyes look straight ahead. On these takes it differs by up to 7 degrees.
         assert np.abs(by_looks - by_angles).max() < math.radians(9)
         # A gaze up and to the side has hardly any torsion, once its roll is taken the right way.
         assert np.abs(by_angles[:, 2]).max() < 0.12
@@ -195,7 +195,7 @@ def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
     up = torch.tensor([-math.radians(30), 0, 0])
     for joint in ("left_eye", "right_eye"):
         torch.testing.assert_close(driven.joints[0, model.free_joint_names.index(joint)], up, atol=1e-5, rtol=0)
-    # The head is at rest where it mostly is: the middle of the turn, which goes to the right.
+    # The head's rest pose is where it mostly is: the middle of the turn, which goes to the right.
     torch.testing.assert_close(driven.head_rotation[:, 1], torch.tensor([0.1, 0, -0.1]), atol=1e-5, rtol=0)
     torch.testing.assert_close(driven.head_translation, rest.head_translation.expand(3, -1))
     with pytest.raises(UserError, match="none of ARKit's"):

@@ -60,7 +60,7 @@ def test_it_says_how_it_was_made(by_descent):
 
 
 def test_the_same_with_any_number_of_threads(case, monkeypatch):
-    monkeypatch.setattr(paper_descent, "_BATCHES", 2)  # so that a batch has several frames
+    monkeypatch.setattr(paper_descent, "_BATCHES", 2)  # this way a batch has several frames
     short, runs = replace(QUICK, epochs=1), []
     for threads in ("1", "2"):
         monkeypatch.setenv("MIEN_THREADS", threads)

@@ -62,7 +62,7 @@ def test_value_and_gradient_equal_the_float64_reference(
     (3 * loss).backward()
     assert image.grad is not None
     torch.testing.assert_close(loss.detach().double(), value, atol=1e-6, rtol=1e-6)
-    # In the white part float32 leaves about 1e-4 of the variances' floor C2; PyTorch's own float32 does no better.
+    # In the white part float32 errs by about 1e-4 of the variances' floor C2. PyTorch's own float32 is no better.
     assert relative_error(image.grad, 3 * gradient) < 5e-5
     with torch.no_grad():
         assert photometric_loss(image, target, *weights, box) == loss

@@ -73,7 +73,7 @@ def test_the_same_bytes_in_odd_places(
     assert "working in" in run_python(arguments, environment, place)
     found = hashes(place)
     if environment is PLACES[NO_UTF8]:
-        # Where names are not UTF-8, a sequence gets "_" for what the locale lacks; its content stays.
+        # If names are not UTF-8, a sequence's name gets "_" for what the locale lacks. Its content is the same.
         found = {name.replace("Frau M__ller", "Frau Müller"): digest for name, digest in found.items()}
     assert found == plain
 

@@ -70,7 +70,7 @@ def test_local_frame_moves_the_camera(backend: Backend) -> None:
     pose = scene.gaussians.T_world_local
     assert pose is not None
     local = replace(scene.gaussians, T_world_local=None)
-    moved = scene.camera.in_frame(pose)  # not by `@`, which adds up in another order on another processor
+    moved = scene.camera.in_frame(pose)  # not `@`, which adds in another order on another processor
     expected = rasterize(local, moved, scene.background, backend)
     found = rasterize(scene.gaussians, scene.camera, scene.background, backend)
     assert torch.equal(found.image, expected.image)
@@ -191,7 +191,7 @@ def test_extremes_stay_finite(backend: Backend, change: dict[str, torch.Tensor])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
 def test_what_is_not_finite_is_named(backend: Backend, name: str, value: float) -> None:
     gaussians = random_scene(3, count=40).gaussians
-    gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view: the native kernel reads colours of no other
+    gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view, since the kernel reads no other colours
     gaussians.opacities[17] = 0.5
     getattr(gaussians, name).view(40, -1)[17, -1] = value
     with pytest.raises(ValueError, match=rf"{name}\[17.* is -?(nan|inf)"):
@@ -251,7 +251,7 @@ def test_a_clamped_alpha_has_no_gradient(backend: Backend) -> None:
 
 
 def _render_in_child(queue: "multiprocessing.Queue[list[float]]") -> None:
-    _native.set_thread_count(3)  # joins the threads of the pool before: hangs if that is still the parent's
+    _native.set_thread_count(3)  # joins the threads of the old pool, and hangs if that is still the parent's
     queue.put(rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist())
 
 

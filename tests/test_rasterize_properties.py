@@ -105,7 +105,7 @@ def test_view_directions_carry_gradients(coefficients: int) -> None:
     assert pose is not None
     T_local_camera = torch.linalg.inv(scene.camera.viewmat @ pose)
     gaussians.means.copy_(T_local_camera[:3, 3] + 0.5 * T_local_camera[:3, 2])
-    gaussians.scales.fill_(5.0)  # the picture is flat: what is left of the gradient is the colour's
+    gaussians.scales.fill_(5.0)  # the picture is flat, so only the colour contributes to the gradient
     gaussians.opacities.fill_(0.9)
     _, expected = gradients(scene.to(torch.float64), "reference", lambda r: r.image[4, 4].sum())
     _, found = gradients(scene, "native", lambda r: r.image[4, 4].sum())

@@ -61,7 +61,7 @@ def test_pictures_equal_those_of_training(method: str, tmp_path: Path) -> None:
         expected = rasterize(gaussians, camera, torch.ones(3))
         image, alpha = portable.render(pose_as(portable, face), portable.camera)
         assert expected.image.numpy().std() > 0.05
-        # Contributions of just 1/255 come or go where networks round differently (test_runtime_equality.py).
+        # Contributions of just 1/255 come or go if networks round differently (test_runtime_equality.py).
         most, share = (0.0, 0.0) if method == "gaussian_avatars" else (1 / 255, 1e-3)
         for found, truth in ((image, expected.image.numpy()), (alpha[..., None], expected.alpha.numpy()[..., None])):
             difference = np.abs(found - truth).max(-1)

@@ -102,7 +102,7 @@ def test_every_pixel_equals_that_of_training(config: GaussianAvatarsConfig, tmp_
     assert (expected.image[0] - expected.image[1]).abs().mean() > 0.02
     for name, picture in (("image", expected.image.numpy()), ("alpha", expected.alpha.numpy())):
         assert np.abs(found[name] - picture).max() <= EQUAL
-        # And more than was promised: both sides run the same operations, so they round alike.
+        # Both sides even run the same operations, so they round alike.
         assert found[name].tobytes() == picture.tobytes()
 
 
@@ -137,7 +137,7 @@ def test_networks_may_round_differently_and_nothing_more(method: str) -> None:
             if name == "quats":
                 found, expected = (q / np.linalg.norm(q, axis=-1, keepdims=True) for q in (found, expected))
             assert np.abs(found - expected).max() <= bound, name
-        # The same Gaussians give the same bytes: whatever differs, differs before.
+        # The same Gaussians give the same bytes, so differences arise before rendering.
         same = Gaussians(*(getattr(theirs, name).numpy() for name in (*ROUNDING, "T_world_local")))
         picture = rasterize(theirs, camera, torch.ones(3)).image.numpy()
         assert portable.render(same)[0].tobytes() == picture.tobytes()

@@ -278,7 +278,7 @@ def test_a_run_is_repeated_from_its_config_to_the_same_bytes(
     assert [first[part] for part in ("method", "settings", "data")] == [
         second[part] for part in ("method", "settings", "data")
     ]
-    # Edited, as its checksum would tell; a run reads its own config.json as strictly as before.
+    # This file is edited, so its checksum is wrong. A run still reads its own config.json strictly.
     (runs / "again" / "config.json").write_text(json.dumps({**first, "settings": {**first["settings"], "steps": 4}}))
     words[-1] = str(runs / "again" / "config.json")
     assert main([*words, "--run", "shorter"]) == 0
@@ -328,7 +328,7 @@ def test_presets_are_the_same_for_all_methods() -> None:
     for name, method in METHODS.items():
         assert set(method.presets) == set(PRESETS)
         assert all(type(config) is method.config for config in method.presets.values())
-        # A change of what a preset means is meant, and told in the changelog.
+        # If this fails, a preset has changed: say so in the changelog.
         assert all(preset.config(name) == method.config() for preset in PRESETS.values())
 
 

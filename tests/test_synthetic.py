@@ -85,7 +85,7 @@ def test_capture_and_truth_keep_their_contracts(monkeypatch):
     assert (len(truth.face), len(truth.valid), truth.neck_lines.shape) == (6, 6, (6, 1, 3))
     scene = SyntheticScene(SMALL, seed=3)
     assert truth.face_model_hash == scene.model.content_hash
-    # Frames come in order whatever the threads do, and a timestep drawn again is the same.
+    # Frames come in order for any number of threads, and a timestep drawn again is the same.
     for timestep in (1, 5):
         np.testing.assert_array_equal(capture.images[timestep, 0], scene.frame(timestep).image)
 

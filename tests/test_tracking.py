@@ -32,7 +32,7 @@ def test_recovers_the_truth(tracked):
     turn = matrix_from_axis_angle(face.head_rotation) @ matrix_from_axis_angle(case.face.head_rotation).mT
     angle = ((turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1).acos().rad2deg()
     assert angle.median() < 0.3
-    # Landmarks without their noise, by the mesh itself and so without any static offset.
+    # These are landmarks of the mesh itself, without noise and without any static offset.
     pixels = case.camera.project(case.model.landmark_positions(case.model(face), "mediapipe"))[0]
     assert (pixels - case.pixels).norm(dim=-1).median() < 0.3
     assert (face.expression - case.face.expression).abs().median() < 0.06
@@ -112,7 +112,7 @@ def _still_then_turn(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Te
     )  # fmt: skip
     pixels = case.camera.project(case.model.landmark_positions(case.model(moving), "mediapipe"))[0]
     generator = torch.Generator().manual_seed(5)
-    # What detectors do: neighbours err alike. A shift of the whole picture a frame, and a smaller error of each point.
+    # As with detectors, neighbours err alike: the picture shifts in each frame, and each point errs a little more.
     shake = noise * torch.randn(50, 1, 2, generator=generator, dtype=torch.float64)
     own = noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
     model = make_small_face_model()
@@ -125,7 +125,7 @@ def test_fast_turns_neither_lag_nor_shrink():
     tracked_yaw = tracked_yaw.double()
     range_ratio = (tracked_yaw.max() - tracked_yaw.min()) / (yaw.max() - yaw.min())
     assert 0.95 < range_ratio < 1.05
-    # Where the yaw crosses the middle of its way: less than half a frame late or early.
+    # The yaw crosses the middle of its way less than half a frame late or early.
     centred = tracked_yaw - (tracked_yaw.max() + tracked_yaw.min()) / 2
     crossing = int((centred > 0).nonzero()[0, 0])
     exact = crossing - float(centred[crossing] / (centred[crossing] - centred[crossing - 1]))

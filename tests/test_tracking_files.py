@@ -178,7 +178,7 @@ def test_scoring_of_other_pictures_is_refused(tmp_path):
     assert read_scoring(tmp_path / "s", "a1").masks.max() == 200
     with pytest.raises(UserError, match=r"other pictures than the capture beside it has; run `mien track` again"):
         read_scoring(tmp_path / "s", "b2")
-    # Those of the first release do not say what they belong to.
+    # Files of the first release do not name the capture that they belong to.
     write_scoring(tmp_path / "old", _scoring())
     assert read_scoring(tmp_path / "old", "b2").masks.max() == 200
 

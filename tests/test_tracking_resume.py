@@ -91,7 +91,7 @@ sys.exit(main(sys.argv[1:]))
 
 def test_killed_tracking_goes_on(case, tmp_path, monkeypatch, capsys):
     """A tracking that was killed, not asked to stop, ends with the same file after the same command."""
-    monkeypatch.undo()  # the other process fits as many at once as ever
+    monkeypatch.undo()  # the other process still fits as many frames at once
     model = make_textured_model()
     monkeypatch.setattr("mien.commands.stages.tracking.face_model_of", lambda choice: model)
     command = ["--overlay", "none", "--tracking.photometric.texture-size", "64"]

@@ -42,7 +42,7 @@ def _film(yaw: tuple[float, float], start: int, name: str) -> tuple[Capture, Fac
     face = case.face[slice(start, start + 12)]
     rotation = face.head_rotation.clone()
     rotation[:, 1] = torch.linspace(*yaw, 12)
-    # As far away as pictures of this lens are filled by, which is about what tracking assumes of square ones.
+    # At this distance the head fills pictures of this lens, about as tracking assumes for square pictures.
     away = face.head_translation * torch.tensor([1, 1, _LENS])
     face = replace(face, head_rotation=rotation, head_translation=away)
     K = case.camera.K * torch.tensor([[_LENS, 1, 1], [1, _LENS, 1], [1, 1, 1]])

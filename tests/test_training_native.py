@@ -36,7 +36,7 @@ def test_adam_update_equals_its_reference(isa: str, count: int) -> None:
     update_all([ours, twin()])
     update_reference(theirs)
     assert ours.moments.step == theirs.moments.step == 4
-    # Where the second moment is small an update is large (up to 10): in float32 its last digits differ.
+    # If the second moment is small, an update is large (up to 10), and its last digits differ in float32.
     torch.testing.assert_close(ours.values, theirs.values, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(ours.moments.first, theirs.moments.first, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(ours.moments.second, theirs.moments.second, rtol=1e-5, atol=1e-6)

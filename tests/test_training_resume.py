@@ -56,7 +56,7 @@ def assert_same_results(run_dir: Path, undisturbed: Path) -> None:
 
 
 def test_killed_runs_end_with_the_same_bytes(tmp_path: Path, undisturbed: Path) -> None:
-    # Before the first checkpoint, in the middle of density control, and again after having resumed.
+    # Stop before the first checkpoint, during density control, and again after resuming.
     for kill_at in (2, 13, 22):
         code, _ = train_until(tmp_path, kill_at, signal.SIGKILL)
         assert code == -signal.SIGKILL

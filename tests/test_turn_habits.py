@@ -58,7 +58,7 @@ def test_only_what_the_face_hardly_shows_stops_nodding(term):
     assert after[PLAIN] > 0.85
     assert after[FAINT] < 0.3
     torch.testing.assert_close(found.state[:, PLAIN], own.state[:, PLAIN], atol=0.03, rtol=0)
-    # What is its own stays: beside pitch nothing has changed.
+    # Motion that does not follow pitch is unchanged.
     turn = own.state[:, :1] - own.state[:, :1].mean()
     change = found.state[:, FAINT : FAINT + 1] - own.state[:, FAINT : FAINT + 1]
     torch.testing.assert_close(change, turn * (turn.T @ change) / (turn.T @ turn), atol=1e-9, rtol=0)

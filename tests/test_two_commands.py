@@ -85,7 +85,7 @@ def test_every_command_that_writes_tells_who_is_at_it(
     with other.holding(*{place for place, _ in commands.values()}):
         for name, (place, command) in commands.items():
             assert main(command) == 2, name
-            (line,) = capsys.readouterr().err.splitlines()  # and no bar of progress before it
+            (line,) = capsys.readouterr().err.splitlines()  # and no progress bar before it
             assert line.startswith(f"mien: {place}: is being written by another command (process {other.pid} on "), name
             assert ("--run NAME" in line) == (name in ("train", "create"))
             assert ("--out DIR" in line) == (name == "bench quality")

@@ -152,7 +152,7 @@ def test_from_pixels_to_an_avatar_that_is_not_passed_on(added, capture, tmp_path
     assert main(["export", root, "--run", "a", "--out", str(workspace / "a.ply")]) == 0
     avatar = load_avatar(workspace / "runs" / "a")
     assert not list((workspace / "runs" / "a").rglob("face_model*"))
-    # Its licence is not known, until the user says that copies are allowed.
+    # The licence is unknown until the user says that copies are allowed.
     capsys.readouterr()
     assert main(["export", root, "--run", "a", "--out", str(workspace / "a.mien")]) != 0
     assert "--shareable" in capsys.readouterr().err

@@ -50,7 +50,7 @@ class Pair:
 
     def __init__(self, cache: Path, without_locks: bool = False) -> None:
         context = multiprocessing.get_context("spawn")
-        self._barrier = barrier = context.Barrier(2)  # kept: it goes with its last name
+        self._barrier = barrier = context.Barrier(2)  # kept, since it is destroyed with its last reference
         self._ends, self._processes = [], []
         for _ in range(2):
             ours, theirs = context.Pipe()

@@ -2,7 +2,7 @@
 
 import os
 
-# Before numpy and torch are imported: cases are forked, and threads do not come along.
+# Set before numpy and torch are imported: cases are forked, and threads do not survive a fork.
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1", MIEN_THREADS="1")
 
 import argparse

@@ -117,7 +117,7 @@ def with_bomb(members: dict[str, bytes], name: str, head: bytes, amount: int) ->
     packed = zlib.compressobj(1, zlib.DEFLATED, -15)
     body = packed.compress(head) + packed.flush(zlib.Z_FULL_FLUSH) + zeros(amount)[2:-4]
     whole = npz_of({key: value for key, value in members.items() if key != name} | {name: b""})
-    # The empty member comes last: its local header, its directory entry and the archive's end are written anew.
+    # The empty member comes last. Its local header, its directory entry and the archive's end are rewritten.
     directory = whole.rfind(b"PK\x01\x02")
     local = whole.rfind(b"PK\x03\x04", 0, directory)
     entry_start = whole.find(b"PK\x01\x02")

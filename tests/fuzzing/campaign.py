@@ -172,7 +172,7 @@ def _side_by_side(jobs: list[Job]) -> Iterator[Result]:
     waiting = list(pipes)
     while waiting:
         for pipe in select.select(waiting, [], [])[0]:
-            # A line comes as a whole: less than a pipe holds, or its rest follows at once.
+            # A line arrives whole: it is shorter than a pipe's buffer, or its rest follows at once.
             if line := pipe.readline():
                 yield Result(**json.loads(line))
             else:

@@ -125,7 +125,7 @@ def make_line(place: Place, dice: Random, heavy: bool) -> Line:
     if dice.random() < 0.05:
         line.words.append(dice.choice(("--help", "--help-all", "-h", "--", "--x", "--out", "--out=", "--OUT=a.png")))
     line.words = [word.replace(PORT, str(place.port)).replace("@CANARY@", str(place.canary)) for word in line.words]
-    # What a shell cannot hand over is no command line: null bytes, and lone surrogates other than those of bytes.
+    # A shell cannot pass null bytes, nor lone surrogates other than those of bytes.
     line.words = [word.replace("\x00", "").replace("\ud800", "\udcff") for word in line.words]
     if dice.random() < 0.4:
         name = dice.choice(list(_SURROUNDINGS))

@@ -210,7 +210,7 @@ def judge_traces(
 def _faults_of_message(message: str, root: str) -> list[str]:
     printed = io.StringIO()
     with contextlib.redirect_stderr(printed):
-        cli._complain(message)  # what reaches the terminal counts: names are made harmless there
+        cli._complain(message)  # what reaches the terminal counts, where names are made harmless
     line = printed.getvalue().removesuffix("\n")
     lines = "message" if "\n" in line or _CONTROL.search(line) else ""
     nameless = "nameless" if root not in message else ""

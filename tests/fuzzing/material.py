@@ -43,7 +43,7 @@ def make_material(root: Path) -> None:
     _write_pictures(root / "pictures")
     write_what_users_give(root / "given", cv2.imread(str(root / "pictures/a.png")))  # type: ignore[arg-type]
     _write_face_models(root / "cache" / "face_models" / "added")
-    load_face_model("anny")  # baked once: a command that had to do so would look like one that hangs
+    load_face_model("anny")  # baked here once, since a command that bakes looks like one that hangs
     for file in (cache_folder() / "face_models").glob("*.*"):
         shutil.copy(file, root / "cache" / "face_models")
     (root / "flame").mkdir()

@@ -60,7 +60,7 @@ def bound_names(native: Any) -> set[str]:
     return {name for name in dir(native) if not name.startswith("_") and callable(getattr(native, name))} - made
 
 
-# Arguments are lists, tuples and what is in them; a place in them is a path of indices.
+# Arguments are lists and tuples with their content; a place in them is a path of indices.
 
 
 def places(value: Any, path: tuple[int, ...] = ()) -> list[tuple[int, ...]]:
@@ -163,7 +163,7 @@ def changed_array(rng: Rng, array: np.ndarray) -> Any:
             same_size = array.itemsize == np.dtype(name).itemsize != 8
             return array.view(name) if same_size else np.zeros(array.shape, name)
         return other_values(rng, array)
-    except (MemoryError, BufferError, TypeError, ValueError):  # numpy's own refusal: nothing of ours
+    except (MemoryError, BufferError, TypeError, ValueError):  # numpy refuses this itself
         return array
 
 
@@ -201,14 +201,14 @@ def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
         if not paths or rng.random() < 0.03:
             arguments = changed(rng, arguments) if arguments else [None]
             continue
-        if rng.random() < 0.4:  # what indexes and counts
+        if rng.random() < 0.4:  # prefer indices and counts
             paths = [path for path in paths if is_whole(at(arguments, path))] or paths
         path, kind = paths[int(rng.integers(0, len(paths)))], rng.random()
         if kind < 0.75:
             new = changed(rng, at(arguments, path))
         elif kind < 0.83:
             new = at(arguments, paths[int(rng.integers(0, len(paths)))])
-        elif kind < 0.95:  # of the same kind, but another call's
+        elif kind < 0.95:  # the same type, but from another call
             value = at(arguments, path)
             stranger = BASELINES[str(rng.choice(STRANGERS))](native, rng)
             alike = [own for own in places(stranger) if isinstance(at(stranger, own), type(value))]
@@ -240,7 +240,7 @@ def run_call(native: Any, seed: int, number: int) -> tuple[str, str]:
 
 def child(path: str, seed: int, first: int, last: int, log: Path) -> None:
     """Run the calls from `first` to `last` - 1. If a call ends the process, the last line of the log is incomplete."""
-    warnings.simplefilter("ignore")  # of objects that were never made
+    warnings.simplefilter("ignore")  # numpy warns of objects that were never made
     native = load(path)
     assert bound_names(native) == set(BASELINES), bound_names(native) ^ set(BASELINES)
     assert native.TRIANGLE_FRAME_FLOATS == 20

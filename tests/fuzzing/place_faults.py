@@ -39,7 +39,7 @@ def faulty_place(path: Path, canary: Path, dice: Random) -> str:
             (shutil.copytree if path.is_dir() else shutil.copy)(path, copy)
         return kind
     if kind == "moved out":
-        # What it was lies outside now, with a link to it: nothing may be changed there.
+        # The original is outside now, with a link to it. Nothing may be changed there.
         outside = canary / f"moved{path.suffix}"
         _remove(outside)
         path.rename(outside)
@@ -89,7 +89,7 @@ def _swap(one: Path, other: Path) -> None:
 
 
 def _socket(path: Path, canary: Path, was_folder: bool) -> None:
-    # The path of a socket may have a hundred characters only: made in its folder.
+    # The path of a socket may have only a hundred characters, so it is made from within its folder.
     here = Path.cwd()
     os.chdir(path.parent)
     try:

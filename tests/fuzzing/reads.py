@@ -70,7 +70,7 @@ def read_face_track(root: Path, file: Path) -> Any:
     tensors = read_tensors(file)
     try:
         return FaceParams(**tensors)
-    except TypeError as error:  # so does `mien.evaluation.load`
+    except TypeError as error:  # as `mien.evaluation.load` does
         raise UserError(f"{file}: {error}") from None
 
 

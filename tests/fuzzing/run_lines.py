@@ -106,7 +106,7 @@ def run_line(case: str, bench: Bench, server: Server, listener: socket.socket) -
     )
     result.outcome = {0: "accepted", 2: "refused"}.get(code if code is not None else -999, "stopped")
     result.findings = list(_faults_of_end(code, told, line))
-    if megabytes > MEMORY / 2**20 + 700 and not line.heavy:  # beside what is imported
+    if megabytes > MEMORY / 2**20 + 700 and not line.heavy:  # in addition to the imported modules
         result.findings.append("memory")
     # The libraries of a command may keep caches in the home folder, and a line is stopped before it is slow.
     cause = _cause(code, told, line)
@@ -160,7 +160,7 @@ def _wait(child: int, line: Line, request: dict[str, Any], ended: Any) -> bool:
         _tell(child, number)
     if ended(_SECONDS):
         return True
-    # Many frames may be what was asked for; that a file keeps a command busy is seen where it is read.
+    # The line may ask for many frames. Files that keep a reader busy are found by the cases of that reader.
     line.surroundings = {**line.surroundings, "signal": signal.SIGTERM}
     _tell(child, signal.SIGTERM)
     if ended(_TO_END):
@@ -183,7 +183,7 @@ def _faults_of_end(code: int | None, told: str, line: Line) -> Iterator[str]:
         yield "signal"
     elif code >= 0 and code not in FINE:
         yield "exit code"
-    # Python itself says so where Ctrl-C meets it between two of its own steps.
+    # Python prints this itself if Ctrl-C arrives between two of its own steps.
     if "Traceback (most recent call last)" in told and not (sent == signal.SIGINT and "Exception ignored in" in told):
         yield "traceback"
     lines = [text for text in told.splitlines() if text.startswith("mien: ")]

@@ -53,7 +53,7 @@ def faulty_tensors(data: bytes, dice: Random) -> tuple[str, bytes]:
     metadata = header.pop("__metadata__", None)
     kept = {} if metadata is None else {"__metadata__": metadata}
     if kind in ("numbers", "arrays", "names"):
-        arrays = dict(sorted(safetensors.numpy.load(data).items()))  # in an order that stays
+        arrays = dict(sorted(safetensors.numpy.load(data).items()))  # in a fixed order
         name, arrays = _FAULTS[kind](arrays, dice)
         header, body = split(safetensors.numpy.save(arrays))
         return f"{kind} {name}", joined({**kept, **header}, body)

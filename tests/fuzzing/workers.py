@@ -69,7 +69,7 @@ def _batch(cases: list[str], bench: Bench, listener: socket.socket) -> Iterator[
                 done += 1
                 yield Result(**json.loads(line))
             continue
-        # The case neither ended nor raised: its process did, or hangs.
+        # The case neither ended nor raised an error: its process ended or hangs.
         if data is None:
             os.killpg(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
@@ -100,7 +100,7 @@ def _child(cases: list[str], bench: Bench, listener: socket.socket, writing: int
             faulthandler.cancel_dump_traceback_later()
             os.write(writing, json.dumps(result.as_json()).encode() + b"\n")
             if result.megabytes > _GROWN or result.findings:
-                break  # what follows is not to suffer from it
+                break  # later cases must not suffer from it
         code = 0
     except BaseException as error:
         print(f"the fuzzer itself failed: {error!r}", file=sys.stderr, flush=True)
