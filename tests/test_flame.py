@@ -173,7 +173,7 @@ FAULTS = {
     "mirrored": (lambda a: _with(a, v_template=a["v_template"] * [-1, 1, 1]), "[+]x to the subject's left"),
     "not finite": (lambda a: _with(a, posedirs=np.full_like(a["posedirs"], np.nan)), "'posedirs'.*not finite"),
     "no split": (lambda a: _without(a, "identities"), "64 directions.*add a number 'identities'"),
-    "no expression": (lambda a: _with(a, identities=np.array(64)), "leaves none for identity or expression"),
+    "no expression": (lambda a: _with(a, identities=np.array(64)), "need at least one each"),
     "an index": (lambda a: _with(a, f=a["f"] + 1), "'f' has the index 4173, but only 4173 entries exist"),
     "weights": (lambda a: _with(a, weights=2 * a["weights"]), "'weights' of a vertex do not add up to 1"),
     "texture": (lambda a: _with(a, vt=np.zeros((4, 2)), ft=a["f"][1:]), "not texture coordinates"),

@@ -197,7 +197,7 @@ def test_what_is_not_looked_at_may_be_anything(arrays: dict[str, np.ndarray], tm
 ODD = {
     "identities as a list": ("identities", np.array([1, 2, 3]), "should be one whole number"),
     "identities as text": ("identities", np.array(2.5), "should be one whole number"),
-    "identities that are huge": ("identities", np.array(2**63, np.uint64), "leaves none for identity or expression"),
+    "identities that are huge": ("identities", np.array(2**63, np.uint64), "need at least one each"),
     "a chain without rows": ("kintree_table", np.zeros((0, 5), int), "gives the joints the parents"),
     "a chain of nothing": ("kintree_table", np.array(3), "gives the joints the parents"),
     "a chain of NaN": ("kintree_table", np.full((2, 5), np.nan), "gives the joints the parents"),

@@ -249,8 +249,8 @@ def _identities(path: Path, arrays: dict[str, np.ndarray], columns: int) -> int:
         )
     if not 0 < split < columns:
         raise UserError(
-            f"{path}: {split} of the {columns} directions of 'shapedirs' would be identity, which leaves none for "
-            "identity or expression; correct 'identities'"
+            f"{path}: 'identities' takes {split} of the {columns} directions of 'shapedirs', but identity and "
+            "expression need at least one each; correct it"
         )
     return split
 

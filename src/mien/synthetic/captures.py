@@ -89,7 +89,7 @@ def write_scene(scene: SyntheticScene, folder: Path) -> str:
             content_hash = _draw_all(scene, folder, inputs)
         except OSError as error:
             raise UserError(f"{folder}: cannot be written ({error.strerror or error}); choose another place") from None
-        say(f"{scene.recipe.name}: drawn, key {scene_key(scene)}, hash of the bytes {content_hash}")
+        say(f"{scene.recipe.name}: drawn (key {scene_key(scene)}, content hash {content_hash})")
     return scene_key(scene)
 
 
@@ -283,7 +283,7 @@ def _make_capture(
 
 def _detect_landmarks(scene: SyntheticScene, images: np.ndarray) -> Iterator[Float[np.ndarray, "t l 2"]]:
     """Yield the landmarks that a detector finds in each camera's pictures."""
-    with progress_bar(f"Landmarks of {scene.recipe.name}", len(scene.cameras)) as advance:
+    with progress_bar(f"Detecting landmarks of {scene.recipe.name}", len(scene.cameras)) as advance:
         for camera in range(len(scene.cameras)):
             found = np.full((len(images), LANDMARKS, 2), np.nan, np.float32)
             with LandmarkDetector(several_faces=False) as detector:
