@@ -164,6 +164,7 @@ def test_face_models_that_may_not_be_passed_on_are_not(tmp_path: Path) -> None:
 
 
 def test_missing_baked_avatar(tmp_path: Path) -> None:
+    """A baked avatar that does not exist is reported as missing."""
     with pytest.raises(UserError, match="missing"):
         read_baked(tmp_path / "none.mien")
 

@@ -141,6 +141,7 @@ def _interrupt(*_: object) -> None:
     ],
 )
 def test_bad_json(text: str, message: str, tmp_path: Path) -> None:
+    """Damaged or foreign json is refused with its reason."""
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(UserError, match=message):
         read_json(tmp_path / "a.json", "x", 1)
@@ -278,6 +279,7 @@ def test_a_full_disk_or_memory_anywhere_is_no_bug(
 
 
 def test_create_into_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`mien create` into a file says so and leaves the file alone."""
     write_toy_video(tmp_path)
     (tmp_path / "out").write_text("mine")
     assert main(["create", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out")]) == 2
@@ -292,6 +294,7 @@ def test_create_into_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_a_workspace_inside_a_workspace(
     run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, place: str
 ) -> None:
+    """A workspace inside a workspace is refused, and nothing is written."""
     write_toy_video(tmp_path)
     outer = tmp_path / "outer"
     shutil.copytree(run_dir, outer / "runs/old")

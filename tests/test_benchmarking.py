@@ -50,6 +50,7 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
 
 @pytest.mark.usefixtures("small")
 def test_scaling_as_json_with_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`mien bench scaling` prints rows for every size and number of threads, and draws a chart."""
     chart = tmp_path / "chart.png"
     assert main(["bench", "scaling", "--json", "--seconds", "0.001", "--plot", str(chart)]) == 0
     shown = json.loads(capsys.readouterr().out)

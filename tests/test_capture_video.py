@@ -70,6 +70,7 @@ def test_rotation_and_mirror_flags_are_applied(tmp_path, degrees, mirrored, turn
 
 
 def test_shrinking_while_reading(tmp_path):
+    """Frames are shrunk while they are read."""
     path = tmp_path / "clip.mp4"
     write_gradient_video(path, width=128, height=96)
     shapes = {frame.shape for _, frame in read_video_frames(path, longest_side=64)}

@@ -76,6 +76,7 @@ def test_one_part_of_a_video_can_be_chosen(video: Path) -> None:
 
 
 def test_a_film_of_all_parts(video: Path, tmp_path: Path) -> None:
+    """A driver with cuts gives one film of all its parts."""
     write_toy_workspace(tmp_path / "w")
     drive_stage(tmp_path / "w/runs/toy", video, tmp_path / "driven.mp4")
     assert probe_video(tmp_path / "driven.mp4").frames == sum(PARTS.values())

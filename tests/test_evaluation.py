@@ -152,6 +152,7 @@ class _Tags(HTMLParser):
 
 
 def test_perceptual_metric_on_some_frames_only(experiment: Experiment, evaluation: Evaluation) -> None:
+    """The perceptual metric can be computed on some frames only, and the mean is theirs."""
     settings = EvaluationSettings(perceptual_frames=3, baselines=False)
     some = evaluate_frames(experiment, settings)
     content = protocol_content(experiment, some, settings)

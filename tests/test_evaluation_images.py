@@ -160,6 +160,7 @@ def test_videos_are_matched_by_order(folders: ImageFolders, tmp_path: Path) -> N
 
 
 def test_command(folders: ImageFolders, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`mien evaluate --images` prints and writes the same scores, and refuses wrong options."""
     given = ["evaluate", "--images", str(folders.images), "--truth", str(folders.truth), "--no-perceptual"]
     out = tmp_path / "scores.json"
     assert main([*given, "--json", "--out", str(out)]) == 0

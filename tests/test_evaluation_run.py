@@ -113,6 +113,7 @@ def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path], tmp_p
 
 
 def test_without_perceptual_metric_and_baselines(workspace: tuple[Path, Path]) -> None:
+    """An evaluation without perceptual metric and baselines says that they were not scored."""
     folder, run_dir = workspace
     entry = evaluate(run_dir, [folder], EvaluationSettings(perceptual=False, baselines=False))["protocols"]
     assert entry["self_reenactment"]["perceptual"] is None

@@ -89,6 +89,7 @@ def test_layout_is_the_one_other_programs_write(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 def test_round_trip(tmp_path: Path, coefficients: int) -> None:
+    """A .ply keeps its Gaussians."""
     written = _gaussians(50, coefficients)
     write_ply(tmp_path / "a.ply", written)
     read = read_ply(tmp_path / "a.ply")
@@ -100,6 +101,7 @@ def test_round_trip(tmp_path: Path, coefficients: int) -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 3), st.integers(0, 2**16))
 def test_round_trip_of_any_number_and_extreme_opacities(tmp_path_factory, n: int, seed: int) -> None:
+    """A .ply keeps any number of Gaussians, with opacities of 0 and 1."""
     path = tmp_path_factory.mktemp("ply") / "a.ply"
     written = _gaussians(n, 4, seed)
     written = Gaussians(written.means, written.quats, written.scales, written.opacities.round(), written.sh)
@@ -134,6 +136,7 @@ def test_in_world_looks_the_same(coefficients: int) -> None:
 
 
 def test_damaged_and_foreign_files(tmp_path: Path) -> None:
+    """Damaged and foreign .ply files are refused with the reason."""
     good = tmp_path / "good.ply"
     write_ply(good, _gaussians(5, 1))
     content = good.read_bytes()

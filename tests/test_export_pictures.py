@@ -70,6 +70,7 @@ def straight(frame: av.VideoFrame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_films_and_sequences(tmp_path: Path) -> None:
+    """Pictures become films or numbered files, depending on the name."""
     pictures = [disc()[..., :3]] * 4
     for name in ("a.mp4", "a.webm"):
         write_pictures(plan_output(tmp_path / name, 4), pictures, 25)
@@ -101,6 +102,7 @@ def test_what_cannot_be_written_is_told_first(
 
 
 def test_options_of_pictures(tmp_path: Path) -> None:
+    """Impossible sizes and colours of pictures are refused by name."""
     assert PictureOptions(background="#3060a0").colour() == (48 / 255, 96 / 255, 160 / 255)
     for options, part in (
         (PictureOptions(size=8193), "--size 8193"),
@@ -150,6 +152,7 @@ def test_sway_loops_around_the_head() -> None:
 
 
 def test_cameras_from_a_file(tmp_path: Path) -> None:
+    """Cameras survive a file, and impossible ones are refused."""
     path, camera = tmp_path / "path.json", camera_from_fov(0.6, 100, 80, FACING)
     write_cameras(path, [camera, camera])
     read = read_cameras(path)

@@ -48,6 +48,7 @@ def test_a_point_on_the_surface_is_found_again():
 
 
 def test_ibug_indices():
+    """300-W's points are 68 different ones, the subject's right first."""
     assert len(IBUG68) == len(set(IBUG68)) == 68
     # The subject's right comes first: MediaPipe's 33 is the outer corner of the right eye.
     assert (IBUG68[36], IBUG68[45]) == (33, 263)

@@ -35,6 +35,7 @@ def files(tmp_path):
 
 
 def test_round_trip(bakes, tmp_path):
+    """A baked model is read as it was baked, and is baked once."""
     baked, read = load_face_model("small"), load_face_model("small")
     assert len(bakes) == 1
     assert read.content_hash == baked.content_hash
@@ -79,6 +80,7 @@ def test_damaged_or_old_files_are_baked_again(bakes, tmp_path, which, damage):
 
 
 def test_many_at_once(bakes):
+    """Many threads can load a model at once."""
     with ThreadPoolExecutor(4) as pool:
         hashes = list(pool.map(lambda _: load_face_model("small").content_hash, range(8)))
     assert len(set(hashes)) == 1

@@ -88,6 +88,7 @@ def test_a_shape_looked_at_without_gradients_still_has_them() -> None:
 
 
 def test_the_same_bits_for_any_number_of_threads_and_any_batch() -> None:
+    """Threads and batches do not change a bit of vertices and gradients."""
     model = load_face_model("anny")
     face = random_face(model, 3).detach()
     before, results = _native.thread_count(), []
@@ -102,6 +103,7 @@ def test_the_same_bits_for_any_number_of_threads_and_any_batch() -> None:
 
 
 def test_no_timestep_and_float64() -> None:
+    """Models can pose no timestep at all, and float64."""
     model = make_small_face_model()
     assert model(model.neutral(0)).shape == (0, len(model.template), 3)
     double = model.to(torch.zeros((), dtype=torch.float64))

@@ -52,6 +52,7 @@ def test_a_pipe_is_no_recording_and_no_ply(tmp_path: Path) -> None:
 
 
 def test_a_ply_of_too_many_gaussians(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A .ply that announces too many Gaussians is refused."""
     path = tmp_path / "head.ply"
     ply.write_ply(path, train_toy_gaussians())
     monkeypatch.setattr(ply, "_MOST_GAUSSIANS", 3)
@@ -64,6 +65,7 @@ def train_toy_gaussians() -> ply.Gaussians:
 
 
 def test_fewer_mattes_than_frames(tmp_path: Path) -> None:
+    """Fewer mattes than frames are refused with the missing frame."""
     for index in range(2):
         assert cv2.imwrite(str(tmp_path / f"{index}.png"), np.zeros((8, 8), np.uint8))
     mattes = GivenMattes(tmp_path, (8, 8))
@@ -90,6 +92,7 @@ def test_a_png_of_a_beginning_and_an_end(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_landmarks_of_an_added_face_model(text: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Damaged landmarks of an added face model are refused by their file."""
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path))
     model = toy_sequence(timesteps=1, size=32)[0]
     path = tmp_path / "face_models" / "added" / "mine.landmarks.json"
@@ -101,6 +104,7 @@ def test_landmarks_of_an_added_face_model(text: bytes, tmp_path: Path, monkeypat
 
 
 def test_face_parameters_of_another_type() -> None:
+    """Face parameters of another type are refused."""
     model, face = toy_sequence(timesteps=1, size=32)[0], still()
     with pytest.raises(UserError, match=r"here: expression is torch\.float64"):
         check_face_params(model, replace(face, expression=face.expression.double()), "here", "track again")
@@ -108,6 +112,7 @@ def test_face_parameters_of_another_type() -> None:
 
 @pytest.mark.parametrize("index", [2**32, -(2**63), -1])
 def test_indices_that_baking_would_narrow_to_some_that_exist(index: int, run: Path, tmp_path: Path) -> None:
+    """Indices are refused that would exist only after narrowing to 32 bits."""
     folder = tmp_path / "avatar"
     folder.mkdir()
     for file in (run / "avatar").iterdir():
@@ -139,6 +144,7 @@ def seal(folder: Path) -> None:
 
 
 def test_curves_that_lack_one(run: Path, tmp_path: Path) -> None:
+    """Curves are refused if one is missing."""
     curves = read_tensors(run / "curves.safetensors")
     curves.pop("psnr")
     write_tensors(tmp_path / "curves.safetensors", curves)
@@ -155,6 +161,7 @@ def test_curves_that_no_plot_can_show(run: Path, tmp_path: Path) -> None:
 
 
 def test_a_curve_without_a_number(run: Path, tmp_path: Path) -> None:
+    """A curve without a finite number is refused."""
     curves = read_tensors(run / "curves.safetensors")
     curves["loss"].fill_(torch.nan)
     write_tensors(tmp_path / "curves.safetensors", curves)
@@ -163,6 +170,7 @@ def test_a_curve_without_a_number(run: Path, tmp_path: Path) -> None:
 
 
 def test_a_crop_that_misses_its_mask(tmp_path: Path) -> None:
+    """A crop that holds nothing of its mask is refused."""
     masks, crops = np.full((2, 1, 8, 8), 255, np.uint8), np.array([[[0, 0, 8, 8]], [[0, 0, 0, 0]]])
     write_scoring(tmp_path / "scoring", Scoring(masks, crops))
     with pytest.raises(UserError, match=r"crops\.safetensors: a crop holds nothing of its mask"):
@@ -170,6 +178,7 @@ def test_a_crop_that_misses_its_mask(tmp_path: Path) -> None:
 
 
 def test_moments_of_another_type(run: Path, tmp_path: Path) -> None:
+    """Moments of another type are refused when a run resumes."""
     newest = checkpoint_files(run / "checkpoints")[-1]
     tensors = read_tensors(newest)
     tensors["store.means:first"] = tensors["store.means:first"].to(torch.int8)
@@ -195,6 +204,7 @@ def test_a_driver_of_another_size_is_named() -> None:
 
 
 def test_triangles_that_face_nowhere(tmp_path: Path) -> None:
+    """A head without a triangle that faces outwards is refused."""
     path = tmp_path / "tiny.npz"
     arrays = tiny_flame()
     np.savez(path, **{**arrays, "f": arrays["f"][:, ::-1]})

@@ -135,6 +135,7 @@ SETTINGS: dict[str, tuple[str, Callable[[dict[str, Any]], object]]] = {
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_settings_that_cannot_be(name: str, avatars: dict[str, Path], tmp_path: Path) -> None:
+    """Impossible settings of an avatar are refused in one line."""
     method, edit = SETTINGS[name]
     folder = received(avatars, method, tmp_path)
     edit_json(folder / "avatar.json", edit)

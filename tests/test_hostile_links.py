@@ -206,6 +206,7 @@ def test_new_files_and_removed_folders_leave_what_links_lead_to(tmp_path: Path, 
     "name", ["", ".", "..", "../x", "/x", "a/b", "a\\b", "a\0b", "a\x1b[2J", NOT_ONE_LINE, "é" * 200, 3]
 )
 def test_names_that_lead_elsewhere(name: Any, tmp_path: Path) -> None:
+    """Names that lead elsewhere are refused."""
     assert not is_plain_name(name)
     with pytest.raises(UserError, match="give a plain name"):
         inside(tmp_path, name)
@@ -213,6 +214,7 @@ def test_names_that_lead_elsewhere(name: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["clip", "Anna 2", "a:b", "12\u202fAM", "ü", "声", ".hidden"])
 def test_names_of_ordinary_files(name: str, tmp_path: Path) -> None:
+    """Names of ordinary files are accepted."""
     assert inside(tmp_path, name) == tmp_path / name
 
 

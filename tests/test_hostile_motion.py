@@ -49,6 +49,7 @@ def test_a_gap_in_json_is_told_with_its_frame(tmp_path: Path) -> None:
 
 
 def test_numbers_of_hundreds_of_digits_in_csv(tmp_path: Path) -> None:
+    """Numbers of hundreds of digits in a csv are refused with their start."""
     path = tmp_path / "a.csv"
     for rows, words in (
         ([row(f"0:0:0:{DIGITS}")], "line 2: Timecode '0:0:0:9999"),
@@ -63,6 +64,7 @@ def test_numbers_of_hundreds_of_digits_in_csv(tmp_path: Path) -> None:
 
 
 def test_numbers_of_hundreds_of_digits_in_json(tmp_path: Path) -> None:
+    """Numbers of hundreds of digits in json are refused with their start."""
     path = tmp_path / "a.json"
     matrix = {"facialTransformationMatrixes": [{"data": [*([0] * 15), DIGITS]}], "faceBlendshapes": []}
     for content, words in (
@@ -93,6 +95,7 @@ def test_huge_recordings_are_not_read(read, tmp_path: Path) -> None:
 
 
 def test_crops_of_hundreds_of_digits(tmp_path: Path) -> None:
+    """Crops that are not four plausible numbers are refused."""
     path = tmp_path / "crops.json"
     no_box = "'a' has no box of 4 numbers"
     for box, words in (
@@ -107,6 +110,7 @@ def test_crops_of_hundreds_of_digits(tmp_path: Path) -> None:
 
 
 def test_cameras_of_huge_numbers(tmp_path: Path) -> None:
+    """Cameras with huge numbers or other types are refused."""
     path = tmp_path / "cameras.json"
     good = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
     for field, value, words in (

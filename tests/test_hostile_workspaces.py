@@ -80,6 +80,7 @@ CAPTURES: dict[str, Callable[[dict[str, Any]], object]] = {
 
 @pytest.mark.parametrize("name", CAPTURES)
 def test_captures_that_cannot_be(name: str, workspace: Path) -> None:
+    """Impossible captures are refused by their file."""
     folder = workspace / "sequences/clip/capture"
     edit_json(folder / "capture.json", CAPTURES[name])
     with pytest.raises(UserError, match=r"capture\.json|timestamps is"):
@@ -92,6 +93,7 @@ def test_captures_that_cannot_be(name: str, workspace: Path) -> None:
      ("principal_point", np.inf)],
 )  # fmt: skip
 def test_capture_numbers_that_cannot_be(name: str, value: float, workspace: Path) -> None:
+    """Impossible numbers of a capture are refused by name."""
     folder = workspace / "sequences/clip/capture"
     arrays = read_arrays(folder / "landmarks.safetensors")
     arrays[name] = np.array(arrays[name])
@@ -148,6 +150,7 @@ TRACKINGS: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("name", TRACKINGS)
 def test_trackings_that_cannot_be(name: str, workspace: Path) -> None:
+    """Impossible trackings are refused in one line."""
     TRACKINGS[name](workspace / "sequences/clip/tracking")
     with pytest.raises(UserError, match="tracking") as error:
         read_tracking(workspace / "sequences/clip/tracking")
@@ -159,6 +162,7 @@ def test_trackings_that_cannot_be(name: str, workspace: Path) -> None:
     [{"timesteps": 10**9}, {"timesteps": HUGE}, {"cameras": "1"}, {"width": HUGE}, {"height": 10**6}, {"width": None}],
 )
 def test_scorings_that_cannot_be(change: dict[str, Any], workspace: Path) -> None:
+    """Impossible scorings are refused."""
     folder = workspace / "sequences/clip/scoring"
     edit_json(folder / "scoring.json", lambda content: content.update(change))
     with pytest.raises(UserError, match="scoring"):
@@ -167,6 +171,7 @@ def test_scorings_that_cannot_be(change: dict[str, Any], workspace: Path) -> Non
 
 @pytest.mark.parametrize("crop", [[-1, 0, 8, 8], [0, 0, 33, 8], [2**31 - 1, 0, 2**31 - 1, 1]])
 def test_crops_out_of_the_picture(crop: list[int], workspace: Path) -> None:
+    """Crops that reach out of the picture are refused."""
     folder = workspace / "sequences/clip/scoring"
     write_arrays(folder / "crops.safetensors", {"crops": np.tile(np.array(crop, np.int32), (5, 1, 1))})
     with pytest.raises(UserError, match="reaches out of the picture"):
@@ -220,6 +225,7 @@ def change_tensors(path: Path, change: Callable[[dict[str, Tensor]], object]) ->
 
 @pytest.mark.parametrize("name", RUNS)
 def test_runs_that_cannot_be(name: str, workspace: Path) -> None:
+    """Impossible runs are refused in one line."""
     change, read = RUNS[name]
     change(workspace / "runs/toy")
     with pytest.raises(UserError) as error:
@@ -290,6 +296,7 @@ def test_metrics_as_they_were_written_are_compared(workspace: Path) -> None:
     ],
 )  # fmt: skip
 def test_safetensors_headers_that_cannot_be(header: bytes, message: str, tmp_path: Path) -> None:
+    """Impossible safetensors headers are refused."""
     path = tmp_path / "a.safetensors"
     path.write_bytes(len(header).to_bytes(8, "little") + header + bytes(4))
     with pytest.raises(UserError, match=message):

@@ -226,6 +226,7 @@ def test_loss_draws_the_picture_that_it_compares(scene: Scene):
 
 
 def test_edges_of_a_square():
+    """A square of two triangles has five edges, each with its faces and opposite vertex."""
     edges = mesh_edges(torch.tensor([[0, 1, 2], [0, 2, 3]]))
     rows = [tuple(row) for row in torch.cat([edges.vertices, edges.faces, edges.opposite[:, None]], 1).tolist()]
     assert rows == [(0, 1, 0, -1, 2), (0, 2, 0, 1, 1), (0, 3, 1, -1, 2), (1, 2, 0, -1, 0), (2, 3, 1, -1, 0)]

@@ -196,6 +196,7 @@ def test_deformation_starts_as_nothing_with_even_weights() -> None:
 
 @pytest.mark.parametrize("layers", [2, 3, 4, 7])
 def test_attribute_network_of_any_depth(layers: int) -> None:
+    """The attribute network can have any depth."""
     assert AttributeNet(48, layers)(torch.randn(5, 3)).shape == (5, 11)
 
 
@@ -225,6 +226,7 @@ def test_children_are_in_a_cube_about_their_parents() -> None:
 
 
 def test_nearest_vertices() -> None:
+    """Each point finds its nearest vertex."""
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     points = torch.tensor([[0.6, 0.1, 0], [0.1, 0.1, 5], [0.4, 0.55, 0]])
     assert nearest_vertices(points, vertices).tolist() == [1, 0, 2]

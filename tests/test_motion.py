@@ -103,6 +103,7 @@ def test_head_angles_are_unreals(tmp_path: Path) -> None:
 
 
 def test_bad_csv_files(tmp_path: Path) -> None:
+    """Bad csv files are refused with line, column and value."""
     good = row("0:00:00:01.0")
     without = [name for name in COLUMNS if name not in ("JawOpen", "TongueOut")]
     for rows, columns, part in (
@@ -130,6 +131,7 @@ def write(path: Path, content: object) -> Path:
 
 
 def test_plain_json(tmp_path: Path) -> None:
+    """Plain json of blend shapes is read, and a frame without a face repeats the one before."""
     frames = [{"timestamp_ms": 40 * i, "blendshapes": {"jawOpen": i / 4, "_neutral": 0.9}} for i in range(4)]
     frames[2]["blendshapes"] = None
     motion = read_blendshape_json(write(tmp_path / "a.json", frames))
@@ -139,6 +141,7 @@ def test_plain_json(tmp_path: Path) -> None:
 
 
 def test_face_landmarker_results(tmp_path: Path) -> None:
+    """Results of MediaPipe's face landmarker are read with the head's rotation."""
     turn = matrix_from_axis_angle(torch.tensor([0.1, -0.4, 0.2])).numpy()
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turn, [1, 2, -45]
@@ -156,6 +159,7 @@ def test_face_landmarker_results(tmp_path: Path) -> None:
 
 
 def test_bad_json_files(tmp_path: Path) -> None:
+    """Bad json files are refused with frame and value."""
     good = {"timestamp_ms": 0, "blendshapes": {}}
     for content, part in (
         ([], "give a list of frames"),

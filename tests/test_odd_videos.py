@@ -281,6 +281,7 @@ def test_huge_pictures_inside_of_a_video_are_not_decoded(tmp_path: Path) -> None
 
 
 def test_a_gif_that_announces_a_huge_screen(tmp_path: Path) -> None:
+    """A gif that announces a huge screen is refused without taking its memory."""
     path = tmp_path / "a.gif"
     encode(path, codec="gif", pixels="rgb8")
     data = bytearray(path.read_bytes())

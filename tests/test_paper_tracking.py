@@ -47,6 +47,7 @@ def test_pixels_calm_what_landmarks_leave(case, by_landmarks, by_descent):
 
 
 def test_all_of_it_from_landmarks(case, by_landmarks):
+    """The schedule is also better than landmarks if it starts from them alone."""
     settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks"))
     alone = track(case.capture, case.model, settings)
     assert wobble(case, alone) < 0.25 * wobble(case, by_landmarks)
@@ -60,6 +61,7 @@ def test_it_says_how_it_was_made(by_descent):
 
 
 def test_the_same_with_any_number_of_threads(case, monkeypatch):
+    """The number of threads does not change a bit."""
     monkeypatch.setattr(paper_descent, "_BATCHES", 2)  # this way a batch has several frames
     short, runs = replace(QUICK, epochs=1), []
     for threads in ("1", "2"):

@@ -67,6 +67,7 @@ def plain(face_clip: Path | None, tmp_path_factory: pytest.TempPathFactory) -> d
 def test_the_same_bytes_in_odd_places(
     environment: dict[str, str], plain: dict[str, str], face_clip: Path | None, tmp_path: Path
 ) -> None:
+    """A run and a capture have the same bytes in every odd place."""
     place = tmp_path / "Köpfe & Gemälde" / "a place"
     place.mkdir(parents=True)
     arguments = [work_anywhere.__file__, str(place), *([] if face_clip is None else [str(face_clip)])]

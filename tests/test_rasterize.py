@@ -51,6 +51,7 @@ def test_gsplat_matches_reference(coefficients: int, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (3, 70), (32, 32), (33, 31), (129, 65)])
 def test_sizes(width: int, height: int, backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of any size agree with the reference."""
     assert_matches_reference(random_scene(width + height, count=150, width=width, height=height), monkeypatch, backend)
 
 
@@ -71,6 +72,7 @@ def test_pixels_that_end_early(backend: Backend, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_splats_larger_than_the_picture(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Splats larger than the picture agree with the reference."""
     scene = random_scene(6, count=30, width=150, height=140)
     scene.gaussians.scales.mul_(20)
     scene.gaussians.opacities.mul_(0.2)
@@ -87,6 +89,7 @@ def test_needles(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("loss", ["image", "alpha"])
 def test_gradient_of_one_output_only(loss: str) -> None:
+    """Gradients are right if only the image or only alpha is used."""
     scene = random_scene(8)
     _, expected = gradients(scene.to(torch.float64), "reference", lambda r: getattr(r, loss).mean())
     _, found = gradients(scene, "native", lambda r: getattr(r, loss).mean())
@@ -110,6 +113,7 @@ def test_threads_do_not_change_a_bit(threads: int) -> None:
 
 
 def test_several_forwards_before_their_backwards() -> None:
+    """Several forward passes can precede their backward passes, in any order."""
     scenes = [random_scene(seed, count=100 + 50 * seed) for seed in range(6)]
     expected = [gradients(scene, "native", lambda r: (r.image**2).sum())[1]["means"] for scene in scenes]
     tensors = [leaves(scene) for scene in scenes]

@@ -127,6 +127,7 @@ def test_means2d_gradient_is_per_pixel_of_motion(backend: Backend) -> None:
 
 
 def test_no_gradients_without_grad_mode() -> None:
+    """Without grad mode nothing requires a gradient."""
     with torch.no_grad():
         rendering = rasterize(one_gaussian(), front_camera())
     assert not rendering.image.requires_grad
@@ -209,6 +210,7 @@ def test_a_camera_that_is_not_finite_is_named(backend: Backend) -> None:
 
 
 def test_layouts_and_dtypes() -> None:
+    """Strided tensors draw the same picture, and other dtypes are refused by name."""
     scene = random_scene(4)
     spread = {name: getattr(scene.gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
     spread = {name: tensor.repeat_interleave(2, 0)[::2] for name, tensor in spread.items()}

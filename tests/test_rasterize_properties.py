@@ -90,6 +90,7 @@ def test_any_scene_matches_the_reference(
 
 @pytest.mark.parametrize(("width", "height"), [(5000, 3), (3, 5000)])
 def test_long_and_thin_pictures(width: int, height: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Long and thin pictures agree with the reference."""
     scene = random_scene(11, 60, 4, width, height)
     scene.gaussians.means.mul_(torch.tensor([2.0, 2.0, 1.0]))  # along the whole picture
     scene.camera.K[0, 0] = scene.camera.K[1, 1] = 0.3 * max(width, height)
@@ -128,6 +129,7 @@ def test_depth_is_the_expected_depth() -> None:
 
 
 def test_depth_of_one_ball_and_its_gradient() -> None:
+    """A ball's depth is its distance, and its gradient moves with it."""
     means = torch.tensor([[0.0, 0.0, 1.25]], requires_grad=True)
     camera = random_scene(0, width=11, height=11).camera
     camera.viewmat.copy_(torch.eye(4))

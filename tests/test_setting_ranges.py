@@ -86,6 +86,8 @@ def test_what_is_in_range_passes() -> None:
 
 
 def test_ranges_in_words() -> None:
+    """Messages say the allowed range in words."""
+
     @dataclass(frozen=True)
     class Some:
         sizes: Annotated[tuple[int, ...], Range(16, 64, filled=True)] = (16,)

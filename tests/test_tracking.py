@@ -174,6 +174,7 @@ def test_a_model_without_landmarks_is_refused():
 
 
 def test_report(tracked):
+    """The report has the residuals, lost frames and jitter of the tracking."""
     case, tracking = tracked
     report = residual_report(case.capture, tracking, make_small_face_model())
     assert report["frames_without_face"] == [20, 21]

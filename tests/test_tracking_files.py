@@ -51,6 +51,7 @@ def _looks(random: torch.Generator) -> Looks:
 
 @pytest.mark.parametrize("offsets", [False, True])
 def test_round_trip(tmp_path, offsets):
+    """A tracking is read as it was written."""
     tracking = _tracking(offsets, pixels=offsets)
     write_tracking(tmp_path / "tracking", tracking)
     again = read_tracking(tmp_path / "tracking")
@@ -102,6 +103,7 @@ def _rewrite(folder, change) -> None:
     ],
 )
 def test_wrong_content(tmp_path, change, message):
+    """Wrong content of a tracking is refused with its reason."""
     write_tracking(tmp_path, _tracking())
     _rewrite(tmp_path, change)
     with pytest.raises(UserError, match=message):
@@ -109,6 +111,7 @@ def test_wrong_content(tmp_path, change, message):
 
 
 def test_damage(tmp_path):
+    """Missing and damaged files of a tracking are refused."""
     with pytest.raises(UserError, match="missing"):
         read_tracking(tmp_path)
     write_tracking(tmp_path, _tracking())
@@ -137,6 +140,7 @@ def _scoring(value: int = 200) -> Scoring:
 
 
 def test_scoring_round_trip_and_frozen(tmp_path):
+    """A scoring is read as it was written, and never overwritten."""
     folder = tmp_path / "scoring"
     assert not scoring_exists(folder)
     write_scoring(folder, _scoring())
@@ -158,6 +162,7 @@ def test_half_written_scoring_is_replaced(tmp_path):
 
 
 def test_damaged_scoring(tmp_path):
+    """Missing, damaged and exchanged masks of a scoring are refused."""
     write_scoring(tmp_path / "s", _scoring())
     mask = tmp_path / "s" / "masks" / "00" / "000001.png"
     whole = mask.read_bytes()

@@ -249,6 +249,7 @@ def test_files_hold_several_cameras(ring, tmp_path):
 
 
 def test_report_of_several_cameras(ring):
+    """The report has figures of each camera."""
     _, capture, tracking = ring
     report = residual_report(capture, tracking, _model_with_sizes())
     assert report["cameras"]["cam1"]["frames"] == 12

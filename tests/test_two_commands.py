@@ -178,6 +178,7 @@ def assert_apart(outcomes: list[Outcome], name: str) -> bool:
 
 
 def test_two_trainings_of_one_run(studio: Studio, both: Pair) -> None:
+    """One of two trainings of a run works, and the run is that of a single training."""
     told = 0
     for index in range(ROUNDS):
         command = ["train", str(studio.root), "--run", f"t{index}", "--steps", "3", "--split", "tail"]
@@ -189,6 +190,7 @@ def test_two_trainings_of_one_run(studio: Studio, both: Pair) -> None:
 
 
 def test_two_captures_of_one_video(studio: Studio, both: Pair, tmp_path: Path) -> None:
+    """One of two captures of a video works, and the result is that of a single one."""
     expected = tree_bytes(studio.root / "sequences" / "clip" / "capture")
     told = 0
     for index in range(ROUNDS):

@@ -65,6 +65,7 @@ def test_it_is_added_once_and_then_goes_by_its_name(added):
 
 
 def test_choices_that_lead_nowhere(added, tmp_path, capsys):
+    """Names and files that are no face model are refused with the reason."""
     path, _ = added
     other = write_npz(tmp_path / "my_head.npz", {"weights": np.zeros(3)})
     for choice, message in (
