@@ -37,12 +37,12 @@ def mapped_bytes() -> int:
     return int(line.split()[1]) << 10
 
 
-def largest_share(pictures: np.ndarray, look: Callable[[np.ndarray], object]) -> int:
+def largest_share(pictures: np.ndarray, read: Callable[[np.ndarray], object]) -> int:
     """Return the growth of the mapped pages while every picture is read."""
     before = mapped_bytes()
     most = 0
     for index in np.ndindex(pictures.shape[:2]):
-        look(pictures[index])
+        read(pictures[index])
         most = max(most, mapped_bytes() - before)
     return most
 

@@ -272,12 +272,12 @@ def test_huge_pictures_inside_of_a_video_are_not_decoded(tmp_path: Path) -> None
     alone = tmp_path / "a.png"
     alone.write_bytes(bomb)
 
-    def look() -> None:
+    def read() -> None:
         assert len(list(read_video_frames(path))) == 1
         with pytest.raises(UserError, match="it is damaged, or has more than the 37,748,736 pixels"):
             list(read_video_frames(alone))
 
-    assert peak_of(look) < 200
+    assert peak_of(read) < 200
 
 
 def test_a_gif_that_announces_a_huge_screen(tmp_path: Path) -> None:
@@ -288,11 +288,11 @@ def test_a_gif_that_announces_a_huge_screen(tmp_path: Path) -> None:
     data[6:10] = struct.pack("<HH", 20_000, 20_000)
     path.write_bytes(data)
 
-    def look() -> None:
+    def read() -> None:
         with pytest.raises(UserError, match="it is damaged, or has more than"):
             list(read_video_frames(path))
 
-    assert peak_of(look) < 200
+    assert peak_of(read) < 200
 
 
 def test_pixels_that_are_not_square_count_as_they_are_shown() -> None:

@@ -44,7 +44,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def studio(cache: Path, both: Pair, tmp_path_factory: pytest.TempPathFactory) -> Studio:
     """Return a workspace with a run that was trained and evaluated alone."""
     made = toy_studio(tmp_path_factory.mktemp("studio") / "it", cache)
-    assert main(["create", str(made.video), "--out", str(made.root), "--run", "alone", *made.look]) == 0
+    assert main(["create", str(made.video), "--out", str(made.root), "--run", "alone", *made.create_options]) == 0
     return made
 
 
@@ -62,11 +62,11 @@ def commands_that_write(studio: Studio, folder: Path) -> dict[str, tuple[Path, l
     return {
         "capture": (
             clip,
-            ["capture", video, "--out", str(root), "--name", "clip", *studio.given, "--capture.end", "9"],
+            ["capture", video, "--out", str(root), "--name", "clip", *studio.capture_options, "--capture.end", "9"],
         ),
         "track": (clip, ["track", str(root), "--face-model", "toy", "--again"]),
         "train": (runs / "new", ["train", str(root), "--run", "new", "--steps", "3"]),
-        "create": (runs / "new", ["create", video, "--out", str(root), "--run", "new", *studio.look]),
+        "create": (runs / "new", ["create", video, "--out", str(root), "--run", "new", *studio.create_options]),
         "evaluate": (runs / "alone", ["evaluate", str(root), "--run", "alone"]),
         "demo": (folder / "demo" / "synthetic-0-1s.mp4", ["demo", "--out", str(folder / "demo"), "--seconds", "1"]),
         "bench quality": (folder / "q" / "quality", ["bench", "quality", "--out", str(folder / "q")]),
@@ -103,10 +103,10 @@ def test_readers_go_on_beside_every_lock(
             ["drive", root, *run, "--by", root, "--out", str(tmp_path / "drive"), "--size", "32"],
             ["export", root, *run, "--out", str(tmp_path / "a.ply")],
             ["evaluate", root, *run, "--compare", "--out", str(tmp_path / "a.html")],
-            ["capture", str(studio.video), "--out", root, "--name", "clip", *studio.given],
+            ["capture", str(studio.video), "--out", root, "--name", "clip", *studio.capture_options],
             ["track", root, "--face-model", "toy", "--overlay", "none"],
             ["train", root, *run, "--steps", "3", "--split", "tail"],
-            ["create", str(studio.video), "--out", root, *run, *studio.look],
+            ["create", str(studio.video), "--out", root, *run, *studio.create_options],
         ):
             assert main(command) == 0, (command, capsys.readouterr().err)
 
@@ -195,7 +195,7 @@ def test_two_captures_of_one_video(studio: Studio, both: Pair, tmp_path: Path) -
     told = 0
     for index in range(ROUNDS):
         root = tmp_path / str(index)
-        command = ["capture", str(studio.video), "--out", str(root), "--name", "clip", *studio.given]
+        command = ["capture", str(studio.video), "--out", str(root), "--name", "clip", *studio.capture_options]
         outcomes = both.run(command, command)
         told += assert_apart(outcomes, "clip")
         assert sum(len(one.worked) for one in outcomes) == 1, "captured once"
@@ -211,7 +211,7 @@ def test_create_beside_evaluate(studio: Studio, both: Pair) -> None:
         shutil.copytree(runs / "alone", run, ignore=shutil.ignore_patterns("metrics.json", "report.html", "videos"))
         if index % 3 == 2:
             (run / "training.json").unlink()
-        create = ["create", str(studio.video), "--out", str(studio.root), "--run", name, *studio.look]
+        create = ["create", str(studio.video), "--out", str(studio.root), "--run", name, *studio.create_options]
         outcomes = both.run(create, ["evaluate", str(studio.root), "--run", name])
         if "missing; run `mien train` again" in outcomes[1].told:  # it came first, and there was nothing to evaluate
             assert outcomes[0].code == 0

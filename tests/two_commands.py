@@ -128,9 +128,9 @@ class Studio:
 
     root: Path
     video: Path
-    given: list[str]
+    capture_options: list[str]
     """Options of a capture with mattes and landmarks, so that nothing has to be detected."""
-    look: list[str]
+    create_options: list[str]
     """Options of `create` with which everything up to the tracking is current and training is short."""
 
 
@@ -151,10 +151,10 @@ def toy_studio(folder: Path, cache: Path) -> Studio:
         cv2.imwrite(str(folder / "pictures" / f"{timestep}.png"), film.images[timestep, 0][..., ::-1])
     marks = np.random.default_rng(0).uniform(8, 40, (_TIMESTEPS, 478, 2)).astype(np.float32)
     write_arrays(folder / "landmarks.safetensors", {"landmarks": marks})
-    given = ["--capture.crop", "none", "--capture.mattes", str(folder / "mattes")]
-    given += ["--capture.landmarks", str(folder / "landmarks.safetensors")]
+    capture_options = ["--capture.crop", "none", "--capture.mattes", str(folder / "mattes")]
+    capture_options += ["--capture.landmarks", str(folder / "landmarks.safetensors")]
     root, video = folder / "workspace", folder / "pictures"
-    assert main(["capture", str(video), "--out", str(root), "--name", "clip", *given]) == 0
+    assert main(["capture", str(video), "--out", str(root), "--name", "clip", *capture_options]) == 0
     workspace, sequence = Workspace(root), root / "sequences" / "clip"
     fingerprint = _tracking_fingerprint(workspace, ["clip"], model, TrackingSettings())
     made_from = {"fingerprint": fingerprint, "tracked_together": ["clip"]}
@@ -164,5 +164,5 @@ def toy_studio(folder: Path, cache: Path) -> Studio:
     from mien.capture import read_capture_hash
 
     write_scoring(sequence / "scoring", Scoring(alpha, crops), read_capture_hash(sequence / "capture"))
-    look = ["--name", "clip", "--face-model", "toy", "--overlay", "none", "--steps", "3", "--split", "tail", *given]
-    return Studio(root, video, given, look)
+    create_options = ["--name", "clip", "--face-model", "toy", "--overlay", "none", "--steps", "3", "--split", "tail"]
+    return Studio(root, video, capture_options, [*create_options, *capture_options])
