@@ -1,12 +1,13 @@
-"""Measure how results differ between processors, emulated by environment: the table of docs/reproducibility.md.
+"""Measure how results differ between processors, and print the table of docs/reproducibility.md.
 
     python benchmarks/processors.py --out out/processors                  # some minutes
     python benchmarks/processors.py --out out/processors --settings isa-avx2 old
 
-One synthetic clip is drawn once. Then a process for each setting tracks it, trains an avatar on it (with the true
-tracking, so that the two do not mix), and renders both its own avatar and that of the first setting. Differences are
-told against the first setting, which is this machine as it is: PSNR of renderings in dB, tracked vertices in
-millimetres, landmarks in pixels. For processors of another kind copy the output folder to another machine.
+Environment variables emulate older processors. One synthetic clip is drawn once. Then a process for each setting tracks
+it, trains an avatar on it (with the true tracking, so that the two do not mix), and renders both its own avatar and
+that of the first setting. The table compares every setting with the first one, which is this machine as it is: PSNR of
+renderings in dB, tracked vertices in millimetres, landmarks in pixels. To compare with another machine, copy the output
+folder there and run the same command.
 """
 
 import argparse
@@ -39,33 +40,33 @@ SETTINGS: dict[str, dict[str, str]] = {
     "isa-sse4": {"MIEN_ISA": "sse4"},
     "old": OLD,
 }
-"""Environments by name; those that name an instruction set are of x86-64."""
+"""Environments by name. Those that name an instruction set need x86-64."""
 
 
 def main() -> None:
-    """Run what is not there yet, and print the table."""
+    """Run the settings without results, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder for clip, avatars and results")
-    parser.add_argument("--settings", nargs="*", default=[*SETTINGS], help=f"of {', '.join(SETTINGS)}")
-    parser.add_argument("--steps", type=int, default=400, help="of the optimiser")
-    parser.add_argument("--size", type=int, default=128, help="of the pictures, pixels")
-    parser.add_argument("--frames", type=int, default=16, help="of the clip")
+    parser.add_argument("--settings", nargs="*", default=[*SETTINGS], help=f"settings to run: {', '.join(SETTINGS)}")
+    parser.add_argument("--steps", type=int, default=400, help="optimiser steps")
+    parser.add_argument("--size", type=int, default=128, help="side of the pictures in pixels")
+    parser.add_argument("--frames", type=int, default=16, help="frames of the clip")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.worker:
-        work(given.out, given.worker, given.steps)
+        measure(given.out, given.worker, given.steps)
         return
-    draw(given.out, given.size, given.frames)
+    draw_clip(given.out, given.size, given.frames)
     names = [FIRST, *(name for name in given.settings if name != FIRST)]
     for name in names:
         if not (given.out / f"{name}.npz").is_file():
             command = [sys.executable, __file__, "--out", given.out, "--steps", str(given.steps), "--worker", name]
             subprocess.run(command, env={"MIEN_THREADS": "1", **os.environ, **SETTINGS[name]}, check=True)
-    print(table(given.out, names))
+    print(format_table(given.out, names))
 
 
-def draw(out: Path, size: int, frames: int) -> None:
-    """The clip, once."""
+def draw_clip(out: Path, size: int, frames: int) -> None:
+    """Draw the clip and its true tracking, unless they exist."""
     if not (out / "truth").is_dir():
         recipe = replace(RECIPES["plain"], width=size, height=size, fps=8.0, seconds=frames / 8, texture_size=512)
         capture, truth = synthesize(recipe, 3)
@@ -73,8 +74,8 @@ def draw(out: Path, size: int, frames: int) -> None:
         write_tracking(out / "truth", truth)
 
 
-def work(out: Path, name: str, steps: int) -> None:
-    """Track, train and render as one processor; write OUT/NAME.npz and OUT/run-NAME."""
+def measure(out: Path, name: str, steps: int) -> None:
+    """Track, train and render in this environment, and write OUT/NAME.npz and OUT/run-NAME."""
     torch.set_num_threads(1)
     capture, truth = read_capture(out / "capture"), read_tracking(out / "truth")
     model = load_face_model(truth.face_model)
@@ -95,14 +96,14 @@ def work(out: Path, name: str, steps: int) -> None:
 
 
 def over_white(capture: Capture) -> np.ndarray:
-    """Training pictures, float32."""
+    """Return the pictures over white, as training sees them, float32."""
     alpha = capture.mattes[:, 0, ..., None] / np.float32(255)
     return alpha * (capture.images[:, 0] / np.float32(255)) + 1 - alpha
 
 
 @torch.no_grad()
 def render(avatar: Avatar, tracking: Tracking) -> np.ndarray:
-    """An avatar at every timestep, float32."""
+    """Return an avatar's pictures at every timestep, float32."""
     pictures = []
     for timestep in range(len(tracking.face)):
         gaussians = avatar.pose(tracking.face[timestep]).gaussians.timestep(0)
@@ -110,20 +111,20 @@ def render(avatar: Avatar, tracking: Tracking) -> np.ndarray:
     return np.stack(pictures)
 
 
-def table(out: Path, names: list[str]) -> str:
-    """Markdown: every setting against the first."""
+def format_table(out: Path, names: list[str]) -> str:
+    """Return a table in Markdown that compares every setting with the first."""
     results = {name: dict(np.load(out / f"{name}.npz")) for name in names}
     first = results[FIRST]
     lines = [
         "| setting | one avatar, rendered | avatar, trained | against the clip | tracking: vertices | landmarks |",
         "|---|---|---|---|---|---|",
-        f"| the machine as it is | | | {decibels(first['trained'], first['clip'])} | | |",
+        f"| the machine as it is | | | {format_psnr(first['trained'], first['clip'])} | | |",
     ]
     for name in names[1:]:
         one = results[name]
         settings = " ".join(f"{key}={value}" for key, value in SETTINGS[name].items())
-        cells = [decibels(one[part], first[part]) for part in ("rendered", "trained")]
-        cells.append(decibels(one["trained"], one["clip"]))
+        cells = [format_psnr(one[part], first[part]) for part in ("rendered", "trained")]
+        cells.append(format_psnr(one["trained"], one["clip"]))
         for part, unit, factor in (("vertices", "mm", 1000), ("landmarks", "px", 1)):
             away = factor * np.linalg.norm(one[part].astype(np.float64) - first[part], axis=-1)
             cells.append("same bytes" if not away.any() else f"{away.mean():.2g} {unit} (most {away.max():.2g})")
@@ -131,8 +132,8 @@ def table(out: Path, names: list[str]) -> str:
     return "\n".join(lines)
 
 
-def decibels(pictures: np.ndarray, expected: np.ndarray) -> str:
-    """PSNR over all pictures."""
+def format_psnr(pictures: np.ndarray, expected: np.ndarray) -> str:
+    """Return the PSNR over all pictures as text."""
     squared = float(((pictures.astype(np.float64) - expected) ** 2).mean())
     return "same bytes" if squared == 0 else f"{-10 * np.log10(squared):.1f} dB"
 

@@ -1,4 +1,4 @@
-"""Fit 3D Gaussians to one picture by gradient descent: the differentiable renderer alone, no data needed.
+"""Fit 3D Gaussians to one picture by gradient descent, with the differentiable renderer alone. It needs no data.
 
 python examples/01_fit_gaussians.py --out out/examples/fit.png
 """
@@ -18,18 +18,18 @@ SIZE = 128
 
 
 def target_picture() -> torch.Tensor:
-    """A disc with a colour gradient on black, [H, W, 3] in 0..1."""
+    """Return a disc with a colour gradient on black, [H, W, 3] in 0..1."""
     rows, columns = torch.meshgrid(torch.linspace(-1, 1, SIZE), torch.linspace(-1, 1, SIZE), indexing="ij")
     inside = (rows**2 + columns**2 < 0.5).float()
     return torch.stack([inside, inside * (columns + 1) / 2, inside * (rows + 1) / 2], dim=-1)
 
 
 def main() -> None:
-    """Optimise positions, sizes, opacities and colours; write target and result side by side."""
+    """Optimise positions, sizes, opacities and colours, and write target and result side by side."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--gaussians", type=int, default=600)
-    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--out", type=Path, required=True, help="picture to write")
+    parser.add_argument("--gaussians", type=int, default=600, help="number of Gaussians")
+    parser.add_argument("--steps", type=int, default=200, help="optimiser steps")
     options = parser.parse_args()
 
     torch.manual_seed(0)

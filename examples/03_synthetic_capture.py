@@ -1,4 +1,4 @@
-"""A capture with exact ground truth, written as a workspace that `mien train` and example 05 can use.
+"""Write a synthetic capture with exact ground truth as a workspace, which `mien train` and example 05 can use.
 
 python examples/03_synthetic_capture.py --out out/examples/subject
 """
@@ -15,12 +15,12 @@ from mien.workspace import Workspace
 
 
 def main() -> None:
-    """Draw the clip, write capture, true tracking and scoring masks, and an overlay to look at."""
+    """Draw the clip, and write capture, true tracking, scoring masks, and a video of the tracking over the capture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="workspace folder")
-    parser.add_argument("--seed", type=int, default=0, help="another seed is another person")
-    parser.add_argument("--seconds", type=float, default=4.0)
-    parser.add_argument("--size", type=int, default=256, help="pixels")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the person and the motion")
+    parser.add_argument("--seconds", type=float, default=4.0, help="length of the clip")
+    parser.add_argument("--size", type=int, default=256, help="side of the pictures in pixels")
     options = parser.parse_args()
 
     recipe = replace(RECIPES["plain"], seconds=options.seconds, width=options.size, height=options.size)

@@ -1,4 +1,4 @@
-"""Your own video: frames, mattes and landmarks, then the face model fitted to them.
+"""Capture your own video (frames, mattes and landmarks) and fit the face model to it.
 
 python examples/04_capture_and_track.py my_video.mp4 --out out/examples/me
 """
@@ -14,11 +14,11 @@ from mien.workspace import Workspace
 
 
 def main() -> None:
-    """What `mien capture` and `mien track` do, as function calls."""
+    """Call the functions behind `mien capture` and `mien track`."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("video", type=Path)
+    parser.add_argument("video", type=Path, help="video of one person")
     parser.add_argument("--out", type=Path, required=True, help="workspace folder")
-    parser.add_argument("--max-frames", type=int, default=0, help="0 takes all")
+    parser.add_argument("--max-frames", type=int, default=0, help="most frames to capture; 0 for all")
     options = parser.parse_args()
 
     folder = Workspace(options.out).sequence_dir(options.video.stem)

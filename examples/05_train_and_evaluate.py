@@ -1,4 +1,4 @@
-"""Train an avatar with settings of your own, then score it on the frames it never saw.
+"""Train an avatar with settings of your own, then score it on held-out frames.
 
 python examples/05_train_and_evaluate.py out/examples/subject --steps 3000
 """
@@ -16,12 +16,12 @@ from mien.workspace import open_workspace
 
 
 def main() -> None:
-    """Stopped at any time, the same command goes on where it was."""
+    """Train and evaluate. If this is interrupted, the same command continues where it stopped."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("workspace", type=Path)
-    parser.add_argument("--run", default="example")
-    parser.add_argument("--steps", type=int, default=3000)
-    parser.add_argument("--gaussians", type=int, default=20_000, help="most Gaussians")
+    parser.add_argument("workspace", type=Path, help="workspace with tracked sequences")
+    parser.add_argument("--run", default="example", help="name of the new run")
+    parser.add_argument("--steps", type=int, default=3000, help="optimiser steps")
+    parser.add_argument("--gaussians", type=int, default=20_000, help="largest number of Gaussians")
     options = parser.parse_args()
 
     torch.set_num_threads(1)

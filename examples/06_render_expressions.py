@@ -1,4 +1,4 @@
-"""A trained avatar by its sliders: one row of expressions, one row of views.
+"""Render a trained avatar: one row of expressions, one row of views.
 
 python examples/06_render_expressions.py out/examples/subject --out out/examples/expressions.png
 """
@@ -23,12 +23,12 @@ ANGLES = (-20, -7, 7, 20)
 
 @torch.no_grad()
 def main() -> None:
-    """Pose, render, write."""
+    """Pose the avatar, render it, and write a sheet of pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("workspace", type=Path)
-    parser.add_argument("--run", default=None, help="default: the only one")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("workspace", type=Path, help="workspace of the avatar")
+    parser.add_argument("--run", default=None, help="name of the run; the only one by default")
+    parser.add_argument("--out", type=Path, required=True, help="picture to write")
+    parser.add_argument("--size", type=int, default=256, help="side of each picture in pixels")
     options = parser.parse_args()
 
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Cross-identity driving: one sequence's motion on another person's avatar, relative to each one's neutral.
+"""Drive an avatar by another person's motion, relative to the neutral face of each.
 
 python examples/07_drive.py out/examples/subject --by out/examples/me --out out/examples/driven.mp4
 """
@@ -19,12 +19,12 @@ from mien.workspace import open_workspace
 
 @torch.no_grad()
 def main() -> None:
-    """The driver's pictures on the left, the avatar on the right."""
+    """Write a video with the driver on the left and the avatar on the right."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("workspace", type=Path, help="of the avatar")
+    parser.add_argument("workspace", type=Path, help="workspace of the avatar")
     parser.add_argument("--by", type=Path, required=True, help="workspace of the driver")
-    parser.add_argument("--run", default=None, help="default: the only one")
-    parser.add_argument("--out", type=Path, required=True, help="an .mp4")
+    parser.add_argument("--run", default=None, help="name of the run; the only one by default")
+    parser.add_argument("--out", type=Path, required=True, help="video to write (.mp4)")
     options = parser.parse_args()
 
     torch.set_num_threads(1)

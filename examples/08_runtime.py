@@ -1,4 +1,4 @@
-"""An avatar without torch: numpy and the native core load, pose and render a .mien file.
+"""Load, pose and render a .mien file without torch, by numpy and the native core alone.
 
 mien export out/examples/subject --out out/examples/avatar.mien
 python examples/08_runtime.py out/examples/avatar.mien --out out/examples/frames
@@ -16,12 +16,12 @@ from mien import runtime
 
 
 def main() -> None:
-    """A short performance: the jaw opens and closes while the head turns; one PNG a frame."""
+    """Render a jaw that opens and closes while the head turns, one PNG per frame, and report the time per frame."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("avatar", type=Path, help="a .mien file")
-    parser.add_argument("--out", type=Path, required=True, help="folder of pictures")
-    parser.add_argument("--frames", type=int, default=25)
-    parser.add_argument("--size", type=int, default=256, help="pixels")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the pictures")
+    parser.add_argument("--frames", type=int, default=25, help="number of frames")
+    parser.add_argument("--size", type=int, default=256, help="side of the pictures in pixels")
     options = parser.parse_args()
 
     avatar = runtime.load(options.avatar)
@@ -40,7 +40,7 @@ def main() -> None:
         seconds += time.perf_counter() - began
         picture = (image.clip(0, 1)[:, :, ::-1] * 255 + 0.5).astype(np.uint8)
         cv2.imwrite(str(options.out / f"{frame:06d}.png"), picture)
-    print(f"wrote {options.out}: {options.frames} pictures, {1000 * seconds / options.frames:.1f} ms a frame")
+    print(f"wrote {options.out}: {options.frames} pictures, {1000 * seconds / options.frames:.1f} ms per frame")
 
 
 if __name__ == "__main__":

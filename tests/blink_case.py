@@ -1,4 +1,4 @@
-"""Pictures of a face whose eyes blink, in plain colours, and trackings of it that may miss blinks."""
+"""Draw a face whose eyes blink, in plain colours, and make trackings of it that may miss blinks."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ class BlinkCase:
         self.columns = [self.reduced.layout.names.index(name) for name in LIDS]
 
     def states(self, lids: np.ndarray) -> Tensor:
-        """Parameters with these lids, [t, 2] right and left."""
+        """Return parameters with these lids, [t, 2], right before left."""
         state = torch.zeros(len(lids), self.reduced.layout.size, dtype=torch.float64)
         state[:, 0] = 0.05 * torch.arange(len(lids)).sin()
         state[:, 1] = 0.1 * (0.7 * torch.arange(len(lids))).sin()
@@ -38,7 +38,7 @@ class BlinkCase:
         return state
 
     def shot(self, lids: np.ndarray, size: int = 192, white: tuple[float, float, float] = WHITE) -> Shot:
-        """A clip in which lids are truly so; eyes are as dark as `white` has them."""
+        """Return a clip in which the lids are as given. `white` is the colour of the eyeballs."""
         camera = _camera(size)
         face = self.reduced.layout.face_params(self.states(lids), unknown_subject(self.reduced).identity)
         vertices = self.model(face.to(torch.zeros(())))
@@ -51,7 +51,7 @@ class BlinkCase:
         return shot_of(capture, TrackingSettings())
 
     def fit(self, lids: np.ndarray, size: int = 192) -> Fit:
-        """What tracking would have with these lids."""
+        """Return a fit that has these lids."""
         own = SequenceFit(batch_of((_camera(size),)), self.states(lids))
         return Fit(unknown_subject(self.reduced), (own,))
 

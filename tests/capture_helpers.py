@@ -1,4 +1,4 @@
-"""Tiny captures and clips made on the fly for the tests of mien.capture."""
+"""Make tiny captures and clips for the tests of mien.capture."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from mien.capture.video import write_video
 
 
 def random_capture(timesteps: int = 3, cameras: int = 2, height: int = 20, width: int = 31, seed: int = 0) -> Capture:
-    """Noise: what a PNG must keep exactly."""
+    """Return a capture of noise, which a PNG must keep exactly."""
     random = np.random.default_rng(seed)
     landmarks = random.uniform(0, 20, (timesteps, cameras, 478, 2)).astype(np.float32)
     valid = np.ones((timesteps, cameras), bool)
@@ -38,13 +38,13 @@ def assert_same_capture(one: Capture, other: Capture) -> None:
 
 
 def tree_bytes(folder: Path) -> dict[str, bytes]:
-    """Every file's content but the cache's stamp, which holds times of change."""
+    """Return the content of every file, except for the cache's stamp, which holds times of change."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "stamp.json")
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 def scan_texture(test_data: Path) -> np.ndarray:
-    """The Lee Perry-Smith scan's photo texture: a flat, frontal face that the detectors find."""
+    """Return the photo texture of the Lee Perry-Smith scan: a flat, frontal face that the detectors find."""
     path = test_data / "leeperrysmith" / "Map-COL.jpg"
     texture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
     assert texture is not None
@@ -54,7 +54,7 @@ def scan_texture(test_data: Path) -> np.ndarray:
 def write_gradient_video(
     path: Path, frames: int = 5, width: int = 64, height: int = 48, fps: float = 25.0
 ) -> np.ndarray:
-    """A clip in which nobody is seen; returns its frames."""
+    """Write a clip without any person, and return its frames."""
     y, x = np.mgrid[:height, :width]
     pictures = np.stack(
         [np.stack([x * 255 // width, y * 255 // height, (x * 0 + 8 * t) % 256], axis=-1) for t in range(frames)]
@@ -64,7 +64,7 @@ def write_gradient_video(
 
 
 def write_face_clip(path: Path, test_data: Path, frames: int = 12, size: tuple[int, int] = (640, 360)) -> np.ndarray:
-    """The scan's texture, wandering over a plain picture; returns the texture's centre in each frame, pixels."""
+    """Write a clip of the scan's texture on a plain picture. Return the texture's centre in each frame, in pixels."""
     width, height = size
     face = cv2.resize(scan_texture(test_data), (240, 240), interpolation=cv2.INTER_AREA)
     lefts = 60 + 4 * np.arange(frames)
@@ -82,14 +82,14 @@ def write_planes(
     colours: tuple[int, int, int, int] = (1, 1, 1, 1),
     ticks: list[int] | None = None,
 ) -> None:
-    """A lossless clip (FFV1 in Matroska, 25 frames a second) of Y'CbCr planes [3, h, w], 4:4:4, exactly as given.
+    """Write a lossless clip (FFV1 in Matroska, 25 frames a second) of exactly these Y'CbCr planes [3, h, w], 4:4:4.
 
     Args:
-        path: ends in .mkv.
-        pictures: uint8 or uint16, as the pixel format has it.
-        pixel_format: as yuv444p10le.
-        colours: codes of matrix, primaries, transfer and range.
-        ticks: times in milliseconds instead of an even rate.
+        path: Path of the clip; it ends in .mkv.
+        pictures: Planes as uint8 or uint16, depending on the pixel format.
+        pixel_format: FFmpeg's name of the pixel format, such as yuv444p10le.
+        colours: Codes of matrix, primaries, transfer and range.
+        ticks: Times in milliseconds; by default the rate is even.
     """
     _, height, width = pictures[0].shape
     with av.open(str(path), "w") as container:
@@ -110,7 +110,7 @@ def write_planes(
 
 
 def to_planes(signal: np.ndarray, weights: tuple[float, float], bits: int) -> np.ndarray:
-    """R'G'B' in 0..1 [h, w, 3] as Y'CbCr planes of studio range; `weights` are those of red and blue in luma."""
+    """Convert R'G'B' in 0..1 [h, w, 3] to Y'CbCr planes of studio range. `weights` are red's and blue's in luma."""
     red, green, blue = np.moveaxis(signal, -1, 0)
     luma = weights[0] * red + (1 - sum(weights)) * green + weights[1] * blue
     chroma = [(blue - luma) / (2 - 2 * weights[1]), (red - luma) / (2 - 2 * weights[0])]
@@ -120,6 +120,6 @@ def to_planes(signal: np.ndarray, weights: tuple[float, float], bits: int) -> np
 
 
 def face_picture(test_data: Path, side: int = 160, margin: int = 0) -> np.ndarray:
-    """The scan's texture with a plain margin around it."""
+    """Return the scan's texture with a plain margin around it."""
     face = cv2.resize(scan_texture(test_data), (side, side), interpolation=cv2.INTER_AREA)
     return np.pad(face, ((margin, margin), (margin, margin), (0, 0)), constant_values=190)

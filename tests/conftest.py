@@ -1,4 +1,4 @@
-"""Shared fixtures; how tests are shared out among processes; what is said of skipped ones at the end."""
+"""Share fixtures, divide the tests among processes, and list the skipped ones at the end."""
 
 import os
 from collections import Counter
@@ -16,14 +16,14 @@ settings.register_profile("mien", deadline=None, derandomize=True)
 settings.load_profile("mien")
 
 MOST_WORKERS = 4
-"""More gain little, since the longest files take a quarter of the time."""
+"""Largest number of worker processes. More gain little, since the longest files take a quarter of the time."""
 MEMORY_OF_A_WORKER = 3 << 30
-"""Bytes."""
+"""Memory that a worker needs, in bytes."""
 
 
 @pytest.fixture(scope="session")
 def test_data() -> Path:
-    """The folder named by MIEN_TEST_DATA (default: ../shared/data beside the checkout)."""
+    """Return the folder named by MIEN_TEST_DATA (default: ../shared/data beside the checkout)."""
     folder = find_test_data()
     if folder is None:
         pytest.skip(NO_TEST_DATA)
@@ -31,7 +31,7 @@ def test_data() -> Path:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """`-n auto`: one worker a core, as far as memory goes."""
+    """Return the number of workers for `-n auto`: one for each core, as far as memory allows."""
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return max(1, min(len(os.sched_getaffinity(0)), MOST_WORKERS, memory // MEMORY_OF_A_WORKER))
 
@@ -41,7 +41,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if item.get_closest_marker("gpu") and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason=NO_GPU))
     if hasattr(config, "workerinput"):
-        # Workers take whole files in this order: what is long comes first, so that all of them end at about one time.
+        # Workers take whole files in this order. Long ones come first, so that all workers end at about the same time.
         slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
         items.sort(key=lambda item: -slow[item.path])
 

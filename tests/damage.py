@@ -1,4 +1,4 @@
-"""Damage to files: flipped bits, cut ends, and edits of json behind the back of its checksum."""
+"""Damage files: flip bits, cut ends, and edit json without correcting its checksum."""
 
 import json
 import random
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Change a json file as an old or foreign version of mien might have written it: without a checksum."""
+    """Change a json file and drop its checksum, as in a file of an old or foreign version of mien."""
     content = json.loads(path.read_text())
     content.pop("checksum", None)
     change(content)
@@ -16,15 +16,23 @@ def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def flip_or_cut(data: bytes, dice: random.Random) -> bytes:
-    """One random damage: an end cut off, a bit flipped, or some neighbouring bytes replaced."""
+    """Damage data once at random: cut off an end, flip a bit, or replace some neighbouring bytes."""
     kind = dice.choice(("cut", "bit", "bit", "bytes")) if data else "bytes"
     if kind == "cut":
         return data[: dice.randrange(len(data))]
     changed = bytearray(data)
-    # Headers are where a reader can go astray, so half of the damage goes there.
+    # Readers fail most easily on headers, so half of the damage is there.
     start = dice.randrange(min(len(data), 256) if dice.random() < 0.5 else len(data)) if data else 0
     if kind == "bit":
         changed[start] ^= 1 << dice.randrange(8)
     else:
         changed[start : start + 8] = dice.randbytes(len(changed[start : start + 8]) or 1)
     return bytes(changed)
+
+
+def nested(depth: int) -> list[Any]:
+    """Return a list within a list and so on, `depth` levels deep."""
+    inner: list[Any] = []
+    for _ in range(depth):
+        inner = [inner]
+    return inner

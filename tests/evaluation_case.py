@@ -1,4 +1,4 @@
-"""An experiment in which the truth is an avatar's own rendering of a small head, so that figures are known."""
+"""Make an experiment in which the truth is an avatar's own rendering of a small head, so that its figures are known."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ SIZE = 72
 
 
 def make_experiment(timesteps: int = 50, split: Split = "blocks", seed: int = 0) -> Experiment:
-    """A head that turns and moves its face; every pixel that the avatar covers is scored."""
+    """Return an experiment with a head that turns and moves its face. Every pixel that the avatar covers is scored."""
     torch.manual_seed(seed)
     face_model = make_small_face_model()
     face = _motion(face_model.neutral(timesteps))
@@ -57,13 +57,13 @@ def _motion(face: FaceParams) -> FaceParams:
 
 
 def _paint(avatar: GaussianAvatars) -> None:
-    """Opaque, small Gaussians; colours follow the place on the head."""
+    """Make the Gaussians opaque and small, with colours that depend on the place on the head."""
     model, store = avatar.face_model, avatar.gaussian_store()
     middle = model.template[model.faces].mean(1)
     rgb = (middle / middle.abs().max() * 0.5 + 0.5).clamp(0.05, 0.95)
     with torch.no_grad():
         store["opacity_logits"].fill_(4.0)
-        # Thin along the triangle's normal, so that the outline is the mesh's.
+        # Gaussians are thin along the triangle's normal, so that the outline is the mesh's.
         store["log_scales"].copy_(torch.tensor([-1.1, -4.0, -1.1]))
         store["sh_constant"].copy_(sh_from_rgb(rgb)[:, None])
 

@@ -1,4 +1,4 @@
-"""Two sequences seen by two cameras each, and runs of them on disk: what evaluation must not take for one camera."""
+"""Write two sequences, each seen by two cameras, and runs of them, to check that evaluation tells the cameras apart."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from mien.training.sequence import Sequence
 
 
 def two_cameras(experiment: Experiment, name: str) -> Sequence:
-    """The experiment's sequence under another name, with a second camera that looks from the side."""
+    """Return the experiment's sequence under another name, with a second camera that looks from the side."""
     sequence = experiment.sequences[0]
     first = sequence.tracking.cameras[0]
     second = orbit(first, torch.tensor([0.0, 0.0, -0.5]), 0.5)
@@ -55,7 +55,7 @@ def two_cameras(experiment: Experiment, name: str) -> Sequence:
 
 
 def write_sequence(root: Path, experiment: Experiment, sequence: Sequence) -> Path:
-    """Write a sequence into a workspace; returns its folder."""
+    """Write a sequence into a workspace, and return its folder."""
     folder = root / "sequences" / sequence.name
     crops = np.repeat(experiment.scorings[0].crops, len(sequence.capture.camera_ids), axis=1)
     write_capture(folder / "capture", sequence.capture)

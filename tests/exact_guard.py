@@ -28,7 +28,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 FEW = 3
-"""So many elements are added one after the other by every kernel of torch: its vectors are longer."""
+"""Number of elements that every kernel of torch adds one after the other, since its vectors are longer."""
 
 _ROOTS = tuple(str(Path(__file__).parents[1] / folder) for folder in ("src", "tests"))
 _PRODUCTS = {
@@ -51,16 +51,16 @@ _NAMED = ("matmul", "dot", "inner", "vdot", "matvec", "vecmat", "vecdot")
 
 
 class InexactError(AssertionError):
-    """Something whose bits depend on the processor was called where they must not."""
+    """A result that must be the same everywhere used arithmetic whose bits depend on the processor."""
 
 
 @contextmanager
 def exact_guard() -> Iterator[None]:
-    """Fail with `InexactError` at the first such call."""
+    """Raise `InexactError` at the first call whose bits depend on the processor."""
     before = sys.getprofile(), sys.gettrace()
     originals = {name: getattr(np, name) for name in _NAMED if hasattr(np, name)}
     with _TorchGuard():
-        torch.ones(1) + 1  # the first one imports what torch needs for it: not under a profiler
+        torch.ones(1) + 1  # the first one makes torch import modules, which must not happen under a profiler
     for name in originals:
         setattr(np, name, _refusing(f"np.{name}"))
     sys.setprofile(_watch)
@@ -90,7 +90,7 @@ class _TorchGuard(TorchDispatchMode):
 
 
 def _added(source: Any, out: Any) -> int:
-    """Count the elements that went into each element of the result."""
+    """Count the elements that are added into each element of the result."""
     result = out[0] if isinstance(out, tuple) else out
     return source.numel() // max(result.numel(), 1) if result.numel() != source.numel() else FEW
 
@@ -120,7 +120,7 @@ def _is_numeric(called: Any) -> bool:
 
 
 def _trace(frame: FrameType, event: str, _: Any) -> Callable[..., Any] | None:
-    """Follow, step by step, only the functions that hold an `@`: an operator is no call that a profiler would see."""
+    """Trace only the functions that contain an `@`, line by line. A profiler would not see the operator as a call."""
     if event == "call" and frame.f_code.co_filename.startswith(_ROOTS) and _products_in(frame.f_code):
         frame.f_trace_opcodes = True
         return _trace_steps

@@ -1,7 +1,7 @@
-"""A head in FLAME's schema made from the anny model: other vertices in other order, other joints, other bases.
+"""Make a head in FLAME's schema from the anny model, with other vertices, other joints and other bases.
 
-Identity and expression are linear bases without names; the jaw is a joint that moves skin; lids follow eyes, and lips
-the jaw, through pose correctives. Nothing of FLAME's own is in it.
+Identity and expression are linear bases without names. The jaw is a joint that moves skin. Through pose correctives
+the lids follow the eyes, and the lips follow the jaw. It contains nothing of FLAME's own.
 """
 
 import pickle
@@ -18,11 +18,11 @@ from mien.rotation import matrix_from_axis_angle
 
 IDENTITIES, EXPRESSIONS = 40, 24
 _SHIFT = np.array([0.003, -0.021, -0.044])
-"""FLAME's origin is not mien's."""
+"""Shift between FLAME's origin and mien's, in metres."""
 
 
 def flame_like(anny: FaceModel) -> dict[str, np.ndarray]:
-    """The arrays of a file in FLAME's schema."""
+    """Return the arrays of a file in FLAME's schema."""
     order, faces, _ = _cut(anny)
     template = anny.template.double().numpy()[order]
     weights, jaw, hinge, residual = _joints(anny, order, template)
@@ -31,7 +31,7 @@ def flame_like(anny: FaceModel) -> dict[str, np.ndarray]:
     posedirs[1, 2, 1] = residual / np.sin(angle)
     eyes = anny.pose_basis.double().numpy().reshape(3, 3, 3, -1, 3)[1:, :, :, order]  # type: ignore[union-attr]
     posedirs[2:] = eyes
-    # A neck that twists its skin a little, so that a transposed rotation shows.
+    # The neck twists its skin a little, so that a transposed rotation is noticed.
     posedirs[0, 0, 2] = 0.01 * weights[:, :1] * weights[:, 1:2] * np.array([1.0, 0.3, 0.2])
     expression = _expression_basis(anny, order)
     identity = anny.identity_basis.double().numpy()[:IDENTITIES, order]
@@ -48,7 +48,7 @@ def flame_like(anny: FaceModel) -> dict[str, np.ndarray]:
 
 
 def _cut(anny: FaceModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which vertices are there, in which order; their triangles; which of anny's each triangle was."""
+    """Return the order of the kept vertices, their triangles, and the index of each triangle in the anny model."""
     random = np.random.default_rng(5)
     kept = np.flatnonzero(~anny.region_mask("teeth", "tongue").numpy())
     order = random.permutation(np.unique(anny.faces.numpy()[kept]))
@@ -59,7 +59,7 @@ def _cut(anny: FaceModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def exact_landmarks(anny: FaceModel) -> dict[str, Landmarks]:
-    """Where anny's landmarks are on the other mesh: what a detector need not be asked in a test."""
+    """Return anny's landmarks on the other mesh, so that tests need no detector."""
     _, _, source = _cut(anny)
     triangle = torch.full((len(anny.faces),), -1)
     triangle[torch.from_numpy(source)] = torch.arange(len(source))
@@ -67,18 +67,18 @@ def exact_landmarks(anny: FaceModel) -> dict[str, Landmarks]:
 
 
 def true_regions(anny: FaceModel) -> np.ndarray:
-    """The name of anny's region that every triangle is in."""
+    """Return the name of the anny region that each triangle belongs to."""
     return np.array(anny.region_names)[anny.face_regions.numpy()[_cut(anny)[2]]]
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> Path:
-    """As a user saves it."""
+    """Write the arrays as a user would save them."""
     np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
     return path
 
 
 def write_pickle(path: Path, arrays: dict[str, np.ndarray]) -> Path:
-    """As FLAME's own files are: arrays within chumpy's variables, a regressor in scipy's compressed columns."""
+    """Write the arrays as in FLAME's own files: in chumpy's variables, with a compressed matrix of scipy."""
     variable, matrix = _class("chumpy.ch", "Ch"), _class("scipy.sparse.csc", "csc_matrix")
     content: dict[str, Any] = dict(arrays)
     for name in ("v_template", "shapedirs", "posedirs", "weights"):
@@ -99,7 +99,7 @@ def write_pickle(path: Path, arrays: dict[str, np.ndarray]) -> Path:
 
 
 def _class(module: str, name: str) -> type:
-    """A class that a pickle names by its module, which nobody has."""
+    """Return a class that a pickle names by a module that does not exist on the reader's machine."""
 
     class Holder:
         def __init__(self, **state: Any):
@@ -118,14 +118,14 @@ def _jaw_open(anny: FaceModel) -> int:
 
 
 def _joints(anny: FaceModel, order: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Weights (root, neck, jaw, eyes), and of the jaw: weights, hinge, what the skin does beyond it when it opens."""
+    """Return the weights (root, neck, jaw, eyes), and the jaw's weights, hinge and residual motion of the skin."""
     theirs = anny.skinning_weights.double().numpy()[order]
     hinge = anny.joint_template[2].double().numpy()
     opened = matrix_from_axis_angle(anny.joint_rotation_basis[_jaw_open(anny), 2].double()[None])[0].numpy()
     rigid = (template - hinge) @ (opened - np.eye(3)).T
     moved = anny.expression_basis[_jaw_open(anny)].double().numpy()[order]
     jaw = np.clip((moved * rigid).sum(1) / np.maximum((rigid * rigid).sum(1), 1e-9), 0, 1)
-    jaw *= theirs[:, 0]  # neck and eyes stay theirs
+    jaw *= theirs[:, 0]  # neck and eyes keep their weights
     weights = np.stack([theirs[:, 1], theirs[:, 0] - jaw, jaw, theirs[:, 3], theirs[:, 4]], axis=1)
     return weights, jaw, hinge, (moved - jaw[:, None] * rigid) * (theirs[:, 0] > 0.999)[:, None]
 
@@ -146,7 +146,7 @@ def _regressor(template: np.ndarray, weights: np.ndarray, hinge: np.ndarray) -> 
 
 
 def _expression_basis(anny: FaceModel, order: np.ndarray) -> np.ndarray:
-    """Principal directions, of unit variance, of random mixtures of what is neither jaw nor gaze."""
+    """Return principal directions of unit variance, fitted to random expressions without jaw and gaze."""
     random = np.random.default_rng(6)
     names = anny.expression_names
     use = [i for i, n in enumerate(names) if not n.startswith(("jaw", "eyeLook", "mouthClose", "tongue"))]
@@ -163,9 +163,10 @@ def _expression_basis(anny: FaceModel, order: np.ndarray) -> np.ndarray:
 def posed_as_flame(
     arrays: dict[str, np.ndarray], pose: np.ndarray, shape: np.ndarray, shift: np.ndarray, rest: np.ndarray
 ) -> np.ndarray:
-    """Vertices [v, 3] by FLAME's own formulas: pose [5, 3] axis-angles of root, neck, jaw, eyes; all coefficients.
+    """Return vertices [v, 3] by FLAME's own formulas.
 
-    `rest` is the person without expression, from which the joints are regressed.
+    `pose` [5, 3] holds the axis-angles of root, neck, jaw and eyes; `shape` holds all coefficients. `rest` is the
+    person without expression; joints are regressed from it.
     """
     shaped = arrays["v_template"] + arrays["shapedirs"].astype(np.float64) @ shape
     joints = arrays["J_regressor"] @ rest
@@ -173,7 +174,7 @@ def posed_as_flame(
     posed = shaped + arrays["posedirs"].astype(np.float64) @ (turns[1:] - np.eye(3)).ravel()
     chain: list[tuple[np.ndarray, np.ndarray]] = []
     for joint, parent in enumerate((-1, 0, 1, 1, 1)):
-        # x -> R x + t, about the joint, then what the parent does.
+        # x -> R x + t, about the joint, then the parent's motion.
         rotation, offset = turns[joint], joints[joint] - turns[joint] @ joints[joint]
         if parent >= 0:
             above, beside = chain[parent]

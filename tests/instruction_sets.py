@@ -1,4 +1,7 @@
-"""The native core's levels that a build for this kind of processor has; one that a machine lacks is skipped."""
+"""Instruction sets of the native core that a build for this kind of processor has.
+
+Levels that a machine lacks are skipped.
+"""
 
 import platform
 from collections.abc import Iterator
@@ -12,7 +15,10 @@ ISAS = ("avx512", "avx2", "sse4") if platform.machine() in ("x86_64", "AMD64") e
 
 
 def each_isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Body of a fixture with `params=ISAS`: one level during a test, then the one before."""
+    """Body of a fixture with `params=ISAS`.
+
+    It sets one level during a test, and restores the previous one afterwards.
+    """
     before = _native.rasterize_isa()
     use_instructions(request.param)
     yield request.param

@@ -1,6 +1,6 @@
-"""Calls that must be refused, and what must hold after one, in a process of their own: `test_native_calls.py` runs it.
+"""Calls that must be refused, and what must hold after them. `test_native_calls.py` runs this file in another process.
 
-Prints a line of JSON for each case: its name and what came of it. Ends early where the core crashes.
+It prints a line of JSON for each case, with its name and outcome. If the core crashes, the output ends early.
 """
 
 import json
@@ -28,7 +28,7 @@ def arguments(name: str, seed: int = 0) -> list[Any]:
 
 
 def call(name: str, **changes: Any) -> Any:
-    """A valid call with some arguments replaced, by position (`_3`)."""
+    """Make a valid call with some arguments replaced, by position (`_3`)."""
     given = arguments(name)
     for place, value in changes.items():
         given[int(place[1:])] = value
@@ -58,7 +58,7 @@ def picture_of_small_scene() -> bytes:
 
 
 def with_room(megabytes: float, body: Callable[[], Any]) -> Any:
-    """Calls it where so much more address space can be had."""
+    """Call `body` with at most this much more address space."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + int(megabytes * 2**20), before[1]))
@@ -69,7 +69,10 @@ def with_room(megabytes: float, body: Callable[[], Any]) -> Any:
 
 
 def memory_that_is_not_there() -> str:
-    """Fails at different places of a forward pass, on every thread; after each the same call gives the same bytes."""
+    """Run out of memory at different places of a forward pass, on every thread.
+
+    Later calls still give the same bytes.
+    """
     _native.set_thread_count(3)
     scene, expected, failed = wide_splats(3000), picture_of_small_scene(), 0
     for megabytes in (0, 1, 4, 9, 20, 50, 90, 200, 300, 500):
@@ -82,7 +85,10 @@ def memory_that_is_not_there() -> str:
 
 
 def memory_for_several_views() -> None:
-    """Views side by side: each is drawn by a thread of its own, where an exception would end the process."""
+    """Run out of memory in views that threads draw side by side.
+
+    An exception in such a thread would end the process.
+    """
     _native.set_thread_count(3)
     views = [wide_splats(2000, width=WIDEST // 2) for _ in range(3)]
     with_room(30, lambda: _native.rasterize_views(views, False))
@@ -147,7 +153,7 @@ def largest_high_pass() -> str:
 
 
 def large_picture() -> None:
-    """More than 2^31 pixels, in a file of holes that takes no memory."""
+    """Pass a picture of more than 2^31 pixels, in a sparse file that takes no memory."""
     with tempfile.TemporaryFile() as file:
         file.truncate(4 * 65536 * 32769)
         _native.box_of_nonzero(np.memmap(file, F32, "r+", shape=(32769, 65536)))

@@ -1,4 +1,4 @@
-"""Needs of tests that a machine may lack: the reason for a skip, and the remedy that makes the test run."""
+"""Things that tests need and a machine may lack: the reason for a skip, and the remedy that makes the test run."""
 
 import os
 from collections import Counter
@@ -29,14 +29,14 @@ _REMEDIES = {
 
 
 def find_test_data() -> Path | None:
-    """The folder that MIEN_TEST_DATA names, or shared/data beside the checkout, if it is there."""
+    """Return the folder that MIEN_TEST_DATA names, or else shared/data beside the checkout, if it exists."""
     named = os.environ.get("MIEN_TEST_DATA")
     folder = Path(named) if named else Path(__file__).parent.parent.parent / "shared" / "data"
     return folder if (folder / "MANIFEST.md").is_file() else None
 
 
 def use_instructions(isa: str) -> None:
-    """Let the native core use that instruction set; skip the test where the processor lacks it."""
+    """Let the native core use that instruction set, or skip the test if the processor lacks it."""
     if not _native.set_rasterize_isa(isa):
         pytest.skip(NO_INSTRUCTIONS + isa)
 

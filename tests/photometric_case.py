@@ -1,4 +1,4 @@
-"""A small textured head, drawn in motion: pictures with known truth for tests of the fit to pixels."""
+"""Draw a small textured head in motion: pictures with known truth for tests of the fit to pixels."""
 
 from dataclasses import dataclass, replace
 
@@ -18,7 +18,7 @@ from tracking_case import capture_of
 
 SIZE, FOCAL = 128, 230.0
 _SHARPER = 3
-"""Pictures are drawn this much larger, then shrunk."""
+"""Factor by which pictures are drawn larger before they are shrunk."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class PhotometricCase:
     face: FaceParams
     camera: Camera
     landmarks: Tensor
-    """True pixels."""
+    """True positions in pixels."""
     capture: Capture
 
 
 def make_textured_model() -> FaceModel:
-    """Of `make_small_face_model`, with texture coordinates: front and back side by side."""
+    """Return the model of `make_small_face_model` with texture coordinates; front and back are side by side."""
     model = make_small_face_model()
     front = torch.stack([0.25 + 2.5 * model.template[:, 0], 0.5 + 3.5 * model.template[:, 1]], dim=-1)
     behind = model.template[model.faces].mean(1)[:, 2] < 0
@@ -41,14 +41,17 @@ def make_textured_model() -> FaceModel:
 
 
 def smooth_noise(height: int, width: int, blur: float, seed: int = 3) -> Tensor:
-    """Colours 0.15..0.85 in blots of about `blur` texels."""
+    """Return colours of 0.15..0.85 in blots of about `blur` texels."""
     noise = np.random.default_rng(seed).standard_normal((height, width, 3)).astype(np.float32)
     noise = cv2.GaussianBlur(noise, (0, 0), blur)
     return torch.from_numpy(np.clip(0.5 + 0.15 * noise / noise.std(), 0.15, 0.85))
 
 
 def make_photometric_case(timesteps: int = 16, shake: float = 0.5) -> PhotometricCase:
-    """Landmarks err as detectors do, neighbours alike: in every frame by a shift of `shake` pixels, and a bit each."""
+    """Draw the head.
+
+    Its landmarks err like a detector's: together by up to `shake` pixels per frame, and each by a little.
+    """
     model = make_textured_model()
     layout = layout_of(model)
     time = torch.arange(timesteps, dtype=torch.float64) / 25
@@ -80,7 +83,7 @@ def make_photometric_case(timesteps: int = 16, shake: float = 0.5) -> Photometri
 
 
 def assert_alike(expected: Tracking, found: Tracking) -> None:
-    """The same to the bit."""
+    """Check that two results are the same to the bit."""
     for name, tensor in expected.face.tensors().items():
         assert torch.equal(tensor, found.face.tensors()[name]), name
     for name in ("residuals", "pixel_residuals"):

@@ -1,4 +1,4 @@
-"""Random scenes for the rasterizer's tests, and which of their pixels can be compared."""
+"""Make random scenes for the rasterizer's tests, and find the pixels that can be compared."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from mien.rotation import matrix_from_axis_angle, rigid_transform
 GSPLAT = pytest.param("gsplat", marks=pytest.mark.gpu)
 GPU = "cuda"
 TOLERANCES: dict[Backend, tuple[float, float]] = {"native": (1e-5, 1e-4), "gsplat": (1e-4, 1e-3)}
-"""Relative L2 of pictures and of gradients. gsplat takes its exponentials from the GPU's fast approximation."""
+"""Relative L2 errors of pictures and of gradients. gsplat uses the GPU's fast approximation of the exponential."""
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh", "T_world_local")
 
 
@@ -38,7 +38,7 @@ def rasterize_anywhere(
     backend: Backend = "auto",
     depth: bool = False,
 ) -> Rendering:
-    """`rasterize` of CPU tensors, on the GPU where that is the back end's place; the picture is on the CPU again."""
+    """Call `rasterize` with CPU tensors, on the GPU if the back end needs one. The picture is returned on the CPU."""
     if backend != "gsplat":
         return rasterize(gaussians, camera, background, backend, depth)
     like = torch.zeros((), device=GPU)
@@ -49,7 +49,10 @@ def rasterize_anywhere(
 
 
 def random_scene(seed: int, count: int = 200, coefficients: int = 4, width: int = 61, height: int = 45) -> Scene:
-    """Gaussians of all shapes around a camera that looks at them askew; some behind it, outside or transparent."""
+    """Return Gaussians of all shapes around a tilted camera.
+
+    Some are behind it, outside of the picture or transparent.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -71,9 +74,9 @@ def random_scene(seed: int, count: int = 200, coefficients: int = 4, width: int 
 
 
 def comparable_pixels(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Tensor:
-    """The pixels [h, w] that do not change when the two cutoffs move a little.
+    """Return the pixels [h, w] that do not change when the two cutoffs move a little.
 
-    At the others one Gaussian's alpha or one transmittance is so close to its cutoff that rounding decides.
+    At the others, an alpha or a transmittance is so close to its cutoff that rounding decides.
     """
     pictures = []
     for factor in (1 - 1e-4, 1 + 1e-4):
@@ -86,14 +89,14 @@ def comparable_pixels(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Tensor:
 
 
 def leaves(scene: Scene) -> dict[str, Tensor]:
-    """Copies of everything that a rendering is differentiable in, as leaves."""
+    """Return copies of everything that a rendering is differentiable in, as leaves."""
     tensors = {name: getattr(scene.gaussians, name) for name in PARAMETERS}
     tensors |= {"background": scene.background, "viewmat": scene.camera.viewmat, "K": scene.camera.K}
     return {name: tensor.detach().clone().requires_grad_() for name, tensor in tensors.items()}
 
 
 def render(scene: Scene, tensors: dict[str, Tensor], backend: Backend) -> Rendering:
-    """The scene with its tensors replaced."""
+    """Render the scene with its tensors replaced."""
     gaussians = Gaussians(**{name: tensors[name] for name in PARAMETERS})
     camera = Camera(tensors["K"], tensors["viewmat"], scene.camera.width, scene.camera.height)
     return rasterize_anywhere(gaussians, camera, tensors["background"], backend)
@@ -102,17 +105,17 @@ def render(scene: Scene, tensors: dict[str, Tensor], backend: Backend) -> Render
 def gradients(
     scene: Scene, backend: Backend, loss: Callable[[Rendering], Tensor]
 ) -> tuple[Rendering, dict[str, Tensor]]:
-    """The rendering, and the gradients of a loss on it."""
+    """Return the rendering, and the gradients of a loss on it."""
     tensors = leaves(scene)
     rendering = render(scene, tensors, backend)
     loss(rendering).backward()
     found = {}
     for name, tensor in [*tensors.items(), ("means2d", rendering.means2d_offset)]:
-        if name == "K" and backend == "gsplat":  # has no gradient of the intrinsics
+        if name == "K" and backend == "gsplat":  # gsplat has no gradient of the intrinsics
             continue
         assert tensor.grad is not None, name
         found[name] = tensor.grad.cpu()
-    # What no back end reads: the last row of transforms, the constant entries of K.
+    # No back end reads the last row of transforms or the constant entries of K.
     found["T_world_local"][3] = found["viewmat"][3] = 0
     if "K" in found:
         found["K"][2] = found["K"][0, 1] = found["K"][1, 0] = 0
@@ -120,13 +123,13 @@ def gradients(
 
 
 def relative_error(value: Tensor, truth: Tensor) -> float:
-    """Relative L2."""
+    """Return the relative L2 error."""
     value, truth = value.detach().double(), truth.detach().double()
     return float((value - truth).norm() / truth.norm().clamp_min(1e-12))
 
 
 class WeightedSum:
-    """A random linear loss on the pixels that can be compared."""
+    """Random linear loss on the pixels that can be compared."""
 
     def __init__(self, comparable: Tensor, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
@@ -151,7 +154,7 @@ def assert_matches_reference(scene: Scene, monkeypatch: pytest.MonkeyPatch, back
     assert torch.equal(found.radii > 0, expected.radii > 0)
     assert ((found.radii - expected.radii).abs() <= 1).all()  # rounded up from 3 sigma
     errors = {name: relative_error(value, expected_gradients[name]) for name, value in found_gradients.items()}
-    # What shines through is 1 - alpha: float32 rounds that to 1e-7, however little it is.
+    # The transmittance is 1 - alpha, which float32 rounds to 1e-7, however small it is.
     errors["background"] = min(
         errors["background"],
         float((found_gradients["background"] - expected_gradients["background"]).abs().max()) * 1e2,

@@ -1,4 +1,7 @@
-"""Signatures of tiny versions of the reference captures; `python tests/reference_signatures.py` writes them anew."""
+"""Compute signatures of tiny versions of the reference captures.
+
+`python tests/reference_signatures.py` rewrites the file.
+"""
 
 import json
 from pathlib import Path
@@ -11,12 +14,12 @@ _FILE = Path(__file__).with_suffix(".json")
 
 
 def stored_signatures() -> dict[str, dict[str, dict[str, list[float]]]]:
-    """By reference, sequence and part."""
+    """Return the stored signatures by reference, sequence and part."""
     return json.loads(_FILE.read_text(encoding="utf-8"))
 
 
 def drawn_signatures(reference: ReferenceCapture) -> dict[str, dict[str, list[float]]]:
-    """By sequence and part, as this machine draws them."""
+    """Return the signatures by sequence and part, as this machine draws them."""
     return {scene.recipe.name: signature_of(scene) for scene in reference.tiny().scenes()}
 
 

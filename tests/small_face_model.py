@@ -1,4 +1,4 @@
-"""A face model small enough to reason about: an ellipsoid without a bottom, two eyeballs, random smooth bases."""
+"""Make a face model that is small enough to reason about: an open ellipsoid, two eyeballs, random smooth bases."""
 
 import math
 
@@ -10,7 +10,7 @@ from mien.tracking.landmarks import LEFT_IRIS, RIGHT_IRIS
 
 
 def make_small_face_model(identities: int = 6, expressions: int = 8, seed: int = 0) -> FaceModel:
-    """About 750 vertices; landmarks on the front, irises on the eyeballs; the first expression turns a jaw joint."""
+    """Return a model of about 750 vertices, with landmarks, irises, and a first expression that turns a jaw joint."""
     random = torch.Generator().manual_seed(seed)
     skull, skull_faces = _sphere(28, 24, open_below=True)
     skull = skull * torch.tensor([0.075, 0.11, 0.095])
@@ -64,7 +64,7 @@ def _landmarks(template: Tensor, faces: Tensor, regions: Tensor, random: torch.G
 
 
 def _smooth_basis(points: Tensor, count: int, size: float, random: torch.Generator) -> Tensor:
-    """Random waves: neighbours move alike. No direction moves the face as a whole, which would be the head pose's."""
+    """Return random waves that move neighbours alike. None of them moves the face as a whole, as the head pose does."""
     waves = torch.randn(count, 4, 3, generator=random) * 40
     phases = torch.rand(count, 4, generator=random) * 2 * math.pi
     amounts = torch.randn(count, 4, 3, generator=random) * size / 2
@@ -78,7 +78,7 @@ def _smooth_basis(points: Tensor, count: int, size: float, random: torch.Generat
 
 
 def _sphere(around: int, rings: int, open_below: bool) -> tuple[Tensor, Tensor]:
-    """A unit sphere of rings from top to bottom; the lowest are left out where it is open."""
+    """Return a unit sphere of rings from top to bottom. If it is open, the lowest rings are left out."""
     kept = rings - 3 if open_below else rings
     polar = torch.linspace(0.05, math.pi - 0.05, rings)[:kept, None]
     angle = torch.linspace(0, 2 * math.pi, around + 1)[:-1]

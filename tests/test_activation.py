@@ -1,4 +1,4 @@
-"""The native sigmoid against torch's."""
+"""The native sigmoid agrees with torch's."""
 
 from collections.abc import Iterator
 
@@ -28,6 +28,7 @@ def test_values_and_gradients_equal_torchs(isa, count: int) -> None:
 
 
 def test_far_out_and_nan(isa) -> None:
+    """Values far out, infinities and NaN give what torch gives."""
     values = torch.tensor([-1e30, -200.0, 200.0, 1e30, torch.inf, -torch.inf, torch.nan, 0.0])
     found = sigmoid(values)
     torch.testing.assert_close(found, values.sigmoid(), equal_nan=True, rtol=1e-6, atol=1e-29)

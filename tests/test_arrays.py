@@ -1,4 +1,4 @@
-"""Memory of large pictures that is used again."""
+"""The memory of large pictures is used again."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""GaussianAvatars' formulas, and avatars on disk."""
+"""GaussianAvatars follows its formulas, and avatars survive a round trip to disk."""
 
 import json
 from dataclasses import replace

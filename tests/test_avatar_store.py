@@ -83,5 +83,5 @@ def test_any_sequence_of_changes_keeps_lengths_and_ties(changes: list[tuple[bool
             store.select(mask)
     assert {len(store[name]) for name in store.names()} == {len(store)}
     assert {len(m.first) for m in store.moments.values()} == {len(store)}
-    # What belonged together at the start still does.
+    # Tensors and moments still belong together.
     assert torch.equal(store["means"].detach()[:, 0] / 3, store["face_index"] / 100)

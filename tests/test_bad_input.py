@@ -1,4 +1,4 @@
-"""Bad input, by what is bad about it; docs/bad_input.md lists for every command which test shows what happens."""
+"""Bad input is refused in one line. docs/bad_input.md lists for every command which test shows this."""
 
 import errno
 import re
@@ -44,7 +44,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def small_disk(size: int) -> Iterator[None]:
-    """No file can grow beyond so many bytes, as on a disk that is full."""
+    """Limit the size of every file, as a full disk would."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -59,7 +59,7 @@ def write_toy_video(folder: Path) -> None:
 
 
 def write_toy_pictures(path: Path, count: int) -> None:
-    """As `mien render` and `mien drive` do."""
+    """Write pictures as `mien render` and `mien drive` do."""
     noise = np.random.default_rng(0).integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
     write_pictures(plan_output(path, count), list(noise), 25.0)
 
@@ -141,6 +141,7 @@ def _interrupt(*_: object) -> None:
     ],
 )
 def test_bad_json(text: str, message: str, tmp_path: Path) -> None:
+    """Damaged or foreign json is refused with its reason."""
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(UserError, match=message):
         read_json(tmp_path / "a.json", "x", 1)
@@ -278,6 +279,7 @@ def test_a_full_disk_or_memory_anywhere_is_no_bug(
 
 
 def test_create_into_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`mien create` into a file says so and leaves the file alone."""
     write_toy_video(tmp_path)
     (tmp_path / "out").write_text("mine")
     assert main(["create", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out")]) == 2
@@ -292,6 +294,7 @@ def test_create_into_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_a_workspace_inside_a_workspace(
     run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, place: str
 ) -> None:
+    """A workspace inside a workspace is refused, and nothing is written."""
     write_toy_video(tmp_path)
     outer = tmp_path / "outer"
     shutil.copytree(run_dir, outer / "runs/old")

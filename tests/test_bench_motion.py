@@ -1,4 +1,4 @@
-"""Lag, lost amplitude and jitter: known ones are found."""
+"""Known lags, losses of amplitude and jitter are found."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ TIME = np.arange(100.0)
 
 
 def bumps(delay: float = 0.0, height: float = 1.0, width: float = 2.0) -> np.ndarray:
-    """Two blinks."""
+    """Return the coefficient of two blinks over time."""
     return height * np.stack([np.exp(-(((TIME - at - delay) / width) ** 2)) for at in (30.0, 62.0)]).sum(0)
 
 
@@ -83,7 +83,7 @@ def truth_of(rotations: torch.Tensor) -> tuple[Tracking, Truth]:
 
 
 def turns(delay: float = 0.0, share: float = 1.0) -> torch.Tensor:
-    """There and back in pitch and yaw, about 60 degrees a second at most."""
+    """Return pitch and yaw that turn and come back, at 60 degrees a second at most."""
     angle = share * np.stack([0.1 * bumps(delay, width=5.0), 0.4 * bumps(delay, width=5.0), 0 * TIME], axis=1)
     return torch.from_numpy(angle).float()
 

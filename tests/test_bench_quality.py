@@ -1,4 +1,4 @@
-"""What `mien bench quality` measures: nothing where a tracking is the truth, and the right amount where it is not."""
+"""`mien bench quality` measures no error if the tracking is the truth, and the right amount if it is not."""
 
 from dataclasses import replace
 from typing import get_args

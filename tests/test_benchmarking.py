@@ -1,4 +1,4 @@
-"""`mien bench render | train-step | scaling`: rows that say what was measured, json, charts; peers draw the same."""
+"""`mien bench render | train-step | scaling` writes rows, json and charts that say what was measured."""
 
 import json
 import subprocess
@@ -50,6 +50,7 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
 
 @pytest.mark.usefixtures("small")
 def test_scaling_as_json_with_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`mien bench scaling` prints rows for every size and number of threads, and draws a chart."""
     chart = tmp_path / "chart.png"
     assert main(["bench", "scaling", "--json", "--seconds", "0.001", "--plot", str(chart)]) == 0
     shown = json.loads(capsys.readouterr().out)
@@ -94,7 +95,7 @@ def test_a_chart_has_a_line_for_every_size(tmp_path: Path) -> None:
 
 
 def test_a_training_case_trains() -> None:
-    """The benchmarked step is the trainer's own, on pictures that it has something to learn from."""
+    """The benchmarked step is the trainer's own, on pictures from which it can learn."""
     state, data = train_step.training_case(load_face_model(), 2000, 96, 80)
     before = state.avatar.gaussian_store()["sh_constant"].detach().clone()
     for _ in range(10):
@@ -127,7 +128,7 @@ def test_peers_are_compared_in_one_run() -> None:
 
 
 def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In float64 on the CPU, which takes the same way through everything but gsplat."""
+    """The cases of a GPU run in float64 on the CPU, which executes all of their code but gsplat's."""
     monkeypatch.setattr(device_benchmark, "COUNTS", (60,))
     monkeypatch.setattr(device_benchmark, "SIZES", ((24, 16),))
     like = torch.zeros((), dtype=torch.float64)

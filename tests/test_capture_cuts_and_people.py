@@ -1,4 +1,4 @@
-"""Several shots, several people: each part and each face in its place."""
+"""Videos with cuts or several people are divided into parts, and each face is followed by itself."""
 
 from collections.abc import Sequence
 
@@ -28,7 +28,7 @@ def scene(face: np.ndarray, left: int, top: int, level: int, size: tuple[int, in
 
 @pytest.fixture(scope="session")
 def shots(test_data, tmp_path_factory):
-    """30 frames, a cut, 8, a cut, 30, a cut, 26 without a face."""
+    """Return a video of four shots: 30 frames, 8 frames, 30 frames, and 26 frames without a face."""
     face = face_picture(test_data, 150)
     small = face_picture(test_data, 110)
     pictures = [scene(face, 20 + t, 50, 190) for t in range(30)]
@@ -55,7 +55,7 @@ def test_each_long_shot_becomes_a_sequence(shots, tmp_path, capsys, monkeypatch)
     assert second.timestamps[0] == 0
     assert (first.source["first_frame"], second.source["first_frame"]) == (0, 38)
     assert first.source["crop"] != second.source["crop"]
-    # Whatever would work again, is not called.
+    # Functions that would work again are not called.
     monkeypatch.setattr("mien.capture.from_video.survey_source", None)
     assert capture_stage(workspace, shots, None, settings) == ["clip-1", "clip-2"]
 
@@ -115,7 +115,7 @@ def test_flashes_motion_and_light_are_no_cuts(test_data):
 
 
 def survey_of(frames: list[list[tuple[float, float, float, float]]]) -> Survey:
-    """Faces as (centre x, centre y, side, colour), at 25 frames a second."""
+    """Return a survey of faces given as (centre x, centre y, side, colour), at 25 frames a second."""
     count = len(frames)
     boxes, looks = np.full((count, MAX_FACES, 4), np.nan), np.full((count, MAX_FACES, 27), np.nan)
     for frame, faces in enumerate(frames):
@@ -167,7 +167,7 @@ def test_false_detections_are_nobody():
 
 
 class _ScriptedDetector(LandmarkDetector):
-    """Finds what it is told."""
+    """Detector that finds what its script says."""
 
     def __init__(self, script: Sequence[Sequence[float]]) -> None:
         self._script = iter(script)
@@ -179,7 +179,10 @@ class _ScriptedDetector(LandmarkDetector):
 
 
 def test_landmarks_of_others_are_refused():
-    """Ann's middle lies at 192 pixels, Bob's at 480; she is away for a while, and once nobody sees her box."""
+    """Landmarks on another person are refused.
+
+    Ann's centre is at 192 pixels, Bob's at 480; Ann is sometimes not found.
+    """
     survey = survey_of([[ANN, BOB], [BOB], [BOB], [ANN, BOB], [BOB], [ANN, BOB]])
     script = [[480, 190], [480], [185, 480], [480], [193], [480, 250]]
     follower = LandmarkFollower(

@@ -1,4 +1,4 @@
-"""Video to capture: the whole way, on a scanned face's texture and on footage."""
+"""A video becomes a capture, with the texture of a scanned face and with real footage."""
 
 import json
 import subprocess
@@ -70,7 +70,7 @@ def test_face_is_foreground_and_corners_are_not(face_capture):
 def test_captured_again_it_is_read_back(face_clip, face_capture, monkeypatch):
     path, capture = face_capture
     before = tree_bytes(path)
-    monkeypatch.setattr("mien.capture.from_video.survey_source", None)  # any work would call it
+    monkeypatch.setattr("mien.capture.from_video.survey_source", None)  # any work would call this function
     assert_same_capture(capture, capture_video(face_clip[0], path, CaptureSettings(size=200)))
     assert tree_bytes(path) == before
 
@@ -127,6 +127,7 @@ def test_interrupted_capture_goes_on_to_the_same_bytes(face_clip, tmp_path, monk
 
 
 def test_folder_of_images_in_natural_order(test_data, tmp_path):
+    """A folder of images is captured in natural order: 1, 2, 10."""
     folder = tmp_path / "pictures"
     folder.mkdir()
     face = cv2.resize(scan_texture(test_data), (128, 128), interpolation=cv2.INTER_AREA)
@@ -185,7 +186,7 @@ def test_a_video_that_lies_on_its_side_is_told_and_turned(test_data, tmp_path, c
     upright = [np.pad(face_picture(test_data, 160), ((20, 20), (60, 60), (0, 0)), mode="edge")] * 6
     path = tmp_path / "lying.mp4"
     write_video(path, iter([np.ascontiguousarray(np.rot90(picture, turn // 90)) for picture in upright]), 25, crf=8)
-    with suppress(UserError):  # of a face on its side, landmarks may or may not be found
+    with suppress(UserError):  # a face on its side may or may not be detected
         capture_video(path, tmp_path / "capture")
     assert f"the face seems to lie {lies}; if it does, add --capture.turn {turn}" in capsys.readouterr().err
     capture = capture_video(path, tmp_path / "turned", CaptureSettings(turn=turn, crop="none"))
@@ -236,7 +237,7 @@ def test_bad_requests_are_refused(face_clip, tmp_path):
 
 
 def test_detectors_say_nothing(face_clip, tmp_path):
-    """Their native code writes to the file descriptor, so another process has to listen."""
+    """Detectors print nothing. Their native code writes to the file descriptor, so another process has to listen."""
     code = (
         "import sys, pathlib; from mien.capture import capture_video, CaptureSettings;"
         "capture_video(pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), CaptureSettings(size=64, max_frames=3))"
@@ -250,6 +251,7 @@ def test_detectors_say_nothing(face_clip, tmp_path):
 
 @pytest.mark.footage
 def test_real_clip(test_data, tmp_path):
+    """A real clip is captured with calm landmarks and a clean matte."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         capture = capture_video(

@@ -1,4 +1,4 @@
-"""What comes with a video: clean plates, ready mattes and landmarks; and what is already at the place."""
+"""A capture takes clean plates, mattes and landmarks that come with a video, and respects what exists at its place."""
 
 import cv2
 import numpy as np
@@ -58,7 +58,10 @@ def test_given_landmarks_and_mattes_are_taken_as_they_are(test_data, tmp_path):
 
 
 def test_mattes_may_be_a_video(test_data, tmp_path):
-    """As any matting program writes: H.264, so near the values; cropped and shrunk as the pictures are."""
+    """Mattes may be a video of any matting program.
+
+    H.264 changes their values a little; they are cropped like the pictures.
+    """
     clip, mattes = tmp_path / "clip.mp4", tmp_path / "mattes.mp4"
     write_video(clip, iter([face_picture(test_data, 160, 80)] * 5), 25.0)
     column = np.arange(320)

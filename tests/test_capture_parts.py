@@ -1,4 +1,4 @@
-"""The pieces of capture: crop, face following, guided filter."""
+"""Crops, face following and the guided filter do their part of a capture."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def test_head_crops_are_kept_whole_and_never_enlarged():
 
 
 def test_crop_maps_pixels_as_it_maps_pictures():
-    """A bright block must land where `to_output` says its centre lands."""
+    """A bright block lands where `to_output` says that its centre lands."""
     picture = np.zeros((300, 400, 3), np.uint8)
     picture[120:136, 200:216] = 255
     crop = choose_crop(face_box(210, 130, 60, 400, 300)[None], 400, 300, 100)
@@ -80,14 +80,14 @@ def test_guided_filter_steps_where_the_picture_does():
     filtered = guided_filter(guide, soft, radius=8, epsilon=1e-4)
     steps = np.diff(filtered, axis=1)[8:-8]
     assert (steps.argmax(axis=1) == 39).all()
-    assert steps.max(axis=1).min() > 0.4  # 0.1 in what was put in
-    # Where the values follow the guide exactly, they pass unchanged.
+    assert steps.max(axis=1).min() > 0.4  # the input deviates by 0.1
+    # Values that follow the guide exactly pass unchanged.
     linear = guide @ np.array([0.3, 0.2, 0.1], np.float32)
     np.testing.assert_allclose(guided_filter(guide, linear, 8, 1e-4)[:, 44:], linear[:, 44:], atol=5e-3)
 
 
 def test_matte_has_its_border_on_the_edge_of_the_picture():
-    """A mask that is soft and 3 pixels off, as a 256x256 network gives for a 512x512 picture."""
+    """A matte ends at the picture's edge, although the mask is soft and 3 pixels off, as from a 256x256 network."""
     picture = np.full((512, 512, 3), 50, np.uint8)
     picture[:, 260:] = (200, 150, 130)
     truth = (np.arange(512) >= 260).astype(float)

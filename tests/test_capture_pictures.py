@@ -1,4 +1,4 @@
-"""Video as it comes: HDR, ten bits, pixel aspect, rotation, odd and large sizes, variable rate."""
+"""Videos of many kinds are captured: HDR, ten bits, pixel aspect, rotation, odd and large sizes, variable rate."""
 
 from fractions import Fraction
 
@@ -15,7 +15,7 @@ from mien.cli import main
 
 BT2020, BT709 = (0.2627, 0.0593), (0.2126, 0.0722)
 COLOURS = np.array([[200, 120, 100], [90, 60, 50], [40, 90, 60], [20, 30, 120], [128, 128, 128], [0, 0, 0]])
-"""sRGB below the knee, as faces are."""
+"""Colours of sRGB below the knee, like those of faces."""
 
 
 def inverse(curve, values, steps=200001):
@@ -34,7 +34,7 @@ def to_bt2020(light):
 
 
 def hdr_signal(light, transfer):
-    """The signal of display light (1 = 203 cd/m2, BT.2020)."""
+    """Return the signal of display light (1 = 203 cd/m2, BT.2020)."""
     display = light * 203
     if transfer == PQ:
         return inverse(pq_light, display)
@@ -158,7 +158,7 @@ def test_frames_are_counted_without_decoding(test_data, tmp_path):
 
 
 def test_a_clip_of_a_telephone_is_captured(test_data, tmp_path, capsys):
-    """HEVC, ten bits, HLG, stored on its side with a rotation flag, at a variable rate, in a .mov: all at once."""
+    """A telephone's clip is captured: HEVC, ten bits, HLG, a rotation flag, a variable rate, in a .mov."""
     path = tmp_path / "IMG_0001.mov"
     upright = np.pad(face_picture(test_data, 160), ((70, 90), (10, 10), (0, 0)), mode="edge")
     stored = np.ascontiguousarray(np.rot90(upright, 3))
@@ -192,6 +192,6 @@ def test_a_clip_of_a_telephone_is_captured(test_data, tmp_path, capsys):
     assert capture.images.shape == (8, 1, *upright.shape)
     assert capture.valid.all()
     np.testing.assert_allclose(capture.timestamps, np.array(ticks) / 600, atol=1e-4)
-    # Highlights are pressed together; below, colours come back.
+    # Highlights are compressed; darker colours are restored.
     ordinary = upright.max(axis=-1) < 200
     assert np.abs(capture.images[4, 0].astype(int) - upright)[ordinary].mean() < 3

@@ -1,4 +1,4 @@
-"""Is the face sharp, and well lit? Blur, darkness and over-exposure are told; good pictures are let pass."""
+"""Blur, darkness and over-exposure of a face are reported; good pictures raise no complaint."""
 
 import json
 
@@ -19,7 +19,7 @@ WIDTH = 0.46 * SIDE
 
 
 def streak(picture: np.ndarray, length: float, angle: float) -> np.ndarray:
-    """What a camera sees of a picture that moves by so many pixels while the shutter is open."""
+    """Return the picture as a camera sees it if it moves by this many pixels while the shutter is open."""
     steps = np.linspace(-0.5, 0.5, 33) * length
     height, width = picture.shape[:2]
     moved = [
@@ -69,7 +69,7 @@ def test_light_distance_and_missing_faces_are_no_blur(face):
 
 
 def capture_said(tmp_path, capsys, pictures) -> tuple[str, dict]:
-    """What `mien capture` says about a clip, and its report."""
+    """Return what `mien capture` prints about a clip, and its report."""
     write_video(tmp_path / "clip.mp4", iter(pictures), 25.0, crf=10)
     arguments = ["capture", str(tmp_path / "clip.mp4"), "--out", str(tmp_path / "out"), "--capture.no-cuts"]
     assert main(arguments) == 0

@@ -1,4 +1,4 @@
-"""Drawn people, filmed: two in one picture, and three scenes with two cuts, from the command line to the avatar."""
+"""Drawn people are captured on the command line: two in one picture, and three scenes with two cuts."""
 
 import json
 from dataclasses import replace
@@ -18,7 +18,7 @@ RECIPE = SyntheticRecipe(fps=FPS, supersample=1, texture_size=256, rotation=(12.
 
 
 class Actor:
-    """A drawn person that can be put before any wall."""
+    """Drawn person that can be put in front of any wall."""
 
     def __init__(self, seed: int, seconds: float, side: int = 192) -> None:
         self.side = side
@@ -28,7 +28,7 @@ class Actor:
         self.landmarks = scene.landmarks()
 
     def put(self, picture: np.ndarray, timestep: int, left: int, top: int) -> np.ndarray:
-        """Draw onto a picture, also beyond its border; returns the true landmarks in it."""
+        """Draw the person onto a picture, also beyond its border, and return the true landmarks in it."""
         frame = self.frames[timestep]
         first, last = max(0, -left), min(self.side, picture.shape[1] - left)
         if first < last:
@@ -40,7 +40,7 @@ class Actor:
 
 
 def wall(level: tuple[int, int, int]) -> np.ndarray:
-    """A plain wall, darker below."""
+    """Return a plain wall that is darker below."""
     shade = np.linspace(1.1, 0.8, HEIGHT)[:, None, None]
     return np.rint(np.broadcast_to(np.array(level) * shade, (HEIGHT, WIDTH, 3))).clip(0, 255).astype(np.uint8)
 
@@ -51,7 +51,7 @@ def ann() -> Actor:
 
 
 def misses(capture_dir: Path, truth: np.ndarray) -> np.ndarray:
-    """Median distance of found from true landmarks in each frame, source pixels; NaN where none were found."""
+    """Return the median distance of found from true landmarks in each frame, in source pixels, or NaN."""
     capture = read_capture(capture_dir)
     crop = capture.source["crop"]
     found = capture.landmarks[:, 0] * (crop["width"] / capture.width) + [crop["left"], crop["top"]]
@@ -88,7 +88,7 @@ def test_of_two_people_the_nearer_is_followed_and_nobody_else_while_she_is_away(
 
 @pytest.fixture(scope="module")
 def three_scenes(ann: Actor, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
-    """Eleven frames (1.1 s) in each of three rooms, at three places; also the true landmarks."""
+    """Write eleven frames (1.1 s) in each of three rooms, at three places. Return the path and the true landmarks."""
     pictures, truth = [], []
     for level, left, top in (((180, 170, 150), 20, 30), ((60, 80, 110), 190, 44), ((120, 150, 110), 100, 10)):
         for _ in range(11):
@@ -114,7 +114,7 @@ def test_three_scenes_become_three_sequences(
         assert capture.timesteps == 11
         assert capture.valid.all()
         assert (capture.source["first_frame"], capture.timestamps[0]) == (11 * part, 0)
-        # No picture of the scene beside it: the corners of the crop show this scene's wall alone.
+        # No picture belongs to the next scene: the corners of the crop show only this scene's wall.
         corners = capture.images[:, 0, 2:8, 2:8].reshape(11, -1)
         assert np.ptp(np.median(corners, axis=1)) < 6
         assert np.nanmax(misses(folder / "capture", truth[11 * part : 11 * (part + 1)])) < 5
@@ -123,7 +123,7 @@ def test_three_scenes_become_three_sequences(
 @pytest.mark.slow
 def test_a_clip_with_cuts_becomes_an_avatar(three_scenes: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     arguments = ["create", str(three_scenes[0]), "--out", str(tmp_path / "out"), "--capture.size", "128"]
-    # Scenes tracked together by their pixels lie in test_subject_commands.
+    # test_subject_commands tracks several scenes together by their pixels.
     arguments += ["--tracking.schedule", "landmarks", "--tracking.keyframes", "6"]
     assert main([*arguments, "--steps", "20", "--preset", "draft", "--hold-out", "scenes-2"]) == 0
     run = tmp_path / "out/runs/gaussian_avatars"

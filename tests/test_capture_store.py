@@ -1,4 +1,4 @@
-"""Captures on disk: round trip, cache, damage."""
+"""Captures on disk survive a round trip, keep a cache, and report damage."""
 
 import dataclasses
 import os
@@ -145,7 +145,7 @@ def test_flipped_bits_never_go_unseen(stored, tmp_path):
     files = [path for path in sorted(stored.rglob("*")) if path.is_file()]
     for trial in range(40):
         path = tmp_path / str(trial)
-        shutil.copytree(stored, path)  # keeps times of change, so the cache stays valid
+        shutil.copytree(stored, path)  # times of change are kept, so the cache stays valid
         target = path / files[trial % len(files)].relative_to(stored)
         content = bytearray(target.read_bytes())
         content[random.integers(len(content))] ^= 1 << random.integers(8)

@@ -1,4 +1,4 @@
-"""Reading and writing video files."""
+"""Video files are read and written with their colours and times."""
 
 import av
 import numpy as np
@@ -14,7 +14,7 @@ def test_written_frames_are_read_back(tmp_path):
     pictures = write_gradient_video(path, frames=5, width=64, height=48, fps=29.97)
     times, frames = zip(*read_video_frames(path), strict=True)
     np.testing.assert_allclose(times, np.arange(5) / 29.97, atol=1e-9)
-    # Chroma has half the resolution: a mean of two levels is what a smooth picture loses.
+    # Chroma has half the resolution, which costs a smooth picture about two levels on average.
     assert np.abs(np.stack(frames).astype(int) - pictures).mean() < 2
     info = probe_video(path)
     assert info.frames == 5
@@ -22,7 +22,10 @@ def test_written_frames_are_read_back(tmp_path):
 
 
 def test_colours_keep_their_level(tmp_path):
-    """Wrong matrices or ranges shift whole colours, which a mean over a picture would hide."""
+    """Colours keep their level.
+
+    Wrong matrices or ranges shift whole colours, which a mean over a picture would hide.
+    """
     colours = np.array([[200, 30, 40], [30, 180, 60], [20, 60, 220], [128, 128, 128], [255, 255, 255], [0, 0, 0]])
     for colour in colours.astype(np.uint8):
         path = tmp_path / "colour.mp4"
@@ -67,6 +70,7 @@ def test_rotation_and_mirror_flags_are_applied(tmp_path, degrees, mirrored, turn
 
 
 def test_shrinking_while_reading(tmp_path):
+    """Frames are shrunk while they are read."""
     path = tmp_path / "clip.mp4"
     write_gradient_video(path, width=128, height=96)
     shapes = {frame.shape for _, frame in read_video_frames(path, longest_side=64)}

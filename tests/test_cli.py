@@ -1,4 +1,4 @@
-"""The command line: help, exit codes and one-line messages; a real run lies in test_end_to_end.py."""
+"""The command line has help, exit codes and one-line messages. A real run is in test_end_to_end.py."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ from mien.cli import COMMANDS, main
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run a command that must fail by the user's mistake; returns its one line."""
+    """Run a command that must fail by the user's mistake, and return its one line."""
     assert main(arguments) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
     assert len(lines) == 1, lines
@@ -35,6 +35,7 @@ def test_overview_lists_every_command(capsys: pytest.CaptureFixture[str]) -> Non
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_every_command(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every command has help."""
     with pytest.raises(SystemExit) as exit_info:
         main([name, "--help"])
     assert exit_info.value.code == 0
@@ -69,6 +70,7 @@ def test_help_is_quick_and_needs_no_torch() -> None:
 
 
 def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """An unknown command is named."""
     assert "no sub-command 'crate'" in complaint(capsys, "crate")
 
 
@@ -92,6 +94,7 @@ def test_wrong_arguments_are_told_in_one_line(
 
 
 def test_missing_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A missing video is named, and nothing is written."""
     message = complaint(capsys, "create", str(tmp_path / "none.mp4"), "--out", str(tmp_path / "out"))
     assert "none.mp4" in message
     assert not (tmp_path / "out").exists()
@@ -104,6 +107,7 @@ def test_file_that_is_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_video_without_a_face(faceless_video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A video without a face is refused by name."""
     message = complaint(capsys, "create", str(faceless_video), "--out", str(tmp_path / "out"))
     assert "wall.mp4" in message
     assert "face" in message
@@ -118,6 +122,7 @@ def test_workspace_that_is_not_there(command: str, tmp_path: Path, capsys: pytes
 
 
 def test_damaged_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A damaged capture is named with the command that makes it again."""
     capture = tmp_path / "out" / "sequences" / "clip" / "capture"
     capture.mkdir(parents=True)
     (capture / "capture.json").write_text('{"format": "mien.capture", "ver')
@@ -153,7 +158,10 @@ def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_a_terminated_command_removes_what_is_unfinished(tmp_path: Path) -> None:
-    """As after Ctrl-C; by default a signal would end the process on the spot."""
+    """A terminated command removes unfinished files, as after Ctrl-C.
+
+    By default a signal would end the process at once.
+    """
     program = f"""
 import os, signal, sys, types
 from dataclasses import dataclass

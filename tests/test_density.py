@@ -1,4 +1,4 @@
-"""Density control on hand-made renderings: who grows, who goes, and where children are."""
+"""Density control decides on hand-made renderings which Gaussians grow, which are pruned, and where children go."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def pose(store: GaussianStore) -> Posed:
 
 
 def rendering(gradients: list[float], radii: list[int] | None = None) -> Rendering:
-    """A rendering whose centres pull with these gradients along x, in pixels."""
+    """Return a rendering whose centres have these gradients along x, in pixels."""
     n = len(gradients)
     offset = torch.zeros(n, 2, requires_grad=True)
     offset.grad = torch.stack([torch.tensor(gradients), torch.zeros(n)], dim=-1)
@@ -161,7 +161,7 @@ def test_rounds_and_resets_happen_at_their_fractions() -> None:
 
 @pytest.mark.parametrize("scale", [0.5, 0.002])
 def test_split_children_are_samples_of_their_parent(scale: float) -> None:
-    """The published code samples with another frame's scale, which puts children almost on their parent."""
+    """Children of a split are samples of their parent. The published code samples with another frame's scale."""
     quat = torch.nn.functional.normalize(torch.tensor([0.9, 0.2, -0.3, 0.1]), dim=0)
     store = make_store([scale])
     store.assign("quats", quat[None])

@@ -1,4 +1,4 @@
-"""What the landmark detector is expected to make of people: files, the model of it, and what tracking gains."""
+"""The model of the landmark detector is fitted and stored, and tracking gains from it."""
 
 import math
 from dataclasses import replace
@@ -110,7 +110,7 @@ def test_derivatives_by_the_person_match_finite_differences():
 
 
 def _fitted_identity(detects: DetectorResponse, expects: DetectorResponse) -> float:
-    """Error of the identity that is fitted to what a detector makes of a person."""
+    """Return the error of the identity that is fitted to a detector's landmarks of a person."""
     model = make_small_face_model()
     layout = layout_of(model)
     truth, reduced = reduce_face_model(model, layout, detects), reduce_face_model(model, layout, expects)

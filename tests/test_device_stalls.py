@@ -1,6 +1,6 @@
-"""Nothing between posing and the optimiser may read a number of a GPU: the host would wait, every step, for all of it.
+"""A training step reads no number from a GPU between posing and the optimiser, since the host would wait for it.
 
-There need not be a GPU: tensors on torch's `meta` device have no numbers, so that whoever asks for one raises.
+This needs no GPU: tensors on torch's `meta` device have no numbers, so reading one raises an error.
 """
 
 import pytest
@@ -42,7 +42,7 @@ CONFIGS = {
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
 def test_a_step_of_training_asks_for_no_number(config: MethodConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The trainer's own step: what it does in every step, in a run whose pictures are composited each time."""
+    """The trainer's own step reads no number, in a run whose pictures are composited in every step."""
     monkeypatch.setattr(trainer, "rasterize", _rendered)
     face_model, sequence = toy_sequence(timesteps=3, size=32)
     settings = TrainSettings(steps=1_000_000, split="none", background="random", record_every=1_000_000)
@@ -63,7 +63,7 @@ def test_steps_are_counted_on_the_host() -> None:
 
 
 def _rendered(gaussians: Gaussians, camera: Camera, background: Tensor) -> Rendering:
-    """What a rasterizer would return, with the same dependences."""
+    """Return a rendering with the same dependences as a rasterizer's."""
     count = len(gaussians)
     offset = torch.zeros(count, 2, device="meta", requires_grad=True)
     parts = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, offset]

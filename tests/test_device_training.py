@@ -1,7 +1,7 @@
-"""Training away from the native core: on a GPU where there is one, and the same code in plain PyTorch on the CPU.
+"""Training works without the native core: on a GPU if there is one, and with the same code in PyTorch on the CPU.
 
-What is not float32 on a CPU takes the plain PyTorch twins of all native operations, and the reference rasterizer where
-a GPU would take gsplat; so training in float64 runs all that a GPU runs but gsplat's kernels.
+Tensors that are not float32 on a CPU use the plain PyTorch twins of all native operations, and the reference rasterizer
+instead of gsplat. So training in float64 runs all the code of a GPU except gsplat's kernels.
 """
 
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ def scene() -> Scene:
 def train_some(
     scene: Scene, like: Tensor, config=train_toy.CONFIG, settings: TrainSettings = SETTINGS
 ) -> TrainingState:
-    """The state after training with this dtype and device."""
+    """Return the state after training with this dtype and device."""
     face_model, sequence = scene
     order = FrameOrder(training_frames([sequence], settings), settings.seed)
     data = TrainingData(order, (Targets(sequence, settings.resolution, like=like),))
@@ -58,7 +58,7 @@ def train_some(
 
 
 def assert_alike(one: TrainingState, other: TrainingState) -> None:
-    """Equal at first; then last digits decide which Gaussians grow, and Adam makes steps of tiny gradients."""
+    """Check that curves are equal at first. Later, last digits decide which Gaussians grow, so they are only close."""
     for name in ("loss", "photometric", "position", "scale", "psnr"):
         assert one.curves[name][:3] == pytest.approx(other.curves[name][:3], rel=2e-4, abs=1e-6), name
     assert one.curves["loss"] == pytest.approx(other.curves["loss"], rel=2e-2)
@@ -66,7 +66,7 @@ def assert_alike(one: TrainingState, other: TrainingState) -> None:
 
 @pytest.fixture
 def no_native_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails whoever asks the native core for a part of a step."""
+    """Make every native operation of a training step fail."""
 
     def refuse(*_: object) -> None:
         raise AssertionError("a native operation away from float32 on a CPU")
@@ -82,7 +82,7 @@ def test_plain_pytorch_trains_as_the_native_core_does(scene: Scene, request: pyt
     plain = train_some(scene, torch.zeros((), dtype=torch.float64))
     assert plain.avatar.gaussian_store()["means"].dtype == torch.float64
     assert plain.curves["gaussians"] == native.curves["gaussians"]
-    assert len(set(native.curves["gaussians"])) > 1  # density control was at work
+    assert len(set(native.curves["gaussians"])) > 1  # density control has run
     assert_alike(plain, native)
     assert native.curves["loss"][-1] < native.curves["loss"][0]
 
@@ -124,7 +124,7 @@ def test_a_gpu_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 def test_a_run_goes_on_elsewhere(scene: Scene, tmp_path: Path, no_gpu: None) -> None:
     face_model, sequence = scene
     train([sequence], face_model, train_toy.CONFIG, replace(SETTINGS, device="auto"), tmp_path / "run", no_bar)
-    # The run is finished: with another device it is the same run, and is only loaded.
+    # The run is finished. On another device it is the same run, and is only loaded.
     again = train([sequence], face_model, train_toy.CONFIG, SETTINGS, tmp_path / "run", no_bar)
     assert len(again.gaussian_store()) > 0
 
@@ -178,7 +178,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def pictures(workspace: Path, out: Path, device: str) -> np.ndarray:
-    """What `mien render --device` wrote."""
+    """Return the pictures that `mien render --device` wrote."""
     options = ["--path", "turntable", "--frames", "2", "--size", "32", "--device", device]
     assert main(["render", str(workspace), "--out", str(out), *options]) == 0
     return np.stack([cv2.imread(str(path)).astype(np.float32) for path in sorted(out.glob("*.png"))])

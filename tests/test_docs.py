@@ -1,4 +1,4 @@
-"""Links of the documentation: files and headings that they point to exist."""
+"""The documentation's links point to files and headings that exist."""
 
 import re
 from functools import cache
@@ -15,18 +15,18 @@ CURRENT = [page for page in PAGES if page.parent.name != "history" and page.name
 _LINK = re.compile(r"!?\[[^\]]*\]\(<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\)")
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
 _PATH = re.compile(r"(?<![\w./])((?:docs|native|examples|benchmarks|src|tests)/[\w./-]+\.(?:md|py|h|cpp))\b")
-"""A file that the text names without a link."""
+"""Pattern of a file that the text names without a link."""
 
 
 def prose(page: Path) -> str:
-    """The text of a page without fenced and indented code."""
+    """Return the text of a page without fenced and indented code."""
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     return re.sub(r"(?m)^ {4,}.*$", "", text)
 
 
 @cache
 def anchors(page: Path) -> set[str]:
-    """The anchors that GitHub gives the headings of a page."""
+    """Return the anchors that GitHub gives the headings of a page."""
     found: dict[str, int] = {}
     for heading in re.findall(r"^#{1,6} +(.+?) *#*$", prose(page), flags=re.MULTILINE):
         text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading)
@@ -38,7 +38,7 @@ def anchors(page: Path) -> set[str]:
 
 
 def broken_links(page: Path, root: Path = ROOT) -> list[str]:
-    """The relative links of a page that lead out of the repository, or to a file or heading that does not exist."""
+    """Return a page's relative links that leave the repository or point to a file or heading that does not exist."""
     broken = []
     for target in _LINK.findall(prose(page)):
         if _ADDRESS.match(target):

@@ -1,4 +1,4 @@
-"""Drivers of every kind, as `mien drive --by` opens them."""
+"""`mien drive --by` opens drivers of every kind."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,12 +20,12 @@ from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
 
 PARTS = {"clip-1": 3, "clip-2": 4, "clip-10": 2}
-"""Timesteps of the parts that a video with cuts falls into; by letters, clip-10 would come second."""
+"""Timesteps of the parts of a video with cuts. There are so many that by letters clip-10 would come second."""
 
 
 @pytest.fixture
 def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A video whose capture and tracking are given: each part has its own grey and its own head pose."""
+    """Return a video whose capture and tracking are given. Each part has its own grey and its own head pose."""
 
     def capture_stage(workspace: Workspace, *_: object) -> list[str]:
         for number, (name, timesteps) in enumerate(PARTS.items(), 1):
@@ -62,7 +62,7 @@ def test_a_video_with_cuts_drives_part_after_part(video: Path) -> None:
     torch.testing.assert_close(driver.face.head_rotation[:, 0], 0.01 * torch.tensor(numbers))
     assert driver.pictures is not None
     assert [int(driver.pictures(index)[0, 0, 0]) for index in range(9)] == [10 * number for number in numbers]
-    # One person at rest for all parts: where the head mostly is.
+    # All parts share one neutral face, with the head where it mostly is.
     assert float(driver.at_rest.head_rotation[0, 0]) == pytest.approx(0.02)
 
 
@@ -76,6 +76,7 @@ def test_one_part_of_a_video_can_be_chosen(video: Path) -> None:
 
 
 def test_a_film_of_all_parts(video: Path, tmp_path: Path) -> None:
+    """A driver with cuts gives one film of all its parts."""
     write_toy_workspace(tmp_path / "w")
     drive_stage(tmp_path / "w/runs/toy", video, tmp_path / "driven.mp4")
     assert probe_video(tmp_path / "driven.mp4").frames == sum(PARTS.values())

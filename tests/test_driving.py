@@ -1,4 +1,4 @@
-"""Driving, neutral estimates and camera paths."""
+"""Driving, neutral estimates and camera paths work in the avatar's own frame."""
 
 import math
 from dataclasses import replace
@@ -47,7 +47,7 @@ def test_a_driver_at_rest_gives_the_avatar_at_rest_with_its_own_identity() -> No
 
 
 def test_motion_is_done_in_the_avatars_own_frame() -> None:
-    """A driver filmed from the side nods and moves ahead; the avatar, filmed from the front, does it in its frame."""
+    """Motion is applied in the avatar's own frame: a driver filmed from the side makes it nod and move ahead."""
     driver_neutral = replace(neutral_of(_face(3)), head_rotation=torch.tensor([[0.0, math.pi / 2, 0.0]]))
     avatar = replace(neutral_of(_face(3, 5)), head_rotation=torch.zeros(1, 3))
     turn = matrix_from_axis_angle(driver_neutral.head_rotation)

@@ -1,4 +1,4 @@
-"""The demo itself, shortened: video, capture, tracking, training, report; then every way to use the avatar."""
+"""A short version of the demo runs: video, capture, tracking, training, report; then every use of the avatar."""
 
 import json
 from pathlib import Path
@@ -53,6 +53,7 @@ def test_the_same_command_finds_everything_done(workspace: Path, capsys: pytest.
 
 @pytest.mark.slow
 def test_using_the_avatar(workspace: Path, tmp_path: Path) -> None:
+    """The avatar can be exported, rendered and driven in every way."""
     avatar = str(workspace)
     assert main(["export", avatar, "--out", str(tmp_path / "open.ply"), "--set", "jawOpen=0.6"]) == 0
     assert len(read_ply(tmp_path / "open.ply")) > 1000
@@ -76,6 +77,7 @@ def test_using_the_avatar(workspace: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_bad_requests_to_an_avatar(workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Bad requests to an avatar are refused with the value, and nothing is written."""
     for arguments, part in (
         (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawopen=1"], "no expression 'jawopen'"),
         (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawOpen=wide"], "no number"),

@@ -1,4 +1,4 @@
-"""Protocols on a case whose truth is the avatar itself: it must win, and the baselines must be what they claim."""
+"""Evaluation of an avatar that is itself the truth: it wins, and the baselines are what they claim to be."""
 
 import json
 from collections import Counter
@@ -51,7 +51,7 @@ def test_mean_frame_is_the_mean_of_training_targets_only(experiment: Experiment)
 
 
 def test_mesh_baseline_wears_the_colours_it_saw(experiment: Experiment) -> None:
-    """Vertex colours equal the paint where the camera looks; the hidden back continues them without a jump."""
+    """Vertex colours equal the paint where the camera looks, and the mesh baseline beats the mean frame."""
     baselines = make_baselines(experiment)
     template = experiment.avatar.face_model.template
     paint = (template / template[experiment.avatar.face_model.faces].mean(1).abs().max() * 0.5 + 0.5).clamp(0, 1)
@@ -132,7 +132,7 @@ def test_report_stands_alone_and_shows_everything(experiment: Experiment, evalua
 
 
 class _Tags(HTMLParser):
-    """Counts tags and checks that they nest."""
+    """Parser that counts tags and checks that they nest."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -152,6 +152,7 @@ class _Tags(HTMLParser):
 
 
 def test_perceptual_metric_on_some_frames_only(experiment: Experiment, evaluation: Evaluation) -> None:
+    """The perceptual metric can be computed on some frames only, and the mean is theirs."""
     settings = EvaluationSettings(perceptual_frames=3, baselines=False)
     some = evaluate_frames(experiment, settings)
     content = protocol_content(experiment, some, settings)

@@ -1,4 +1,4 @@
-"""Cross-reenactment: the measures on made-up landmarks, and the protocol from folders with a made-up detector."""
+"""Cross-reenactment is measured on made-up landmarks, and from folders with a made-up detector."""
 
 import json
 from dataclasses import replace
@@ -52,6 +52,7 @@ def test_head_pose_size_and_identity_do_not_count_as_expression() -> None:
 
 
 def test_figures_of_perfect_still_and_opposite_avatars() -> None:
+    """A perfect avatar has no error, and a still and an opposite one have known errors."""
     at_rest = _face()
     motions = []
     for step in range(6):
@@ -71,7 +72,7 @@ def test_figures_of_perfect_still_and_opposite_avatars() -> None:
 
 
 class _MadeUpReader:
-    """Landmarks that turn with the brightness of the picture; no face in pictures that are all white."""
+    """Detector whose landmarks turn with the brightness of the picture. It finds no face in white pictures."""
 
     def __enter__(self) -> "_MadeUpReader":
         return self
@@ -87,7 +88,7 @@ class _MadeUpReader:
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A run, and another workspace's sequence with two cameras."""
+    """Return a run, and a sequence of another workspace with two cameras."""
     root = tmp_path_factory.mktemp("cross")
     experiment = make_experiment(timesteps=20)
     own = write_sequence(root / "anna", experiment, experiment.sequences[0])
@@ -100,6 +101,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_protocol_from_folders(
     folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Cross-reenactment from folders writes its figures into metrics.json."""
     monkeypatch.setattr(cross, "FaceReader", _MadeUpReader)
     own, driver = folders
     anna, bert = own.parent.parent, driver.parent.parent
@@ -132,6 +134,7 @@ def test_driven_avatar_keeps_its_identity_and_moves_from_its_own_neutral(folders
 
 
 def test_driver_of_another_face_model(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """A driver with another face model is refused."""
     own, driver = folders
     experiment = make_experiment(timesteps=20)
     tracking = replace(experiment.sequences[0].tracking, face_model_hash="other")
@@ -141,6 +144,7 @@ def test_driver_of_another_face_model(folders: tuple[Path, Path], tmp_path: Path
 
 
 def test_no_face_in_the_drivers_pictures(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A driver without a face in its pictures is refused."""
     monkeypatch.setattr(cross, "FaceReader", _MadeUpReader)
     monkeypatch.setattr(cross.Driven, "driver_picture", lambda self, timestep: np.full((8, 8, 3), 255, np.uint8))
     own, driver = folders

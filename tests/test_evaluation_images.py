@@ -1,4 +1,4 @@
-"""Pictures of other programs: the same figures as `mien evaluate`, and clear words where names or sizes differ."""
+"""Pictures of other programs get the same figures as `mien evaluate`, and clear messages if names or sizes differ."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ PLAIN = ScoreSettings(perceptual=False)
 
 
 def write_pictures(folder: Path, names: list[str], seed: int = 0, size: tuple[int, int] = (40, 36)) -> np.ndarray:
-    """Random pictures as png; returns them."""
+    """Write random pictures as png, and return them."""
     folder.mkdir(exist_ok=True)
     pictures = np.random.default_rng(seed).integers(0, 256, (len(names), *size, 3)).astype(np.uint8)
     for name, picture in zip(names, pictures, strict=True):
@@ -160,6 +160,7 @@ def test_videos_are_matched_by_order(folders: ImageFolders, tmp_path: Path) -> N
 
 
 def test_command(folders: ImageFolders, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`mien evaluate --images` prints and writes the same scores, and refuses wrong options."""
     given = ["evaluate", "--images", str(folders.images), "--truth", str(folders.truth), "--no-perceptual"]
     out = tmp_path / "scores.json"
     assert main([*given, "--json", "--out", str(out)]) == 0

@@ -1,4 +1,4 @@
-"""Protocols by time, by sequence and by camera; videos and tables over runs; from folders as the commands do."""
+"""Runs are evaluated by time, by sequence and by camera, from folders as the commands do; tables compare them."""
 
 import json
 import re
@@ -34,7 +34,7 @@ STEPS = 12
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A workspace: two sequences of two cameras, a run that leaves out a sequence and a camera, one that does not."""
+    """Return a workspace of two sequences with two cameras each, and of runs with and without held-out parts."""
     root = tmp_path_factory.mktemp("rig") / "anna"
     experiment = make_experiment()
     folders = [write_sequence(root, experiment, two_cameras(experiment, name)) for name in ("talk", "laugh")]
@@ -53,7 +53,7 @@ def experiments(root: Path) -> dict[str, Experiment]:
 
 @pytest.fixture(scope="module")
 def scored(root: Path) -> dict[str, dict]:
-    """metrics.json of the three runs."""
+    """Return metrics.json of the three runs."""
     folders = {name: root / "sequences" / name for name in ("talk", "laugh")}
     metrics = {"held": evaluate(root / "runs" / "held", list(folders.values()), QUICK)}
     for name in ("short", "longer"):

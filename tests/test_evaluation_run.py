@@ -1,4 +1,4 @@
-"""From a run's folder to metrics.json and report.html, through the files that the stages before write."""
+"""A run's folder becomes metrics.json and report.html, through the files that the earlier stages write."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ STEPS = 30
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A sequence and a run that was trained on it for a few steps."""
+    """Return a sequence, and a run that was trained on it for a few steps."""
     root = tmp_path_factory.mktemp("workspace")
     folder, run_dir = root / "sequences" / "clip", root / "runs" / "first"
     experiment = make_experiment()
@@ -113,6 +113,7 @@ def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path], tmp_p
 
 
 def test_without_perceptual_metric_and_baselines(workspace: tuple[Path, Path]) -> None:
+    """An evaluation without perceptual metric and baselines says that they were not scored."""
     folder, run_dir = workspace
     entry = evaluate(run_dir, [folder], EvaluationSettings(perceptual=False, baselines=False))["protocols"]
     assert entry["self_reenactment"]["perceptual"] is None

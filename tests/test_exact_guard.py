@@ -1,4 +1,4 @@
-"""The guard sees what it is for, and what must be the same everywhere stands within it."""
+"""The guard finds inexact arithmetic, and everything that must be the same everywhere passes it."""
 
 from dataclasses import replace
 
@@ -94,7 +94,10 @@ def test_native_rasterizer_adds_up_by_itself():
 
 
 def test_a_step_of_training_adds_up_by_itself():
-    """One avatar's own step, from the pose to the optimiser; the first step makes what later ones keep."""
+    """A training step of an avatar uses no inexact sum, from the pose to the optimiser.
+
+    The first step fills the caches.
+    """
     face_model, sequence = toy_sequence(timesteps=3, size=32)
     settings = TrainSettings(steps=100, split="none", background="random", record_every=100)
     state = trainer.start([sequence], face_model, GaussianAvatarsConfig(), settings, torch.zeros(()))

@@ -1,4 +1,4 @@
-"""The scripts in examples/ and the page docs/api.md run as they stand, on little data."""
+"""The scripts in examples/ and the code in docs/api.md run as they are, on little data."""
 
 import os
 import re
@@ -54,7 +54,8 @@ def test_face_model(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_capture_and_track(folder: Path) -> None:
-    overlay = f"{SUBJECT}/sequences/synthetic/tracking/overlay.mp4"  # the drawn head with lines over it: a face still
+    # A drawn head with lines over it is still a face.
+    overlay = f"{SUBJECT}/sequences/synthetic/tracking/overlay.mp4"
     printed = run_script(folder, example("04_capture_and_track.py"), overlay, "--out", "out/examples/me")
     assert "landmark residual" in printed
 

@@ -1,4 +1,4 @@
-"""The .ply writer and reader against a byte layout built by hand, round trips, and damaged or foreign files."""
+""".ply files have the bytes of a layout built by hand, survive round trips, and are refused if damaged or foreign."""
 
 import struct
 from pathlib import Path
@@ -38,7 +38,7 @@ def _assert_same(first: Gaussians, second: Gaussians, tolerance: float = 3e-7) -
 
 
 def test_layout_is_the_one_other_programs_write(tmp_path: Path) -> None:
-    """One Gaussian of SH degree 1, its bytes built here by hand from the format's description."""
+    """The layout is that of other programs, with the bytes of one Gaussian built from the format's description."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(9)] + ["opacity", "scale_0", "scale_1", "scale_2"]
     names += ["rot_0", "rot_1", "rot_2", "rot_3"]
@@ -89,6 +89,7 @@ def test_layout_is_the_one_other_programs_write(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 def test_round_trip(tmp_path: Path, coefficients: int) -> None:
+    """A .ply keeps its Gaussians."""
     written = _gaussians(50, coefficients)
     write_ply(tmp_path / "a.ply", written)
     read = read_ply(tmp_path / "a.ply")
@@ -100,6 +101,7 @@ def test_round_trip(tmp_path: Path, coefficients: int) -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 3), st.integers(0, 2**16))
 def test_round_trip_of_any_number_and_extreme_opacities(tmp_path_factory, n: int, seed: int) -> None:
+    """A .ply keeps any number of Gaussians, with opacities of 0 and 1."""
     path = tmp_path_factory.mktemp("ply") / "a.ply"
     written = _gaussians(n, 4, seed)
     written = Gaussians(written.means, written.quats, written.scales, written.opacities.round(), written.sh)
@@ -120,7 +122,7 @@ def test_local_frame_is_kept(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("coefficients", [1, 4, 16])
 def test_in_world_looks_the_same(coefficients: int) -> None:
-    """Positions, rotations and colours that depend on the view: one picture with the frame, one without it."""
+    """Gaussians moved into the world look the same: positions, rotations and colours that depend on the view."""
     pose = rigid_transform(matrix_from_axis_angle(torch.tensor([0.4, -0.9, 0.2])), torch.tensor([0.05, 0.02, -0.5]))
     local = _gaussians(40, coefficients)
     local = Gaussians(0.05 * local.means, local.quats, 0.3 * local.scales, local.opacities, 0.3 * local.sh, pose)
@@ -134,6 +136,7 @@ def test_in_world_looks_the_same(coefficients: int) -> None:
 
 
 def test_damaged_and_foreign_files(tmp_path: Path) -> None:
+    """Damaged and foreign .ply files are refused with the reason."""
     good = tmp_path / "good.ply"
     write_ply(good, _gaussians(5, 1))
     content = good.read_bytes()

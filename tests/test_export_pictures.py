@@ -1,4 +1,4 @@
-"""Pictures as files: what the ending asks for, straight alpha, and everything refused before any work."""
+"""Pictures are written as the ending asks for, with straight alpha, and everything wrong is refused before any work."""
 
 import math
 from pathlib import Path
@@ -24,7 +24,7 @@ FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 
 
 def disc(size: int = 64) -> np.ndarray:
-    """A reddish disc with a soft edge, RGBA, straight."""
+    """Return a reddish disc with a soft edge as straight RGBA."""
     rows, columns = np.mgrid[:size, :size] + 0.5
     distance = np.hypot(rows - size / 2, columns - size / 2)
     alpha = np.clip((size / 3 - distance) / 4 + 0.5, 0, 1).astype(np.float32)
@@ -63,13 +63,14 @@ def test_webm_keeps_alpha_and_outlines_have_no_fringe(tmp_path: Path) -> None:
 
 
 def straight(frame: av.VideoFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and alpha; the latter as it was decoded, since swscale reads beyond the rows of alpha planes."""
+    """Return colours and alpha. Alpha is taken as decoded, since swscale reads beyond the rows of alpha planes."""
     plane = frame.planes[3]
     rows = np.frombuffer(bytes(plane), np.uint8).reshape(plane.height, plane.line_size)
     return frame.to_ndarray(format="rgb24"), rows[:, : plane.width].copy()
 
 
 def test_films_and_sequences(tmp_path: Path) -> None:
+    """Pictures become films or numbered files, depending on the name."""
     pictures = [disc()[..., :3]] * 4
     for name in ("a.mp4", "a.webm"):
         write_pictures(plan_output(tmp_path / name, 4), pictures, 25)
@@ -101,6 +102,7 @@ def test_what_cannot_be_written_is_told_first(
 
 
 def test_options_of_pictures(tmp_path: Path) -> None:
+    """Impossible sizes and colours of pictures are refused by name."""
     assert PictureOptions(background="#3060a0").colour() == (48 / 255, 96 / 255, 160 / 255)
     for options, part in (
         (PictureOptions(size=8193), "--size 8193"),
@@ -112,7 +114,7 @@ def test_options_of_pictures(tmp_path: Path) -> None:
 
 
 def test_one_view_over_every_background() -> None:
-    """Straight colours and alpha put over a colour give the picture rendered over it."""
+    """Straight colours and alpha, put over a colour, give the picture rendered over it."""
     gaussians = Gaussians(
         means=torch.tensor([[0.0, 0, -0.6]]), quats=torch.tensor([[1.0, 0, 0, 0]]), scales=torch.full((1, 3), 0.04),
         opacities=torch.tensor([0.8]), sh=sh_from_rgb(torch.tensor([[[0.9, 0.4, 0.1]]])),
@@ -150,6 +152,7 @@ def test_sway_loops_around_the_head() -> None:
 
 
 def test_cameras_from_a_file(tmp_path: Path) -> None:
+    """Cameras survive a file, and impossible ones are refused."""
     path, camera = tmp_path / "path.json", camera_from_fov(0.6, 100, 80, FACING)
     write_cameras(path, [camera, camera])
     read = read_cameras(path)

@@ -1,4 +1,4 @@
-"""Lids put where pictures have them."""
+"""Lids are put where pictures show them."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def still() -> np.ndarray:
 
 
 def blinks() -> np.ndarray:
-    """Both eyes for three frames, the left one alone for one."""
+    """Return lids that blink: both eyes for three frames, and the left one alone for one frame."""
     lids = still()
     lids[7:10] = np.array([0.6, 1.0, 0.7])[:, None]
     lids[16, 1] = 1.0
@@ -39,7 +39,7 @@ def test_blinks_that_landmarks_missed_are_found_in_pictures(case):
     tracked = 0.1 + 0.4 * (true - 0.1)
     found = case.lids_of(place_lids(case.reduced, [case.shot(true)], case.fit(tracked), 1.0))
     np.testing.assert_allclose(found[true > 0.5], true[true > 0.5], atol=0.15)
-    # A wink is one eye's alone, and what is open stays.
+    # A wink closes only one eye, and open eyes stay open.
     np.testing.assert_allclose(found[true < 0.5], 0.1, atol=0.05)
 
 

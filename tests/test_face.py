@@ -1,4 +1,4 @@
-"""The anny head: does everything move as an anatomist would expect?"""
+"""The anny head moves as an anatomist would expect."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def model() -> FaceModel:
 
 
 def posed(model: FaceModel, identity: Tensor | None = None, **values: float | tuple[float, float, float]) -> FaceParams:
-    """A face by names of expressions (a number) and joints (an axis-angle)."""
+    """Return a face with these expressions (a number each) and joints (an axis-angle each), by name."""
     face = model.neutral()
     for name, value in values.items():
         if isinstance(value, tuple):
@@ -49,6 +49,7 @@ def someone(model: FaceModel, seed: int = 0) -> Tensor:
 
 
 def test_contract(model):
+    """The head has the documented shapes and sizes."""
     v, f, e, k = len(model.template), len(model.faces), len(model.expression_names), len(model.joint_names)
     assert 4000 < v < 5000
     assert 8000 < f < 9500
@@ -70,6 +71,7 @@ def test_contract(model):
 
 
 def test_head_frame(model):
+    """The head frame has its origin between the ears, with +x left, +y up and +z ahead."""
     left, right = (model.joint_template[model.joint_names.index(f"{side}_eye")] for side in ("left", "right"))
     torch.testing.assert_close((left + right) / 2, torch.tensor([0, 0, 0.08]), atol=TOLERANCE, rtol=0)
     assert 0.055 < left[0] - right[0] < 0.07
@@ -171,6 +173,7 @@ def test_lids_follow_the_gaze_and_no_expression_does_it_twice(model):
 
 
 def test_pinned_expressions(model):
+    """Pinned expressions are bounded to 0."""
     for name in ("mouthClose", "tongueOut"):
         assert torch.equal(model.expression_bounds[model.expression_names.index(name)], torch.zeros(2))
     assert model.expression_bounds[model.expression_names.index("eyeWideLeft"), 1] == 1.5

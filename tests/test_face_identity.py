@@ -1,4 +1,4 @@
-"""Principal components over people: unit variance, no rigid motion, scale kept."""
+"""Principal components of people have unit variance, no rigid motion, and keep the scale."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ DIRECTIONS = 4
 
 @pytest.fixture
 def points(monkeypatch):
-    """A symmetric cloud whose vertex i mirrors onto i ^ 1."""
+    """Return a symmetric cloud whose vertex i mirrors onto i ^ 1."""
     monkeypatch.setattr(anny_identity, "COMPONENTS", 2 * DIRECTIONS)
     half = np.random.default_rng(0).normal(size=(20, 3)) * 0.05
     return np.stack([half, half * [-1, 1, 1]], axis=1).reshape(-1, 3)

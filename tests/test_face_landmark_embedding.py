@@ -1,4 +1,4 @@
-"""Placing landmarks: exact where the answer is known, repeatable where a detector looks."""
+"""Landmarks are placed exactly if the answer is known, and repeatably if a detector finds them."""
 
 import json
 from dataclasses import replace
@@ -45,6 +45,7 @@ def test_a_point_on_the_surface_is_found_again():
 
 
 def test_ibug_indices():
+    """300-W's points are 68 different ones, the subject's right first."""
     assert len(IBUG68) == len(set(IBUG68)) == 68
     # The subject's right comes first: MediaPipe's 33 is the outer corner of the right eye.
     assert (IBUG68[36], IBUG68[45]) == (33, 263)
@@ -68,7 +69,10 @@ def test_few_pictures_agree_with_the_shipped_landmarks(few):
 
 
 def test_landmarks_of_lids_are_not_inside_the_eyeballs(few):
-    """In every picture a hidden point may be as near as the lid's edge; it is millimetres too deep."""
+    """Landmarks of the lids are not inside the eyeballs.
+
+    A picture alone cannot tell, since a hidden point looks as near.
+    """
     model, landmarks, _ = few
     points = landmarks["mediapipe"].positions(model.template, model.faces)
     for name, lids in (("left_eye", LEFT_EYELIDS), ("right_eye", RIGHT_EYELIDS)):

@@ -1,4 +1,4 @@
-"""Baked face models on disk: whatever happens to the files, loading gives the model."""
+"""Loading gives the face model, whatever happens to the baked files on disk."""
 
 import json
 import subprocess
@@ -17,7 +17,7 @@ from small_face_model import make_small_face_model
 
 @pytest.fixture
 def bakes(monkeypatch, tmp_path):
-    """A source that bakes a small model; counts how often. The cache is a fresh folder."""
+    """Return a source that bakes a small model and counts how often. The cache is a fresh folder."""
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path))
     counts = []
 
@@ -35,6 +35,7 @@ def files(tmp_path):
 
 
 def test_round_trip(bakes, tmp_path):
+    """A baked model is read as it was baked, and is baked once."""
     baked, read = load_face_model("small"), load_face_model("small")
     assert len(bakes) == 1
     assert read.content_hash == baked.content_hash
@@ -79,6 +80,7 @@ def test_damaged_or_old_files_are_baked_again(bakes, tmp_path, which, damage):
 
 
 def test_many_at_once(bakes):
+    """Many threads can load a model at once."""
     with ThreadPoolExecutor(4) as pool:
         hashes = list(pool.map(lambda _: load_face_model("small").content_hash, range(8)))
     assert len(set(hashes)) == 1
@@ -140,7 +142,7 @@ def test_without_a_home_folder_models_are_baked_for_this_process(home, bakes, mo
     assert load_face_model("small").content_hash == load_face_model("small").content_hash
     assert len(bakes) == 1
     said = capsys.readouterr().err
-    assert said.count("MIEN_CACHE names a folder to keep them") == 1
+    assert said.count("set MIEN_CACHE to keep them") == 1
     assert ("there is no home folder" if home is None else "/proc/nowhere/.cache/mien cannot be written to") in said
     (folder,) = tmp_path.glob("mien-cache-*")
     assert loading._is_baked("small", loading._SOURCES["small"])

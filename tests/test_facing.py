@@ -1,4 +1,4 @@
-"""Pictures that see a face from the side count little beside those that it faces."""
+"""Pictures that see a face from the side count little beside those from the front."""
 
 import torch
 
@@ -11,7 +11,7 @@ HEAD = torch.tensor([0.0, 0.0, -0.9], dtype=torch.float64)
 
 
 def cameras_at(*angles: float) -> CameraBatch:
-    """Around the head, radians to the subject's left of where it looks with no rotation."""
+    """Return cameras around the head, at angles in radians to the subject's left of straight ahead."""
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     turned = torch.tensor(angles, dtype=torch.float64)
     places = HEAD + 0.9 * torch.stack([turned.sin(), 0 * turned, turned.cos()], dim=1)
@@ -21,7 +21,7 @@ def cameras_at(*angles: float) -> CameraBatch:
 
 
 def views_of(*pictures: tuple[int, int]) -> Views:
-    """Of pairs of a timestep and a camera."""
+    """Return views of these pairs of a timestep and a camera."""
     row, camera = torch.tensor(pictures).unbind(1)
     nothing = torch.zeros(len(row), 1, 2, dtype=torch.float64)
     return Views(nothing, row, camera, torch.ones(len(row), dtype=torch.float64))
@@ -48,7 +48,10 @@ def test_trust_goes_with_the_head():
 
 
 def test_the_best_picture_of_a_timestep_counts_whole():
-    """Also where a head is seen from the side alone: else priors would decide."""
+    """The best picture of a timestep counts in full, even if it shows the head from the side.
+
+    Otherwise priors would decide.
+    """
     trust = trust_of(views_of((0, 0), (1, 1), (2, 0), (2, 1)), heads_turned(0.0, 0.0, 0.0), cameras_at(1.2, -1.5))
     assert trust[:3].eq(1).all()
     assert 0.2 < trust[3] < 0.6

@@ -1,4 +1,4 @@
-"""Whether a path can be written is known before any work; long names; arrays without torch."""
+"""A path that cannot be written is reported before any work; long names work; arrays are stored without torch."""
 
 import os
 import subprocess
@@ -46,6 +46,7 @@ def test_places_that_cannot_be_written(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() == 0, reason=IS_ROOT)
 def test_a_folder_without_permission(tmp_path: Path) -> None:
+    """A folder without permission is refused before any work."""
     tmp_path.chmod(0o500)
     try:
         with pytest.raises(UserError, match="Permission denied"):

@@ -1,4 +1,4 @@
-"""Head models of users in FLAME's schema: read from any of its files, posed as FLAME poses, refused in clear words."""
+"""Head models in FLAME's schema are read from any of its files, posed as FLAME poses, and refused in clear words."""
 
 import os
 import pickle
@@ -38,7 +38,7 @@ def model(arrays, tmp_path_factory) -> FaceModel:
 
 @pytest.mark.parametrize("moved", ["nothing", "root", "neck", "jaw", "eyes", "identity", "expression", "all"])
 def test_poses_as_flame_does(moved, arrays, model):
-    """Jaw, eyes and correctives are FLAME's own; its root and neck are the head's pose and the neck's, turned round."""
+    """Jaw, eyes and correctives move as in FLAME; its root and neck become the head's pose and an inverse neck."""
     random = np.random.default_rng(1)
     columns = arrays["shapedirs"].shape[2]
     identities = len(model.identity_basis)
@@ -169,14 +169,14 @@ FAULTS = {
         lambda a: _with(a, kintree_table=np.array([[-1, 0, 0, 0, 1], [0, 1, 2, 3, 4]])), "body models .* give a head"
     ),
     "other vertices": (lambda a: _with(a, weights=a["weights"][1:]), r"'weights' is float64 \[4172 5\].*\[4173 5\]"),
-    "millimetres": (lambda a: _with(a, v_template=1000 * a["v_template"]), "has to be in metres"),
+    "millimetres": (lambda a: _with(a, v_template=1000 * a["v_template"]), "a head in metres with y upwards is 0.1 to"),
     "mirrored": (lambda a: _with(a, v_template=a["v_template"] * [-1, 1, 1]), "[+]x to the subject's left"),
     "not finite": (lambda a: _with(a, posedirs=np.full_like(a["posedirs"], np.nan)), "'posedirs'.*not finite"),
     "no split": (lambda a: _without(a, "identities"), "64 directions.*add a number 'identities'"),
-    "no expression": (lambda a: _with(a, identities=np.array(64)), "no expression"),
-    "an index": (lambda a: _with(a, f=a["f"] + 1), "'f' names vertex 4173 of 4173"),
+    "no expression": (lambda a: _with(a, identities=np.array(64)), "need at least one each"),
+    "an index": (lambda a: _with(a, f=a["f"] + 1), "'f' has the index 4173, but only 4173 entries exist"),
     "weights": (lambda a: _with(a, weights=2 * a["weights"]), "'weights' of a vertex do not add up to 1"),
-    "texture": (lambda a: _with(a, vt=np.zeros((4, 2)), ft=a["f"][1:]), "no texture coordinates"),
+    "texture": (lambda a: _with(a, vt=np.zeros((4, 2)), ft=a["f"][1:]), "not texture coordinates"),
 }  # fmt: skip
 
 
@@ -200,13 +200,13 @@ def test_an_archive_with_objects_is_refused(arrays, tmp_path):
 def test_regions_by_landmarks_are_about_the_true_ones(model):
     found, truth = with_regions_by_landmarks(model), true_regions(load_face_model("anny"))
     names = np.array(found.region_names)[found.face_regions.numpy()]
-    # Many of what has clear borders; the others only have to be there.
+    # Regions with clear borders have many triangles; the others only have to exist.
     bounds = {"lips": 0.7, "eyes": 0.9, "ears": 0.8, "neck": 0.8, "eye_sockets": 0.8, "eyelids": 0.6, "mouth": 0.5,
               "scalp": 0.6, "nose": 0.5, "brows": 0.15, "irises": 0.5, "skin": 0.55}  # fmt: skip
     for name, bound in bounds.items():
         here, there = names == name, truth == name
         assert (here & there).sum() >= bound * (here | there).sum(), name
-    # No part of what a fit to pixels looks at is inside of the mouth or behind the eyes.
+    # A fit to pixels uses nothing inside of the mouth or behind the eyes.
     assert not np.isin(names[np.isin(truth, ["eye_sockets"])], ["skin", "lips"]).any()
 
 

@@ -1,4 +1,4 @@
-"""Landmarks that swing between two answers."""
+"""Landmarks that swing between two answers are found."""
 
 import torch
 

@@ -1,7 +1,7 @@
-"""Mutated files of every kind that mien reads, and odd command lines: one line of complaint or sound content, never
-a crash, a hang, a traceback, a byte outside.
+"""Mutated files and odd command lines cause one line of complaint or sound content.
 
-`tests/fuzzing` has the mutators and the judge; `make fuzz MINUTES=30` runs the same at length.
+They never cause a crash, a hang, a traceback or a byte outside. `tests/fuzzing` has the mutators and the judge;
+`make fuzz MINUTES=30` runs the same at length.
 """
 
 import os
@@ -13,12 +13,15 @@ import pytest
 
 REPLAY = "one again: PYTHONPATH=tests .venv/bin/python -m fuzzing --replay CASE"
 SECONDS = 400
-"""A busy machine needs as long; an idle one with two cores needs half a minute."""
+"""Time limit for a busy machine. An idle one with two cores needs half a minute."""
 
 
 @pytest.mark.slow
 def test_random_damage_to_every_file(tmp_path: Path) -> None:
-    """In processes of their own: a decoder that crashes would take the tests with it."""
+    """Random damage to any file does no harm.
+
+    Cases run in other processes, so that a crashing decoder spares the tests.
+    """
     asked = ("--self-check", "--seed", "0", "--cases", "1500", "--lines", "20", "--workers", "2")
     result = subprocess.run(
         [sys.executable, "-m", "fuzzing", *asked, "--findings", str(tmp_path / "findings.jsonl")],

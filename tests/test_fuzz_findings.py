@@ -1,4 +1,4 @@
-"""What the fuzzers found once: each is refused where it is read, in one line that names the file."""
+"""Every former finding of the fuzzers is refused when it is read, in one line that names the file."""
 
 import os
 from dataclasses import replace
@@ -42,7 +42,7 @@ def still(timesteps: int = 1) -> FaceParams:
 
 
 def test_a_pipe_is_no_recording_and_no_ply(tmp_path: Path) -> None:
-    """Opening a pipe waits for who writes into it; a device never ends."""
+    """A pipe is not a recording or a .ply. Opening a pipe would wait for a writer, and a device never ends."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for read in (read_live_link_face, read_blendshape_json, read_ply):
@@ -51,6 +51,7 @@ def test_a_pipe_is_no_recording_and_no_ply(tmp_path: Path) -> None:
 
 
 def test_a_ply_of_too_many_gaussians(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A .ply that announces too many Gaussians is refused."""
     path = tmp_path / "head.ply"
     ply.write_ply(path, train_toy_gaussians())
     monkeypatch.setattr(ply, "_MOST_GAUSSIANS", 3)
@@ -63,6 +64,7 @@ def train_toy_gaussians() -> ply.Gaussians:
 
 
 def test_fewer_mattes_than_frames(tmp_path: Path) -> None:
+    """Fewer mattes than frames are refused with the missing frame."""
     for index in range(2):
         assert cv2.imwrite(str(tmp_path / f"{index}.png"), np.zeros((8, 8), np.uint8))
     mattes = GivenMattes(tmp_path, (8, 8))
@@ -89,6 +91,7 @@ def test_a_png_of_a_beginning_and_an_end(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_landmarks_of_an_added_face_model(text: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Damaged landmarks of an added face model are refused by their file."""
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path))
     model = toy_sequence(timesteps=1, size=32)[0]
     path = tmp_path / "face_models" / "added" / "mine.landmarks.json"
@@ -100,6 +103,7 @@ def test_landmarks_of_an_added_face_model(text: bytes, tmp_path: Path, monkeypat
 
 
 def test_face_parameters_of_another_type() -> None:
+    """Face parameters of another type are refused."""
     model, face = toy_sequence(timesteps=1, size=32)[0], still()
     with pytest.raises(UserError, match=r"here: expression is torch\.float64"):
         check_face_params(model, replace(face, expression=face.expression.double()), "here", "track again")
@@ -107,6 +111,7 @@ def test_face_parameters_of_another_type() -> None:
 
 @pytest.mark.parametrize("index", [2**32, -(2**63), -1])
 def test_indices_that_baking_would_narrow_to_some_that_exist(index: int, run: Path, tmp_path: Path) -> None:
+    """Indices are refused that would exist only after narrowing to 32 bits."""
     folder = tmp_path / "avatar"
     folder.mkdir()
     for file in (run / "avatar").iterdir():
@@ -131,13 +136,14 @@ def test_an_avatar_of_no_method_names_its_file(run: Path, tmp_path: Path) -> Non
 
 
 def seal(folder: Path) -> None:
-    """Make the json vouch for the tensors beside it again."""
+    """Update the hash in the json after a change of the tensors."""
     content = read_json(folder / "avatar.json", "mien.avatar", 1)
     digest = file_digest(folder / "avatar.safetensors")
     write_json(folder / "avatar.json", "mien.avatar", 1, {**content, "tensors_sha256": digest})
 
 
 def test_curves_that_lack_one(run: Path, tmp_path: Path) -> None:
+    """Curves are refused if one is missing."""
     curves = read_tensors(run / "curves.safetensors")
     curves.pop("psnr")
     write_tensors(tmp_path / "curves.safetensors", curves)
@@ -154,6 +160,7 @@ def test_curves_that_no_plot_can_show(run: Path, tmp_path: Path) -> None:
 
 
 def test_a_curve_without_a_number(run: Path, tmp_path: Path) -> None:
+    """A curve without a finite number is refused."""
     curves = read_tensors(run / "curves.safetensors")
     curves["loss"].fill_(torch.nan)
     write_tensors(tmp_path / "curves.safetensors", curves)
@@ -162,6 +169,7 @@ def test_a_curve_without_a_number(run: Path, tmp_path: Path) -> None:
 
 
 def test_a_crop_that_misses_its_mask(tmp_path: Path) -> None:
+    """A crop that holds nothing of its mask is refused."""
     masks, crops = np.full((2, 1, 8, 8), 255, np.uint8), np.array([[[0, 0, 8, 8]], [[0, 0, 0, 0]]])
     write_scoring(tmp_path / "scoring", Scoring(masks, crops))
     with pytest.raises(UserError, match=r"crops\.safetensors: a crop holds nothing of its mask"):
@@ -169,6 +177,7 @@ def test_a_crop_that_misses_its_mask(tmp_path: Path) -> None:
 
 
 def test_moments_of_another_type(run: Path, tmp_path: Path) -> None:
+    """Moments of another type are refused when a run resumes."""
     newest = checkpoint_files(run / "checkpoints")[-1]
     tensors = read_tensors(newest)
     tensors["store.means:first"] = tensors["store.means:first"].to(torch.int8)
@@ -194,6 +203,7 @@ def test_a_driver_of_another_size_is_named() -> None:
 
 
 def test_triangles_that_face_nowhere(tmp_path: Path) -> None:
+    """A head without a triangle that faces outwards is refused."""
     path = tmp_path / "tiny.npz"
     arrays = tiny_flame()
     np.savez(path, **{**arrays, "f": arrays["f"][:, ::-1]})
@@ -212,7 +222,10 @@ def test_divergence_names_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_png_chunk_that_is_longer_than_its_file() -> None:
-    """A decoder takes memory for the length that a chunk announces: 4 GB for a picture of 8x8 pixels."""
+    """A PNG chunk that is longer than its file is refused.
+
+    A decoder would allocate the 4 GB that the chunk announces.
+    """
     data = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
     assert png_fits(data)
     assert png_fits(data + b"whatever other programs add")

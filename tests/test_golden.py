@@ -1,4 +1,4 @@
-"""A picture made by another program (gsplat), by every back end that runs here."""
+"""Every back end that runs here draws the same picture as another program (gsplat)."""
 
 import math
 from pathlib import Path

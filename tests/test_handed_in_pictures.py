@@ -1,4 +1,4 @@
-"""Pictures that users hand in: what they announce is looked at before memory is taken."""
+"""The announced size of a user's picture is checked before memory is allocated."""
 
 import struct
 import subprocess
@@ -18,7 +18,7 @@ from mien.evaluation.image_source import read_picture
 
 
 def png(width: int, height: int, rows: int) -> bytes:
-    """A black grey PNG that announces a size and holds so many rows of it."""
+    """Return a black grey PNG that announces a size and holds this many rows of it."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -81,7 +81,7 @@ def test_lossless_and_lossy_webp_are_read(tmp_path: Path) -> None:
 
 
 def test_other_kinds_of_pictures_are_not_decoded(tmp_path: Path) -> None:
-    """Under whatever name: each decoder is one more that strangers' files reach."""
+    """Other kinds of pictures are not decoded under any name, since every decoder may have faults."""
     path = tmp_path / "a.png"
     path.write_bytes(b"P5 2 2 255 abcd")
     assert cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR) is not None
@@ -110,7 +110,7 @@ def test_the_largest_picture_is_read(tmp_path: Path) -> None:
 
 
 def test_opencv_itself_refuses_what_our_reader_would_miss(tmp_path: Path) -> None:
-    """The command line tells OpenCV the same limit, before it is imported."""
+    """OpenCV refuses what mien's reader would miss. The command line sets OpenCV's limit before it is imported."""
     path = tmp_path / "a.png"
     path.write_bytes(png(10_000, 8_000, 8_000))
     code = (

@@ -1,4 +1,4 @@
-"""HeadGaS's formulas."""
+"""HeadGaS follows its formulas."""
 
 from dataclasses import replace
 

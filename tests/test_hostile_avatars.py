@@ -1,4 +1,4 @@
-"""Avatars, face models and checkpoints from a stranger: refused where they are read, whatever their checksums say."""
+"""Avatars, face models and checkpoints from a stranger are refused when they are read, whatever their checksums say."""
 
 import hashlib
 import itertools
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 import train_toy
-from damage import edit_json
+from damage import edit_json, nested
 from mien import runtime
 from mien.avatar import METHODS, Avatar, load_avatar, make_portable, write_avatar
 from mien.errors import UserError
@@ -35,7 +35,7 @@ WRONG_NUMBERS = (float("nan"), float("inf"), 3e38)
 
 @pytest.fixture(scope="module")
 def avatars(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A folder of an untrained avatar of each method."""
+    """Return a folder with an untrained avatar of each method."""
     face_model, sequence = toy_sequence(5, 32)
     folders = {}
     for name, method in METHODS.items():
@@ -57,7 +57,7 @@ def refused(folder: Path, match: str = ".") -> None:
 
 
 def change(folder: Path, edit: Callable[[dict[str, Tensor]], object]) -> None:
-    """Change an avatar's tensors and make its checksums right again."""
+    """Change an avatar's tensors and correct its checksums."""
     tensors = read_tensors(folder / "avatar.safetensors")
     edit(tensors)
     write_tensors(folder / "avatar.safetensors", {name: tensor.contiguous() for name, tensor in tensors.items()})
@@ -67,7 +67,7 @@ def change(folder: Path, edit: Callable[[dict[str, Tensor]], object]) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_numbers_that_cannot_be_drawn(method: str, avatars: dict[str, Path], tmp_path: Path) -> None:
-    """One number in a dozen of the tensors, spread over all."""
+    """Numbers that cannot be drawn are refused, wherever they are in the tensors."""
     names = [name for name, tensor in read_tensors(avatars[method] / "avatar.safetensors").items()
              if tensor.is_floating_point() and tensor.numel()]  # fmt: skip
     folder = received(avatars, method, tmp_path)
@@ -135,6 +135,7 @@ SETTINGS: dict[str, tuple[str, Callable[[dict[str, Any]], object]]] = {
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_settings_that_cannot_be(name: str, avatars: dict[str, Path], tmp_path: Path) -> None:
+    """Impossible settings of an avatar are refused in one line."""
     method, edit = SETTINGS[name]
     folder = received(avatars, method, tmp_path)
     edit_json(folder / "avatar.json", edit)
@@ -147,7 +148,7 @@ def test_settings_that_cannot_be(name: str, avatars: dict[str, Path], tmp_path: 
 def test_what_counts_only_at_the_beginning_takes_no_memory(
     method: str, avatars: dict[str, Path], tmp_path: Path
 ) -> None:
-    """A million points to begin with, of which a trained avatar has kept what its tensors hold."""
+    """Settings that only matter at the start take no memory. The avatar has the points of its tensors."""
     folder = received(avatars, method, tmp_path)
     edit_json(folder / "avatar.json", of_config(points=1_000_000))
     expected, found = load_avatar(avatars[method]), load_avatar(folder)
@@ -198,7 +199,7 @@ MODELS: dict[str, Callable[[FaceModel], FaceModel]] = {
 def test_face_models_that_cannot_be(
     name: str, avatars: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By themselves and as an avatar carries them, hash and all."""
+    """Impossible face models are refused, by themselves and inside an avatar, with a matching hash."""
     monkeypatch.setattr("mien.face.model.FaceModel.__init__", unchecked_init(FaceModel))
     wrong = MODELS[name](toy_face_model())
     folder = received(avatars, "gaussian_avatars", tmp_path)
@@ -211,7 +212,7 @@ def test_face_models_that_cannot_be(
 
 
 def unchecked_init(cls: type) -> Callable[..., None]:
-    """Without the checks of types that tests have on: users have none."""
+    """Return an `__init__` without the type checks of the tests, since users have none."""
     defaults = {f.name: f.default for f in fields(cls)}
 
     def init(self: Any, **values: Any) -> None:
@@ -273,7 +274,7 @@ def new_portable(method: str) -> portable.PortableAvatar:
 
 
 def rewrite(path: Path, edit: Callable[[dict[str, Any], dict[str, np.ndarray]], object]) -> None:
-    """Change a .mien file and make all of its checksums right again, by the format's own description."""
+    """Change a .mien file and correct all of its checksums, by the format's own description."""
     with safetensors.safe_open(path, framework="numpy") as file:
         header = json.loads(file.metadata()["mien"])
     arrays = safetensors.numpy.load_file(path)
@@ -318,13 +319,6 @@ PORTABLES: dict[str, tuple[str, Edit]] = {
     "lines": ("gaussian_avatars", lambda c, a: c["about"].update(name="a\x1b[2Jb")),
     "deep": ("gaussian_avatars", lambda c, a: c["about"].update(name=nested(400))),
 }  # fmt: skip
-
-
-def nested(depth: int) -> list[Any]:
-    inner: list[Any] = []
-    for _ in range(depth):
-        inner = [inner]
-    return inner
 
 
 @pytest.mark.parametrize("name", PORTABLES)

@@ -1,4 +1,4 @@
-"""Motion, landmarks and crops that users hand in: gaps, huge numbers and huge files are told in time."""
+"""Gaps, huge numbers and huge files in motion, landmarks and crops are reported in time."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ def refused(read, path: Path, words: str) -> None:
 
 
 def test_a_gap_in_a_csv_is_told_with_its_line(tmp_path: Path) -> None:
-    """A year between two rows would be filled with two billion moments."""
+    """A gap in a csv is reported with its line. A year between two rows would be filled with two billion moments."""
     path = tmp_path / "a.csv"
     start = [row("0:00:00:00.0"), row("0:00:00:01.0"), row("0:00:00:02.0")]
     refused(read_live_link_face, write_csv(path, *start, row("8760:00:00:00.0")), "line 5: comes 31,536,000 s after")
@@ -36,7 +36,7 @@ def test_a_gap_in_a_csv_is_told_with_its_line(tmp_path: Path) -> None:
 
 
 def test_many_gaps_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """None is long, but together they are."""
+    """Many gaps are reported that are not long by themselves, but are long together."""
     monkeypatch.setattr(motion, "MOST_MOMENTS", 5_000)
     start = [row(f"0:00:00:0{frame}.0") for frame in range(6)]
     later = [row(f"0:{minute:02d}:00:00.0") for minute in range(1, 5)]
@@ -49,6 +49,7 @@ def test_a_gap_in_json_is_told_with_its_frame(tmp_path: Path) -> None:
 
 
 def test_numbers_of_hundreds_of_digits_in_csv(tmp_path: Path) -> None:
+    """Numbers of hundreds of digits in a csv are refused with their start."""
     path = tmp_path / "a.csv"
     for rows, words in (
         ([row(f"0:0:0:{DIGITS}")], "line 2: Timecode '0:0:0:9999"),
@@ -63,6 +64,7 @@ def test_numbers_of_hundreds_of_digits_in_csv(tmp_path: Path) -> None:
 
 
 def test_numbers_of_hundreds_of_digits_in_json(tmp_path: Path) -> None:
+    """Numbers of hundreds of digits in json are refused with their start."""
     path = tmp_path / "a.json"
     matrix = {"facialTransformationMatrixes": [{"data": [*([0] * 15), DIGITS]}], "faceBlendshapes": []}
     for content, words in (
@@ -93,6 +95,7 @@ def test_huge_recordings_are_not_read(read, tmp_path: Path) -> None:
 
 
 def test_crops_of_hundreds_of_digits(tmp_path: Path) -> None:
+    """Crops that are not four plausible numbers are refused."""
     path = tmp_path / "crops.json"
     no_box = "'a' has no box of 4 numbers"
     for box, words in (
@@ -107,6 +110,7 @@ def test_crops_of_hundreds_of_digits(tmp_path: Path) -> None:
 
 
 def test_cameras_of_huge_numbers(tmp_path: Path) -> None:
+    """Cameras with huge numbers or other types are refused."""
     path = tmp_path / "cameras.json"
     good = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
     for field, value, words in (

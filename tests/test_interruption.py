@@ -1,4 +1,4 @@
-"""Ctrl-C and kill in the middle of rendering and of scoring: nothing half-written, and the same command ends alike."""
+"""After Ctrl-C or kill during rendering or scoring, nothing is half-written, and the same command ends alike."""
 
 import importlib
 import json
@@ -50,7 +50,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def stop(arguments: list[str], steps: int, how: signal.Signals) -> int:
-    """Run the command in a process of its own until so many pictures are done, then send it a signal."""
+    """Run the command in another process until this many pictures are done, then send it a signal."""
     with subprocess.Popen([sys.executable, "-c", SLOWLY, *arguments], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for _ in range(steps):
@@ -72,7 +72,7 @@ def visible(folder: Path) -> list[str]:
 def test_interrupted_rendering(
     name: str, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What was there stays until it is replaced as a whole; numbered pictures are whole, one by one."""
+    """An interrupted rendering leaves the old file until the new one is whole. Every numbered picture is whole."""
     command = ["render", str(workspace), *LOOK, "--out"]
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
     assert main([*command, str(undisturbed / name)]) == 0

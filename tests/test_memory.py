@@ -1,16 +1,14 @@
-"""Long clips in bounded memory: each test fails where all of a sequence's pictures are held at once."""
+"""Long clips take bounded memory: each test fails if all of a sequence's pictures are held at once."""
 
-import gc
-import tracemalloc
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from bounded_memory import MIB, allocating_at_most
 from capture_helpers import random_capture
 from mien import picture_files
 from mien.capture import read_capture, write_capture
@@ -23,18 +21,16 @@ from small_face_model import make_small_face_model
 from test_tracking_scoring import _tracking, _upright
 from tracking_case import capture_of, make_tracking_case
 
-MIB = 1 << 20
-
 
 @pytest.fixture
 def tiny_limit(monkeypatch: pytest.MonkeyPatch) -> int:
-    """What may be held is a mebibyte."""
+    """Limit the memory of mapped pictures to a mebibyte."""
     monkeypatch.setattr(picture_files, "_MAX_KEPT_BYTES", MIB)
     return MIB
 
 
 def mapped_bytes() -> int:
-    """File pages in this process's share of the memory."""
+    """Return the bytes of file pages in this process's memory."""
     status = Path("/proc/self/status")
     if not status.is_file():
         pytest.skip(NO_PROC)
@@ -42,25 +38,12 @@ def mapped_bytes() -> int:
     return int(line.split()[1]) << 10
 
 
-@contextmanager
-def allocating_at_most(limit: int) -> Iterator[None]:
-    """Of what numpy and Python ask for."""
-    gc.collect()
-    tracemalloc.start()
-    try:
-        yield
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < limit, f"{peak / MIB:.0f} MiB"
-
-
-def largest_share(pictures: np.ndarray, look: Callable[[np.ndarray], object]) -> int:
-    """How far the mapped pages grow while every picture is looked at."""
+def largest_share(pictures: np.ndarray, read: Callable[[np.ndarray], object]) -> int:
+    """Return the growth of the mapped pages while every picture is read."""
     before = mapped_bytes()
     most = 0
     for index in np.ndindex(pictures.shape[:2]):
-        look(pictures[index])
+        read(pictures[index])
         most = max(most, mapped_bytes() - before)
     return most
 
@@ -114,7 +97,7 @@ def test_few_pictures_stay_in_memory_and_many_are_the_same(tmp_path: Path, monke
 
 
 def test_tracking_looks_at_a_bounded_number_of_frames_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And finds the same."""
+    """Tracking reads a bounded number of frames at once, and finds the same result."""
     case = make_tracking_case(timesteps=24)
     model = make_small_face_model()
     expected = track(case.capture, model)

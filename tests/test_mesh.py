@@ -1,4 +1,4 @@
-"""The mesh rasterizer: coverage, perspective, depth order, near plane, and the pictures made from it."""
+"""The mesh rasterizer handles coverage, perspective, depth order and the near plane, and its pictures are right."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,12 +28,12 @@ from mien.render.mesh import (
 
 
 def pixel_camera(width: int = 16, height: int = 12) -> Camera:
-    """At depth 1, world x and y are pixels."""
+    """Return a camera for which world x and y at depth 1 are pixels."""
     return Camera(torch.eye(3), torch.eye(4), width, height)
 
 
 def at_depth(pixels: Sequence[tuple[float, float, float]]) -> Tensor:
-    """World points of (x, y, depth) for `pixel_camera`."""
+    """Return the world points of (x, y, depth) for `pixel_camera`."""
     points = torch.tensor(pixels, dtype=torch.float32)
     return torch.cat([points[:, :2] * points[:, 2:], points[:, 2:]], dim=-1)
 
@@ -45,7 +45,7 @@ def random_mesh(seed: int = 0, faces: int = 60) -> tuple[Tensor, Tensor]:
 
 
 def camera_at(position: list[float], fov_x: float, size: int) -> Camera:
-    """A square camera that looks at the origin."""
+    """Return a square camera that looks at the origin."""
     viewmat = look_at(torch.tensor(position), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     return camera_from_fov(fov_x, size, size, viewmat)
 
@@ -183,6 +183,7 @@ def test_native_interpolation_equals_the_reference():
 
 
 def test_texture_lookup():
+    """Textures are sampled between texels, and at the border beyond them."""
     texture = torch.arange(12.0).view(3, 4, 1)
     uv = torch.tensor([[[0.125, 1 - 1 / 6], [0.875, 1 / 6]], [[0.25, 0.5], [-1.0, 2.0]]])
     expected = torch.tensor([[[0.0], [11.0]], [[4.5], [0.0]]])
@@ -218,6 +219,7 @@ def test_normals_of_a_sphere_point_outwards():
 
 
 def test_picture_of_a_sphere():
+    """A sphere covers the area of its projection, and the background is as given."""
     sphere = trimesh.creation.icosphere(subdivisions=4)
     vertices, faces = torch.tensor(np.array(sphere.vertices)).float(), torch.tensor(np.array(sphere.faces)).long()
     camera = camera_at([0.0, 0.0, 4.0], 0.8, 64)

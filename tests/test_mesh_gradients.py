@@ -1,4 +1,4 @@
-"""Gradients through rasterized meshes: native and plain PyTorch, against finite differences and areas."""
+"""Gradients through rasterized meshes, native and in PyTorch, agree with finite differences and with areas."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ from mien.render.mesh_reference import (
 
 @dataclass(frozen=True)
 class Scene:
-    """A bumpy ball with a smaller one before it: silhouettes over the background and over another surface."""
+    """Bumpy ball behind a smaller one, with silhouettes over the background and over another surface."""
 
     points: Tensor
     faces: Tensor
@@ -78,7 +78,7 @@ def loss_weights(shape: tuple[int, ...]) -> Tensor:
 def finite_difference(
     function: Callable[[Tensor], Tensor], at: Tensor, step: float, entries: int = 24
 ) -> tuple[Tensor, Tensor]:
-    """Some entries of a scalar function's gradient by central differences: the entries, and their derivatives."""
+    """Return some entries of a function's gradient and their derivatives by central differences."""
     flat = at.double().flatten()
     chosen = torch.randperm(len(flat), generator=torch.Generator().manual_seed(9))[:entries]
     out = []
@@ -226,6 +226,7 @@ def test_loss_draws_the_picture_that_it_compares(scene: Scene):
 
 
 def test_edges_of_a_square():
+    """A square of two triangles has five edges, each with its faces and opposite vertex."""
     edges = mesh_edges(torch.tensor([[0, 1, 2], [0, 2, 3]]))
     rows = [tuple(row) for row in torch.cat([edges.vertices, edges.faces, edges.opposite[:, None]], 1).tolist()]
     assert rows == [(0, 1, 0, -1, 2), (0, 2, 0, 1, 1), (0, 3, 1, -1, 2), (1, 2, 0, -1, 0), (2, 3, 1, -1, 0)]
@@ -240,7 +241,7 @@ def head_area(camera: Camera, vertices: Tensor, faces: Tensor, supersample: int 
 
 @pytest.mark.parametrize("size", [256, 512, 1024])
 def test_silhouette_gradient_of_a_head_is_that_of_its_area(size: int):
-    """A growing head covers more pixels: by as much as its silhouettes' gradients say."""
+    """The silhouette gradient of a head is the growth of its area: a larger head covers more pixels."""
     model = load_face_model("anny")
     vertices, faces = model(model.neutral())[0], model.faces
     camera = camera_from_fov(

@@ -1,6 +1,6 @@
-"""Gradients of antialiased meshes against deodr, an independent renderer with another scheme.
+"""Gradients of antialiased meshes agree with deodr, an independent renderer with another scheme.
 
-It is in the lock where it has a wheel: Linux on x86-64.
+It is in the lock file for the platforms with a wheel: Linux on x86-64.
 """
 
 import numpy as np
@@ -17,13 +17,13 @@ SIZE = 192
 
 
 def smooth_weights() -> Tensor:
-    """What the picture is compared with: waves that are much wider than a pixel."""
+    """Return weights for the comparison: waves that are much wider than a pixel."""
     y, x = torch.meshgrid(torch.arange(SIZE) / SIZE, torch.arange(SIZE) / SIZE, indexing="ij")
     return torch.stack([(7 * x + 3 * y).sin(), (5 * y - 4 * x).cos(), (6 * x * y).sin()], dim=-1)
 
 
 def of_deodr(renderer, points: Tensor, faces: Tensor, colors: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Picture, and the gradient by pixel positions of its sum times the weights."""
+    """Return the picture, and the gradient of its weighted sum with respect to pixel positions."""
     depth = points[:, 2].double().numpy()
     place = (points[:, :2] / points[:, 2:]).double().numpy()
     edges = np.ones(faces.shape, bool)
@@ -40,7 +40,7 @@ def of_deodr(renderer, points: Tensor, faces: Tensor, colors: Tensor) -> tuple[n
 
 
 def silhouettes(place: np.ndarray, faces: Tensor, flags: np.ndarray) -> np.ndarray:
-    """Which edges of each triangle (its corners 0-1, 1-2, 2-0) have nothing or a back face behind them."""
+    """Return which edges of each triangle (corners 0-1, 1-2, 2-0) have nothing or a back face behind them."""
     table = faces.numpy()
     corner = place[table]
     first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
@@ -76,7 +76,7 @@ def test_gradients_of_a_head_agree_with_deodr(colored: bool):
     assert np.abs(drawn.detach().numpy() - expected_image).mean() < 0.01
     by_points = torch.autograd.grad((drawn * smooth_weights()).sum(), points)[0]
     by_pixel = (by_points[:, :2] * points.detach()[:, 2:]).double().numpy()
-    # The other scheme blends every outline over the pixel outside of it: pictures differ there, gradients a little.
+    # The other scheme blends every outline over the pixel outside of it. Pictures differ there, and gradients a little.
     assert (by_pixel * expected).sum() / np.linalg.norm(by_pixel) / np.linalg.norm(expected) > 0.95
     if not colored:
         x, y = ((points.detach()[:, :2] / points.detach()[:, 2:]).double().numpy() - SIZE / 2).T / SIZE

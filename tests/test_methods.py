@@ -1,4 +1,4 @@
-"""One suite over all methods, on a toy scene: what the seam promises."""
+"""Every method keeps the promises of the interface, in one suite on a toy scene."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""Metrics against hand-computed values, a slow second implementation of SSIM, and a published ST-LPIPS figure."""
+"""Metrics agree with values computed by hand, a slow second implementation of SSIM, and a published ST-LPIPS figure."""
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ def pair() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_psnr_and_l1_of_a_constant_difference() -> None:
+    """A constant difference has the PSNR and L1 of the formulas."""
     target = torch.full((8, 9, 3), 0.25)
     assert psnr(target + 0.1, target) == pytest.approx(20.0, abs=1e-4)
     assert l1(target - 0.1, target) == pytest.approx(0.1, abs=1e-6)

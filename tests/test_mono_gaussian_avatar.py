@@ -1,4 +1,4 @@
-"""MonoGaussianAvatar's formulas."""
+"""MonoGaussianAvatar follows its formulas."""
 
 from dataclasses import replace
 
@@ -68,7 +68,7 @@ def test_canonical_face_leaves_points_at_their_canonical_places() -> None:
 
 
 class Perfect(torch.nn.Module):
-    """A deformation network that knows the face model's vertices."""
+    """Deformation network that knows the face model's vertices."""
 
     def __init__(self, face_model: FaceModel) -> None:
         super().__init__()
@@ -82,7 +82,7 @@ class Perfect(torch.nn.Module):
 
 
 def perfect_avatar() -> MonoGaussianAvatar:
-    """An avatar whose points are the canonical mesh's vertices."""
+    """Return an avatar whose points are the canonical mesh's vertices."""
     avatar = new_avatar(face_model=with_pose_correctives())
     vertices = avatar.face_model.head_vertices(avatar.canonical_face())[0]
     avatar.store.resize(len(vertices))
@@ -196,6 +196,7 @@ def test_deformation_starts_as_nothing_with_even_weights() -> None:
 
 @pytest.mark.parametrize("layers", [2, 3, 4, 7])
 def test_attribute_network_of_any_depth(layers: int) -> None:
+    """The attribute network can have any depth."""
     assert AttributeNet(48, layers)(torch.randn(5, 3)).shape == (5, 11)
 
 
@@ -225,6 +226,7 @@ def test_children_are_in_a_cube_about_their_parents() -> None:
 
 
 def test_nearest_vertices() -> None:
+    """Each point finds its nearest vertex."""
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     points = torch.tensor([[0.6, 0.1, 0], [0.1, 0.1, 5], [0.4, 0.55, 0]])
     assert nearest_vertices(points, vertices).tolist() == [1, 0, 2]

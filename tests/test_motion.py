@@ -1,4 +1,4 @@
-"""Motion of other programs: Live Link Face's csv and blend shapes as json, good and bad, and what the avatar does."""
+"""Motion of other programs, as Live Link Face's csv or as json of blend shapes, is read, refused and applied."""
 
 import json
 import math
@@ -71,11 +71,11 @@ REAL_LOOKS = (
     ((0, 0, 0.4733, 0.3900), (0, 0.5690, 0, 0.3827), (-0.3425, -0.1774, 0.0601), (-0.2848, -0.1774, 0.0503)),
     ((0.2948, 0.0970, 0, 0), (0.2953, 0.0095, 0, 0), (-0.0057, 0.1804, -0.0010), (0.0583, 0.1804, 0.0106)),
 )
-"""Rounded rows of real takes, in which both ways to tell the gaze are filled."""
+"""Rounded rows of real takes that give the gaze both as coefficients and as angles."""
 
 
 def test_angles_have_the_signs_of_real_takes(tmp_path: Path) -> None:
-    """Yaw to the right, pitch down: the angles beside real eyeLook coefficients say the same as these."""
+    """Angles have the signs of real takes: yaw to the right and pitch down agree with the eyeLook coefficients."""
     columns = ("EyeLookDown", "EyeLookIn", "EyeLookOut", "EyeLookUp")
     for left, right, left_angles, right_angles in REAL_LOOKS:
         looks, angles = {}, {}
@@ -84,14 +84,14 @@ def test_angles_have_the_signs_of_real_takes(tmp_path: Path) -> None:
             angles |= {f"{side}Eye{name}": value for name, value in zip(("Yaw", "Pitch", "Roll"), turns, strict=True)}
         by_looks = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", **looks))).eyes[0]
         by_angles = read_live_link_face(write_csv(tmp_path / "b.csv", row("0:0:0:0", **angles))).eyes[0]
-        # Where the eyes are straight ahead is a matter of calibration: up to 7 degrees on these takes.
+        # The calibration decides where the eyes look straight ahead. On these takes it differs by up to 7 degrees.
         assert np.abs(by_looks - by_angles).max() < math.radians(9)
         # A gaze up and to the side has hardly any torsion, once its roll is taken the right way.
         assert np.abs(by_angles[:, 2]).max() < 0.12
 
 
 def test_head_angles_are_unreals(tmp_path: Path) -> None:
-    """Yaw to the subject's right, pitch down, roll to the left shoulder: +x left, +y up, +z ahead."""
+    """Head angles follow Unreal: yaw to the subject's right, pitch down, roll to the left shoulder."""
     turns = {"HeadYaw": 0.3, "HeadPitch": 0.2, "HeadRoll": 0.1}
     rotation = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", **turns))).head_rotation[0]
     turned = matrix_from_axis_angle(torch.from_numpy(rotation)).numpy()
@@ -102,6 +102,7 @@ def test_head_angles_are_unreals(tmp_path: Path) -> None:
 
 
 def test_bad_csv_files(tmp_path: Path) -> None:
+    """Bad csv files are refused with line, column and value."""
     good = row("0:00:00:01.0")
     without = [name for name in COLUMNS if name not in ("JawOpen", "TongueOut")]
     for rows, columns, part in (
@@ -129,6 +130,7 @@ def write(path: Path, content: object) -> Path:
 
 
 def test_plain_json(tmp_path: Path) -> None:
+    """Plain json of blend shapes is read, and a frame without a face repeats the one before."""
     frames = [{"timestamp_ms": 40 * i, "blendshapes": {"jawOpen": i / 4, "_neutral": 0.9}} for i in range(4)]
     frames[2]["blendshapes"] = None
     motion = read_blendshape_json(write(tmp_path / "a.json", frames))
@@ -138,6 +140,7 @@ def test_plain_json(tmp_path: Path) -> None:
 
 
 def test_face_landmarker_results(tmp_path: Path) -> None:
+    """Results of MediaPipe's face landmarker are read with the head's rotation."""
     turn = matrix_from_axis_angle(torch.tensor([0.1, -0.4, 0.2])).numpy()
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turn, [1, 2, -45]
@@ -155,6 +158,7 @@ def test_face_landmarker_results(tmp_path: Path) -> None:
 
 
 def test_bad_json_files(tmp_path: Path) -> None:
+    """Bad json files are refused with frame and value."""
     good = {"timestamp_ms": 0, "blendshapes": {}}
     for content, part in (
         ([], "give a list of frames"),
@@ -194,7 +198,7 @@ def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
     up = torch.tensor([-math.radians(30), 0, 0])
     for joint in ("left_eye", "right_eye"):
         torch.testing.assert_close(driven.joints[0, model.free_joint_names.index(joint)], up, atol=1e-5, rtol=0)
-    # The head is at rest where it mostly is: the middle of the turn, which goes to the right.
+    # The head's rest pose is where it mostly is: the middle of the turn, which goes to the right.
     torch.testing.assert_close(driven.head_rotation[:, 1], torch.tensor([0.1, 0, -0.1]), atol=1e-5, rtol=0)
     torch.testing.assert_close(driven.head_translation, rest.head_translation.expand(3, -1))
     with pytest.raises(UserError, match="none of ARKit's"):

@@ -1,4 +1,4 @@
-"""Native functions refuse what does not belong together, and survive a want of memory; `native_cases.py` calls them."""
+"""Native functions refuse arguments that do not belong together, and survive a lack of memory (`native_cases.py`)."""
 
 import json
 import os

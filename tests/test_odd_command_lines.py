@@ -1,4 +1,4 @@
-"""What people type: one line that names the value and the remedy, exit code 2, and nothing written."""
+"""Mistyped commands end with one line that names the value and the remedy, exit code 2, and nothing written."""
 
 import json
 import shlex
@@ -21,7 +21,7 @@ SKEWED = {**CAMERA, "viewmat": (2 * np.eye(4)).tolist()}
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a workspace W, whose name has a space and an umlaut, and odd files."""
+    """Return a folder with a space and an umlaut in its name, a workspace W, and odd files."""
     place = tmp_path_factory.mktemp("Köpfe und Leute")
     write_toy_workspace(place / "W")
     for name in ("empty.csv", "empty.json", "empty.mp4"):
@@ -152,7 +152,7 @@ def test_the_same_video_twice_is_warned_of(place: Path) -> None:
 def test_landmarks_that_no_face_could_have(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The toy capture's landmarks all lie in one point."""
+    """Landmarks that no face can have are refused: those of the toy capture are all at one point."""
     monkeypatch.chdir(place)
     assert main(["track", "W", "--again"]) == 2
     assert "no face fits the landmarks" in capsys.readouterr().err
@@ -161,7 +161,10 @@ def test_landmarks_that_no_face_could_have(
 def test_an_avatar_of_an_older_version_says_train_again(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Before checksums, avatar.json did not name the hash of its tensors."""
+    """An avatar of an older version asks to be trained again.
+
+    Before checksums, avatar.json had no hash of its tensors.
+    """
     monkeypatch.chdir(place)
     path = place / "W/runs/toy/avatar/avatar.json"
     whole = path.read_bytes()

@@ -1,4 +1,4 @@
-"""Videos as people have them: odd names, odd streams, codecs nobody knows, files that name other files."""
+"""Videos with odd names, odd streams, unknown codecs, or references to other files are read or refused."""
 
 import http.server
 import os
@@ -32,7 +32,7 @@ NAMES = (
 
 @pytest.mark.parametrize("name", NAMES)
 def test_any_name_is_a_file(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Given as people give it, relative to the folder they are in."""
+    """Any name is a file, also relative to the folder it is in."""
     monkeypatch.chdir(tmp_path)
     path = Path(name)
     pictures = write_gradient_video(Path("clip.mp4"), frames=3)
@@ -107,7 +107,7 @@ def test_files_that_name_other_files_are_refused(name: str, tmp_path: Path, monk
 
 
 def test_no_connection_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither for what a playlist lists nor for a name that looks like an address."""
+    """No connection is made, neither for the entries of a playlist nor for a name that looks like an address."""
     asked = []
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -149,7 +149,7 @@ def encode(
     title: str | None = None,
     sound: bool = False,
 ) -> None:
-    """A clip made by FFmpeg alone; sound comes first."""
+    """Encode a clip with FFmpeg alone. Sound comes first."""
     with av.open(str(path.absolute()), "w", format=format_name) as container:
         container.metadata.update({} if title is None else {"title": title})
         audio = container.add_stream("pcm_s16le", rate=8000, layout="mono") if sound else None
@@ -200,13 +200,16 @@ def test_ordinary_oddities_are_read(kind: str, tmp_path: Path) -> None:
 
 
 def test_frames_that_an_edit_list_leaves_out_are_not_counted(tmp_path: Path) -> None:
-    """As telephones trim: landmarks and mattes of a user are counted against what is shown."""
+    """Frames that an edit list leaves out, as telephones trim, are not counted.
+
+    Mattes are counted against what is shown.
+    """
     encode(tmp_path / "a.mp4", ticks=(-50, -10, 0, 10, 30))
     assert count_frames(tmp_path / "a.mp4") == len(list(read_video_frames(tmp_path / "a.mp4"))) == 3
 
 
 def test_a_cover_picture_is_no_video(tmp_path: Path) -> None:
-    """As files of music programs have one; a film may have one, too."""
+    """A cover picture, as music programs add to files, is not a video. A film may have one, too."""
     for moving in (True, False):
         path = tmp_path / "a.mp4"
         with av.open(str(path), "w") as container:
@@ -233,7 +236,7 @@ def test_a_cover_picture_is_no_video(tmp_path: Path) -> None:
 
 
 def peak_of(work) -> int:
-    """MiB by which the process's largest memory grew."""
+    """Return the growth of the process's peak memory in MiB."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     work()
     return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) >> 10
@@ -256,7 +259,7 @@ def test_a_video_that_announces_huge_pictures_is_refused(tmp_path: Path) -> None
 
 
 def test_huge_pictures_inside_of_a_video_are_not_decoded(tmp_path: Path) -> None:
-    """The container says 64x48; the pictures in it unpack to 300 megapixels."""
+    """Huge pictures inside of a video are not decoded: the container says 64x48, but they unpack to 300 megapixels."""
     bomb = png(20_000, 15_000, 2_000)
     path = tmp_path / "a.mov"
     with av.open(str(path), "w") as container:
@@ -269,30 +272,31 @@ def test_huge_pictures_inside_of_a_video_are_not_decoded(tmp_path: Path) -> None
     alone = tmp_path / "a.png"
     alone.write_bytes(bomb)
 
-    def look() -> None:
+    def read() -> None:
         assert len(list(read_video_frames(path))) == 1
         with pytest.raises(UserError, match="it is damaged, or has more than the 37,748,736 pixels"):
             list(read_video_frames(alone))
 
-    assert peak_of(look) < 200
+    assert peak_of(read) < 200
 
 
 def test_a_gif_that_announces_a_huge_screen(tmp_path: Path) -> None:
+    """A gif that announces a huge screen is refused without taking its memory."""
     path = tmp_path / "a.gif"
     encode(path, codec="gif", pixels="rgb8")
     data = bytearray(path.read_bytes())
     data[6:10] = struct.pack("<HH", 20_000, 20_000)
     path.write_bytes(data)
 
-    def look() -> None:
+    def read() -> None:
         with pytest.raises(UserError, match="it is damaged, or has more than"):
             list(read_video_frames(path))
 
-    assert peak_of(look) < 200
+    assert peak_of(read) < 200
 
 
 def test_pixels_that_are_not_square_count_as_they_are_shown() -> None:
-    """640x480 with pixels 9,000 times as wide as high would be shown in 8 GB."""
+    """Pixels that are not square count as they are shown: 640x480 with pixels 9,000 times as wide would take 8 GB."""
     with pytest.raises(UserError, match=r"clip: is shown with 5760000x480 pixels, more than the 37,748,736"):
         Display("clip", 9000.0).show(av.VideoFrame(640, 480, "yuv420p"))
     assert Display("clip", 9000.0, 512).show(av.VideoFrame(640, 480, "yuv420p")).shape == (1, 512, 3)

@@ -1,4 +1,4 @@
-"""Outlines of heads: they are found, agree with the truth, and pull a fit there."""
+"""Outlines of heads are found, agree with the truth, and pull a fit towards it."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def true_state(case: PhotometricCase) -> torch.Tensor:
 
 
 def step_of(case: PhotometricCase, state: torch.Tensor, columns: slice) -> torch.Tensor:
-    """The Gauss-Newton step of some parameters of each timestep."""
+    """Return the Gauss-Newton step of some parameters of each timestep."""
     subject = Subject(case.face.identity.double(), torch.zeros(478, 3).double())
     rows = torch.arange(len(state))
     frames, _ = term_of(case).joint_equations(state, rows, subject, batch_of((case.camera,)))

@@ -1,4 +1,4 @@
-"""The `paper` schedule: better than landmarks alone, the same in every run, its terms and its optimiser."""
+"""The `paper` schedule is better than landmarks alone, and the same in every run; its terms and optimiser are right."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -46,6 +46,7 @@ def test_pixels_calm_what_landmarks_leave(case, by_landmarks, by_descent):
 
 
 def test_all_of_it_from_landmarks(case, by_landmarks):
+    """The schedule is also better than landmarks if it starts from them alone."""
     settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks"))
     alone = track(case.capture, case.model, settings)
     assert wobble(case, alone) < 0.25 * wobble(case, by_landmarks)
@@ -59,7 +60,8 @@ def test_it_says_how_it_was_made(by_descent):
 
 
 def test_the_same_with_any_number_of_threads(case, monkeypatch):
-    monkeypatch.setattr(epochs, "_BATCHES", 2)  # so that a batch has several frames
+    """The number of threads does not change a bit."""
+    monkeypatch.setattr(epochs, "_BATCHES", 2)  # this way a batch has several frames
     short, runs = replace(QUICK, epochs=1), []
     for threads in ("1", "2"):
         monkeypatch.setenv("MIEN_THREADS", threads)
@@ -68,7 +70,10 @@ def test_the_same_with_any_number_of_threads(case, monkeypatch):
 
 
 def test_landmarks_cost_what_they_cost_other_schedules(case):
-    """The detector's whole response counts: turns and expressions as well."""
+    """Landmarks cost what they cost in other schedules.
+
+    The detector's whole response counts, with turns and expressions.
+    """
     settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, gap_weight=0.0))
     shot, layout = shot_of(case.capture, settings), layout_of(case.model)
     model = reduce_face_model(case.model, layout)
@@ -107,7 +112,7 @@ def test_adam_is_that_of_torch():
 def test_an_interrupted_fit_goes_on(
     case, tmp_path, monkeypatch, start: Literal["fast", "landmarks"], interrupted_at: int
 ):
-    """Interrupted on its way through the frames, or in the epochs: the same numbers as without."""
+    """An interrupted fit continues to the same numbers, whether it stopped in the frames or in the epochs."""
     short = replace(QUICK, start=start, first_steps=10, steps=3, epochs=3)
     settings = replace(LANDMARKS, schedule="paper", paper=short)
     expected = track_subject([case.capture], case.model, settings)[0]

@@ -1,4 +1,4 @@
-"""The fused L1 + SSIM loss against its plain PyTorch reference."""
+"""The fused L1 + SSIM loss agrees with its plain PyTorch reference."""
 
 from collections.abc import Iterator
 
@@ -10,6 +10,7 @@ from torch.nn.functional import conv2d, interpolate
 from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.training.photometric import Box, photometric_loss, photometric_loss_reference, ssim, ssim_map
+from rasterize_scenes import relative_error
 
 WHOLE_AND_PARTS = [
     (64, 48, None),
@@ -35,7 +36,7 @@ def smooth_picture(height: int, width: int, seed: int) -> Tensor:
 
 
 def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A noisy picture and another one; both have a white part, where SSIM's variances vanish."""
+    """Return a noisy picture and another one. Both have a white part, in which SSIM's variances vanish."""
     noise = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(2))
     image, target = smooth_picture(height, width, 0) + 0.05 * noise, smooth_picture(height, width, 1)
     image[: height // 3], target[: height // 3] = 1, 1
@@ -43,14 +44,10 @@ def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 def exact(image: Tensor, target: Tensor, weights: tuple[float, float], box: Box | None) -> tuple[Tensor, Tensor]:
-    """Value and gradient in float64."""
+    """Return value and gradient in float64."""
     image = image.double().requires_grad_()
     loss = photometric_loss_reference(image, target.double(), *weights, box)
     return loss.detach(), torch.autograd.grad(loss, image)[0]
-
-
-def relative_error(value: Tensor, expected: Tensor) -> float:
-    return float((value.double() - expected).norm() / expected.norm().clamp_min(1e-12))
 
 
 @pytest.mark.parametrize(("height", "width", "box"), WHOLE_AND_PARTS)
@@ -65,7 +62,7 @@ def test_value_and_gradient_equal_the_float64_reference(
     (3 * loss).backward()
     assert image.grad is not None
     torch.testing.assert_close(loss.detach().double(), value, atol=1e-6, rtol=1e-6)
-    # In the white part float32 leaves about 1e-4 of the variances' floor C2; PyTorch's own float32 does no better.
+    # In the white part float32 errs by about 1e-4 of the variances' floor C2. PyTorch's own float32 is no better.
     assert relative_error(image.grad, 3 * gradient) < 5e-5
     with torch.no_grad():
         assert photometric_loss(image, target, *weights, box) == loss
@@ -102,7 +99,7 @@ def test_equal_pictures_lose_nothing():
 
 
 def test_ssim_follows_its_formula():
-    """One pixel by hand: a 2D window in one piece, statistics about the means."""
+    """SSIM follows its formula at one pixel by hand: a 2D window in one piece, and statistics about the means."""
     image, target = (picture.double() for picture in pair(30, 30))
     distances = torch.arange(11).double() - 5
     window = (-(distances[:, None] ** 2 + distances**2) / 4.5).exp()

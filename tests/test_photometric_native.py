@@ -1,4 +1,4 @@
-"""The native alignment of a textured mesh with a picture against plain PyTorch; texture and light from pictures."""
+"""The native alignment of a textured mesh with a picture agrees with PyTorch; so do texture and light from pictures."""
 
 import math
 
@@ -59,7 +59,7 @@ def sighting(seed: int = 5, parameters: int = 0) -> Sighting:
 
 
 def reference(seen: Sighting, skin: SkinTexture) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Cost, half gradient and half Hessian, residuals: plain PyTorch in float64, no high-pass filter."""
+    """Return cost, half gradient, half Hessian and residuals by PyTorch in float64, without a high-pass filter."""
     vertices, normals = seen.posed.vertices, seen.posed.normals
     fragments = rasterize_mesh(vertices, MODEL.faces, CAMERA)
     points = interpolate(fragments, vertices, MODEL.faces)

@@ -1,4 +1,4 @@
-"""Faces fitted to pixels: better than landmarks alone; its derivatives; what it does where nothing is seen."""
+"""Faces fitted to pixels are better than landmarks alone. Derivatives are right, and unseen faces keep still."""
 
 from dataclasses import replace
 
@@ -37,14 +37,14 @@ def by_pixels(case: PhotometricCase) -> Tracking:
 
 
 def wobble(case: PhotometricCase, tracking: Tracking) -> float:
-    """Pixels by which landmarks stray from a constant error: what differs from picture to picture."""
+    """Return the median deviation of landmarks from their mean error, in pixels."""
     points = case.model.landmark_positions(case.model(tracking.face), "mediapipe")
     error = tracking.cameras[0].project(points)[0] - case.landmarks
     return float((error - error.mean(0)).norm(dim=-1).median())
 
 
 def turn_error(case: PhotometricCase, tracking: Tracking) -> float:
-    """Degrees beside the mean error."""
+    """Return the median deviation of the rotation from its mean error, in degrees."""
     turn = matrix_from_axis_angle(tracking.face.head_rotation) @ matrix_from_axis_angle(case.face.head_rotation).mT
     vector = torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], dim=-1)
     return float((vector - vector.mean(0)).norm(dim=-1).median().rad2deg())

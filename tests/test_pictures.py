@@ -1,4 +1,4 @@
-"""Pictures: sizes, places, heat scale and inlining."""
+"""Pictures in reports have the right sizes, places and heat scale, and are inlined."""
 
 import base64
 

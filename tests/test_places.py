@@ -24,7 +24,7 @@ PLACES = {
 
 
 def run_python(arguments: list[str], environment: dict[str, str], folder: Path | None = None) -> str:
-    """Run Python without this process's locale, home and threads; return its output."""
+    """Run Python without this process's locale, home and threads, and return its output."""
     kept = {name: value for name, value in os.environ.items() if name not in OF_PLACES}
     done = subprocess.run(
         [sys.executable, *arguments], cwd=folder, env={**kept, **environment}, capture_output=True, check=False
@@ -34,7 +34,7 @@ def run_python(arguments: list[str], environment: dict[str, str], folder: Path |
 
 
 def hashes(place: Path) -> dict[str, str]:
-    """Digests of the files that are the same everywhere. Curves hold times, so they are left out."""
+    """Return digests of the files that are the same everywhere. Curves hold times, so they are left out."""
     files = [path for kind in ("*.png", "*.safetensors") for path in place.rglob(kind)]
     return {
         str(path.relative_to(place)): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -67,26 +67,30 @@ def plain(face_clip: Path | None, tmp_path_factory: pytest.TempPathFactory) -> d
 def test_the_same_bytes_in_odd_places(
     environment: dict[str, str], plain: dict[str, str], face_clip: Path | None, tmp_path: Path
 ) -> None:
+    """A run and a capture have the same bytes in every odd place."""
     place = tmp_path / "Köpfe & Gemälde" / "a place"
     place.mkdir(parents=True)
     arguments = [work_anywhere.__file__, str(place), *([] if face_clip is None else [str(face_clip)])]
     assert "working in" in run_python(arguments, environment, place)
     found = hashes(place)
     if environment is PLACES[NO_UTF8]:
-        # Where names are not UTF-8, a sequence gets "_" for what the locale lacks; its content stays.
+        # If names are not UTF-8, a sequence's name gets "_" for what the locale lacks. Its content is the same.
         found = {name.replace("Frau M__ller", "Frau Müller"): digest for name, digest in found.items()}
     assert found == plain
 
 
 def test_the_environment_starts_in_any_locale() -> None:
-    """Python reads .pth files in the locale's encoding: an absolute path with an umlaut stops it under LC_ALL=C."""
+    """The environment starts in any locale.
+
+    An absolute path with an umlaut in a .pth file would stop it under LC_ALL=C.
+    """
     for path in Path(str(distribution("mien").locate_file(""))).glob("*mien*.pth"):
         assert path.read_bytes().isascii(), f"{path}: run `make setup`"
     assert run_python(["-c", "import mien; print(mien.__version__)"], {"LC_ALL": "C"}).strip() == mien.__version__
 
 
 def test_help_and_names_are_printed_in_any_locale(tmp_path: Path) -> None:
-    """Help has characters that ASCII lacks, and a file's name may be no UTF-8."""
+    """Help and names are printed in any locale. Help has characters that ASCII lacks, and names need not be UTF-8."""
     help_of_all = "from mien.cli import main; main(['bench', '--help-all'])"
     assert "mien bench" in run_python(["-c", help_of_all], ASCII)
     odd = "from mien import cli; cli._overview = lambda: '\\udcff \\u2022'; cli.main([])"

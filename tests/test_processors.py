@@ -1,4 +1,4 @@
-"""The table of docs/reproducibility.md: nothing where bytes are the same, and the right amount where they are not."""
+"""The table of docs/reproducibility.md shows no difference for equal bytes, and the right amount otherwise."""
 
 import importlib.util
 from pathlib import Path
@@ -20,7 +20,7 @@ def test_the_table_tells_differences(tmp_path: Path) -> None:
             tmp_path / f"{name}.npz", trained=pictures + shift, rendered=pictures, clip=pictures + 0.1,
             vertices=vertices, landmarks=landmarks + shift,
         )  # fmt: skip
-    rows = processors.table(tmp_path, ["here", "isa-avx2", "old"]).splitlines()
+    rows = processors.format_table(tmp_path, ["here", "isa-avx2", "old"]).splitlines()
     assert rows[2] == "| the machine as it is | | | 20.0 dB | | |"
     assert rows[3] == "| `MIEN_ISA=avx2` | same bytes | same bytes | 20.0 dB | same bytes | same bytes |"
     assert rows[4].endswith("| same bytes | 40.0 dB | 20.9 dB | same bytes | 0.014 px (most 0.014) |")

@@ -1,4 +1,4 @@
-"""Progress in a log file: a line now and then, the last one once."""
+"""Progress in a log file is a line now and then, and the last line once."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from mien.progress import progress_bar
 
 
 class Clock:
-    """Time that passes when told."""
+    """Clock that a test sets."""
 
     def __init__(self) -> None:
         self.now = 0.0

@@ -1,4 +1,4 @@
-"""The native rasterizer against the float64 reference, forward and backward; the reference against differences."""
+"""The native rasterizer agrees with the float64 reference, forward and backward, and the reference with differences."""
 
 import os
 import subprocess
@@ -51,6 +51,7 @@ def test_gsplat_matches_reference(coefficients: int, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (3, 70), (32, 32), (33, 31), (129, 65)])
 def test_sizes(width: int, height: int, backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of any size agree with the reference."""
     assert_matches_reference(random_scene(width + height, count=150, width=width, height=height), monkeypatch, backend)
 
 
@@ -62,7 +63,7 @@ def test_counts(count: int, backend: Backend, monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_pixels_that_end_early(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Many opaque layers: transmittance runs out, and alpha is clamped at 0.999."""
+    """Pixels end early under many opaque layers, when transmittance runs out, and alpha is clamped at 0.999."""
     scene = random_scene(5, count=600, width=40, height=40)
     scene.gaussians.scales.mul_(4)
     scene.gaussians.opacities.clamp_(min=0.9).mul_(1.2).clamp_(max=1.0)
@@ -71,6 +72,7 @@ def test_pixels_that_end_early(backend: Backend, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_splats_larger_than_the_picture(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Splats larger than the picture agree with the reference."""
     scene = random_scene(6, count=30, width=150, height=140)
     scene.gaussians.scales.mul_(20)
     scene.gaussians.opacities.mul_(0.2)
@@ -79,7 +81,7 @@ def test_splats_larger_than_the_picture(backend: Backend, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_needles(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Long and thin: the covariance's determinant cancels if it is computed carelessly."""
+    """Needles are drawn, although the covariance's determinant cancels if it is computed carelessly."""
     scene = random_scene(7, count=60, width=100, height=100)
     scene.gaussians.scales.copy_(torch.tensor([0.5, 1e-4, 1e-4]))
     assert_matches_reference(scene, monkeypatch, backend)
@@ -87,6 +89,7 @@ def test_needles(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("loss", ["image", "alpha"])
 def test_gradient_of_one_output_only(loss: str) -> None:
+    """Gradients are right if only the image or only alpha is used."""
     scene = random_scene(8)
     _, expected = gradients(scene.to(torch.float64), "reference", lambda r: getattr(r, loss).mean())
     _, found = gradients(scene, "native", lambda r: getattr(r, loss).mean())
@@ -110,6 +113,7 @@ def test_threads_do_not_change_a_bit(threads: int) -> None:
 
 
 def test_several_forwards_before_their_backwards() -> None:
+    """Several forward passes can precede their backward passes, in any order."""
     scenes = [random_scene(seed, count=100 + 50 * seed) for seed in range(6)]
     expected = [gradients(scene, "native", lambda r: (r.image**2).sum())[1]["means"] for scene in scenes]
     tensors = [leaves(scene) for scene in scenes]
@@ -136,7 +140,7 @@ def test_reference_gradients_match_finite_differences() -> None:
 
 
 def test_the_environment_chooses_the_level() -> None:
-    """`MIEN_ISA` names one; what is not there is told with those that are."""
+    """`MIEN_ISA` chooses the instruction set. If it does not exist, the message lists those that do."""
     ask = [sys.executable, "-c", "from mien import _native; print(_native.rasterize_isa())"]
     for name in ISAS:
         if _native.set_rasterize_isa(name):

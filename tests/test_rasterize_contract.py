@@ -1,4 +1,4 @@
-"""What `rasterize` promises besides the right colours: batches, frames, edge cases and clear refusals."""
+"""`rasterize` keeps its contract besides the colours: batches, frames, edge cases and clear refusals."""
 
 import multiprocessing
 import sys
@@ -21,7 +21,7 @@ BACKENDS = ["native", "reference", GSPLAT]
 
 
 def one_gaussian(depth: float = 1.0, opacity: float = 0.8, scale: float = 0.02) -> Gaussians:
-    """An orange ball on the optical axis."""
+    """Return an orange ball on the optical axis."""
     return Gaussians(
         means=torch.tensor([[0.0, 0.0, float(depth)]]),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -70,7 +70,7 @@ def test_local_frame_moves_the_camera(backend: Backend) -> None:
     pose = scene.gaussians.T_world_local
     assert pose is not None
     local = replace(scene.gaussians, T_world_local=None)
-    moved = scene.camera.in_frame(pose)  # not by `@`, which adds up in another order on another processor
+    moved = scene.camera.in_frame(pose)  # not `@`, which adds in another order on another processor
     expected = rasterize(local, moved, scene.background, backend)
     found = rasterize(scene.gaussians, scene.camera, scene.background, backend)
     assert torch.equal(found.image, expected.image)
@@ -127,6 +127,7 @@ def test_means2d_gradient_is_per_pixel_of_motion(backend: Backend) -> None:
 
 
 def test_no_gradients_without_grad_mode() -> None:
+    """Without grad mode nothing requires a gradient."""
     with torch.no_grad():
         rendering = rasterize(one_gaussian(), front_camera())
     assert not rendering.image.requires_grad
@@ -191,7 +192,7 @@ def test_extremes_stay_finite(backend: Backend, change: dict[str, torch.Tensor])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
 def test_what_is_not_finite_is_named(backend: Backend, name: str, value: float) -> None:
     gaussians = random_scene(3, count=40).gaussians
-    gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view: the native kernel reads colours of no other
+    gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view, since the kernel reads no other colours
     gaussians.opacities[17] = 0.5
     getattr(gaussians, name).view(40, -1)[17, -1] = value
     with pytest.raises(ValueError, match=rf"{name}\[17.* is -?(nan|inf)"):
@@ -209,6 +210,7 @@ def test_a_camera_that_is_not_finite_is_named(backend: Backend) -> None:
 
 
 def test_layouts_and_dtypes() -> None:
+    """Strided tensors draw the same picture, and other dtypes are refused by name."""
     scene = random_scene(4)
     spread = {name: getattr(scene.gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
     spread = {name: tensor.repeat_interleave(2, 0)[::2] for name, tensor in spread.items()}
@@ -251,12 +253,12 @@ def test_a_clamped_alpha_has_no_gradient(backend: Backend) -> None:
 
 
 def _render_in_child(queue: "multiprocessing.Queue[list[float]]") -> None:
-    _native.set_thread_count(3)  # joins the threads of the pool before: hangs if that is still the parent's
+    _native.set_thread_count(3)  # joins the threads of the old pool, and hangs if that is still the parent's
     queue.put(rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist())
 
 
 def test_a_forked_child_renders() -> None:
-    """Threads do not survive a fork; the pool must notice."""
+    """A forked child renders. Threads do not survive a fork, so the pool must notice it."""
     _native.set_thread_count(2)
     scene = random_scene(0)
     expected = rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist()

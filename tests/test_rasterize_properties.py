@@ -1,4 +1,4 @@
-"""The native rasterizer against the float64 reference on scenes that nobody chose: sizes, counts, shapes, oddities."""
+"""The native rasterizer agrees with the float64 reference on random scenes of any size, count, shape and oddity."""
 
 import pytest
 import torch
@@ -27,7 +27,7 @@ ODDITIES = (
 
 
 def make_odd(scene: Scene, oddities: list[str]) -> None:
-    """Give Gaussian i the oddity i, in place; those after them stay as they are."""
+    """Give Gaussian i the oddity i, in place. The Gaussians after them stay as they are."""
     gaussians = scene.gaussians
     pose, viewmat = gaussians.T_world_local, scene.camera.viewmat
     assert pose is not None
@@ -90,6 +90,7 @@ def test_any_scene_matches_the_reference(
 
 @pytest.mark.parametrize(("width", "height"), [(5000, 3), (3, 5000)])
 def test_long_and_thin_pictures(width: int, height: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Long and thin pictures agree with the reference."""
     scene = random_scene(11, 60, 4, width, height)
     scene.gaussians.means.mul_(torch.tensor([2.0, 2.0, 1.0]))  # along the whole picture
     scene.camera.K[0, 0] = scene.camera.K[1, 1] = 0.3 * max(width, height)
@@ -98,14 +99,14 @@ def test_long_and_thin_pictures(width: int, height: int, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("coefficients", [4, 9, 16])
 def test_view_directions_carry_gradients(coefficients: int) -> None:
-    """A small opaque ball in the middle of one pixel: moving it sideways changes its colour through its direction."""
+    """View directions carry gradients: moving a small opaque ball sideways changes its colour through its direction."""
     scene = random_scene(coefficients, 1, coefficients, 9, 9)
     gaussians = scene.gaussians
     pose = gaussians.T_world_local
     assert pose is not None
     T_local_camera = torch.linalg.inv(scene.camera.viewmat @ pose)
     gaussians.means.copy_(T_local_camera[:3, 3] + 0.5 * T_local_camera[:3, 2])
-    gaussians.scales.fill_(5.0)  # the picture is flat: what is left of the gradient is the colour's
+    gaussians.scales.fill_(5.0)  # the picture is flat, so only the colour contributes to the gradient
     gaussians.opacities.fill_(0.9)
     _, expected = gradients(scene.to(torch.float64), "reference", lambda r: r.image[4, 4].sum())
     _, found = gradients(scene, "native", lambda r: r.image[4, 4].sum())
@@ -128,6 +129,7 @@ def test_depth_is_the_expected_depth() -> None:
 
 
 def test_depth_of_one_ball_and_its_gradient() -> None:
+    """A ball's depth is its distance, and its gradient moves with it."""
     means = torch.tensor([[0.0, 0.0, 1.25]], requires_grad=True)
     camera = random_scene(0, width=11, height=11).camera
     camera.viewmat.copy_(torch.eye(4))
@@ -146,7 +148,10 @@ def test_depth_of_one_ball_and_its_gradient() -> None:
 @pytest.mark.exact
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_views_of_one_call_equal_single_calls_to_the_bit(threads: int) -> None:
-    """Of several views each is drawn by one thread; gradients of what they share add up in their order."""
+    """Views of one call equal single calls to the bit.
+
+    One thread draws each view; shared gradients add up in their order.
+    """
     scenes = [random_scene(seed, 300, 4, 90, 70) for seed in range(5)]
     cameras = [scene.camera for scene in scenes]
     shared = scenes[0].gaussians

@@ -1,4 +1,4 @@
-"""Posing in one native call against the same put together from its parts."""
+"""Posing in one native call agrees with the same posing from its parts."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def a_store(face_model: FaceModel) -> GaussianStore:
 
 
 def results(gaussians: Gaussians, face: FaceParams, store: GaussianStore) -> list[Tensor]:
-    """Values, and gradients of a loss that weighs every number differently."""
+    """Return values, and gradients of a loss that weighs every number differently."""
     parts = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
     parts += [] if gaussians.T_world_local is None else [gaussians.T_world_local]
     generator = torch.Generator().manual_seed(5)

@@ -1,4 +1,4 @@
-"""Triangle frames and Gaussians bound to them."""
+"""Triangle frames are right, and bound Gaussians move with them."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from mien.rotation import matrix_from_axis_angle, matrix_from_quaternion
 def random_rig(
     seed: int = 0, timesteps: tuple[int, ...] = (), dtype: torch.dtype = torch.float64
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The arguments of `bind_to_world`, at the size of a head."""
+    """Return arguments of `bind_to_world`, at the size of a head."""
     generator = torch.Generator().manual_seed(seed)
     vertices = 0.1 * torch.randn(*timesteps, 20, 3, generator=generator, dtype=dtype)
     faces = torch.stack([torch.randperm(20, generator=generator)[:3] for _ in range(30)])
@@ -24,7 +24,7 @@ def random_rig(
 
 
 def gradients(outputs: tuple[Tensor, ...], inputs: list[Tensor]) -> tuple[Tensor, ...]:
-    """Of a loss that weighs every number of the outputs differently."""
+    """Return gradients of a loss that weighs every number of the outputs differently."""
     generator = torch.Generator().manual_seed(9)
     loss = sum((o * torch.randn(o.shape, generator=generator, dtype=torch.float64).to(o)).sum() for o in outputs)
     assert isinstance(loss, Tensor)
@@ -32,6 +32,7 @@ def gradients(outputs: tuple[Tensor, ...], inputs: list[Tensor]) -> tuple[Tensor
 
 
 def test_frame_of_a_known_triangle():
+    """A known triangle has the frame of the paper's formula."""
     vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0.5, 1, 0]])
     frames = triangle_frames(vertices, torch.tensor([[0, 1, 2]]))
     # Columns: first edge (+x), normal (+z), their cross product (-y).

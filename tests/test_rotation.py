@@ -1,4 +1,4 @@
-"""Rotations obey their axioms, whichever way they are written."""
+"""Rotations obey their axioms in every representation."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Avatars without torch: the same pictures, no torch import, files that say when they are damaged."""
+"""Avatars without torch draw the same pictures, do not import torch, and report damaged files."""
 
 import json
 import subprocess
@@ -25,7 +25,7 @@ method = pytest.mark.parametrize("method", METHODS)
 
 
 def new_avatar(method: str, **config: object) -> Avatar:
-    """An avatar of the toy head whose parameters are all away from where they start."""
+    """Return an avatar of the toy head whose parameters all differ from their initial values."""
     face_model, sequence = toy_sequence(5, SIZE)
     torch.manual_seed(0)
     settings = replace(METHODS[method].config(), **config)  # type: ignore[arg-type]
@@ -58,7 +58,7 @@ def test_pictures_equal_those_of_training(method: str, tmp_path: Path) -> None:
         expected = rasterize(gaussians, camera, torch.ones(3))
         image, alpha = portable.render(pose_as(portable, face), portable.camera)
         assert expected.image.numpy().std() > 0.05
-        # Contributions of just 1/255 come or go where networks round differently (test_runtime_equality.py).
+        # Contributions of just 1/255 come or go if networks round differently (test_runtime_equality.py).
         most, share = (0.0, 0.0) if method == "gaussian_avatars" else (1 / 255, 1e-3)
         for found, truth in ((image, expected.image.numpy()), (alpha[..., None], expected.alpha.numpy()[..., None])):
             difference = np.abs(found - truth).max(-1)
@@ -68,6 +68,7 @@ def test_pictures_equal_those_of_training(method: str, tmp_path: Path) -> None:
 
 @torch.no_grad()
 def test_colours_that_depend_on_the_view_in_either_frame(tmp_path: Path) -> None:
+    """Colours that depend on the view equal those of training, in world and in head frame."""
     for frame in ("world", "head"):
         avatar = new_avatar("gaussian_avatars", sh_degree=2, sh_frame=frame)
         portable = export(avatar, tmp_path / f"{frame}.mien")
@@ -168,7 +169,7 @@ def test_linear_bases_add_to_the_raw_values(kind: str) -> None:
 
 @pytest.mark.parametrize("seed", range(30))
 def test_damaged_files_are_told(seed: int, tmp_path: Path) -> None:
-    """Cut short or with a bit flipped anywhere: one line."""
+    """Files that are cut short, or have a bit flipped anywhere, are reported in one line."""
     path = tmp_path / "a.mien"
     export(new_avatar("gaussian_avatars"), path)
     random, content = np.random.default_rng(seed), bytearray(path.read_bytes())
@@ -185,7 +186,7 @@ def test_damaged_files_are_told(seed: int, tmp_path: Path) -> None:
 
 
 def test_files_with_other_content_are_told(tmp_path: Path) -> None:
-    """Written by someone else's program: the checksum is right, what is inside is not."""
+    """Files with other content are reported, although another program wrote a right checksum."""
     path = tmp_path / "a.mien"
     whole = export(new_avatar("gaussian_avatars"), path).portable
     bound = whole.baked

@@ -1,4 +1,4 @@
-"""What avatars without torch may differ by from what training renders: nothing, or the rounding of networks."""
+"""Avatars without torch differ from what training renders in nothing but the rounding of networks."""
 
 import subprocess
 import sys
@@ -39,7 +39,7 @@ def noise(seed: int, *shape: int) -> torch.Tensor:
 
 
 def talking_face(model: FaceModel, timesteps: int) -> FaceParams:
-    """Somebody half a metre away, with every expression, joint and the head in motion."""
+    """Return a person half a metre away, with every expression, every joint and the head in motion."""
     still = model.neutral(timesteps)
     low, high = model.expression_bounds.unbind(-1)
     chance = torch.rand(still.expression.shape, generator=torch.Generator().manual_seed(1))
@@ -54,7 +54,7 @@ def talking_face(model: FaceModel, timesteps: int) -> FaceParams:
 
 
 def grown_avatar(model: FaceModel, face: FaceParams, config: GaussianAvatarsConfig, count: int) -> GaussianAvatars:
-    """As training leaves them: several Gaussians to a triangle, small, coloured, mostly opaque."""
+    """Return an avatar as training leaves it: several Gaussians per triangle, small, coloured, mostly opaque."""
     avatar = GaussianAvatars(config, model, face)
     store = avatar.store
     store.append(torch.arange(count - len(store)) % len(store))
@@ -71,7 +71,7 @@ def view(size: int) -> Camera:
 
 
 def rendered_without_torch(avatar: Avatar, face: FaceParams, camera: Camera, folder: Path) -> dict[str, np.ndarray]:
-    """Pictures by a process that has never imported torch."""
+    """Return pictures by a process that has never imported torch."""
     runtime.write_portable(folder / "a.mien", make_portable(avatar, camera, "someone"))
     fields = {"expression": face.expression, "joints": face.joints}
     fields |= {"rotation": face.head_rotation, "translation": face.head_translation}
@@ -90,7 +90,7 @@ def rendered_without_torch(avatar: Avatar, face: FaceParams, camera: Camera, fol
 )
 @torch.no_grad()
 def test_every_pixel_equals_that_of_training(config: GaussianAvatarsConfig, tmp_path: Path) -> None:
-    """The finishing line of the runtime: 30,000 Gaussians at 512x512, no pixel left out."""
+    """Every pixel equals that of training: 30,000 Gaussians at 512x512, no pixel left out."""
     model, camera = load_face_model("anny"), view(SIZE)
     face = talking_face(model, TIMESTEPS)
     avatar = grown_avatar(model, face, config, GAUSSIANS)
@@ -102,19 +102,22 @@ def test_every_pixel_equals_that_of_training(config: GaussianAvatarsConfig, tmp_
     assert (expected.image[0] - expected.image[1]).abs().mean() > 0.02
     for name, picture in (("image", expected.image.numpy()), ("alpha", expected.alpha.numpy())):
         assert np.abs(found[name] - picture).max() <= EQUAL
-        # And more than was promised: both sides run the same operations, so they round alike.
+        # Both sides even run the same operations, so they round alike.
         assert found[name].tobytes() == picture.tobytes()
 
 
 NETWORKS = {"headgas": {"points": 8_000}, "mono_gaussian_avatar": {"points": 6_000}}
 ROUNDING = {"means": 5e-7, "quats": 2e-6, "scales": 5e-9, "opacities": 5e-7, "sh": 2e-6}
-"""Metres; components of a unit quaternion; metres; 0..1; coefficients."""
+"""Largest differences: metres, components of a unit quaternion, metres, 0..1, coefficients."""
 
 
 @pytest.mark.parametrize("method", NETWORKS)
 @torch.no_grad()
 def test_networks_may_round_differently_and_nothing_more(method: str) -> None:
-    """Matrix products of torch and numpy differ in their last bits; the exact rule is docs/avatar_file.md's."""
+    """Networks may round differently, since matrix products of torch and numpy do.
+
+    docs/avatar_file.md has the exact rule.
+    """
     model, camera = load_face_model("anny"), view(256)
     face = talking_face(model, TIMESTEPS)
     torch.manual_seed(0)
@@ -134,7 +137,7 @@ def test_networks_may_round_differently_and_nothing_more(method: str) -> None:
             if name == "quats":
                 found, expected = (q / np.linalg.norm(q, axis=-1, keepdims=True) for q in (found, expected))
             assert np.abs(found - expected).max() <= bound, name
-        # The same Gaussians give the same bytes: whatever differs, differs before.
+        # The same Gaussians give the same bytes, so differences arise before rendering.
         same = Gaussians(*(getattr(theirs, name).numpy() for name in (*ROUNDING, "T_world_local")))
         picture = rasterize(theirs, camera, torch.ones(3)).image.numpy()
         assert portable.render(same)[0].tobytes() == picture.tobytes()

@@ -1,16 +1,12 @@
-"""Settings of methods and runs: by option, by file, in which order, and what is refused before any work."""
+"""Settings of methods and runs come from options and files in a known order, and wrong ones are refused before work."""
 
 import json
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal
 
 import pytest
 
-import train_toy
-from mien import _native
 from mien.avatar import (
     METHODS,
     FaceTuning,
@@ -19,18 +15,14 @@ from mien.avatar import (
     HeadGasConfig,
     Method,
     MethodConfig,
-    Progress,
     Rate,
-    RefillSettings,
 )
 from mien.cli import main
-from mien.commands.help_text import field_docs
 from mien.commands.settings_options import leaves
 from mien.commands.stages import training
-from mien.errors import UserError
-from mien.ranges import FRACTION, NotBelow, Range, check_ranges
-from mien.training import DIALS, PRESETS, TrainSettings, train
-from toy_scene import toy_face_model, toy_sequence
+from mien.ranges import Range
+from mien.training import DIALS, PRESETS, TrainSettings
+from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
 Choices = tuple[MethodConfig, TrainSettings]
@@ -38,7 +30,7 @@ Choices = tuple[MethodConfig, TrainSettings]
 
 @pytest.fixture
 def workspace(tmp_path: Path) -> Path:
-    """A tracked sequence, which `mien train` checks before any work."""
+    """Return a workspace with a tracked sequence, which `mien train` checks before any work."""
     for name in ("capture/capture.json", "tracking/tracking.json"):
         path = tmp_path / "w" / "sequences" / "clip" / name
         path.parent.mkdir(parents=True)
@@ -48,7 +40,7 @@ def workspace(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def choices(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The settings that `mien train` uses with some options."""
+    """Return a function that gives the settings that `mien train` uses with some options."""
     asked: list[Choices] = []
 
     def remember(workspace: object, names: object, run: object, method: MethodConfig, settings: TrainSettings) -> None:
@@ -68,7 +60,7 @@ def choices(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def complaint(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
-    """The one line about a command that must fail by the user's mistake."""
+    """Run a command that must fail by the user's mistake, and return its one line."""
     assert main(words) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
     return line
@@ -286,120 +278,13 @@ def test_a_run_is_repeated_from_its_config_to_the_same_bytes(
     assert [first[part] for part in ("method", "settings", "data")] == [
         second[part] for part in ("method", "settings", "data")
     ]
-    # Edited, as its checksum would tell; a run reads its own config.json as strictly as before.
+    # This file is edited, so its checksum is wrong. A run still reads its own config.json strictly.
     (runs / "again" / "config.json").write_text(json.dumps({**first, "settings": {**first["settings"], "steps": 4}}))
     words[-1] = str(runs / "again" / "config.json")
     assert main([*words, "--run", "shorter"]) == 0
     assert json.loads((runs / "shorter" / "training.json").read_text())["steps"] == 4
     capsys.readouterr()
     assert "damaged or edited" in complaint(capsys, ["evaluate", str(tmp_path), "--run", "again"])
-
-
-# -- ranges -----------------------------------------------------------------------------------------------------------
-
-CONFIGS: list[Any] = [method.config() for method in METHODS.values()]
-EVERYTHING: list[Any] = [*CONFIGS, TrainSettings(), RefillSettings((0.1, 0.2), (10, 20))]
-
-
-def numbers(settings: Any, path: str = "") -> Iterator[tuple[str, Any, Any, Any]]:
-    """Dotted name, owner, hint and value of every field that holds numbers."""
-    hints = get_type_hints(type(settings), include_extras=True)
-    for field in fields(settings):
-        value, hint = getattr(settings, field.name), hints[field.name]
-        if is_dataclass(value):
-            yield from numbers(value, f"{path}{field.name}.")
-        elif {int, float} & ({hint} | set(get_args(hint)) | {a for arg in get_args(hint) for a in get_args(arg)}):
-            yield path + field.name, settings, hint, value
-
-
-def changed(settings: Any, path: str, value: Any) -> Any:
-    """Settings with another value of a dotted name."""
-    name, _, rest = path.partition(".")
-    return replace(settings, **{name: changed(getattr(settings, name), rest, value) if rest else value})
-
-
-@pytest.mark.parametrize("settings", EVERYTHING, ids=lambda settings: type(settings).__name__)
-def test_every_number_has_a_range_that_is_checked(settings: Any) -> None:
-    names = [name for name, *_ in numbers(settings)]
-    assert len(names) >= 3
-    for name, owner, hint, value in numbers(settings):
-        marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
-        (allowed,) = [mark for mark in marks if isinstance(mark, Range)]
-        assert allowed.holds(value), name
-        whole = isinstance(allowed.least, int) and (isinstance(value, int) or "int" in str(hint))
-        wrong = [math.nan, math.inf, -math.inf] if not whole else []
-        wrong += [allowed.most + 1 if whole else allowed.most * 1.001 + 1e-3, allowed.least - (1 if whole else 1e-3)]
-        for bad in wrong:
-            value_ = (type(value[0] if value else 0.1)(bad),) if isinstance(value, tuple) else bad
-            with pytest.raises(UserError) as told:
-                check_ranges(changed(settings, name, value_), lambda name: f"--{name}")
-            assert f"--{name} " in str(told.value), (name, bad, type(owner))
-            assert "give " in str(told.value)
-
-
-def test_what_is_in_range_passes() -> None:
-    for settings in (*CONFIGS, *(preset.settings for preset in PRESETS.values())):
-        settings.check()
-    GaussianAvatarsConfig(density=GradientSettings(start=0.5, stop=0.5, opacity_resets=())).check()
-    TrainSettings(resolution=16).check()
-
-
-def test_ranges_in_words() -> None:
-    @dataclass(frozen=True)
-    class Some:
-        sizes: Annotated[tuple[int, ...], Range(16, 64, filled=True)] = (16,)
-        first: Annotated[float, FRACTION] = 0.0
-        last: Annotated[float, FRACTION, NotBelow("first")] = 1.0
-
-    for some, words in (
-        (Some(sizes=()), "--sizes (nothing): give numbers from 16 to 64"),
-        (Some(sizes=(16, 70)), "--sizes 16 70: give numbers from 16 to 64"),
-        (Some(first=1.5), "--first 1.5: give a number from 0 to 1"),
-        (Some(first=0.5, last=0.25), "--last 0.25: give at least as much as --first 0.5"),
-    ):
-        with pytest.raises(UserError) as told:
-            check_ranges(some, lambda name: f"--{name}")
-        assert str(told.value) == words
-
-
-def test_training_refuses_settings_out_of_range(tmp_path: Path) -> None:
-    face_model, sequence = toy_sequence(timesteps=5, size=32)
-    with pytest.raises(UserError, match="--training.record-every 0"):
-        train([sequence], face_model, train_toy.CONFIG, TrainSettings(record_every=0), tmp_path / "run")
-    config = replace(train_toy.CONFIG, sh_degree=4)
-    with pytest.raises(UserError, match="--method.sh-degree 4"):
-        train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
-def test_settings_that_make_training_diverge_are_told(tmp_path: Path) -> None:
-    face_model, sequence = toy_sequence(timesteps=5, size=32)
-    config = replace(HeadGasConfig(points=50), log_scales_rate=Rate(100.0))
-    with pytest.raises(UserError, match=r"training diverged by step \d+ \(.*\); lower the learning rates"):
-        train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "run")
-    assert not (tmp_path / "run" / "avatar").exists()
-
-
-def test_a_rate_that_starts_at_nothing_stays_there() -> None:
-    assert Rate(0.0, 1e-3).at(Progress(5, 10)) == 0
-    assert Rate(1e-2, 1e-4).at(Progress(5, 10)) == pytest.approx(1e-3)
-
-
-def test_threads_of_a_run_are_those_it_asks_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before, seen = _native.thread_count(), []
-    face_model, sequence = toy_sequence(timesteps=5, size=32)
-    settings = replace(train_toy.SETTINGS, steps=1, threads=before + 1)
-    monkeypatch.setattr("mien.training.trainer.step", lambda state, *_: _end(state, seen))
-    monkeypatch.setattr("mien.training.trainer.write_results", lambda *_: None)
-    train([sequence], face_model, train_toy.CONFIG, settings, tmp_path)
-    assert seen == [before + 1]
-    assert _native.thread_count() == before
-
-
-def _end(state: Any, seen: list[int]) -> str:
-    seen.append(_native.thread_count())
-    state.step += 1
-    return ""
 
 
 # -- help and presets -------------------------------------------------------------------------------------------------
@@ -439,29 +324,17 @@ def test_help_stays_short_and_says_how_to_see_more(capsys: pytest.CaptureFixture
     assert short.rstrip().endswith("mien train --method headgas --help-all")
 
 
-@pytest.mark.parametrize("settings", [*EVERYTHING, FaceTuning(), Rate(1.0)], ids=lambda one: type(one).__name__)
-def test_every_field_has_a_sentence(settings: Any) -> None:
-    docs = field_docs(type(settings))
-    for field in fields(settings):
-        about = docs[field.name]
-        assert about[0].isupper(), field.name
-        assert about.endswith("."), field.name
-        assert not about.startswith("Of "), field.name
-        if is_dataclass(getattr(settings, field.name)):
-            test_every_field_has_a_sentence(getattr(settings, field.name))
-
-
 def test_presets_are_the_same_for_all_methods() -> None:
     for name, method in METHODS.items():
         assert set(method.presets) == set(PRESETS)
         assert all(type(config) is method.config for config in method.presets.values())
-        # A change of what a preset means is meant, and told in the changelog.
+        # If this fails, a preset has changed: say so in the changelog.
         assert all(preset.config(name) == method.config() for preset in PRESETS.values())
 
 
 @dataclass(frozen=True)
 class Dust:
-    """How dust settles."""
+    """Settings of dust."""
 
     grains: Annotated[int, Range(1, 10)] = 3
     """Number of grains."""
@@ -476,7 +349,7 @@ class ToyConfig(MethodConfig):
     shines: bool = False
     """Whether the toy shines."""
     dust: Dust = Dust()
-    """How dust settles on it."""
+    """Settings of the dust on the toy."""
 
 
 def test_settings_of_an_added_method_appear_by_themselves(

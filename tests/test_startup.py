@@ -1,4 +1,4 @@
-"""Help, mistyped options and wrong paths are told without the libraries that take seconds to import."""
+"""Help, mistyped options and wrong paths are answered without importing the libraries that take seconds."""
 
 import importlib
 import json
@@ -30,7 +30,7 @@ print(json.dumps(found), file=sys.__stdout__)
 
 
 def modules_after(lines: list[list[str]], folder: Path) -> list[tuple[int, set[str]]]:
-    """Exit code and imported modules after each of some command lines, run one after the other in a new process."""
+    """Return exit code and imported modules after each of some command lines, run in turn in a new process."""
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, json.dumps(lines)], capture_output=True, text=True, check=True, cwd=folder
     )
@@ -50,7 +50,7 @@ def test_help_and_wrong_options_import_nothing_heavy(tmp_path: Path) -> None:
 
 
 def test_wrong_values_and_paths_import_nothing_heavy(tmp_path: Path) -> None:
-    """Where everything before the mistake is right: a workspace with a sequence and a run, a video, a csv."""
+    """Wrong values and paths import nothing heavy, even if everything before the mistake is right."""
     for name in ("w/sequences/s/capture/capture.json", "w/sequences/s/tracking/tracking.json", "w/runs/r/config.json"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_text("{}")
@@ -110,7 +110,7 @@ def test_what_is_written_twice_to_keep_options_light_agrees() -> None:
 
 @pytest.mark.parametrize("room", LAZY_ROOMS)
 def test_lazy_rooms_give_all_their_names(room: str) -> None:
-    """Each in a module of the room, none hidden by a module of the same name, whatever was imported before."""
+    """Lazy rooms give all their names, each from a module of the room. No submodule of the same name hides one."""
     module = importlib.import_module(f"mien.{room}")
     for path in Path(str(module.__file__)).parent.glob("*.py"):
         importlib.import_module(f"mien.{room}.{path.stem}")

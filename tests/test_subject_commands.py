@@ -1,4 +1,4 @@
-"""Several videos of one person on the command line: captured apart, tracked and trained together."""
+"""Several videos of one person are captured apart, and tracked and trained together, on the command line."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ PARTS = {"one": slice(0, 12), "two": slice(12, 24), "three": slice(24, 32)}
 
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """One person, filmed three times."""
+    """Write three films of one person."""
     folder = tmp_path_factory.mktemp("clips")
     recipe = SyntheticRecipe(width=192, height=192, seconds=3.2, fps=10.0, supersample=1, texture_size=256)
     write_synthetic_video(recipe, folder / "whole.mp4", 3)

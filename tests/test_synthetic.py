@@ -1,4 +1,4 @@
-"""Synthetic captures: the same bytes from the same seed, and a truth that is true."""
+"""Synthetic captures have the same bytes for the same seed, and their truth is true."""
 
 from dataclasses import replace
 
@@ -12,9 +12,9 @@ from mien.render.mesh import shade, vertex_normals
 from mien.rotation import matrix_from_axis_angle
 from mien.synthetic import RECIPES, SyntheticScene, synthesize, write_synthetic_video
 from mien.synthetic.light import studio_lighting
-from mien.synthetic.motion import head_motion
+from mien.synthetic.motion import generate_motion
 from mien.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
-from mien.synthetic.shading import turned
+from mien.synthetic.shading import turn_light
 from mien.tracking.neck_line import bottom_vertices
 
 SMALL = replace(RECIPES["demo"], width=192, height=192, seconds=0.6, fps=10.0, texture_size=256, noise=0.0)
@@ -32,7 +32,7 @@ def plain():
 
 
 def test_heads_are_posed_as_the_face_model_poses_them(scene):
-    """The same vertices, normals and landmarks as by matrix products and by the native core, to a micrometre."""
+    """Heads are posed as the face model poses them: vertices, normals and landmarks agree to a micrometre."""
     face = replace(scene.face[3], joints=scene.face[3].joints + 0.2)
     found = HeadPoser(scene.model, scene.identity)(face)
     for expected in (scene.model.head_vertices(face)[0], scene.model.head_vertices_reference(face)[0]):
@@ -54,7 +54,7 @@ def test_light_on_a_turned_head_is_that_of_the_room():
     normals = random.standard_normal((50, 3))
     normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32)
     expected = shade(torch.from_numpy(normals @ turn.T), torch.from_numpy(lighting.sh_light)).clamp_min(0)
-    np.testing.assert_allclose(turned(lighting, turn).irradiance(normals), expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(turn_light(lighting, turn).irradiance(normals), expected, rtol=0, atol=1e-5)
 
 
 def test_recipe_and_seed_decide_every_byte(scene):
@@ -85,13 +85,13 @@ def test_capture_and_truth_keep_their_contracts(monkeypatch):
     assert (len(truth.face), len(truth.valid), truth.neck_lines.shape) == (6, 6, (6, 1, 3))
     scene = SyntheticScene(SMALL, seed=3)
     assert truth.face_model_hash == scene.model.content_hash
-    # Frames come in order whatever the threads do, and a timestep drawn again is the same.
+    # Frames come in order for any number of threads, and a timestep drawn again is the same.
     for timestep in (1, 5):
         np.testing.assert_array_equal(capture.images[timestep, 0], scene.frame(timestep).image)
 
 
 def test_landmarks_are_the_projected_mesh(plain):
-    """Pictures and parameters agree: irises are dark or coloured where the truth puts them, beside white."""
+    """Landmarks are those of the projected mesh: irises are dark or coloured at the true place, beside white."""
     open_eyed = int((plain.face.expression[:, plain.model.expression_names.index("eyeBlinkLeft")] < 0.05).nonzero()[0])
     big = SyntheticScene(replace(PLAIN, width=512, height=512), seed=3)
     image, marks = big.frame(open_eyed).image.astype(float), big.landmarks()[open_eyed]
@@ -109,7 +109,7 @@ def test_landmarks_are_the_projected_mesh(plain):
 
 
 def test_matte_is_the_coverage(scene):
-    """Where the matte is 0 the wall is seen unchanged; where it is 255 no wall is."""
+    """The matte is the coverage: the wall is unchanged where it is 0, and invisible where it is 255."""
     frame = scene.frame(3)
     darker = SyntheticScene(SMALL, seed=3)
     darker.__dict__["subject"] = scene.subject  # the same person, not built again
@@ -130,7 +130,7 @@ def test_the_face_model_lies_inside_the_matte(scene):
 
 
 def test_hair_and_glasses_are_not_the_face_models(scene, plain):
-    """They cover pixels that the same head without them leaves free."""
+    """Hair and glasses cover pixels that the same head without them leaves free."""
     assert (scene.frame(0).matte.astype(int) - plain.frame(0).matte).clip(0).sum() > 255 * 300
     assert torch.equal(scene.vertices(0), plain.vertices(0))
 
@@ -148,7 +148,7 @@ def test_motion_is_bounded_smooth_and_blinks():
     closed = face.expression[:, scene.model.expression_names.index("eyeBlinkLeft")] > 0.8
     blinks = int((closed[1:] & ~closed[:-1]).sum())
     assert 2 <= blinks <= 9
-    assert torch.equal(head_motion(scene.model, scene.identity, recipe, 5).expression, face.expression)
+    assert torch.equal(generate_motion(scene.model, scene.identity, recipe, 5).expression, face.expression)
 
 
 def test_shoulders_hold_still_while_the_head_turns():
@@ -175,7 +175,7 @@ def test_video_is_written_frame_by_frame(tmp_path, scene):
 
 
 def test_a_detector_finds_the_face():
-    """MediaPipe, which has only seen people, finds the head in every frame, and its landmarks where the truth is."""
+    """MediaPipe, which was trained on people, finds the head in every frame, and its landmarks near the truth."""
     mediapipe = pytest.importorskip("mediapipe")
     clip = SyntheticScene(replace(RECIPES["demo"], width=384, height=384, fps=1.0, texture_size=512), seed=1)
     truth = clip.landmarks()

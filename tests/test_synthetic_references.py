@@ -1,4 +1,4 @@
-"""Reference captures: named by keys, drawn alike everywhere, true to the micrometre, in pieces like in one go."""
+"""Reference captures have keys, are drawn alike everywhere, are true to the micrometre, and can be drawn in pieces."""
 
 from dataclasses import replace
 
@@ -20,8 +20,8 @@ from mien.synthetic import (
     truth_of,
     write_synthetic_capture,
 )
+from mien.synthetic.captures import _Pictures, hash_scene, inputs_hash, read_synthetic_hash, scene_key
 from mien.synthetic.signature import TOLERANCES, signature_distance, signature_of
-from mien.synthetic.writing import _Pictures, hash_scene, inputs_hash, read_synthetic_hash, scene_key
 from reference_signatures import drawn_signatures, stored_signatures
 
 KEYS = {
@@ -33,8 +33,10 @@ KEYS = {
     "glasses": "cf70d19c2a6ef102",
     "off-model": "87621466675cf748",
 }
-"""A change means that figures on this capture cannot be compared any more: say so in docs/results.md, and set the new
-one. Whoever changes what is drawn raises `DRAWING`, and with it all of them."""
+"""Keys of the references. A change means that figures on the capture cannot be compared any more.
+
+Then say so in docs/results.md, and set the new key. A change of the drawing raises `DRAWING`, and with it all keys.
+"""
 SMALL = replace(
     RECIPES["demo"], width=64, height=64, fps=4.0, texture_size=128, supersample=1, hair="none", glasses=False,
     brows_and_lashes=False, script=(Segment("free", 1.0), Segment("still", 1.0)),
@@ -60,7 +62,7 @@ def test_keys_follow_recipe_and_seeds():
 @pytest.mark.exact
 @pytest.mark.parametrize("name", REFERENCES)
 def test_each_reference_is_drawn_as_everywhere(name):
-    """Without a matrix product of a library, and with the signature that was stored on another machine."""
+    """Each reference is drawn as everywhere: without a library's matrix product, and with the stored signature."""
     with exact_guard():
         drawn = drawn_signatures(REFERENCES[name])
     stored = stored_signatures()[name]
@@ -82,7 +84,7 @@ def test_another_recipe_has_another_signature():
 
 
 def test_an_unknown_reference_names_those_there_are():
-    with pytest.raises(UserError, match="choose of: mono-short, mono-long, ring-16"):
+    with pytest.raises(UserError, match="choose one of: mono-short, mono-long, ring-16"):
         reference_named("mono")
 
 

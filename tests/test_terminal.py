@@ -1,4 +1,4 @@
-"""Output on a terminal: control characters are shown instead of sent, and a closed output ends a command quietly."""
+"""Control characters are shown instead of sent to a terminal, and a closed output ends a command quietly."""
 
 import io
 import os
@@ -143,7 +143,7 @@ def test_progress_that_nobody_reads_ends_the_command_quietly() -> None:
 
 
 def test_a_closed_output_is_not_taken_by_the_next_file(tmp_path: Path) -> None:
-    """Else what a library prints would land in a file of the user."""
+    """The next file that is opened does not take a closed output, or else a library's messages would land in it."""
     code = (
         "import sys, os; from mien.terminal import open_closed_streams; open_closed_streams();"
         "file = open(sys.argv[1], 'wb'); os.write(1, b'chatter'); print('more'); sys.exit(file.fileno() < 3)"

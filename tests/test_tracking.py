@@ -1,4 +1,4 @@
-"""Tracking recovers what was projected: pose, expression, eyes; smooth without lag; gaps and bad input handled."""
+"""Tracking recovers the projected pose, expression and eyes, smooth without lag, also with gaps and bad input."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def test_recovers_the_truth(tracked):
     turn = matrix_from_axis_angle(face.head_rotation) @ matrix_from_axis_angle(case.face.head_rotation).mT
     angle = ((turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1).acos().rad2deg()
     assert angle.median() < 0.3
-    # Landmarks without their noise, by the mesh itself and so without any static offset.
+    # These are landmarks of the mesh itself, without noise and without any static offset.
     pixels = case.camera.project(case.model.landmark_positions(case.model(face), "mediapipe"))[0]
     assert (pixels - case.pixels).norm(dim=-1).median() < 0.3
     assert (face.expression - case.face.expression).abs().median() < 0.06
@@ -42,7 +42,7 @@ def test_recovers_the_truth(tracked):
 
 
 def test_a_few_landmarks_will_do():
-    """300-W's without their contour, and irises: what the others show does not count."""
+    """A few landmarks are enough: 300-W's without their contour, and the irises."""
     case = make_tracking_case(timesteps=20)
     settings = replace(KNOWN_FOCAL, landmarks="ibug51")
     counted = landmark_weights("ibug51") > 0
@@ -99,7 +99,7 @@ def test_expression_stays_in_bounds():
 
 
 def _still_then_turn(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """True yaw, tracked yaw and tracked landmarks (metres) of a head that keeps still, then turns 0.4 rad in 0.3 s."""
+    """Return true yaw, tracked yaw and tracked landmarks (metres) of a head that rests, then turns 0.4 rad in 0.3 s."""
     case = make_tracking_case(timesteps=50, noise=0)
     face = case.face[0]
     yaw = 0.2 * torch.tanh((torch.arange(50, dtype=torch.float64) - 33) / 2.0)
@@ -111,7 +111,7 @@ def _still_then_turn(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Te
     )  # fmt: skip
     pixels = case.camera.project(case.model.landmark_positions(case.model(moving), "mediapipe"))[0]
     generator = torch.Generator().manual_seed(5)
-    # What detectors do: neighbours err alike. A shift of the whole picture a frame, and a smaller error of each point.
+    # As with detectors, neighbours err alike: the picture shifts in each frame, and each point errs a little more.
     shake = noise * torch.randn(50, 1, 2, generator=generator, dtype=torch.float64)
     own = noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
     model = make_small_face_model()
@@ -124,7 +124,7 @@ def test_fast_turns_neither_lag_nor_shrink():
     tracked_yaw = tracked_yaw.double()
     range_ratio = (tracked_yaw.max() - tracked_yaw.min()) / (yaw.max() - yaw.min())
     assert 0.95 < range_ratio < 1.05
-    # Where the yaw crosses the middle of its way: less than half a frame late or early.
+    # The yaw crosses the middle of its way less than half a frame late or early.
     centred = tracked_yaw - (tracked_yaw.max() + tracked_yaw.min()) / 2
     crossing = int((centred > 0).nonzero()[0, 0])
     exact = crossing - float(centred[crossing] / (centred[crossing] - centred[crossing - 1]))
@@ -173,6 +173,7 @@ def test_a_model_without_landmarks_is_refused():
 
 
 def test_report(tracked):
+    """The report has the residuals, lost frames and jitter of the tracking."""
     case, tracking = tracked
     report = residual_report(case.capture, tracking, make_small_face_model())
     assert report["frames_without_face"] == [20, 21]
@@ -191,7 +192,7 @@ def test_report_flags_a_bad_frame(tracked):
 
 
 def test_anny_lips_and_lids_part():
-    """The embedding tells upper from lower lip and lid, without which no mouth would open in a tracking."""
+    """The embedding tells the upper from the lower lip and lid. Otherwise no mouth would open in a tracking."""
     model = load_face_model("anny")
     face = model.neutral(3)
     expression = face.expression.clone()
@@ -209,7 +210,7 @@ def test_anny_lips_and_lids_part():
 
 
 def test_settings_that_a_schedule_does_not_use_do_not_count():
-    """A tracking by pixels is current whatever was asked of the other schedule."""
+    """Settings that a schedule does not use do not count: a tracking by pixels stays current if others change."""
     paper, sizes = PaperSettings(epochs=2), PhotometricSettings(sizes=(64,))
     asked = TrackingSettings(paper=paper, photometric=sizes)
     assert asked.in_effect() == TrackingSettings(photometric=sizes)

@@ -1,4 +1,4 @@
-"""Trackings and scoring masks on disk: round trips, damage, and that a scoring mask never changes."""
+"""Trackings and scoring masks survive round trips, report damage, and a scoring mask never changes."""
 
 import hashlib
 import json
@@ -51,6 +51,7 @@ def _looks(random: torch.Generator) -> Appearance:
 
 @pytest.mark.parametrize("offsets", [False, True])
 def test_round_trip(tmp_path, offsets):
+    """A tracking is read as it was written."""
     tracking = _tracking(offsets, pixels=offsets)
     write_tracking(tmp_path / "tracking", tracking)
     again = read_tracking(tmp_path / "tracking")
@@ -80,7 +81,7 @@ def test_round_trip(tmp_path, offsets):
 
 
 def _rewrite(folder, change) -> None:
-    """Change the tensors and keep the json in step: what is then found wrong is the content, not the hash."""
+    """Change the tensors and keep the json in step, so that the content is found to be wrong, not the hash."""
     import hashlib
 
     file = folder / "tracking.safetensors"
@@ -102,6 +103,7 @@ def _rewrite(folder, change) -> None:
     ],
 )
 def test_wrong_content(tmp_path, change, message):
+    """Wrong content of a tracking is refused with its reason."""
     write_tracking(tmp_path, _tracking())
     _rewrite(tmp_path, change)
     with pytest.raises(UserError, match=message):
@@ -109,6 +111,7 @@ def test_wrong_content(tmp_path, change, message):
 
 
 def test_damage(tmp_path):
+    """Missing and damaged files of a tracking are refused."""
     with pytest.raises(UserError, match="missing"):
         read_tracking(tmp_path)
     write_tracking(tmp_path, _tracking())
@@ -137,6 +140,7 @@ def _scoring(value: int = 200) -> Scoring:
 
 
 def test_scoring_round_trip_and_frozen(tmp_path):
+    """A scoring is read as it was written, and never overwritten."""
     folder = tmp_path / "scoring"
     assert not scoring_exists(folder)
     write_scoring(folder, _scoring())
@@ -158,6 +162,7 @@ def test_half_written_scoring_is_replaced(tmp_path):
 
 
 def test_damaged_scoring(tmp_path):
+    """Missing, damaged and exchanged masks of a scoring are refused."""
     write_scoring(tmp_path / "s", _scoring())
     mask = tmp_path / "s" / "masks" / "00" / "000001.png"
     whole = mask.read_bytes()
@@ -178,13 +183,13 @@ def test_scoring_of_other_pictures_is_refused(tmp_path):
     assert read_scoring(tmp_path / "s", "a1").masks.max() == 200
     with pytest.raises(UserError, match=r"other pictures than the capture beside it has; run `mien track` again"):
         read_scoring(tmp_path / "s", "b2")
-    # Those of the first release do not say what they belong to.
+    # Files of the first release do not name the capture that they belong to.
     write_scoring(tmp_path / "old", _scoring())
     assert read_scoring(tmp_path / "old", "b2").masks.max() == 200
 
 
 def test_the_hash_of_a_scoring_is_over_masks_and_crops(tmp_path):
-    """Figures of other runs name it, so that it must not change."""
+    """The hash of a scoring covers masks and crops. Figures of other runs name it, so it must not change."""
     write_scoring(tmp_path / "s", _scoring())
     digest = hashlib.sha256(_scoring().masks.tobytes() + _scoring().crops.astype(np.int32).tobytes()).hexdigest()
     assert read_scoring_hash(tmp_path / "s") == digest

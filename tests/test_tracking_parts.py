@@ -1,4 +1,4 @@
-"""The parts of tracking: derivatives, solvers, weights, gaps."""
+"""The parts of tracking are right: derivatives, solvers, weights, gaps."""
 
 from dataclasses import replace
 
@@ -79,6 +79,7 @@ def test_derivatives_match_finite_differences(which):
 
 
 def test_free_parameters():
+    """Pinned expressions, the neck and the roll of eyes are not free, and eyes that diverge cost more."""
     layout = layout_of(make_small_face_model())
     assert layout.names[6:13] == tuple(f"move{index}" for index in range(7)), "the last expression is pinned"
     assert layout.names[13:] == ("left_eye_x", "left_eye_y", "right_eye_x", "right_eye_y"), "no neck, no roll of eyes"
@@ -90,6 +91,7 @@ def test_free_parameters():
 
 
 def test_bounded_least_squares():
+    """Least squares in a box keep the bounds and reach the minimum."""
     # |x - target|^2 in a box: the solution is the clipped target; in a tilted metric, the bound is still kept.
     target = torch.tensor([[2.0, 0.5], [-1.0, 0.2]], dtype=torch.float64)
     metric = torch.tensor([[2.0, 0.9], [0.9, 1.0]], dtype=torch.float64)

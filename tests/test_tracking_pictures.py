@@ -1,4 +1,4 @@
-"""What shows a tracking: the model's pictures, heat, overlay, contact sheet and the report's page."""
+"""Pictures of a tracking are right: renderings of the model, heat, overlay, contact sheet, and the report's page."""
 
 import threading
 from dataclasses import replace
@@ -39,7 +39,7 @@ def case() -> PhotometricCase:
 
 @pytest.fixture(scope="module")
 def truth(case: PhotometricCase) -> Tracking:
-    """As pictures were drawn: with this texture, and no shades."""
+    """Return a fit with the texture that the pictures were drawn with, and without shading."""
     texture = smooth_noise(256, 256, 4.0)
     return Tracking(
         face_model=case.model.name, face_model_hash="", face=case.face, valid=torch.ones(6, dtype=torch.bool),
@@ -180,7 +180,7 @@ def test_tracked_faces_have_looks(case, schedule):
 
 
 def test_calibrated_cameras_in_another_world_are_compared_too(case, tmp_path):
-    """Lit from one side, so that light has to be turned into the world; pictures of all cameras in a grid."""
+    """Calibrated cameras in another world are compared, too: light turns into the world, and cameras form a grid."""
     W_other = torch.eye(4)
     W_other[:3, :3] = matrix_from_axis_angle(torch.tensor([0.3, 1.2, -0.2]))
     W_other[:3, 3] = torch.tensor([1.0, 2.0, -0.5])

@@ -1,4 +1,4 @@
-"""The fit seen while it runs: pictures at every stage, at a bounded cost, and no other numbers for it."""
+"""The preview shows the fit at every stage, at a bounded cost, and does not change its numbers."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +23,7 @@ FAST = TrackingSettings(focal=FOCAL, photometric=PhotometricSettings(texture_siz
 
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float, int]]:
-    """Stage, progress and height of every picture that is written."""
+    """Collect stage, progress and height of every picture that is written."""
     monkeypatch.setattr(preview, "_INTERVAL_SECONDS", 0.0)
     monkeypatch.setattr(preview, "_MAX_SHARE", 1e9)
     shown, headed = [], Preview._headed
@@ -72,7 +72,7 @@ def test_two_sequences_and_the_paper_schedule_are_shown(tmp_path, seen):
 
 
 def test_looking_takes_a_small_part_of_the_time(tmp_path, monkeypatch):
-    """A look that takes a second is not repeated within ten; the newest fit is shown then, and the end always."""
+    """The preview takes a small part of the time: a picture that takes a second is not repeated within ten."""
     now, drawn, written = [0.0], [], []
     monkeypatch.setattr(preview.time, "monotonic", lambda: now[0])
 

@@ -1,4 +1,4 @@
-"""Tracking that was stopped goes on from what it had finished, to the same numbers; damaged pieces are made anew."""
+"""An interrupted tracking continues to the same numbers, and damaged pieces are made again."""
 
 import signal
 import subprocess
@@ -18,7 +18,7 @@ from mien.tracking.settings import PhotometricSettings
 from photometric_case import PhotometricCase, assert_alike, make_photometric_case, make_textured_model
 
 FAST = TrackingSettings(photometric=PhotometricSettings(texture_size=128, keyframes=4, shared_steps=1))
-"""The focal length is unknown, so that it has to be kept as well."""
+"""Settings with an unknown focal length, so that it has to be stored as well."""
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def expected(case: PhotometricCase) -> Tracking:
 
 
 def stopped_after(pieces: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the pieces that are written; after so many, the next one stops the program."""
+    """Collect the names of the pieces that are written; after this many, the next one stops the program."""
     write, names = StageCache._write, []
 
     def write_then_stop(self: StageCache, name: str, tensors: dict) -> None:
@@ -92,8 +92,8 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_killed_tracking_goes_on(case, tmp_path, monkeypatch, capsys):
-    """The process is killed, not asked to stop; then the same command ends with the same file."""
-    monkeypatch.undo()  # the other process fits as many at once as ever
+    """A tracking that was killed, not asked to stop, ends with the same file after the same command."""
+    monkeypatch.undo()  # the other process still fits as many frames at once
     model = make_textured_model()
     monkeypatch.setattr("mien.commands.stages.tracking.face_model_of", lambda choice: model)
     command = ["--overlay", "none", "--tracking.photometric.texture-size", "64"]

@@ -1,4 +1,4 @@
-"""The neck line and the scoring mask: what stays of a picture, and what goes."""
+"""The neck line and the scoring mask decide which parts of a picture are scored."""
 
 from dataclasses import replace
 
@@ -52,6 +52,7 @@ def test_a_closed_model_has_no_neck():
 
 
 def test_neck_line_of_an_upright_head():
+    """The neck line of an upright head is horizontal, at its bottom vertices."""
     model, face = _upright()
     camera = still_camera().to(torch.zeros(()))
     a, b, d = fit_neck_lines(model, face, (camera,))[0, 0].tolist()
@@ -128,6 +129,7 @@ def test_make_scoring():
 
 
 def test_overlay(tmp_path):
+    """The overlay shows mesh and landmarks, and is written as a video."""
     model, face = _upright(3)
     tracking = _tracking(model, face)
     tracking = replace(tracking, residuals=torch.tensor([[0.5], [torch.nan], [0.5]]))

@@ -1,4 +1,4 @@
-"""Several sequences of one subject, several calibrated cameras: one identity, one face a timestep."""
+"""Several sequences or calibrated cameras of one subject share one identity, and one face per timestep."""
 
 from dataclasses import replace
 
@@ -17,10 +17,10 @@ from small_face_model import make_small_face_model
 from tracking_case import FOCAL, FPS, SIZE, capture_of, make_tracking_case, still_camera
 
 FEW = TrackingSettings(keyframes=8)
-"""Quicker than the default, and good enough for what is tested."""
+"""Settings that are quicker than the default, and good enough for these tests."""
 DOUBLE = torch.zeros((), dtype=torch.float64)
 _LENS = 1.4
-"""Times the focal length of `tracking_case`."""
+"""Factor on the focal length of `tracking_case`."""
 
 
 def _noisy(pixels: torch.Tensor, noise: float, seed: int) -> torch.Tensor:
@@ -37,12 +37,12 @@ def _landmarks(model: FaceModel, face: FaceParams) -> torch.Tensor:
 
 
 def _film(yaw: tuple[float, float], start: int, name: str) -> tuple[Capture, FaceParams]:
-    """A dozen frames in which the head turns from one angle to another only, badly detected."""
+    """Return a dozen noisy frames of a head that turns from one angle to another."""
     case = make_tracking_case(timesteps=60, noise=0)
     face = case.face[slice(start, start + 12)]
     rotation = face.head_rotation.clone()
     rotation[:, 1] = torch.linspace(*yaw, 12)
-    # As far away as pictures of this lens are filled by, which is about what tracking assumes of square ones.
+    # At this distance the head fills pictures of this lens, about as tracking assumes for square pictures.
     away = face.head_translation * torch.tensor([1, 1, _LENS])
     face = replace(face, head_rotation=rotation, head_translation=away)
     K = case.camera.K * torch.tensor([[_LENS, 1, 1], [1, _LENS, 1], [1, 1, 1]])
@@ -58,7 +58,7 @@ def _with_half_the_pixels(capture: Capture) -> Capture:
 
 
 def _shape_error(truth: FaceParams, tracking: Tracking) -> float:
-    """RMS distance of the vertices at rest from the true ones without shift and scale, millimetres."""
+    """Return the RMS distance of the rest vertices from the true ones, without shift and scale, in millimetres."""
     model = make_small_face_model()
 
     def at_rest(identity: torch.Tensor) -> torch.Tensor:
@@ -115,7 +115,7 @@ def test_focal_lengths_are_shared_only_if_asked(two_sequences):
 
 
 def _model_with_sizes() -> FaceModel:
-    """The small face model with one more identity: the size of the head, 6 % a standard deviation."""
+    """Return the small face model with one more identity: the size of the head, 6 % per standard deviation."""
     model = make_small_face_model()
     return replace(
         model,
@@ -125,7 +125,7 @@ def _model_with_sizes() -> FaceModel:
 
 
 def _z_up() -> torch.Tensor:
-    """T_other_world: another world frame, in which z is up and the head looks along -x: rotation vectors are long."""
+    """Return T_other_world for a world in which z is up and the head looks along -x. Its rotation vectors are long."""
     R_other_world = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
     return rigid_transform(R_other_world, torch.tensor([0.3, -0.2, 1.5], dtype=torch.float64))
 
@@ -136,7 +136,7 @@ def _moved(face: FaceParams, T_other_world: torch.Tensor) -> FaceParams:
 
 
 def _ring(angles: tuple[float, ...], T_other_world: torch.Tensor) -> tuple[Camera, ...]:
-    """Cameras 0.9 m around a head at (0, 0, -0.9), at angles in radians to the subject's left of straight ahead."""
+    """Return cameras 0.9 m from a head at (0, 0, -0.9), at angles in radians to the subject's left."""
     centre, up = torch.tensor([0.0, 0.0, -0.9]).double(), torch.tensor([0.0, 1.0, 0.0]).double()
     cameras = []
     for angle in torch.tensor(angles).double():
@@ -147,7 +147,7 @@ def _ring(angles: tuple[float, ...], T_other_world: torch.Tensor) -> tuple[Camer
 
 
 def _multi_capture(face: FaceParams, cameras: tuple[Camera, ...], blind: dict[int, tuple[int, ...]]) -> Capture:
-    """What calibrated cameras detect; `blind` names, for each camera, timesteps at which it finds no face."""
+    """Return what calibrated cameras detect. `blind` gives, for each camera, the timesteps without a face."""
     points = _landmarks(_model_with_sizes(), face)
     seen = torch.stack([camera.to(DOUBLE).project(points)[0] for camera in cameras], dim=1)
     landmarks = _noisy(seen, 0.3, 7).numpy().astype(np.float32)
@@ -184,7 +184,7 @@ def _one_camera(capture: Capture) -> Capture:
 
 
 def _pose_errors(face: FaceParams, tracking: Tracking) -> tuple[float, float]:
-    """Medians over timesteps: of the rotation in degrees, and of the landmarks' places in millimetres."""
+    """Return medians over timesteps of the rotation error in degrees and of the landmarks' error in millimetres."""
     found = tracking.face.to(DOUBLE)
     turn = matrix_from_axis_angle(found.head_rotation) @ matrix_from_axis_angle(face.head_rotation).mT
     angle = axis_angle_from_matrix(turn).norm(dim=1).rad2deg()
@@ -205,7 +205,7 @@ def test_cameras_tell_pose_and_metric_scale(ring):
 
 
 def test_cameras_from_the_side_are_believed_less(ring):
-    """What a detector makes of a face from the side is off in its own way."""
+    """Cameras from the side count less, since a detector errs in other ways on a face from the side."""
     face, capture, _ = ring
     landmarks = capture.landmarks.copy()
     landmarks[:, 2] += (0, 4)
@@ -249,6 +249,7 @@ def test_files_hold_several_cameras(ring, tmp_path):
 
 
 def test_report_of_several_cameras(ring):
+    """The report has figures of each camera."""
     _, capture, tracking = ring
     report = residual_report(capture, tracking, _model_with_sizes())
     assert report["cameras"]["cam1"]["frames"] == 12

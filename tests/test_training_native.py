@@ -1,4 +1,4 @@
-"""The native parts of a training step against their plain PyTorch twins."""
+"""The native parts of a training step agree with their plain PyTorch twins."""
 
 from collections.abc import Iterator
 
@@ -22,7 +22,7 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
-    """Standard normal numbers."""
+    """Return standard normal numbers."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
@@ -36,7 +36,7 @@ def test_adam_update_equals_its_reference(isa: str, count: int) -> None:
     update_all([ours, twin()])
     update_reference(theirs)
     assert ours.moments.step == theirs.moments.step == 4
-    # Where the second moment is small an update is large (up to 10): in float32 its last digits differ.
+    # If the second moment is small, an update is large (up to 10), and its last digits differ in float32.
     torch.testing.assert_close(ours.values, theirs.values, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(ours.moments.first, theirs.moments.first, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(ours.moments.second, theirs.moments.second, rtol=1e-5, atol=1e-6)
@@ -81,6 +81,7 @@ def test_observing_a_view_equals_its_reference(isa: str, count: int) -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130)])
 def test_box_of_nonzero(isa: str, size: tuple[int, int]) -> None:
+    """The box of nonzero values is the smallest one."""
     values = torch.zeros(size)
     assert _native.box_of_nonzero(values) == (0, 0, 0, 0)
     for pixel in ((size[0] - 1, size[1] // 2), (size[0] // 3, size[1] - 1), (size[0] // 2, size[1] // 3)):
@@ -92,12 +93,14 @@ def test_box_of_nonzero(isa: str, size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("size", [(0, 5), (1, 1), (40, 130)])
 def test_mean_squared_difference(isa: str, size: tuple[int, int]) -> None:
+    """The mean squared difference agrees with float64."""
     image, picture = random(*size, 3), (255 * random(*size, 3, seed=1).sigmoid()).to(torch.uint8)
     expected = (image.double() - picture.double() / 255).square().sum() / max(image.numel(), 1)
     assert _native.mean_squared_difference(image, picture) == pytest.approx(float(expected), rel=1e-5)
 
 
 def test_the_same_bits_for_any_number_of_threads() -> None:
+    """The number of threads does not change a bit."""
     means, log_scales, radii = random(20_000, 3), random(20_000, 3, seed=1), torch.ones(20_000, dtype=torch.int32)
     before, results = _native.thread_count(), []
     for threads in (1, 2, 3):

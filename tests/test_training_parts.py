@@ -1,4 +1,4 @@
-"""Splits, frame order, targets, the optimiser and the face track."""
+"""Splits, frame order, targets, the optimiser and the face track do their parts of training."""
 
 from dataclasses import replace
 
@@ -198,6 +198,7 @@ def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:
 
 
 def test_rates() -> None:
+    """Learning rates fall from start to end, after their beginning."""
     assert Rate(1.0, 0.01).at(Progress(50, 100)) == pytest.approx(0.1)
     assert Rate(1.0, 0.01).at(Progress(100, 100)) == pytest.approx(0.01)
     assert Rate(0.3).at(Progress(70, 100)) == 0.3

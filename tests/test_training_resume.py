@@ -1,4 +1,4 @@
-"""A run that is stopped at any moment and started again ends with the same bytes as one left alone."""
+"""A run that is stopped at any moment and started again ends with the same bytes as an uninterrupted one."""
 
 import signal
 import subprocess
@@ -31,7 +31,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def train_until(run_dir: Path, signal_at_step: int, signal_number: int) -> tuple[int, int]:
-    """Start training in another process, send it a signal; returns its exit code and the step it began at."""
+    """Train in another process until a step, and send it a signal. Return its exit code and its first step."""
     script = Path(train_toy.__file__)
     process = subprocess.Popen(
         [sys.executable, str(script), str(run_dir), str(STEPS)], stdout=subprocess.PIPE, text=True, cwd=script.parent
@@ -56,7 +56,7 @@ def assert_same_results(run_dir: Path, undisturbed: Path) -> None:
 
 
 def test_killed_runs_end_with_the_same_bytes(tmp_path: Path, undisturbed: Path) -> None:
-    # Before the first checkpoint, in the middle of density control, and again after having resumed.
+    # Stop before the first checkpoint, during density control, and again after resuming.
     for kill_at in (2, 13, 22):
         code, _ = train_until(tmp_path, kill_at, signal.SIGKILL)
         assert code == -signal.SIGKILL
@@ -96,7 +96,7 @@ def test_finished_run_is_loaded(undisturbed: Path, capsys: pytest.CaptureFixture
 
 @pytest.mark.exact
 def test_threads_do_not_change_a_bit() -> None:
-    """Whole steps on a real face model, with enough Gaussians that every native loop is divided."""
+    """The number of threads does not change a bit, in whole steps with enough Gaussians to divide every native loop."""
     results = []
     before = torch.get_num_threads()
     torch.set_num_threads(1)

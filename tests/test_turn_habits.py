@@ -1,4 +1,4 @@
-"""Expressions that nod with the head: what the face hardly shows goes, what it shows stays."""
+"""Expressions that nod with the head are removed if the face hardly shows them, and stay if it does."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from mien.tracking.landmarks.term import unknown_subject
 from tracking_case import make_tracking_case
 
 PLAIN, FAINT = 6, 7
-"""Columns of an expression that moves landmarks by centimetres, and of one that does so by tenths of millimetres."""
+"""Columns of an expression that moves landmarks by centimetres, and of one that moves them by tenths of millimetres."""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def term() -> LandmarkTerm:
 
 
 def _nodding(term: LandmarkTerm, turn: float) -> SequenceFit:
-    """Both expressions follow pitch, beside a motion of their own."""
+    """Return a fit in which both expressions follow pitch, beside motion of their own."""
     time = torch.arange(60, dtype=torch.float64)
     state = torch.zeros(60, term.model.layout.size, dtype=torch.float64)
     state[:, 5] -= 0.9
@@ -41,7 +41,7 @@ def _nodding(term: LandmarkTerm, turn: float) -> SequenceFit:
 
 
 def _following(state: torch.Tensor) -> torch.Tensor:
-    """Correlation of each column with pitch."""
+    """Return the correlation of each column with pitch."""
     turned = (state - state.mean(0)) / (state - state.mean(0)).norm(dim=0).clamp_min(1e-12)
     return turned[:, 0] @ turned
 
@@ -55,7 +55,7 @@ def test_only_what_the_face_hardly_shows_stops_nodding(term):
     assert after[PLAIN] > 0.85
     assert after[FAINT] < 0.3
     torch.testing.assert_close(found.state[:, PLAIN], own.state[:, PLAIN], atol=0.03, rtol=0)
-    # What is its own stays: beside pitch nothing has changed.
+    # Motion that does not follow pitch is unchanged.
     turn = own.state[:, :1] - own.state[:, :1].mean()
     change = found.state[:, FAINT : FAINT + 1] - own.state[:, FAINT : FAINT + 1]
     torch.testing.assert_close(change, turn * (turn.T @ change) / (turn.T @ turn), atol=1e-9, rtol=0)

@@ -1,4 +1,4 @@
-"""A face model of the user's from its file to an avatar: added once, then tracked, trained and exported by its name."""
+"""A user's face model is added once, then tracked, trained and exported by its name."""
 
 import shutil
 from dataclasses import replace
@@ -26,7 +26,7 @@ from tracking_case import capture_of, still_camera
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory) -> Path:
-    """A cache of its own, with the anny model in it."""
+    """Return a fresh cache that holds the anny model."""
     load_face_model("anny")
     folder = tmp_path_factory.mktemp("cache")
     shutil.copytree(cache_folder() / "face_models", folder / "face_models")
@@ -35,7 +35,7 @@ def cache(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def added(cache, monkeypatch, tmp_path_factory):
-    """`mien face-models --add FILE`, with the landmarks that a detector would find in some minutes."""
+    """Run `mien face-models --add FILE`, with the landmarks that a detector would need minutes to find."""
     monkeypatch.setenv("MIEN_CACHE", str(cache))
     anny, calls = load_face_model("anny"), []
 
@@ -65,6 +65,7 @@ def test_it_is_added_once_and_then_goes_by_its_name(added):
 
 
 def test_choices_that_lead_nowhere(added, tmp_path, capsys):
+    """Names and files that are no face model are refused with the reason."""
     path, _ = added
     other = write_npz(tmp_path / "my_head.npz", {"weights": np.zeros(3)})
     for choice, message in (
@@ -87,7 +88,7 @@ def test_choices_that_lead_nowhere(added, tmp_path, capsys):
 
 
 def _speaking(model: FaceModel, timesteps: int) -> FaceParams:
-    """A person before the camera who turns, opens the mouth to 0.25 radians and looks about."""
+    """Return a person in front of the camera who turns, opens the mouth to 0.25 radians and looks around."""
     time = torch.linspace(0, 1, timesteps, dtype=torch.float64)
     face = model.neutral(timesteps).to(time)
     random = torch.Generator().manual_seed(3)
@@ -128,7 +129,7 @@ def test_landmarks_give_its_jaw_and_shape(added):
 
 @pytest.fixture(scope="module")
 def capture() -> Capture:
-    """Ten small pictures of a head that is drawn with another model, anny."""
+    """Return ten small pictures of a head that is drawn with another model, anny."""
     recipe = SyntheticRecipe(
         name="clip", width=96, height=96, seconds=0.4, hair="none", glasses=False, brows_and_lashes=False, clothes=False
     )
@@ -152,7 +153,7 @@ def test_from_pixels_to_an_avatar_that_is_not_passed_on(added, capture, tmp_path
     assert main(["export", root, "--run", "a", "--out", str(workspace / "a.ply")]) == 0
     avatar = load_avatar(workspace / "runs" / "a")
     assert not list((workspace / "runs" / "a").rglob("face_model*"))
-    # Its licence is not known, until the user says that copies are allowed.
+    # The licence is unknown until the user says that copies are allowed.
     capsys.readouterr()
     assert main(["export", root, "--run", "a", "--out", str(workspace / "a.mien")]) != 0
     assert "--shareable" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A face model of about a hundred vertices, and a tiny capture of it that was never filmed: for fast training tests."""
+"""Make a face model of about a hundred vertices and a tiny capture of it, for fast training tests."""
 
 import math
 
@@ -15,7 +15,7 @@ from mien.training import Sequence
 
 
 def toy_face_model(rings: int = 9, around: int = 12) -> FaceModel:
-    """An ellipsoid head with two expressions (the lower half drops, the front swells), a neck and a derived jaw."""
+    """Return an ellipsoid head with two expressions (dropped lower half, swollen front), a neck and a derived jaw."""
     template, faces = _sphere(rings, around)
     template = template * torch.tensor([0.08, 0.11, 0.09])
     v = len(template)
@@ -46,7 +46,7 @@ def toy_face_model(rings: int = 9, around: int = 12) -> FaceModel:
 
 
 def toy_face(timesteps: int) -> FaceParams:
-    """A head half a metre in front of the camera that talks, nods and turns a little."""
+    """Return a head half a metre in front of the camera that talks, nods and turns a little."""
     time = torch.linspace(0, 2 * math.pi, timesteps + 1)[:-1]
     still = torch.zeros(timesteps)
     return FaceParams(
@@ -65,14 +65,14 @@ def runtime_face(face: FaceParams) -> Face:
 
 
 def toy_camera(size: int) -> Camera:
-    """The world is the camera's with y up and z backward; the head fills half of the picture."""
+    """Return a camera in a world with y up and z backward, in which the head fills half of the picture."""
     focal = 1.2 * size
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     return Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])), size, size)
 
 
 def toy_tracking(face_model: FaceModel, timesteps: int, size: int) -> Tracking:
-    """The exact tracking of the toy capture."""
+    """Return the exact tracking of the toy capture."""
     return Tracking(
         face_model=face_model.name, face_model_hash=face_model.content_hash, face=toy_face(timesteps),
         valid=torch.ones(timesteps, dtype=torch.bool), cameras=(toy_camera(size),),
@@ -82,7 +82,7 @@ def toy_tracking(face_model: FaceModel, timesteps: int, size: int) -> Tracking:
 
 
 def toy_capture(face_model: FaceModel, timesteps: int = 10, size: int = 64) -> tuple[Capture, np.ndarray]:
-    """Pictures of coloured blobs at the mesh's triangles, and their alpha as the scoring mask."""
+    """Return pictures of coloured blobs at the mesh's triangles, with their alpha as the scoring mask."""
     camera, face = toy_camera(size), toy_face(timesteps)
     vertices = face_model(face)
     rows = torch.arange(size) + 0.5
@@ -109,14 +109,14 @@ def toy_capture(face_model: FaceModel, timesteps: int = 10, size: int = 64) -> t
 
 
 def toy_sequence(timesteps: int = 10, size: int = 48) -> tuple[FaceModel, Sequence]:
-    """The toy face model and its capture, tracked exactly."""
+    """Return the toy face model and its capture, tracked exactly."""
     face_model = toy_face_model()
     capture, alpha = toy_capture(face_model, timesteps, size)
     return face_model, Sequence("toy", capture, toy_tracking(face_model, timesteps, size), alpha)
 
 
 def _facing(vertices: Tensor, faces: Tensor) -> Tensor:
-    """1 for triangles whose outside the camera sees."""
+    """Return 1 for triangles whose outside the camera sees, and 0 for others."""
     v0, v1, v2 = vertices[faces].unbind(1)
     normal = torch.linalg.cross(v1 - v0, v2 - v0)
     return ((normal * (v0 + v1 + v2)).sum(-1) < 0).float()

@@ -1,4 +1,4 @@
-"""A workspace on disk around the toy head: one sequence, one run."""
+"""Write a workspace around the toy head to disk: one sequence, one run."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,13 +7,14 @@ import numpy as np
 
 import train_toy
 from mien.capture import write_capture
+from mien.evaluation import EvaluationSettings, evaluate
 from mien.tracking import Scoring, write_scoring, write_tracking
 from mien.training import read_sequence, train
 from toy_scene import toy_sequence
 
 
 def write_toy_workspace(root: Path, timesteps: int = 5) -> None:
-    """`root/sequences/clip` and `root/runs/toy`, as `mien create` would leave them; the last fifth is held out."""
+    """Write `root/sequences/clip` and `root/runs/toy` as `mien create` leaves them. The last fifth is held out."""
     face_model, sequence = toy_sequence(timesteps, 32)
     folder = root / "sequences" / "clip"
     write_capture(folder / "capture", sequence.capture)
@@ -22,3 +23,10 @@ def write_toy_workspace(root: Path, timesteps: int = 5) -> None:
     write_scoring(folder / "scoring", Scoring(sequence.scoring, crops))
     settings = replace(train_toy.SETTINGS, split="tail")
     train([read_sequence(folder)], face_model, train_toy.CONFIG, settings, root / "runs" / "toy")
+
+
+def write_evaluated_workspace(root: Path) -> Path:
+    """Write the toy workspace with the figures of its run, and return its folder."""
+    write_toy_workspace(root)
+    evaluate(root / "runs/toy", [root / "sequences/clip"], EvaluationSettings(perceptual=False, video_frames=0))
+    return root

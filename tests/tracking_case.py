@@ -1,4 +1,4 @@
-"""A synthetic capture with known truth for tests of tracking: a small head in motion, as landmarks only."""
+"""Make a synthetic capture with known truth for tests of tracking: a small head in motion, as landmarks only."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ class TrackingCase:
 
 
 def make_tracking_case(timesteps: int = 60, noise: float = 0.3, missing: tuple[int, ...] = ()) -> TrackingCase:
-    """The truth is float64; `noise` is the standard deviation of each landmark's coordinates in pixels."""
+    """Return a case with float64 truth. `noise` is the standard deviation of each landmark coordinate in pixels."""
     random = torch.Generator().manual_seed(1)
     model = make_small_face_model().to(torch.zeros((), dtype=torch.float64))
     layout = layout_of(model)

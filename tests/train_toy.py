@@ -1,4 +1,4 @@
-"""Trains the toy scene into the folder given as argument; a test kills this process at will."""
+"""Train the toy scene into the folder given as argument. Tests kill this process at any moment."""
 
 import sys
 from collections.abc import Iterator

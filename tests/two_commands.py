@@ -1,4 +1,4 @@
-"""Two processes that run `mien` at the same moment, many times; and a workspace for them on which all is quick."""
+"""Run two `mien` processes at the same moment, many times, on a workspace for which all is quick."""
 
 import contextlib
 import importlib
@@ -28,7 +28,7 @@ WORK = {
     "capture": ("mien.capture.from_video", "survey_source"),
     "evaluate": ("mien.evaluation.evaluate", "_evaluate"),
 }
-"""Function, with its module, that a command runs while it writes."""
+"""Module and function that each command runs while it writes."""
 _TIMESTEPS, _SIZE = 5, 48
 _PATIENCE_SECONDS = 120
 
@@ -40,7 +40,7 @@ class Outcome:
     pid: int
     code: int
     told: str
-    """Standard error."""
+    """Text on standard error."""
     worked: list[tuple[str, float, float]]
     """Calls of `WORK` that were made, with start and end on the system's clock."""
 
@@ -50,7 +50,7 @@ class Pair:
 
     def __init__(self, cache: Path, without_locks: bool = False) -> None:
         context = multiprocessing.get_context("spawn")
-        self._barrier = barrier = context.Barrier(2)  # kept: it goes with its last name
+        self._barrier = barrier = context.Barrier(2)  # kept, since it is destroyed with its last reference
         self._ends, self._processes = [], []
         for _ in range(2):
             ours, theirs = context.Pipe()
@@ -60,7 +60,7 @@ class Pair:
             self._processes.append(process)
 
     def run(self, *commands: list[str]) -> list[Outcome]:
-        """One command in each process, begun at once."""
+        """Run one command in each process, started together."""
         for end, command in zip(self._ends, commands, strict=True):
             end.send(command)
         assert all(end.poll(_PATIENCE_SECONDS) for end in self._ends), "a command does not end"
@@ -111,7 +111,10 @@ def _watch(module: Any, name: str, kind: str, worked: list[tuple[str, float, flo
 
 @contextlib.contextmanager
 def pair(cache: Path, without_locks: bool = False) -> Iterator[Pair]:
-    """Two processes with this folder of face models; `without_locks` breaks them, to see what the tests say."""
+    """Start two processes with this folder of face models.
+
+    `without_locks` breaks them, to see that the tests notice.
+    """
     both = Pair(cache, without_locks)
     try:
         yield both
@@ -121,18 +124,18 @@ def pair(cache: Path, without_locks: bool = False) -> Iterator[Pair]:
 
 @dataclass(frozen=True)
 class Studio:
-    """A filmed toy head: a workspace in which it is captured and tracked, and the commands that made it."""
+    """Filmed toy head: a workspace in which it is captured and tracked, and the options of its commands."""
 
     root: Path
     video: Path
-    given: list[str]
-    """Options of a capture: mattes and landmarks, so that nothing needs to be detected."""
-    look: list[str]
-    """Options of `create` that find everything up to the tracking current, and train for a moment."""
+    capture_options: list[str]
+    """Options of a capture with mattes and landmarks, so that nothing has to be detected."""
+    create_options: list[str]
+    """Options of `create` with which everything up to the tracking is current and training is short."""
 
 
 def toy_studio(folder: Path, cache: Path) -> Studio:
-    """Film, capture and track the toy head, without any detector; MIEN_CACHE has to be `cache`."""
+    """Film, capture and track the toy head without any detector. MIEN_CACHE has to be `cache`."""
     from mien.commands.stages.tracking import _tracking_fingerprint
     from mien.tracking import Scoring, TrackingSettings, write_scoring, write_tracking
     from mien.workspace import Workspace
@@ -148,10 +151,10 @@ def toy_studio(folder: Path, cache: Path) -> Studio:
         cv2.imwrite(str(folder / "pictures" / f"{timestep}.png"), film.images[timestep, 0][..., ::-1])
     marks = np.random.default_rng(0).uniform(8, 40, (_TIMESTEPS, 478, 2)).astype(np.float32)
     write_arrays(folder / "landmarks.safetensors", {"landmarks": marks})
-    given = ["--capture.crop", "none", "--capture.mattes", str(folder / "mattes")]
-    given += ["--capture.landmarks", str(folder / "landmarks.safetensors")]
+    capture_options = ["--capture.crop", "none", "--capture.mattes", str(folder / "mattes")]
+    capture_options += ["--capture.landmarks", str(folder / "landmarks.safetensors")]
     root, video = folder / "workspace", folder / "pictures"
-    assert main(["capture", str(video), "--out", str(root), "--name", "clip", *given]) == 0
+    assert main(["capture", str(video), "--out", str(root), "--name", "clip", *capture_options]) == 0
     workspace, sequence = Workspace(root), root / "sequences" / "clip"
     fingerprint = _tracking_fingerprint(workspace, ["clip"], model, TrackingSettings())
     made_from = {"fingerprint": fingerprint, "tracked_together": ["clip"]}
@@ -161,5 +164,5 @@ def toy_studio(folder: Path, cache: Path) -> Studio:
     from mien.capture import read_capture_hash
 
     write_scoring(sequence / "scoring", Scoring(alpha, crops), read_capture_hash(sequence / "capture"))
-    look = ["--name", "clip", "--face-model", "toy", "--overlay", "none", "--steps", "3", "--split", "tail", *given]
-    return Studio(root, video, given, look)
+    create_options = ["--name", "clip", "--face-model", "toy", "--overlay", "none", "--steps", "3", "--split", "tail"]
+    return Studio(root, video, capture_options, [*create_options, *capture_options])

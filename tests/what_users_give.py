@@ -1,4 +1,4 @@
-"""Landmarks, mattes, crops, cameras and motion as other programs write them: without any redundancy."""
+"""Write landmarks, mattes, crops, cameras and motion as other programs do, without checksums."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from mien.evaluation.image_folders import write_crops
 
 
 def write_what_users_give(folder: Path, picture: np.ndarray) -> None:
-    """One file of each kind, for three pictures of 32x32 pixels."""
+    """Write one file of each kind, for three pictures of 32x32 pixels."""
     points = np.random.default_rng(0).uniform(0, 32, (3, 478, 2)).astype(np.float32)
     points[1] = np.nan
     folder.mkdir()

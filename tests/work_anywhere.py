@@ -1,4 +1,4 @@
-"""Trains a toy and captures a clip: a test runs this in odd places. Names come as arguments, in whatever encoding."""
+"""Train a toy and capture a clip. A test runs this in odd places; names come as arguments in any encoding."""
 
 import os
 import sys
@@ -9,7 +9,7 @@ from toy_workspace import write_toy_workspace
 
 
 def work(place: Path, clip: Path | None) -> None:
-    """Into `place`: a workspace of the toy, and what a capture of the clip's first frames makes."""
+    """Write into `place` a toy workspace and a capture of the clip's first frames."""
     write_toy_workspace(place / "toy")
     if clip is not None:
         options = ["--capture.size", "96", "--capture.max-frames", "3"]

@@ -1,4 +1,9 @@
-"""mien's native core and its peers on one scene, in turn, in one run (README.md beside this file)."""
+"""Measure mien's native core and its peers in turn, forward and backward, on the same scenes in one run.
+
+    python benchmarks/peers/compare.py --counts 10000 30000 --rounds 3
+
+README.md beside this file lists the peers.
+"""
 
 import json
 import time
@@ -17,7 +22,7 @@ from mien.benchmarking.timing import Timing, benchmark_row, format_machine, form
 from mien.render import rasterize
 
 Draw = Callable[[Scene], Tensor]
-"""A scene to its picture [h, w, 3], differentiable in the scene's parameters."""
+"""Function from a scene to its picture [h, w, 3], differentiable in the scene's parameters."""
 
 
 @dataclass(frozen=True)
@@ -29,13 +34,13 @@ class Comparison:
     size: int = 512
     """Side of the picture in pixels."""
     rounds: int = 3
-    """Every peer runs once a round; the native core, which is quick, ten times."""
+    """Number of rounds. In each round every peer runs once, and the native core, which is quick, ten times."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the machine and a list of rows for programs."""
 
 
-def peers_here() -> dict[str, Draw]:
-    """What can run on this machine, the native core first."""
+def find_peers() -> dict[str, Draw]:
+    """Return the peers that can run on this machine, the native core first."""
     peers: dict[str, Draw] = {"mien_native": lambda s: rasterize(s.gaussians, s.camera, s.background, "native").image}
     if torch.cuda.is_available():
         peers["gsplat"] = _draw_on_gpu
@@ -44,12 +49,12 @@ def peers_here() -> dict[str, Draw]:
 
 
 def measure(scene: Scene, rounds: int) -> dict[str, Timing]:
-    """Forward and backward of every peer, in turn."""
+    """Measure forward and backward of every peer, in turn."""
     walls: dict[str, list[float]] = {}
     processors: dict[str, list[float]] = {}
     expected: Tensor | None = None
     for turn in range(rounds + 1):
-        for name, draw in peers_here().items():
+        for name, draw in find_peers().items():
             for _ in range(10 if name == "mien_native" else 1):
                 processor, wall = time.process_time(), time.perf_counter()
                 picture = draw(scene)
@@ -74,7 +79,7 @@ def _draw_on_gpu(scene: Scene) -> Tensor:
 
 
 def main(comparison: Comparison) -> None:
-    """Print one row a peer and count."""
+    """Print one row for each peer and number of Gaussians."""
     torch.set_num_threads(_native.thread_count())  # the same number for every peer
     machine, rows = measure_machine(), []
     for count in comparison.counts:

@@ -1,4 +1,6 @@
-"""Gaussian splatting as a plain PyTorch loop over tiles, with autograd: what one writes without a native core.
+"""Draw Gaussians in a plain PyTorch loop over tiles, with autograd, as one would without a native core.
+
+`compare.py` measures it: python benchmarks/peers/compare.py
 
 Tiles of 16x16 pixels and boxes of 3 standard deviations, as in the original CUDA scheme (Kerbl et al. 2023).
 """
@@ -14,7 +16,7 @@ TILE = 16
 
 
 def render_tiles(gaussians: Gaussians, camera: Camera, background: Tensor) -> Tensor:
-    """The picture [h, w, 3], differentiable in the Gaussians."""
+    """Return the picture [h, w, 3], differentiable in the Gaussians."""
     splats = project_splats(gaussians, camera, torch.zeros(len(gaussians), 2))
     order = splats.drawn.nonzero()[:, 0]
     order = order[splats.depths.detach()[order].argsort()]
@@ -40,7 +42,7 @@ def render_tiles(gaussians: Gaussians, camera: Camera, background: Tensor) -> Te
 
 
 def _weights(centres: Tensor, conics: Tensor, opacities: Tensor, xs: Tensor, ys: Tensor) -> tuple[Tensor, Tensor]:
-    """How much each splat adds to each pixel, front to back, [n, h, w]; and what shines through all of them, [h, w]."""
+    """Return the weights of splats in pixels, front to back [n, h, w], and the transmittance behind all [h, w]."""
     dx = xs[None, None, :] - centres[:, 0, None, None]
     dy = ys[None, :, None] - centres[:, 1, None, None]
     a, b, c = conics[:, :, None, None].unbind(1)

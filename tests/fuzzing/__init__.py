@@ -1,5 +1,5 @@
-"""Structure-aware fuzzers: files that are wrong in the ways that readers trip over, and odd command lines.
+"""Fuzz readers and commands with files that are wrong in typical ways, and with odd command lines.
 
-`make fuzz MINUTES=30` runs them at length, tests/test_fuzz.py briefly. A case is named `TARGET:SEED:NUMBER` and is the
-same every time: `PYTHONPATH=tests .venv/bin/python -m fuzzing --replay TARGET:SEED:NUMBER`.
+`make fuzz MINUTES=30` runs the fuzzers at length, and tests/test_fuzz.py runs them briefly. A case is named
+`TARGET:SEED:NUMBER` and is always the same: `PYTHONPATH=tests .venv/bin/python -m fuzzing --replay CASE` repeats it.
 """

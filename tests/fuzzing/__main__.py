@@ -2,7 +2,7 @@
 
 import os
 
-# Before numpy and torch are imported: cases are forked, and threads do not come along.
+# Set before numpy and torch are imported: cases are forked, and threads do not survive a fork.
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1", MIEN_THREADS="1")
 
 import argparse
@@ -17,7 +17,7 @@ from fuzzing import campaign
 
 
 def main() -> int:
-    """Run what is asked for; 1 where something was found."""
+    """Run the fuzzers. The exit code is 1 if something was found."""
     parser = argparse.ArgumentParser(prog="fuzzing", description=__doc__)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cases", type=int, default=1500, help="mutated inputs over all targets")

@@ -1,4 +1,4 @@
-"""Faults in .npz and .pkl files: in the arrays, in the headers of their members, in the operations of a pickle."""
+"""Make faults in .npz and .pkl files: in arrays, in the headers of members, and in the operations of a pickle."""
 
 import io
 import pickletools
@@ -33,7 +33,7 @@ _TYPES = (
 
 
 def faulty_npz(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """One fault in a .npz."""
+    """Make one fault in a .npz."""
     members = members_of(data)
     name = dice.choice(list(members))
     kind = dice.choice(
@@ -91,13 +91,13 @@ def faulty_npz(data: bytes, dice: Random) -> tuple[str, bytes]:
 
 
 def members_of(data: bytes) -> dict[str, bytes]:
-    """The .npy files of a .npz by name."""
+    """Return the .npy files of a .npz by name."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         return {info.filename.removesuffix(".npy"): archive.read(info) for info in archive.infolist()}
 
 
 def npz_of(members: dict[str, bytes]) -> bytes:
-    """A .npz of any members."""
+    """Return a .npz with these members."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         for name, content in members.items():
@@ -106,18 +106,18 @@ def npz_of(members: dict[str, bytes]) -> bytes:
 
 
 def npy_of(array: np.ndarray) -> bytes:
-    """A .npy file."""
+    """Return a .npy file."""
     out = io.BytesIO()
     np.save(out, array)
     return out.getvalue()
 
 
 def with_bomb(members: dict[str, bytes], name: str, head: bytes, amount: int) -> bytes:
-    """A .npz with a member of zeros that is a thousandth as long packed."""
+    """Return a .npz with a member of zeros that is a thousand times as long unpacked."""
     packed = zlib.compressobj(1, zlib.DEFLATED, -15)
     body = packed.compress(head) + packed.flush(zlib.Z_FULL_FLUSH) + zeros(amount)[2:-4]
     whole = npz_of({key: value for key, value in members.items() if key != name} | {name: b""})
-    # The empty member comes last: its local header, its directory entry and the archive's end are written anew.
+    # The empty member comes last. Its local header, its directory entry and the archive's end are rewritten.
     directory = whole.rfind(b"PK\x01\x02")
     local = whole.rfind(b"PK\x03\x04", 0, directory)
     entry_start = whole.find(b"PK\x01\x02")
@@ -140,7 +140,7 @@ def _with_header(member: bytes, text: str) -> bytes:
 
 
 def faulty_pickle(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """One to three faults in the operations of a pickle, or a small pickle that asks for much."""
+    """Make one to three faults in the operations of a pickle, or return a small pickle that asks for much memory."""
     kind = dice.choice(("remove", "double", "swap", "argument", "argument", "global", "small", "cut", "insert"))
     if kind == "small":
         return kind, dice.choice(_SMALL)(dice)

@@ -1,4 +1,4 @@
-"""Faults in videos: the boxes of mp4 and mov, and the bytes of other containers."""
+"""Make faults in videos: in the boxes of mp4 and mov, and in the bytes of other containers."""
 
 import struct
 from random import Random
@@ -22,11 +22,11 @@ _CODECS = (
     b"dvh1",
 )
 Box = tuple[bytes, int, int]
-"""Type, where its size field stands, and its whole size."""
+"""Type of a box, offset of its size field, and its whole size."""
 
 
 def boxes_of(data: bytes, start: int = 0, end: int | None = None) -> list[Box]:
-    """All boxes, also those within others, in order."""
+    """Return all boxes in order, including those within others."""
     found, end = [], len(data) if end is None else end
     while start + 8 <= end:
         size, kind = struct.unpack(">I4s", data[start : start + 8])
@@ -39,7 +39,7 @@ def boxes_of(data: bytes, start: int = 0, end: int | None = None) -> list[Box]:
 
 
 def faulty_mp4(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """One to three faults in the boxes of an mp4 or mov."""
+    """Make one to three faults in the boxes of an mp4 or mov."""
     kind = dice.choice(
         (
             "field",
@@ -106,7 +106,7 @@ def _with_fault(data: bytes, kind: str, found: list[Box], dice: Random) -> bytes
 
 
 def with_tag(data: bytes, text: bytes, dice: Random) -> bytes:
-    """A title as telephones write it, behind everything else of the moov box."""
+    """Add a title at the end of the moov box, as telephones write it."""
     text = text[:65_000]
     title = struct.pack(">I4sHH", 12 + len(text), b"\xa9nam", len(text), dice.choice((0, 0x15C7, 0x55C4))) + text
     moov = next((box for box in boxes_of(data) if box[0] == b"moov"), None)
@@ -119,7 +119,7 @@ def with_tag(data: bytes, text: bytes, dice: Random) -> bytes:
 
 
 def faulty_stream(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """Faults in the first bytes, where any container says what it holds, or in between."""
+    """Make faults in the first bytes, where a container says what it holds, or in later ones."""
     kind = dice.choice(("head", "head", "head", "field", "field", "middle", "cut", "double", "remove"))
     for _ in range(dice.choice((1, 1, 3))):
         at = dice.randrange(max(1, len(data) if kind in ("middle", "double", "remove") else min(len(data), 512)))

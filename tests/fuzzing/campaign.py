@@ -1,4 +1,4 @@
-"""Cases over all targets, in several workers; what was found, by its cause, and a table."""
+"""Run cases over all targets in several workers, and collect the findings by cause in a table."""
 
 import contextlib
 import json
@@ -32,27 +32,27 @@ class Plan:
     only: list[str] | None = None
     workers: int = 1
     until: float | None = None
-    """Time of `time.monotonic` up to which further seeds follow; None for one seed."""
+    """Time of `time.monotonic` after which no further seed starts; None for one seed."""
     lines: int = 0
-    """Command lines, besides."""
+    """Number of command lines to run as well."""
     heavy: int = 0
-    """Command lines that take long."""
+    """Number of command lines that take long."""
     self_check: bool = False
-    """Find first that the fuzzers can fail."""
+    """Whether to check first that the fuzzers can fail."""
 
 
 @dataclass
 class Tally:
-    """Counts by format, and findings by cause."""
+    """Counts by format, and findings by cause, of a campaign."""
 
     outcomes: Counter[tuple[str, str]] = field(default_factory=Counter)
     findings: dict[str, list[Result]] = field(default_factory=dict)
     seconds: float = 0.0
-    """Longest of a mutated input."""
+    """Longest time of a mutated input, in seconds."""
     megabytes: float = 0.0
-    """Most that one took."""
+    """Most memory that a mutated input took, in megabytes."""
     missed: list[str] = field(default_factory=list)
-    """Faults that the self-check planted and the fuzzers did not find."""
+    """Planted faults that the fuzzers did not find in the self-check."""
 
     def add(self, result: Result) -> None:
         self.outcomes[result.format, result.outcome] += 1
@@ -62,7 +62,7 @@ class Tally:
             self.findings.setdefault(result.cause, []).append(result)
 
     def table(self) -> str:
-        """Figures by format, then causes with a case of each."""
+        """Return a table of the counts by format, then the causes with a case of each."""
         rows = ["| format | cases | refused | accepted | stopped | findings |", "|---|---|---|---|---|---|"]
         formats = [*dict.fromkeys(target.format for target in TARGETS.values()), LINES]
         total = Counter[str]()
@@ -88,7 +88,7 @@ def _row(name: str, counts: Counter[str]) -> str:
 
 
 def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
-    """Run a plan below a folder for everything that is made; findings are written as json lines as they come."""
+    """Run a plan; everything is made below `folder`. Findings are written as json lines as they come."""
     material = folder / "material"
     make_material_aside(material)
     tally, began = Tally(), time.monotonic()
@@ -118,7 +118,7 @@ def _made(path: Path) -> Path:
 
 
 def replay(case: str, folder: Path) -> Result:
-    """One case or command line again."""
+    """Run one case or command line again."""
     make_material_aside(folder / "material")
     if case.startswith((LIGHT, HEAVY)):
         return next(run_lines([case], folder / "worker", folder / "material"))
@@ -126,11 +126,11 @@ def replay(case: str, folder: Path) -> Result:
 
 
 Job = Callable[[], Iterator[Result]]
-"""Cases for a process of its own."""
+"""Job that runs its cases in a process of its own."""
 
 
 def _all_results(plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
-    """Command lines beside the cases of the first seed, then further seeds."""
+    """Yield the results of the command lines beside the cases of the first seed, then those of further seeds."""
     lines = [
         f"{name}:{plan.seed}:{n}" for name, count in ((LIGHT, plan.lines), (HEAVY, plan.heavy)) for n in range(count)
     ]
@@ -150,7 +150,7 @@ def _all_results(plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
 
 
 def _side_by_side(jobs: list[Job]) -> Iterator[Result]:
-    """Results of jobs in a process each, as they come."""
+    """Yield the results of jobs, each in a process of its own, as they come."""
     pipes, children = [], []
     for job in jobs:
         reading, writing = os.pipe()
@@ -172,7 +172,7 @@ def _side_by_side(jobs: list[Job]) -> Iterator[Result]:
     waiting = list(pipes)
     while waiting:
         for pipe in select.select(waiting, [], [])[0]:
-            # A line comes as a whole: less than a pipe holds, or its rest follows at once.
+            # A line arrives whole: it is shorter than a pipe's buffer, or its rest follows at once.
             if line := pipe.readline():
                 yield Result(**json.loads(line))
             else:
@@ -183,12 +183,12 @@ def _side_by_side(jobs: list[Job]) -> Iterator[Result]:
 
 
 def make_material_aside(material: Path) -> None:
-    """Whole files of every kind."""
+    """Write whole files of every kind, in another process."""
     _aside(lambda: make_material(material))
 
 
 def _aside(work: Callable[[], Any]) -> Any:
-    """Run `work` in its own process and return its result as json. This one stays without threads, to fork safely."""
+    """Run `work` in another process and return its result. This process starts no threads, so that it forks safely."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:

@@ -1,4 +1,4 @@
-"""Odd command lines over all sub-commands: options and values at edges, faulty workspaces, odd surroundings."""
+"""Make odd command lines for all sub-commands: values at edges, faulty workspaces, odd surroundings."""
 
 import dataclasses
 import importlib
@@ -39,7 +39,7 @@ HEAVY = (
     "bench render --seconds 0.001 --json", "bench scaling --seconds 0.001",
     "drive W --by videos/clip.mp4 --out o.mp4", "track W --face-model flame/tiny.npz",
 )  # fmt: skip
-"""These take longer than a case may; they are stopped then, and have to end as a stopped command does."""
+"""Commands that take longer than a case may. They are stopped, and must end as a stopped command does."""
 _NUMBERS = (
     "0", "1", "2", "3", "16", "0.5", "-1", "-0", "nan", "inf", "-inf", "1e400", "9" * 400, "9" * 5000, "2147483647",
     "2147483648", "4294967296", "9223372036854775808",
@@ -88,7 +88,7 @@ _SURROUNDINGS: dict[str, dict[str, Any]] = {
     "hung up": {"signal": 1},
 }
 AT_START = frozenset({"LANG=C", "ascii", "stdout closed", "stderr closed", "stdin closed", "few open files"})
-"""Variables that Python reads only when it starts. They need a new process."""
+"""Surroundings that matter only when Python starts, and so need a new process."""
 
 
 @dataclass
@@ -99,20 +99,20 @@ class Line:
     heavy: bool = False
     surroundings: dict[str, Any] = field(default_factory=dict)
     names: list[str] = field(default_factory=list)
-    """Names of the surroundings and of the faults in the workspace."""
+    """Names of the surroundings, and of the faults in the workspace."""
 
     @property
     def apart(self) -> bool:
-        """Whether it needs a process that is started, not forked."""
+        """Whether the line needs a new process instead of a fork."""
         return bool(AT_START & set(self.names))
 
     def text(self) -> str:
-        """For reports."""
+        """Return the line as a report shows it."""
         return ascii(f"mien {shlex.join(word[:200] for word in self.words)}  [{', '.join(self.names)}]")
 
 
 def make_line(place: Place, dice: Random, heavy: bool) -> Line:
-    """A line of any sub-command; may make files in the place's folder faulty."""
+    """Make a line for any sub-command. It may also make files in the place's folder faulty."""
     line = Line(shlex.split(dice.choice(HEAVY if heavy else BASES)), heavy)
     if dice.random() < 0.05:
         line.words = [dice.choice((*COMMANDS, "rendr", "", "--version", "-h", "\x1b[31m")), *line.words[1:]]
@@ -125,7 +125,7 @@ def make_line(place: Place, dice: Random, heavy: bool) -> Line:
     if dice.random() < 0.05:
         line.words.append(dice.choice(("--help", "--help-all", "-h", "--", "--x", "--out", "--out=", "--OUT=a.png")))
     line.words = [word.replace(PORT, str(place.port)).replace("@CANARY@", str(place.canary)) for word in line.words]
-    # What a shell cannot hand over is no command line: null bytes, and lone surrogates other than those of bytes.
+    # A shell cannot pass null bytes, nor lone surrogates other than those of bytes.
     line.words = [word.replace("\x00", "").replace("\ud800", "\udcff") for word in line.words]
     if dice.random() < 0.4:
         name = dice.choice(list(_SURROUNDINGS))
@@ -140,7 +140,7 @@ def make_line(place: Place, dice: Random, heavy: bool) -> Line:
 
 
 def options_of(command: str) -> Iterator[tuple[str, Any]]:
-    """All options of a sub-command with their types, as tyro makes them of its classes."""
+    """Return all options of a sub-command with their types, as tyro derives them from its classes."""
     yield from _options(importlib.import_module(f"mien.commands.{command.replace('-', '_')}").Command, "")
 
 

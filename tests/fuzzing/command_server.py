@@ -1,7 +1,7 @@
-"""Runs command lines in processes that are forked off one that has imported everything: as real ones, but at once.
+"""Run command lines in forks of a process that has imported everything, so that they start at once.
 
-Reads a request as a line of json, forks, and answers with the process's number, then with how it ended. The child
-comes back to the bottom of this file, so that it ends as any Python program does: with what is flushed at the end.
+A request is a line of json. The server forks, and answers with the process's number and then with its exit. The child
+returns to the bottom of this file, so that it ends as any Python program does, with its output flushed.
 """
 
 import os
@@ -16,7 +16,7 @@ from typing import Any
 
 
 def apply_limits(request: dict[str, Any]) -> None:
-    """Limits and streams of a request, in the process that is to run it."""
+    """Set the limits and streams of a request in the process that will run it."""
     os.setpgid(0, 0)
     os.chdir(request["folder"])
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -43,7 +43,7 @@ def _broken_pipe() -> None:
 
 
 def prepare(request: dict[str, Any]) -> None:
-    """Become the process that a request asks for."""
+    """Turn this process into the one that a request asks for."""
     os.environ.clear()
     os.environ.update(request["env"])
     broken = request["stdout"] == "broken"
@@ -54,7 +54,7 @@ def prepare(request: dict[str, Any]) -> None:
 
 
 def _serve() -> bool:
-    """Answer requests; true in a child, which has become what was asked for."""
+    """Answer requests. Return True in a child, which has become the requested process."""
     requests, answers = os.fdopen(os.dup(0), "rb"), os.dup(1)
     while line := requests.readline():
         child = os.fork()

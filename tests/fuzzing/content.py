@@ -1,4 +1,4 @@
-"""Converts a read object to values that can be compared and searched."""
+"""Convert what was read to values that can be compared and searched."""
 
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 def content_of(value: Any) -> Any:
-    """A value as something that can be compared."""
+    """Return a value in a form that can be compared."""
     if isinstance(value, nn.Module):
         return content_of(dict(value.state_dict()))
     if isinstance(value, Tensor):
@@ -23,7 +23,7 @@ def content_of(value: Any) -> Any:
 
 
 def expect_finite(value: Any, path: str = "") -> None:
-    """Every number in arrays, lists and classes is finite, apart from those that say that something is not known."""
+    """Check that all numbers in a value are finite, except for those where NaN means that something is unknown."""
     if path.rpartition(".")[2] in _MAY_BE_NAN:
         return
     if isinstance(value, nn.Module):
@@ -59,4 +59,4 @@ _MAY_BE_NAN = frozenset(
         "settings",
     }
 )
-"""Names of values that may be NaN: a face was not found, or the value is only shown."""
+"""Names of values that may be NaN, because a face was not found or the value is only shown."""

@@ -1,4 +1,4 @@
-"""Values at edges: the numbers and texts that break readers."""
+"""Choose values at edges: numbers and texts that break readers."""
 
 import math
 from random import Random
@@ -11,11 +11,11 @@ INTEGERS = (
 )  # fmt: skip
 FLOATS = (math.nan, math.inf, -math.inf, 3e38, -3e38, 3.5e38, 1e308, 1e-320, -0.0, 0.5, 1e16, 1e-9, 1e30, -1e30)
 CANARY, PORT = "@CANARY@", "@PORT@"
-"""Replaced by the folder that nothing may be written into, and by the port that nothing may connect to."""
+"""Placeholders for the folder that nothing may be written into, and for the port that nothing may connect to."""
 DEEP = "@DEEP"
-"""Replaced by brackets, so many deep as the digits behind it say."""
+"""Placeholder for nested brackets; the digits after it give the depth."""
 SCRIPT = "<script>mien_fuzz(1)</script>"
-"""Has to be escaped in every report."""
+"""Text that must be escaped in every report."""
 TEXTS = (
     "", " ", "text", "0", "nan", "null", "x" * 300, "x" * 100_000, "a\nb", "\x1b]0;own\x07\x1b[31mred", "a\x00b",
     "\u202eabc",
@@ -28,17 +28,17 @@ _DEPTHS = (2, 100, 500, 990, 1000, 5000, 100_000)
 
 
 def edge_integer(dice: Random) -> int:
-    """A whole number at an edge, or beside one."""
+    """Return a whole number at an edge, or beside one."""
     return dice.choice(INTEGERS) + dice.choice((0, 0, 0, 1, -1))
 
 
 def edge_number(dice: Random) -> int | float:
-    """A number at an edge."""
+    """Return a number at an edge."""
     return edge_integer(dice) if dice.random() < 0.5 else dice.choice(FLOATS)
 
 
 def edge_value(dice: Random) -> Any:
-    """Anything that json can hold, at an edge."""
+    """Return a json value at an edge."""
     kind = dice.randrange(8)
     if kind < 3:
         return edge_number(dice)
@@ -52,11 +52,11 @@ def edge_value(dice: Random) -> Any:
 
 
 def packed_integer(dice: Random, size: int, order: str = "little") -> bytes:
-    """An edge as an unsigned field of so many bytes."""
+    """Return an edge as an unsigned field of this many bytes."""
     value = edge_integer(dice) if dice.random() < 0.8 else dice.getrandbits(8 * size)
     return (value % (1 << 8 * size)).to_bytes(size, "little" if order == "little" else "big")
 
 
 def put(data: bytes, at: int, field: bytes) -> bytes:
-    """`data` with some bytes replaced."""
+    """Return `data` with some bytes replaced."""
     return data[:at] + field + data[at + len(field) :]

@@ -1,4 +1,4 @@
-"""Faults by kind of file: what a case does to its copies before they are read."""
+"""Make faults by kind of file: each changes the copies of a case before they are read."""
 
 import json
 import os
@@ -18,7 +18,7 @@ from fuzzing.tensor_faults import faulty_tensors, split
 from fuzzing.text_faults import faulty_ply, faulty_table, playlist
 
 DAMAGE = "damage"
-"""Name of the faults that a checksum has to notice."""
+"""Name of the faults that a checksum must notice."""
 _REPAIRED, _WITHOUT = 0.75, 0.9
 """Shares of faulty json files with a corrected checksum, and with a corrected checksum or none."""
 
@@ -28,20 +28,20 @@ class Place:
     """Folder and file of a case. `file` changes if the file is renamed."""
 
     root: Path
-    """The copies."""
+    """Folder with the copies."""
     file: Path
     canary: Path
-    """Outside: nothing may be written there."""
+    """Folder outside of the copies, into which nothing may be written."""
     port: int
     """Port of this machine to which nothing may connect."""
 
     def filled(self, data: bytes) -> bytes:
-        """Bytes with the names of folder and port for their placeholders."""
+        """Return the bytes with the placeholders of folder and port replaced."""
         return data.replace(CANARY.encode(), os.fsencode(self.canary)).replace(PORT.encode(), str(self.port).encode())
 
 
 def faulty_file(place: Place, dice: Random) -> str:
-    """Damage without repair, another thing in its place, or a fault of its format with everything made right around."""
+    """Damage a file, put something else in its place, or make a fault of its format with correct checksums."""
     chance = dice.random()
     if chance < 0.12:
         place.file.write_bytes(flip_or_cut(place.file.read_bytes(), dice))
@@ -52,22 +52,22 @@ def faulty_file(place: Place, dice: Random) -> str:
 
 
 def faulty_without_damage(place: Place, dice: Random) -> str:
-    """As `faulty_file`, for what may be read from elsewhere."""
+    """Make a fault as `faulty_file` does, but no unrepaired damage, for files that may also be read from elsewhere."""
     return faulty_place(place, dice) if dice.random() < 0.5 else faulty_format(place, dice)
 
 
 def faulty_place(place: Place, dice: Random) -> str:
-    """Something else where the file is."""
+    """Put something else where the file is."""
     return "place: " + place_faults.faulty_place(place.file, place.canary, dice)
 
 
 def any_fault(place: Place, dice: Random) -> str:
-    """Any of them."""
+    """Make any fault."""
     return faulty_place(place, dice) if place.file.is_dir() or dice.random() < 0.4 else faulty_format(place, dice)
 
 
 def faulty_format(place: Place, dice: Random) -> str:
-    """A fault of the file's own format."""
+    """Make a fault of the file's own format."""
     if place.file.suffix == ".partial":
         return faulty_lines(place, dice)
     data, suffix = place.file.read_bytes(), place.file.suffix
@@ -84,7 +84,7 @@ def faulty_format(place: Place, dice: Random) -> str:
 
 
 def faulty_portable(place: Place, dice: Random) -> str:
-    """A fault in a .mien file: in its arrays, its content, or the entry around that."""
+    """Make a fault in a .mien file: in its arrays, in its content, or in the entry around the content."""
     if dice.random() < 0.25:
         return faulty_file(place, dice)
     data = place.file.read_bytes()
@@ -123,7 +123,7 @@ def _faulty_json_file(data: bytes, dice: Random) -> tuple[str, bytes]:
 
 
 def faulty_lines(place: Place, dice: Random) -> str:
-    """A fault in one of the json lines of a file, or in its place."""
+    """Make a fault in one of the json lines of a file, or in its place."""
     if dice.random() < 0.2:
         return faulty_place(place, dice)
     lines = place.file.read_bytes().splitlines()
@@ -140,7 +140,7 @@ def faulty_lines(place: Place, dice: Random) -> str:
 
 
 def write_playlist(place: Place, dice: Random) -> str:
-    """A list of other files under a video's name."""
+    """Write a list of other files under a video's name."""
     kind, ending, data = playlist("clip.mp4", dice)
     clip = place.canary / "clip.mp4"
     if not clip.exists():
@@ -151,7 +151,7 @@ def write_playlist(place: Place, dice: Random) -> str:
 
 
 def rename(place: Place, dice: Random) -> str:
-    """An odd name."""
+    """Give the file an odd name."""
     place.file = place_faults.rename_oddly(place.file, dice, place.port)
     return ascii(place.file.stem)[:30]
 

@@ -1,4 +1,4 @@
-"""Faults in json: values at edges, entries that are missing, doubled, renamed or of another type; and in its text."""
+"""Make faults in json: edge values; missing, doubled, renamed or mistyped entries; and faults of its text."""
 
 import json
 import re
@@ -9,11 +9,11 @@ from typing import Any
 from fuzzing.edges import DEEP, TEXTS, edge_number, edge_value
 
 Place = tuple[Any, Any]
-"""A container and the key or index of one of its entries."""
+"""Container, and the key or index of one of its entries."""
 
 
 def places(value: Any) -> Iterator[Place]:
-    """All entries of all containers."""
+    """Return all entries of all containers."""
     keys = list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
     for key in keys:
         yield value, key
@@ -21,7 +21,7 @@ def places(value: Any) -> Iterator[Place]:
 
 
 def faulty_json(value: Any, dice: Random) -> tuple[str, Any]:
-    """One to three faults in a copy of a json value, and their names."""
+    """Make one to three faults in a copy of a json value, and return it with their names."""
     changed = json.loads(json.dumps(value))
     names = []
     for _ in range(dice.choice((1, 1, 1, 2, 3))):
@@ -42,7 +42,7 @@ _FAULTS = (
 
 
 def _picked(found: list[Place], dice: Random) -> Place:
-    """Entries near the top as often as the many numbers in the depth."""
+    """Choose a place; entries near the top are as likely as the many numbers further down."""
     container, key = dice.choice(found)
     if isinstance(container, list) and len(container) > 3 and dice.random() < 0.5:
         outer = [place for place in found if isinstance(place[0], dict)]
@@ -90,7 +90,7 @@ def _of_another_type(old: Any) -> Any:
 
 
 def written(value: Any, dice: Random) -> bytes:
-    """A json value as bytes; what json cannot say is put into the text."""
+    """Return a json value as bytes, including values that json cannot express."""
     text = json.dumps(value, indent=dice.choice((None, 1)), ensure_ascii=dice.random() < 0.5)
     if dice.random() < 0.7:
         text = text.replace("Infinity", "1e999")
@@ -98,12 +98,12 @@ def written(value: Any, dice: Random) -> bytes:
 
 
 def nested(depth: int) -> str:
-    """Brackets in brackets."""
+    """Return brackets nested in brackets."""
     return "[" * depth + "]" * depth
 
 
 def faulty_text(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """A fault in json's text that no value has."""
+    """Make a fault in the text of a json file that no value can express."""
     text = data.decode("utf-8", "replace")
     numbers = list(re.finditer(r"-?[0-9.]+(e-?[0-9]+)?", text))
     kind = dice.choice(("literal", "literal", "twice", "tail", "encoding", "deep", "quotes", "bytes", "comment"))

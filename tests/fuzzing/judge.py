@@ -1,4 +1,4 @@
-"""One case from its fault to its judgement, in a process of its own or one that others went before in."""
+"""Run one case from its fault to its verdict, in a fresh process or after other cases."""
 
 import contextlib
 import hashlib
@@ -28,11 +28,11 @@ from mien import cli
 from mien.errors import UserError
 
 SECONDS = 20.0
-"""Longest that a case may take."""
+"""Longest time that a case may take, in seconds."""
 MEMORY = 2 << 30
 """Most bytes that a case may hold."""
 LIMIT = 5 << 30
-"""Bytes beyond which the system refuses: more than may be held, so that it is seen who would take them."""
+"""Bytes beyond which the system refuses. It is more than `MEMORY`, so that cases that would take them are seen."""
 LARGEST_FILE = 4 << 30
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e]")
 _INNER = ("site-packages", "fuzzing/", "lib/python")
@@ -58,15 +58,15 @@ class Bench:
 
     @property
     def told(self) -> Path:
-        """File of what the case prints."""
+        """File with the output of the case."""
         return self.folder / "told.txt"
 
     def patience(self) -> float:
-        """Seconds after which a case hangs: longer where others keep the machine busy."""
+        """Return the seconds after which a case hangs; they are longer if others keep the machine busy."""
         return self.seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1) - 1)
 
     def prepare(self) -> None:
-        """Fresh folders, and an environment in which nothing of the user's is touched."""
+        """Make fresh folders, and an environment that keeps the user's own files out of reach."""
         shutil.rmtree(self.folder, ignore_errors=True)
         for name in ("home", "here", "tmp"):
             (self.folder / name).mkdir(parents=True)
@@ -83,29 +83,29 @@ class Result:
     """Verdict on a case."""
 
     case: str
-    """TARGET:SEED:NUMBER."""
+    """Name of the case: TARGET:SEED:NUMBER."""
     format: str
     kind: str = ""
     """Kind of the fault."""
     outcome: str = ""
-    """refused, accepted, or finding."""
+    """Outcome: refused, accepted or finding."""
     findings: list[str] = field(default_factory=list)
     message: str = ""
     cause: str = ""
-    """Name of the origin, which findings of the same origin share."""
+    """Name of the cause; findings with the same origin share it."""
     traceback: list[str] = field(default_factory=list)
     seconds: float = 0.0
     megabytes: float = 0.0
-    """Most memory beyond what the process had before."""
+    """Most memory beyond the process's own at the start."""
     confirmed: bool | None = None
-    """Whether it came again in a process of its own."""
+    """Whether the finding was repeated in a process of its own."""
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
 
 
 def limit_this_process() -> None:
-    """Limits that hold for all cases of a process."""
+    """Set the limits that hold for all cases of a process."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST_FILE, LARGEST_FILE))
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
@@ -113,7 +113,7 @@ def limit_this_process() -> None:
 
 
 def run_case(case: str, bench: Bench, listener: socket.socket, expected: Callable[[Target, Path], Any]) -> Result:
-    """Make a fault, read, use, and judge."""
+    """Make a fault, read the file, use the result, and judge."""
     name, seed, number = case.rsplit(":", 2)
     target, dice = TARGETS[name], Random(case)
     result = Result(case, target.format)
@@ -150,7 +150,7 @@ def run_case(case: str, bench: Bench, listener: socket.socket, expected: Callabl
 
 
 def snapshot(bench: Bench, home: bool = True) -> dict[str, Any]:
-    """All that lies outside of the copies, with the home folder or without."""
+    """Return the state of everything outside of the copies, with or without the home folder."""
     found: dict[str, Any] = {}
     for folder in (bench.canary, bench.folder / "here", *([bench.folder / "home"] if home else [])):
         for path in sorted([folder, *folder.rglob("*")]):
@@ -175,7 +175,7 @@ def judge_traces(
     home: bool = True,
     slow: bool = True,
 ) -> None:
-    """Whether anything was left, written outside, called, printed."""
+    """Add findings if the case left files, wrote outside, opened a connection or printed control characters."""
     if (after := snapshot(bench, home)) != before:
         changed = sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path))
         result.findings.append("outside")
@@ -210,7 +210,7 @@ def judge_traces(
 def _faults_of_message(message: str, root: str) -> list[str]:
     printed = io.StringIO()
     with contextlib.redirect_stderr(printed):
-        cli._complain(message)  # what reaches the terminal counts: names are made harmless there
+        cli._complain(message)  # what reaches the terminal counts, where names are made harmless
     line = printed.getvalue().removesuffix("\n")
     lines = "message" if "\n" in line or _CONTROL.search(line) else ""
     nameless = "nameless" if root not in message else ""
@@ -234,7 +234,7 @@ def _add_traceback(result: Result, error: BaseException) -> None:
 
 
 def _forget_peak() -> int:
-    """Begin a new peak of this process's memory; returns what it holds."""
+    """Reset the recorded peak of this process's memory, and return what it holds now."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
     return _status("VmRSS")

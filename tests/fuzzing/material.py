@@ -1,4 +1,4 @@
-"""One whole file of each kind that mien writes or is given, to make faulty copies of."""
+"""Write one whole file of each kind that mien writes or reads, to make faulty copies of."""
 
 import contextlib
 import json
@@ -32,7 +32,7 @@ QUICK = EvaluationSettings(perceptual=False, video_frames=0)
 
 
 def make_material(root: Path) -> None:
-    """Write everything below the folder `root`; the same bytes every time on one machine."""
+    """Write everything below `root`, with the same bytes every time on one machine."""
     root.mkdir(parents=True, exist_ok=True)
     write_toy_workspace(root / "W")
     _evaluate_and_keep_the_partial_file(root)
@@ -43,7 +43,7 @@ def make_material(root: Path) -> None:
     _write_pictures(root / "pictures")
     write_what_users_give(root / "given", cv2.imread(str(root / "pictures/a.png")))  # type: ignore[arg-type]
     _write_face_models(root / "cache" / "face_models" / "added")
-    load_face_model("anny")  # baked once: a command that had to do so would look like one that hangs
+    load_face_model("anny")  # baked here once, since a command that bakes looks like one that hangs
     for file in (cache_folder() / "face_models").glob("*.*"):
         shutil.copy(file, root / "cache" / "face_models")
     (root / "flame").mkdir()
@@ -76,7 +76,7 @@ def _write_pictures(folder: Path) -> None:
 
 
 def _write_face_models(folder: Path) -> None:
-    """As `mien face-models --add` leaves one."""
+    """Write a face model as `mien face-models --add` leaves it."""
     bare = toy_face_model()
     marks = Landmarks(torch.arange(478) % len(bare.faces), torch.full((478, 3), 1 / 3))
     model = replace(bare, name="mine", landmarks={"mediapipe": marks})
@@ -86,7 +86,7 @@ def _write_face_models(folder: Path) -> None:
 
 
 def tiny_flame() -> dict[str, np.ndarray]:
-    """A head of two hundred vertices in FLAME's schema: an egg, two eyeballs; four identities, three expressions."""
+    """Return a head of 200 vertices in FLAME's schema: an egg with two eyeballs, four identities, three expressions."""
     dice = np.random.default_rng(0)
     egg, egg_faces = _ball(14, 12)
     ball, ball_faces = _ball(6, 5)
@@ -126,7 +126,7 @@ def _ball(around: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _write_videos(folder: Path) -> None:
-    """Six small pictures in every container that the codecs here can fill."""
+    """Write six small pictures into every container that the codecs here can fill."""
     folder.mkdir()
     noise = np.random.default_rng(0).integers(0, 255, (6, 48, 64, 3), dtype=np.uint8)
     for ending in ("mp4", "mov", "mkv", "avi", "ts", "flv", "webm"):
@@ -136,7 +136,7 @@ def _write_videos(folder: Path) -> None:
 
 
 def copy_of(material: Path, parts: tuple[str, ...], root: Path) -> None:
-    """Fresh copies of some parts of the material."""
+    """Make fresh copies of some parts of the material."""
     root.mkdir(parents=True)
     for part in parts:
         source, target = material / part, root / part

@@ -1,4 +1,4 @@
-"""A valid call of every native function, small and random: what `native_calls.py` makes invalid."""
+"""Make a valid call of every native function, small and random, for `native_calls.py` to mutate."""
 
 from typing import Any
 
@@ -48,7 +48,7 @@ Sizes = tuple[int, int, int]
 
 
 def sizes_of_face(rng: Rng) -> Sizes:
-    """Vertices, expressions, free joints (the first joint is not free)."""
+    """Return the numbers of vertices, expressions and free joints (the first joint is not free)."""
     return int(rng.choice([3, 15, 16, 50])), int(rng.integers(0, 6)), int(rng.integers(0, 4))
 
 
@@ -102,11 +102,11 @@ def compose_rigid_backward(native: Any, rng: Rng) -> Arguments:
 # Rigs
 
 FRAME = 20
-"""Numbers of a triangle's frame (TRIANGLE_FRAME_FLOATS)."""
+"""Number of floats in a triangle's frame (TRIANGLE_FRAME_FLOATS)."""
 
 
 def rig(rng: Rng, v: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """faces, face_index, and local means, quats, log_scales."""
+    """Return faces, face_index, and local means, quats and log_scales."""
     f, n = few(rng), few(rng)
     return below(rng, v, f, 3), below(rng, f, n), [normal(rng, n, 3), normal(rng, n, 4), normal(rng, n, 3)]
 
@@ -250,4 +250,4 @@ BASELINES: dict[str, Baseline] = {
     "rasterize_isa": lambda native, rng: [],
     "set_rasterize_isa": lambda native, rng: [str(rng.choice(["avx512", "avx2", "sse4", "baseline", ""]))],
 }  # fmt: skip
-"""By name: what makes the positional arguments of a valid call."""
+"""Functions that make the positional arguments of a valid call, by the name of the native function."""

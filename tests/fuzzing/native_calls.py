@@ -1,11 +1,11 @@
-"""Calls every native function with mutated arguments, under AddressSanitizer and UndefinedBehaviorSanitizer.
+"""Call every native function with mutated arguments, under AddressSanitizer and UndefinedBehaviorSanitizer.
 
     make fuzz-native CALLS=50000 SEED=1
 
 Each call is a valid one (`native_baselines.py`) with one to three arguments changed: shapes, types, strides, alignment,
 indices, integers at the edges, NaN, objects of other calls. An error in Python is fine, as long as it is one of
-`REFUSALS`; a report of a sanitizer, a signal or 20 seconds of silence is a finding, printed with the command that runs
-that call alone. Every call has its own random numbers, from seed and number.
+`REFUSALS`. A report of a sanitizer, a signal or 20 seconds of silence is a finding, and is printed with the command
+that runs that call alone. Every call has its own random numbers, which depend on the seed and the call's number.
 """
 
 import argparse
@@ -30,18 +30,18 @@ REFUSALS = (TypeError, ValueError, IndexError, OverflowError, MemoryError, Buffe
 SECONDS_A_CALL = 20
 MOST_FINDINGS = 20
 SETTINGS_FOR = 50
-"""Calls that share a number of threads and an instruction set."""
+"""Number of consecutive calls with the same number of threads and the same instruction set."""
 INTEGERS = [0, 1, -1, 2, 3, 15, 255, 2**15, 2**16, 2**24, 2**31 - 1, 2**31 - 2, 2**31, -(2**31), 2**32, 2**62]
 INTEGERS += [2**63 - 1, -(2**63), 2**63, 2**64, 10**30]
 FLOATS = [0.0, -0.0, 1.0, -1.0, 1e-45, 1e-30, 1e30, 3.4e38, 1e300, float("inf"), float("-inf"), float("nan")]
 DTYPES = ["f4", "f8", "f2", "i4", "i8", "u1", "u4", "?", "c8", ">f4", "O", "U3"]
 LENGTHS = [0, 1, 2, 3, 4, 7, 64]
 STRANGERS = ["ride_backward", "rasterize_views_backward", "align_mesh", "pose_face"]
-"""Between them they take every class."""
+"""Functions whose arguments are passed to others. Together they take every class."""
 
 
 def load(path: str) -> Any:
-    """The native module from a file, without the package around it; what asks for torch gets a stand-in."""
+    """Load the native module from a file, without the package around it. Stand-ins replace its imports from torch."""
     dlpack = types.ModuleType("torch.utils.dlpack")
     dlpack.__dict__["from_dlpack"] = lambda exported: exported
     sys.modules |= {"torch": types.ModuleType("torch"), "torch.utils": types.ModuleType("torch.utils")}
@@ -61,7 +61,7 @@ def bound_names(native: Any) -> set[str]:
     return {name for name, one in named.items() if callable(one) and not hasattr(one, "_fields")} - made
 
 
-# Arguments are lists, tuples and what is in them; a place in them is a path of indices.
+# Arguments are lists and tuples with their content; a place in them is a path of indices.
 
 
 def places(value: Any, path: tuple[int, ...] = ()) -> list[tuple[int, ...]]:
@@ -94,7 +94,7 @@ def put(value: Any, path: tuple[int, ...], new: Any) -> Any:
 
 
 def other_shape(rng: Rng, array: np.ndarray) -> np.ndarray:
-    """The same numbers, repeated or cut, in another shape; or no numbers in a huge one."""
+    """Return the same numbers, repeated or cut, in another shape, or no numbers in a huge one."""
     shape, kind = list(array.shape), rng.integers(0, 6)
     axis = int(rng.integers(0, max(len(shape), 1)))
     if kind == 0 or not shape:
@@ -118,7 +118,7 @@ def other_shape(rng: Rng, array: np.ndarray) -> np.ndarray:
 
 
 def other_layout(rng: Rng, array: np.ndarray) -> Any:
-    """The same values elsewhere in memory: strided, broadcast, read-only, unaligned, or as a capsule."""
+    """Return the same values elsewhere in memory: strided, broadcast, read-only, unaligned, or as a capsule."""
     kind = rng.integers(0, 8)
     if kind == 0 and array.ndim:
         return np.repeat(array, 2, axis=-1)[..., ::2]
@@ -141,7 +141,7 @@ def other_layout(rng: Rng, array: np.ndarray) -> Any:
 
 
 def other_values(rng: Rng, array: np.ndarray) -> np.ndarray:
-    """A copy with some numbers from the edges."""
+    """Return a copy with some numbers from the edges."""
     array = array.copy()
     if array.size == 0 or array.dtype.kind not in "fiu":
         return array
@@ -171,12 +171,12 @@ def changed_array(rng: Rng, array: np.ndarray) -> Any:
             same_size = array.itemsize == np.dtype(name).itemsize != 8
             return array.view(name) if same_size else np.zeros(array.shape, name)
         return other_values(rng, array)
-    except (MemoryError, BufferError, TypeError, ValueError):  # numpy's own refusal: nothing of ours
+    except (MemoryError, BufferError, TypeError, ValueError):  # numpy refuses this itself
         return array
 
 
 def changed(rng: Rng, value: Any) -> Any:
-    """Another value of about the same kind."""
+    """Return another value of about the same kind."""
     if isinstance(value, np.ndarray):
         return changed_array(rng, value)
     if isinstance(value, list | tuple) and value:
@@ -203,20 +203,20 @@ def is_whole(value: Any) -> bool:
 
 
 def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
-    """One to three places changed; some get what belongs elsewhere, in this call or in another."""
+    """Change one to three arguments. Some get a value from elsewhere in this call or from another call."""
     for _ in range(int(rng.integers(1, 4))):
         paths = places(arguments)
         if not paths or rng.random() < 0.03:
             arguments = changed(rng, arguments) if arguments else [None]
             continue
-        if rng.random() < 0.4:  # what indexes and counts
+        if rng.random() < 0.4:  # prefer indices and counts
             paths = [path for path in paths if is_whole(at(arguments, path))] or paths
         path, kind = paths[int(rng.integers(0, len(paths)))], rng.random()
         if kind < 0.75:
             new = changed(rng, at(arguments, path))
         elif kind < 0.83:
             new = at(arguments, paths[int(rng.integers(0, len(paths)))])
-        elif kind < 0.95:  # of the same kind, but another call's
+        elif kind < 0.95:  # the same type, but from another call
             value = at(arguments, path)
             stranger = BASELINES[str(rng.choice(STRANGERS))](native, rng)
             alike = [own for own in places(stranger) if isinstance(at(stranger, own), type(value))]
@@ -231,7 +231,7 @@ def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
 
 
 def run_call(native: Any, seed: int, number: int) -> tuple[str, str]:
-    """The function's name, and what came of it."""
+    """Make one call, and return the function's name and the outcome."""
     names = sorted(BASELINES)
     name, rng = names[number % len(names)], np.random.default_rng((seed, number))
     arguments = BASELINES[name](native, rng)
@@ -248,8 +248,8 @@ def run_call(native: Any, seed: int, number: int) -> tuple[str, str]:
 
 
 def child(path: str, seed: int, first: int, last: int, log: Path) -> None:
-    """Runs calls first .. last - 1; the log's last line is unfinished where one ends the process."""
-    warnings.simplefilter("ignore")  # of objects that were never made
+    """Run the calls from `first` to `last` - 1. If a call ends the process, the last line of the log is incomplete."""
+    warnings.simplefilter("ignore")  # numpy warns of objects that were never made
     native = load(path)
     assert bound_names(native) == set(BASELINES), bound_names(native) ^ set(BASELINES)
     assert native.TRIANGLE_FRAME_FLOATS == 20
@@ -267,7 +267,7 @@ def child(path: str, seed: int, first: int, last: int, log: Path) -> None:
 
 
 def environment() -> dict[str, str]:
-    """The sanitizer has to be there before everything else, and to find what throws exceptions."""
+    """Return an environment in which the sanitizer is loaded first and finds what throws exceptions."""
 
     def found(library: str) -> str:
         command = [os.environ.get("CXX", "g++"), f"-print-file-name={library}"]

@@ -1,4 +1,4 @@
-"""Valid calls of the native functions on meshes, and what every baseline is made of."""
+"""Make valid calls of the native functions on meshes, and the parts of all baselines."""
 
 from collections.abc import Callable
 from typing import Any
@@ -28,7 +28,7 @@ def few(rng: Rng) -> int:
 
 
 def picture(rng: Rng) -> tuple[int, int]:
-    """Height and width."""
+    """Return height and width of a picture."""
     return int(rng.choice([1, 3, 8, 33, 64])), int(rng.choice([6, 7, 16, 31, 65]))
 
 
@@ -36,7 +36,7 @@ VIEW = np.diag([1, -1, -1, 1]).astype(F32)
 
 
 def camera(rng: Rng, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """K and viewmat of a camera 3 units before the origin."""
+    """Return K and viewmat of a camera 3 units in front of the origin."""
     focal = float(width)
     viewmat = VIEW.copy()
     viewmat[2, 3] = 3

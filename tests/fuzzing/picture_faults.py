@@ -1,4 +1,4 @@
-"""Faults in pictures: sizes, lengths, types and order of what PNG, JPEG, WebP, TIFF and BMP are made of."""
+"""Make faults in pictures: in sizes, lengths, types and order of the parts of PNG, JPEG, WebP, TIFF and BMP."""
 
 import struct
 import zlib
@@ -12,7 +12,7 @@ _SIDES = (0, 1, 2, 31, 33, 255, 4096, 20_000, 65_535, 2**20, 2**31 - 1, 2**31, 2
 
 
 def faulty_picture(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """One fault in a picture of whatever format."""
+    """Make one fault in a picture of any format."""
     for start, fault in _FORMATS.items():
         if data.startswith(start):
             return fault(data, dice)
@@ -20,7 +20,7 @@ def faulty_picture(data: bytes, dice: Random) -> tuple[str, bytes]:
 
 
 def chunks_of(data: bytes) -> list[tuple[bytes, bytes]]:
-    """Names and contents of a PNG's chunks."""
+    """Return the names and contents of a PNG's chunks."""
     found, at = [], 8
     while at + 12 <= len(data):
         size = int.from_bytes(data[at : at + 4], "big")
@@ -30,7 +30,7 @@ def chunks_of(data: bytes) -> list[tuple[bytes, bytes]]:
 
 
 def png_of(chunks: list[tuple[bytes, bytes]]) -> bytes:
-    """A PNG of any chunks, with their checksums right."""
+    """Return a PNG with these chunks and correct checksums."""
     parts = [
         struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body)) for name, body in chunks
     ]
@@ -38,7 +38,7 @@ def png_of(chunks: list[tuple[bytes, bytes]]) -> bytes:
 
 
 def zeros(amount: int) -> bytes:
-    """A zlib stream of so many zeros, a thousandth as long, made in a moment; its checksum is wrong."""
+    """Return a zlib stream of this many zeros, a thousandth as long and quickly made. Its checksum is wrong."""
     pack = zlib.compressobj(9, zlib.DEFLATED, -15)
     block = pack.compress(bytes(1 << 20)) + pack.flush(zlib.Z_FULL_FLUSH)
     return b"\x78\x9c" + block * (amount >> 20) + b"\x03\x00" + bytes(4)
@@ -136,7 +136,7 @@ def _faulty_jpeg(data: bytes, dice: Random) -> tuple[str, bytes]:
 
 
 def _faulty_fields(places: tuple[int, ...], sizes: tuple[int, ...]) -> Fault:
-    """Faults in little-endian fields at fixed places of a header, and in whatever follows."""
+    """Make faults in little-endian fields at fixed places of a header, and in the bytes after it."""
 
     def faulty(data: bytes, dice: Random) -> tuple[str, bytes]:
         kind = dice.choice(("field", "field", "field", "field", "body", "end"))

@@ -1,4 +1,4 @@
-"""A small tracking that was stopped: its finished pieces, and going on from them."""
+"""Make a small tracking that was stopped, with its finished pieces, and continue it."""
 
 import pickle
 from pathlib import Path
@@ -15,7 +15,7 @@ _TIMESTEPS = 4
 
 
 def write_pieces(folder: Path) -> None:
-    """Every piece of a tracking, none dropped, and the capture that it is of (for this process's children alone)."""
+    """Write every piece of a tracking, none of them dropped, and its capture (for children of this process only)."""
     torch.set_num_threads(1)
     capture = make_photometric_case(_TIMESTEPS).capture
     drop, forget = StageCache.drop, StageCache.forget
@@ -28,6 +28,6 @@ def write_pieces(folder: Path) -> None:
 
 
 def go_on(folder: Path) -> None:
-    """Track on from the pieces in a folder."""
+    """Continue a tracking from the pieces in a folder."""
     capture = pickle.loads((folder / "capture.pickle").read_bytes())
     track_subject([capture], make_textured_model(), SETTINGS, folder)

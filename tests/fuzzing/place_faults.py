@@ -1,4 +1,4 @@
-"""Faults in what lies where: files that are missing, folders, links, pipes, devices, swapped, huge; and odd names."""
+"""Make faults in places: files that are missing, folders, links, pipes, devices, swapped, huge; and odd names."""
 
 import os
 import shutil
@@ -9,7 +9,7 @@ from random import Random
 from fuzzing.edges import DEEP, PORT
 
 SPARSE = 3 << 30
-"""Bytes of a file that takes no room on the disk."""
+"""Size in bytes of a file that takes no room on the disk."""
 NAMES = (
     "take:1", "http:x", f"http:127.0.0.1:{PORT}", "file:x", "concat:a|b", "pipe:1", "data:,x", "-", "--help", "-i",
     "a b", " ", "...", "%d", "%06d", "%s%n",
@@ -18,11 +18,11 @@ NAMES = (
     "a'b", 'a"b', "\\", "@x", "#x", "<script>mien_fuzz(1)</script>".replace("/", "∕"), "\udcff", "\u2028", "é",
     ".hidden", "capture.json",
 )  # fmt: skip
-"""Names of files without their ending; none has a slash."""
+"""Names of files without their ending. None has a slash."""
 
 
 def faulty_place(path: Path, canary: Path, dice: Random) -> str:
-    """Put something else where a file or folder is; returns what."""
+    """Put something else where a file or folder is, and return the kind of fault."""
     kind = dice.choice(_KINDS)
     beside = [other for other in path.parent.iterdir() if other != path and other.is_dir() == path.is_dir()]
     if kind == "swapped" and beside:
@@ -39,7 +39,7 @@ def faulty_place(path: Path, canary: Path, dice: Random) -> str:
             (shutil.copytree if path.is_dir() else shutil.copy)(path, copy)
         return kind
     if kind == "moved out":
-        # What it was lies outside now, with a link to it: nothing may be changed there.
+        # The original is outside now, with a link to it. Nothing may be changed there.
         outside = canary / f"moved{path.suffix}"
         _remove(outside)
         path.rename(outside)
@@ -52,7 +52,7 @@ def faulty_place(path: Path, canary: Path, dice: Random) -> str:
 
 
 def outside_of(canary: Path) -> None:
-    """Fill the folder that nothing may be written into, and that links lead to."""
+    """Fill the folder that links lead to and that nothing may be written into."""
     (canary / "folder").mkdir(parents=True)
     for name in (
         "victim.json",
@@ -89,7 +89,7 @@ def _swap(one: Path, other: Path) -> None:
 
 
 def _socket(path: Path, canary: Path, was_folder: bool) -> None:
-    # The path of a socket may have a hundred characters only: made in its folder.
+    # The path of a socket may have only a hundred characters, so it is made from within its folder.
     here = Path.cwd()
     os.chdir(path.parent)
     try:
@@ -109,7 +109,7 @@ def _victim(path: Path, canary: Path, was_folder: bool) -> None:
 
 
 def _beyond(path: Path, canary: Path, was_folder: bool) -> None:
-    """A dangling link: whoever writes through it makes a new file outside."""
+    """Make a dangling link. A program that writes through it makes a new file outside."""
     path.symlink_to(canary / f"new{path.suffix}")
 
 

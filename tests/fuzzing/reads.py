@@ -1,4 +1,4 @@
-"""Readers of each kind of file: from the folder with the copies, and the faulty file."""
+"""Readers of each kind of file. They take the folder with the copies, and the faulty file."""
 
 import itertools
 import os
@@ -39,7 +39,7 @@ from mien.workspace import open_workspace
 from toy_scene import toy_sequence
 
 SEEN = 3
-"""Pictures of a video that are looked at."""
+"""Number of pictures of a video that are read."""
 
 
 def read_capture(root: Path, file: Path) -> Any:
@@ -70,7 +70,7 @@ def read_face_track(root: Path, file: Path) -> Any:
     tensors = read_tensors(file)
     try:
         return FaceParams(**tensors)
-    except TypeError as error:  # so does `mien.evaluation.load`
+    except TypeError as error:  # as `mien.evaluation.load` does
         raise UserError(f"{file}: {error}") from None
 
 
@@ -161,7 +161,7 @@ def read_no_playlist(root: Path, file: Path) -> Any:
 
 
 def read_by_ending(root: Path, file: Path) -> Any:
-    """As people type it: from the file's own folder."""
+    """Read a file by its ending from its own folder, as people do."""
     before = Path.cwd()
     os.chdir(file.parent)
     try:
@@ -178,7 +178,7 @@ def read_workspace(root: Path, file: Path) -> Any:
 
 
 def nothing_read(root: Path, file: Path) -> Any:
-    """Nothing: the command reads."""
+    """Read nothing, because the command reads."""
 
 
 def _read_any(file: Path) -> None:
@@ -195,7 +195,7 @@ def _read_any(file: Path) -> None:
 
 
 def _known(found: dict[str, Any]) -> dict[str, Any]:
-    """Without the one entry that damage to the name `checksum` leaves."""
+    """Return the entries except for the one that results from damage to the name `checksum`."""
     names = (
         "method",
         "settings",

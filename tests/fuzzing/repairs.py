@@ -1,7 +1,7 @@
-"""Checksums and hashes made right after a fault, as somebody does who wants it to be read.
+"""Correct checksums and hashes after a fault, as an attacker would.
 
-Written without mien's own functions, whose change would silently change what is fuzzed: a test repairs one sane edit
-of each format and reads it.
+This module uses none of mien's functions, since a change of theirs would silently change what is fuzzed. A test repairs
+one harmless edit of each format and reads it.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ import safetensors.numpy
 from fuzzing.tensor_faults import joined, split
 
 _UNSOUND = (Exception,)
-"""Errors of a file that is too faulty to be repaired. It stays as it is."""
+"""Errors of files that are too faulty to be repaired. Such files stay as they are."""
 _GEOMETRY = (
     "template", "faces", "identity_basis", "expression_basis", "joint_template", "joint_identity_basis",
     "joint_rotation_basis", "joint_translation_basis", "skinning_weights", "pose_basis",
@@ -27,13 +27,13 @@ _FACE = ("identity", "expression", "joints", "head_rotation", "head_translation"
 
 
 def json_checksum(content: dict[str, Any]) -> str:
-    """As `mien.files.write_json` leaves it."""
+    """Return the checksum that `mien.files.write_json` would write."""
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:32]
 
 
 def with_checksum(content: Any) -> Any:
-    """A json value with its checksum right, where it can have one."""
+    """Return a json value with a correct checksum, if it can have one."""
     if not isinstance(content, dict):
         return content
     content = {name: value for name, value in content.items() if name != "checksum"}
@@ -43,7 +43,7 @@ def with_checksum(content: Any) -> Any:
 
 
 def repair_tensors(data: bytes) -> bytes:
-    """A safetensors file with the checksum of header and body right, where it has one."""
+    """Return a safetensors file with a correct checksum of header and body, if it has one."""
     with contextlib.suppress(*_UNSOUND):
         header, body = split(data)
         metadata = header.pop("__metadata__")
@@ -55,7 +55,7 @@ def repair_tensors(data: bytes) -> bytes:
 
 
 def repair_portable(data: bytes, content: Any = None) -> bytes:
-    """A .mien file with the hash over content and arrays right, with other content if some is given."""
+    """Return a .mien file with a correct hash over content and arrays, and with other content if some is given."""
     with contextlib.suppress(*_UNSOUND):
         header, body = split(data)
         entry = json.loads(header["__metadata__"]["mien"])
@@ -72,13 +72,13 @@ def repair_portable(data: bytes, content: Any = None) -> bytes:
 
 
 def edit_json(path: Path, **values: Any) -> None:
-    """Change entries of a json file, and make its checksum right."""
+    """Change entries of a json file, and correct its checksum."""
     content = json.loads(path.read_text())
     path.write_text(json.dumps(with_checksum({**content, **values})))
 
 
 def repair_around(file: Path) -> None:
-    """Make right what the files beside `file` say about it; what is too faulty stays."""
+    """Correct what the files beside `file` say about it. Files that are too faulty stay as they are."""
     for repair in _AROUND.get(file.name, ()):
         with contextlib.suppress(*_UNSOUND):
             repair(file.parent)
@@ -89,7 +89,7 @@ def _tracking(folder: Path) -> None:
 
 
 def _run_of_tracking(folder: Path) -> None:
-    """The digest by which a run knows its tracking."""
+    """Return the digest of a tracking that its runs store."""
     arrays = safetensors.numpy.load_file(folder / "tracking.safetensors")
     digest = hashlib.sha256()
     for name in sorted(set(_FACE) & arrays.keys()):

@@ -1,4 +1,4 @@
-"""Runs odd command lines as real processes, and judges how they end."""
+"""Run odd command lines as real processes, and judge how they end."""
 
 import contextlib
 import json
@@ -22,19 +22,19 @@ from fuzzing.material import copy_of
 
 PARTS = ("W", "given", "pictures", "videos", "flame", "head.mien", "head.ply", "cache")
 LINES, LIGHT, HEAVY = "command lines", "line", "heavy line"
-"""Their format in the table; what the names of their cases begin with."""
+"""Name of the format in the table, and prefixes of the names of its cases."""
 FINE = frozenset({0, 2, 130, 141, 143})
 TESTS = str(Path(__file__).parent.parent)
 APART = 0.08
-"""Share of the lines that run in a new process instead of a fork, whatever they need."""
+"""Share of the lines that run in a new process instead of a fork, whether or not they need one."""
 _SECONDS = 60.0
-"""A busy machine needs as long for a command on small input; those that take longer are told to stop then."""
+"""Seconds that a command on small input may need on a busy machine. Commands that take longer are then stopped."""
 _TO_END = 20.0
-"""Seconds that a command gets to end after it was told to."""
+"""Seconds that a command has to end after a signal."""
 
 
 class Server:
-    """`fuzzing.command_server` as this process sees it."""
+    """Client of `fuzzing.command_server`."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
@@ -46,7 +46,7 @@ class Server:
         )
 
     def run(self, request: dict[str, Any], line: Line) -> tuple[int | None, int]:
-        """Exit code (None where it hung), most megabytes."""
+        """Run a line, and return its exit code (None if it hung) and the most megabytes that it took."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(request).encode() + b"\n")
@@ -60,14 +60,14 @@ class Server:
         return (code if in_time else None), megabytes
 
     def close(self) -> None:
-        """End it."""
+        """Stop the server."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait()
 
 
 def run_lines(cases: list[str], folder: Path, material: Path) -> Iterator[Result]:
-    """Results of command lines in order."""
+    """Yield the results of command lines in order."""
     if not cases:
         return
     server = Server()
@@ -86,7 +86,7 @@ def run_lines(cases: list[str], folder: Path, material: Path) -> Iterator[Result
 
 
 def run_line(case: str, bench: Bench, server: Server, listener: socket.socket) -> Result:
-    """One command line from its making to its judgement."""
+    """Make, run and judge one command line."""
     dice, result = Random(case), Result(case, LINES)
     bench.prepare()
     copy_of(bench.material, PARTS, bench.root)
@@ -106,7 +106,7 @@ def run_line(case: str, bench: Bench, server: Server, listener: socket.socket) -
     )
     result.outcome = {0: "accepted", 2: "refused"}.get(code if code is not None else -999, "stopped")
     result.findings = list(_faults_of_end(code, told, line))
-    if megabytes > MEMORY / 2**20 + 700 and not line.heavy:  # beside what is imported
+    if megabytes > MEMORY / 2**20 + 700 and not line.heavy:  # in addition to the imported modules
         result.findings.append("memory")
     # The libraries of a command may keep caches in the home folder, and a line is stopped before it is slow.
     cause = _cause(code, told, line)
@@ -133,7 +133,7 @@ def _request(line: Line, bench: Bench) -> dict[str, Any]:
 
 
 def _run_apart(request: dict[str, Any], line: Line) -> tuple[int | None, int]:
-    """In a process that is started anew, as a shell does."""
+    """Run a line in a new process, as a shell does."""
     source = "import json, os, sys; from fuzzing.command_server import prepare; asked = json.loads(sys.argv[1]); "
     source += (
         "prepare(asked); os.execve(sys.executable, [sys.executable, '-m', 'mien.cli', *asked['words']], os.environ)"
@@ -154,13 +154,13 @@ def _run_apart(request: dict[str, Any], line: Line) -> tuple[int | None, int]:
 
 
 def _wait(child: int, line: Line, request: dict[str, Any], ended: Any) -> bool:
-    """Wait for the end of a process; signal it if the line asks for that, or where it takes too long; false: hung."""
+    """Wait for a process to end. Signal it if the line asks for that or it takes too long. Return False if it hangs."""
     number = line.surroundings.get("signal")
     if number is not None and not ended(0.05 + (sum(map(len, line.words)) % 20) / 10):
         _tell(child, number)
     if ended(_SECONDS):
         return True
-    # Many frames may be what was asked for; that a file keeps a command busy is seen where it is read.
+    # The line may ask for many frames. Files that keep a reader busy are found by the cases of that reader.
     line.surroundings = {**line.surroundings, "signal": signal.SIGTERM}
     _tell(child, signal.SIGTERM)
     if ended(_TO_END):
@@ -183,7 +183,7 @@ def _faults_of_end(code: int | None, told: str, line: Line) -> Iterator[str]:
         yield "signal"
     elif code >= 0 and code not in FINE:
         yield "exit code"
-    # Python itself says so where Ctrl-C meets it between two of its own steps.
+    # Python prints this itself if Ctrl-C arrives between two of its own steps.
     if "Traceback (most recent call last)" in told and not (sent == signal.SIGINT and "Exception ignored in" in told):
         yield "traceback"
     lines = [text for text in told.splitlines() if text.startswith("mien: ")]
@@ -197,7 +197,7 @@ def _faults_of_end(code: int | None, told: str, line: Line) -> Iterator[str]:
 
 
 def _cause(code: int | None, told: str, line: Line) -> str:
-    """Name the origin of a finding: the end of its traceback, or else the command and its surroundings."""
+    """Return the cause of a finding: the end of its traceback, or else the command and its surroundings."""
     text = told
     for log in re.findall(r"the traceback is in (\S+);", told):
         with contextlib.suppress(OSError):

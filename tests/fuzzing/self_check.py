@@ -1,6 +1,6 @@
-"""Whether the fuzzers can fail: readers that are wrong in every way are found, and repairs repair.
+"""Check that the fuzzers can fail: they find readers that are wrong in every way, and repairs work.
 
-A repair that stopped working would leave every fault to be noticed by a checksum, and nothing behind it would be tried.
+If a repair stopped working, checksums would catch every fault, and nothing behind them would be tested.
 """
 
 import json
@@ -75,7 +75,7 @@ def _raise(error: Exception) -> Callable[[Path, Path], Any]:
 
 
 def _complain_as_it_comes(file: Path) -> None:
-    """A command line whose door to the terminal is open (in a child: nobody else sees it)."""
+    """Print a message without making control characters harmless. It runs in a child, so nobody else sees it."""
     cli._complain = lambda message: print(message, file=sys.stderr) or 2  # type: ignore[func-returns-value]
     raise UserError(f"{file}: two\nlines")
 
@@ -102,7 +102,7 @@ _WRONG: dict[str, Callable[[Path, Path], Any]] = {
     "printed": lambda root, file: print("\x1b[2J", file=sys.stderr, flush=True),
     "script": _report,
 }
-"""Readers by what is to be found of them."""
+"""Faulty readers, by the finding that they must cause."""
 
 
 def _edit_json(*path: Any, value: Any) -> Callable[[Path], None]:
@@ -148,4 +148,4 @@ _EDITS: dict[str, Callable[[Path], None]] = {
     "avatar's face_model.safetensors": _edit_numbers("expression_basis", _bit_more),
     "head.mien": _edit_numbers("baked.attributes.opacity_logits", _bit_more),
 }
-"""An edit that a reader has to accept once everything around it is made right."""
+"""Edits that readers must accept once everything around them is repaired."""

@@ -1,4 +1,4 @@
-"""Targets of the fuzzer: the file that is made faulty, its reader, and the use of what was read."""
+"""List the targets of the fuzzer: the file that is made faulty, its reader, and the use of what was read."""
 
 import math
 from collections.abc import Callable
@@ -12,9 +12,9 @@ from fuzzing.faults import Place
 from fuzzing.material import RUN, SEQUENCE
 
 Read = Callable[[Path, Path], Any]
-"""From the folder with the copies, and the faulty file, to what was read."""
+"""Reader that takes the folder with the copies and the faulty file."""
 Use = Callable[[Path, Any, Random], None]
-"""With that folder, what was read, and dice for what is chosen."""
+"""Use of what was read. It also takes the folder with the copies, and dice for its choices."""
 
 
 @dataclass(frozen=True)
@@ -23,20 +23,20 @@ class Target:
 
     name: str
     format: str
-    """As the table of results has it."""
+    """Name of the format in the table of results."""
     files: str
-    """Pattern below the material."""
+    """Pattern of the files below the material."""
     parts: tuple[str, ...]
     """Parts of the material that the reader needs."""
     read: Read
     use: Use = uses.nothing
     exact: bool = False
-    """Whether bytes that were damaged without repair have to be refused, or to give the very content."""
+    """Whether files with unrepaired damage must be refused or give exactly the same content."""
     fault: Callable[[Place, Random], str] = faults.faulty_file
     weight: float = 1.0
     """Relative frequency among the targets."""
     named: bool = True
-    """Whether the message has to name a file of the folder."""
+    """Whether the message must name a file of the folder."""
 
 
 def _all() -> tuple[Target, ...]:
@@ -111,7 +111,7 @@ TARGETS = {target.name: target for target in _all()}
 
 
 def spread(total: int, names: list[str] | None = None) -> list[tuple[str, int]]:
-    """So many cases over the targets by their weights: names and numbers, mixed so that any part of them holds all."""
+    """Divide cases among the targets by their weights. They are mixed, so that any part of them holds all targets."""
     chosen = [TARGETS[name] for name in names] if names else list(TARGETS.values())
     share = total / sum(target.weight for target in chosen)
     places = []

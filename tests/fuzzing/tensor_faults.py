@@ -1,4 +1,4 @@
-"""Faults in safetensors files: in the header, in offsets, types and shapes, and in the numbers."""
+"""Make faults in safetensors files: in the header, in offsets, types and shapes, and in the numbers."""
 
 import json
 from random import Random
@@ -34,26 +34,26 @@ _KINDS = (np.float64, np.float32, np.float16, np.int64, np.int32, np.int8, np.ui
 
 
 def split(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Header and body of a whole safetensors file."""
+    """Return header and body of a whole safetensors file."""
     size = int.from_bytes(data[:8], "little")
     return json.loads(data[8 : 8 + size]), data[8 + size :]
 
 
 def joined(header: Any, body: bytes, dice: Random | None = None) -> bytes:
-    """A safetensors file of any header."""
+    """Return a safetensors file with this header."""
     text = json.dumps(header).encode() if dice is None else written(header, dice)
     text += b" " * (-len(text) % 8)
     return len(text).to_bytes(8, "little") + text + body
 
 
 def faulty_tensors(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """One fault in a safetensors file; checksums are for others to repair."""
+    """Make one fault in a safetensors file. Checksums are not repaired here."""
     kind = dice.choice(("numbers",) * 5 + ("arrays",) * 6 + ("entry",) * 3 + ("header", "metadata", "length", "names"))
     header, body = split(data)
     metadata = header.pop("__metadata__", None)
     kept = {} if metadata is None else {"__metadata__": metadata}
     if kind in ("numbers", "arrays", "names"):
-        arrays = dict(sorted(safetensors.numpy.load(data).items()))  # in an order that stays
+        arrays = dict(sorted(safetensors.numpy.load(data).items()))  # in a fixed order
         name, arrays = _FAULTS[kind](arrays, dice)
         header, body = split(safetensors.numpy.save(arrays))
         return f"{kind} {name}", joined({**kept, **header}, body)
@@ -83,7 +83,7 @@ def faulty_tensors(data: bytes, dice: Random) -> tuple[str, bytes]:
 
 
 def faulty_arrays(arrays: dict[str, np.ndarray], dice: Random) -> tuple[str, dict[str, np.ndarray]]:
-    """Arrays of other sizes, axes or types; some that are missing or too many."""
+    """Change sizes, axes or types of arrays, drop some, or add some."""
     name = dice.choice(list(arrays))
     array, kind = (
         arrays[name],
@@ -115,7 +115,7 @@ def faulty_arrays(arrays: dict[str, np.ndarray], dice: Random) -> tuple[str, dic
 
 
 def faulty_numbers(arrays: dict[str, np.ndarray], dice: Random) -> tuple[str, dict[str, np.ndarray]]:
-    """Numbers at edges in one of the arrays: some, or all."""
+    """Replace some or all numbers of one array by numbers at edges."""
     filled = [name for name, array in arrays.items() if array.size]
     if not filled:
         return "nothing", arrays
@@ -136,7 +136,7 @@ def faulty_numbers(arrays: dict[str, np.ndarray], dice: Random) -> tuple[str, di
 
 
 def edge_for(dtype: np.dtype, dice: Random) -> float | int | bool:
-    """A number at an edge of a type."""
+    """Return a number at an edge of a type."""
     if dtype.kind == "f":
         value = dice.choice(FLOATS)
         with np.errstate(all="ignore"):

@@ -1,4 +1,4 @@
-"""Faults in tables (csv), in the text before a .ply, and in what videos are listed with."""
+"""Make faults in tables (csv), in the header of a .ply, and in playlists."""
 
 import csv
 import io
@@ -19,7 +19,7 @@ _TIMES = (
 
 
 def faulty_table(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """One to three faults in a csv."""
+    """Make one to three faults in a csv."""
     rows = list(csv.reader(io.StringIO(data.decode())))
     kind = dice.choice(("cell", "cell", "cell", "time", "time", "name", "column", "row", "more", "text", "text"))
     for _ in range(dice.choice((1, 1, 3))):
@@ -74,7 +74,7 @@ def _faulty_encoding(text: str, dice: Random) -> tuple[str, bytes]:
 
 
 def faulty_ply(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """One or two faults in the header of a .ply, or in its numbers."""
+    """Make one or two faults in the header of a .ply, or in its numbers."""
     head, mark, body = data.partition(b"end_header\n")
     lines = head.decode("latin1").splitlines()
     kind = dice.choice(
@@ -157,7 +157,7 @@ _LINK = '<?xml version="1.0"?><?quicktime type="application/x-quicktime-media-li
 
 
 def playlist(clip: str, dice: Random) -> tuple[str, str, bytes]:
-    """A list that names other files for a player to open: its kind, its ending, its content."""
+    """Return a list that names other files for a player to open: its kind, its ending and its content."""
     name = dice.choice(
         (
             clip,

@@ -1,4 +1,4 @@
-"""Doing with what was read what people do, so that what is let in does no harm later: folder, what was read, dice."""
+"""Use what was read as people do, to check that accepted files do no harm later."""
 
 import contextlib
 import io
@@ -37,11 +37,11 @@ from toy_scene import toy_camera, toy_face_model
 
 
 class CommandError(Exception):
-    """A command ended otherwise than commands may."""
+    """A command ended in a way that commands must not end."""
 
 
 def nothing(root: Path, found: Any, dice: Random) -> None:
-    """Nothing more."""
+    """Do nothing else."""
 
 
 def expect_finite(root: Path, found: Any, dice: Random) -> None:
@@ -98,7 +98,7 @@ def use_rendering(root: Path, found: Any, dice: Random) -> None:
 
 
 def use_partial(root: Path, found: Any, dice: Random) -> None:
-    """Add, forget; and evaluate with the faulty lines behind the right first one."""
+    """Add and forget scores, and evaluate with the faulty lines after the correct first one."""
     for file in (root / RUN).glob(".*.partial"):
         kept = PartialScores(file, "0")
         kept.read()
@@ -178,7 +178,7 @@ LINES = (
 
 
 def run_a_line(root: Path, found: Any, dice: Random) -> None:
-    """One command on the faulty workspace, in this process."""
+    """Run one command on the faulty workspace, in this process."""
     os.environ["MIEN_CACHE"] = str(root / "cache")
     words = [word.format(W=root / "W", root=root) for word in dice.choice(LINES).split()]
     told = io.StringIO()

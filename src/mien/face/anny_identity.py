@@ -61,7 +61,7 @@ def sample_people(
     return people.reshape(SAMPLES, -1, 3)
 
 
-def steps_of_sampling(data: Path) -> int:
+def count_sampling_steps(data: Path) -> int:
     """Number of times that `sample_people` advances its progress bar."""
     return len(macro_targets(data)) + sum(1 if c.negative is None else 2 for c in head_controls(data))
 

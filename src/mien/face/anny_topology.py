@@ -66,7 +66,7 @@ class HeadTopology:
     parts."""
 
 
-def head_topology(data: Path, mesh: BaseMesh) -> HeadTopology:
+def cut_head(data: Path, mesh: BaseMesh) -> HeadTopology:
     """Cut the head out of the base mesh."""
     quads, parts = _cut(mesh)
     triangles = _triangulate(quads, mesh.vertices)

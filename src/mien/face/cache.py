@@ -34,7 +34,7 @@ def cache_folder() -> Path:
 def _temporary_folder(reason: str) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="mien-cache-"))
     atexit.register(remove_tree, folder)
-    say(f"{reason}: face models are baked into {folder} for this command alone; MIEN_CACHE names a folder to keep them")
+    say(f"{reason}: face models are baked into {folder} for this command only; set MIEN_CACHE to keep them")
     return folder
 
 

@@ -12,7 +12,7 @@ _FLAT = 0.02
 """Cosine below which a triangle is seen edge-on."""
 
 
-def outside_of(template: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+def find_outside(template: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
     """Return which triangles form the outside of the head's largest piece, without mouth, nostrils and inner lids."""
     return _outside(*_seen_from_within(template), faces)
 

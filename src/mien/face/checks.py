@@ -58,8 +58,8 @@ def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: st
     }  # fmt: skip
     for name, tensor in face.tensors().items():
         if tuple(tensor.shape) != shapes[name]:
-            told = f"{name} is {list(tensor.shape)}, which the face model {model.name!r} has not"
-            raise UserError(f"{where}: {told} ({list(shapes[name])}); {remedy}")
+            fault = f"{name} is {list(tensor.shape)}, but the face model {model.name!r} has {list(shapes[name])}"
+            raise UserError(f"{where}: {fault}; {remedy}")
         if tensor.dtype != torch.float32:
             raise UserError(f"{where}: {name} is {tensor.dtype}, not torch.float32; {remedy}")
         if not _is_moderate(tensor):
@@ -69,7 +69,7 @@ def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: st
 def _faults(model: FaceModel) -> Iterator[str]:
     texts = (model.name, *model.region_names, *model.expression_names, *model.joint_names)
     if not all(isinstance(text, str) and is_one_line(text) for text in texts):
-        yield "a name in it is no text, or not in one line"
+        yield "one of its names is not a text of one line"
     fault = skeleton_fault(model.joint_names, model.joint_parents, model.joint_free)
     if fault is not None:
         yield fault
@@ -81,7 +81,7 @@ def _faults(model: FaceModel) -> Iterator[str]:
         if tensor is None and name in _OPTIONAL:
             continue
         if not isinstance(tensor, Tensor) or tensor.dtype != (torch.int64 if name in _INDICES else torch.float32):
-            yield f"{name} is of another type"
+            yield f"{name} has the wrong type"
             return
         shape = tuple(tensor.shape)
         if len(shape) != len(axes) or any(
@@ -97,7 +97,7 @@ def _faults(model: FaceModel) -> Iterator[str]:
     for name, counts in _INDICES.items():
         tensor = getattr(model, name)
         if tensor.numel() and not (int(tensor.min()) >= 0 and int(tensor.max()) < sizes[counts]):
-            yield f"{name} names what does not exist"
+            yield f"{name} has an index that is out of range"
 
 
 def _is_moderate(tensor: Tensor) -> bool:

@@ -18,12 +18,11 @@ import torch
 from jaxtyping import Float, Int
 
 from mien.errors import UserError
-from mien.face.chart import outside_of, unwrap
+from mien.face.chart import find_outside, unwrap
 from mien.face.inert_pickle import read_inert_pickle
-from mien.face.model import FaceModel
+from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
 from mien.face.npz import read_npz
 
-JOINTS = ("head", "neck", "jaw", "left_eye", "right_eye")
 REGIONS = ("skin", "neck", "eyes", "irises")
 """Regions that follow from skinning weights. `mien.tracking.landmarks` finds more, by landmarks."""
 
@@ -31,14 +30,12 @@ _CHAIN = (-1, 0, 1, 1, 1)
 """Parents in FLAME's chain: the root, the neck on it, jaw and eyes on the neck."""
 _SPLITS = {400: 300}
 """Number of identity directions, by the number of columns of the basis: FLAME 2020 and 2023."""
-_LARGEST_COEFFICIENT = 3.0
+_MAX_COEFFICIENT = 3.0
 """Bound of an expression coefficient. FLAME's coefficients are in standard deviations."""
-_EYE_BACK = 0.08
-"""Distance from the midpoint of the eyeballs' centres back to the origin, in metres, as in the anny model."""
 _IRIS_RADIUS = 0.0061
 """Radius of the iris in metres. It hardly differs between people."""
 _QUANTUM = 1e-7
-_SIZES = (0.1, 0.6)
+_MIN_HEIGHT, _MAX_HEIGHT = 0.1, 0.6
 """Range of the height of a head with its neck, in metres."""
 _SHAPES = {
     "v_template": "v 3", "f": "f 3", "shapedirs": "v 3 n", "posedirs": "v 3 36", "J_regressor": "5 v", "weights": "v 5",
@@ -47,10 +44,9 @@ _SHAPES = {
 _KEYS = frozenset({*_SHAPES, "kintree_table", "identities", "vt", "ft"})
 _OTHERS = frozenset({"lmk_face_idx", "lmk_bary_coords", "mean"})
 """Keys by which FLAME's other files are recognised."""
-_LONGEST_NAME = 40
-"""Characters of a name that a message shows."""
-_NAMED = 20
-_LARGEST_NUMBER = 1e6
+_MAX_NAME_LENGTH, _MAX_NAMES = 40, 20
+"""Most characters of a name, and most names, that a message shows."""
+_MAX_NUMBER = 1e6
 """Bound of all numbers in the file: metres, weights and indices."""
 
 
@@ -92,8 +88,8 @@ def read_flame(path: Path) -> FlameFile:
     if uv is not None and uv_faces is not None:
         numbers = uv.dtype.kind in "iuf" and uv_faces.dtype.kind in "iuf"
         if uv.ndim != 2 or uv.shape[1] != 2 or uv_faces.shape != faces.shape or not numbers:
-            raise UserError(f"{path}: 'vt' {uv.shape} and 'ft' {uv_faces.shape} are no texture coordinates of 'f' "
-                            f"{faces.shape}; leave both out, and they are made")  # fmt: skip
+            raise UserError(f"{path}: 'vt' {uv.shape} and 'ft' {uv_faces.shape} are not texture coordinates of 'f' "
+                            f"{faces.shape}; leave both out, and mien makes them")  # fmt: skip
         _check_values(path, "vt", uv)
         _check_values(path, "ft", uv_faces)
         uv_faces = _indices(path, "ft", uv_faces, len(uv))
@@ -137,10 +133,10 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
         identity_basis=_tensor(flame.identity),
         expression_basis=_tensor(flame.expression),
         expression_names=tuple(f"expression_{index:03d}" for index in range(e)),
-        expression_bounds=torch.tensor([[-_LARGEST_COEFFICIENT, _LARGEST_COEFFICIENT]]).repeat(e, 1),
+        expression_bounds=torch.tensor([[-_MAX_COEFFICIENT, _MAX_COEFFICIENT]]).repeat(e, 1),
         expression_sigmas=torch.ones(e),
         joint_names=JOINTS,
-        joint_parents=(-1, 0, 0, 0, 0),
+        joint_parents=JOINT_PARENTS,
         joint_free=(False, True, True, True, True),
         joint_template=_rounded(pivots),
         joint_identity_basis=_rounded(basis),
@@ -198,7 +194,7 @@ def _remedy(names: list[str]) -> str:
         return "this is a landmark embedding: give the model itself (generic_model.pkl or flame2023.pkl)"
     if {"mean", "tex_dir"} & set(names):
         return "this is FLAME's texture space: give the model itself (generic_model.pkl or flame2023.pkl)"
-    here = ", ".join(name[:_LONGEST_NAME] for name in sorted(names)[:_NAMED]) or "nothing"
+    here = ", ".join(name[:_MAX_NAME_LENGTH] for name in sorted(names)[:_MAX_NAMES]) or "nothing"
     return f"it needs {', '.join(_SHAPES)} and kintree_table (here: {here})"
 
 
@@ -209,7 +205,7 @@ def _check_shape(path: Path, key: str, array: np.ndarray, wanted: str, sizes: di
     if not fits:
         known = " ".join(str(sizes.get(symbol, symbol)) for symbol in wanted.split())
         raise UserError(
-            f"{path}: {key!r} is {array.dtype} [{' '.join(map(str, array.shape))}], but has to be numbers [{known}]; "
+            f"{path}: {key!r} is {array.dtype} [{' '.join(map(str, array.shape))}], but should be numbers [{known}]; "
             "give a head model in FLAME's schema"
         )
     _check_values(path, key, array)
@@ -221,15 +217,15 @@ def _check_values(path: Path, key: str, array: np.ndarray) -> None:
     if not np.isfinite(array).all():
         raise UserError(f"{path}: {key!r} holds numbers that are not finite; download it again")
     largest = max(float(array.max(initial=0)), -float(array.min(initial=0)))
-    if largest > _LARGEST_NUMBER:
+    if largest > _MAX_NUMBER:
         raise UserError(
-            f"{path}: {key!r} holds {largest:g}, and a head has no number above {_LARGEST_NUMBER:g}; download it again"
+            f"{path}: {key!r} holds {largest:g}, but a head has no number above {_MAX_NUMBER:g}; download it again"
         )
 
 
 def _check_chain(path: Path, table: np.ndarray | None) -> None:
     if table is None:
-        raise UserError(f"{path}: has no 'kintree_table', which says how its joints hang together; add FLAME's")
+        raise UserError(f"{path}: has no 'kintree_table', the list of each joint's parent; add FLAME's")
     # The root's parent is -1, or 2**32 - 1 if it was written as unsigned.
     fits = table.ndim == 2 and len(table) > 0 and table.dtype.kind in "iuf" and bool((np.abs(table) < 2**33).all())
     parents = table[0].astype(np.int64) if fits else np.zeros(0)
@@ -244,7 +240,7 @@ def _check_chain(path: Path, table: np.ndarray | None) -> None:
 def _identities(path: Path, arrays: dict[str, np.ndarray], columns: int) -> int:
     given = arrays.get("identities")
     if given is not None and (given.size != 1 or given.dtype.kind not in "iu"):
-        raise UserError(f"{path}: 'identities' is {given.dtype} {list(given.shape)}, but has to be one whole number")
+        raise UserError(f"{path}: 'identities' is {given.dtype} {list(given.shape)}, but should be one whole number")
     split = _SPLITS.get(columns) if given is None else int(given.item())
     if split is None:
         raise UserError(
@@ -253,8 +249,8 @@ def _identities(path: Path, arrays: dict[str, np.ndarray], columns: int) -> int:
         )
     if not 0 < split < columns:
         raise UserError(
-            f"{path}: {split} of the {columns} directions of 'shapedirs' would be identity, which leaves no expression "
-            "or no identity; correct 'identities'"
+            f"{path}: 'identities' takes {split} of the {columns} directions of 'shapedirs', but identity and "
+            "expression need at least one each; correct it"
         )
     return split
 
@@ -262,29 +258,31 @@ def _identities(path: Path, arrays: dict[str, np.ndarray], columns: int) -> int:
 def _indices(path: Path, key: str, values: np.ndarray, count: int) -> Int[np.ndarray, "f 3"]:
     values = values.astype(np.int64)
     if values.min() < 0 or values.max() >= count:
-        raise UserError(f"{path}: {key!r} names vertex {values.max()} of {count}; download it again")
+        raise UserError(
+            f"{path}: {key!r} has the index {values.max()}, but only {count} entries exist; download it again"
+        )
     return values
 
 
 def _check_sense(path: Path, flame: FlameFile) -> None:
     """Check units, axes and joints, which shapes do not show."""
     height = float(np.ptp(flame.template[:, 1]))
-    if not _SIZES[0] < height < _SIZES[1]:
+    if not _MIN_HEIGHT < height < _MAX_HEIGHT:
         raise UserError(
-            f"{path}: 'v_template' is {height:g} high; it has to be in metres with y upwards ({_SIZES[0]:g} to "
-            f"{_SIZES[1]:g}): scale it, and with it 'shapedirs' and 'posedirs'"
+            f"{path}: 'v_template' is {height:g} high, but a head in metres with y upwards is {_MIN_HEIGHT:g} to "
+            f"{_MAX_HEIGHT:g} high: scale it together with 'shapedirs' and 'posedirs'"
         )
     if not np.allclose(flame.weights.sum(1), 1, atol=1e-3) or flame.weights.min() < -1e-6:
         raise UserError(f"{path}: 'weights' of a vertex do not add up to 1 or are negative; give FLAME's weights")
     left, right = (flame.weights[:, joint] > 0.5 for joint in (3, 4))
     if not left.any() or not right.any():
-        raise UserError(f"{path}: 'weights' give no vertex to an eye: the model needs both eyeballs")
+        raise UserError(f"{path}: 'weights' assign no vertex to one of the eyes: the model needs both eyeballs")
     ahead = flame.template[left | right].mean(0) - flame.template[flame.weights[:, 1] > 0.5].mean(0)
     if flame.template[left, 0].mean() <= flame.template[right, 0].mean() or ahead[2] <= 0:
         raise UserError(
             f"{path}: the eyes are not where FLAME's are; 'v_template' needs +x to the subject's left, +y up, +z ahead"
         )
-    if not outside_of(flame.template - _origin(_eyeballs(flame)[1]), flame.faces).any():
+    if not find_outside(flame.template - _origin(_eyeballs(flame)[1]), flame.faces).any():
         raise UserError(f"{path}: 'f' has no triangle that faces outwards; give FLAME's triangles")
 
 
@@ -296,4 +294,4 @@ def _eyeballs(flame: FlameFile) -> tuple[list[np.ndarray], Float[np.ndarray, "2 
 
 def _origin(centres: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, " 3"]:
     """The head frame's origin in FLAME's coordinates, in metres: behind the midpoint of the eyeballs' centres."""
-    return centres.mean(0) - np.array([0.0, 0.0, _EYE_BACK])
+    return centres.mean(0) - np.array([0.0, 0.0, EYE_BACK])

@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from mien.errors import UserError
-from mien.face.npz import LARGEST_MODEL
+from mien.face.npz import MAX_MODEL_BYTES
 
-_LARGEST_FILE = LARGEST_MODEL + (16 << 20)
+_MAX_FILE_BYTES = MAX_MODEL_BYTES + (16 << 20)
 """Largest file in bytes."""
-_MOST_OPCODES = 400_000
+_MAX_OPCODES = 400_000
 """Most opcodes of a pickle. FLAME's files have some hundreds; each costs up to about a hundred bytes of memory."""
 _NUMBERS = re.compile(r"[biuf][1248]")
 """Numpy's type codes for arrays of plain numbers."""
@@ -54,8 +54,8 @@ def read_inert_pickle(path: Path, wanted: Collection[str] | None = None) -> dict
         UserError: the file is missing, is no pickle, is damaged or too large, or holds no dictionary.
     """
     try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise UserError(f"{path}: has more than {_LARGEST_FILE:,} bytes, too many for a face model")
+        if path.stat().st_size > _MAX_FILE_BYTES:
+            raise UserError(f"{path}: has more than {_MAX_FILE_BYTES:,} bytes, too many for a face model")
         content = _Machine(path.read_bytes()).run()
         named = content.entries if isinstance(content, _StandIn) else content
         values = {} if not isinstance(named, dict) else _arrays(named, wanted)
@@ -65,7 +65,7 @@ def read_inert_pickle(path: Path, wanted: Collection[str] | None = None) -> dict
         raise
     except Exception as error:  # a damaged pickle may fail in any way
         reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: is no pickle, or a damaged one ({reason}); download it again") from None
+        raise UserError(f"{path}: is not a pickle, or is damaged ({reason}); download it again") from None
     if not isinstance(named, dict):
         raise UserError(f"{path}: holds a {type(content).__name__}, not named arrays; give the face model's own file")
     return values
@@ -83,19 +83,19 @@ class _Machine:
 
     def run(self) -> Any:
         """Execute the pickle and return the object that it builds."""
-        for _ in range(_MOST_OPCODES):
+        for _ in range(_MAX_OPCODES):
             code = self._file.read(1)
             if not code or code[0] not in _OPCODES:
-                raise ValueError("it has no end" if not code else f"unknown opcode {code!r}")
+                raise ValueError("its end is missing" if not code else f"unknown opcode {code!r}")
             opcode = _OPCODES[code[0]]
             if opcode.name == "STOP":
                 return self._stack.pop()
             argument = None if opcode.arg is None else self._argument(opcode.name, opcode.arg)
             act = _ACTIONS.get(opcode.name)
             if act is None:
-                raise ValueError(f"it uses {opcode.name}, which no file of arrays does")
+                raise ValueError(f"it uses {opcode.name}, which files of arrays do not need")
             act(self, argument)
-        raise ValueError(f"it has more than {_MOST_OPCODES:,} opcodes")
+        raise ValueError(f"it has more than {_MAX_OPCODES:,} opcodes")
 
     def _argument(self, name: str, described: pickletools.ArgumentDescriptor) -> Any:
         if name != "STRING":
@@ -104,7 +104,7 @@ class _Machine:
         # ASCII.
         quoted = self._file.readline().strip()
         if len(quoted) < 2 or quoted[:1] not in b"'\"" or quoted[-1:] != quoted[:1]:
-            raise ValueError("a text without quotes")
+            raise ValueError("it has a text without quotes")
         return codecs.escape_decode(quoted[1:-1])[0].decode("latin1")
 
     def push(self, value: Any) -> None:
@@ -256,14 +256,14 @@ _ACTIONS: dict[str, Callable[[_Machine, Any], None]] = {
 
 def _arrays(named: dict[str, Any], wanted: Collection[str] | None) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    left = LARGEST_MODEL
+    left = MAX_MODEL_BYTES
     for key, value in named.items():
         made = _plain(value) if wanted is None or key in wanted else None
         if made is None:
             continue
         left -= made.nbytes if isinstance(made, np.ndarray) else 0
         if left < 0:
-            raise ValueError(f"its arrays have more than {LARGEST_MODEL:,} bytes together")
+            raise ValueError(f"its arrays have more than {MAX_MODEL_BYTES:,} bytes together")
         found[key] = made
     return found
 
@@ -317,12 +317,12 @@ def _dense(state: dict[str, Any], by_column: bool) -> np.ndarray | None:
     if data is None or indices is None or starts is None or shape is None:
         return None
     rows, columns = (int(size) for size in shape)
-    if rows < 0 or columns < 0 or 8 * math.prod((rows, columns)) > LARGEST_MODEL:
+    if rows < 0 or columns < 0 or 8 * math.prod((rows, columns)) > MAX_MODEL_BYTES:
         raise ValueError(f"a matrix of {rows} x {columns} numbers is too large for a face model")
     lengths = np.diff(starts)
     lines = columns if by_column else rows
     if starts.shape != (lines + 1,) or (lengths < 0).any() or lengths.sum() != len(data) or (indices < 0).any():
-        raise ValueError("a compressed matrix that does not fit together")
+        raise ValueError("the parts of a compressed matrix do not fit together")
     matrix = np.zeros((columns, rows) if by_column else (rows, columns))
     np.add.at(matrix, (np.repeat(np.arange(lines), lengths), indices), data)
     return matrix.T if by_column else matrix

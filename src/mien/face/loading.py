@@ -91,9 +91,9 @@ def available_face_models() -> list[FaceModelInfo]:
         for name, source in _SOURCES.items()
     ]
     return ours + [
-        FaceModelInfo(name, "its own, which is yours to obey", f"added from {source['path']}", True)
+        FaceModelInfo(name, "its own; you have to follow it", f"added from {source['path']}", True)
         for name in _added_names()
-        if (source := added_from(name)) is not None
+        if (source := read_added_source(name)) is not None
     ]
 
 
@@ -117,7 +117,7 @@ def add_face_model(model: FaceModel, source: Path, source_sha256: str) -> None:
     write_json(_source_file(stem), _SOURCE_FORMAT, 1, content)
 
 
-def added_from(name: str) -> dict[str, Any] | None:
+def read_added_source(name: str) -> dict[str, Any] | None:
     """Return what the user added a model from (`path`, `sha256`), or None if it was not added by the current recipe."""
     try:
         content = read_json(_source_file(_added_file(name)), _SOURCE_FORMAT, 1)
@@ -199,7 +199,7 @@ def _landmarks(marks: dict[str, Any], model: FaceModel) -> Landmarks:
     faces = np.array(marks["faces"])
     barycentric = np.array(marks["barycentric"], np.float64)
     if faces.ndim != 1 or not faces.size or faces.dtype != np.int64 or barycentric.shape != (len(faces), 3):
-        raise ValueError("landmarks are a triangle and three weights each")
+        raise ValueError("a landmark needs a triangle and three weights")
     if not are_indices(faces, len(model.faces)) or not is_moderate(barycentric):
         raise ValueError("a landmark lies on no triangle")
     return Landmarks(torch.from_numpy(faces), torch.tensor(barycentric, dtype=model.template.dtype))
@@ -235,7 +235,7 @@ def _added_file(name: str) -> Path:
 def _added_names() -> list[str]:
     files = sorted((cache_folder() / "face_models" / "added").glob(f"*{_SOURCE_SUFFIX}"))
     names = [file.name.removesuffix(_SOURCE_SUFFIX) for file in files]
-    return [name for name in names if added_from(name) is not None]
+    return [name for name in names if read_added_source(name) is not None]
 
 
 def _read_added(name: str) -> FaceModel:

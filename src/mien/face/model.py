@@ -12,6 +12,13 @@ from mien.face.params import FaceParams
 from mien.face.posing import has_native_posing, pose_vertices
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 
+JOINTS = ("head", "neck", "jaw", "left_eye", "right_eye")
+"""Joints of the models that mien builds. Other models may have other joints after `head`."""
+JOINT_PARENTS = (-1, 0, 0, 0, 0)
+"""Parents of `JOINTS`, as in `FaceModel.joint_parents`."""
+EYE_BACK = 0.08
+"""Distance from the midpoint of the eyeballs' centres back to the origin of the head frame, in metres."""
+
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-LARGEST_MODEL = 256 << 20
+MAX_MODEL_BYTES = 256 << 20
 """Largest size of all arrays of a face model together, in bytes. FLAME 2023 has 60 MB."""
-_LARGEST_DIRECTORY = 1 << 20
+_MAX_DIRECTORY_BYTES = 1 << 20
 """Largest list of members at the end of the archive, in bytes. Each member takes about 50."""
 _END, _END_SIZE = b"PK\x05\x06", 22
 _END_OF_LARGE = b"PK\x06\x07"
 """Marker of archives with more than 65,534 members, or of 4 GB and more."""
-_LONGEST_COMMENT = 65535
+_MAX_COMMENT_BYTES = 65535
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -30,7 +30,7 @@ def read_npz(path: Path, wanted: Collection[str]) -> tuple[list[str], dict[str, 
 
     Raises:
         ValueError: a wanted member is no array of plain numbers, occurs twice, or is damaged; or the arrays are larger
-            than `LARGEST_MODEL`.
+            than `MAX_MODEL_BYTES`.
         Exception: whatever Python's `zipfile` raises for a file that is no archive or a damaged one.
     """
     _check_directory(path)
@@ -38,12 +38,12 @@ def read_npz(path: Path, wanted: Collection[str]) -> tuple[list[str], dict[str, 
         members = archive.infolist()
         names = [member.filename.removesuffix(_ENDING) for member in members]
         arrays: dict[str, np.ndarray] = {}
-        left = LARGEST_MODEL
+        left = MAX_MODEL_BYTES
         for name, member in zip(names, members, strict=True):
             if name not in wanted:
                 continue
             if name in arrays:
-                raise ValueError(f"{name!r} stands in it twice")
+                raise ValueError(f"{name!r} occurs twice")
             try:
                 arrays[name] = _read_member(archive, member, left)
             except ValueError as error:
@@ -56,19 +56,19 @@ def _check_directory(path: Path) -> None:
     """Refuse archives with a list of members that would fill the memory."""
     with path.open("rb") as file:
         size = path.stat().st_size
-        file.seek(max(0, size - _LONGEST_COMMENT - _END_SIZE))
+        file.seek(max(0, size - _MAX_COMMENT_BYTES - _END_SIZE))
         tail = file.read()
     place = tail.rfind(_END)
     if place < 0 or len(tail) < place + _END_SIZE:
-        raise ValueError("it has no end: copy it again")
+        raise ValueError("its end is missing: copy it again")
     directory = int.from_bytes(tail[place + 12 : place + 16], "little")
-    if directory > _LARGEST_DIRECTORY or tail[max(0, place - 20) : place].startswith(_END_OF_LARGE):
+    if directory > _MAX_DIRECTORY_BYTES or tail[max(0, place - 20) : place].startswith(_END_OF_LARGE):
         raise ValueError("it has far more members than a face model")
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, limit: int) -> np.ndarray:
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError("is compressed as numpy never does it")
+        raise ValueError("is compressed in a way that numpy does not use")
     with archive.open(member) as file:
         version = np.lib.format.read_magic(file)
         if version not in _HEADERS:
@@ -80,10 +80,12 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, limit: int) 
         if not all(length >= 0 for length in shape):
             raise ValueError(f"has the shape {shape}")
         if size > limit:
-            raise ValueError(f"has {size:,} bytes; the arrays of a face model have at most {LARGEST_MODEL:,} together")
+            raise ValueError(
+                f"has {size:,} bytes; the arrays of a face model have at most {MAX_MODEL_BYTES:,} together"
+            )
         data = file.read(size)
         # Reading to the end makes zipfile compare the checksum.
         if len(data) != size or file.read(1):
-            raise ValueError("is not as long as it says")
+            raise ValueError("is not as long as its header states")
     values = np.frombuffer(data, kind).reshape(shape, order="F" if by_column else "C")
     return values.astype(kind.newbyteorder("="))

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from mien.face.model import FaceModel
 
 
-_MOST_SHAPES = 256
+_MAX_SHAPES = 256
 """Largest number of expressions plus nine per free joint: kMostFaceShapes of native/face.h."""
 
 
 def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:
     """Whether `pose_vertices` supports this model and these parameters."""
-    if model.expression_basis.shape[0] + 9 * len(model.free_joint_names) > _MOST_SHAPES:
+    if model.expression_basis.shape[0] + 9 * len(model.free_joint_names) > _MAX_SHAPES:
         return False
     tensors = (model.template, *face.tensors().values())
     return all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)

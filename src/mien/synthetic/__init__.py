@@ -1,11 +1,27 @@
-"""Synthetic captures with exact ground truth: heads that are drawn instead of filmed."""
+"""Synthetic captures with exact ground truth: heads that are drawn instead of filmed.
 
+The order of the files:
+
+- `recipe` says what a capture shows; `references` are the fixed recipes that figures are measured on.
+- `motion` makes the face parameters of every timestep from the recipe's script; `posing` turns them into vertices.
+- `subject` builds the person on the face model: `anatomy` measures the head; `skin`, `hair`, `facial_hair` and
+  `accessories` cover it; `off_model` bends it beyond the face model.
+- `painter` draws the posed person with the materials of `shading` in the light of `light`. `arithmetic` has the noise
+  and the ramps of all of these.
+- `scene` joins them into frames; `captures` writes whole captures; `truth` stores what is known exactly.
+- `signature` compares what two machines drew. `detector_calibration` measures a landmark detector on drawn people.
+"""
+
+from mien.synthetic.captures import (
+    read_synthetic_hash,
+    synthesize,
+    write_synthetic_capture,
+    write_synthetic_video,
+)
 from mien.synthetic.recipe import RECIPES, Detail, Segment, SyntheticRecipe
 from mien.synthetic.references import REFERENCES, ReferenceCapture, reference_named
 from mien.synthetic.scene import SyntheticFrame, SyntheticScene
-from mien.synthetic.synthesize import synthesize, write_synthetic_video
 from mien.synthetic.truth import Truth, read_truth, truth_of, write_truth
-from mien.synthetic.writing import read_synthetic_hash, write_synthetic_capture
 
 __all__ = [
     "RECIPES",

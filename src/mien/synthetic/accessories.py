@@ -1,5 +1,6 @@
 """Build what a person wears: glasses, and a shirt over shoulders. The face model has none of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -7,12 +8,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mien.synthetic.anatomy import NOSE_BRIDGE, Anatomy
-from mien.synthetic.hair import unit
-from mien.synthetic.noise import SolidNoise, smoothstep
+from mien.synthetic.arithmetic import SolidNoise, smoothstep, unit
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class RigidMesh:
     """A rigid piece of mesh."""
 
     vertices: Float[np.ndarray, "v 3"]
@@ -24,8 +24,8 @@ class Part:
 class Glasses:
     """A pair of glasses in the head frame."""
 
-    frame: Part
-    lenses: Part
+    frame: RigidMesh
+    lenses: RigidMesh
 
 
 def build_glasses(anatomy: Anatomy) -> Glasses:
@@ -79,7 +79,7 @@ def _temple(anatomy: Anatomy, rim: np.ndarray, side: float) -> Float[np.ndarray,
     return np.stack([side * x, y, z], -1)
 
 
-def _tube(path: Float[np.ndarray, "p 3"], radius: float, *, closed: bool, sides: int = 8) -> Part:
+def _tube(path: Float[np.ndarray, "p 3"], radius: float, *, closed: bool, sides: int = 8) -> RigidMesh:
     following = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
     tangent = unit(following)
     reference = np.where(np.abs(tangent[:, 2:3]) > 0.8, [[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]])
@@ -88,17 +88,17 @@ def _tube(path: Float[np.ndarray, "p 3"], radius: float, *, closed: bool, sides:
     turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)[None, :, None]
     normals = np.cos(turn) * first[:, None] + np.sin(turn) * second[:, None]
     vertices = path[:, None] + radius * normals
-    return Part(_flat(vertices), _flat(normals), _grid_faces(len(path), sides, closed_rows=closed))
+    return RigidMesh(_flat(vertices), _flat(normals), _grid_faces(len(path), sides, closed_rows=closed))
 
 
-def _lens(rim: Float[np.ndarray, "p 3"], side: float) -> Part:
+def _lens(rim: Float[np.ndarray, "p 3"], side: float) -> RigidMesh:
     centre = rim.mean(0) + np.array([0, 0, 0.002])
     vertices = np.concatenate([centre[None], rim])
     bulge = (rim - centre) * np.array([8.0, 8.0, 0])
     normals = unit(np.concatenate([[[0.0, 0.0, 1.0]], bulge + np.array([0.25 * side, 0, 1.0])]))
     ring = np.arange(len(rim))
     faces = np.stack([np.zeros_like(ring), ring + 1, (ring + 1) % len(rim) + 1], -1)
-    return Part(vertices.astype(np.float32), normals.astype(np.float32), faces.astype(np.int64))
+    return RigidMesh(vertices.astype(np.float32), normals.astype(np.float32), faces.astype(np.int64))
 
 
 def build_shirt(
@@ -106,7 +106,7 @@ def build_shirt(
     neck_size: tuple[float, float],
     shoulder_points: Float[np.ndarray, "p 3"],
     seed: int,
-) -> Part:
+) -> RigidMesh:
     """Build shoulders in a shirt with a round collar.
 
     Args:
@@ -155,7 +155,7 @@ def build_shirt(
         np.add.at(normals, faces[:, corner], areas)
     normals = unit(normals)
     normals *= np.sign((normals * (vertices - vertices.mean(0))).sum(-1).sum() or 1.0)
-    return Part(vertices, normals.astype(np.float32), faces)
+    return RigidMesh(vertices, normals.astype(np.float32), faces)
 
 
 def _laid_over(grid: Float[np.ndarray, "r c 3"], points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "r c 3"]:
@@ -187,10 +187,15 @@ def _flat(array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array.reshape(-1, 3).astype(np.float32))
 
 
-def _join(parts: list[Part]) -> Part:
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    return Part(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.normals for part in parts]),
-        np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)]),
-    )
+def _join(parts: list[RigidMesh]) -> RigidMesh:
+    vertices, faces = stack_meshes([(part.vertices, part.faces) for part in parts])
+    return RigidMesh(vertices, np.concatenate([part.normals for part in parts]), faces)
+
+
+def stack_meshes(
+    meshes: Sequence[tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]],
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Return the vertices (float32) and triangles of several meshes as one mesh."""
+    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in meshes[:-1]])
+    vertices = np.concatenate([vertices for vertices, _ in meshes]).astype(np.float32)
+    return vertices, np.concatenate([faces + offset for (_, faces), offset in zip(meshes, offsets, strict=True)])

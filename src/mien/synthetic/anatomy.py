@@ -115,7 +115,7 @@ class Anatomy:
         return np.clip((points[:, 1] - threshold) / 0.004 + 0.5, 0, 1).astype(np.float32)
 
 
-def measure(model: FaceModel, identity: torch.Tensor) -> Anatomy:
+def measure_anatomy(model: FaceModel, identity: torch.Tensor) -> Anatomy:
     """Return the anatomy of a person at rest."""
     rest, faces = rest_vertices(model, identity), model.faces.numpy()
     return Anatomy(

@@ -27,13 +27,13 @@ from mien.tracking.landmarks import DetectorResponse, response_path, write_respo
 
 _FIRST_SEED = 500
 """First seed, far from those of the reference captures, so that nobody is both calibrated on and measured on."""
-_LOOKS = 2
+_SHOWINGS = 2
 """Times that each picture is shown to the detector, which follows a face from picture to picture."""
 _FOCALS = (1.2, 1.7, 2.4, 3.2)
 """Focal lengths in picture widths."""
-_WRONG = 0.008
+_MAX_OFFSET = 0.008
 """Median offset in metres above which the detector has found something else."""
-_LEAST_PICTURES = 5
+_MIN_PICTURES = 5
 """Fewest pictures of a person."""
 _DEPTH_RIDGE = 0.05
 """Regularisation of a person's offsets towards zero, in pictures. Only turned heads show depth."""
@@ -64,7 +64,7 @@ def sight_person(seed: int, face_model: FaceModel) -> Sightings:
     with LandmarkDetector(several_faces=False) as detector:
         for timestep in range(scene.recipe.timesteps):
             image = scene.frame(timestep).image
-            faces = [detector.detect(image) for _ in range(_LOOKS)][-1]
+            faces = [detector.detect(image) for _ in range(_SHOWINGS)][-1]
             if len(faces):
                 found.append((timestep, torch.from_numpy(np.asarray(faces[0])).float()))
     if not found:
@@ -75,7 +75,7 @@ def sight_person(seed: int, face_model: FaceModel) -> Sightings:
     pixels, depth = pixels.reshape(*points.shape[:2], 2), depth.reshape(points.shape[:2])
     detected = torch.stack([marks for _, marks in found])
     across = (detected - pixels) * (depth / scene.camera.K[0, 0].float())[..., None]
-    right = across.norm(dim=-1).median(1).values < _WRONG
+    right = across.norm(dim=-1).median(1).values < _MAX_OFFSET
     R_seen = scene.camera.viewmat[:2, :3].float() @ matrix_from_axis_angle(face.head_rotation)
     habits = torch.cat([face.head_rotation[:, :2], face.expression], dim=1)
     return Sightings(R_seen[right], across[right], habits[right])
@@ -87,10 +87,10 @@ def fit_response(people: Sequence[Sightings], components: int = _COMPONENTS) -> 
     Raises:
         UserError: the detector found too few people.
     """
-    people = [person for person in people if len(person.R_seen) >= _LEAST_PICTURES]
+    people = [person for person in people if len(person.R_seen) >= _MIN_PICTURES]
     if len(people) < 2 * _FOLDS:
         raise UserError(
-            f"the detector found {len(people)} people, {2 * _FOLDS} are needed: draw more, and look at the pictures"
+            f"the detector found {len(people)} people, but {2 * _FOLDS} are needed: draw more, and check the pictures"
         )
     offsets = [_offsets(person, person.across) for person in people]
     habits = torch.zeros(0)
@@ -176,7 +176,7 @@ def main(name: tyro.conf.Positional[str] = "anny", people: int = 200) -> None:
     deviation = 1e3 * float(response.by_person.square().sum(0).mean().sqrt())
     say(
         f"{response_path(name)}: mean offset {1e3 * float(response.mean.norm(dim=1).mean()):.2f} mm; people differ by "
-        f"{deviation:.2f} mm along each axis, of which components of others leave {1e3 * response.rest_sigma:.2f} mm"
+        f"{deviation:.2f} mm along each axis; components of other people leave {1e3 * response.rest_sigma:.2f} mm of it"
     )
 
 

@@ -1,4 +1,4 @@
-"""Strands of hair: scalp, brows and lashes. They are curves with a width, drawn as ribbons that face the camera."""
+"""Hair on the scalp as strands: curves with a width, drawn as ribbons that face the camera."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,9 +6,14 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from mien.exact import dot, length, mixed, product
-from mien.synthetic.anatomy import BROWS_LOWER, BROWS_UPPER, LOWER_LIDS, SIDES, UPPER_LIDS, Anatomy, resample
-from mien.synthetic.noise import SolidNoise, smoothstep
+from mien import exact
+from mien.exact import dot, length, mixed
+from mien.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy
+from mien.synthetic.arithmetic import SolidNoise, smoothstep, unit
+
+_LONG_STEPS = 22
+_LONG_COUNT = 7500
+"""Points per strand, and strands, of long hair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,25 +53,14 @@ def ribbon(points: np.ndarray, across: np.ndarray, widths: np.ndarray) -> Float[
     return np.stack([points - half, points + half], axis=2).reshape(-1, 3).astype(np.float32)
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Return the vectors scaled to length 1."""
-    return vectors * (1 / np.sqrt(dot(vectors, vectors) + 1e-20))[..., None]
-
-
-def along(vectors: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return scalar products with one direction, in the dtype of `vectors`."""
-    x, y, z = direction.tolist()
-    return vectors[..., 0] * x + vectors[..., 1] * y + vectors[..., 2] * z
-
-
-def short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, count: int = 9000) -> Strands:
+def grow_short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, count: int = 9000) -> Strands:
     """Grow short hair with a side parting: long on top, short at the sides and the nape.
 
     A strand follows the skull in the direction in which it is combed, at the height of its layer, so it never enters
     the head.
     """
     random, noise = np.random.default_rng([seed, 3]), SolidNoise(seed + 31)
-    roots = scalp_points(anatomy, count, random)
+    roots = _scalp_points(anatomy, count, random)
     part = random.choice([-1.0, 1.0]) * 0.028
     centre = anatomy.skull_centre
     direction = unit(roots - centre)
@@ -97,7 +91,7 @@ def short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, coun
     return Strands(points, (0.00095 * taper).astype(np.float32), colors.astype(np.float32), outwards)
 
 
-def scalp_points(anatomy: Anatomy, count: int, random: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+def _scalp_points(anatomy: Anatomy, count: int, random: np.random.Generator) -> Float[np.ndarray, "n 3"]:
     """Sample roots on the scalp, evenly spread and sparser towards the hairline."""
     faces = anatomy.faces[anatomy.skin & ~anatomy.region("ears")]
     corners = anatomy.vertices[faces]
@@ -132,129 +126,117 @@ def _combed(
 
 
 @dataclass(frozen=True, eq=False)
-class SkinStrands:
-    """Brow hairs. Every point lies over a triangle of the skin and moves with it."""
+class DrapedStrands:
+    """Strands that move with the head at their roots, and partly with the shoulders at their ends."""
 
-    faces: Int[np.ndarray, "n s"]
-    """Index of each point's triangle in the face model."""
-    barycentric: Float[np.ndarray, "n s 3"]
-    heights: Float[np.ndarray, "n s"]
-    """Heights above the skin, in metres."""
-    widths: Float[np.ndarray, "n s"]
-    colors: Float[np.ndarray, "n s 3"]
+    rest: Strands
+    follow: Float[np.ndarray, "n s"]
+    """Share of the shoulders' motion that each point follows, 0..1."""
 
-    def posed(self, anatomy: Anatomy, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Strands:
-        """Return the strands on a posed head, in the head frame."""
-        corners = anatomy.faces[self.faces]
-        outwards = unit(mixed(self.barycentric, normals[corners]))
-        points = mixed(self.barycentric, vertices[corners]) + self.heights[..., None] * outwards
-        return Strands(points, self.widths, self.colors, outwards)
+    def posed(self, T_head_shoulders: Float[np.ndarray, "4 4"]) -> Strands:
+        """Return the strands in the head frame when the shoulders are turned relative to the head."""
+        points = self.rest.points
+        on_shoulders = exact.rotated(points, T_head_shoulders[:3, :3], T_head_shoulders[:3, 3])
+        moved = points + self.follow[..., None] * (on_shoulders - points)
+        return Strands(moved.astype(np.float32), self.rest.widths, self.rest.colors, self.rest.outwards)
 
 
-def brow_strands(
-    anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int, per_side: int = 620, steps: int = 4
-) -> SkinStrands:
-    """Grow hairs that rise at the inner end of the brow and lie along it towards the temple."""
-    random = np.random.default_rng([seed, 4])
-    curves = []
-    for side in SIDES:
-        upper, lower = (resample(anatomy.landmarks[list(c[side])], 24) for c in (BROWS_UPPER, BROWS_LOWER))
-        along = random.uniform(0, 1, per_side) ** 0.9
-        across = np.clip(random.normal(0.5, 0.27, per_side), 0.0, 1.0)
-        across = 0.45 + (across - 0.45) * (1 - 0.65 * along**2)  # the tail is thin
-        reach = random.uniform(0.10, 0.2, per_side) * (1 - 0.4 * along)
-        slant = (0.42 * (1 - along) ** 2 - 0.12 * (across - 0.5)) + random.normal(0, 0.06, per_side)
-        t = np.linspace(0, 1, steps)
-        u = np.clip(along[:, None] + reach[:, None] * t, 0, 1.12)
-        v = np.clip(across[:, None] + slant[:, None] * t * (1 - 0.4 * t), -0.1, 1.1)
-        curves.append(_between(lower, upper, u, v))
-    points = np.concatenate(curves)
-    faces, barycentric = front_points(anatomy, points.reshape(-1, 3))
-    count = len(points)
-    heights = np.linspace(0.0001, 0.0012, steps) * random.uniform(0.5, 1.2, (count, 1))
-    tint = np.exp(0.2 * random.normal(size=(count, 1, 1)))
-    return SkinStrands(
-        faces=faces.reshape(count, steps),
-        barycentric=barycentric.reshape(count, steps, 3),
-        heights=heights.astype(np.float32),
-        widths=(0.00055 * np.linspace(1, 0.4, steps) * np.ones((count, 1))).astype(np.float32),
-        colors=(color * tint * np.ones((count, steps, 1))).astype(np.float32),
+def grow_long_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], collar: float, seed: int) -> DrapedStrands:
+    """Grow shoulder-length strands that hang from a parting. They stay outside of skull, ears and face.
+
+    Args:
+        anatomy: Anatomy of the head.
+        color: Linear albedo.
+        collar: Height of the collar in the head frame, in metres. The hair ends near it.
+        seed: Seed of this hair.
+    """
+    random, noise = np.random.default_rng([seed, 3]), SolidNoise(seed + 31)
+    roots = _scalp_points(anatomy, _LONG_COUNT, random)
+    part = random.choice([-1.0, 1.0]) * 0.018
+    centre = anatomy.skull_centre
+    layer = random.uniform(0.08, 1.0, _LONG_COUNT)
+    side = np.where(
+        np.abs(roots[:, 0] - part) < 0.002, random.choice([-1.0, 1.0], _LONG_COUNT), np.sign(roots[:, 0] - part)
     )
+    path = _Path(anatomy, centre, side.astype(np.float32), layer)
+    ends = collar - 0.012 + 0.014 * noise(roots, 0.03) + random.normal(0, 0.006, _LONG_COUNT)
+    length = 0.06 + 1.12 * (roots[:, 1] - ends)
+    points = np.empty((_LONG_COUNT, _LONG_STEPS, 3), np.float32)
+    outwards = np.empty_like(points)
+    place = path.lifted(roots - 0.001 * unit(roots - centre), 0.0)
+    wobble = random.normal(0, 0.05, (_LONG_COUNT, 3))
+    for step in range(_LONG_STEPS):
+        points[:, step] = place
+        outwards[:, step] = unit((place - centre) * np.array([1, 0.35, 1], np.float32))
+        locks = np.stack(
+            [noise(roots + 0.1 * axis + 0.02 * step * np.array([0, 0.12, 0]), 0.017) for axis in range(3)], -1
+        )
+        heading = unit(path.heading(place, part) + 0.22 * locks + wobble)
+        place = path.lifted(place + heading * (length / (_LONG_STEPS - 1))[:, None], (step + 1) / (_LONG_STEPS - 1))
+    along = np.linspace(0, 1, _LONG_STEPS)
+    taper = (1 - 0.45 * along**3) * random.uniform(0.8, 1.2, (_LONG_COUNT, 1))
+    inner = 0.3 + 0.7 * layer[:, None] * smoothstep(-0.2, 0.3, along)
+    lighter = 1 + 0.25 * smoothstep(0.4, 1.0, along)  # the sun has bleached the ends
+    tint = np.exp(0.14 * random.normal(size=(_LONG_COUNT, 1)) + 0.2 * noise(roots, 0.010)[:, None])
+    colors = color * (inner * tint * lighter)[..., None]
+    strands = Strands(points, (0.00125 * taper).astype(np.float32), colors.astype(np.float32), outwards)
+    chin = float(anatomy.landmarks[CHIN, 1])
+    return DrapedStrands(strands, 0.55 * smoothstep(chin + 0.03, collar, points[..., 1]))
 
 
-def _between(lower: np.ndarray, upper: np.ndarray, u: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "n s 3"]:
-    """Interpolate bilinearly in the band between two chains; `u` runs along it (and may exceed 1), `v` across."""
-    place = u * (len(lower) - 1)
-    index = np.clip(place.astype(int), 0, len(lower) - 2)
-    fraction = (place - index)[..., None]
-    low = lower[index] + fraction * (lower[index + 1] - lower[index])
-    high = upper[index] + fraction * (upper[index + 1] - upper[index])
-    return low + v[..., None] * (high - low)
+class _Path:
+    """Constrains where a strand may be, and directs where it goes next."""
 
+    def __init__(self, anatomy: Anatomy, centre: np.ndarray, side: np.ndarray, layer: np.ndarray) -> None:
+        self._anatomy, self._centre, self._side, self._layer = anatomy, centre, side, layer
+        ears = anatomy.vertices[np.unique(anatomy.faces[anatomy.region("ears")])]
+        self._ear = np.abs(ears).mean(0) * np.array([1, 0, 0]) + ears.mean(0) * np.array([0, 1, 1])
+        self._brow = float(anatomy.landmarks[[105, 334], 1].mean())
+        self._top = float(anatomy.landmarks[FOREHEAD_TOP, 1])
+        self._chin = float(anatomy.landmarks[CHIN, 1])
 
-def front_points(
-    anatomy: Anatomy, points: Float[np.ndarray, "n 3"]
-) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Return the skin triangle and the barycentric coordinates nearest to each point, by the triangles' planes."""
-    candidates = np.flatnonzero(anatomy.skin)
-    corners = anatomy.vertices[anatomy.faces[candidates]]
-    centres = corners.mean(1)
-    squares = dot(centres, centres)
-    faces = np.empty(len(points), np.int64)
-    weights = np.empty((len(points), 3), np.float32)
-    for start in range(0, len(points), 512):
-        part = points[start : start + 512]
-        away = squares - 2 * product(part, centres.T)
-        near = np.argpartition(away, 12, axis=1)[:, :12]
-        barycentric = _barycentric(part[:, None], corners[near])
-        clamped = np.clip(barycentric, 0, 1)
-        clamped /= clamped.sum(-1, keepdims=True)
-        distance = length(mixed(clamped, corners[near]) - part[:, None])
-        best = distance.argmin(1)
-        rows = np.arange(len(part))
-        faces[start : start + 512] = candidates[near[rows, best]]
-        weights[start : start + 512] = clamped[rows, best]
-    return faces, weights
+    def heading(self, points: Float[np.ndarray, "n 3"], part: float) -> Float[np.ndarray, "n 3"]:
+        """Return the direction: sideways and back on top of the head, along it at its sides, then straight down."""
+        relative = points - self._centre
+        outward = unit(relative)
+        top = smoothstep(0.25, 0.9, outward[:, 1])
+        front = smoothstep(0.0, 0.08, relative[:, 2]) * smoothstep(-0.05, 0.3, outward[:, 1])
+        aside = self._side * (0.15 + 1.1 * top + 0.35 * front)
+        combed = np.stack([aside, -1.0 + 0.6 * top + 0.35 * front, -0.35 * top - 0.5 * front], -1)
+        on_skull = smoothstep(0.1, 0.5, outward[:, 1])[:, None]
+        inward = exact.dot(combed, outward)[:, None] * outward
+        down = np.stack([-0.04 * np.sign(points[:, 0]), -np.ones(len(points)), np.full(len(points), 0.02)], -1)
+        return unit(on_skull * (combed - inward) + (1 - on_skull) * down)
 
+    def lifted(self, points: Float[np.ndarray, "n 3"], along: float) -> Float[np.ndarray, "n 3"]:
+        """Return the points moved off the head by their layer's height, and off the face."""
+        points = self._beside_the_face(points.astype(np.float32))
+        relative = points - self._centre
+        radius = exact.length(relative)
+        outward = relative / radius[:, None]
+        top = smoothstep(0.3, 0.85, outward[:, 1])
+        mirrored = points * np.array([1, 1, 1], np.float32)
+        mirrored[:, 0] = np.abs(mirrored[:, 0])
+        at_ear = np.exp(-((mirrored - self._ear) ** 2).sum(-1) / (2 * 0.042**2))
+        height = self._layer * (0.011 + 0.009 * top) * smoothstep(-0.02, 0.25, np.full(len(points), along))
+        height = height + 0.003 + 0.016 * at_ear * (along > 0.05)
+        least = self._anatomy.skull_radius(outward.astype(np.float32)) + height
+        upper = smoothstep(self._chin - 0.06, self._chin - 0.02, points[:, 1])
+        # A strand lies on the skull. Where the skull recedes, it hangs free.
+        slack = np.where(outward[:, 1] > -0.1, 0.002 + 0.25 * smoothstep(0.25, -0.1, outward[:, 1]), 1.0)
+        held = np.clip(radius, least, least + slack)
+        return (self._centre + outward * (radius + upper * (held - radius))[:, None]).astype(np.float32)
 
-def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
-    e1, e2, d = b - a, c - a, points - a
-    d11, d12, d22 = dot(e1, e1), dot(e1, e2), dot(e2, e2)
-    p1, p2 = dot(d, e1), dot(d, e2)
-    determinant = np.maximum(d11 * d22 - d12 * d12, 1e-18)
-    v, w = (d22 * p1 - d12 * p2) / determinant, (d11 * p2 - d12 * p1) / determinant
-    return np.stack([1 - v - w, v, w], -1)
-
-
-def lash_strands(
-    landmarks: Float[np.ndarray, "l 3"],
-    eye_centres: Float[np.ndarray, "2 3"],
-    eye_radius: float,
-    steps: int = 4,
-) -> Strands:
-    """Grow lashes along the posed rims of the lids, outwards from the eyeball. Upper ones curl up."""
-    points, outwards, widths = [], [], []
-    on_lid = eye_radius + 0.0012
-    for side, centre in zip(SIDES, eye_centres, strict=True):
-        for rims, longest, curl, count in ((UPPER_LIDS, 0.0058, 0.62, 44), (LOWER_LIDS, 0.0030, -0.5, 24)):
-            roots = resample(landmarks[list(rims[side])], count + 6)[3:-3]
-            radial = unit(roots - centre)
-            # If landmarks lie on the inner fold of a lid, lashes still start on its outside.
-            roots = centre + np.maximum(length(roots - centre)[:, None], on_lid) * radial
-            aside = np.linspace(0.6, -0.25, count)[:, None] * np.array([1.0 if side == "left" else -1.0, 0, 0])
-            vary = 1 + 0.25 * np.sin(np.arange(count) * 12.9898) * np.cos(np.arange(count) * 4.1)
-            upward = np.array([0.0, 1.0, 0.0]) - radial[:, 1:2] * radial
-            t = np.linspace(0, 1, steps)[None, :, None]
-            reach = (longest * vary * (0.65 + 0.35 * np.sin(np.linspace(0.2, 2.6, count))))[:, None, None]
-            bend = t * (radial + 0.5 * aside)[:, None] + curl * t * t * upward[:, None]
-            points.append(roots[:, None] + reach * bend)
-            outwards.append(np.repeat(radial[:, None], steps, 1))
-            widths.append(np.repeat((0.0003 if curl > 0 else 0.00016) * np.linspace(1, 0.4, steps)[None], count, 0))
-    total = sum(len(part) for part in points)
-    return Strands(
-        np.concatenate(points).astype(np.float32),
-        np.concatenate(widths).astype(np.float32),
-        np.full((total, steps, 3), 0.012, np.float32),
-        np.concatenate(outwards).astype(np.float32),
-    )
+    def _beside_the_face(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Turn points about the skull's vertical axis until they leave the face free."""
+        x, z = points[:, 0] - self._centre[0], points[:, 2] - self._centre[2]
+        around = np.arctan2(np.abs(x), z)
+        side = np.where(np.abs(x) > 0.03, np.sign(x), self._side)
+        heights = [self._chin - 0.08, self._chin, self._brow - 0.03, self._brow, self._top, self._top + 0.03]
+        least = np.radians(np.interp(points[:, 1], heights, [46, 54, 62, 52, 16, 0]))
+        around = np.maximum(around, least + 0.10 * self._layer)
+        around = np.where(points[:, 1] > self._top + 0.03, np.arctan2(np.abs(x), z), around)
+        distance = np.hypot(x, z)
+        moved = np.stack([self._centre[0] + side * distance * np.sin(around), points[:, 1],
+                          self._centre[2] + distance * np.cos(around)], -1)  # fmt: skip
+        return np.where((points[:, 1] > self._top + 0.03)[:, None], points, moved).astype(np.float32)

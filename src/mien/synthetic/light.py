@@ -20,7 +20,7 @@ _SH_FACTORS = np.array([
     0.28209479177387814, *[0.4886025119029199] * 3, *[1.0925484305920792] * 2, 0.31539156525252005,
     1.0925484305920792, 0.5462742152960396,
 ])  # fmt: skip
-_DIRECTIONS = 112
+_DIRECTION_COUNT = 112
 _MAP_SIZE = 224
 _MAP_DISTANCE = 20.0  # metres: nearly parallel rays, and depths that float32 can still separate
 
@@ -66,7 +66,7 @@ class Lighting:
         return total.astype(np.float32)
 
 
-def polynomial(sh_light: Float[np.ndarray, "9 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def irradiance_polynomial(sh_light: Float[np.ndarray, "9 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return `mien.render.mesh.shade` as a polynomial of the normal: `constant + linear @ n + n @ square @ n`.
 
     The shapes are [3], [3, 3] and [3, 3, 3]. The first axis is the colour channel.
@@ -84,9 +84,9 @@ def studio_lighting(seed: int) -> Lighting:
     key = np.array([1 + warm, 1.0, 1 - 1.4 * warm])
     return Lighting(
         lamps=(
-            Lamp(_unit(0.75 * side, 0.62, 0.85), (1.2 * key).astype(np.float32), 9.0),
-            Lamp(_unit(-0.8 * side, 0.15, 0.75), np.array([0.10, 0.11, 0.125], np.float32), 4.0),
-            Lamp(_unit(-0.7 * side, 0.5, -0.75), np.array([0.40, 0.43, 0.48], np.float32), 8.0),
+            Lamp(_direction(0.75 * side, 0.62, 0.85), (1.2 * key).astype(np.float32), 9.0),
+            Lamp(_direction(-0.8 * side, 0.15, 0.75), np.array([0.10, 0.11, 0.125], np.float32), 4.0),
+            Lamp(_direction(-0.7 * side, 0.5, -0.75), np.array([0.40, 0.43, 0.48], np.float32), 8.0),
         ),
         ambient=np.array([0.155, 0.16, 0.17], np.float32),
     )
@@ -128,8 +128,8 @@ def compute_visibility(
 
     Without occluders nothing is in shadow.
     """
-    index = np.arange(_DIRECTIONS) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * index / _DIRECTIONS), math.pi * (1 + 5**0.5) * index  # Fibonacci's spiral
+    index = np.arange(_DIRECTION_COUNT) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * index / _DIRECTION_COUNT), math.pi * (1 + 5**0.5) * index  # Fibonacci's spiral
     directions = np.stack([np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth)], -1)
     directions = directions.astype(np.float32)
     unshadowed = np.clip(exact.product(directions, normals.T), 0, None)
@@ -160,6 +160,6 @@ def _lit_share(
     return lit / 9
 
 
-def _unit(x: float, y: float, z: float) -> np.ndarray:
+def _direction(x: float, y: float, z: float) -> np.ndarray:
     vector = np.array([x, y, z], np.float32)
     return vector / exact.length(vector)

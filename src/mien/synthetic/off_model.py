@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mien import exact
 from mien.face import FaceModel, FaceParams
-from mien.synthetic.noise import SolidNoise, smoothstep
+from mien.synthetic.arithmetic import SolidNoise, smoothstep
 from mien.synthetic.posing import rest_vertices
 
 _EXTRA = (("jawOpen", "mouthSmileLeft"), ("mouthPucker", "mouthFunnel"), ("browInnerUp", "browDownLeft"))

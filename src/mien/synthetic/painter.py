@@ -12,8 +12,7 @@ from mien.camera import Camera
 from mien.render.mesh import MeshFragments, interpolate, rasterize_mesh
 from mien.synthetic import shading
 from mien.synthetic.anatomy import LIPS_OUTER, SIDES, UPPER_LIDS
-from mien.synthetic.hair import unit
-from mien.synthetic.noise import SolidNoise
+from mien.synthetic.arithmetic import SolidNoise, unit
 from mien.synthetic.posing import project
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.subject import (
@@ -77,7 +76,7 @@ class _Canvas:
         self.face_index = face_index[self.pixels]
         self.material = subject.materials.astype(np.int8)[self.face_index]
         self.colors = np.zeros((len(self.pixels), 3), np.float32)
-        self.light = shading.turned(subject.lighting, posed.R_world_head)
+        self.light = shading.turn_light(subject.lighting, posed.R_world_head)
 
     def part(self, rows: Int[np.ndarray, " n"]) -> MeshFragments:
         """Return some samples as a picture one pixel high."""
@@ -236,7 +235,7 @@ def _add_lenses(canvas: _Canvas, image: Float[np.ndarray, "p 3"]) -> None:
     normals = unit(interpolate(part, torch.from_numpy(lenses.normals), faces)[0].numpy())
     row, column = np.divmod(index.numpy(), right - left)
     pixels = (row + top) * camera.width + column + left
-    image[pixels] = 0.93 * image[pixels] + shading.lens_reflection(normals, canvas.views(pixels), canvas.light)
+    image[pixels] = 0.93 * image[pixels] + shading.shade_lens(normals, canvas.views(pixels), canvas.light)
 
 
 def develop(
@@ -259,7 +258,7 @@ _TABLE_SIZE = 1 << 16
 _SRGB_TABLE = _srgb((np.arange(_TABLE_SIZE) + 0.5) / _TABLE_SIZE).astype(np.float32)
 
 
-def wall(recipe: SyntheticRecipe, seed: int) -> Float[np.ndarray, "h w 3"]:
+def paint_wall(recipe: SyntheticRecipe, seed: int) -> Float[np.ndarray, "h w 3"]:
     """Return a plain wall in linear colour, brighter on one side."""
     random = np.random.default_rng([seed, 7])
     y, x = np.mgrid[0 : recipe.height, 0 : recipe.width].astype(np.float32)

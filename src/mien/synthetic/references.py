@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mien.errors import UserError
+from mien.synthetic.captures import scene_key, write_scene
 from mien.synthetic.recipe import Segment, SyntheticRecipe
 from mien.synthetic.scene import SyntheticScene
-from mien.synthetic.writing import scene_key, write_scene
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class ReferenceCapture:
     """One synthetic person in one or several sequences, and how methods are trained on it for comparison."""
 
     name: str
-    what: str
+    description: str
     """Description in one line, for tables."""
     seed: int
     """Seed of the person."""
@@ -68,7 +68,7 @@ def reference_named(name: str) -> ReferenceCapture:
         UserError: there is none of that name.
     """
     if name not in REFERENCES:
-        raise UserError(f"there is no reference capture {name!r}; choose of: {', '.join(REFERENCES)}")
+        raise UserError(f"there is no reference capture {name!r}; choose one of: {', '.join(REFERENCES)}")
     return REFERENCES[name]
 
 
@@ -87,8 +87,8 @@ _RING = replace(
 )  # fmt: skip
 
 
-def _one(name: str, what: str, seed: int, recipe: SyntheticRecipe, steps: int = 2_000) -> ReferenceCapture:
-    return ReferenceCapture(name, what, seed, (replace(recipe, name=name),), steps=steps)
+def _one(name: str, description: str, seed: int, recipe: SyntheticRecipe, steps: int = 2_000) -> ReferenceCapture:
+    return ReferenceCapture(name, description, seed, (replace(recipe, name=name),), steps=steps)
 
 
 REFERENCES = {

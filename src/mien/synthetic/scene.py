@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
@@ -11,18 +12,22 @@ import torch
 from jaxtyping import Float, UInt8
 
 from mien import exact
-from mien.camera import Camera
+from mien.camera import Camera, look_at
 from mien.face import FaceModel, load_face_model
 from mien.parallel import stream_in_threads
-from mien.synthetic.motion import head_motion
+from mien.synthetic.motion import generate_motion
 from mien.synthetic.off_model import bend_off_model
-from mien.synthetic.painter import develop, draw, to_uint8, wall
+from mien.synthetic.painter import develop, draw, paint_wall, to_uint8
 from mien.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
 from mien.synthetic.recipe import SyntheticRecipe
-from mien.synthetic.rig import cameras_of
 from mien.synthetic.subject import Subject, build_subject, pose_subject
 from mien.tracking import Tracking
 from mien.tracking.neck_line import fit_neck_lines
+
+_MAX_AZIMUTH = 72.0
+"""Largest angle to either side of a ring, in degrees."""
+_ELEVATIONS = (0.0, 24.0, -16.0)
+"""Elevations of the three rows of a ring in degrees above the face; cameras alternate between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,13 +64,13 @@ class SyntheticScene:
         count = self.model.identity_basis.shape[0]
         coefficients = np.random.default_rng([seed, 0]).standard_normal(count).astype(np.float32)
         self.identity = torch.from_numpy(recipe.identity_scale * np.clip(coefficients, -2, 2)).float()
-        self.face = head_motion(self.model, self.identity, recipe, self.motion_seed)
+        self.face = generate_motion(self.model, self.identity, recipe, self.motion_seed)
         self.drawn_model, self._drawn_face = self.model, self.face
         if recipe.off_model > 0:
             bent = bend_off_model(self.model, self.identity, recipe.off_model, seed)
             self.drawn_model, self._drawn_face = bent.model, bent.face(self.face, recipe.fps, seed)
             self.face = replace(self.face, vertex_offsets=bent.offsets)
-        self.cameras = cameras_of(recipe)
+        self.cameras = _place_cameras(recipe)
 
     @property
     def camera(self) -> Camera:
@@ -86,7 +91,7 @@ class SyntheticScene:
     @cached_property
     def background(self) -> Float[np.ndarray, "h w 3"]:
         """The empty room in linear colour. It looks the same to every camera."""
-        return wall(self.recipe, self.seed)
+        return paint_wall(self.recipe, self.seed)
 
     def vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
         """Return the true vertices of the head in the face model's topology, in world space, in metres."""
@@ -180,3 +185,27 @@ class SyntheticScene:
         }
         digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
         return {"kind": "synthetic", "content_hash": digest, **content}
+
+
+def _place_cameras(recipe: SyntheticRecipe) -> tuple[Camera, ...]:
+    """Return one camera per camera_id, all in one world frame.
+
+    The first is at the world's origin and looks along -z at the head, `recipe.distance` away. The others of a ring look
+    at the same point from the same distance. They are spread evenly from one side to the other, in three rows.
+    """
+    focal = recipe.focal * recipe.width
+    K = torch.tensor([[focal, 0, recipe.width / 2], [0, focal, recipe.height / 2], [0, 0, 1.0]])
+    front = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    viewmats = [front]
+    target = torch.tensor([0.0, 0.0, -recipe.distance])
+    for index in range(1, len(recipe.camera_ids)):
+        share = (index - 1) / max(len(recipe.camera_ids) - 2, 1)
+        azimuth = math.radians(_MAX_AZIMUTH * (2 * share - 1))
+        elevation = math.radians(_ELEVATIONS[index % len(_ELEVATIONS)])
+        away = torch.tensor([
+            math.sin(azimuth) * math.cos(elevation),
+            math.sin(elevation),
+            math.cos(azimuth) * math.cos(elevation),
+        ])  # fmt: skip
+        viewmats.append(look_at(target + recipe.distance * away, target, torch.tensor([0.0, 1.0, 0.0])))
+    return tuple(Camera(K, viewmat, recipe.width, recipe.height) for viewmat in viewmats)

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from mien import exact
 from mien.exact import dot
 from mien.render.mesh import sample_texture
-from mien.synthetic.hair import Strands, along, unit
-from mien.synthetic.light import Lighting, polynomial
-from mien.synthetic.noise import smoothstep
+from mien.synthetic.arithmetic import along, smoothstep, unit
+from mien.synthetic.hair import Strands
+from mien.synthetic.light import Lighting, irradiance_polynomial
 
-_HIGHLIGHT = 0.2
+_MIN_HIGHLIGHT = 0.2
 """Weaker lamps contribute only diffuse light."""
 
 
@@ -39,9 +39,9 @@ class LocalLight:
         return out
 
 
-def turned(lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> LocalLight:
+def turn_light(lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> LocalLight:
     """Return the light for one head pose."""
-    constant, linear, square = (part.astype(np.float64) for part in polynomial(lighting.sh_light))
+    constant, linear, square = (part.astype(np.float64) for part in irradiance_polynomial(lighting.sh_light))
     R = R_world_head.astype(np.float64)
     linear = exact.product(linear, R)
     square = exact.product(exact.product(R.T, square), R)
@@ -50,12 +50,12 @@ def turned(lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> LocalL
     rows = [square[:, axis, axis] + share for axis in range(3)]
     rows += [2 * square[:, first, second] for first, second in ((0, 1), (1, 2), (0, 2))]
     quadratic = np.stack([*rows, *linear.T, constant - share]).astype(np.float32)
-    bright = [lamp for lamp in lighting.lamps if lamp.color.max() > _HIGHLIGHT]
+    bright = [lamp for lamp in lighting.lamps if lamp.color.max() > _MIN_HIGHLIGHT]
     lamps = tuple((exact.rotated(lamp.direction, R_world_head.T).astype(np.float32), lamp.color) for lamp in bright)
     return LocalLight(quadratic, lamps)
 
 
-def highlight(
+def shade_highlights(
     normals: Float[np.ndarray, "n 3"],
     views: Float[np.ndarray, "n 3"],
     light: LocalLight,
@@ -89,7 +89,7 @@ def shade_skin(
     normals = unit(unit(normals) - gradient)
     diffuse = albedo * light.irradiance(normals) * shadow
     grazing = 1 - np.clip(dot(normals, views), 0, 1)[:, None]
-    sheen = highlight(normals, views, light, ((0.30, 26.0), (0.12, 120.0)))
+    sheen = shade_highlights(normals, views, light, ((0.30, 26.0), (0.12, 120.0)))
     return diffuse + shadow * gloss * (sheen + 0.06 * grazing**4)
 
 
@@ -162,7 +162,7 @@ def shade_eye(
     if not is_wet:
         return diffuse
     cornea = unit(normals + 0.75 * outward * smoothstep(1.25, 0.9, q)[:, None])
-    wet = highlight(cornea, views, light, ((0.5, 900.0), (0.1, 60.0)))
+    wet = shade_highlights(cornea, views, light, ((0.5, 900.0), (0.1, 60.0)))
     return diffuse + np.minimum(wet, 1.5) * (0.25 + 0.75 * shadow)
 
 
@@ -193,7 +193,9 @@ def shade_teeth(
     rounded = unit(rounded).astype(np.float32)
     albedo = np.array([0.70, 0.64, 0.52], np.float32) * (1 - 0.5 * gap)[:, None]
     scarce = 0.9 * np.exp(-np.clip(depth - 0.005, 0, None) / 0.010)[:, None]
-    return (albedo * light.irradiance(rounded) * 0.8 + highlight(rounded, views, light, ((0.35, 150.0),))) * scarce
+    return (
+        albedo * light.irradiance(rounded) * 0.8 + shade_highlights(rounded, views, light, ((0.35, 150.0),))
+    ) * scarce
 
 
 def shade_mouth(
@@ -208,7 +210,9 @@ def shade_mouth(
     # All light comes from the opening: use the room's light for a surface that faces it, not for the surface's own
     # normal.
     opening = light.irradiance(np.array([[0.0, 0.1, 0.995]], np.float32))
-    return (albedo * opening * 0.8 + 0.5 * scarce * highlight(normals, views, light, ((0.2, 40.0),))) * scarce + 0.002
+    return (
+        albedo * opening * 0.8 + 0.5 * scarce * shade_highlights(normals, views, light, ((0.2, 40.0),))
+    ) * scarce + 0.002
 
 
 def shade_frame(
@@ -216,16 +220,16 @@ def shade_frame(
 ) -> Float[np.ndarray, "n 3"]:
     """Shade the frame as dark polished plastic."""
     albedo = np.array([0.016, 0.011, 0.009], np.float32)
-    return albedo * light.irradiance(normals) + highlight(normals, views, light, ((0.9, 90.0),))
+    return albedo * light.irradiance(normals) + shade_highlights(normals, views, light, ((0.9, 90.0),))
 
 
-def lens_reflection(
+def shade_lens(
     normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], light: LocalLight
 ) -> Float[np.ndarray, "n 3"]:
     """Return the light that a coated lens adds to what is behind it."""
     grazing = 1 - np.abs(dot(normals, views))[:, None]
     room = np.array([0.010, 0.013, 0.014], np.float32) * (1 + 8 * grazing**3)
-    return room + highlight(normals, views, light, ((0.2, 60.0),))
+    return room + shade_highlights(normals, views, light, ((0.2, 60.0),))
 
 
 def look_up(channels: Float[np.ndarray, "s s c"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n c"]:

@@ -12,8 +12,8 @@ from mien.camera import Camera
 from mien.render.mesh import interpolate, rasterize_mesh
 from mien.synthetic import anatomy as places
 from mien.synthetic.anatomy import SIDES, Anatomy, FrontView, face_view
-from mien.synthetic.beard import beard_zone
-from mien.synthetic.noise import SolidNoise, smoothstep
+from mien.synthetic.arithmetic import SolidNoise, smoothstep
+from mien.synthetic.facial_hair import beard_zone
 from mien.synthetic.recipe import SyntheticRecipe
 
 _TONES = np.array(

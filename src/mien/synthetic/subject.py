@@ -8,12 +8,11 @@ from jaxtyping import Float, Int
 
 from mien import exact
 from mien.face import FaceModel, FaceParams
-from mien.synthetic.accessories import Glasses, Part, build_glasses, build_shirt
-from mien.synthetic.anatomy import CHIN, SIDES, Anatomy, measure
-from mien.synthetic.beard import RootedStrands, full_beard
-from mien.synthetic.hair import SkinStrands, Strands, brow_strands, lash_strands, ribbon_faces, short_hair
+from mien.synthetic.accessories import Glasses, RigidMesh, build_glasses, build_shirt, stack_meshes
+from mien.synthetic.anatomy import CHIN, SIDES, Anatomy, measure_anatomy
+from mien.synthetic.facial_hair import RootedStrands, SkinStrands, grow_beard, grow_brows, grow_lashes
+from mien.synthetic.hair import DrapedStrands, Strands, grow_long_hair, grow_short_hair, ribbon_faces
 from mien.synthetic.light import Lighting, Visibility, compute_visibility, studio_lighting
-from mien.synthetic.long_hair import DrapedStrands, long_hair
 from mien.synthetic.motion import neck_pivot, shoulder_rotation
 from mien.synthetic.posing import HeadPoser, head_pose, landmark_positions
 from mien.synthetic.recipe import SyntheticRecipe
@@ -69,7 +68,7 @@ class Subject:
     """Brows and beard."""
     lashes: bool
     glasses: Glasses | None
-    shirt: Part | None
+    shirt: RigidMesh | None
     faces: Int[np.ndarray, "f 3"]
     """Triangles of everything that is opaque."""
     materials: Int[np.ndarray, " f"]
@@ -97,7 +96,7 @@ class PosedSubject:
 def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRecipe, seed: int) -> Subject:
     """Build a person from a seed: paint the skin, add hair and clothes, and compute what shades what."""
     random = np.random.default_rng([seed, 6])
-    anatomy = measure(model, identity)
+    anatomy = measure_anatomy(model, identity)
     hair_color = _HAIR_COLORS[random.integers(len(_HAIR_COLORS))]
     collar, size = _collar(anatomy)
     hair = _grow_hair(anatomy, recipe, hair_color, float(collar[1]), seed)
@@ -105,9 +104,9 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
     shirt = build_shirt(collar, size, _shoulder_points(anatomy, collar, size), seed) if recipe.clothes else None
     on_skin: tuple[SkinStrands | RootedStrands, ...] = ()
     if recipe.brows_and_lashes:
-        on_skin += (brow_strands(anatomy, 0.7 * hair_color, seed),)
+        on_skin += (grow_brows(anatomy, 0.7 * hair_color, seed),)
     if recipe.beard > 0:
-        on_skin += (full_beard(anatomy, 0.8 * hair_color, recipe.beard, seed),)
+        on_skin += (grow_beard(anatomy, 0.8 * hair_color, recipe.beard, seed),)
     kept = _uncovered_faces(anatomy, collar) if recipe.clothes else np.arange(len(anatomy.faces))
     faces, materials = _all_faces(
         anatomy, kept, _strand_sizes(hair, on_skin, recipe.brows_and_lashes, anatomy), glasses, shirt
@@ -162,7 +161,9 @@ def _grow_hair(
 ) -> Strands | DrapedStrands | None:
     if recipe.hair == "none":
         return None
-    return long_hair(anatomy, color, collar, seed) if recipe.hair == "long" else short_hair(anatomy, color, seed)
+    return (
+        grow_long_hair(anatomy, color, collar, seed) if recipe.hair == "long" else grow_short_hair(anatomy, color, seed)
+    )
 
 
 def _at_rest(hair: Strands | DrapedStrands | None) -> Strands | None:
@@ -183,7 +184,7 @@ def _posed_strands(
         strands.append(hair.posed(T_head_shoulders) if isinstance(hair, DrapedStrands) else hair)
     strands += [part.posed(subject.anatomy, head, normals) for part in subject.on_skin]
     if subject.lashes:
-        strands.append(lash_strands(landmarks, eye_centres, subject.eyes[0].radius))
+        strands.append(grow_lashes(landmarks, eye_centres, subject.eyes[0].radius))
     return tuple(strands)
 
 
@@ -252,7 +253,7 @@ def _shoulder_points(
 
 
 def _occluders(
-    anatomy: Anatomy, hair: Strands | None, glasses: Glasses | None, shirt: Part | None
+    anatomy: Anatomy, hair: Strands | None, glasses: Glasses | None, shirt: RigidMesh | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what casts shadows: the head at rest, every fourth strand three times as wide, the rims, the shoulders."""
     closed = ~anatomy.region("eyes", "irises", "teeth", "tongue", "mouth", "eye_sockets")
@@ -264,13 +265,7 @@ def _occluders(
     meshes += [
         (part.vertices, part.faces) for part in ([glasses.frame] if glasses else []) + ([shirt] if shirt else [])
     ]
-    return _stack(meshes)
-
-
-def _stack(meshes: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in meshes])
-    vertices = np.concatenate([vertices for vertices, _ in meshes]).astype(np.float32)
-    return vertices, np.concatenate([faces + offset for (_, faces), offset in zip(meshes, offsets, strict=False)])
+    return stack_meshes(meshes)
 
 
 def _strand_sizes(
@@ -284,7 +279,7 @@ def _strand_sizes(
     sizes = [] if rest is None else [rest.widths.shape]
     sizes += [strands.widths.shape for strands in on_skin]
     if lashes:
-        sizes.append(lash_strands(anatomy.landmarks, np.zeros((2, 3)), 0.017).widths.shape)
+        sizes.append(grow_lashes(anatomy.landmarks, np.zeros((2, 3)), 0.017).widths.shape)
     return sizes
 
 
@@ -293,7 +288,7 @@ def _all_faces(
     kept: np.ndarray,
     strand_sizes: list[tuple[int, int]],
     glasses: Glasses | None,
-    shirt: Part | None,
+    shirt: RigidMesh | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the triangles over `opaque_vertices` and their materials."""
     of_model = np.full(len(anatomy.faces), SKIN)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from mien import exact
 from mien.errors import UserError
 from mien.storage import read_arrays, read_json, write_arrays, write_json
-from mien.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy, measure
+from mien.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy, measure_anatomy
 from mien.synthetic.scene import SyntheticScene
 from mien.tracking import Tracking, read_tracking, write_tracking
 
@@ -19,7 +19,7 @@ FORMAT, VERSION = "mien.synthetic_truth", 1
 _JSON, _ARRAYS, _TRACKING = "truth.json", "truth.safetensors", "tracking"
 _METRE, _PIXEL = 1e-5, 1 / 16
 """Units of the stored 16-bit numbers: 10 micrometres, a sixteenth of a pixel."""
-_LARGEST = np.iinfo(np.int16).max
+_MAX_STORED = np.iinfo(np.int16).max
 _REMEDY = "delete the folder and draw the capture again"
 _EAR = 234
 
@@ -54,7 +54,7 @@ def surface_of(
     scene: SyntheticScene,
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "t n 3"], Float[np.ndarray, "t c l 2"]]:
     """Return `vertex_index`, `vertices` and `landmarks` of the truth."""
-    index = face_region(measure(scene.model, scene.identity))
+    index = face_region(measure_anatomy(scene.model, scene.identity))
     chosen = torch.from_numpy(index)
     vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.recipe.timesteps)])
     landmarks = np.stack([scene.landmarks(camera) for camera in range(len(scene.cameras))], axis=1)
@@ -109,7 +109,7 @@ def read_truth(folder: Path) -> Truth:
 
 
 def _packed(values: np.ndarray, unit: float) -> np.ndarray:
-    return np.clip(np.rint(values / unit), -_LARGEST, _LARGEST).astype(np.int16)
+    return np.clip(np.rint(values / unit), -_MAX_STORED, _MAX_STORED).astype(np.int16)
 
 
 def _unpacked(values: np.ndarray, unit: float) -> np.ndarray:

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mien.errors import UserError
-from mien.face import FaceModel, add_face_model, added_from, load_face_model
+from mien.face import FaceModel, add_face_model, load_face_model, read_added_source
 from mien.face.flame import flame_face_model, read_flame
 from mien.face.loading import cache_folder, is_built_in
 from mien.locks import hold
@@ -54,7 +54,7 @@ def add_face_model_stage(path: Path, name: str | None = None, shareable: bool = 
 
 
 def _add(path: Path, name: str, shareable: bool) -> FaceModel:
-    digest, known = file_digest(path), added_from(name)
+    digest, known = file_digest(path), read_added_source(name)
     other = f"add this one under another name: mien face-models --add {path} --name NAME"
     if is_built_in(name):
         raise UserError(f"{path}: {name!r} is the name of one of mien's own face models; {other}")

@@ -74,7 +74,7 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
     """Run all stages on one reference capture and skip those with current results; return its row and its pictures."""
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
     times = _Times(workspace.root / _TIMES)
-    say(f"== {reference.name}: {reference.what}")
+    say(f"== {reference.name}: {reference.description}")
     with times.measured("draw"):
         key = reference.write(drawn)
     with times.measured("capture"):

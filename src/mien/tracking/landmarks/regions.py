@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from mien.face import FaceModel
-from mien.face.chart import edge_connected, outside_of
+from mien.face.chart import edge_connected, find_outside
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 
 _LIPS_OUTER = (61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185)
@@ -27,7 +27,7 @@ def with_regions_by_landmarks(model: FaceModel) -> FaceModel:
     """Return the model with the regions of the default model, except teeth and tongue. Eyes stay as they are."""
     marks = model.landmark_positions(model.template, "mediapipe").numpy()
     middle = model.template[model.faces].numpy().mean(1)
-    outside = outside_of(model.template.numpy(), model.faces.numpy())
+    outside = find_outside(model.template.numpy(), model.faces.numpy())
     found = _around_the_face(model, middle, marks)
     found["nose"] = _within(middle, marks[list(NOSE)], hull=True) & (middle[:, 2] > marks[list(_TEMPLES), 2].mean())
     found["brows"] = outside & (_within(middle, marks[list(_BROWS[0])]) | _within(middle, marks[list(_BROWS[1])]))

@@ -1,4 +1,7 @@
-"""Synthetic captures on disk, with their truth: drawn frame by frame in bounded memory, resumable."""
+"""Draw whole synthetic captures: in memory, as a video file, or into a folder with their truth.
+
+A folder is drawn frame by frame in bounded memory. If drawing is interrupted, it continues where it stopped.
+"""
 
 import hashlib
 import json
@@ -7,19 +10,21 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
+from mien.camera import Camera
 from mien.capture import Capture, write_capture
 from mien.capture.faces import LANDMARKS, LandmarkDetector
 from mien.capture.video import write_video
 from mien.errors import UserError
 from mien.face.loading import face_model_edition
 from mien.inside import remove_tree
-from mien.progress import progress_bar, say
+from mien.progress import progress_bar, say, track_progress
 from mien.storage import read_json, write_json
 from mien.synthetic.recipe import SyntheticRecipe
 from mien.synthetic.scene import SyntheticScene
 from mien.synthetic.truth import hash_surface, truth_of, write_truth
+from mien.tracking import Tracking
 
 FORMAT, VERSION = "mien.synthetic_capture", 2
 _JSON, _WORK, _STATE = "synthetic.json", ".drawing", "state.json"
@@ -28,6 +33,39 @@ DRAWING = 3
 """Drawing version, raised whenever a recipe would be drawn differently. Every key depends on it."""
 _CHUNK = 16
 """Timesteps after which progress is saved."""
+
+
+def synthesize(recipe: SyntheticRecipe, seed: int) -> tuple[Capture, Tracking]:
+    """Draw a capture and return it with its exact tracking (ground truth), with a progress bar.
+
+    The same recipe and seed give the same bytes on the same machine. Landmarks are the face model's own, projected.
+    Mattes are exact.
+
+    Example:
+        >>> capture, truth = synthesize(RECIPES["plain"], seed=3)
+    """
+    scene = SyntheticScene(recipe, seed)
+    cameras = len(scene.cameras)
+    shape = (recipe.timesteps, cameras, recipe.height, recipe.width)
+    images, mattes = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint8)
+    drawn = track_progress(scene.all_frames(range(recipe.timesteps)), f"Drawing {recipe.name}", recipe.timesteps)
+    for timestep, frames in enumerate(drawn):
+        for camera, frame in enumerate(frames):
+            images[timestep, camera], mattes[timestep, camera] = frame.image, frame.matte
+    landmarks = np.stack([scene.landmarks(camera) for camera in range(cameras)], axis=1)
+    calibration = scene.cameras if cameras > 1 else None
+    return _make_capture(scene, images, mattes, landmarks, scene.source, calibration), scene.tracking()
+
+
+def write_synthetic_video(recipe: SyntheticRecipe, path: Path, seed: int) -> None:
+    """Draw a clip into a video file with a few frames in memory at a time, with a progress bar."""
+    scene = SyntheticScene(recipe, seed)
+
+    def images() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        for frame in track_progress(scene.frames(), f"Drawing {recipe.name}", recipe.timesteps):
+            yield frame.image
+
+    write_video(path, images(), recipe.fps, recipe.detail.compression)
 
 
 def write_synthetic_capture(recipe: SyntheticRecipe, seed: int, folder: Path) -> str:
@@ -51,7 +89,7 @@ def write_scene(scene: SyntheticScene, folder: Path) -> str:
             content_hash = _draw_all(scene, folder, inputs)
         except OSError as error:
             raise UserError(f"{folder}: cannot be written ({error.strerror or error}); choose another place") from None
-        say(f"{scene.recipe.name}: drawn, key {scene_key(scene)}, hash of the bytes {content_hash}")
+        say(f"{scene.recipe.name}: drawn (key {scene_key(scene)}, content hash {content_hash})")
     return scene_key(scene)
 
 
@@ -140,7 +178,9 @@ def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
     if recipe.cameras == "front":
         write_video(folder / VIDEO_NAME, (frame[0] for frame in images), recipe.fps, recipe.detail.compression)
     else:
-        write_capture(folder / CAPTURE_NAME, _as_capture(scene, images, mattes, content_hash))
+        landmarks = np.stack(list(_detect_landmarks(scene, images)), axis=1)
+        source = {**scene.source, "key": scene_key(scene), "drawn_hash": content_hash}
+        write_capture(folder / CAPTURE_NAME, _make_capture(scene, images, mattes, landmarks, source, scene.cameras))
     truth = truth_of(scene)
     write_truth(folder / TRUTH_NAME, truth)
     content = {
@@ -217,9 +257,15 @@ def _draw_missing(scene: SyntheticScene, store: _Pictures, inputs: str) -> None:
             advance()
 
 
-def _as_capture(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray, content_hash: str) -> Capture:
+def _make_capture(
+    scene: SyntheticScene,
+    images: np.ndarray,
+    mattes: np.ndarray,
+    landmarks: np.ndarray,
+    source: dict,
+    calibration: tuple[Camera, ...] | None,
+) -> Capture:
     recipe = scene.recipe
-    landmarks = np.stack(list(_detected(scene, images)), axis=1)
     return Capture(
         name=recipe.name,
         camera_ids=recipe.camera_ids,
@@ -230,14 +276,14 @@ def _as_capture(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray, c
         landmarks=landmarks,
         valid=np.isfinite(landmarks[..., 0, 0]),
         principal_point=np.tile(np.array([recipe.width / 2, recipe.height / 2], np.float32), (len(scene.cameras), 1)),
-        source={**scene.source, "key": scene_key(scene), "drawn_hash": content_hash},
-        calibration=scene.cameras,
+        source=source,
+        calibration=calibration,
     )
 
 
-def _detected(scene: SyntheticScene, images: np.ndarray) -> Iterator[Float[np.ndarray, "t l 2"]]:
+def _detect_landmarks(scene: SyntheticScene, images: np.ndarray) -> Iterator[Float[np.ndarray, "t l 2"]]:
     """Yield the landmarks that a detector finds in each camera's pictures."""
-    with progress_bar(f"Landmarks of {scene.recipe.name}", len(scene.cameras)) as advance:
+    with progress_bar(f"Detecting landmarks of {scene.recipe.name}", len(scene.cameras)) as advance:
         for camera in range(len(scene.cameras)):
             found = np.full((len(images), LANDMARKS, 2), np.nan, np.float32)
             with LandmarkDetector(several_faces=False) as detector:

@@ -1,13 +1,15 @@
-"""Solid noise: random functions of a point in space. The same seed gives the same noise."""
+"""Arithmetic of the drawing: directions, ramps, and solid noise, which is a random function of a point in space."""
 
 import numpy as np
 from jaxtyping import Float
+
+from mien.exact import dot
 
 _PERIOD = 32  # lattice cells after which the noise repeats; a power of two
 
 
 class SolidNoise:
-    """Smooth random functions of space with a mean near zero and values in -1..1."""
+    """Smooth random functions of space with a mean near zero and values in -1..1. The seed decides them."""
 
     def __init__(self, seed: int) -> None:
         self._lattice = np.random.default_rng(seed).uniform(-1, 1, (_PERIOD,) * 3).astype(np.float32)
@@ -47,3 +49,14 @@ def smoothstep(low: float | np.floating, high: float | np.floating, value: np.nd
     """Return 0 below `low`, 1 above `high`, and a smooth ramp between. It falls if `low` > `high`."""
     t = np.clip((value - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Return the vectors scaled to length 1."""
+    return vectors * (1 / np.sqrt(dot(vectors, vectors) + 1e-20))[..., None]
+
+
+def along(vectors: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return scalar products with one direction, in the dtype of `vectors`."""
+    x, y, z = direction.tolist()
+    return vectors[..., 0] * x + vectors[..., 1] * y + vectors[..., 2] * z
