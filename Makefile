@@ -75,16 +75,16 @@ fuzz: setup
 	$(MAKE) fuzz-native
 
 lint: setup
-	$(BIN)/ruff check src tests examples benchmarks
-	$(BIN)/ruff format --check src tests examples benchmarks
+	$(BIN)/ruff check src tests examples benchmarks docs/site docs/pictures
+	$(BIN)/ruff format --check src tests examples benchmarks docs/site docs/pictures
 	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 	$(BIN)/typos
 	$(BIN)/lint-imports
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 format: setup
-	$(BIN)/ruff check --fix src tests examples benchmarks
-	$(BIN)/ruff format src tests examples benchmarks
+	$(BIN)/ruff check --fix src tests examples benchmarks docs/site docs/pictures
+	$(BIN)/ruff format src tests examples benchmarks docs/site docs/pictures
 	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 
 # The site of the documentation, with the reference of the public API: build/docs/index.html. A broken link is an error.

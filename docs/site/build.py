@@ -1,8 +1,8 @@
 """Build the site of the documentation: `make docs`.
 
-The pages are those of docs/, README.md, CONTRIBUTING.md, CHANGELOG.md and the notes beside code. They are copied into one
-folder, where every link between them is written anew, and a page is added for each room of the public API and for
-each piece of code that a page links. docs/README.md becomes the front page, and its sections the menu.
+The pages are those of docs/, README.md, CONTRIBUTING.md, CHANGELOG.md and the pages beside code. They are copied into
+one folder, and the links between them are changed to match. A page is added for each room of the public API, and for
+each file of code that a page links. docs/README.md becomes the front page, and its sections become the menu.
 
 Any warning of Sphinx (a link, a heading or a reference that leads nowhere) fails the build, and so does a path of this
 machine in the result. External links are not opened.
@@ -16,6 +16,7 @@ import posixpath
 import re
 import shutil
 import sys
+import textwrap
 from functools import cache
 from pathlib import Path
 from urllib.parse import unquote
@@ -94,10 +95,11 @@ def _menu(page: str, captions: bool) -> str:
     """Hidden tables of contents, for the sidebar: one for each section of a page that has a table of pages."""
     menu = ""
     for section in re.split(r"^#+ ", page, flags=re.MULTILINE)[1:]:
-        entries = re.findall(r"^\| *\[[^\]]*\]\(([^)\s#:]+\.md)\)", section, flags=re.MULTILINE)
-        caption = f":caption: {section.splitlines()[0]}\n" if captions else ""
+        entries = re.findall(r"^\| *\[([^\]]*)\]\(([^)\s#:]+)\.md\)", section, flags=re.MULTILINE)
         if entries:
-            menu += f"\n```{{toctree}}\n:hidden:\n{caption}\n" + "\n".join(entries) + "\n```\n"
+            caption = f":caption: {section.splitlines()[0]}\n" if captions else ""
+            lines = "\n".join(f"{title} <{page}>" for title, page in entries)
+            menu += f"\n```{{toctree}}\n:hidden:\n{caption}\n{lines}\n```\n"
     return menu
 
 
@@ -112,7 +114,10 @@ def write_reference(to: Path) -> None:
         to / "reference.md",
         "# Reference\n\nThe public API: what each room exports, with shapes, units and errors, from the docstrings.\n"
         "[The ten entry points](api.md) are a shorter way in.\n\n| room | what it is |\n|---|---|\n"
-        + "\n".join(rows) + "\n\n```{toctree}\n:hidden:\n\n" + "\n".join(names) + "\n```\n",
+        + "\n".join(rows)
+        + "\n\n```{toctree}\n:hidden:\n\n"
+        + "\n".join(names)
+        + "\n```\n",
     )
 
 
@@ -120,7 +125,7 @@ def _page_of(door: str, exported: list[PublicName]) -> str:
     parts = [f"{door}\n{'=' * len(door)}\n\n.. automodule:: {door}\n   :no-members:\n\n.. currentmodule:: {door}\n"]
     parts.append(".. list-table::\n   :widths: 30 70\n   :class: names\n")
     for public in exported:
-        doc = public.doc.split("\n\n")[0].replace("\n", " ")
+        doc = public.doc.split("\n\n")[0].replace("\n", " ") or f"``{_value(public)}``"
         parts[-1] += f"\n   * - :py:obj:`{public.name} <{public.full}>`\n     - {doc}"
     parts[-1] += "\n"
     kinds = {"Classes": inspect.isclass, "Functions": inspect.isroutine}
@@ -137,26 +142,26 @@ def _page_of(door: str, exported: list[PublicName]) -> str:
 
 
 def _constant(public: PublicName) -> str:
-    lines = [f".. py:data:: {public.name}"]
+    doc = "".join(f"   {line}\n" for line in public.doc.splitlines())
+    return f".. py:data:: {public.name}\n   :value: {_value(public)}\n\n{doc}"
+
+
+def _value(public: PublicName) -> str:
+    """The expression that defines a constant, shortened."""
     for node in ast.parse(inspect.getsource(importlib.import_module(public.home))).body:
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
-        if not any(isinstance(target, ast.Name) and target.id == public.name for target in targets):
-            continue
-        if isinstance(node, ast.AnnAssign):
-            lines.append(f"   :type: {ast.unparse(node.annotation)}")
-        value = ast.unparse(node.value)
-        if len(value) <= _LONGEST_VALUE:
-            lines.append(f"   :value: {value}")
-    return "\n".join([*lines, "", *(f"   {line}" for line in public.doc.splitlines()), ""])
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        if any(isinstance(target, ast.Name) and target.id == public.name for target in targets):
+            return textwrap.shorten(ast.unparse(node.value), _LONGEST_VALUE, placeholder=" ...")
+    return "..."
 
 
 def paths_of_this_machine(site: Path) -> list[str]:
     """Files of the site that hold a path of this machine."""
-    secrets = [str(path).encode() for path in {ROOT, ROOT.resolve(), Path.home(), Path(sys.prefix)} if len(str(path)) > 1]
+    paths = {str(path) for path in (ROOT, ROOT.resolve(), Path.home(), Path(sys.prefix))} - {"/"}
     return [
         str(file.relative_to(site))
         for file in sorted(site.rglob("*"))
-        if file.is_file() and any(secret in file.read_bytes() for secret in secrets)
+        if file.is_file() and any(path.encode() in file.read_bytes() for path in paths)
     ]
 
 

@@ -13,16 +13,14 @@ version = release = re.search(r'^version = "(.+)"', (_ROOT / "pyproject.toml").r
 html_title = f"mien {release}"
 copyright = "the authors of mien, Apache-2.0"  # noqa: A001
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "links"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "docstrings", "links"]
 exclude_patterns = ["**/_*"]
 nitpicky = True  # a reference that leads nowhere is a warning, and build.py lets no warning pass
 
 # Markdown, as GitHub shows it.
 myst_heading_anchors = 6
-myst_links_external_new_tab = False
-myst_enable_extensions = []
 
-# The reference: one page for each room, in the order of its `__all__` (reference.py).
+# The reference: one page for each room (build.py).
 default_role = "literal"
 add_module_names = False
 autodoc_class_signature = "mixed"
@@ -34,9 +32,6 @@ autodoc_typehints_format = "short"
 python_maximum_signature_line_length = 88
 python_display_short_literal_types = True
 toc_object_entries_show_parents = "hide"
-napoleon_numpy_docstring = False
-napoleon_use_rtype = False
-napoleon_use_ivar = True
 
 html_theme = "furo"
 html_static_path = ["_static"]

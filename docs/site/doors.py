@@ -9,6 +9,7 @@ import inspect
 import pkgutil
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -102,8 +103,7 @@ def _tree(module: str) -> ast.Module:
     assert spec is not None, module
     if spec.origin is None or not spec.origin.endswith(".py"):  # the native core
         return ast.Module(body=[], type_ignores=[])
-    with open(spec.origin, encoding="utf-8") as file:
-        return ast.parse(file.read())
+    return ast.parse(Path(spec.origin).read_text("utf-8"))
 
 
 def first_line(module: ModuleType) -> str:

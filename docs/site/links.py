@@ -1,7 +1,7 @@
 """Sphinx extension: code in the text that names something of mien is checked, and linked to the reference.
 
-A full name such as `mien.render.rasterize` has to exist, wherever it is written. Other names are linked if the reference
-has exactly one thing of that name.
+A full name such as `mien.render.rasterize` has to exist, wherever it is written. Other names are linked if the
+reference has exactly one thing of that name.
 """
 
 import re
