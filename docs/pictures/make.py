@@ -15,12 +15,19 @@ import torch
 from matplotlib.figure import Figure
 
 from mien.avatar import load_avatar
-from mien.capture import Capture, CaptureSettings, capture_video, read_capture, write_capture
-from mien.capture.video import write_video
+from mien.capture import Capture, CaptureSettings, capture_video, write_capture
 from mien.face import FaceParams, load_face_model
 from mien.render import rasterize
-from mien.synthetic import RECIPES, Segment, SyntheticRecipe, SyntheticScene
-from mien.tracking import TrackingSettings, draw_overlay, make_scoring, track, write_scoring, write_tracking
+from mien.synthetic import RECIPES, Segment, SyntheticRecipe, SyntheticScene, write_synthetic_video
+from mien.tracking import (
+    SmoothnessSettings,
+    Tracking,
+    TrackingSettings,
+    make_scoring,
+    track,
+    write_scoring,
+    write_tracking,
+)
 from mien.training import PRESETS, read_sequence, train
 
 SIZE, PERSON = 256, 3
@@ -169,7 +176,36 @@ def needles(out: Path) -> None:
     )
 
 
-PICTURES = {function.__name__: function for function in (mouth, shards, needles)}
+def tracked(recipe: SyntheticRecipe, settings: TrackingSettings, out: Path) -> Tracking:
+    """Draw a video, capture it with the landmark detector, and track it."""
+    video = out / f"{recipe.name}.mp4"
+    if not video.exists():
+        write_synthetic_video(recipe, video, PERSON)
+    capture = capture_video(video, out / f"{recipe.name}-capture", CaptureSettings(size=SIZE, crop="none"))
+    return track(capture, load_face_model(recipe.face_model), settings)
+
+
+def nose_of(tracking: Tracking) -> np.ndarray:
+    """Rows [t, 2] of the tip of the nose, in pixels."""
+    model = load_face_model(tracking.face_model)
+    points = model.landmark_positions(model(tracking.face), "mediapipe")[:, 1]
+    return tracking.cameras[0].project(points)[0].numpy()
+
+
+def jitter(out: Path) -> None:
+    """The tip of the nose while the head is still, in a clip with much noise."""
+    recipe = replace(_BASE, name="noisy", fps=25.0, noise=0.12, script=(Segment("still", 2.4),))
+    for label, settings in (
+        ("rough", TrackingSettings(schedule="landmarks", smoothness=SmoothnessSettings(10, 10, 100, 10000))),
+        ("landmarks", TrackingSettings(schedule="landmarks")),
+        ("fast", TrackingSettings()),
+        ("smooth", TrackingSettings(smoothness=SmoothnessSettings(0.05, 0.1, 1.0, 50.0))),
+    ):
+        nose = nose_of(tracked(recipe, settings, out))
+        print(label, nose.std(axis=0), np.abs(np.diff(nose, 2, axis=0)).mean(axis=0))
+
+
+PICTURES = {function.__name__: function for function in (mouth, shards, needles, jitter)}
 
 
 if __name__ == "__main__":
