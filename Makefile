@@ -1,4 +1,4 @@
-# make setup | demo | test | test-312 | test-exact | sanitize | fuzz | lint | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# make setup | demo | test | test-312 | test-exact | sanitize | fuzz | lint | docs | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 PYTHON312 ?= $(shell for python in python3.12 $(HOME)/.pyenv/versions/3.12*/bin/python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UV_VERSION := 0.13.8
 
-.PHONY: setup build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native lint format bench gpu lock clean
+.PHONY: setup build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native lint format docs bench gpu lock clean
 setup: $(VENV)/.built
 
 $(VENV)/.packages: requirements/lock.txt
@@ -75,17 +75,22 @@ fuzz: setup
 	$(MAKE) fuzz-native
 
 lint: setup
-	$(BIN)/ruff check src tests examples benchmarks
-	$(BIN)/ruff format --check src tests examples benchmarks
+	$(BIN)/ruff check src tests examples benchmarks docs/site docs/pictures
+	$(BIN)/ruff format --check src tests examples benchmarks docs/site docs/pictures
 	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 	$(BIN)/typos
 	$(BIN)/lint-imports
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 format: setup
-	$(BIN)/ruff check --fix src tests examples benchmarks
-	$(BIN)/ruff format src tests examples benchmarks
+	$(BIN)/ruff check --fix src tests examples benchmarks docs/site docs/pictures
+	$(BIN)/ruff format src tests examples benchmarks docs/site docs/pictures
 	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
+
+# The site of the documentation, with the reference of the public API: build/docs/index.html. A broken link is an error.
+docs: setup
+	$(BIN)/python docs/site/build.py --out build/docs
+	@echo "open build/docs/index.html"
 
 # Re-resolve the locked requirements (both Pythons, every platform) after a change in pyproject.toml or overrides.txt.
 lock: $(VENV)/.packages

@@ -7,6 +7,8 @@ from urllib.parse import unquote
 
 import pytest
 
+from mien.cli import COMMANDS
+
 ROOT = Path(__file__).parent.parent
 _OUTSIDE_DOCS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md", "native/README.md")
 PAGES = [*(ROOT / name for name in _OUTSIDE_DOCS), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -70,6 +72,42 @@ def test_every_page_of_the_documentation_is_linked() -> None:
         if not _ADDRESS.match(target)
     }
     assert [page.name for page in PAGES if page.resolve() not in linked and page.name != "README.md"] == []
+
+
+def test_the_index_names_every_page() -> None:
+    index, log = (ROOT / "docs" / name for name in ("README.md", "log.md"))
+    named = {
+        (page.parent / unquote(target).partition("#")[0]).resolve()
+        for page in (index, log)
+        for target in re.findall(
+            r"^\| *\[[^\]]*\]\(([^)\s]+)\) *\| *\S", page.read_text(encoding="utf-8"), re.MULTILINE
+        )
+    }
+    assert [str(page.relative_to(ROOT)) for page in PAGES if page.resolve() not in named and page != index] == []
+
+
+def test_pictures_are_small_and_described() -> None:
+    shown = {
+        (page.parent / target).resolve(): text
+        for page in PAGES
+        for text, target in re.findall(r"!\[([^\]]*)\]\(([^)\s]+)\)", prose(page))
+    }
+    assert all(len(text.split()) > 3 for text in shown.values()), "a picture has no text that says what it shows"
+    pictures = [path for path in (ROOT / "docs").rglob("*") if path.suffix in (".png", ".jpg", ".webp", ".gif")]
+    assert [path.name for path in pictures if path.resolve() not in shown] == [], "a picture that no page shows"
+    assert [path.name for path in pictures if path.stat().st_size > 120_000] == []
+    assert sum(path.stat().st_size for path in pictures) < 1_000_000
+
+
+def test_commands_that_pages_name_exist() -> None:
+    targets = set(re.findall(r"^([a-z0-9-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    missing = []
+    for page in CURRENT:
+        text = page.read_text(encoding="utf-8")
+        missing += [(page.name, name) for name in re.findall(r"`make ([a-z][a-z0-9-]*)", text) if name not in targets]
+        for names in re.findall(r"`mien ((?:[a-z][a-z-]*(?: \| )?)+)", text):
+            missing += [(page.name, name) for name in names.split(" | ") if name.split()[0] not in COMMANDS]
+    assert missing == []
 
 
 def test_broken_links_are_found(tmp_path: Path) -> None:

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from mien.rotation import compose_rigid, invert_rigid, rigid_transform
 
+__all__ = ["Camera", "camera_from_fov", "camera_from_opengl", "look_at"]
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:

@@ -1,5 +1,7 @@
 """Errors that the user can fix."""
 
+__all__ = ["CannotWriteError", "UserError"]
+
 
 class UserError(Exception):
     """Bad input: the command line prints the message without a traceback and exits with code 2.

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+__all__ = ["Gaussians", "rgb_from_sh", "sh_from_rgb", "world_means"]
+
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:

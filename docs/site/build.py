@@ -1,0 +1,193 @@
+"""Build the site of the documentation: `make docs`.
+
+The pages are those of docs/, README.md, CONTRIBUTING.md, CHANGELOG.md and the pages beside code. They are copied into
+one folder, and the links between them are changed to match. A page is added for each room of the public API, and for
+each file of code that a page links. docs/README.md becomes the front page, and its sections become the menu.
+
+Any warning of Sphinx (a link, a heading or a reference that leads nowhere) fails the build, and so does a path of this
+machine in the result. External links are not opened.
+"""
+
+import argparse
+import ast
+import importlib
+import inspect
+import posixpath
+import re
+import shutil
+import sys
+import textwrap
+from functools import cache
+from pathlib import Path
+from urllib.parse import unquote
+
+from doors import PublicName, doors, first_line
+from sphinx.cmd.build import main as sphinx_build
+
+ROOT = Path(__file__).parent.parent.parent
+FRONT = "docs/README.md"
+_LOG = "docs/log.md"
+_BESIDE_CODE = {
+    "README.md": "readme.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "examples/README.md": "examples.md",
+    "native/README.md": "native.md",
+}
+"""Pages outside docs/, and what they are called in the site."""
+_LINK = re.compile(r"(?P<before>\]\()(?P<target>[^)\s#:]+)(?P<after>(#[^)\s]*)?\))")
+_CODE = {".py": "python", ".h": "cpp", ".cpp": "cpp", ".toml": "toml"}
+_LONGEST_VALUE = 88
+"""Longest value of a constant that the reference shows, in characters."""
+_REFERENCE = "| Reference |"
+"""Where the front page names the reference, which exists in the site only."""
+
+
+@cache
+def pages() -> dict[str, str]:
+    """Page of the repository -> page of the site."""
+    below_docs = {
+        path.relative_to(ROOT).as_posix(): path.relative_to(ROOT / "docs").as_posix()
+        for path in sorted((ROOT / "docs").rglob("*.md"))
+    }
+    return {**below_docs, FRONT: "index.md", **_BESIDE_CODE}
+
+
+def copy_pages(to: Path) -> None:
+    """Copy every page, and whatever it links."""
+    for source, name in pages().items():
+        text = _with_links_of_the_site((ROOT / source).read_text("utf-8"), source, name, to)
+        if source == FRONT:
+            assert _REFERENCE in text
+            text = text.replace(_REFERENCE, "| [Reference](reference.md) |")
+        if source in (FRONT, _LOG):
+            text += _menu(text, captions=source == FRONT)
+        _write(to / name, text)
+
+
+def _with_links_of_the_site(text: str, source: str, name: str, to: Path) -> str:
+    def target_of(match: re.Match[str]) -> str:
+        linked = posixpath.normpath(posixpath.join(posixpath.dirname(source), unquote(match["target"])))
+        place = pages().get(linked) or _copied(linked, to)
+        if place is None:
+            return match[0]  # Sphinx reports it
+        return match["before"] + posixpath.relpath(place, posixpath.dirname(name) or ".") + match["after"]
+
+    parts = re.split(r"(^```[\s\S]*?^```|^ {4,}.*$|`[^`\n]+`)", text, flags=re.MULTILINE)
+    return "".join(part if index % 2 else _LINK.sub(target_of, part) for index, part in enumerate(parts))
+
+
+def _copied(linked: str, to: Path) -> str | None:
+    """The place in the site of a file that is not a page: a picture is copied, code gets a page."""
+    path = ROOT / linked
+    if not path.is_file() or not path.resolve().is_relative_to(ROOT.resolve()):
+        return None
+    if path.suffix not in _CODE:
+        (to / linked).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, to / linked)
+        return linked
+    code = path.read_text("utf-8")
+    _write(to / f"code/{linked}.md", f"---\norphan: true\n---\n# {linked}\n\n````{_CODE[path.suffix]}\n{code}````\n")
+    return f"code/{linked}.md"
+
+
+def _menu(page: str, captions: bool) -> str:
+    """Hidden tables of contents, for the sidebar: one for each section of a page that has a table of pages."""
+    menu = ""
+    for section in re.split(r"^#+ ", page, flags=re.MULTILINE)[1:]:
+        entries = re.findall(r"^\| *\[([^\]]*)\]\(([^)\s#:]+)\.md\)", section, flags=re.MULTILINE)
+        if entries:
+            caption = f":caption: {section.splitlines()[0]}\n" if captions else ""
+            lines = "\n".join(f"{title} <{page}>" for title, page in entries)
+            menu += f"\n```{{toctree}}\n:hidden:\n{caption}\n{lines}\n```\n"
+    return menu
+
+
+def write_reference(to: Path) -> None:
+    """Write one page for each door, and a page that names them all."""
+    rows, names = [], []
+    for door, exported in doors().items():
+        _write(to / f"reference/{door}.rst", _page_of(door, exported))
+        rows.append(f"| [`{door}`](reference/{door}.rst) | {first_line(importlib.import_module(door))} |")
+        names.append(f"reference/{door}")
+    _write(
+        to / "reference.md",
+        "# Reference\n\nThe public API: what each room exports, with shapes, units and errors, from the docstrings.\n"
+        "[The ten entry points](api.md) are a shorter way in.\n\n| room | what it is |\n|---|---|\n"
+        + "\n".join(rows)
+        + "\n\n```{toctree}\n:hidden:\n\n"
+        + "\n".join(names)
+        + "\n```\n",
+    )
+
+
+def _page_of(door: str, exported: list[PublicName]) -> str:
+    parts = [f"{door}\n{'=' * len(door)}\n\n.. automodule:: {door}\n   :no-members:\n\n.. currentmodule:: {door}\n"]
+    parts.append(".. list-table::\n   :widths: 30 70\n   :class: names\n")
+    for public in exported:
+        doc = public.doc.split("\n\n")[0].replace("\n", " ") or f"``{_value(public)}``"
+        parts[-1] += f"\n   * - :py:obj:`{public.name} <{public.full}>`\n     - {doc}"
+    parts[-1] += "\n"
+    kinds = {"Classes": inspect.isclass, "Functions": inspect.isroutine}
+    for title, belongs in kinds.items():
+        group = [public for public in exported if belongs(public.value)]
+        if group:
+            parts.append(f"{title}\n{'-' * len(title)}\n")
+        parts += [f".. auto{'class' if title == 'Classes' else 'function'}:: {public.name}\n" for public in group]
+    rest = [public for public in exported if not any(belongs(public.value) for belongs in kinds.values())]
+    if rest:
+        parts.append("Constants and types\n-------------------\n")
+    parts += [_constant(public) for public in rest]
+    return "\n".join(parts)
+
+
+def _constant(public: PublicName) -> str:
+    doc = "".join(f"   {line}\n" for line in public.doc.splitlines())
+    return f".. py:data:: {public.name}\n   :value: {_value(public)}\n\n{doc}"
+
+
+def _value(public: PublicName) -> str:
+    """The expression that defines a constant, shortened."""
+    for node in ast.parse(inspect.getsource(importlib.import_module(public.home))).body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        if any(isinstance(target, ast.Name) and target.id == public.name for target in targets):
+            return textwrap.shorten(ast.unparse(node.value), _LONGEST_VALUE, placeholder=" ...")
+    return "..."
+
+
+def paths_of_this_machine(site: Path) -> list[str]:
+    """Files of the site that hold a path of this machine."""
+    paths = {str(path) for path in (ROOT, ROOT.resolve(), Path.home(), Path(sys.prefix))} - {"/"}
+    return [
+        str(file.relative_to(site))
+        for file in sorted(site.rglob("*"))
+        if file.is_file() and any(path.encode() in file.read_bytes() for path in paths)
+    ]
+
+
+def build(out: Path) -> int:
+    """Build the site into `out`, and return the exit code."""
+    work = out.with_name(out.name + "-pages")
+    for folder in (work, out):
+        shutil.rmtree(folder, ignore_errors=True)
+    copy_pages(work)
+    write_reference(work)
+    (out.parent).mkdir(parents=True, exist_ok=True)
+    arguments = ["-b", "html", "-q", "-W", "--keep-going", "-c", str(Path(__file__).parent)]
+    code = sphinx_build([*arguments, "-d", str(work / "_doctrees"), str(work), str(out)])
+    (out / ".buildinfo").unlink(missing_ok=True)
+    leaks = paths_of_this_machine(out)
+    for name in leaks:
+        print(f"{out / name} holds a path of this machine", file=sys.stderr)
+    return code or bool(leaks)
+
+
+def _write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, "utf-8")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "docs", help="folder of the site")
+    sys.exit(build(parser.parse_args().out))
