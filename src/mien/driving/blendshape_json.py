@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from mien.bounded import parse_json
-from mien.errors import UserError
 from mien.driving.motion import (
     ARKIT_NAMES,
     LARGEST,
@@ -29,6 +28,7 @@ from mien.driving.motion import (
     held,
     open_recording,
 )
+from mien.errors import UserError
 from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
 
 _INDEX = {name: index for index, name in enumerate(ARKIT_NAMES)}

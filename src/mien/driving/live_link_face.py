@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mien.errors import UserError
 from mien.driving.motion import (
     ARKIT_NAMES,
     LARGEST,
@@ -27,6 +26,7 @@ from mien.driving.motion import (
     held,
     open_recording,
 )
+from mien.errors import UserError
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 HEAD = ("HeadYaw", "HeadPitch", "HeadRoll")

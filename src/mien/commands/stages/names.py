@@ -46,7 +46,7 @@ def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
             raise UserError(f"{video}: no such video or folder of pictures; check the path")
     if names and len(names) != len(videos):
         raise UserError(
-            f"--name {' '.join(names)}: {len(names)} names, but the number of videos is {len(videos)}; give one name for each"
+            f"--name {' '.join(names)}: {len(names)} names for {len(videos)} videos; give one name for each"
         )
     found = [sequence_name(video, name) for video, name in zip(videos, names or [None] * len(videos), strict=True)]
     twice = [name for name, count in Counter(found).items() if count > 1]
