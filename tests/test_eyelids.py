@@ -9,7 +9,7 @@ import torch
 from blink_case import SKIN, BlinkCase
 from mien.tracking.eyelids import place_lids
 from mien.tracking.eyelids.eyes import eyes_of
-from mien.tracking.eyelids.placing import weighed
+from mien.tracking.eyelids.placing import weigh_positions
 from mien.tracking.fitting import CameraBatch, Views, layout_of
 from small_face_model import make_small_face_model
 
@@ -125,20 +125,20 @@ def bowls(at: np.ndarray, depth: float = 400.0) -> np.ndarray:
 
 def test_colours_that_agree_change_little():
     tracked = 0.1 + 0.02 * np.random.default_rng(0).standard_normal(50)
-    np.testing.assert_allclose(weighed(bowls(tracked), tracked, 1.0), tracked, atol=0.02)
+    np.testing.assert_allclose(weigh_positions(bowls(tracked), tracked, 1.0), tracked, atol=0.02)
 
 
 def test_a_few_frames_that_disagree_follow_the_colours():
     tracked = np.full(50, 0.1)
     seen = tracked.copy()
     seen[20:23] = (0.5, 1.0, 0.5)
-    np.testing.assert_allclose(weighed(bowls(seen), tracked, 1.0), seen, atol=0.05)
+    np.testing.assert_allclose(weigh_positions(bowls(seen), tracked, 1.0), seen, atol=0.05)
 
 
 def test_colours_that_contradict_every_frame_count_for_nothing():
     random = np.random.default_rng(0)
     tracked = np.full(50, 0.1)
-    found = weighed(bowls(random.uniform(0.0, 1.0, 50)), tracked, 1.0)
+    found = weigh_positions(bowls(random.uniform(0.0, 1.0, 50)), tracked, 1.0)
     np.testing.assert_allclose(found, tracked, atol=0.05)
 
 
@@ -147,7 +147,7 @@ def test_what_colours_find_too_open_throughout_is_corrected_but_where_lids_meet(
     tracked[30] = 0.5
     seen = np.full(50, 0.1)
     seen[30] = 1.0
-    found = weighed(bowls(seen), tracked, 1.0)
+    found = weigh_positions(bowls(seen), tracked, 1.0)
     np.testing.assert_allclose(np.delete(found, 30), 0.2, atol=0.02)
     assert found[30] == pytest.approx(1.0, abs=0.05)
 
@@ -156,4 +156,4 @@ def test_frames_whose_lids_would_be_opener_than_any_are_left_alone():
     tracked = np.full(50, 0.1)
     seen = tracked.copy()
     seen[10] = -2.0
-    assert weighed(bowls(seen), tracked, 1.0)[10] == pytest.approx(0.1, abs=0.01)
+    assert weigh_positions(bowls(seen), tracked, 1.0)[10] == pytest.approx(0.1, abs=0.01)

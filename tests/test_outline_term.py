@@ -9,7 +9,7 @@ import torch
 from mien.tracking import TrackingSettings, track
 from mien.tracking.fitting import Subject, Views, batch_of, layout_of
 from mien.tracking.pixels.outline import OutlineTerm, edge_distances, outline_term
-from mien.tracking.pixels.shared import moved_like_keyframes
+from mien.tracking.pixels.shared import move_like_keyframes
 from mien.tracking.pixels.surface import surface_model
 from photometric_case import SIZE, PhotometricCase, make_photometric_case
 
@@ -94,7 +94,7 @@ def test_timesteps_between_keyframes_move_as_these_do():
     slopes = torch.randn(6, 6, generator=random, dtype=torch.float64)
     step = torch.cat([0.3 + 0.1 * state[:, :6] @ slopes, torch.ones(40, 3).double()], dim=1)
     keyframes = torch.arange(0, 40, 2)
-    moved = moved_like_keyframes(state, keyframes, step[keyframes])
+    moved = move_like_keyframes(state, keyframes, step[keyframes])
     assert torch.equal(moved[:, 6:], state[:, 6:])
     wrong = (moved - state - step)[1::2, :6].norm(dim=1)
     assert float(wrong.mean()) < 0.2 * float((step - step.mean(0))[1::2, :6].norm(dim=1).mean())

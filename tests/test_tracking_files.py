@@ -174,14 +174,14 @@ def test_damaged_scoring(tmp_path):
         read_scoring(tmp_path / "s")
     write_scoring(tmp_path / "other", _scoring(value=100))
     mask.write_bytes((tmp_path / "other" / "masks" / "00" / "000001.png").read_bytes())
-    with pytest.raises(UserError, match="not those that were written"):
+    with pytest.raises(UserError, match="have changed since they were written"):
         read_scoring(tmp_path / "s")
 
 
 def test_scoring_of_other_pictures_is_refused(tmp_path):
     write_scoring(tmp_path / "s", _scoring(), capture_hash="a1")
     assert read_scoring(tmp_path / "s", "a1").masks.max() == 200
-    with pytest.raises(UserError, match=r"other pictures than the capture beside it has; run `mien track` again"):
+    with pytest.raises(UserError, match=r"other pictures than the capture beside it; run `mien track` again"):
         read_scoring(tmp_path / "s", "b2")
     # Files of the first release do not name the capture that they belong to.
     write_scoring(tmp_path / "old", _scoring())

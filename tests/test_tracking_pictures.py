@@ -25,7 +25,7 @@ from mien.tracking.pixels.outcome import appearance_in_world, turn_light
 from mien.tracking.report.contact_sheet import contact_sheet, sheet_frames, worst_of_runs
 from mien.tracking.report.heat import heat_map
 from mien.tracking.report.overlay import OverlayPainter, overlay_stride
-from mien.tracking.report.page import findings, named
+from mien.tracking.report.page import findings, name_runs
 from mien.tracking.settings import PaperSettings, PhotometricSettings
 from photometric_case import FOCAL, SIZE, PhotometricCase, make_photometric_case, smooth_noise
 
@@ -142,14 +142,14 @@ def test_the_sheet_has_what_stands_out(case, truth):
     sheet = contact_sheet(case.capture, odd, case.model, frames)
     assert sheet.shape[1] > 4 * 240
     assert worst_of_runs([2, 3, 7], np.array([0, 0, 1, 5, 0, 0, 0, 3.0])) == [3, 7]
-    assert named([3, 7, 8, 9, 12]) == "3, 7-9, 12"
+    assert name_runs([3, 7, 8, 9, 12]) == "3, 7-9, 12"
 
 
 @pytest.mark.parametrize(("schedule", "appearance", "alone", "said"), [
-    ("fast", True, 0, "Pixels took part in all 6 frames"),
-    ("fast", True, 2, "In 2 of 6 frames with a face pixels were no help, so landmarks alone decided: 0-1."),
-    ("fast", False, 6, "landmarks alone decided in all frames"),
-    ("landmarks", False, 6, "landmarks alone, as asked"),
+    ("fast", True, 0, "Pixels were used in all 6 frames"),
+    ("fast", True, 2, "Pixels did not improve 2 of 6 frames with a face, so landmarks alone determined them: 0-1."),
+    ("fast", False, 6, "landmarks alone determined all frames"),
+    ("landmarks", False, 6, "fitted to landmarks alone"),
 ])  # fmt: skip
 def test_the_page_says_aloud_what_decided(case, truth, tmp_path, schedule, appearance, alone, said):
     residuals = truth.pixel_residuals.clone()

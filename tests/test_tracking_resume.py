@@ -68,7 +68,7 @@ def test_goes_on_from_every_piece(case, expected, tmp_path, monkeypatch, capsys,
     written = stopped_after(99, monkeypatch)
     found = track_subject([case.capture], case.model, FAST, keep)[0]
     assert not before & {f"{name}.safetensors" for name in written}, "what was finished is done again"
-    assert "goes on where it was interrupted" in capsys.readouterr().err
+    assert "continues where it was interrupted" in capsys.readouterr().err
     assert_alike(expected, found)
     assert not keep.exists()
 
@@ -112,7 +112,7 @@ def test_killed_tracking_goes_on(case, tmp_path, monkeypatch, capsys):
     assert len(list(sequences.glob(".tracking-*/*.safetensors"))) >= 5
     capsys.readouterr()
     assert main(["track", str(tmp_path / "killed"), *command]) == 0
-    assert "goes on where it was interrupted" in capsys.readouterr().err
+    assert "continues where it was interrupted" in capsys.readouterr().err
     assert not list(sequences.glob(".tracking-*"))
     files = [tmp_path / name / "sequences/clip/tracking/tracking.safetensors" for name in ("killed", "undisturbed")]
     assert files[0].read_bytes() == files[1].read_bytes()
@@ -130,7 +130,7 @@ def test_damaged_pieces_are_made_anew(case, expected, tmp_path, monkeypatch, cap
         whole = (keep / f"{name}.safetensors").read_bytes()
         (keep / f"{name}.safetensors").write_bytes(whole[: len(whole) // 2])
     assert_alike(expected, track_subject([case.capture], case.model, FAST, keep)[0])
-    assert "round-0.safetensors: damaged, so this part" in capsys.readouterr().err
+    assert "round-0.safetensors: is damaged, so this part" in capsys.readouterr().err
 
 
 def test_pieces_are_the_same_made_or_read(tmp_path):

@@ -6,6 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+BETA1, BETA2 = 0.9, 0.999
+"""Decay of both running means per update (Kingma and Ba 2015)."""
+
 
 @dataclass(eq=False)
 class Moments:

@@ -75,7 +75,7 @@ def _read_tracking(path: Path) -> Tracking:
     content = read_json(path / _JSON, _FORMAT, _VERSION, _STAGE)
     tensors = read_tensors(path / _TENSORS, _STAGE)
     if file_digest(path / _TENSORS) != content.get("tensors_sha256"):
-        raise UserError(f"{path / _TENSORS}: is not what {_JSON} was written with; {_REMEDY}")
+        raise UserError(f"{path / _TENSORS}: does not match {_JSON}; {_REMEDY}")
     _check_shapes(path, tensors)
     with expect_whole(path / _JSON, _REMEDY):
         return Tracking(
@@ -101,7 +101,7 @@ def check_tracking_of(capture: Capture, tracking: Tracking, where: Path) -> None
     sizes = {(camera.width, camera.height) for camera in tracking.cameras}
     found = (len(tracking.face), len(tracking.cameras), sizes)
     if found != (capture.timesteps, len(capture.camera_ids), {(capture.width, capture.height)}):
-        raise UserError(f"{where}: is of other pictures than the capture beside it has; {_REMEDY}")
+        raise UserError(f"{where}: belongs to other pictures than the capture beside it; {_REMEDY}")
 
 
 def _cameras(entries: Any, Ks: Tensor, viewmats: Tensor) -> tuple[Camera, ...]:
@@ -109,14 +109,14 @@ def _cameras(entries: Any, Ks: Tensor, viewmats: Tensor) -> tuple[Camera, ...]:
     for entry, K, viewmat in zip(entries, Ks, viewmats, strict=True):
         fault = camera_fault(K.numpy(), viewmat.numpy(), entry["width"], entry["height"])
         if fault is not None:
-            raise ValueError(f"a camera is none: {fault}")
+            raise ValueError(f"a camera is not valid: {fault}")
         cameras.append(Camera(K, viewmat, entry["width"], entry["height"]))
     return tuple(cameras)
 
 
 def _text(value: object) -> str:
     if not (isinstance(value, str) and is_one_line(value)):
-        raise ValueError(f"{value!r:.40} is no name")
+        raise ValueError(f"{value!r:.40} is not a name")
     return value
 
 
@@ -124,7 +124,7 @@ def _read_settings(settings: Any) -> dict[str, Any]:
     """The settings unchanged. Only `tracked_together` is checked: it is read before a capture is tracked again."""
     together = settings.get("tracked_together", [])
     if not (isinstance(together, list) and all(isinstance(name, str) for name in together)):
-        raise ValueError("tracked_together is no list of names")
+        raise ValueError("tracked_together is not a list of names")
     return dict(settings)
 
 
@@ -144,7 +144,7 @@ def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
             raise UserError(f"{path / _TENSORS}: {name!r} has the shape {list(shape)}; {_REMEDY}")
         floats = name != "valid"
         if tensors[name].dtype != (torch.float32 if floats else torch.uint8):
-            raise UserError(f"{path / _TENSORS}: {name!r} is {tensors[name].dtype}; {_REMEDY}")
+            raise UserError(f"{path / _TENSORS}: {name!r} has the type {tensors[name].dtype}; {_REMEDY}")
         if floats and (tensors[name].abs() > MAX_NUMBER).any():
             raise UserError(f"{path / _TENSORS}: {name!r} holds numbers beyond {MAX_NUMBER:g}; {_REMEDY}")
         finite = tensors[name].isfinite()

@@ -84,7 +84,7 @@ def track_subject(
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError):
         if keep is None or not begun:
             raise
-    say("What was kept of an interrupted tracking is of no use; tracking starts again")
+    say("The stored pieces of an interrupted tracking cannot be used, so tracking starts again")
     remove_tree(keep)
     return _track_subject(captures, face_model, settings, keep, preview)
 
@@ -97,7 +97,7 @@ def _track_subject(
     preview: Path | None,
 ) -> list[Tracking]:
     if "mediapipe" not in face_model.landmarks:
-        raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; calibrate them for it first")
+        raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; place them on it first")
     shots, cache = [shot_of(capture, settings) for capture in captures], StageCache(keep)
     with torch.no_grad():
         model = reduce_face_model(face_model, layout_of(face_model), _response(face_model, shots, settings))
@@ -108,7 +108,7 @@ def _track_subject(
         except torch.linalg.LinAlgError:
             names = ", ".join(capture.name for capture in captures)
             raise UserError(
-                f"{names}: no face fits the landmarks; look at the pictures, and capture it again"
+                f"{names}: no face fits the landmarks; check the pictures, then capture the video again"
             ) from None
         refined: PhotometricFit | None = None
         if settings.schedule == "fast" or (settings.schedule == "paper" and settings.paper.start == "fast"):

@@ -16,7 +16,7 @@ from mien.tracking.scoring import Scoring
 
 _FORMAT, _VERSION = "mien.scoring", 1
 _STAGE = "`mien track`"
-_REMEDY = "delete the folder and run `mien track` again (scores before and after will not compare)"
+_REMEDY = "delete the folder and run `mien track` again (scores from before and after cannot be compared)"
 
 
 def scoring_exists(path: Path, capture_hash: str | None = None) -> bool:
@@ -70,8 +70,8 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
     content = read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE)
     if capture_hash is not None and content.get("capture_hash", capture_hash) != capture_hash:
         raise UserError(
-            f"{path}: its masks are of other pictures than the capture beside it has; run `mien track` again, "
-            "which makes them anew"
+            f"{path}: its masks belong to other pictures than the capture beside it; run `mien track` again "
+            "to make new ones"
         )
     with expect_whole(path / "scoring.json", _REMEDY):
         sides = side(content["height"]), side(content["width"])
@@ -79,13 +79,13 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
     crops = read_arrays(path / "crops.safetensors", _STAGE).get("crops")
     # The size of the crops bounds the number of masks that are read. The json may claim any number.
     if crops is None or crops.shape != (*counts, 4) or crops.dtype != np.int32 or crops.size == 0:
-        raise UserError(f"{path / 'crops.safetensors'}: has not 4 whole numbers for each frame; {_REMEDY}")
+        raise UserError(f"{path / 'crops.safetensors'}: does not hold 4 whole numbers for each frame; {_REMEDY}")
     shape = (*crops.shape[:2], *sides)
     left, top, width, height = np.moveaxis(crops.astype(np.int64), -1, 0)
     if min(left.min(), top.min(), width.min(), height.min()) < 0 or not (
         (left + width).max() <= shape[3] and (top + height).max() <= shape[2]
     ):
-        raise UserError(f"{path / 'crops.safetensors'}: a crop reaches out of the picture; {_REMEDY}")
+        raise UserError(f"{path / 'crops.safetensors'}: a crop extends beyond the picture; {_REMEDY}")
     # Check this before memory for all masks is reserved: a damaged size may ask for more than there is.
     missing = [t_c for t_c in np.ndindex(*shape[:2]) if not _mask_file(path, *t_c).is_file()]
     if missing:
@@ -95,12 +95,12 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
     for timestep, camera in np.ndindex(*shape[:2]):
         mask = decode_png(_mask_file(path, timestep, camera), shape[2:], _REMEDY)
         if mask.any() and not crops[timestep, camera, 2:].all():
-            raise UserError(f"{path / 'crops.safetensors'}: a crop holds nothing of its mask; {_REMEDY}")
+            raise UserError(f"{path / 'crops.safetensors'}: a crop is empty although its mask is not; {_REMEDY}")
         masks.write(timestep, camera, mask)
         digest.update(mask.tobytes())
     digest.update(crops.astype(np.int32).tobytes())
     if digest.hexdigest() != content.get("sha256"):
-        raise UserError(f"{path}: masks or crops are not those that were written; {_REMEDY}")
+        raise UserError(f"{path}: masks or crops have changed since they were written; {_REMEDY}")
     return Scoring(masks.array(), crops.astype(np.int64))
 
 

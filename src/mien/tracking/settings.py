@@ -1,4 +1,4 @@
-"""Settings of tracking: of the fit to landmarks, of the fit to pixels, and of the paper's descent."""
+"""Settings of tracking: the fit to landmarks, the fit to pixels, and the paper's descent."""
 
 import math
 from dataclasses import dataclass, field, replace

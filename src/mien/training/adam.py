@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from mien import _native
+from mien.adam import BETA1, BETA2
 from mien.arrays import unpacked
 from mien.avatar import Moments, ParameterGroup, Progress
 
-_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
+_EPSILON = 1e-15
 
 
 class Update(NamedTuple):
@@ -83,10 +84,10 @@ def update_reference(update: Update) -> None:
     values, gradient, moments, rate = update
     moments.step += 1
     step = float(moments.step)
-    moments.first.lerp_(gradient, 1 - _BETA1)
-    moments.second.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
-    denominator = moments.second.sqrt().mul_(1 / math.sqrt(1 - _BETA2**step)).add_(_EPSILON)
-    values.addcdiv_(moments.first, denominator, value=-rate / (1 - _BETA1**step))
+    moments.first.lerp_(gradient, 1 - BETA1)
+    moments.second.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
+    denominator = moments.second.sqrt().mul_(1 / math.sqrt(1 - BETA2**step)).add_(_EPSILON)
+    values.addcdiv_(moments.first, denominator, value=-rate / (1 - BETA1**step))
 
 
 def _native_task(update: Update) -> tuple[Any, Any, Any, Any, Any, float] | None:

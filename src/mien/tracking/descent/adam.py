@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.adam import Moments
+from mien.adam import BETA1, BETA2, Moments
 
-_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-12
+_EPSILON = 1e-12
 
 _SETTLED = 2.0
 """Gradient of a squared cost at one standard deviation; it damps steps with smaller gradients. Plain Adam moves by its
@@ -27,11 +27,11 @@ def apply_adam(moments: Moments, values: Tensor, gradient: Tensor, rate: float, 
     """
     moments.step += 1
     count = int(moments.step)
-    moments.first.lerp_(gradient, 1 - _BETA1)
-    moments.second.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
-    root = (moments.second / (1 - _BETA2**count)).sqrt_().add_(settled)
+    moments.first.lerp_(gradient, 1 - BETA1)
+    moments.second.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
+    root = (moments.second / (1 - BETA2**count)).sqrt_().add_(settled)
     moved = moments.first / root
-    values.sub_(moved.mul_(rate).mul_(1 / (1 - _BETA1**count)))
+    values.sub_(moved.mul_(rate).mul_(1 / (1 - BETA1**count)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,7 @@
-"""The costs of the `paper` schedule. One unit is one squared standard deviation, as in the fit to landmarks."""
+"""The costs of the `paper` schedule, and what its pictures show of the surface.
+
+One unit of a cost is one squared standard deviation, as in the fit to landmarks.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -103,12 +106,12 @@ def without_smooth_difference(
     lit = lit * (_LIGHT**2 / (_LIGHT**2 + difference.square().sum(-1, keepdim=True)))
     depth = float(camera.project(vertices.mean(0, keepdim=True))[1])
     sigma = max(scene.settings.light_extent * float(camera.K[0, 0]) / depth, 1.0)
-    sums = _blurred(torch.cat([difference * lit, lit], dim=-1).numpy(), sigma)
+    sums = _blur(torch.cat([difference * lit, lit], dim=-1).numpy(), sigma)
     smooth = torch.from_numpy(sums[..., :3] / np.maximum(sums[..., 3:], 1e-3)) * (lit > 0)
     return replace(target, image=target.image - smooth)
 
 
-def _blurred(image: Float[np.ndarray, "h w c"], sigma: float) -> Float[np.ndarray, "h w c"]:
+def _blur(image: Float[np.ndarray, "h w c"], sigma: float) -> Float[np.ndarray, "h w c"]:
     """Blur a picture; a wide blur runs on a smaller copy. The result is the same within 0.01, many times faster."""
     height, width = image.shape[:2]
     factor = max(int(sigma / _BLUR_AT), 1)

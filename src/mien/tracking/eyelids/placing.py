@@ -2,8 +2,8 @@
 
 Skin is tracked by its texture, but the texture does not include what the lids uncover. So each picture decides on its
 own which position of the lids explains it best: every pixel that the lids may cover looks like this person's eyeball
-or like the skin around the eye (`eyelid_colors`). This is weighed against the lids of the fit, which are right within
-a few hundredths of a blink, or altogether wrong. Nothing is smoothed over time, and nothing assumes that anybody
+or like the skin around the eye (`EyeColors`). This is weighed against the lids of the fit, which are right within a few
+hundredths of a blink, or altogether wrong. Nothing is smoothed over time, and nothing assumes that anybody
 blinks: the usual position of the lids comes from the fit, and the closed position from the model.
 """
 
@@ -66,7 +66,7 @@ def place_lids(
     sequences = []
     for shot, own in zip(shots, fit.sequences, strict=True):
         if eyes:
-            own = replace(own, state=_placed(_Sequence(model, shot, fit, own, eyes), weight))
+            own = replace(own, state=_place(_Sequence(model, shot, fit, own, eyes), weight))
         sequences.append(own)
     return replace(fit, sequences=tuple(sequences))
 
@@ -113,9 +113,9 @@ class _Sequence:
         return eye_crop(eye, picture, best[1], corners, tracked, positions)
 
 
-def _placed(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
+def _place(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
     state = sequence.own.state.clone()
-    colors = _learned(sequence)
+    colors = _learn(sequence)
 
     def of_row(row: int) -> list[Float[np.ndarray, " k"] | None]:
         crops = sequence.crops(row, _POSITIONS.tolist())
@@ -128,7 +128,9 @@ def _placed(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
         if seen.sum() >= _MIN_PICTURES:
             known = np.stack([cost for cost in of_eye if cost is not None])
             before = state[torch.from_numpy(seen), eye.column].numpy() / eye.closed
-            state[torch.from_numpy(seen), eye.column] = torch.from_numpy(weighed(known, before, weight)) * eye.closed
+            state[torch.from_numpy(seen), eye.column] = (
+                torch.from_numpy(weigh_positions(known, before, weight)) * eye.closed
+            )
     return sequence.model.layout.bounds.clip(state)
 
 
@@ -136,7 +138,7 @@ def _costs(crop: EyeCrop | None, colors: EyeColors | None) -> Float[np.ndarray, 
     return None if crop is None or colors is None else colors.costs(crop, _BAND)
 
 
-def _learned(sequence: _Sequence) -> list[EyeColors | None]:
+def _learn(sequence: _Sequence) -> list[EyeColors | None]:
     """The colours of each eye, or None for an eye that is seen too little."""
     rows = torch.linspace(0, len(sequence.own.state) - 1, min(_LEARNED_FROM, len(sequence.own.state)))
     ends = [float(_POSITIONS[0])]
@@ -147,7 +149,7 @@ def _learned(sequence: _Sequence) -> list[EyeColors | None]:
     ]
 
 
-def weighed(
+def weigh_positions(
     costs: Float[np.ndarray, "n k"], tracked: Float[np.ndarray, " n"], weight: float
 ) -> Float[np.ndarray, " n"]:
     """The positions of the lids in n frames that best suit both the costs of k positions and the tracked positions.

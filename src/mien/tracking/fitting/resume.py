@@ -28,7 +28,7 @@ class StageCache:
     resumed: bool = False
 
     def get_or_compute(self, name: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
-        """Return the kept piece, or call `make` and keep its result."""
+        """Return the piece of that name. If none is stored yet, `make` computes it and it is stored."""
         found = self.read(name)
         if found is not None:
             return found
@@ -50,10 +50,10 @@ class StageCache:
         try:
             tensors = read_tensors(path)
         except UserError:
-            say(f"{path.name}: damaged, so this part of tracking is done again")
+            say(f"{path.name}: is damaged, so this part of tracking runs again")
             return None
         if not self.resumed:
-            say("Tracking goes on where it was interrupted")
+            say("Tracking continues where it was interrupted")
             self.resumed = True
         return _as_read(tensors)
 

@@ -1,4 +1,4 @@
-"""A capture as input of a fit: detected landmarks, known or assumed cameras, and the frame of the fit."""
+"""A capture as input of a fit: detected landmarks without flicker, known or assumed cameras, the frame of the fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
     found = int(valid.sum())
     if found < _MIN_FRAMES:
         raise UserError(
-            f"{capture.name}: a face was found in {found} frames, tracking needs {_MIN_FRAMES}; film longer"
+            f"{capture.name}: a face was found in {found} frames, but tracking needs {_MIN_FRAMES}; film longer"
         )
     detected = without_flicker(detected, seen)
     row, camera = seen[valid].nonzero().unbind(1)
@@ -129,6 +129,10 @@ def _source_focal(capture: Capture) -> tuple[float, float]:
 
 def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c"]) -> Float[Tensor, "t c l 2"]:
     """Return the landmarks, with the mean of both answers wherever they swing for several frames.
+
+    A detector that crops each picture by its last answer can swing between two answers. If nothing moves, the crop of
+    the next picture depends on the last answer and the answer on the crop, so landmarks may go to and fro for ever. No
+    part of a face does that: none moves up in one frame and down in the next, again and again.
 
     Args:
         landmarks: Landmarks in pixels; any value where not seen.

@@ -181,8 +181,8 @@ def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[Vie
                 seen[drawn.face_index[drawn.face_index >= 0].unique().long()] += 1
     if len(found) < settings.pictures // 2:
         raise UserError(
-            f"the landmark detector found a face in {len(found)} of {settings.pictures} pictures of {model.name}: look "
-            "at them; its regions or its head frame may be wrong"
+            f"the landmark detector found a face in {len(found)} of {settings.pictures} pictures of {model.name}: "
+            "check the regions and the head frame of the model"
         )
     return Views(*(torch.stack(parts) for parts in zip(*found, strict=True))), seen / len(found)
 

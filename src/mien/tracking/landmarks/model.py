@@ -120,8 +120,8 @@ class LandmarkModel:
         by_angles, by_derived = self._by_joint_motion(transforms, shaped, face)
         by_expression[..., self.layout.derived_column] += by_derived
         of_head = torch.cat([by_expression, by_angles], dim=-1)
-        by_frame = torch.cat([by_rotation, by_world, _chained(by_head, of_head, row)], dim=-1)
-        by_identity = _chained(by_head, self._by_identity(transforms, face), row) if with_identity else None
+        by_frame = torch.cat([by_rotation, by_world, _chain(by_head, of_head, row)], dim=-1)
+        by_identity = _chain(by_head, self._by_identity(transforms, face), row) if with_identity else None
         by_bias = by_head @ torch.einsum("vkrc,kl->vlrc", transforms[:, :, :3, :3], self.joint_weights)[row]
         by_person = torch.einsum("blxc,klc->blxk", by_bias, self.response.by_person) if with_identity else None
         return Linearization(pixels, by_frame, by_identity, by_log_focal, by_bias, by_person)
@@ -214,7 +214,7 @@ def _project_with_derivatives(
     return pixels, scaled @ cameras.viewmat[:, None, :3, :3], by_log_focal
 
 
-def _chained(
+def _chain(
     by_head: Float[Tensor, "b l 2 3"], of_head: Float[Tensor, "v l 3 s"], row: Int[Tensor, " b"]
 ) -> Float[Tensor, "b l 2 s"]:
     """Compute by_head @ of_head[row] axis by axis, which is many times faster than as many tiny matrix products."""

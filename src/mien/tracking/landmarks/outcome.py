@@ -1,4 +1,4 @@
-"""Results of a fit as Trackings: in world space, for every timestep, with the results of the fit to pixels."""
+"""The result of a fit as a Tracking: in world space, for every timestep."""
 
 import dataclasses
 import json

@@ -79,7 +79,7 @@ def _fit_jointly(
         shared = shared.with_prior(precision, _shared_values(at))
         state = torch.cat([own.state for own in at.fit.sequences])
         step, shared_step = solve_arrow(frames, shared, bounds.held(state, frames.gradient), damping)
-        candidate = _moved(at, step, shared_step, start, lenses, bounds, terms[0].model.response)
+        candidate = _move(at, step, shared_step, start, lenses, bounds, terms[0].model.response)
         candidate_cost = cost(candidate)
         if candidate_cost < best:
             at, best, damping = candidate, candidate_cost, damping / 5
@@ -115,7 +115,7 @@ def _equations(
     return join_frames(frames), join_shared(shared)
 
 
-def _moved(
+def _move(
     at: _Joint,
     step: Float[Tensor, "v p"],
     shared_step: Float[Tensor, " s"],

@@ -214,6 +214,10 @@ def quiet_landmarks(term: LandmarkTerm, share: float) -> LandmarkTerm:
 def trust_of(views: Views, state: Float[Tensor, "v p"], cameras: CameraBatch) -> Float[Tensor, " n"]:
     """Weight of each picture's landmarks, 0..1. It is 1 for the most frontal picture of each timestep.
 
+    In pictures from the side a detector guesses the far half of the face, and its landmarks of the near half change
+    with the view. A single camera is fully trusted, because the effect of turns on landmarks was measured for that case
+    (`DetectorResponse`).
+
     Args:
         views: The pictures.
         state: Parameters of the timesteps. The first six are the head's axis-angle rotation and translation (metres).

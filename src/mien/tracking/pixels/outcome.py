@@ -60,8 +60,8 @@ def _with_pixel_residuals(tracking: Tracking, shot: Shot, found: Float[Tensor, "
     left = (shot.valid & residuals.isnan().all(1)).nonzero()[:, 0].tolist()
     if left:
         some = ", ".join(map(str, left[:_SOME])) + (", ..." if len(left) > _SOME else "")
-        say(f"{shot.capture.name}: in {len(left)} of {int(shot.valid.sum())} frames with a face pixels were no help, "
-            f"so landmarks alone decided: {some}")  # fmt: skip
+        say(f"{shot.capture.name}: the fit to pixels did not improve {len(left)} of {int(shot.valid.sum())} frames "
+            f"with a face. They keep their fit to landmarks: {some}")  # fmt: skip
     return replace(tracking, pixel_residuals=residuals)
 
 

@@ -190,7 +190,8 @@ def refine_photometrically(
             at = keep(f"round-{number}-looks", f"{status}, texture and light", partial(now.update_appearance, at))
             course.advance(_APPEARANCE_COST, f"{status}, texture and light")
             if not (at.texture.trust > 0).any():
-                say(f"{model.face_model.name}: the pictures show none of its skin, so the fit to landmarks stays")
+                name = model.face_model.name
+                say(f"{name}: the pictures show no part of its texture, so the fit to landmarks is kept")
                 return replace(at, fit=fit)
             advance = partial(course.advance, status=f"{status}, frames")
             step_all = partial(_step_sequences, now, at, settings, cache, f"step-{number}", advance)

@@ -77,12 +77,12 @@ def step_shared(
     for own, own_step, chosen, lens in zip(fit.sequences, steps, rows, prior.lenses, strict=True):
         longer = 0.0 if lens is None else float(shared_step[len(subject.shared) + lens])
         factor = math.exp(min(max(longer, -_FOCAL_STEP), _FOCAL_STEP))
-        sequences.append(SequenceFit(own.cameras.with_focal(factor), moved_like_keyframes(own.state, chosen, own_step)))
+        sequences.append(SequenceFit(own.cameras.with_focal(factor), move_like_keyframes(own.state, chosen, own_step)))
     response = terms[0].landmarks.model.response
     return Fit(move_subject(subject, shared_step[: len(subject.shared)], response), tuple(sequences))
 
 
-def moved_like_keyframes(
+def move_like_keyframes(
     state: Float[Tensor, "v p"], chosen: Int[Tensor, " k"], step: Float[Tensor, "k p"]
 ) -> Float[Tensor, "v p"]:
     """Move all timesteps as the keyframes moved: head poses by a step that is affine in the pose, nothing else.

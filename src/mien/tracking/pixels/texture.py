@@ -1,4 +1,7 @@
-"""The subject's skin as a texture, and the light of each sequence, from pictures with roughly tracked faces."""
+"""The subject's skin as a texture and the light of each sequence, from pictures with roughly tracked faces.
+
+`PhotometricFit` is a fit with both.
+"""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -27,12 +27,13 @@ _SOME = 40
 _FOCAL_FROM = {
     "calibrated": "as calibrated",
     "given": "as given",
-    "assumed": "assumed, since faces hardly tell it (--tracking.focal says it, which makes head turns more exact)",
+    "assumed": "assumed, because faces hardly determine it (head turns are more exact if --tracking.focal gives it)",
 }
+_BY_PIXELS = "The face was fitted to landmarks, then to pixels (schedule `{}`), which correct the detector's errors."
 _WAYS = {
-    "landmarks": "Fitted to landmarks alone, as asked (schedule `landmarks`); pixels were not looked at.",
-    "fast": "Fitted to landmarks, then to pixels (schedule `fast`), which know better where the detector errs.",
-    "paper": "Fitted to landmarks, then to pixels (schedule `paper`), which know better where the detector errs.",
+    "landmarks": "The face was fitted to landmarks alone (schedule `landmarks`). Pixels were not used.",
+    "fast": _BY_PIXELS.format("fast"),
+    "paper": _BY_PIXELS.format("paper"),
 }
 
 
@@ -57,16 +58,17 @@ def write_report_page(
 
 def page_html(name: str, tracking: Tracking, report: dict[str, Any], plot: str, sheet: str) -> str:
     """The page as html. `plot` and `sheet` are addresses of pictures."""
-    panels = "the picture, the tracked mesh over it"
+    panels = "the picture and the tracked mesh over it"
     if tracking.appearance is not None:
-        panels += (", the model's own picture (its texture in the fitted light), and the difference of colours"
-                   " (black is none; grey parts, such as hair, eyes and mouth, are not compared)")  # fmt: skip
+        panels = ("the picture, the tracked mesh over it, the model's own picture (its texture in the fitted light), "
+                  "and the difference of colours (black is none; grey parts, such as hair, eyes and mouth, are not "
+                  "compared)")  # fmt: skip
     paragraphs = "".join(f'<p class="{kind}">{_with_code(text)}</p>' for kind, text in findings(tracking, report))
     rows = "".join(f"<tr><th>{escape(what)}</th><td>{escape(value)}</td></tr>" for what, value in _figures(report))
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(name)}: tracking</title>'
         f"<style>{_STYLE}</style></head><body><h1>{escape(name)}: how the face was tracked</h1>{paragraphs}"
-        f"<table>{rows}</table><h2>Frames</h2><p>Evenly spread frames, and those that stand out; of each "
+        f"<table>{rows}</table><h2>Frames</h2><p>Evenly spread frames, and frames that stand out. Each shows "
         f'{escape(panels)}.</p><img class="sheet" alt="contact sheet" src="{sheet}">'
         f'<h2>Over time</h2><img alt="residuals over time" src="{plot}">'
         '<h2>Overlay</h2><video controls preload="none" src="overlay.mp4"></video></body></html>\n'
@@ -82,30 +84,30 @@ def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]
     """The main findings as pairs of class and text. The class is `odd` if the finding is a reason to look closer."""
     schedule = str(tracking.settings.get("schedule", "landmarks"))
     with_face = report["frames"] - len(report["frames_without_face"])
-    found = [("", _WAYS.get(schedule, f"Schedule `{schedule}`."))]
+    found = [("", _WAYS.get(schedule, f"The schedule was `{schedule}`."))]
     if schedule != "landmarks":
         alone = report["landmarks_only_frames"]
         if tracking.appearance is None:
-            found = [("odd", f"Pictures gave the texture of {tracking.face_model} nothing (schedule `{schedule}`), so "
-                             "landmarks alone decided in all frames.")]  # fmt: skip
+            found = [("odd", f"The pictures show no part of the texture of {tracking.face_model} (schedule "
+                             f"`{schedule}`), so landmarks alone determined all frames.")]  # fmt: skip
         elif alone:
-            found.append(("odd", f"In {len(alone)} of {with_face} frames with a face pixels were no help, so landmarks "
-                                 f"alone decided: {named(alone)}."))  # fmt: skip
+            found.append(("odd", f"Pixels did not improve {len(alone)} of {with_face} frames with a face, so landmarks "
+                                 f"alone determined them: {name_runs(alone)}."))  # fmt: skip
         else:
-            found.append(("", f"Pixels took part in all {with_face} frames with a face."))
+            found.append(("", f"Pixels were used in all {with_face} frames with a face."))
     if report["flagged_frames"]:
         flagged = report["flagged_frames"]
         stand_out = "1 frame stands" if len(flagged) == 1 else f"{len(flagged)} frames stand"
-        found.append(("odd", f"{stand_out} out and should be looked at: {named(flagged)}."))
+        found.append(("odd", f"{stand_out} out and should be checked: {name_runs(flagged)}."))
     else:
         found.append(("", "No frame stands out."))
     if report["frames_without_face"]:
-        found.append(("odd", "No face was found, so that motion is interpolated, in frames "
-                             f"{named(report['frames_without_face'])}."))  # fmt: skip
+        found.append(("odd", f"No face was found in frames {name_runs(report['frames_without_face'])}. Their motion is "
+                             "interpolated."))  # fmt: skip
     return found
 
 
-def named(timesteps: Sequence[int]) -> str:
+def name_runs(timesteps: Sequence[int]) -> str:
     """Numbers of frames as text, with runs abbreviated: 3, 7-9, 12."""
     runs: list[list[int]] = []
     for timestep in timesteps:
@@ -121,7 +123,7 @@ def _figures(report: dict[str, Any]) -> list[tuple[str, str]]:
     colors, iris = report["residual_colors"], report["iris_distance"]
     rows = [
         ("Frames", str(report["frames"])),
-        ("Landmarks, from where the detector saw them: median, 95 %, largest", _three(report["residual_px"], 1, "px")),
+        ("Distance of landmarks from the detected ones: median, 95 %, largest", _three(report["residual_px"], 1, "px")),
     ]
     if colors is not None:
         rows.append(("Difference of colours: median, 95 %, largest", _three(colors, 100, "%")))

@@ -69,7 +69,7 @@ class Preview:
         if self._current is not None:
             with torch.no_grad():
                 self._body, self._current = self._draw(self._current()), None
-        self._write(self._headed(stage, progress), last=stage == DONE)
+        self._write(self._with_header(stage, progress), last=stage == DONE)
         now = time.monotonic()
         self._due = now + max(_INTERVAL_SECONDS, (now - start) / _MAX_SHARE)
 
@@ -96,9 +96,9 @@ class Preview:
         _head(strips[0])
         parts = [*strips, _plot(curves, self._before, labels)]
         self._before = curves
-        return np.concatenate([_widened(part) for part in parts])
+        return np.concatenate([_widen(part) for part in parts])
 
-    def _headed(self, stage: str, progress: float) -> UInt8[np.ndarray, "h w 3"]:
+    def _with_header(self, stage: str, progress: float) -> UInt8[np.ndarray, "h w 3"]:
         header = np.full((_HEADER, _WIDTH, 3), 40, np.uint8)
         names = ", ".join(sample.shot.capture.name for sample in self._samples)
         seconds = time.monotonic() - self._began
@@ -113,7 +113,7 @@ class Preview:
         refresh = "" if last else f'<meta http-equiv="refresh" content="{_INTERVAL_SECONDS:.0f}">'
         page = (
             f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">{refresh}<title>Tracking</title></head>'
-            '<body style="margin:0;background:#222"><img alt="the fit as it is now" style="max-width:100%" '
+            '<body style="margin:0;background:#222"><img alt="the present state of the fit" style="max-width:100%" '
             f'src="{data_uri("image/png", png)}"></body></html>\n'
         )
         write_atomically(self._path.with_suffix(".png"), lambda path: path.write_bytes(png))
@@ -167,7 +167,7 @@ def _plot(
     curves: Sequence[Float[np.ndarray, " n"]], before: Sequence[Float[np.ndarray, " n"]], labels: Sequence[str]
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Plots of the residuals over the frames, one below the other. The previous residuals are grey."""
-    names = ("landmarks, median distance in px", "colours, rms of the three channels, whole pictures, in %")
+    names = ("landmarks, median distance in px", "colours, root mean square over the three channels, in %")
     shown = [index for index, values in enumerate(curves) if np.isfinite(values).any()]
     plots = [np.full((1, _WIDTH, 3), _PAPER, np.uint8)]
     for index in shown:
@@ -178,8 +178,8 @@ def _plot(
             x, y = np.linspace(50, _WIDTH - 15, len(values)), _CURVE - 25 - (_CURVE - 50) * values / top
             points = np.stack([x, y], axis=1)[np.isfinite(values)]
             cv2.polylines(plot, [np.round(points).astype(np.int32)], False, color, 1, cv2.LINE_AA)
-        told = f"{names[index]}: {np.nanmedian(curves[index]):.2f} over all frames (grey: when it was last drawn)"
-        _text(plot, told, (50, 16), _COLORS[index])
+        title = f"{names[index]}: {np.nanmedian(curves[index]):.2f} over all frames (grey: when last drawn)"
+        _text(plot, title, (50, 16), _COLORS[index])
         _text(plot, f"{top:.2f}", (5, 30), _INK)
         _text(plot, "0", (5, _CURVE - 22), _INK)
         for at in np.linspace(0, len(labels) - 1, 6).round().astype(int):
@@ -192,5 +192,5 @@ def _text(picture: UInt8[np.ndarray, "h w 3"], text: str, at: tuple[int, int], c
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, 1, cv2.LINE_AA)
 
 
-def _widened(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w2 3"]:
+def _widen(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w2 3"]:
     return np.pad(picture, ((0, 0), (0, _WIDTH - picture.shape[1]), (0, 0)), constant_values=_PAPER)

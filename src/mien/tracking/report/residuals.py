@@ -206,7 +206,7 @@ def _plot(path: Path, capture: Capture, tracking: Tracking, face_model: FaceMode
         colors = 100 * tracking.pixel_residuals.nanmedian(1).values
         _plot_flagged(axes[1], time, colors.numpy(), report["flagged_frames"], "colours, %")
     else:
-        axes[1].text(0.5, 0.5, "pixels were not looked at", ha="center", transform=axes[1].transAxes)
+        axes[1].text(0.5, 0.5, "pixels were not used", ha="center", transform=axes[1].transAxes)
     axes[2].plot(time, seen_rotation(tracking, frontal).rad2deg().numpy(), label=["pitch", "yaw", "roll"])
     axes[2].set_ylabel("head rotation, degrees")
     axes[2].legend(loc="upper right")
