@@ -15,8 +15,9 @@ from mien.capture.video import probe_video
 from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import cross
-from mien.evaluation.cross import cross_reenactment, frontal_camera, load_driven
+from mien.evaluation.cross import cross_reenactment, load_driven
 from mien.evaluation.redetection import angle_degrees, motion, similarity, transfer_figures
+from mien.face import most_frontal_camera
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import write_tracking
 from mien.training import TrainSettings
@@ -128,7 +129,7 @@ def test_driven_avatar_keeps_its_identity_and_moves_from_its_own_neutral(folders
     far = (driven.faces.head_rotation[driven.by_rest[-1]] - driven.avatar.subject.head_rotation[0]).norm()
     assert moved < far
     cameras = driven.tracking.cameras
-    assert frontal_camera(cameras[::-1], driven.avatar.subject) == 1
+    assert most_frontal_camera(cameras[::-1], driven.avatar.subject) == 1
 
 
 def test_driver_of_another_face_model(folders: tuple[Path, Path], tmp_path: Path) -> None:

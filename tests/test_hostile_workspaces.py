@@ -23,13 +23,13 @@ from mien.capture.frame_files import CacheWriter, FrameLayout, FrameWriter
 from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, compare_runs, evaluate
-from mien.evaluation.experiment import Frame
 from mien.evaluation.load import load_experiments
 from mien.evaluation.partial import PartialScores
 from mien.inside import check_tree, inside, is_plain_name, open_new, remove_tree
 from mien.storage import file_digest, read_arrays, read_json, read_tensors, write_arrays, write_json, write_tensors
 from mien.tracking import TrackingSettings, pipeline, read_scoring, read_tracking, track_subject
 from mien.training import read_curves, read_run_config, read_sequence, read_training_summary, run_camera
+from mien.training.frames import Frame
 from mien.workspace import Workspace, check_new_workspace, open_workspace
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace

@@ -12,6 +12,8 @@ from torch import Tensor
 from mien.picture_files import encode_picture
 
 WHITE = 255
+Box = tuple[int, int, int, int]
+"""Left, top, width and height of a part of a picture, in pixels."""
 _HEAT_STOPS = 6
 """Number of colours in the gradient of a heat scale."""
 

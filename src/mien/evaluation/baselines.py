@@ -8,8 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from mien.evaluation.experiment import Experiment, Frame, spread_frames, target_image
+from mien.evaluation.experiment import Experiment, spread_frames, target_image
 from mien.render.mesh import rasterize_mesh, render_mesh, vertex_normals
+from mien.training.frames import Frame
 
 _COLOUR_FRAMES = 60
 """Number of training frames, evenly spread, for the mean vertex colours. More frames make no visible difference."""

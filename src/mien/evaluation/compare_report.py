@@ -10,15 +10,16 @@ from jaxtyping import UInt8
 
 from mien.errors import UserError
 from mien.evaluation.compare import COLUMNS, Comparison, Row, Table, figure
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
+from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.load import load_experiments
-from mien.evaluation.metrics import Box, crop_to
+from mien.evaluation.metrics import crop_to
 from mien.evaluation.report_sections import frame_name
 from mien.evaluation.report_words import GLOSSARY
 from mien.evaluation.videos import HEAT_LIMIT
-from mien.pictures import error_heat, heat_gradient, picture_uri, shrink, to_uint8
+from mien.pictures import Box, error_heat, heat_gradient, picture_uri, shrink, to_uint8
 from mien.progress import track_progress
 from mien.storage import write_atomically
+from mien.training.frames import Frame
 
 _FRAMES = 5
 _PICTURE_SIZE = 320

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from torch.nn.functional import normalize
 
 from mien.avatar import load_avatar, neutral_of
 from mien.avatar.avatar import Avatar
@@ -21,7 +20,7 @@ from mien.errors import UserError
 from mien.evaluation.redetection import MEASURED_BY, FaceReader, Motion, motion, transfer_figures
 from mien.evaluation.scoring import evenly_spread
 from mien.evaluation.videos import labelled_row, same_size
-from mien.face import FaceParams
+from mien.face import FaceParams, most_frontal_camera
 from mien.face.checks import check_face_params
 from mien.pictures import to_uint8
 from mien.progress import track_progress
@@ -86,21 +85,13 @@ def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
     cameras = read_tracking(sequence_dir / "tracking").cameras
     return Driven(
         avatar=avatar,
-        camera=cameras[frontal_camera(cameras, avatar.subject)],
+        camera=cameras[most_frontal_camera(cameras, avatar.subject)],
         faces=faces,
         driver=capture,
         tracking=tracking,
-        driver_camera=frontal_camera(tracking.cameras, at_rest),
+        driver_camera=most_frontal_camera(tracking.cameras, at_rest),
         by_rest=tuple(sorted(valid, key=_activity(tracking.face, at_rest).__getitem__)),
     )
-
-
-def frontal_camera(cameras: Items[Camera], neutral: FaceParams) -> int:
-    """The index of the camera that sees the face of the one timestep `neutral` most squarely."""
-    ahead = matrix_from_axis_angle(neutral.head_rotation)[0, :, 2]
-    origin = neutral.head_translation[0]
-    facing = [float(normalize(camera.position - origin, dim=0) @ ahead) for camera in cameras]
-    return max(range(len(cameras)), key=facing.__getitem__)
 
 
 def _activity(face: FaceParams, at_rest: FaceParams) -> list[float]:

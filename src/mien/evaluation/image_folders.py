@@ -12,7 +12,6 @@ from torch import Tensor
 
 from mien.errors import UserError
 from mien.evaluation.image_source import PictureSource, open_pictures
-from mien.evaluation.metrics import Box
 from mien.evaluation.scoring import (
     PIXELS,
     SSIM_WINDOW,
@@ -25,6 +24,7 @@ from mien.evaluation.scoring import (
     score_pictures,
     worker_threads,
 )
+from mien.pictures import Box
 from mien.progress import progress_bar, say
 from mien.storage import read_json, write_json
 from mien.tracking.scoring import head_crop

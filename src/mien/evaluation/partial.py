@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from mien.bounded import parse_json, read_bytes
-from mien.evaluation.experiment import Frame
 from mien.evaluation.scoring import Scores
 from mien.inside import open_to_append
 from mien.limits import whole
 from mien.storage import write_atomically
+from mien.training.frames import Frame
 
 _LARGEST = 256 << 20
 """Largest size of the file in bytes, and largest index in a frame. A frame takes some hundred bytes."""

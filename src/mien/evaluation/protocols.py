@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from mien.evaluation.baselines import Baselines, make_baselines
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, scored_on, spread_frames, target_image
+from mien.evaluation.experiment import Experiment, avatar_image, scored_on, spread_frames, target_image
 from mien.evaluation.metrics import psnr
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.scoring import (
@@ -25,6 +25,7 @@ from mien.evaluation.scoring import (
     worker_threads,
 )
 from mien.progress import progress_bar
+from mien.training.frames import Frame
 
 AVATAR, AS_TRACKED, MEAN_FRAME, MESH = "avatar", "as_tracked", "mean_frame", "mesh"
 _TRAINING_FRAMES = 200

@@ -6,13 +6,14 @@ from html import escape
 import numpy as np
 import torch
 
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
-from mien.evaluation.metrics import Box, crop_to
+from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
+from mien.evaluation.metrics import crop_to
 from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import AVATAR, MESH, Evaluation
 from mien.evaluation.videos import HEAT_LIMIT
-from mien.pictures import error_heat, heat_gradient, picture_uri, shrink, to_uint8
+from mien.pictures import Box, error_heat, heat_gradient, picture_uri, shrink, to_uint8
 from mien.render.mesh import render_mesh
+from mien.training.frames import Frame
 
 _PICTURE_SIZE = 400
 _OVERLAY_SIZE = 300

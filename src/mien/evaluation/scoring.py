@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.evaluation.metrics import Box, crop_to, l1, psnr, ssim
+from mien.evaluation.metrics import crop_to, l1, psnr, ssim
 from mien.evaluation.perceptual import MINIMUM_SIZE, Backbone, PerceptualDistance, load_perceptual
-from mien.pictures import to_uint8
+from mien.pictures import Box, to_uint8
 from mien.threads import asked_threads
 
 METRICS = ("psnr", "ssim", "l1", "perceptual")

@@ -8,13 +8,14 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.capture.video import write_video
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
+from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
-from mien.evaluation.metrics import Box, crop_to
+from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import AVATAR, Evaluation
 from mien.picture_files import write_png
-from mien.pictures import WHITE, error_heat, shrink, side_by_side, to_uint8
+from mien.pictures import WHITE, Box, error_heat, shrink, side_by_side, to_uint8
 from mien.progress import track_progress
+from mien.training.frames import Frame
 
 HEAT_LIMIT = 0.25
 """Error, of a range of 1, that gets the brightest colour of heat maps."""
