@@ -18,11 +18,11 @@ from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, read_metrics
 from mien.evaluation.baselines import make_baselines
 from mien.evaluation.compare import compare_runs
-from mien.evaluation.compare_text import comparison_text
 from mien.evaluation.experiment import Experiment, head_box, spread_frames, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import evaluate_frames
+from mien.evaluation.text import comparison_text
 from mien.evaluation.videos import same_size, video_frames
 from mien.pictures import to_uint8
 from mien.storage import write_json

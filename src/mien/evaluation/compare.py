@@ -6,14 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from mien.errors import UserError
-from mien.evaluation.metrics_file import read_figures
-from mien.evaluation.words import FACES, NAMES
+from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FACE_SOURCE_NAMES, figure, read_figures
 from mien.training import read_run_config
-
-COLUMNS = (
-    ("psnr", "PSNR", 2, True), ("ssim", "SSIM", 3, True), ("l1", "L1", 4, False), ("perceptual", "ST-LPIPS", 3, False),
-)  # fmt: skip
-"""Metric, heading, number of digits, whether higher is better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +102,6 @@ def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
     return Comparison(tuple(runs), tuple(tables), tuple(warnings + more))
 
 
-def figure(entry: Mapping[str, Any], part: str | None, metric: str) -> float | None:
-    """One figure of a row, or None if it was not computed."""
-    return (entry if part is None else entry[part]).get(metric)
-
-
 def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
     """Tables by protocol and by the scored frames and masks, and warnings if those differ."""
     tables, warnings = [], []
@@ -152,7 +141,7 @@ def _differences(table: Table) -> list[str]:
     if len({row.faces for row in own}) > 1:
         warnings.append(
             f"{table.protocol}: some runs correct the tracking of held-out frames and some do not; compare the rows "
-            f"with faces {FACES['as_tracked']}, or train alike"
+            f"with faces {FACE_SOURCE_NAMES['as_tracked']}, or train alike"
         )
     if len({(row.entry.get("perceptual_backbone"), row.entry.get("perceptual_frames")) for row in own}) > 1:
         warnings.append(f"{table.protocol}: ST-LPIPS was computed on other frames; evaluate the runs alike")
@@ -163,13 +152,13 @@ def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
     rows: list[Row] = []
     for run in runs:
         entry = run.metrics["protocols"][protocol]
-        rows.append(Row(run.label, entry, run, FACES[entry["face_params"]]))
+        rows.append(Row(run.label, entry, run, FACE_SOURCE_NAMES[entry["face_params"]]))
     for run in runs:
         entry = run.metrics["protocols"][protocol]
         if entry["face_params"] != "as_tracked":
-            rows.append(Row(run.label, entry["as_tracked"], None, FACES["as_tracked"]))
+            rows.append(Row(run.label, entry["as_tracked"], None, FACE_SOURCE_NAMES["as_tracked"]))
     first = runs[0].metrics["protocols"][protocol]
-    for key, name in NAMES.items():
+    for key, name in BASELINE_NAMES.items():
         rows += _baseline_rows(key, name, runs, protocol)
     return Table(protocol, first["split"], first["frames"], first.get("scored_on", {}), tuple(rows))
 

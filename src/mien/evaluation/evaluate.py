@@ -8,14 +8,14 @@ from typing import Any
 
 from mien.errors import UserError
 from mien.evaluation.cross import cross_reenactment
-from mien.evaluation.cross_report import cross_section
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import FORMAT, VERSION, read_metrics
+from mien.evaluation.page import ReportVideo
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
 from mien.evaluation.report import RunRecord, write_report
-from mien.evaluation.report_video import ReportVideo
+from mien.evaluation.report_sections import cross_section
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.inside import check_tree
 from mien.locks import hold

@@ -17,9 +17,7 @@ from mien.pictures import WHITE, Box, error_heat, shrink, side_by_side, to_uint8
 from mien.progress import track_progress
 from mien.training.frames import Frame
 
-HEAT_LIMIT = 0.25
-"""Error, of a range of 1, that gets the brightest colour of heat maps."""
-_LARGEST = 440
+_MAX_SIDE = 440
 _BAR = 26
 _CRF = 24
 
@@ -45,7 +43,7 @@ def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evalu
         panels = {
             f"truth: {where}": to_uint8(truth),
             f"rendering: {scores['psnr']:.1f} dB, head {scores['head_psnr']:.1f}": to_uint8(image),
-            "error": error_heat(image, truth, HEAT_LIMIT),
+            "error": error_heat(image, truth),
         }
         return labelled_row(panels)
 
@@ -68,7 +66,7 @@ def labelled_row(panels: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.n
     """Pictures in a row, shrunk, each below a bar with its name."""
     named = []
     for name, panel in panels.items():
-        small = shrink(panel, _LARGEST)
+        small = shrink(panel, _MAX_SIDE)
         bar = np.full((_BAR, small.shape[1], 3), WHITE, np.uint8)
         cv2.putText(bar, name, (4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA)
         named.append(np.concatenate([bar, small]))
