@@ -53,7 +53,7 @@ def test_a_pipe_is_no_recording_and_no_ply(tmp_path: Path) -> None:
 def test_a_ply_of_too_many_gaussians(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "head.ply"
     ply.write_ply(path, train_toy_gaussians())
-    monkeypatch.setattr(ply, "_MOST_GAUSSIANS", 3)
+    monkeypatch.setattr(ply, "_MAX_GAUSSIANS", 3)
     with pytest.raises(UserError, match=r"head\.ply: 4 Gaussians, more than 3"):
         read_ply(path)
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -149,3 +150,15 @@ def invert_rigid(transforms: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]
     rotation = transforms[..., :3, :3]
     x, y, z = (rotation * transforms[..., :3, 3:]).unbind(-2)
     return rigid_transform(rotation.transpose(-1, -2), -((x + y) + z))
+
+
+def align_centred(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3 3"], float]:
+    """Rotation and scale with target ~ scale * rotation @ source, by least squares (Umeyama 1991).
+
+    Both sets of points have their mean at the origin.
+    """
+    u, values, vt = np.linalg.svd(target.T @ source)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return (u * signs) @ vt, float((values * signs).sum() / (source**2).sum())

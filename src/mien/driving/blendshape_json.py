@@ -17,7 +17,17 @@ from typing import Any
 
 import numpy as np
 
-from mien.driving.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, check_size, check_times, evenly, gaze_of, held
+from mien.driving.motion import (
+    ARKIT_NAMES,
+    MAX_COEFFICIENT,
+    MIN_COEFFICIENT,
+    Motion,
+    check_size,
+    check_times,
+    gaze_of,
+    repeat_lost,
+    resample_evenly,
+)
 from mien.errors import UserError
 from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
 
@@ -25,11 +35,11 @@ _INDEX = {name: index for index, name in enumerate(ARKIT_NAMES)}
 _NO_EXPRESSION = "_neutral"
 _DEFAULT_FPS = 30.0
 _CENTIMETRE = 0.01
-_FARTHEST = 1e6
+_MAX_MATRIX_ENTRY = 1e6
 """Largest number in a transformation matrix (translations are in centimetres)."""
-_LATEST = 1e15
+_MAX_MILLISECONDS = 1e15
 """Largest timestamp in milliseconds: thirty thousand years, so the zero of any clock is accepted."""
-_SHOWN = 80
+_MAX_SHOWN = 80
 """Largest number of characters of a value that a message shows."""
 
 
@@ -65,7 +75,7 @@ def read_blendshape_json(path: Path) -> Motion:
         raise UserError(f"{path}: no frame has a face in it")
     seconds = _seconds(frames, path)
     check_times(seconds, lambda index: f"{path}, frame {index}")
-    fps, rows = evenly(seconds, held(rows, found))
+    fps, rows = resample_evenly(seconds, repeat_lost(rows, found))
     coefficients = rows[:, :52].astype(np.float32)
     head = rows[:, 52:].astype(np.float32)
     return Motion(fps, coefficients, gaze_of(coefficients), head[:, :3], head[:, 3:], int((~found).sum()))
@@ -85,7 +95,7 @@ def from_face_landmarker(frame: dict[str, Any], where: str) -> tuple[dict[str, A
         matrix = np.array(poses[0]["data"], dtype=np.float64).reshape(4, 4).T if poses else None
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise UserError(f"{where}: is not as FaceLandmarker gives its results ({_short(error)})") from None
-    if matrix is not None and not (np.abs(matrix) < _FARTHEST).all():
+    if matrix is not None and not (np.abs(matrix) < _MAX_MATRIX_ENTRY).all():
         raise UserError(f"{where}: its facial transformation matrix holds numbers that no face has (NaN or huge)")
     return scores, matrix
 
@@ -105,7 +115,11 @@ def _row(scores: dict[str, Any], where: str) -> np.ndarray:
         if name not in _INDEX:
             near = difflib.get_close_matches(str(name), ARKIT_NAMES, 1)
             raise UserError(f"{where}: no blend shape {_short(name)}" + (f"; did you mean {near[0]}?" if near else ""))
-        if isinstance(score, bool) or not isinstance(score, (int, float)) or not SMALLEST <= score <= LARGEST:
+        if (
+            isinstance(score, bool)
+            or not isinstance(score, (int, float))
+            or not MIN_COEFFICIENT <= score <= MAX_COEFFICIENT
+        ):
             raise UserError(f"{where}: {name} is {_short(score)}; scores go from 0 to 1")
         row[_INDEX[name]] = score
     return row
@@ -117,7 +131,7 @@ def _seconds(frames: list[dict[str, Any]], path: Path) -> np.ndarray:
     if all(stamp is None for stamp in stamps):
         return np.arange(len(frames)) / _DEFAULT_FPS
     for index, stamp in enumerate(stamps):
-        if isinstance(stamp, bool) or not isinstance(stamp, (int, float)) or not abs(stamp) < _LATEST:
+        if isinstance(stamp, bool) or not isinstance(stamp, (int, float)) or not abs(stamp) < _MAX_MILLISECONDS:
             raise UserError(f"{path}, frame {index}: timestamp_ms is {_short(stamp)}; give every frame a number")
         if index and stamp <= stamps[index - 1]:  # pyright: ignore[reportOperatorIssue]
             raise UserError(f"{path}, frame {index}: its timestamp_ms is not after the one before")
@@ -125,9 +139,9 @@ def _seconds(frames: list[dict[str, Any]], path: Path) -> np.ndarray:
 
 
 def _short(value: object) -> str:
-    """A value as messages show it, cut to `_SHOWN` characters."""
+    """A value as messages show it, cut to `_MAX_SHOWN` characters."""
     try:
         text = repr(value)
     except ValueError:  # Python refuses to print integers with thousands of digits.
         text = f"a number of {type(value).__name__} with thousands of digits"
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."

@@ -14,7 +14,17 @@ from pathlib import Path
 
 import numpy as np
 
-from mien.driving.motion import ARKIT_NAMES, LARGEST, SMALLEST, Motion, check_size, check_times, evenly, gaze_of, held
+from mien.driving.motion import (
+    ARKIT_NAMES,
+    MAX_COEFFICIENT,
+    MIN_COEFFICIENT,
+    Motion,
+    check_size,
+    check_times,
+    gaze_of,
+    repeat_lost,
+    resample_evenly,
+)
 from mien.errors import UserError
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
@@ -23,7 +33,7 @@ EYES = tuple(f"{side}Eye{angle}" for side in ("Left", "Right") for angle in ("Ya
 _TIMECODE = re.compile(r"([0-9]{1,4}):([0-9]{1,2}):([0-9]{1,2})[:;]([0-9]{1,4})(?:\.([0-9]{1,20}))?")
 _RATES = (24, 25, 30, 48, 50, 60, 90, 120, 240)
 _USUAL_RATE = 60
-_SHOWN = 40
+_MAX_SHOWN = 40
 """Largest number of characters of a cell that a message shows."""
 
 
@@ -62,7 +72,7 @@ def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
     stamp = columns["timecode"]
     seconds = _seconds(path, [(line, row[stamp] if stamp < len(row) else "") for line, row in lines], fps)
     check_times(seconds, lambda row_index: f"{path}, line {lines[row_index][0]}")
-    rate, values = evenly(seconds, held(values, found))
+    rate, values = resample_evenly(seconds, repeat_lost(values, found))
     coefficients = values[:, :52].astype(np.float32)
     turns = {name: values[:, 52 + index] for index, name in enumerate(angles)}
     zero = np.zeros((len(values), 3), np.float32)
@@ -108,14 +118,14 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
             raise UserError(
                 f"{where} is {_short(text, bare=True)}; angles are radians, -3.14 to 3.14: convert it from degrees"
             )
-    elif not SMALLEST <= value <= LARGEST:
+    elif not MIN_COEFFICIENT <= value <= MAX_COEFFICIENT:
         raise UserError(f"{where} is {_short(text, bare=True)}; coefficients go from 0 to 1: mend or delete the line")
     return value
 
 
 def _short(text: str, *, bare: bool = False) -> str:
-    """A cell as messages show it, cut to `_SHOWN` characters."""
-    cut = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    """A cell as messages show it, cut to `_MAX_SHOWN` characters."""
+    cut = text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
     return cut if bare else repr(cut)
 
 

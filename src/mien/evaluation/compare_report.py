@@ -19,7 +19,7 @@ from mien.training.frames import Frame
 
 _FRAMES = 5
 _PICTURE_SIZE = 320
-_MOST_RUNS = 8
+_MAX_RUNS = 8
 _PARTS = (None, "head")
 
 
@@ -85,7 +85,7 @@ def _row_html(table: Table, row: Row) -> str:
 
 def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> str:
     """Some frames of a table: the truth and every run's rendering in a row, their errors below."""
-    runs = [row.run for row in table.rows if row.run is not None][:_MOST_RUNS]
+    runs = [row.run for row in table.rows if row.run is not None][:_MAX_RUNS]
     count = len(table.rows[0].entry["per_frame"]["psnr"])
     places = sorted({round(index * (count - 1) / max(1, _FRAMES - 1)) for index in range(_FRAMES)})
     columns: list[list[tuple[str, str]]] = []

@@ -17,9 +17,9 @@ from mien.capture import Capture, read_capture, read_capture_hash
 from mien.capture.video import write_video
 from mien.driving import drive
 from mien.errors import UserError
-from mien.evaluation.redetection import MEASURED_BY, FaceReader, Motion, motion, transfer_figures
+from mien.evaluation.redetection import MEASURED_BY, FaceReader, MeasuredMotion, measure_motion, transfer_figures
 from mien.evaluation.scoring import evenly_spread
-from mien.evaluation.videos import labelled_row, same_size
+from mien.evaluation.videos import labelled_row, match_sizes
 from mien.face import FaceParams, most_frontal_camera
 from mien.face.checks import check_face_params
 from mien.pictures import to_uint8
@@ -28,7 +28,7 @@ from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import Tracking, check_tracking_of, read_tracking
 
-_FRAMES = 100
+_MAX_FRAMES = 100
 _MEANS = (
     "expression_error", "expression_error_still", "head_rotation_error_degrees", "head_rotation_error_still_degrees",
     "mouth_correlation", "eyes_correlation", "faces_found",
@@ -139,7 +139,7 @@ def measure(driven: Driven, name: str) -> dict[str, Any]:
     Raises:
         UserError: no face is found in the driver's pictures.
     """
-    frames = evenly_spread(sorted(driven.by_rest), _FRAMES)
+    frames = evenly_spread(sorted(driven.by_rest), _MAX_FRAMES)
     seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     found_driver = found_avatar = 0
     with FaceReader() as reader:
@@ -157,8 +157,8 @@ def measure(driven: Driven, name: str) -> dict[str, Any]:
     figures: dict[str, float | None] = dict.fromkeys(_MEANS)
     if seen:
         rest = seen[next(timestep for timestep in driven.by_rest if timestep in seen)]
-        pairs: list[tuple[Motion, Motion]] = [
-            (motion(theirs, rest[0]), motion(ours, rest[1])) for theirs, ours in seen.values()
+        pairs: list[tuple[MeasuredMotion, MeasuredMotion]] = [
+            (measure_motion(theirs, rest[0]), measure_motion(ours, rest[1])) for theirs, ours in seen.values()
         ]
         figures |= transfer_figures(pairs)
     return {**figures, "faces_found": found_avatar / found_driver, "frames": found_driver}
@@ -170,7 +170,7 @@ def _write_video(path: Path, driven: Driven, most: int) -> Path:
         labelled_row({f"driver: {t}": driven.driver_picture(t), "avatar": driven.picture(t)})
         for t in track_progress(timesteps, f"video {path.stem}", len(timesteps))
     )
-    write_video(path, same_size(pictures), driven.driver.fps, crf=24)
+    write_video(path, match_sizes(pictures), driven.driver.fps, crf=24)
     return path
 
 

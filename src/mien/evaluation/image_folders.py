@@ -35,8 +35,8 @@ CROPS_FORMAT, CROPS_VERSION = "mien.crops", 1
 CROPS_NAME = "crops.json"
 Background = Literal["white", "black"]
 _COLORS = {"white": 255, "black": 0}
-_NAMED = 3
-_FARTHEST = 1_000_000
+_MAX_NAMED = 3
+_MAX_COORDINATE = 1_000_000
 """Largest coordinate or size of a head box, in pixels."""
 
 
@@ -128,7 +128,9 @@ def read_crops(path: Path) -> dict[str, Box]:
         raise UserError(f"{str(error).split('; ')[0]}; write it again, or leave it out") from None
     boxes: dict[str, Box] = {}
     for name, box in crops.items() if isinstance(crops, dict) else [("", None)]:
-        fits = isinstance(box, list) and len(box) == 4 and all(type(v) is int and abs(v) <= _FARTHEST for v in box)
+        fits = (
+            isinstance(box, list) and len(box) == 4 and all(type(v) is int and abs(v) <= _MAX_COORDINATE for v in box)
+        )
         if not isinstance(box, list) or not fits or min(box[2:]) < 1:
             raise UserError(f"{path}: {name!r} has no box of 4 numbers (left, top, width, height); write it again")
         boxes[name] = (box[0], box[1], box[2], box[3])
@@ -221,7 +223,7 @@ def _matched(truth: PictureSource, images: PictureSource) -> list[str]:
 
 
 def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+    return ", ".join(names[:_MAX_NAMED]) + (", ..." if len(names) > _MAX_NAMED else "")
 
 
 def _floats(image: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:

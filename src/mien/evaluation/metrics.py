@@ -9,7 +9,7 @@ from torch import Tensor
 from mien.pictures import Box
 from mien.training.photometric import C1, C2, WINDOW_RADIUS, WINDOW_SIGMA
 
-PSNR_LIMIT = 100.0
+MAX_PSNR = 100.0
 """PSNR of identical images in dB, so that results stay finite."""
 
 
@@ -42,11 +42,11 @@ def psnr(
 ) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1: -10 log10 of the mean squared difference.
 
-    The mean is over the channels of the pixels in `box` that `mask` selects. The result is at most `PSNR_LIMIT`. The
+    The mean is over the channels of the pixels in `box` that `mask` selects. The result is at most `MAX_PSNR`. The
     figure for a set of frames is the mean of the figures of its frames, as is usual in the field.
     """
     squared = _mean((crop_to(image, box) - crop_to(target, box)) ** 2, box, mask)
-    return float(-10 * torch.log10(squared.clamp_min(10 ** (-PSNR_LIMIT / 10))))
+    return float(-10 * torch.log10(squared.clamp_min(10 ** (-MAX_PSNR / 10))))
 
 
 def ssim(

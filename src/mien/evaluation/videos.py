@@ -49,7 +49,7 @@ def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evalu
 
     first = experiment.sequences[frames[0].sequence].capture
     drawn = (picture(frame) for frame in track_progress(frames, f"video {path.stem}", len(frames)))
-    write_video(path, same_size(drawn), first.fps, _CRF)
+    write_video(path, match_sizes(drawn), first.fps, _CRF)
     return len(frames)
 
 
@@ -73,7 +73,7 @@ def labelled_row(panels: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.n
     return side_by_side(named)
 
 
-def same_size(pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def match_sizes(pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Yield the pictures in the size of the first. Smaller ones get a white border, larger ones are shrunk."""
     size: tuple[int, int] | None = None
     for picture in pictures:

@@ -14,11 +14,11 @@ from mien.errors import UserError
 from mien.gaussians import Gaussians
 from mien.storage import write_atomically
 
-_HEADER_LIMIT = 65536
+_MAX_HEADER_BYTES = 65536
 _REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
 """Number of SH coefficients (1, 4, 9, 16) by the number of f_rest_* properties."""
-_DIGITS_OF_COUNT = 12
-_MOST_GAUSSIANS = 2_000_000
+_MAX_COUNT_DIGITS = 12
+_MAX_GAUSSIANS = 2_000_000
 """Largest number of Gaussians that is read: a head has tens of thousands, and memory grows with it."""
 _LOCAL_COMMENT = "mien frame: local"
 _WORLD_COMMENT = "mien frame: world"
@@ -76,8 +76,8 @@ def read_ply(path: Path) -> Gaussians:
             expected, left = count * len(names) * 4, os.fstat(file.fileno()).st_size - file.tell()
             if left < expected:
                 raise UserError(f"{path}: truncated, {left} of {expected} bytes of vertices; copy or export it again")
-            if count > _MOST_GAUSSIANS:
-                raise UserError(f"{path}: {count:,} Gaussians, more than {_MOST_GAUSSIANS:,}; take fewer of them")
+            if count > _MAX_GAUSSIANS:
+                raise UserError(f"{path}: {count:,} Gaussians, more than {_MAX_GAUSSIANS:,}; take fewer of them")
             body = file.read(expected)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -92,7 +92,7 @@ def _read_header(path: Path, file: IO[bytes]) -> list[str]:
     Raises:
         UserError: it is no .ply.
     """
-    content = file.read(_HEADER_LIMIT)
+    content = file.read(_MAX_HEADER_BYTES)
     end = content.find(b"end_header\n")
     if not content.startswith(b"ply") or end < 0:
         raise UserError(f"{path}: no .ply file; give one with 3D Gaussians, as `mien export` writes")
@@ -137,8 +137,8 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
     if missing or others:
         reason = f"lacks {', '.join(missing)}" if missing else f"has {others[0]!r}, not float"
         raise UserError(f"{path}: {reason}; give a .ply with 3D Gaussians in full precision")
-    if len(elements[0][2]) > _DIGITS_OF_COUNT:
-        raise UserError(f"{path}: {elements[0][2][:_DIGITS_OF_COUNT]}... vertices are too many; export it again")
+    if len(elements[0][2]) > _MAX_COUNT_DIGITS:
+        raise UserError(f"{path}: {elements[0][2][:_MAX_COUNT_DIGITS]}... vertices are too many; export it again")
     return int(elements[0][2]), names
 
 
