@@ -194,7 +194,7 @@ def test_comparison_ranks_runs_of_the_same_frames(scored: dict[str, dict], root:
     assert f"\x1b[1m{figures['longer']:.2f}\x1b[0m" in text
     plain = comparison_text(comparison)
     assert re.sub(r"\x1b\[\d*m", "", text) == plain
-    lines = [line for line in plain.splitlines() if "." in line and "held out" not in line]
+    lines = [line for line in plain.splitlines() if "." in line and "held-out" not in line]
     assert len({line.index(".") for line in lines}) == 1, "columns must line up"
     assert [line.split("  ")[0] for line in lines] == ["short", "longer", "mean training picture", "coloured mesh"]
 
@@ -211,7 +211,7 @@ def test_comparison_warns_of_other_frames_masks_and_missing_runs(
     comparison = compare_runs({"short": root / "runs" / "short", "other": other, "never": tmp_path / "never"})
     assert len(comparison.tables) == 2
     warnings = "\n".join(comparison.warnings)
-    assert "not scored on the same frames, pictures and masks, so not compared: short | other" in warnings
+    assert "not scored on the same frames, pictures and masks: short | other" in warnings
     assert "never: was not evaluated" in warnings
     with pytest.raises(UserError, match="no evaluated run"):
         compare_runs({"never": tmp_path / "never"})

@@ -103,7 +103,7 @@ def measure_machine(gpu: bool = False) -> Machine:
 def format_machine(machine: Machine) -> str:
     """Return the machine's description in one line."""
     processor = (
-        f"{machine.processor}, {machine.cores} cores, {machine.isa}, {machine.gflops:.0f} GFLOP/s a thread "
+        f"{machine.processor}, {machine.cores} cores, {machine.isa}, {machine.gflops:.0f} GFLOP/s per thread "
         f"(matrix product), load {machine.load:.1f}"
     )
     return f"{machine.gpu}; {processor}" if machine.gpu else processor

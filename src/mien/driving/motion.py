@@ -73,10 +73,9 @@ def gaze_of(coefficients: Float32[np.ndarray, "t 52"]) -> Float32[np.ndarray, "t
 def resample_evenly(
     seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]
 ) -> tuple[float, Float[np.ndarray, "t c"]]:
-    """Frames per second, and rows at evenly spaced times. Rows that are even already stay; others are interpolated
-    linearly.
+    """Return frames per second, and rows at evenly spaced times.
 
-    `seconds` must increase strictly.
+    Rows that are even already stay; others are interpolated linearly. `seconds` must increase strictly.
     """
     if len(rows) < 2:
         return 30.0, rows
@@ -96,7 +95,7 @@ def check_size(path: Path) -> None:
         OSError: The file is missing.
     """
     if not stat.S_ISREG(path.stat().st_mode):
-        raise UserError(f"{path}: is no ordinary file; copy it to one")
+        raise UserError(f"{path}: is not an ordinary file; copy its content into one")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise UserError(f"{path}: has more than {MAX_FILE_BYTES:,} bytes; cut it into shorter recordings")
 
@@ -115,13 +114,13 @@ def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -
     longest = int(np.argmax(steps)) if len(steps) else 0
     if len(steps) and steps[longest] > MAX_GAP_SECONDS:
         raise UserError(
-            f"{where(longest + 1)}: comes {steps[longest]:,.0f} s after the one before, and gaps of up to "
+            f"{where(longest + 1)}: comes {steps[longest]:,.0f} s after the one before, but only gaps of up to "
             f"{MAX_GAP_SECONDS:g} s are filled; cut the file there"
         )
     moments = float(seconds[-1] - seconds[0]) / float(np.median(steps)) if len(steps) else 1.0
     if max(moments, len(seconds)) > MAX_MOMENTS:
         raise UserError(
-            f"{where(0)}: the times from here on make {moments:,.0f} moments, more than {MAX_MOMENTS:,}; cut the file "
+            f"{where(0)}: the times from here on give {moments:,.0f} moments, more than {MAX_MOMENTS:,}; cut the file "
             "into shorter ones"
         )
 

@@ -113,15 +113,22 @@ def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
         for run in runs:
             entry = run.metrics["protocols"].get(protocol)
             if entry is None:
-                warnings.append(f"{run.label}: has no {protocol}; it held out other frames or was evaluated otherwise")
+                warnings.append(
+                    f"{run.label}: has no {protocol}; it held out other frames or was evaluated with other settings"
+                )
                 continue
             if not entry.get("scored_on"):
-                warnings.append(f"{run.label}: was evaluated by an older mien; evaluate it again to compare its mask")
+                warnings.append(
+                    f"{run.label}: was evaluated by an older version of mien; evaluate it again to compare its mask"
+                )
             groups.setdefault(_ground(entry), []).append(run)
         tables += [_table(protocol, group) for group in groups.values()]
         if len(groups) > 1:
             sets = " | ".join(", ".join(run.label for run in group) for group in groups.values())
-            warnings.append(f"{protocol}: not scored on the same frames, pictures and masks, so not compared: {sets}")
+            warnings.append(
+                f"{protocol}: these runs have separate tables, because they were not scored on the same frames, "
+                f"pictures and masks: {sets}"
+            )
     for table in tables:
         warnings += _differences(table)
     return tables, warnings
@@ -141,10 +148,12 @@ def _differences(table: Table) -> list[str]:
     if len({row.faces for row in own}) > 1:
         warnings.append(
             f"{table.protocol}: some runs correct the tracking of held-out frames and some do not; compare the rows "
-            f"with faces {FACE_SOURCE_NAMES['as_tracked']}, or train alike"
+            f"with faces {FACE_SOURCE_NAMES['as_tracked']}, or train the runs alike"
         )
     if len({(row.entry.get("perceptual_backbone"), row.entry.get("perceptual_frames")) for row in own}) > 1:
-        warnings.append(f"{table.protocol}: ST-LPIPS was computed on other frames; evaluate the runs alike")
+        warnings.append(
+            f"{table.protocol}: ST-LPIPS was computed on different frames; evaluate the runs with the same settings"
+        )
     return warnings
 
 
@@ -171,7 +180,7 @@ def _baseline_rows(key: str, name: str, runs: Sequence[ScoredRun], protocol: str
         if entry is not None:
             found.setdefault(f"{entry['psnr']:.2f} {entry['head']['psnr']:.2f}", ([], entry))[0].append(run.label)
     several = len(found) > 1
-    return [Row(name, entry, None, f"of {', '.join(of)}" if several else "", True) for of, entry in found.values()]
+    return [Row(name, entry, None, f"as in {', '.join(of)}" if several else "", True) for of, entry in found.values()]
 
 
 def _row_content(row: Row) -> dict[str, Any]:

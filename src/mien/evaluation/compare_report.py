@@ -48,7 +48,7 @@ def comparison_html(comparison: Comparison, pictures: Sequence[str]) -> str:
 
 def _heading(table: Table) -> str:
     names = ", ".join(dict.fromkeys(table.rows[0].entry["per_frame"]["sequence"]))
-    return f"{table.protocol.replace('_', ' ').capitalize()}: {table.frames} frames held out of {names} ({table.split})"
+    return f"{table.protocol.replace('_', ' ').capitalize()}: {table.frames} held-out frames of {names} ({table.split})"
 
 
 def _table_html(table: Table) -> str:
@@ -96,7 +96,8 @@ def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> str
         experiment = load_experiments(run.run_dir, sequence_dirs[run.run_dir]).get(table.protocol)
         if experiment is None or len(experiment.held_out_frames) != count:
             raise UserError(
-                f"{run.run_dir / 'metrics.json'}: is of other frames than the run held out; evaluate it again"
+                f"{run.run_dir / 'metrics.json'}: has figures of other frames than the run held out; evaluate the "
+                "run again"
             )
         frames = [experiment.held_out_frames[place] for place in places]
         boxes = [head_box(experiment, [frame]) for frame in frames]

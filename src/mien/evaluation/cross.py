@@ -70,15 +70,15 @@ def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
     avatar, tracking = load_avatar(run_dir), read_tracking(driver_dir / "tracking")
     if tracking.face_model_hash != avatar.face_model.content_hash:
         raise UserError(
-            f"{driver_dir}: was tracked with the face model {tracking.face_model}, the avatar has another "
-            f"({avatar.face_model.name}); track the driver with the avatar's"
+            f"{driver_dir}: was tracked with the face model {tracking.face_model}, but the avatar has another "
+            f"({avatar.face_model.name}); track the driver with the avatar's face model"
         )
     check_face_params(avatar.face_model, tracking.face, str(driver_dir), "track it again")
     capture = read_capture(driver_dir / "capture")
     check_tracking_of(capture, tracking, driver_dir / "tracking")
     valid = torch.nonzero(tracking.valid)[:, 0].tolist()
     if not valid:
-        raise UserError(f"{driver_dir}: no frame of it was tracked; choose another driver")
+        raise UserError(f"{driver_dir}: has no tracked frame; choose another driver")
     at_rest = neutral_of(tracking.face[tracking.valid])
     bounds = avatar.face_model.expression_bounds
     faces = drive(tracking.face, at_rest, avatar.subject, bounds, who=str(driver_dir))

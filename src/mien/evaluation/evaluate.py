@@ -59,8 +59,8 @@ def _evaluate(
     experiments = load_experiments(run_dir, sequence_dirs)
     if not experiments and not driver_dirs:
         raise UserError(
-            f"{run_dir}: nothing was held out, so nothing can be scored; train with `--split blocks` or `tail`, on 5 "
-            "frames or more"
+            f"{run_dir}: no frame was held out, so nothing can be scored; train with `--split blocks` or "
+            "`--split tail`, on 5 frames or more"
         )
     partials = {
         name: PartialScores(run_dir / f".{name}.partial", _fingerprint(run_dir, name, experiment, settings))

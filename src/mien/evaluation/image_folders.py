@@ -128,10 +128,8 @@ def read_crops(path: Path) -> dict[str, Box]:
         raise UserError(f"{str(error).split('; ')[0]}; write it again, or leave it out") from None
     boxes: dict[str, Box] = {}
     for name, box in crops.items() if isinstance(crops, dict) else [("", None)]:
-        fits = (
-            isinstance(box, list) and len(box) == 4 and all(type(v) is int and abs(v) <= _MAX_COORDINATE for v in box)
-        )
-        if not isinstance(box, list) or not fits or min(box[2:]) < 1:
+        is_list = isinstance(box, list) and len(box) == 4
+        if not is_list or not all(type(v) is int and abs(v) <= _MAX_COORDINATE for v in box) or min(box[2:]) < 1:
             raise UserError(f"{path}: {name!r} has no box of 4 numbers (left, top, width, height); write it again")
         boxes[name] = (box[0], box[1], box[2], box[3])
     return boxes
@@ -179,20 +177,20 @@ class _Pairs:
                 if (matte == 0).any():
                     surround.append(float(np.abs(image[matte == 0].astype(np.int16) - int(color[0])).mean()))
             if crop is not None and not _meets(crop, truth):
-                raise UserError(f"{name}: the head box {crop} lies outside of the picture; write {CROPS_NAME} again")
+                raise UserError(f"{name}: the head box {crop} is outside the picture; write {CROPS_NAME} again")
             yield index, _Pair(name, image, truth, crop)
         if surround and float(np.mean(surround)) > 64:
             say(
                 f"warning: {self._folders.images}: pictures are not {self._folders.background} where the mattes are "
-                "empty, which costs much PSNR; render them over that colour, or give --background"
+                "empty, which lowers PSNR; render them over that colour, or set --background"
             )
 
     def _check_size(self, name: str, picture: np.ndarray, truth: np.ndarray, folder: Path | None) -> None:
         if picture.shape[:2] != truth.shape[:2]:
             sizes = [f"{shape[1]}x{shape[0]}" for shape in (picture.shape, truth.shape)]
             raise UserError(
-                f"{folder}: {name} has {sizes[0]} pixels, its truth {sizes[1]}; bring them to one size (mien does not "
-                "resize: that would change the figures)"
+                f"{folder}: {name} has {sizes[0]} pixels, and its truth has {sizes[1]}; give them one size (mien "
+                "does not resize pictures, because that would change the figures)"
             )
 
 
@@ -207,7 +205,7 @@ def _matched(truth: PictureSource, images: PictureSource) -> list[str]:
         if truth.count != images.count:
             raise UserError(
                 f"{images.path}: has {images.count} pictures, {truth.path} has {truth.count}; videos are matched by "
-                "order, so give equally many"
+                "order, so give equal numbers"
             )
         return truth.names or images.names or [f"{index:06d}" for index in range(truth.count)]
     missing = sorted(set(truth.names) - set(images.names))

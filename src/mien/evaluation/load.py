@@ -46,7 +46,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
     sequences = tuple(sequence_of(folder, scoring) for folder, scoring in zip(sequence_dirs, scorings, strict=True))
     for folder, digest in zip(sequence_dirs, digests, strict=True):
         if _digests(folder) != digest:
-            raise UserError(f"{folder}: was written anew while it was read; run the same command again")
+            raise UserError(f"{folder}: was changed while it was read; run the same command again")
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
     avatar = load_avatar(run_dir)
     for folder, sequence in zip(sequence_dirs, sequences, strict=True):

@@ -117,4 +117,4 @@ def _is_number(value: Any) -> bool:
 
 def _require(holds: bool, what: str) -> None:
     if not holds:
-        raise ValueError(f"{what} is not what it should be")
+        raise ValueError(f"{what} is missing or has a wrong value")

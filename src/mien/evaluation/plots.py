@@ -45,7 +45,7 @@ def line_chart(series: Sequence[Series], axes: Axes) -> str:
     """An <svg> of some series over common axes. Series without a finite value are left out."""
     drawn = [one for one in series if np.isfinite(one.y).any()]
     if not drawn:
-        return '<p class="note">Nothing to draw.</p>'
+        return '<p class="note">There are no values to draw.</p>'
     x_range = _range(np.concatenate([one.x for one in drawn]))
     y_range = _padded(_range(np.concatenate([one.y for one in drawn])), axes.from_zero)
     plot = _Plot(axes, x_range, y_range)

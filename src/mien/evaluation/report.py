@@ -119,7 +119,7 @@ def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> str:
     summary = run.summary
     tiles.append((f"{summary['gaussians']:,}", "Gaussians"))
     tiles.append((_duration(summary["seconds"]), f"training, {summary['steps']:,} steps"))
-    tiles.append((f"{summary['step_ms_median']:.1f} ms", "a step, median"))
+    tiles.append((f"{summary['step_ms_median']:.1f} ms", "per step, median"))
     content = "".join(f'<div class="tile"><b>{value}</b><span>{name}</span></div>' for value, name in tiles)
     return f'<div class="tiles">{content}</div>'
 
@@ -136,16 +136,16 @@ def _table(protocols: Mapping[str, Any]) -> str:
             if key in subjects
         )
         caption = (
-            f"{_TITLES.get(name, name)} · {entry['frames']} frames held out ({entry['split']}) · face parameters "
-            f"{entry['face_params'].replace('_', ' ')} · PSNR on frames trained on: "
-            f"{entry['training_frames']['psnr']:.2f}, head {entry['training_frames']['head']['psnr']:.2f} dB"
-            f" · ST-LPIPS on {entry['perceptual_frames']} frames, evenly spread"
+            f"{_TITLES.get(name, name)} · {entry['frames']} held-out frames ({entry['split']}) · face parameters "
+            f"{entry['face_params'].replace('_', ' ')} · PSNR on training frames: "
+            f"{entry['training_frames']['psnr']:.2f} dB, head crop {entry['training_frames']['head']['psnr']:.2f} dB"
+            f" · ST-LPIPS on {entry['perceptual_frames']} evenly spread frames"
         )
         parts.append(
             f'<div class="card table"><div class="scroll"><table>{_table_head()}<tbody>{rows}</tbody></table></div>'
             f'<p class="note">{escape(caption)}</p></div>'
         )
-    return "".join(parts) or '<p class="note">Nothing was held out, so nothing was scored.</p>'
+    return "".join(parts) or '<p class="note">No frame was held out, so nothing was scored.</p>'
 
 
 def _table_head() -> str:

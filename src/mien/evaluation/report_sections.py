@@ -30,10 +30,12 @@ _CROSS_COLUMNS = (
     ("frames", "Frames", 0),
 )  # fmt: skip
 _CROSS_NOTE = (
-    "Motion relative to each one's neutral; there is no true picture. A face detector reads the driver's and the "
-    "avatar's pictures alike. Expression: distance between what lips, lids and brows do, head pose taken out, in "
-    "distances between the outer eye corners. If still: the same for an avatar that never moves. r: correlation of the "
-    "opening of mouth and eyes over the frames. This says how much of the motion arrives, not how good pictures look."
+    "There is no true picture, so a face detector reads the pictures of the driver and of the avatar, and the motions "
+    "that it finds are compared, each relative to its own neutral face. Expression: distance between the motions of "
+    "lips, lids and brows without the head pose; the unit is the distance between the outer eye corners. Head: "
+    "difference of the head rotations. If still: the same figure for an avatar that never moves. r: correlation of the "
+    "openings of mouth and eyes over the frames. The figures show how much of the motion arrives, not how good the "
+    "pictures look."
 )
 
 
@@ -83,9 +85,9 @@ def over_time(experiment: Experiment, evaluation: Evaluation) -> str:
         there = [i for i, f in enumerate(evaluation.frames) if (f.sequence, f.camera) == (sequence, camera)]
         timesteps = [evaluation.frames[i].timestep for i in there]
         seen = [evaluation.training_psnr[f][1] for f in here]
-        series = [_series("trained on", [f.timestep for f in here], seen, "quiet")]
-        mesh = f"{BASELINE_NAMES['mesh']}, held out"
-        for subject, label, style in ((AVATAR, "held out", "main"), (MESH, mesh, "second")):
+        series = [_series("training frames", [f.timestep for f in here], seen, "quiet")]
+        mesh = f"{BASELINE_NAMES['mesh']}, held-out frames"
+        for subject, label, style in ((AVATAR, "held-out frames", "main"), (MESH, mesh, "second")):
             if subject in evaluation.scores:
                 series.append(
                     _series(label, timesteps, [evaluation.scores[subject][i]["head_psnr"] for i in there], style)
@@ -124,7 +126,7 @@ def training_curves(curves: Mapping[str, np.ndarray]) -> str:
             values = np.minimum(values, np.percentile(values, 99))
         series = [Series(title, steps, values)]
         if name in ("loss", "psnr"):
-            series = [Series("one frame each", steps, values, "quiet"), Series("mean", *_smooth(steps, values))]
+            series = [Series("single frames", steps, values, "quiet"), Series("mean", *_smooth(steps, values))]
         chart = line_chart(series, Axes("step", title, from_zero=from_zero))
         cards.append(_card(title, chart))
     return f'<div class="grid2">{"".join(cards)}</div>'
@@ -170,7 +172,7 @@ def _overlay(experiment: Experiment, frame: Frame) -> str:
 def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> str:
     """The median held-out frame as truth, mean training picture, coloured mesh and avatar."""
     if evaluation.baselines is None:
-        return '<p class="note">Not scored in this evaluation.</p>'
+        return '<p class="note">This evaluation did not score the baselines.</p>'
     frame = evaluation.frames[evaluation.ranked()[len(evaluation.frames) // 2]]
     pictures = {
         "truth": target_image(experiment, frame),

@@ -29,7 +29,7 @@ def driven_line(entry: Mapping[str, Any]) -> str:
         return f"{text}no face is found in any picture of the avatar"
     expression, rotation = "expression_error", "head_rotation_error"
     return (
-        f"{text}expression error {entry[expression]:.4f} eye distances (of an avatar that never moves: "
+        f"{text}expression error {entry[expression]:.4f} eye distances (an avatar that never moves: "
         f"{entry[f'{expression}_still']:.4f}), head rotation error {entry[f'{rotation}_degrees']:.1f} degrees "
         f"({entry[f'{rotation}_still_degrees']:.1f}), faces found in {100 * entry['faces_found']:.0f} % of frames"
     )
@@ -39,7 +39,7 @@ def scores_lines(scores: Mapping[str, Any]) -> list[str]:
     """The figures of `score_folders`, with one line for each part of the picture."""
     lines = [f"{scores['frames']} pictures; whole frame: {_figures(scores)}"]
     if scores["crop"] is None:
-        return [*lines, "head crop: not known; give --crops or --mattes"]
+        return [*lines, "head crop: unknown; give --crops or --mattes"]
     return [*lines, f"head crop ({scores['crop']}): {_figures(scores['head'])}"]
 
 
@@ -53,7 +53,7 @@ def comparison_text(comparison: Comparison, bold: bool = False) -> str:
 def _table_text(table: Table, bold: bool) -> str:
     """A heading and an aligned table: first the whole frame, then the head crop."""
     sequences = ", ".join(sorted(set(table.rows[0].entry["per_frame"]["sequence"])))
-    title = printable(f"{table.protocol}: {table.frames} frames held out of {sequences} ({table.split})")
+    title = printable(f"{table.protocol}: {table.frames} held-out frames of {sequences} ({table.split})")
     extra = ("Gaussians", "training", "ms/frame")
     heads = [
         "",
