@@ -23,7 +23,7 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import evaluate_frames
 from mien.evaluation.text import comparison_text
-from mien.evaluation.videos import match_sizes, video_frames
+from mien.evaluation.videos import choose_video_frames, match_sizes
 from mien.pictures import to_uint8
 from mien.storage import write_json
 from mien.training import TrainSettings
@@ -143,8 +143,8 @@ def test_each_protocol_has_a_video_and_a_place_in_the_report(
 
 def test_long_videos_show_every_camera_from_its_first_frame() -> None:
     frames = [Frame(0, t, c) for t in range(30) for c in (0, 1)]
-    assert video_frames(frames, 10) == [Frame(0, t, c) for c in (0, 1) for t in range(5)]
-    assert len(video_frames(frames, 60)) == 60
+    assert choose_video_frames(frames, 10) == [Frame(0, t, c) for c in (0, 1) for t in range(5)]
+    assert len(choose_video_frames(frames, 60)) == 60
     sizes = [
         picture.shape for picture in match_sizes(iter([np.zeros((8, 9, 3), np.uint8), np.zeros((20, 4, 3), np.uint8)]))
     ]

@@ -164,8 +164,8 @@ def measure(driven: Driven, name: str) -> dict[str, Any]:
     return {**figures, "faces_found": found_avatar / found_driver, "frames": found_driver}
 
 
-def _write_video(path: Path, driven: Driven, most: int) -> Path:
-    timesteps = range(min(most, driven.driver.timesteps))
+def _write_video(path: Path, driven: Driven, max_count: int) -> Path:
+    timesteps = range(min(max_count, driven.driver.timesteps))
     pictures = (
         labelled_row({f"driver: {t}": driven.driver_picture(t), "avatar": driven.picture(t)})
         for t in track_progress(timesteps, f"video {path.stem}", len(timesteps))

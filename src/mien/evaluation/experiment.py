@@ -64,11 +64,11 @@ class Experiment:
         return self.faces[frame.sequence][frame.timestep]
 
 
-def spread_frames(frames: Items[Frame], most: int) -> list[Frame]:
-    """At most `most` of the frames, evenly spread over sequences, cameras and time. With 0, all of them."""
+def spread_frames(frames: Items[Frame], max_count: int) -> list[Frame]:
+    """At most `max_count` of the frames, evenly spread over sequences, cameras and time. With 0, all of them."""
     # Sort by camera first: a stride over the cameras of each timestep could always select the same one.
     ordered = sorted(frames, key=lambda frame: (frame.sequence, frame.camera, frame.timestep))
-    return evenly_spread(ordered, most)
+    return evenly_spread(ordered, max_count)
 
 
 def head_box(experiment: Experiment, frames: Items[Frame]) -> Box:

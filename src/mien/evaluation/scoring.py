@@ -89,9 +89,9 @@ def mean_scores(rows: Sequence[Scores]) -> dict[str, Any]:
     return {**whole, "head": {name: mean(f"head_{name}") for name in METRICS}}
 
 
-def evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
-    """At most `most` of the items, always with the first one. With 0, all of them."""
-    step = max(1, -(-len(items) // most)) if most else 1
+def evenly_spread(items: Sequence[Item], max_count: int) -> list[Item]:
+    """At most `max_count` of the items, evenly spread, always with the first one. With 0, all of them."""
+    step = max(1, -(-len(items) // max_count)) if max_count else 1
     return list(items[::step])
 
 

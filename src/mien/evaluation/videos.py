@@ -22,17 +22,17 @@ _BAR = 26
 _CRF = 24
 
 
-def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evaluation, most: int) -> int:
+def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evaluation, max_count: int) -> int:
     """Write held-out frames as truth, rendering and error heat map side by side; return the number of frames.
 
     Args:
         path: The .mp4 file.
         experiment: The evaluated experiment.
         evaluation: Its figures, which are written above the pictures.
-        most: Largest number of frames. If there are more, the first ones of each sequence and camera are used.
+        max_count: Largest number of frames. If there are more, the first ones of each sequence and camera are used.
     """
     places = {frame: index for index, frame in enumerate(evaluation.frames)}
-    frames = video_frames(evaluation.frames, most)
+    frames = choose_video_frames(evaluation.frames, max_count)
     boxes = {view: head_box(experiment, [f for f in frames if f[::2] == view]) for view in {f[::2] for f in frames}}
 
     def picture(frame: Frame) -> UInt8[np.ndarray, "h w 3"]:
@@ -53,12 +53,12 @@ def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evalu
     return len(frames)
 
 
-def video_frames(frames: Sequence[Frame], most: int) -> list[Frame]:
-    """At most `most` frames for a video, camera by camera: the first ones of each, equally many."""
+def choose_video_frames(frames: Sequence[Frame], max_count: int) -> list[Frame]:
+    """At most `max_count` frames for a video, camera by camera: the first ones of each, equally many."""
     groups: dict[tuple[int, int], list[Frame]] = {}
     for frame in sorted(frames, key=lambda one: (one.sequence, one.camera, one.timestep)):
         groups.setdefault((frame.sequence, frame.camera), []).append(frame)
-    each = len(frames) if len(frames) <= most else max(1, most // len(groups))
+    each = len(frames) if len(frames) <= max_count else max(1, max_count // len(groups))
     return [frame for group in groups.values() for frame in group[:each]]
 
 
