@@ -128,11 +128,14 @@ def read_crops(path: Path) -> dict[str, Box]:
         raise UserError(f"{str(error).split('; ')[0]}; write it again, or leave it out") from None
     boxes: dict[str, Box] = {}
     for name, box in crops.items() if isinstance(crops, dict) else [("", None)]:
-        is_list = isinstance(box, list) and len(box) == 4
-        if not is_list or not all(type(v) is int and abs(v) <= _MAX_COORDINATE for v in box) or min(box[2:]) < 1:
+        if not isinstance(box, list) or len(box) != 4 or not all(map(_is_coordinate, box)) or min(box[2:]) < 1:
             raise UserError(f"{path}: {name!r} has no box of 4 numbers (left, top, width, height); write it again")
         boxes[name] = (box[0], box[1], box[2], box[3])
     return boxes
+
+
+def _is_coordinate(value: Any) -> bool:
+    return type(value) is int and abs(value) <= _MAX_COORDINATE
 
 
 class _Pairs:
