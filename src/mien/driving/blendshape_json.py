@@ -27,6 +27,7 @@ from mien.driving.motion import (
     gaze_of,
     repeat_lost,
     resample_evenly,
+    shorten,
 )
 from mien.errors import UserError
 from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
@@ -39,8 +40,6 @@ _MAX_MATRIX_ENTRY = 1e6
 """Largest number in a transformation matrix (translations are in centimetres)."""
 _MAX_MILLISECONDS = 1e15
 """Largest timestamp in milliseconds: thirty thousand years, so the zero of any clock is accepted."""
-_MAX_SHOWN = 80
-"""Largest number of characters of a value that a message shows."""
 
 
 def read_blendshape_json(path: Path) -> Motion:
@@ -139,9 +138,8 @@ def _seconds(frames: list[dict[str, Any]], path: Path) -> np.ndarray:
 
 
 def _short(value: object) -> str:
-    """A value as messages show it, cut to `_MAX_SHOWN` characters."""
+    """A value as messages show it."""
     try:
-        text = repr(value)
+        return shorten(repr(value))
     except ValueError:  # Python refuses to print integers with thousands of digits.
-        text = f"a number of {type(value).__name__} with thousands of digits"
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
+        return f"a number of type {type(value).__name__} with thousands of digits"

@@ -24,6 +24,7 @@ from mien.driving.motion import (
     gaze_of,
     repeat_lost,
     resample_evenly,
+    shorten,
 )
 from mien.errors import UserError
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
@@ -33,8 +34,8 @@ EYES = tuple(f"{side}Eye{angle}" for side in ("Left", "Right") for angle in ("Ya
 _TIMECODE = re.compile(r"([0-9]{1,4}):([0-9]{1,2}):([0-9]{1,2})[:;]([0-9]{1,4})(?:\.([0-9]{1,20}))?")
 _RATES = (24, 25, 30, 48, 50, 60, 90, 120, 240)
 _USUAL_RATE = 60
-_MAX_SHOWN = 40
-"""Largest number of characters of a cell that a message shows."""
+_SIDES = ("Left", "Right")
+_ANGLES = {name.lower() for name in (*HEAD, *EYES)}
 
 
 def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
@@ -84,9 +85,6 @@ def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
     return Motion(rate, coefficients, eyes, head, zero, int((~found).sum()))
 
 
-_SIDES = ("Left", "Right")
-
-
 def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The header, and all further rows that are not empty, with their line numbers."""
     try:
@@ -112,27 +110,15 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise UserError(f"{where} is {_short(text)}, not a number; correct or delete the line") from None
+        raise UserError(f"{where} is {shorten(text)!r}, not a number; correct or delete the line") from None
     if name.strip().lower() in _ANGLES:
         if not abs(value) <= math.pi:
             raise UserError(
-                f"{where} is {_short(text, bare=True)}; angles are in radians, from -3.14 to 3.14; convert it from "
-                "degrees"
+                f"{where} is {shorten(text)}; angles are in radians, from -3.14 to 3.14; convert it from degrees"
             )
     elif not MIN_COEFFICIENT <= value <= MAX_COEFFICIENT:
-        raise UserError(
-            f"{where} is {_short(text, bare=True)}; coefficients go from 0 to 1; correct or delete the line"
-        )
+        raise UserError(f"{where} is {shorten(text)}; coefficients go from 0 to 1; correct or delete the line")
     return value
-
-
-def _short(text: str, *, bare: bool = False) -> str:
-    """A cell as messages show it, cut to `_MAX_SHOWN` characters."""
-    cut = text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
-    return cut if bare else repr(cut)
-
-
-_ANGLES = {name.lower() for name in (*HEAD, *EYES)}
 
 
 def _seconds(path: Path, timecodes: list[tuple[int, str]], fps: float | None) -> np.ndarray:
@@ -141,7 +127,8 @@ def _seconds(path: Path, timecodes: list[tuple[int, str]], fps: float | None) ->
         match = _TIMECODE.fullmatch(text.strip())
         if match is None:
             raise UserError(
-                f"{path}, line {line}: Timecode {_short(text)} is not HH:MM:SS:FF.fraction; correct or delete the line"
+                f"{path}, line {line}: Timecode {shorten(text)!r} is not HH:MM:SS:FF.fraction; correct or delete the "
+                "line"
             )
         hours, minutes, seconds, frame = (int(part) for part in match.groups()[:4])
         parsed.append((3600 * hours + 60 * minutes + seconds, frame + float(f"0.{match.group(5) or 0}")))

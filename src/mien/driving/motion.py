@@ -33,6 +33,8 @@ MAX_MOMENTS = 500_000
 """Largest number of moments in a recording: about two hours at 60 per second."""
 MAX_FILE_BYTES = 128 << 20
 """Largest recording that is read, in bytes. An hour of Live Link Face has about this size."""
+_MAX_SHOWN = 80
+"""Largest number of characters of a value that a message shows."""
 MIN_COEFFICIENT, MAX_COEFFICIENT = -0.5, 1.5
 """Bounds of a coefficient. They go from 0 to 1, and a little beyond in programs that calibrate or exaggerate."""
 
@@ -85,6 +87,11 @@ def resample_evenly(
     if count == len(rows) and np.abs(even - seconds).max() < 0.5 * step:
         return (len(rows) - 1) / float(seconds[-1] - seconds[0]), rows
     return 1 / step, np.stack([np.interp(even, seconds, column) for column in rows.T], axis=1)
+
+
+def shorten(text: str) -> str:
+    """The text as messages show it, cut to `_MAX_SHOWN` characters."""
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
 
 
 def check_size(path: Path) -> None:
