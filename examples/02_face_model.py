@@ -18,7 +18,7 @@ from mien.render import render_mesh
 SHOWN = ("neutral", "jawOpen", "mouthSmileLeft", "eyeBlinkRight", "browInnerUp", "mouthPucker")
 
 
-def frontal_camera(size: int) -> Camera:
+def camera_in_front(size: int) -> Camera:
     """Return a camera 0.6 m in front of the face. The head looks along +z with +y up, so the camera turns around."""
     viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
     viewmat[2, 3] = 0.6
@@ -43,7 +43,7 @@ def main() -> None:
         if name != "neutral":
             face.expression[:, model.expression_names.index(name)] = 1.0
         vertices = model(face)[0]  # metres, world space
-        picture, _alpha = render_mesh(vertices, model.faces, frontal_camera(options.size), supersample=2)
+        picture, _alpha = render_mesh(vertices, model.faces, camera_in_front(options.size), supersample=2)
         pictures.append((picture.clamp(0, 1).numpy()[:, :, ::-1] * 255).astype(np.uint8))
     options.out.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(options.out), np.concatenate(pictures, axis=1))

@@ -8,13 +8,14 @@ import torch
 from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
 from mien.camera import Camera, camera_from_fov
 from mien.capture.capture import Capture
-from mien.evaluation.experiment import Experiment, Frame
+from mien.evaluation.experiment import Experiment
 from mien.face import FaceParams
 from mien.gaussians import sh_from_rgb
 from mien.pictures import to_uint8
 from mien.render import rasterize
 from mien.tracking import Scoring, Tracking
 from mien.training import Split, held_out
+from mien.training.frames import Frame
 from mien.training.sequence import Sequence
 from small_face_model import make_small_face_model
 

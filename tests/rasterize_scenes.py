@@ -81,8 +81,8 @@ def comparable_pixels(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Tensor:
     pictures = []
     for factor in (1 - 1e-4, 1 + 1e-4):
         with monkeypatch.context() as patch:
-            patch.setattr("mien.render.reference.ALPHA_MIN", factor / 255)
-            patch.setattr("mien.render.reference.TRANSMITTANCE_MIN", factor * 1e-4)
+            patch.setattr("mien.render.reference.MIN_ALPHA", factor / 255)
+            patch.setattr("mien.render.reference.MIN_TRANSMITTANCE", factor * 1e-4)
             picture = rasterize(scene.gaussians, scene.camera, scene.background, backend="reference")
             pictures.append(picture.image.detach())
     return ((pictures[0] - pictures[1]).abs() < 1e-7).all(-1)

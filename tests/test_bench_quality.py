@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from mien.benchmarking.motion import Following
+from mien.benchmarking.following import Following
 from mien.benchmarking.quality import (
     QualityRow,
     TrackingErrors,

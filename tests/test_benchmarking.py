@@ -42,7 +42,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_timing_counts_every_run_and_orders_its_figures() -> None:
     runs: list[int] = []
-    timing = time_function(lambda: runs.append(sum(range(10_000))), seconds=0.0, least=5)
+    timing = time_function(lambda: runs.append(sum(range(10_000))), seconds=0.0, min_runs=5)
     assert len(runs) == 7  # two of which warm up
     assert 0 < timing.min_ms <= timing.median_ms
     assert timing.cpu_ms > 0

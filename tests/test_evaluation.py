@@ -121,7 +121,7 @@ def test_report_stands_alone_and_shows_everything(experiment: Experiment, evalua
     for forbidden in ("http://", "https://", "<script", "<link", "url(", "/somewhere"):
         assert forbidden not in page
     assert "mien create &#x27;&lt;clip&gt;.mp4&#x27;" in page, "the command must be there, quoted and escaped"
-    for wanted in ("Held out", "best", "median", "worst", "Mean training picture", "Gaussians", "1 min 11 s"):
+    for wanted in ("Held-out frames", "best", "median", "worst", "Mean training picture", "Gaussians", "1 min 11 s"):
         assert wanted in page
     figures = _Tags()
     figures.feed(page)

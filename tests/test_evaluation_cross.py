@@ -15,8 +15,9 @@ from mien.capture.video import probe_video
 from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import cross
-from mien.evaluation.cross import cross_reenactment, frontal_camera, load_driven
-from mien.evaluation.redetection import angle_degrees, motion, similarity, transfer_figures
+from mien.evaluation.cross import cross_reenactment, load_driven
+from mien.evaluation.redetection import angle_degrees, measure_motion, similarity, transfer_figures
+from mien.face import most_frontal_camera
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import write_tracking
 from mien.training import TrainSettings
@@ -40,14 +41,14 @@ def test_similarity_is_found_again() -> None:
 
 def test_head_pose_size_and_identity_do_not_count_as_expression() -> None:
     at_rest, rotation = _face(), _turn(0.0, 0.4, 0.0)
-    moved = motion(0.8 * at_rest @ rotation.T + 5, at_rest)
+    moved = measure_motion(0.8 * at_rest @ rotation.T + 5, at_rest)
     assert np.abs(moved.displacement).max() < 1e-9
     np.testing.assert_allclose(moved.rotation, rotation, atol=1e-9)
     assert angle_degrees(moved.rotation) == pytest.approx(np.degrees(0.4))
     opened = at_rest.copy()
     opened[14, 1] += 10  # the lower lip
     unit = np.linalg.norm(at_rest[33] - at_rest[263])
-    same_on_a_larger_face = motion(3 * opened, 3 * at_rest)
+    same_on_a_larger_face = measure_motion(3 * opened, 3 * at_rest)
     assert np.linalg.norm(same_on_a_larger_face.displacement, axis=1).max() == pytest.approx(10 / unit)
 
 
@@ -58,7 +59,7 @@ def test_figures_of_perfect_still_and_opposite_avatars() -> None:
     for step in range(6):
         points = at_rest.copy()
         points[14] += (at_rest[14] - at_rest[13]) * 0.2 * step
-        motions.append(motion(points @ _turn(0.0, 0.1 * step, 0.0).T, at_rest))
+        motions.append(measure_motion(points @ _turn(0.0, 0.1 * step, 0.0).T, at_rest))
     perfect = transfer_figures([(one, one) for one in motions])
     assert perfect["expression_error"] == 0
     assert perfect["head_rotation_error_degrees"] == pytest.approx(0, abs=1e-5)
@@ -130,7 +131,7 @@ def test_driven_avatar_keeps_its_identity_and_moves_from_its_own_neutral(folders
     far = (driven.faces.head_rotation[driven.by_rest[-1]] - driven.avatar.subject.head_rotation[0]).norm()
     assert moved < far
     cameras = driven.tracking.cameras
-    assert frontal_camera(cameras[::-1], driven.avatar.subject) == 1
+    assert most_frontal_camera(cameras[::-1], driven.avatar.subject) == 1
 
 
 def test_driver_of_another_face_model(folders: tuple[Path, Path], tmp_path: Path) -> None:

@@ -139,7 +139,7 @@ def test_pictures_without_a_truth_are_left_out_with_a_warning(
 def test_damaged_pictures_are_named(folders: ImageFolders) -> None:
     path = folders.images / "b.png"
     path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(UserError, match=r"b\.png: no whole picture"):
+    with pytest.raises(UserError, match=r"b\.png: is not a complete picture"):
         score_folders(folders, PLAIN)
     cv2.imwrite(str(path), np.zeros((40, 36, 3), np.uint16))
     with pytest.raises(UserError, match="8 bits"):

@@ -18,15 +18,16 @@ from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, read_metrics
 from mien.evaluation.baselines import make_baselines
 from mien.evaluation.compare import compare_runs
-from mien.evaluation.compare_text import comparison_text
-from mien.evaluation.experiment import Experiment, Frame, head_box, spread_frames, target_image
+from mien.evaluation.experiment import Experiment, head_box, spread_frames, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import evaluate_frames
-from mien.evaluation.videos import same_size, video_frames
+from mien.evaluation.text import comparison_text
+from mien.evaluation.videos import choose_video_frames, match_sizes
 from mien.pictures import to_uint8
 from mien.storage import write_json
 from mien.training import TrainSettings
+from mien.training.frames import Frame
 
 QUICK = EvaluationSettings(perceptual=False, video_frames=40)
 STEPS = 12
@@ -142,10 +143,10 @@ def test_each_protocol_has_a_video_and_a_place_in_the_report(
 
 def test_long_videos_show_every_camera_from_its_first_frame() -> None:
     frames = [Frame(0, t, c) for t in range(30) for c in (0, 1)]
-    assert video_frames(frames, 10) == [Frame(0, t, c) for c in (0, 1) for t in range(5)]
-    assert len(video_frames(frames, 60)) == 60
+    assert choose_video_frames(frames, 10) == [Frame(0, t, c) for c in (0, 1) for t in range(5)]
+    assert len(choose_video_frames(frames, 60)) == 60
     sizes = [
-        picture.shape for picture in same_size(iter([np.zeros((8, 9, 3), np.uint8), np.zeros((20, 4, 3), np.uint8)]))
+        picture.shape for picture in match_sizes(iter([np.zeros((8, 9, 3), np.uint8), np.zeros((20, 4, 3), np.uint8)]))
     ]
     assert sizes == [(8, 9, 3)] * 2
 
@@ -193,7 +194,7 @@ def test_comparison_ranks_runs_of_the_same_frames(scored: dict[str, dict], root:
     assert f"\x1b[1m{figures['longer']:.2f}\x1b[0m" in text
     plain = comparison_text(comparison)
     assert re.sub(r"\x1b\[\d*m", "", text) == plain
-    lines = [line for line in plain.splitlines() if "." in line and "held out" not in line]
+    lines = [line for line in plain.splitlines() if "." in line and "held-out" not in line]
     assert len({line.index(".") for line in lines}) == 1, "columns must line up"
     assert [line.split("  ")[0] for line in lines] == ["short", "longer", "mean training picture", "coloured mesh"]
 
@@ -210,7 +211,7 @@ def test_comparison_warns_of_other_frames_masks_and_missing_runs(
     comparison = compare_runs({"short": root / "runs" / "short", "other": other, "never": tmp_path / "never"})
     assert len(comparison.tables) == 2
     warnings = "\n".join(comparison.warnings)
-    assert "not scored on the same frames, pictures and masks, so not compared: short | other" in warnings
+    assert "not scored on the same frames, pictures and masks: short | other" in warnings
     assert "never: was not evaluated" in warnings
     with pytest.raises(UserError, match="no evaluated run"):
         compare_runs({"never": tmp_path / "never"})

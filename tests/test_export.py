@@ -142,7 +142,7 @@ def test_damaged_and_foreign_files(tmp_path: Path) -> None:
     content = good.read_bytes()
     cases = {
         "truncated": content[:-7],
-        "no .ply": b"GIF89a" + content,
+        "is not a .ply": b"GIF89a" + content,
         "not supported": content.replace(b"binary_little_endian", b"ascii", 1),
         "lacks f_dc_0": content.replace(b"f_dc_0", b"red_is"),
         "lacks y": content.replace(b"float y", b"float w"),

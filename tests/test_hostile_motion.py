@@ -37,7 +37,7 @@ def test_a_gap_in_a_csv_is_told_with_its_line(tmp_path: Path) -> None:
 
 def test_many_gaps_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Many gaps are reported that are not long by themselves, but are long together."""
-    monkeypatch.setattr(motion, "MOST_MOMENTS", 5_000)
+    monkeypatch.setattr(motion, "MAX_MOMENTS", 5_000)
     start = [row(f"0:00:00:0{frame}.0") for frame in range(6)]
     later = [row(f"0:{minute:02d}:00:00.0") for minute in range(1, 5)]
     refused(read_live_link_face, write_csv(tmp_path / "a.csv", *start, *later), "make 5,760 moments, more than 5,000")
@@ -74,7 +74,7 @@ def test_numbers_of_hundreds_of_digits_in_json(tmp_path: Path) -> None:
         ([{"blendshapes": {"x" * 3000: 1}}], r"no blend shape 'x+\.\.\.$"),
         ([{"blendshapes": {"jawOpen": [[1] * 3000]}}], r"jawOpen is \[\[1"),
         (matrix, "not as FaceLandmarker"),
-        ({**matrix, "facialTransformationMatrixes": [{"data": [1e30] * 16}]}, "numbers that no face has"),
+        ({**matrix, "facialTransformationMatrixes": [{"data": [1e30] * 16}]}, "contains NaN or huge numbers"),
         ({"faceBlendshapes": {"a": 1}}, "not as FaceLandmarker"),
         ({"faceBlendshapes": [{"categories": [{"categoryName": [], "score": 1}]}]}, "not as FaceLandmarker"),
         ({"faceBlendshapes": [], "facialTransformationMatrixes": {"a": 1}}, "not as FaceLandmarker"),
@@ -90,7 +90,7 @@ def test_numbers_of_hundreds_of_digits_in_json(tmp_path: Path) -> None:
 def test_huge_recordings_are_not_read(read, tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     with path.open("wb") as file:
-        file.truncate(motion.LARGEST_FILE + 1)
+        file.truncate(motion.MAX_FILE_BYTES + 1)
     refused(read, path, "has more than 134,217,728 bytes")
 
 

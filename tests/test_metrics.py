@@ -7,7 +7,7 @@ import torch
 
 from mien.errors import UserError
 from mien.evaluation import perceptual
-from mien.evaluation.metrics import PSNR_LIMIT, crop_to, l1, psnr, ssim, ssim_map
+from mien.evaluation.metrics import MAX_PSNR, crop_to, l1, psnr, ssim, ssim_map
 from mien.evaluation.perceptual import load_perceptual
 
 
@@ -27,7 +27,7 @@ def test_psnr_and_l1_of_a_constant_difference() -> None:
 
 def test_identical_images_have_finite_figures(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
     image = pair[1]
-    assert psnr(image, image) == PSNR_LIMIT
+    assert psnr(image, image) == MAX_PSNR
     assert l1(image, image) == 0
     assert ssim(image, image) == pytest.approx(1, abs=1e-6)
 

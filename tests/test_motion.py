@@ -161,8 +161,8 @@ def test_bad_json_files(tmp_path: Path) -> None:
     """Bad json files are refused with frame and value."""
     good = {"timestamp_ms": 0, "blendshapes": {}}
     for content, part in (
-        ([], "give a list of frames"),
-        ("jawOpen", "give a list of frames"),
+        ([], "is not a list of frames"),
+        ("jawOpen", "is not a list of frames"),
         ([{"jawOpen": 1}], 'frame 0: has no "blendshapes"'),
         ([good, good], "frame 1: its timestamp_ms is not after"),
         ([good, {"blendshapes": {}}], "frame 1: timestamp_ms is None"),
@@ -173,7 +173,7 @@ def test_bad_json_files(tmp_path: Path) -> None:
         ([{"blendshapes": None}], "no frame has a face"),
         ([{"faceBlendshapes": [{"categories": [{}]}]}], "not as FaceLandmarker"),
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [1, 2]}]}], "not as FaceLandmarker"),
-        ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [0] * 16}]}], "holds no rotation"),
+        ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [0] * 16}]}], "is not a rotation"),
     ):
         with pytest.raises(UserError, match=part):
             read_blendshape_json(write(tmp_path / "a.json", content))

@@ -74,7 +74,7 @@ ODD = [
     ("drive W --by empty.csv --out a.mp4", "empty.csv: has no frames"),
     ("drive W --by bytes.csv --out a.mp4", "bytes.csv: cannot be read as csv"),
     ("drive W --by empty.json --out a.mp4", "empty.json: cannot be read as json"),
-    ("drive W --by list.json --out a.mp4", "list.json: give a list of frames"),
+    ("drive W --by list.json --out a.mp4", "list.json: is not a list of frames"),
     ("drive W --by empty.mp4 --out a.mp4", "empty.mp4: is empty"),
     ("drive W --by text.txt --out a.mp4", "text.txt: cannot be read as a video"),
     ("drive W --by folder.png --out a.mp4", "not a mien workspace"),

@@ -9,7 +9,8 @@ from torch.nn.functional import conv2d, interpolate
 
 from instruction_sets import ISAS, each_isa
 from mien import _native
-from mien.training.photometric import Box, photometric_loss, photometric_loss_reference, ssim, ssim_map
+from mien.pictures import Box
+from mien.training.photometric import differentiable_ssim_map, photometric_loss, photometric_loss_reference
 from rasterize_scenes import relative_error
 
 WHOLE_AND_PARTS = [
@@ -93,7 +94,7 @@ def test_a_box_around_all_differences_changes_nothing():
 
 def test_equal_pictures_lose_nothing():
     image, _ = pair(40, 40)
-    assert ssim(image, image) == 1
+    assert differentiable_ssim_map(image, image).mean() == 1
     assert abs(float(photometric_loss(image, image))) < 1e-6
     assert photometric_loss(image, image, box=(50, 50, 10, 10)) == 0  # a box outside the picture
 
@@ -110,11 +111,11 @@ def test_ssim_follows_its_formula():
     covariance = (window * (x - mean_x) * (y - mean_y)).sum()
     expected = (2 * mean_x * mean_y + 1e-4) * (2 * covariance + 9e-4)
     expected /= (mean_x**2 + mean_y**2 + 1e-4) * (variance_x + variance_y + 9e-4)
-    torch.testing.assert_close(ssim_map(image, target)[17, 14, 1], expected)
+    torch.testing.assert_close(differentiable_ssim_map(image, target)[17, 14, 1], expected)
     # Zeros beyond the border.
     mean_at_corner = conv2d(image[None, None, :, :, 0], window[None, None], padding=5)[0, 0, 0, 0]
     black = torch.zeros_like(image)
-    assert ssim_map(image, black)[0, 0, 0] < 1e-4 / (mean_at_corner**2 + 1e-4)
+    assert differentiable_ssim_map(image, black)[0, 0, 0] < 1e-4 / (mean_at_corner**2 + 1e-4)
 
 
 def test_threads_do_not_change_a_bit(isa: str):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.gaussians import Gaussians
-from mien.render.projection import ALPHA_MAX, ALPHA_MIN, project_splats
+from mien.render.projection import MAX_ALPHA, MIN_ALPHA, project_splats
 
 TILE = 16
 
@@ -47,7 +47,7 @@ def _weights(centres: Tensor, conics: Tensor, opacities: Tensor, xs: Tensor, ys:
     dy = ys[None, :, None] - centres[:, 1, None, None]
     a, b, c = conics[:, :, None, None].unbind(1)
     alpha = opacities[:, None, None] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    alpha = torch.where(alpha < ALPHA_MIN, 0, alpha.clamp_max(ALPHA_MAX))
+    alpha = torch.where(alpha < MIN_ALPHA, 0, alpha.clamp_max(MAX_ALPHA))
     through = torch.cumprod(1 - alpha, dim=0)
     before = torch.cat([through.new_ones(1, *through.shape[1:]), through])
     return alpha * before[:-1], before[-1]

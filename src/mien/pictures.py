@@ -12,6 +12,10 @@ from torch import Tensor
 from mien.picture_files import encode_picture
 
 WHITE = 255
+Box = tuple[int, int, int, int]
+"""Left, top, width and height of a part of a picture, in pixels."""
+ERROR_LIMIT = 0.25
+"""Error, for colours in 0..1, that gets the brightest colour of `error_heat`."""
 _HEAT_STOPS = 6
 """Number of colours in the gradient of a heat scale."""
 
@@ -34,7 +38,7 @@ def heat_gradient() -> str:
 
 
 def error_heat(
-    image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], limit: float = 0.25
+    image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], limit: float = ERROR_LIMIT
 ) -> UInt8[np.ndarray, "h w 3"]:
     """The mean absolute difference of the channels as a heat map. `limit` (0..1) and above get the brightest colour."""
     difference = (image - target).abs().mean(-1)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -161,3 +162,15 @@ def left_jacobian(axis_angle: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
     second = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
     cross = skew(axis_angle)
     return torch.eye(3).to(axis_angle) + first * cross + second * (cross @ cross)
+
+
+def align_centred(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3 3"], float]:
+    """Rotation and scale with target ~ scale * rotation @ source, by least squares (Umeyama 1991).
+
+    Both sets of points have their mean at the origin.
+    """
+    u, values, vt = np.linalg.svd(target.T @ source)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return (u * signs) @ vt, float((values * signs).sum() / (source**2).sum())

@@ -23,8 +23,8 @@ from mien.evaluation import evaluate
 from mien.evaluation import read_metrics as read_figures
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.compare_report import comparison_html
-from mien.evaluation.compare_text import comparison_text
 from mien.evaluation.partial import PartialScores
+from mien.evaluation.text import comparison_text
 from mien.export import in_world, write_ply
 from mien.export import read_ply as read_gaussians
 from mien.face import FaceModel

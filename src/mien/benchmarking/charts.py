@@ -25,7 +25,7 @@ def write_scaling_chart(path: Path, rows: Sequence[BenchmarkRow], machine: Machi
                 label = f"{size[0]}x{size[1]}, {threads} thread{'s' if threads > 1 else ''}"
                 counts, times = [row.gaussians for row in line], [row.min_ms for row in line]
                 panel.loglog(counts, times, style + "o", color=f"C{index}", markersize=3, label=label)
-        panel.set(title=name.replace("_", " "), xlabel="Gaussians", ylabel="milliseconds, least")
+        panel.set(title=name.replace("_", " "), xlabel="Gaussians", ylabel="milliseconds (minimum)")
         panel.grid(alpha=0.3, which="both")
         panel.legend(fontsize=7)
     figure.suptitle(format_machine(machine), fontsize=8)

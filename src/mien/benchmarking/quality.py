@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from mien.benchmarking.motion import (
+from mien.benchmarking.following import (
     Following,
     blink_following,
     jitter,
@@ -17,11 +17,11 @@ from mien.benchmarking.motion import (
 )
 from mien.capture import Capture
 from mien.face import FaceModel
-from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.rotation import align_centred, axis_angle_from_matrix, matrix_from_axis_angle
 from mien.synthetic import Truth
 from mien.tracking import Tracking, residual_report
 
-_FACING = 0.2
+_MIN_FACING = 0.2
 """Smallest cosine between a visible vertex's normal and the direction to the camera."""
 
 
@@ -103,10 +103,8 @@ def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray,
     """Return the mean distance after the best rotation, shift and, unless `rigid`, scale of `points` (Umeyama 1991)."""
     a, b = points.astype(np.float64), target.astype(np.float64)
     a, b = a - a.mean(0), b - b.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation, scale = (u * sign) @ vt, 1.0 if rigid else (s * sign).sum() / (a * a).sum()
-    return float(np.linalg.norm(scale * a @ rotation.T - b, axis=-1).mean())
+    rotation, scale = align_centred(a, b)
+    return float(np.linalg.norm((1.0 if rigid else scale) * a @ rotation.T - b, axis=-1).mean())
 
 
 def _visible(truth: Truth, face_model: FaceModel, timestep: int) -> Bool[np.ndarray, " n"]:
@@ -128,7 +126,7 @@ def _visible(truth: Truth, face_model: FaceModel, timestep: int) -> Bool[np.ndar
     for camera in truth.tracking.cameras:
         towards = pose[:3, :3].T @ (camera.position.numpy() - pose[:3, 3]) - points
         towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
-        facing |= (normals * towards).sum(-1) > _FACING
+        facing |= (normals * towards).sum(-1) > _MIN_FACING
     return facing
 
 

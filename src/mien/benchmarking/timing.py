@@ -55,14 +55,14 @@ class Machine:
     """Name of the GPU, torch's CUDA version and gsplat's version, if the GPU is measured."""
 
 
-def time_function(function: Callable[[], object], seconds: float = 0.8, least: int = 7) -> Timing:
-    """Time a function for about `seconds` and at least `least` runs, after two warm-up runs."""
+def time_function(function: Callable[[], object], seconds: float = 0.8, min_runs: int = 7) -> Timing:
+    """Time a function for about `seconds` and at least `min_runs` runs, after two warm-up runs."""
     for _ in range(2):
         function()
     walls: list[float] = []
     processors: list[float] = []
     end = time.perf_counter() + seconds
-    while len(walls) < least or time.perf_counter() < end:
+    while len(walls) < min_runs or time.perf_counter() < end:
         processor, wall = time.process_time(), time.perf_counter()
         function()
         walls.append(1e3 * (time.perf_counter() - wall))
@@ -103,7 +103,7 @@ def measure_machine(gpu: bool = False) -> Machine:
 def format_machine(machine: Machine) -> str:
     """Return the machine's description in one line."""
     processor = (
-        f"{machine.processor}, {machine.cores} cores, {machine.isa}, {machine.gflops:.0f} GFLOP/s a thread "
+        f"{machine.processor}, {machine.cores} cores, {machine.isa}, {machine.gflops:.0f} GFLOP/s per thread "
         f"(matrix product), load {machine.load:.1f}"
     )
     return f"{machine.gpu}; {processor}" if machine.gpu else processor

@@ -93,7 +93,7 @@ class Command:
 
     def _compare(self) -> None:
         from mien.commands.stages.evaluating import comparison_stage
-        from mien.evaluation.compare_text import comparison_text
+        from mien.evaluation.text import comparison_text
 
         comparison = comparison_stage([open_workspace(folder) for folder in self.workspaces], self.run_name, self.out)
         if self.as_json:
@@ -113,7 +113,7 @@ class Command:
     def _score_images(self, images: Path, truth: Path) -> None:
         from mien.evaluation.image_folders import ImageFolders, score_folders, write_scores
         from mien.evaluation.scoring import ScoreSettings
-        from mien.evaluation.words import scores_lines
+        from mien.evaluation.text import scores_lines
 
         folders = ImageFolders(images, truth, self.mattes, self.crops, self.background)
         scores = score_folders(folders, ScoreSettings(self.perceptual, self.perceptual_frames))

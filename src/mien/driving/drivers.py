@@ -44,7 +44,7 @@ def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) 
     is_csv = path.suffix.lower() == ".csv"
     motion = read_live_link_face(path, fps) if is_csv else read_blendshape_json(path)
     if motion.lost:
-        say(f"{path}: no face in {motion.lost} of {len(motion)} frames; they repeat the one before")
+        say(f"{path}: {motion.lost} of {len(motion)} frames have no face; each repeats the frame before it")
     face, at_rest = face_of_motion(motion, face_model)
     return Driver(face, at_rest, motion.fps, None)
 
@@ -57,9 +57,11 @@ def read_tracked_driver(folders: Sequence[Path]) -> Driver:
     """
     sequences = [read_sequence(folder) for folder in folders]
     shapes = {(one.tracking.face.expression.shape[1], one.tracking.face.joints.shape[1]) for one in sequences}
-    if len(shapes) > 1 or not any(bool(one.tracking.valid.any()) for one in sequences):
-        told = ", ".join(map(str, folders))
-        raise UserError(f"{told}: no frame was tracked, or with several face models; track them again")
+    names = ", ".join(map(str, folders))
+    if len(shapes) > 1:
+        raise UserError(f"{names}: were tracked with different face models; track them again")
+    if not any(bool(one.tracking.valid.any()) for one in sequences):
+        raise UserError(f"{names}: no frame was tracked; track again, or choose another driver")
     face = concatenate([one.tracking.face for one in sequences])
     at_rest = neutral_of(concatenate([one.tracking.face[one.tracking.valid] for one in sequences]))
     places = [(one, timestep) for one in sequences for timestep in range(one.capture.timesteps)]

@@ -17,14 +17,15 @@ import numpy as np
 
 from mien.driving.motion import (
     ARKIT_NAMES,
-    LARGEST,
-    SMALLEST,
+    MAX_COEFFICIENT,
+    MIN_COEFFICIENT,
     Motion,
     check_times,
-    evenly,
     gaze_of,
-    held,
     open_recording,
+    repeat_lost,
+    resample_evenly,
+    shorten,
 )
 from mien.errors import UserError
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
@@ -34,8 +35,8 @@ EYES = tuple(f"{side}Eye{angle}" for side in ("Left", "Right") for angle in ("Ya
 _TIMECODE = re.compile(r"([0-9]{1,4}):([0-9]{1,2}):([0-9]{1,2})[:;]([0-9]{1,4})(?:\.([0-9]{1,20}))?")
 _RATES = (24, 25, 30, 48, 50, 60, 90, 120, 240)
 _USUAL_RATE = 60
-_SHOWN = 40
-"""Largest number of characters of a cell that a message shows."""
+_SIDES = ("Left", "Right")
+_ANGLES = {name.lower() for name in (*HEAD, *EYES)}
 
 
 def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
@@ -63,17 +64,17 @@ def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
     indices = [columns[name] for name in (*wanted[1:], *(name.lower() for name in angles))]
     found = np.array([_has_face(row, columns, len(header)) for _, row in lines])
     if not found.any():
-        raise UserError(f"{path}: no row has a face in it; record it again")
+        raise UserError(f"{path}: no row has a face; record it again")
     values = np.zeros((len(lines), len(indices)))
     for row_index in np.flatnonzero(found):
         line, row = lines[row_index]
         if len(row) < len(header):
-            raise UserError(f"{path}, line {line}: {len(row)} of {len(header)} values; mend or delete the line")
+            raise UserError(f"{path}, line {line}: has {len(row)} of {len(header)} values; correct or delete the line")
         values[row_index] = [_number(path, line, header[index], row[index]) for index in indices]
     stamp = columns["timecode"]
     seconds = _seconds(path, [(line, row[stamp] if stamp < len(row) else "") for line, row in lines], fps)
     check_times(seconds, lambda row_index: f"{path}, line {lines[row_index][0]}")
-    rate, values = evenly(seconds, held(values, found))
+    rate, values = resample_evenly(seconds, repeat_lost(values, found))
     coefficients = values[:, :52].astype(np.float32)
     turns = {name: values[:, 52 + index] for index, name in enumerate(angles)}
     zero = np.zeros((len(values), 3), np.float32)
@@ -85,9 +86,6 @@ def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
     return Motion(rate, coefficients, eyes, head, zero, int((~found).sum()))
 
 
-_SIDES = ("Left", "Right")
-
-
 def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The header, and all further rows that are not empty, with their line numbers."""
     try:
@@ -97,7 +95,7 @@ def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{path}: cannot be read as csv ({error}); give a csv of Live Link Face") from None
     if len(rows) < 2:
-        raise UserError(f"{path}: has no frames; give a csv of Live Link Face with a header and a row a frame")
+        raise UserError(f"{path}: has no frames; give a csv of Live Link Face with a header and one row for each frame")
     return rows[0][1], rows[1:]
 
 
@@ -112,24 +110,15 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise UserError(f"{where} is {_short(text)}, not a number; mend or delete the line") from None
+        raise UserError(f"{where} is {shorten(text)!r}, not a number; correct or delete the line") from None
     if name.strip().lower() in _ANGLES:
         if not abs(value) <= math.pi:
             raise UserError(
-                f"{where} is {_short(text, bare=True)}; angles are radians, -3.14 to 3.14: convert it from degrees"
+                f"{where} is {shorten(text)}; angles are in radians, from -3.14 to 3.14; convert it from degrees"
             )
-    elif not SMALLEST <= value <= LARGEST:
-        raise UserError(f"{where} is {_short(text, bare=True)}; coefficients go from 0 to 1: mend or delete the line")
+    elif not MIN_COEFFICIENT <= value <= MAX_COEFFICIENT:
+        raise UserError(f"{where} is {shorten(text)}; coefficients go from 0 to 1; correct or delete the line")
     return value
-
-
-def _short(text: str, *, bare: bool = False) -> str:
-    """A cell as messages show it, cut to `_SHOWN` characters."""
-    cut = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
-    return cut if bare else repr(cut)
-
-
-_ANGLES = {name.lower() for name in (*HEAD, *EYES)}
 
 
 def _seconds(path: Path, timecodes: list[tuple[int, str]], fps: float | None) -> np.ndarray:
@@ -137,7 +126,10 @@ def _seconds(path: Path, timecodes: list[tuple[int, str]], fps: float | None) ->
     for line, text in timecodes:
         match = _TIMECODE.fullmatch(text.strip())
         if match is None:
-            raise UserError(f"{path}, line {line}: Timecode {_short(text)}; expected HH:MM:SS:FF.fraction")
+            raise UserError(
+                f"{path}, line {line}: Timecode {shorten(text)!r} is not HH:MM:SS:FF.fraction; correct or delete the "
+                "line"
+            )
         hours, minutes, seconds, frame = (int(part) for part in match.groups()[:4])
         parsed.append((3600 * hours + 60 * minutes + seconds, frame + float(f"0.{match.group(5) or 0}")))
     whole, frames = np.array(parsed).T
@@ -148,7 +140,9 @@ def _seconds(path: Path, timecodes: list[tuple[int, str]], fps: float | None) ->
     back = np.flatnonzero(np.diff(times) <= 0)
     if len(back):
         line = timecodes[int(back[0]) + 1][0]
-        raise UserError(f"{path}, line {line}: its Timecode is not after the one before; delete the line, or set --fps")
+        raise UserError(
+            f"{path}, line {line}: its Timecode does not come after the one before; delete the line, or set --fps"
+        )
     return times
 
 

@@ -29,13 +29,15 @@ ARKIT_NAMES = (
 LOOK_ANGLE = math.radians(30)
 """Rotation of an eye for an eyeLook coefficient of 1, in radians. Apple gives no angle; this is about the most that
 eyes turn."""
-LONGEST_GAP = 60.0
+MAX_GAP_SECONDS = 60.0
 """Longest gap between two moments, in seconds, that is interpolated. A longer gap means another recording."""
-MOST_MOMENTS = 500_000
+MAX_MOMENTS = 500_000
 """Largest number of moments in a recording: about two hours at 60 per second."""
-LARGEST_FILE = 128 << 20
+MAX_FILE_BYTES = 128 << 20
 """Largest recording that is read, in bytes. An hour of Live Link Face has about this size."""
-SMALLEST, LARGEST = -0.5, 1.5
+_MAX_SHOWN = 80
+"""Largest number of characters of a value that a message shows."""
+MIN_COEFFICIENT, MAX_COEFFICIENT = -0.5, 1.5
 """Bounds of a coefficient. They go from 0 to 1, and a little beyond in programs that calibrate or exaggerate."""
 
 
@@ -72,10 +74,12 @@ def gaze_of(coefficients: Float32[np.ndarray, "t 52"]) -> Float32[np.ndarray, "t
     return eyes
 
 
-def evenly(seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]) -> tuple[float, Float[np.ndarray, "t c"]]:
-    """Frames per second and evenly spaced rows. Rows that are even already stay; others are interpolated linearly.
+def resample_evenly(
+    seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]
+) -> tuple[float, Float[np.ndarray, "t c"]]:
+    """Return frames per second, and rows at evenly spaced times.
 
-    `seconds` must increase strictly.
+    Rows that are even already stay; others are interpolated linearly. `seconds` must increase strictly.
     """
     if len(rows) < 2:
         return 30.0, rows
@@ -87,49 +91,54 @@ def evenly(seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]) -> 
     return 1 / step, np.stack([np.interp(even, seconds, column) for column in rows.T], axis=1)
 
 
+def shorten(text: str) -> str:
+    """The text as messages show it, cut to `_MAX_SHOWN` characters."""
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
+
+
 def open_recording(path: Path) -> IO[bytes]:
     """Open a recording for reading. One that is too large for the memory, or that would never end, is refused.
 
     Raises:
-        UserError: The file has more than `LARGEST_FILE` bytes, or is a pipe, a device or a folder.
+        UserError: The file has more than `MAX_FILE_BYTES` bytes, or is a pipe, a device or a folder.
         OSError: The file is missing.
     """
     try:
         file = open_ordinary(path)
     except NotOrdinaryError:
-        raise UserError(f"{path}: is not an ordinary file; copy it to one") from None
-    if os.fstat(file.fileno()).st_size > LARGEST_FILE:
+        raise UserError(f"{path}: is not an ordinary file; copy its content into one") from None
+    if os.fstat(file.fileno()).st_size > MAX_FILE_BYTES:
         file.close()
-        raise UserError(f"{path}: has more than {LARGEST_FILE:,} bytes; cut it into shorter recordings")
+        raise UserError(f"{path}: has more than {MAX_FILE_BYTES:,} bytes; cut it into shorter recordings")
     return file
 
 
 def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -> None:
-    """Refuse times for which `evenly` would make up too many moments.
+    """Refuse times for which `resample_evenly` would make up too many moments.
 
     Args:
         seconds: The times, which increase strictly.
         where: Returns the name of a row's place in its file.
 
     Raises:
-        UserError: A gap is longer than `LONGEST_GAP`, or there would be more than `MOST_MOMENTS`.
+        UserError: A gap is longer than `MAX_GAP_SECONDS`, or there would be more than `MAX_MOMENTS`.
     """
     steps = np.diff(seconds)
     longest = int(np.argmax(steps)) if len(steps) else 0
-    if len(steps) and steps[longest] > LONGEST_GAP:
+    if len(steps) and steps[longest] > MAX_GAP_SECONDS:
         raise UserError(
-            f"{where(longest + 1)}: comes {steps[longest]:,.0f} s after the one before, and gaps of up to "
-            f"{LONGEST_GAP:g} s are filled; cut the file there"
+            f"{where(longest + 1)}: comes {steps[longest]:,.0f} s after the one before, but only gaps of up to "
+            f"{MAX_GAP_SECONDS:g} s are filled; cut the file there"
         )
     moments = float(seconds[-1] - seconds[0]) / float(np.median(steps)) if len(steps) else 1.0
-    if max(moments, len(seconds)) > MOST_MOMENTS:
+    if max(moments, len(seconds)) > MAX_MOMENTS:
         raise UserError(
-            f"{where(0)}: the times from here on make {moments:,.0f} moments, more than {MOST_MOMENTS:,}; cut the file "
+            f"{where(0)}: the times from here on give {moments:,.0f} moments, more than {MAX_MOMENTS:,}; cut the file "
             "into shorter ones"
         )
 
 
-def held(rows: Float[np.ndarray, "r c"], found: np.ndarray) -> Float[np.ndarray, "r c"]:
+def repeat_lost(rows: Float[np.ndarray, "r c"], found: np.ndarray) -> Float[np.ndarray, "r c"]:
     """The rows, with each row without a face replaced by the last one before it (at the start, by the first one)."""
     last = np.maximum.accumulate(np.where(found, np.arange(len(rows)), -1))
     return rows[np.where(last < 0, int(np.argmax(found)), last)]

@@ -41,8 +41,8 @@ def drive(
         theirs, ours = getattr(driver, name).shape[1:], getattr(avatar_neutral, name).shape[1:]
         if theirs != ours:
             raise UserError(
-                f"{who} has {_times(theirs)} {name} parameters, the avatar {_times(ours)}: "
-                "they were tracked with different face models; track the driver with the avatar's"
+                f"{who} has {_times(theirs)} {name} parameters and the avatar has {_times(ours)}, so they were tracked "
+                "with different face models; track the driver with the avatar's face model"
             )
     expression = avatar_neutral.expression + driver.expression - driver_neutral.expression
     if expression_bounds is not None:

@@ -8,10 +8,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from mien.evaluation.experiment import Experiment, Frame, spread_frames, target_image
+from mien.evaluation.experiment import Experiment, spread_frames, target_image
 from mien.render.mesh import rasterize_mesh, render_mesh, vertex_normals
+from mien.training.frames import Frame
 
-_COLOUR_FRAMES = 60
+_MAX_COLOUR_FRAMES = 60
 """Number of training frames, evenly spread, for the mean vertex colours. More frames make no visible difference."""
 _DEPTH_TOLERANCE = 0.004
 """Depth in metres behind the depth picture up to which a vertex still counts as visible."""
@@ -81,7 +82,7 @@ def _vertex_colors(experiment: Experiment) -> Float[Tensor, "v 3"]:
     face_model = experiment.avatar.face_model
     count = len(face_model.template)
     colors, weights = torch.zeros(count, 3), torch.zeros(count)
-    for frame in spread_frames(experiment.training_frames, _COLOUR_FRAMES):
+    for frame in spread_frames(experiment.training_frames, _MAX_COLOUR_FRAMES):
         vertices = face_model(experiment.face(frame))[0]
         seen, weight = _seen_colors(experiment, frame, vertices, face_model.faces)
         colors += weight[:, None] * seen

@@ -6,14 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from mien.errors import UserError
-from mien.evaluation.metrics_file import read_figures
-from mien.evaluation.words import FACES, NAMES
+from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FACE_SOURCE_NAMES, figure, read_figures
 from mien.training import read_run_config
-
-COLUMNS = (
-    ("psnr", "PSNR", 2, True), ("ssim", "SSIM", 3, True), ("l1", "L1", 4, False), ("perceptual", "ST-LPIPS", 3, False),
-)  # fmt: skip
-"""Metric, heading, number of digits, whether higher is better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +102,6 @@ def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
     return Comparison(tuple(runs), tuple(tables), tuple(warnings + more))
 
 
-def figure(entry: Mapping[str, Any], part: str | None, metric: str) -> float | None:
-    """One figure of a row, or None if it was not computed."""
-    return (entry if part is None else entry[part]).get(metric)
-
-
 def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
     """Tables by protocol and by the scored frames and masks, and warnings if those differ."""
     tables, warnings = [], []
@@ -124,15 +113,22 @@ def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
         for run in runs:
             entry = run.metrics["protocols"].get(protocol)
             if entry is None:
-                warnings.append(f"{run.label}: has no {protocol}; it held out other frames or was evaluated otherwise")
+                warnings.append(
+                    f"{run.label}: has no {protocol}; it held out other frames or was evaluated with other settings"
+                )
                 continue
             if not entry.get("scored_on"):
-                warnings.append(f"{run.label}: was evaluated by an older mien; evaluate it again to compare its mask")
+                warnings.append(
+                    f"{run.label}: was evaluated by an older version of mien; evaluate it again to compare its mask"
+                )
             groups.setdefault(_ground(entry), []).append(run)
         tables += [_table(protocol, group) for group in groups.values()]
         if len(groups) > 1:
             sets = " | ".join(", ".join(run.label for run in group) for group in groups.values())
-            warnings.append(f"{protocol}: not scored on the same frames, pictures and masks, so not compared: {sets}")
+            warnings.append(
+                f"{protocol}: these runs have separate tables, because they were not scored on the same frames, "
+                f"pictures and masks: {sets}"
+            )
     for table in tables:
         warnings += _differences(table)
     return tables, warnings
@@ -152,10 +148,12 @@ def _differences(table: Table) -> list[str]:
     if len({row.faces for row in own}) > 1:
         warnings.append(
             f"{table.protocol}: some runs correct the tracking of held-out frames and some do not; compare the rows "
-            f"with faces {FACES['as_tracked']}, or train alike"
+            f"with faces {FACE_SOURCE_NAMES['as_tracked']}, or train the runs alike"
         )
     if len({(row.entry.get("perceptual_backbone"), row.entry.get("perceptual_frames")) for row in own}) > 1:
-        warnings.append(f"{table.protocol}: ST-LPIPS was computed on other frames; evaluate the runs alike")
+        warnings.append(
+            f"{table.protocol}: ST-LPIPS was computed on different frames; evaluate the runs with the same settings"
+        )
     return warnings
 
 
@@ -163,13 +161,13 @@ def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
     rows: list[Row] = []
     for run in runs:
         entry = run.metrics["protocols"][protocol]
-        rows.append(Row(run.label, entry, run, FACES[entry["face_params"]]))
+        rows.append(Row(run.label, entry, run, FACE_SOURCE_NAMES[entry["face_params"]]))
     for run in runs:
         entry = run.metrics["protocols"][protocol]
         if entry["face_params"] != "as_tracked":
-            rows.append(Row(run.label, entry["as_tracked"], None, FACES["as_tracked"]))
+            rows.append(Row(run.label, entry["as_tracked"], None, FACE_SOURCE_NAMES["as_tracked"]))
     first = runs[0].metrics["protocols"][protocol]
-    for key, name in NAMES.items():
+    for key, name in BASELINE_NAMES.items():
         rows += _baseline_rows(key, name, runs, protocol)
     return Table(protocol, first["split"], first["frames"], first.get("scored_on", {}), tuple(rows))
 
@@ -182,7 +180,7 @@ def _baseline_rows(key: str, name: str, runs: Sequence[ScoredRun], protocol: str
         if entry is not None:
             found.setdefault(f"{entry['psnr']:.2f} {entry['head']['psnr']:.2f}", ([], entry))[0].append(run.label)
     several = len(found) > 1
-    return [Row(name, entry, None, f"of {', '.join(of)}" if several else "", True) for of, entry in found.values()]
+    return [Row(name, entry, None, f"as in {', '.join(of)}" if several else "", True) for of, entry in found.values()]
 
 
 def _row_content(row: Row) -> dict[str, Any]:

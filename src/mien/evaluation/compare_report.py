@@ -2,27 +2,24 @@
 
 from collections.abc import Mapping, Sequence
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import UInt8
-
 from mien.errors import UserError
-from mien.evaluation.compare import COLUMNS, Comparison, Row, Table, figure
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
+from mien.evaluation.compare import Comparison, Row, Table
+from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.load import load_experiments
-from mien.evaluation.metrics import Box, crop_to
+from mien.evaluation.metrics import crop_to
+from mien.evaluation.metrics_file import COLUMNS, figure
+from mien.evaluation.page import error_scale, glossary_html, metric_groups, metric_headings, page_html, picture_html
 from mien.evaluation.report_sections import frame_name
-from mien.evaluation.report_words import GLOSSARY
-from mien.evaluation.videos import HEAT_LIMIT
-from mien.pictures import error_heat, heat_gradient, picture_uri, shrink, to_uint8
+from mien.pictures import Box, error_heat, to_uint8
 from mien.progress import track_progress
 from mien.storage import write_atomically
+from mien.training.frames import Frame
 
 _FRAMES = 5
 _PICTURE_SIZE = 320
-_MOST_RUNS = 8
+_MAX_RUNS = 8
 _PARTS = (None, "head")
 
 
@@ -40,37 +37,26 @@ def write_comparison(path: Path, comparison: Comparison, sequence_dirs: Mapping[
 
 def comparison_html(comparison: Comparison, pictures: Sequence[str]) -> str:
     """The page as text. `pictures` holds a piece of HTML for each table."""
-    style = files("mien.evaluation").joinpath("report.css").read_text(encoding="utf-8")
     body = ["<h1>Runs compared</h1>"]
     body.append(f'<p class="sub">{escape(", ".join(run.label for run in comparison.runs))}</p>')
     body += [f'<p class="warning">{escape(warning)}</p>' for warning in comparison.warnings]
     for table, shown in zip(comparison.tables, pictures, strict=True):
         body += [f"<h2>{escape(_heading(table))}</h2>", _table_html(table), shown]
-    terms = "".join(f"<dt>{term}</dt><dd>{escape(text)}</dd>" for term, text in GLOSSARY.items())
-    body.append(f'<details class="card"><summary>How to read this</summary><dl>{terms}</dl></details>')
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>mien: runs compared</title>\n<style>\n{style}</style></head>\n"
-        f'<body><main class="broad">\n{chr(10).join(body)}\n</main></body></html>\n'
-    )
+    body.append(glossary_html())
+    return page_html("runs compared", "\n".join(body), broad=True)
 
 
 def _heading(table: Table) -> str:
     names = ", ".join(dict.fromkeys(table.rows[0].entry["per_frame"]["sequence"]))
-    return f"{table.protocol.replace('_', ' ').capitalize()}: {table.frames} frames held out of {names} ({table.split})"
+    return f"{table.protocol.replace('_', ' ').capitalize()}: {table.frames} held-out frames of {names} ({table.split})"
 
 
 def _table_html(table: Table) -> str:
-    metrics = "".join(f"<th>{name} {'↑' if higher else '↓'}</th>" for _, name, _, higher in COLUMNS)
-    head_metrics = metrics.replace("<th>", '<th class="head">', 1)
     rows = "".join(_row_html(table, row) for row in table.rows)
     return (
         '<div class="card table"><div class="scroll"><table><thead><tr><th class="blank" colspan="2"></th>'
-        f'<th class="group" colspan="{len(COLUMNS)}">Whole frame</th>'
-        f'<th class="group head" colspan="{len(COLUMNS)}">Head crop</th>'
-        '<th class="group head" colspan="3">Cost</th></tr>'
-        f"<tr><th></th><th class=left>faces</th>{metrics}{head_metrics}"
+        f'{metric_groups()}<th class="group head" colspan="3">Cost</th></tr>'
+        f"<tr><th></th><th class=left>faces</th>{metric_headings()}"
         f'<th class="head">Gaussians</th><th>training, s</th><th>ms/frame</th></tr></thead><tbody>{rows}</tbody>'
         "</table></div></div>"
     )
@@ -99,7 +85,7 @@ def _row_html(table: Table, row: Row) -> str:
 
 def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> str:
     """Some frames of a table: the truth and every run's rendering in a row, their errors below."""
-    runs = [row.run for row in table.rows if row.run is not None][:_MOST_RUNS]
+    runs = [row.run for row in table.rows if row.run is not None][:_MAX_RUNS]
     count = len(table.rows[0].entry["per_frame"]["psnr"])
     places = sorted({round(index * (count - 1) / max(1, _FRAMES - 1)) for index in range(_FRAMES)})
     columns: list[list[tuple[str, str]]] = []
@@ -110,7 +96,8 @@ def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> str
         experiment = load_experiments(run.run_dir, sequence_dirs[run.run_dir]).get(table.protocol)
         if experiment is None or len(experiment.held_out_frames) != count:
             raise UserError(
-                f"{run.run_dir / 'metrics.json'}: is of other frames than the run held out; evaluate it again"
+                f"{run.run_dir / 'metrics.json'}: has figures of other frames than the run held out; evaluate the "
+                "run again"
             )
         frames = [experiment.held_out_frames[place] for place in places]
         boxes = [head_box(experiment, [frame]) for frame in frames]
@@ -118,16 +105,12 @@ def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> str
         if not truths:
             truths = [_truth(experiment, frame, box) for frame, box in zip(frames, boxes, strict=True)]
             captions = [frame_name(experiment, frame) for frame in frames]
-    scale = (
-        f'<span class="scale">Error 0 <i style="background:{heat_gradient()}"></i> '
-        f"{HEAT_LIMIT * 255:.0f} of 255 and more</span>"
-    )
     grid = f'style="grid-template-columns:repeat({len(runs) + 1},minmax(0,280px))"'
     body = []
     for index, caption in enumerate(captions):
         heads = "".join(f"<span>{escape(name)}</span>" for name in ["Truth", *(run.label for run in runs)])
         images = truths[index] + "".join(column[index][0] for column in columns)
-        errors = scale + "".join(column[index][1] for column in columns)
+        errors = error_scale("Error ") + "".join(column[index][1] for column in columns)
         figures = [run.metrics["protocols"][table.protocol]["per_frame"]["head_psnr"][places[index]] for run in runs]
         notes = "".join(f"<span>head crop {value:.2f} dB</span>" for value in figures)
         body.append(
@@ -141,12 +124,9 @@ def _drawn(experiment: Experiment, frame: Frame, box: Box) -> tuple[str, str]:
     """A rendering and its error, cut to a box, as HTML."""
     image, truth = avatar_image(experiment, frame), target_image(experiment, frame)
     cut = crop_to(image, box)
-    return _img(to_uint8(cut), "rendering"), _img(error_heat(cut, crop_to(truth, box), HEAT_LIMIT), "error")
+    errors = error_heat(cut, crop_to(truth, box))
+    return picture_html(to_uint8(cut), "rendering", _PICTURE_SIZE), picture_html(errors, "error", _PICTURE_SIZE)
 
 
 def _truth(experiment: Experiment, frame: Frame, box: Box) -> str:
-    return _img(to_uint8(crop_to(target_image(experiment, frame), box)), "truth")
-
-
-def _img(picture: UInt8[np.ndarray, "_ _ 3"], what: str) -> str:
-    return f'<img alt="{what}" src="{picture_uri(shrink(picture, _PICTURE_SIZE))}">'
+    return picture_html(to_uint8(crop_to(target_image(experiment, frame), box)), "truth", _PICTURE_SIZE)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from torch.nn.functional import normalize
 
 from mien.avatar import load_avatar, neutral_of
 from mien.avatar.avatar import Avatar
@@ -18,10 +17,10 @@ from mien.capture import Capture, read_capture, read_capture_hash
 from mien.capture.video import write_video
 from mien.driving import drive
 from mien.errors import UserError
-from mien.evaluation.redetection import MEASURED_BY, FaceReader, Motion, motion, transfer_figures
+from mien.evaluation.redetection import MEASURED_BY, FaceReader, MeasuredMotion, measure_motion, transfer_figures
 from mien.evaluation.scoring import evenly_spread
-from mien.evaluation.videos import labelled_row, same_size
-from mien.face import FaceParams
+from mien.evaluation.videos import labelled_row, match_sizes
+from mien.face import FaceParams, most_frontal_camera
 from mien.face.checks import check_face_params
 from mien.pictures import to_uint8
 from mien.progress import track_progress
@@ -29,7 +28,7 @@ from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import Tracking, check_tracking_of, read_tracking
 
-_FRAMES = 100
+_MAX_FRAMES = 100
 _MEANS = (
     "expression_error", "expression_error_still", "head_rotation_error_degrees", "head_rotation_error_still_degrees",
     "mouth_correlation", "eyes_correlation", "faces_found",
@@ -71,36 +70,28 @@ def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
     avatar, tracking = load_avatar(run_dir), read_tracking(driver_dir / "tracking")
     if tracking.face_model_hash != avatar.face_model.content_hash:
         raise UserError(
-            f"{driver_dir}: was tracked with the face model {tracking.face_model}, the avatar has another "
-            f"({avatar.face_model.name}); track the driver with the avatar's"
+            f"{driver_dir}: was tracked with the face model {tracking.face_model}, but the avatar has another "
+            f"({avatar.face_model.name}); track the driver with the avatar's face model"
         )
     check_face_params(avatar.face_model, tracking.face, str(driver_dir), "track it again")
     capture = read_capture(driver_dir / "capture")
     check_tracking_of(capture, tracking, driver_dir / "tracking")
     valid = torch.nonzero(tracking.valid)[:, 0].tolist()
     if not valid:
-        raise UserError(f"{driver_dir}: no frame of it was tracked; choose another driver")
+        raise UserError(f"{driver_dir}: has no tracked frame; choose another driver")
     at_rest = neutral_of(tracking.face[tracking.valid])
     bounds = avatar.face_model.expression_bounds
     faces = drive(tracking.face, at_rest, avatar.subject, bounds, who=str(driver_dir))
     cameras = read_tracking(sequence_dir / "tracking").cameras
     return Driven(
         avatar=avatar,
-        camera=cameras[frontal_camera(cameras, avatar.subject)],
+        camera=cameras[most_frontal_camera(cameras, avatar.subject)],
         faces=faces,
         driver=capture,
         tracking=tracking,
-        driver_camera=frontal_camera(tracking.cameras, at_rest),
+        driver_camera=most_frontal_camera(tracking.cameras, at_rest),
         by_rest=tuple(sorted(valid, key=_activity(tracking.face, at_rest).__getitem__)),
     )
-
-
-def frontal_camera(cameras: Items[Camera], neutral: FaceParams) -> int:
-    """The index of the camera that sees the face of the one timestep `neutral` most squarely."""
-    ahead = matrix_from_axis_angle(neutral.head_rotation)[0, :, 2]
-    origin = neutral.head_translation[0]
-    facing = [float(normalize(camera.position - origin, dim=0) @ ahead) for camera in cameras]
-    return max(range(len(cameras)), key=facing.__getitem__)
 
 
 def _activity(face: FaceParams, at_rest: FaceParams) -> list[float]:
@@ -148,7 +139,7 @@ def measure(driven: Driven, name: str) -> dict[str, Any]:
     Raises:
         UserError: no face is found in the driver's pictures.
     """
-    frames = evenly_spread(sorted(driven.by_rest), _FRAMES)
+    frames = evenly_spread(sorted(driven.by_rest), _MAX_FRAMES)
     seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     found_driver = found_avatar = 0
     with FaceReader() as reader:
@@ -166,20 +157,20 @@ def measure(driven: Driven, name: str) -> dict[str, Any]:
     figures: dict[str, float | None] = dict.fromkeys(_MEANS)
     if seen:
         rest = seen[next(timestep for timestep in driven.by_rest if timestep in seen)]
-        pairs: list[tuple[Motion, Motion]] = [
-            (motion(theirs, rest[0]), motion(ours, rest[1])) for theirs, ours in seen.values()
+        pairs: list[tuple[MeasuredMotion, MeasuredMotion]] = [
+            (measure_motion(theirs, rest[0]), measure_motion(ours, rest[1])) for theirs, ours in seen.values()
         ]
         figures |= transfer_figures(pairs)
     return {**figures, "faces_found": found_avatar / found_driver, "frames": found_driver}
 
 
-def _write_video(path: Path, driven: Driven, most: int) -> Path:
-    timesteps = range(min(most, driven.driver.timesteps))
+def _write_video(path: Path, driven: Driven, max_count: int) -> Path:
+    timesteps = range(min(max_count, driven.driver.timesteps))
     pictures = (
         labelled_row({f"driver: {t}": driven.driver_picture(t), "avatar": driven.picture(t)})
         for t in track_progress(timesteps, f"video {path.stem}", len(timesteps))
     )
-    write_video(path, same_size(pictures), driven.driver.fps, crf=24)
+    write_video(path, match_sizes(pictures), driven.driver.fps, crf=24)
     return path
 
 

@@ -8,14 +8,14 @@ from typing import Any
 
 from mien.errors import UserError
 from mien.evaluation.cross import cross_reenactment
-from mien.evaluation.cross_report import cross_section
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import FORMAT, VERSION, read_metrics
+from mien.evaluation.page import ReportVideo
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
 from mien.evaluation.report import RunRecord, write_report
-from mien.evaluation.report_video import ReportVideo
+from mien.evaluation.report_sections import cross_section
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.inside import check_tree
 from mien.locks import hold
@@ -59,8 +59,8 @@ def _evaluate(
     experiments = load_experiments(run_dir, sequence_dirs)
     if not experiments and not driver_dirs:
         raise UserError(
-            f"{run_dir}: nothing was held out, so nothing can be scored; train with `--split blocks` or `tail`, on 5 "
-            "frames or more"
+            f"{run_dir}: no frame was held out, so nothing can be scored; train with `--split blocks` or "
+            "`--split tail`, on 5 frames or more"
         )
     partials = {
         name: PartialScores(run_dir / f".{name}.partial", _fingerprint(run_dir, name, experiment, settings))

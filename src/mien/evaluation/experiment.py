@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,12 +11,13 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar
 from mien.camera import Camera
-from mien.evaluation.metrics import Box
 from mien.evaluation.scoring import evenly_spread
 from mien.face import FaceParams
+from mien.pictures import Box
 from mien.render import rasterize
 from mien.render.validation import drawable
 from mien.tracking import Scoring
+from mien.training.frames import Frame
 from mien.training.sequence import Sequence, composite
 
 FaceSource = Literal["as_tracked", "corrected"]
@@ -25,14 +26,6 @@ frames. Corrections never use the pixels of held-out frames."""
 
 
 _HEAD_MARGIN = 0.05
-
-
-class Frame(NamedTuple):
-    """One picture: the indices of a sequence, of a timestep in it, and of the camera."""
-
-    sequence: int
-    timestep: int
-    camera: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +64,11 @@ class Experiment:
         return self.faces[frame.sequence][frame.timestep]
 
 
-def spread_frames(frames: Items[Frame], most: int) -> list[Frame]:
-    """At most `most` of the frames, evenly spread over sequences, cameras and time. With 0, all of them."""
+def spread_frames(frames: Items[Frame], max_count: int) -> list[Frame]:
+    """At most `max_count` of the frames, evenly spread over sequences, cameras and time. With 0, all of them."""
     # Sort by camera first: a stride over the cameras of each timestep could always select the same one.
     ordered = sorted(frames, key=lambda frame: (frame.sequence, frame.camera, frame.timestep))
-    return evenly_spread(ordered, most)
+    return evenly_spread(ordered, max_count)
 
 
 def head_box(experiment: Experiment, frames: Items[Frame]) -> Box:

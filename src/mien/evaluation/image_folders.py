@@ -12,7 +12,6 @@ from torch import Tensor
 
 from mien.errors import UserError
 from mien.evaluation.image_source import PictureSource, open_pictures
-from mien.evaluation.metrics import Box
 from mien.evaluation.scoring import (
     PIXELS,
     SSIM_WINDOW,
@@ -25,6 +24,7 @@ from mien.evaluation.scoring import (
     worker_threads,
 )
 from mien.parallel import stream_in_threads
+from mien.pictures import Box
 from mien.progress import progress_bar, say
 from mien.storage import read_json, write_json
 from mien.tracking.scoring import head_crop
@@ -35,8 +35,8 @@ CROPS_FORMAT, CROPS_VERSION = "mien.crops", 1
 CROPS_NAME = "crops.json"
 Background = Literal["white", "black"]
 _COLORS = {"white": 255, "black": 0}
-_NAMED = 3
-_FARTHEST = 1_000_000
+_MAX_NAMED = 3
+_MAX_COORDINATE = 1_000_000
 """Largest coordinate or size of a head box, in pixels."""
 
 
@@ -128,11 +128,14 @@ def read_crops(path: Path) -> dict[str, Box]:
         raise UserError(f"{str(error).split('; ')[0]}; write it again, or leave it out") from None
     boxes: dict[str, Box] = {}
     for name, box in crops.items() if isinstance(crops, dict) else [("", None)]:
-        fits = isinstance(box, list) and len(box) == 4 and all(type(v) is int and abs(v) <= _FARTHEST for v in box)
-        if not isinstance(box, list) or not fits or min(box[2:]) < 1:
+        if not isinstance(box, list) or len(box) != 4 or not all(map(_is_coordinate, box)) or min(box[2:]) < 1:
             raise UserError(f"{path}: {name!r} has no box of 4 numbers (left, top, width, height); write it again")
         boxes[name] = (box[0], box[1], box[2], box[3])
     return boxes
+
+
+def _is_coordinate(value: Any) -> bool:
+    return type(value) is int and abs(value) <= _MAX_COORDINATE
 
 
 class _Pairs:
@@ -177,20 +180,20 @@ class _Pairs:
                 if (matte == 0).any():
                     surround.append(float(np.abs(image[matte == 0].astype(np.int16) - int(color[0])).mean()))
             if crop is not None and not _meets(crop, truth):
-                raise UserError(f"{name}: the head box {crop} lies outside of the picture; write {CROPS_NAME} again")
+                raise UserError(f"{name}: the head box {crop} is outside the picture; write {CROPS_NAME} again")
             yield index, _Pair(name, image, truth, crop)
         if surround and float(np.mean(surround)) > 64:
             say(
                 f"warning: {self._folders.images}: pictures are not {self._folders.background} where the mattes are "
-                "empty, which costs much PSNR; render them over that colour, or give --background"
+                "empty, which lowers PSNR; render them over that colour, or set --background"
             )
 
     def _check_size(self, name: str, picture: np.ndarray, truth: np.ndarray, folder: Path | None) -> None:
         if picture.shape[:2] != truth.shape[:2]:
             sizes = [f"{shape[1]}x{shape[0]}" for shape in (picture.shape, truth.shape)]
             raise UserError(
-                f"{folder}: {name} has {sizes[0]} pixels, its truth {sizes[1]}; bring them to one size (mien does not "
-                "resize: that would change the figures)"
+                f"{folder}: {name} has {sizes[0]} pixels, and its truth has {sizes[1]}; give them one size (mien "
+                "does not resize pictures, because that would change the figures)"
             )
 
 
@@ -205,7 +208,7 @@ def _matched(truth: PictureSource, images: PictureSource) -> list[str]:
         if truth.count != images.count:
             raise UserError(
                 f"{images.path}: has {images.count} pictures, {truth.path} has {truth.count}; videos are matched by "
-                "order, so give equally many"
+                "order, so give equal numbers"
             )
         return truth.names or images.names or [f"{index:06d}" for index in range(truth.count)]
     missing = sorted(set(truth.names) - set(images.names))
@@ -221,7 +224,7 @@ def _matched(truth: PictureSource, images: PictureSource) -> list[str]:
 
 
 def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+    return ", ".join(names[:_MAX_NAMED]) + (", ..." if len(names) > _MAX_NAMED else "")
 
 
 def _floats(image: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:

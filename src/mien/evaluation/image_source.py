@@ -50,7 +50,7 @@ def open_pictures(path: Path) -> PictureSource:
     """
     if path.is_file():
         count = sum(1 for _ in read_video_frames(path))
-        say(f"warning: {path}: a video's compression changes pixels; png pictures score more truly")
+        say(f"warning: {path}: video compression changes pixels; png pictures give more accurate figures")
         return PictureSource(path, count, None, {})
     if not path.is_dir():
         raise UserError(f"{path}: no such folder; name a folder of pictures, or a video")
@@ -59,10 +59,12 @@ def open_pictures(path: Path) -> PictureSource:
         if file.suffix.lower() not in ENDINGS or file.name.startswith("."):
             continue
         if file.stem in files:
-            raise UserError(f"{path}: holds both {files[file.stem].name} and {file.name}; keep one picture a name")
+            raise UserError(
+                f"{path}: contains both {files[file.stem].name} and {file.name}; keep one picture of each name"
+            )
         files[file.stem] = file
     if not files:
-        raise UserError(f"{path}: holds no picture; give files that end in {', '.join(ENDINGS)}")
+        raise UserError(f"{path}: contains no picture; give files that end in {', '.join(ENDINGS)}")
     return PictureSource(path, len(files), list(files), files)
 
 
@@ -79,7 +81,7 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check the file") from None
     picture = None if cut else decode_picture(path, cv2.IMREAD_UNCHANGED)
     if picture is None:
-        raise UserError(f"{path}: no whole picture; write it again")
+        raise UserError(f"{path}: is not a complete picture; write it again")
     if picture.dtype != np.uint8:
         raise UserError(f"{path}: has {picture.dtype} values; convert it to 8 bits a channel")
     if picture.ndim == 2:

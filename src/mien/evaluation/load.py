@@ -10,13 +10,13 @@ from mien.avatar import load_avatar
 from mien.capture import read_capture_hash
 from mien.config import decode
 from mien.errors import UserError
-from mien.evaluation.experiment import Experiment, FaceSource, Frame
+from mien.evaluation.experiment import Experiment, FaceSource
 from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
 from mien.storage import expect_whole, read_tensors
 from mien.tracking import read_scoring, read_scoring_hash
 from mien.training import Sequence, TrainSettings, check_data, read_run_config
-from mien.training.frames import training_frames
+from mien.training.frames import Frame, training_frames
 from mien.training.sequence import sequence_of
 from mien.training.split import held_out
 
@@ -46,7 +46,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
     sequences = tuple(sequence_of(folder, scoring) for folder, scoring in zip(sequence_dirs, scorings, strict=True))
     for folder, digest in zip(sequence_dirs, digests, strict=True):
         if _digests(folder) != digest:
-            raise UserError(f"{folder}: was written anew while it was read; run the same command again")
+            raise UserError(f"{folder}: was changed while it was read; run the same command again")
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
     avatar = load_avatar(run_dir)
     for folder, sequence in zip(sequence_dirs, sequences, strict=True):
@@ -58,7 +58,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
         faces=faces,
         face_source="as_tracked",
         scorings=scorings,
-        training_frames=tuple(Frame(f.sequence, f.timestep, f.camera) for f in training_frames(sequences, settings)),
+        training_frames=tuple(training_frames(sequences, settings)),
         held_out_frames=(),
         split=settings.split,
         digests=digests,

@@ -6,13 +6,11 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-PSNR_LIMIT = 100.0
-"""PSNR of identical images in dB, so that results stay finite."""
-_WINDOW_SIZE, _WINDOW_SIGMA = 11, 1.5
-_C1, _C2 = 0.01**2, 0.03**2
+from mien.pictures import Box
+from mien.training.photometric import C1, C2, WINDOW_RADIUS, WINDOW_SIGMA
 
-Box = tuple[int, int, int, int]
-"""Left, top, width and height, in pixels."""
+MAX_PSNR = 100.0
+"""PSNR of identical images in dB, so that results stay finite."""
 
 
 def crop_to(image: Shaped[Tensor, "h w *c"], box: Box | None) -> Shaped[Tensor, "y x *c"]:
@@ -44,11 +42,11 @@ def psnr(
 ) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1: -10 log10 of the mean squared difference.
 
-    The mean is over the channels of the pixels in `box` that `mask` selects. The result is at most `PSNR_LIMIT`. The
+    The mean is over the channels of the pixels in `box` that `mask` selects. The result is at most `MAX_PSNR`. The
     figure for a set of frames is the mean of the figures of its frames, as is usual in the field.
     """
     squared = _mean((crop_to(image, box) - crop_to(target, box)) ** 2, box, mask)
-    return float(-10 * torch.log10(squared.clamp_min(10 ** (-PSNR_LIMIT / 10))))
+    return float(-10 * torch.log10(squared.clamp_min(10 ** (-MAX_PSNR / 10))))
 
 
 def ssim(
@@ -68,24 +66,25 @@ def ssim_map(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> F
     """Structural similarity of every pixel and channel, -1..1.
 
     The definition is that of training codes for 3D Gaussians: an 11x11 Gaussian window of sigma 1.5, zeros beyond the
-    border, C1 = 0.01^2 and C2 = 0.03^2 for a range of 1, and each channel separately.
+    border, C1 = 0.01^2 and C2 = 0.03^2 for a range of 1, and each channel separately. That of the loss
+    (`differentiable_ssim_map`) has the same definition, but other rounding: OpenCV blurs twenty times as fast as torch,
+    and scores need no gradient.
     """
     x, y = (np.ascontiguousarray(t.detach().cpu().numpy()) for t in (image, target))
     mean_x, mean_y = _blur(x), _blur(y)
     variance_x = _blur(x * x) - mean_x * mean_x
     variance_y = _blur(y * y) - mean_y * mean_y
     covariance = _blur(x * y) - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + _C1) / (mean_x * mean_x + mean_y * mean_y + _C1)
-    structure = (2 * covariance + _C2) / (variance_x + variance_y + _C2)
+    luminance = (2 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
+    structure = (2 * covariance + C2) / (variance_x + variance_y + C2)
     return torch.from_numpy(luminance * structure)
 
 
 def _blur(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """The mean around every pixel, weighted by the Gaussian window, with zeros beyond the border."""
-    offsets = np.arange(_WINDOW_SIZE) - _WINDOW_SIZE // 2
-    window = np.exp(-(offsets**2) / (2 * _WINDOW_SIGMA**2)).astype(image.dtype)
+    offsets = np.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1)
+    window = np.exp(-(offsets**2) / (2 * WINDOW_SIGMA**2)).astype(image.dtype)
     window = window / window.sum()
-    # OpenCV is twenty times as fast as torch for this on a CPU.
     return cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
 
 

@@ -1,19 +1,28 @@
-"""Reads metrics.json, and checks that every figure to compare or show is there and is a number."""
+"""Reads metrics.json, checks that every figure to compare or show is there and is a number, and names the figures."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mien.evaluation.words import FACES, NAMES
+from mien.evaluation.scoring import METRICS
 from mien.inside import is_one_line
 from mien.storage import expect_whole, read_json
 
 FORMAT, VERSION = "mien.metrics", 1
 _REMEDY = "delete this file, not its folder, and run `mien evaluate` again"
-_METRICS = ("psnr", "ssim", "l1", "perceptual")
+COLUMNS = (
+    ("psnr", "PSNR, dB", 2, True), ("ssim", "SSIM", 3, True), ("l1", "L1", 4, False),
+    ("perceptual", "ST-LPIPS", 3, False),
+)  # fmt: skip
+"""Metric, heading, number of digits, whether higher is better."""
+BASELINE_NAMES = {"mean_frame": "mean training picture", "mesh": "coloured mesh"}
+"""Names of the baselines, by their keys in metrics.json."""
+FACE_SOURCE_NAMES = {"corrected": "corrected", "as_tracked": "as tracked"}
+"""Names for the source of held-out face parameters: tracking with corrections from training, or tracking alone."""
 _DRIVEN = ("expression_error", "expression_error_still", "head_rotation_error_degrees",
            "head_rotation_error_still_degrees", "faces_found")  # fmt: skip
-_MOST = 1e12
+_MAX_FIGURE = 1e12
 """Largest figure of any kind: seconds, decibels, numbers of Gaussians."""
 
 
@@ -49,15 +58,21 @@ def read_figures(run_dir: Path) -> dict[str, Any]:
     return content
 
 
+def figure(entry: Mapping[str, Any], part: str | None, metric: str) -> float | None:
+    """One figure of the whole frame (no `part`) or of a part, or None if it was not computed or is not finite."""
+    value = (entry if part is None else entry[part]).get(metric)
+    return None if value is None or not math.isfinite(value) else value
+
+
 def _check_protocol(entry: Mapping[str, Any]) -> None:
     _check_row(entry)
-    _require(is_one_line(entry["split"]) and entry["face_params"] in FACES, "split or face_params")
+    _require(is_one_line(entry["split"]) and entry["face_params"] in FACE_SOURCE_NAMES, "split or face_params")
     _number(entry, "frames", whole=True)
     _number(entry, "seconds_per_frame")
     if entry["face_params"] != "as_tracked":
         _check_row(entry["as_tracked"])
     for name, row in entry["baselines"].items():
-        _require(name in NAMES, "a baseline's name")
+        _require(name in BASELINE_NAMES, "a baseline's name")
         _check_row(row)
     for name in ("perceptual_backbone", "pixels"):
         _require(entry.get(name) is None or is_one_line(entry[name]), name)
@@ -80,7 +95,7 @@ def _check_frames(frames: Mapping[str, Sequence[Any]]) -> None:
 def _check_row(row: Mapping[str, Any]) -> None:
     """Check the figures of the whole frame and of the head crop. Only PSNR is required."""
     for part in (row, row["head"]):
-        for name in _METRICS:
+        for name in METRICS:
             _require(_is_number(part.get(name)) or (name != "psnr" and part.get(name) is None), name)
 
 
@@ -97,9 +112,9 @@ def _number(entry: Mapping[str, Any], name: str, *, whole: bool = False) -> None
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MOST
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MAX_FIGURE
 
 
 def _require(holds: bool, what: str) -> None:
     if not holds:
-        raise ValueError(f"{what} is not what it should be")
+        raise ValueError(f"{what} is missing or has a wrong value")

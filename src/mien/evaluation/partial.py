@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from mien.bounded import parse_json, read_bytes
-from mien.evaluation.experiment import Frame
 from mien.evaluation.scoring import Scores
 from mien.inside import open_to_append
 from mien.limits import whole
 from mien.storage import write_atomically
+from mien.training.frames import Frame
 
-_LARGEST = 256 << 20
-"""Largest size of the file in bytes, and largest index in a frame. A frame takes some hundred bytes."""
+_MAX_BYTES = 256 << 20
+"""Largest file that is read, in bytes. A frame takes some hundred bytes."""
+_MAX_INDEX = _MAX_BYTES
+"""Largest index in a frame."""
 
 Scored = tuple[dict[str, Scores], float]
 """A frame's figures by the scored subject, and the seconds that rendering the avatar took."""
@@ -49,7 +51,7 @@ class PartialScores:
 
     def _lines(self) -> list[str]:
         try:
-            return read_bytes(self.path, _LARGEST).decode("utf-8", "replace").splitlines()
+            return read_bytes(self.path, _MAX_BYTES).decode("utf-8", "replace").splitlines()
         except (OSError, ValueError):
             return []
 
@@ -68,7 +70,7 @@ def _parsed(line: str) -> tuple[Frame, Scored] | None:
     """The frame and figures of a line, or None if the line is not complete."""
     try:
         content: dict[str, Any] = parse_json(line)
-        frame = Frame(*(whole(number, 0, _LARGEST) for number in content["frame"]))
+        frame = Frame(*(whole(number, 0, _MAX_INDEX) for number in content["frame"]))
         scores = {str(name): _figures(row) for name, row in content["scores"].items()}
         return frame, (scores, float(content["seconds"]))
     except (ValueError, LookupError, TypeError, AttributeError):

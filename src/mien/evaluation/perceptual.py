@@ -23,7 +23,7 @@ _WEIGHTS = {"st-lpips-alex": "weights/vST0.0/alex_shift_tolerant.pth"}
 _PACKAGE = "stlpips_pytorch"
 _BLUR = torch.tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])[None, None] / 16
 _STRIP = 16
-MINIMUM_SIZE = 32
+MIN_SIDE = 32
 """Smallest side of a picture in pixels. Smaller pictures have no features left in the deepest layers."""
 
 
@@ -52,7 +52,7 @@ class PerceptualDistance(nn.Module):
 
     def features(self, image: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "c y x"]]:
         """Five feature maps of an image in 0..1, of unit length at each pixel, to be compared by `between`."""
-        assert min(image.shape[:2]) >= MINIMUM_SIZE, f"{tuple(image.shape)} is too small to compare"
+        assert min(image.shape[:2]) >= MIN_SIDE, f"{tuple(image.shape)} is too small to compare"
         values = ((image.permute(2, 0, 1)[None] * 2 - 1) - self.shift) / self.scale
         # Work in place if possible, because large new buffers cost as much as the arithmetic on them.
         maps = [self._first_map(values).relu_()]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 12, 10, 34
-_MOST_POINTS = 400
+_MAX_POINTS = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ def line_chart(series: Sequence[Series], axes: Axes) -> str:
     """An <svg> of some series over common axes. Series without a finite value are left out."""
     drawn = [one for one in series if np.isfinite(one.y).any()]
     if not drawn:
-        return '<p class="note">Nothing to draw.</p>'
+        return '<p class="note">There are no values to draw.</p>'
     x_range = _range(np.concatenate([one.x for one in drawn]))
     y_range = _padded(_range(np.concatenate([one.y for one in drawn])), axes.from_zero)
     plot = _Plot(axes, x_range, y_range)
@@ -61,11 +61,11 @@ def line_chart(series: Sequence[Series], axes: Axes) -> str:
     )
 
 
-def thinned(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
+def thin(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
     """A long curve as the means of a limited number of bins, for a small file and a smooth line."""
-    if len(x) <= _MOST_POINTS:
+    if len(x) <= _MAX_POINTS:
         return x, y
-    bins = np.array_split(np.arange(len(x)), _MOST_POINTS)
+    bins = np.array_split(np.arange(len(x)), _MAX_POINTS)
     return np.array([x[b].mean() for b in bins]), np.array([y[b].mean() for b in bins])
 
 
@@ -100,7 +100,7 @@ class _Plot:
         return f'<text class="tick middle" x="{x:.1f}" y="{y}">{_number(value)}</text>'
 
     def line(self, series: Series) -> str:
-        x, y = thinned(series.x, series.y)
+        x, y = thin(series.x, series.y)
         parts, pen = [], "M"
         for a, b in zip(x.tolist(), y.tolist(), strict=True):
             if not math.isfinite(b):

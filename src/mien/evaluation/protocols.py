@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from mien.evaluation.baselines import Baselines, make_baselines
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, scored_on, spread_frames, target_image
+from mien.evaluation.experiment import Experiment, avatar_image, scored_on, spread_frames, target_image
 from mien.evaluation.metrics import psnr
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.scoring import (
@@ -25,9 +25,10 @@ from mien.evaluation.scoring import (
 )
 from mien.parallel import stream_in_threads
 from mien.progress import progress_bar
+from mien.training.frames import Frame
 
 AVATAR, AS_TRACKED, MEAN_FRAME, MESH = "avatar", "as_tracked", "mean_frame", "mesh"
-_TRAINING_FRAMES = 200
+_MAX_TRAINING_FRAMES = 200
 _ALWAYS = {f"{part}{metric}" for part in ("", "head_") for metric in ("psnr", "ssim", "l1")}
 """Figures that every frame has."""
 _MASK = "frozen scoring mask: matte cut below the neck line, over white"
@@ -138,9 +139,9 @@ def _as_tracked(experiment: Experiment) -> Experiment:
 
 
 def _training_psnr(experiment: Experiment) -> dict[Frame, tuple[float, float]]:
-    """PSNR on the whole frame and on the head crop of at most `_TRAINING_FRAMES` training frames."""
+    """PSNR on the whole frame and on the head crop of at most `_MAX_TRAINING_FRAMES` training frames."""
     figures = {}
-    for frame in spread_frames(experiment.training_frames, _TRAINING_FRAMES):
+    for frame in spread_frames(experiment.training_frames, _MAX_TRAINING_FRAMES):
         image, target = as_8_bit(avatar_image(experiment, frame)), target_image(experiment, frame)
         figures[frame] = (psnr(image, target), psnr(image, target, experiment.crop(frame)))
     return figures

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
+from mien.rotation import align_centred
 from mien.tracking.landmarks import BROWS, EYE_CORNERS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 
 MEASURED_BY = "MediaPipe face mesh, 478 points in 3D, each picture by itself"
@@ -56,7 +57,7 @@ class FaceReader:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class MeasuredMotion:
     """Motion of one face relative to the same face at rest."""
 
     displacement: Float[np.ndarray, "m 3"]
@@ -69,14 +70,14 @@ class Motion:
     """Mean opening of the lids, in the same unit."""
 
 
-def motion(points: Float[np.ndarray, "l 3"], at_rest: Float[np.ndarray, "l 3"]) -> Motion:
+def measure_motion(points: Float[np.ndarray, "l 3"], at_rest: Float[np.ndarray, "l 3"]) -> MeasuredMotion:
     """The motion of a face, from its landmarks and those of the same face at rest."""
     rotation, scale, shift = similarity(points[_RIGID], at_rest[_RIGID])
     aligned = scale * points @ rotation.T + shift
     unit = float(np.linalg.norm(at_rest[_OUTER_CORNERS[0]] - at_rest[_OUTER_CORNERS[1]]))
     displacement = (aligned - at_rest)[_MOVING] / unit
     # The fit takes the picture back to rest, so the head's own rotation is the inverse.
-    return Motion(displacement, rotation.T, _opening(aligned, _MOUTH) / unit, _opening(aligned, _EYES) / unit)
+    return MeasuredMotion(displacement, rotation.T, _opening(aligned, _MOUTH) / unit, _opening(aligned, _EYES) / unit)
 
 
 def similarity(
@@ -84,11 +85,7 @@ def similarity(
 ) -> tuple[Float[np.ndarray, "3 3"], float, Float[np.ndarray, " 3"]]:
     """Rotation, scale and shift with target ~ scale * rotation @ source + shift, by least squares (Umeyama 1991)."""
     source_mean, target_mean = source.mean(0), target.mean(0)
-    centred, wanted = source - source_mean, target - target_mean
-    u, values, vt = np.linalg.svd(wanted.T @ centred)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * signs) @ vt
-    scale = float((values * signs).sum() / (centred**2).sum())
+    rotation, scale = align_centred(source - source_mean, target - target_mean)
     return rotation, scale, target_mean - scale * rotation @ source_mean
 
 
@@ -97,7 +94,7 @@ def angle_degrees(rotation: Float[np.ndarray, "3 3"]) -> float:
     return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
 
 
-def transfer_figures(pairs: list[tuple[Motion, Motion]]) -> dict[str, float | None]:
+def transfer_figures(pairs: list[tuple[MeasuredMotion, MeasuredMotion]]) -> dict[str, float | None]:
     """How well (driver, avatar) motions agree, and the same for an avatar that never moves (`..._still`).
 
     Correlations are Pearson's, of an opening over the frames. They are None if an opening hardly changes, or for fewer

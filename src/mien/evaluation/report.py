@@ -1,12 +1,10 @@
-"""report.html: one file that can be sent around. No network, no scripts; works in light, in dark and on paper."""
+"""report.html: the page of a run."""
 
 import json
-import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -15,9 +13,9 @@ import numpy as np
 
 from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
+from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, figure
+from mien.evaluation.page import GLOSSARY, ReportVideo, glossary_html, metric_groups, metric_headings, page_html
 from mien.evaluation.protocols import Evaluation
-from mien.evaluation.report_video import ReportVideo
-from mien.evaluation.report_words import GLOSSARY
 from mien.storage import write_atomically
 
 _TITLES = {
@@ -26,9 +24,11 @@ _TITLES = {
     "self_reenactment_sequence": "Self-reenactment, held-out sequences",
     "novel_view": "Novel views, held-out cameras",
 }
-_BASELINES = {"mesh": "Tracked mesh with its colours", "mean_frame": "Mean training picture"}
-_ROWS = {"avatar": "Avatar", "as_tracked": "Avatar, faces as tracked", **_BASELINES}
-_METRICS = (("psnr", "PSNR, dB ↑", 2), ("ssim", "SSIM ↑", 3), ("l1", "L1 ↓", 4), ("perceptual", "ST-LPIPS ↓", 3))
+_ROWS = {
+    "avatar": "Avatar",
+    "as_tracked": "Avatar, faces as tracked",
+    **{key: BASELINE_NAMES[key].capitalize() for key in ("mesh", "mean_frame")},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +64,7 @@ def write_report(
     text = report_html(
         run, protocols, results, {name: video.html(path.parent) for name, video in videos.items()}, driven
     )
-
-    def write(temporary: Path) -> None:
-        temporary.write_text(text, encoding="utf-8")
-
-    write_atomically(path, write)
+    write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
 
 def report_html(
@@ -79,7 +75,6 @@ def report_html(
     driven: str = "",
 ) -> str:
     """The page as text. `videos` holds a piece of HTML by protocol."""
-    style = files("mien.evaluation").joinpath("report.css").read_text(encoding="utf-8")
     title = f"{', '.join(entry['sequence'] for entry in run.config['data'])} · {run.config['method']['kind']}"
     body = [_heading(title, run), _tiles(run, protocols)]
     body += ["<h2>Figures</h2>", _table(protocols), _how_to_read(protocols)]
@@ -95,12 +90,7 @@ def report_html(
     if first is not None:
         body += ["<h2>Tracking</h2>", sections.tracking_overlays(first[0])]
     body.append(_settings(run))
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>mien: {escape(title)}</title>\n<style>\n{style}</style></head>\n"
-        f"<body><main>\n{chr(10).join(body)}\n</main></body></html>\n"
-    )
+    return page_html(title, "\n".join(body))
 
 
 def _heading(title: str, run: RunRecord) -> str:
@@ -129,7 +119,7 @@ def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> str:
     summary = run.summary
     tiles.append((f"{summary['gaussians']:,}", "Gaussians"))
     tiles.append((_duration(summary["seconds"]), f"training, {summary['steps']:,} steps"))
-    tiles.append((f"{summary['step_ms_median']:.1f} ms", "a step, median"))
+    tiles.append((f"{summary['step_ms_median']:.1f} ms", "per step, median"))
     content = "".join(f'<div class="tile"><b>{value}</b><span>{name}</span></div>' for value, name in tiles)
     return f'<div class="tiles">{content}</div>'
 
@@ -146,33 +136,30 @@ def _table(protocols: Mapping[str, Any]) -> str:
             if key in subjects
         )
         caption = (
-            f"{_TITLES.get(name, name)} · {entry['frames']} frames held out ({entry['split']}) · face parameters "
-            f"{entry['face_params'].replace('_', ' ')} · PSNR on frames trained on: "
-            f"{entry['training_frames']['psnr']:.2f}, head {entry['training_frames']['head']['psnr']:.2f} dB"
-            f" · ST-LPIPS on {entry['perceptual_frames']} frames, evenly spread"
+            f"{_TITLES.get(name, name)} · {entry['frames']} held-out frames ({entry['split']}) · face parameters "
+            f"{entry['face_params'].replace('_', ' ')} · PSNR on training frames: "
+            f"{entry['training_frames']['psnr']:.2f} dB, head crop {entry['training_frames']['head']['psnr']:.2f} dB"
+            f" · ST-LPIPS on {entry['perceptual_frames']} evenly spread frames"
         )
         parts.append(
             f'<div class="card table"><div class="scroll"><table>{_table_head()}<tbody>{rows}</tbody></table></div>'
             f'<p class="note">{escape(caption)}</p></div>'
         )
-    return "".join(parts) or '<p class="note">Nothing was held out, so nothing was scored.</p>'
+    return "".join(parts) or '<p class="note">No frame was held out, so nothing was scored.</p>'
 
 
 def _table_head() -> str:
-    names = "".join(f"<th>{label}</th>" for _, label, _ in _METRICS)
-    groups = '<th class="group" colspan="4">Whole frame</th><th class="group head" colspan="4">Head crop</th>'
-    head_names = names.replace("<th>", '<th class="head">', 1)
-    return f'<thead><tr><th class="blank"></th>{groups}</tr><tr><th></th>{names}{head_names}</tr></thead>'
+    return f'<thead><tr><th class="blank"></th>{metric_groups()}</tr><tr><th></th>{metric_headings()}</tr></thead>'
 
 
 def _cells(key: str, subjects: Mapping[str, Any]) -> str:
     """One row's figures. The avatar's PSNR includes its lead over the better baseline."""
     cells = []
     for part in (None, "head"):
-        for index, (metric, _, digits) in enumerate(_METRICS):
-            value = _figure(subjects[key], part, metric)
+        for index, (metric, _, digits, _) in enumerate(COLUMNS):
+            value = figure(subjects[key], part, metric)
             text = "–" if value is None else f"{value:.{digits}f}"
-            others = [_figure(entry, part, metric) for name, entry in subjects.items() if name in _BASELINES]
+            others = [figure(entry, part, metric) for name, entry in subjects.items() if name in BASELINE_NAMES]
             known = [other for other in others if other is not None]
             if key == "avatar" and metric == "psnr" and value is not None and known:
                 text += f" <small>{value - max(known):+.1f}</small>"
@@ -180,16 +167,10 @@ def _cells(key: str, subjects: Mapping[str, Any]) -> str:
     return "".join(cells)
 
 
-def _figure(entry: Mapping[str, Any], part: str | None, metric: str) -> float | None:
-    value = (entry if part is None else entry[part])[metric]
-    return None if value is None or not math.isfinite(value) else value
-
-
 def _how_to_read(protocols: Mapping[str, Any]) -> str:
     backbones = {entry["perceptual_backbone"] for entry in protocols.values()} - {None}
     texts = {**GLOSSARY, "ST-LPIPS": f"{GLOSSARY['ST-LPIPS']} Here: {', '.join(sorted(backbones)) or 'not computed'}."}
-    entries = "".join(f"<dt>{term}</dt><dd>{escape(text)}</dd>" for term, text in texts.items())
-    return f'<details class="card"><summary>How to read this</summary><dl>{entries}</dl></details>'
+    return glossary_html(texts)
 
 
 def _settings(run: RunRecord) -> str:

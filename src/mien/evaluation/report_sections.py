@@ -2,23 +2,41 @@
 
 from collections.abc import Mapping, Sequence
 from html import escape
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
-from mien.evaluation.metrics import Box, crop_to
+from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
+from mien.evaluation.metrics import crop_to
+from mien.evaluation.metrics_file import BASELINE_NAMES
+from mien.evaluation.page import error_scale, picture_html, video_html
 from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import AVATAR, MESH, Evaluation
-from mien.evaluation.videos import HEAT_LIMIT
-from mien.pictures import error_heat, heat_gradient, picture_uri, shrink, to_uint8
+from mien.pictures import Box, error_heat, to_uint8
 from mien.render.mesh import render_mesh
+from mien.training.frames import Frame
 
 _PICTURE_SIZE = 400
 _OVERLAY_SIZE = 300
 _ROWS = 6
 _OVERLAYS = 6
 _SMOOTHING = 15
+_CROSS_COLUMNS = (
+    ("expression_error", "Expression ↓", 4), ("expression_error_still", "if still", 4),
+    ("head_rotation_error_degrees", "Head, ° ↓", 2), ("head_rotation_error_still_degrees", "if still", 2),
+    ("mouth_correlation", "Mouth r ↑", 2), ("eyes_correlation", "Eyes r ↑", 2), ("faces_found", "Faces found ↑", 2),
+    ("frames", "Frames", 0),
+)  # fmt: skip
+_CROSS_NOTE = (
+    "There is no true picture, so a face detector reads the pictures of the driver and of the avatar, and the motions "
+    "that it finds are compared, each relative to its own neutral face. Expression: distance between the motions of "
+    "lips, lids and brows without the head pose; the unit is the distance between the outer eye corners. Head: "
+    "difference of the head rotations. If still: the same figure for an avatar that never moves. r: correlation of the "
+    "openings of mouth and eyes over the frames. The figures show how much of the motion arrives, not how good the "
+    "pictures look."
+)
 
 
 def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
@@ -29,11 +47,7 @@ def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
     names = {len(ranked) - 1: "best", middle: "median", 0: "worst"}
     box = head_box(experiment, [evaluation.frames[ranked[place]] for place in places])
     rows = [_comparison_row(experiment, evaluation, ranked[place], names.get(place, ""), box) for place in places]
-    scale = (
-        f'<span class="scale">0 <i style="background:{heat_gradient()}"></i> '
-        f"{HEAT_LIMIT * 255:.0f} of 255 and more</span>"
-    )
-    labels = f'<div class="labels"><span>Truth</span><span>Render</span><span>Error {scale}</span></div>'
+    labels = f'<div class="labels"><span>Truth</span><span>Rendering</span><span>Error {error_scale()}</span></div>'
     return labels + "".join(rows)
 
 
@@ -49,13 +63,13 @@ def _places(count: int, middle: int) -> list[int]:
 def _comparison_row(experiment: Experiment, evaluation: Evaluation, index: int, name: str, box: Box) -> str:
     frame, scores = evaluation.frames[index], evaluation.scores[AVATAR][index]
     target, image = target_image(experiment, frame), avatar_image(experiment, frame)
-    whole = (to_uint8(target), to_uint8(image), error_heat(image, target, HEAT_LIMIT))
+    whole = (to_uint8(target), to_uint8(image), error_heat(image, target))
     pictures = [crop_to(torch.from_numpy(picture), box).numpy() for picture in whole]
     figures = f"PSNR {scores['psnr']:.2f} dB, head {scores['head_psnr']:.2f} dB, SSIM {scores['ssim']:.3f}"
     if "perceptual" in scores:
         figures += f", ST-LPIPS {scores['perceptual']:.3f}"
     tag = f"<strong>{name}</strong> · " if name else ""
-    images = "".join(map(_image, pictures, ("truth", "render", "error")))
+    images = "".join(map(_image, pictures, ("truth", "rendering", "error")))
     return (
         f'<figure class="row"><div class="triple">{images}</div>'
         f"<figcaption>{tag}{escape(frame_name(experiment, frame))} · {figures}</figcaption></figure>"
@@ -71,8 +85,9 @@ def over_time(experiment: Experiment, evaluation: Evaluation) -> str:
         there = [i for i, f in enumerate(evaluation.frames) if (f.sequence, f.camera) == (sequence, camera)]
         timesteps = [evaluation.frames[i].timestep for i in there]
         seen = [evaluation.training_psnr[f][1] for f in here]
-        series = [_series("trained on", [f.timestep for f in here], seen, "quiet")]
-        for subject, label, style in ((AVATAR, "held out", "main"), (MESH, "coloured mesh, held out", "second")):
+        series = [_series("training frames", [f.timestep for f in here], seen, "quiet")]
+        mesh = f"{BASELINE_NAMES['mesh']}, held-out frames"
+        for subject, label, style in ((AVATAR, "held-out frames", "main"), (MESH, mesh, "second")):
             if subject in evaluation.scores:
                 series.append(
                     _series(label, timesteps, [evaluation.scores[subject][i]["head_psnr"] for i in there], style)
@@ -111,7 +126,7 @@ def training_curves(curves: Mapping[str, np.ndarray]) -> str:
             values = np.minimum(values, np.percentile(values, 99))
         series = [Series(title, steps, values)]
         if name in ("loss", "psnr"):
-            series = [Series("one frame each", steps, values, "quiet"), Series("mean", *_smooth(steps, values))]
+            series = [Series("single frames", steps, values, "quiet"), Series("mean", *_smooth(steps, values))]
         chart = line_chart(series, Axes("step", title, from_zero=from_zero))
         cards.append(_card(title, chart))
     return f'<div class="grid2">{"".join(cards)}</div>'
@@ -150,26 +165,37 @@ def _overlay(experiment: Experiment, frame: Frame) -> str:
     vertices = face_model(sequence.tracking.face[frame.timestep])[0]
     mesh, alpha = render_mesh(vertices, face_model.faces, camera, supersample=2)
     blended = picture * (1 - 0.6 * alpha[..., None]) + 0.6 * alpha[..., None] * mesh
-    image = _image(shrink(to_uint8(blended), _OVERLAY_SIZE), "tracked mesh over the frame")
+    image = picture_html(to_uint8(blended), "tracked mesh over the frame", _OVERLAY_SIZE)
     return f"<figure>{image}<figcaption>timestep {frame.timestep}</figcaption></figure>"
 
 
 def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> str:
     """The median held-out frame as truth, mean training picture, coloured mesh and avatar."""
     if evaluation.baselines is None:
-        return '<p class="note">Not scored in this evaluation.</p>'
+        return '<p class="note">This evaluation did not score the baselines.</p>'
     frame = evaluation.frames[evaluation.ranked()[len(evaluation.frames) // 2]]
     pictures = {
         "truth": target_image(experiment, frame),
-        "mean training picture": evaluation.baselines.mean_frame_image(experiment, frame),
-        "tracked mesh with its colours": evaluation.baselines.mesh_image(experiment, frame),
+        BASELINE_NAMES["mean_frame"]: evaluation.baselines.mean_frame_image(experiment, frame),
+        BASELINE_NAMES["mesh"]: evaluation.baselines.mesh_image(experiment, frame),
         "avatar": avatar_image(experiment, frame),
     }
     figures = (
-        f"<figure>{_image(shrink(to_uint8(picture), _PICTURE_SIZE), name)}<figcaption>{name}</figcaption></figure>"
+        f"<figure>{_image(to_uint8(picture), name)}<figcaption>{name}</figcaption></figure>"
         for name, picture in pictures.items()
     )
     return f'<div class="strip">{"".join(figures)}</div>'
+
+
+def cross_section(entry: Mapping[str, Any], videos: Sequence[Path], page_folder: Path) -> str:
+    """The table and the videos, as HTML."""
+    heads = "".join(f"<th>{name}</th>" for _, name, _ in _CROSS_COLUMNS)
+    rows = "".join(_driver_row(driver) for driver in entry["drivers"])
+    shown = "".join(video_html(path, page_folder, "Driver, avatar") for path in videos)
+    return (
+        '<h2>Cross-reenactment</h2><div class="card table"><div class="scroll"><table><thead><tr><th>Driver</th>'
+        f'{heads}</tr></thead><tbody>{rows}</tbody></table></div><p class="note">{escape(_CROSS_NOTE)}</p></div>{shown}'
+    )
 
 
 def frame_name(experiment: Experiment, frame: Frame) -> str:
@@ -188,8 +214,17 @@ def _series(label: str, x: Sequence[int], y: Sequence[float], style: str) -> Ser
 
 
 def _image(picture: np.ndarray, what: str) -> str:
-    return f'<img alt="{escape(what)}" src="{picture_uri(shrink(picture, _PICTURE_SIZE))}">'
+    return picture_html(picture, what, _PICTURE_SIZE)
 
 
 def _card(title: str, content: str) -> str:
     return f'<div class="card wide"><h3>{title}</h3>{content}</div>'
+
+
+def _driver_row(driver: Mapping[str, Any]) -> str:
+    cells = "".join(_figure_cell(driver[key], digits) for key, _, digits in _CROSS_COLUMNS)
+    return f"<tr><td>{escape(driver['driver'])}</td>{cells}</tr>"
+
+
+def _figure_cell(value: float | int | None, digits: int) -> str:
+    return f"<td>{'–' if value is None else f'{value:.{digits}f}'}</td>"

@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.evaluation.metrics import Box, crop_to, l1, psnr, ssim
-from mien.evaluation.perceptual import MINIMUM_SIZE, Backbone, PerceptualDistance, load_perceptual
-from mien.pictures import to_uint8
+from mien.evaluation.metrics import crop_to, l1, psnr, ssim
+from mien.evaluation.perceptual import MIN_SIDE, Backbone, PerceptualDistance, load_perceptual
+from mien.pictures import Box, to_uint8
 from mien.threads import asked_threads
 
 METRICS = ("psnr", "ssim", "l1", "perceptual")
-_MOST_THREADS = 8
+_MAX_THREADS = 8
 """Default limit of the threads. Each thread needs some hundred megabytes for the perceptual metric's features."""
 SSIM_WINDOW = "11x11 Gaussian window, sigma 1.5, zeros beyond the border"
 PIXELS = "8 bits a channel, rounded"
@@ -64,7 +64,7 @@ def score_pictures(
     parts = [("", None), *([("head_", crop)] if crop is not None else [])]
     for prefix, box in parts:
         cut = crop_to(target, box)
-        small = min(cut.shape[:2]) < MINIMUM_SIZE
+        small = min(cut.shape[:2]) < MIN_SIDE
         reference = metric.features(cut) if metric is not None and not small else None
         for name, picture in pictures.items():
             image, row = crop_to(picture, box), rows[name]
@@ -86,9 +86,9 @@ def mean_scores(rows: Sequence[Scores]) -> dict[str, Any]:
     return {**whole, "head": {name: mean(f"head_{name}") for name in METRICS}}
 
 
-def evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
-    """At most `most` of the items, always with the first one. With 0, all of them."""
-    step = max(1, -(-len(items) // most)) if most else 1
+def evenly_spread(items: Sequence[Item], max_count: int) -> list[Item]:
+    """At most `max_count` of the items, evenly spread, always with the first one. With 0, all of them."""
+    step = max(1, -(-len(items) // max_count)) if max_count else 1
     return list(items[::step])
 
 
@@ -100,4 +100,4 @@ def worker_threads(threads: int) -> int:
     """
     if threads > 0:
         return threads
-    return asked_threads() or min(_MOST_THREADS, os.cpu_count() or 1)
+    return asked_threads() or min(_MAX_THREADS, os.cpu_count() or 1)

@@ -8,32 +8,31 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.capture.video import write_video
-from mien.evaluation.experiment import Experiment, Frame, avatar_image, head_box, target_image
+from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
-from mien.evaluation.metrics import Box, crop_to
+from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import AVATAR, Evaluation
 from mien.picture_files import write_png
-from mien.pictures import WHITE, error_heat, shrink, side_by_side, to_uint8
+from mien.pictures import WHITE, Box, error_heat, shrink, side_by_side, to_uint8
 from mien.progress import track_progress
+from mien.training.frames import Frame
 
-HEAT_LIMIT = 0.25
-"""Error, of a range of 1, that gets the brightest colour of heat maps."""
-_LARGEST = 440
+_MAX_SIDE = 440
 _BAR = 26
 _CRF = 24
 
 
-def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evaluation, most: int) -> int:
+def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evaluation, max_count: int) -> int:
     """Write held-out frames as truth, rendering and error heat map side by side; return the number of frames.
 
     Args:
         path: The .mp4 file.
         experiment: The evaluated experiment.
         evaluation: Its figures, which are written above the pictures.
-        most: Largest number of frames. If there are more, the first ones of each sequence and camera are used.
+        max_count: Largest number of frames. If there are more, the first ones of each sequence and camera are used.
     """
     places = {frame: index for index, frame in enumerate(evaluation.frames)}
-    frames = video_frames(evaluation.frames, most)
+    frames = choose_video_frames(evaluation.frames, max_count)
     boxes = {view: head_box(experiment, [f for f in frames if f[::2] == view]) for view in {f[::2] for f in frames}}
 
     def picture(frame: Frame) -> UInt8[np.ndarray, "h w 3"]:
@@ -44,22 +43,22 @@ def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evalu
         panels = {
             f"truth: {where}": to_uint8(truth),
             f"rendering: {scores['psnr']:.1f} dB, head {scores['head_psnr']:.1f}": to_uint8(image),
-            "error": error_heat(image, truth, HEAT_LIMIT),
+            "error": error_heat(image, truth),
         }
         return labelled_row(panels)
 
     first = experiment.sequences[frames[0].sequence].capture
     drawn = (picture(frame) for frame in track_progress(frames, f"video {path.stem}", len(frames)))
-    write_video(path, same_size(drawn), first.fps, _CRF)
+    write_video(path, match_sizes(drawn), first.fps, _CRF)
     return len(frames)
 
 
-def video_frames(frames: Sequence[Frame], most: int) -> list[Frame]:
-    """At most `most` frames for a video, camera by camera: the first ones of each, equally many."""
+def choose_video_frames(frames: Sequence[Frame], max_count: int) -> list[Frame]:
+    """At most `max_count` frames for a video, camera by camera: the first ones of each, equally many."""
     groups: dict[tuple[int, int], list[Frame]] = {}
     for frame in sorted(frames, key=lambda one: (one.sequence, one.camera, one.timestep)):
         groups.setdefault((frame.sequence, frame.camera), []).append(frame)
-    each = len(frames) if len(frames) <= most else max(1, most // len(groups))
+    each = len(frames) if len(frames) <= max_count else max(1, max_count // len(groups))
     return [frame for group in groups.values() for frame in group[:each]]
 
 
@@ -67,14 +66,14 @@ def labelled_row(panels: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.n
     """Pictures in a row, shrunk, each below a bar with its name."""
     named = []
     for name, panel in panels.items():
-        small = shrink(panel, _LARGEST)
+        small = shrink(panel, _MAX_SIDE)
         bar = np.full((_BAR, small.shape[1], 3), WHITE, np.uint8)
         cv2.putText(bar, name, (4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA)
         named.append(np.concatenate([bar, small]))
     return side_by_side(named)
 
 
-def same_size(pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def match_sizes(pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Yield the pictures in the size of the first. Smaller ones get a white border, larger ones are shrunk."""
     size: tuple[int, int] | None = None
     for picture in pictures:

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from mien.export.frames import in_world
     from mien.export.ply import read_ply, write_ply
+    from mien.export.world_space import in_world
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
-            "frames": ["in_world"],
+            "world_space": ["in_world"],
             "ply": ["read_ply", "write_ply"],
         },
     )

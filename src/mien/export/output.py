@@ -47,14 +47,14 @@ def plan_output(path: Path, frames: int, transparent: bool = False) -> Output:
         check_writable(path)
         if frames != 1:
             numbered = path.with_name(f"{path.stem}_%06d.png")
-            raise UserError(f"{path}: one picture, but there are {frames}; write --out {numbered}, or a folder")
+            raise UserError(f"{path}: is one picture, but there are {frames}; use --out {numbered}, or a folder")
     elif ending in (".mp4", ".webm"):
         output = Output(path, "mp4" if ending == ".mp4" else "webm", transparent)
         check_writable(path)
     else:
         raise UserError(f"{path}: cannot write {path.suffix}; use {ENDINGS}")
     if output.kind == "mp4" and transparent:
-        raise UserError(f"{path}: an .mp4 cannot be transparent; use .webm or .png, or name a --background")
+        raise UserError(f"{path}: an .mp4 cannot be transparent; use .webm or .png, or choose a --background")
     if output.kind == "sequence" and output.numbered(frames).exists():
         raise UserError(f"{output.numbered(frames)}: belongs to a longer sequence; delete it, or choose another name")
     return output

@@ -72,7 +72,7 @@ def _write_webm(output: Output, pictures: Iterable[np.ndarray], fps: int | float
     iterator = iter(pictures)
     first = next(iterator, None)
     if first is None:
-        raise UserError(f"{output.path}: no frames to write; check the selection of frames")
+        raise UserError(f"{output.path}: there are no frames to write; check the selection of frames")
     everything = itertools.chain([first], iterator)
     write_atomically(output.path, lambda aside: _encode_webm(aside, everything, first.shape, fps))
 

@@ -14,11 +14,11 @@ from mien.errors import UserError
 from mien.gaussians import Gaussians
 from mien.storage import write_atomically
 
-_HEADER_LIMIT = 65536
+_MAX_HEADER_BYTES = 65536
 _REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
 """Number of SH coefficients (1, 4, 9, 16) by the number of f_rest_* properties."""
-_DIGITS_OF_COUNT = 12
-_MOST_GAUSSIANS = 2_000_000
+_MAX_COUNT_DIGITS = 12
+_MAX_GAUSSIANS = 2_000_000
 """Largest number of Gaussians that is read: a head has tens of thousands, and memory grows with it."""
 _LOCAL_COMMENT = "mien frame: local"
 _WORLD_COMMENT = "mien frame: world"
@@ -75,9 +75,11 @@ def read_ply(path: Path) -> Gaussians:
             count, names = _parse_header(path, lines)
             expected, left = count * len(names) * 4, os.fstat(file.fileno()).st_size - file.tell()
             if left < expected:
-                raise UserError(f"{path}: truncated, {left} of {expected} bytes of vertices; copy or export it again")
-            if count > _MOST_GAUSSIANS:
-                raise UserError(f"{path}: {count:,} Gaussians, more than {_MOST_GAUSSIANS:,}; take fewer of them")
+                raise UserError(
+                    f"{path}: is truncated: it has {left} of {expected} bytes of vertices; copy or export it again"
+                )
+            if count > _MAX_GAUSSIANS:
+                raise UserError(f"{path}: has {count:,} Gaussians, more than {_MAX_GAUSSIANS:,}; remove some of them")
             body = file.read(expected)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -92,10 +94,10 @@ def _read_header(path: Path, file: IO[bytes]) -> list[str]:
     Raises:
         UserError: it is no .ply.
     """
-    content = file.read(_HEADER_LIMIT)
+    content = file.read(_MAX_HEADER_BYTES)
     end = content.find(b"end_header\n")
     if not content.startswith(b"ply") or end < 0:
-        raise UserError(f"{path}: no .ply file; give one with 3D Gaussians, as `mien export` writes")
+        raise UserError(f"{path}: is not a .ply file; give one with 3D Gaussians, as `mien export` writes")
     file.seek(end + len(b"end_header\n"))
     return content[:end].decode("ascii", errors="replace").splitlines()
 
@@ -137,8 +139,8 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
     if missing or others:
         reason = f"lacks {', '.join(missing)}" if missing else f"has {others[0]!r}, not float"
         raise UserError(f"{path}: {reason}; give a .ply with 3D Gaussians in full precision")
-    if len(elements[0][2]) > _DIGITS_OF_COUNT:
-        raise UserError(f"{path}: {elements[0][2][:_DIGITS_OF_COUNT]}... vertices are too many; export it again")
+    if len(elements[0][2]) > _MAX_COUNT_DIGITS:
+        raise UserError(f"{path}: has too many vertices ({elements[0][2][:_MAX_COUNT_DIGITS]}...); export it again")
     return int(elements[0][2]), names
 
 
@@ -153,14 +155,16 @@ def _pose_of(path: Path, lines: list[str]) -> Tensor | None:
             raise ValueError
         return pose
     except (ValueError, RuntimeError):
-        raise UserError(f"{path}: damaged frame comment {marked[0]!r}; export it again") from None
+        raise UserError(f"{path}: has a damaged frame comment, {marked[0]!r}; export it again") from None
 
 
 def _activated(columns: dict[str, np.ndarray], pose: Tensor | None, path: Path) -> Gaussians:
     """Gaussians from raw columns by name."""
     rest = sum(name.startswith("f_rest_") for name in columns)
     if rest not in _REST_COEFFICIENTS:
-        raise UserError(f"{path}: {rest} f_rest_* properties; expected 0, 9, 24 or 45 (SH degree 0 to 3)")
+        raise UserError(
+            f"{path}: has {rest} f_rest_* properties, not 0, 9, 24 or 45 (SH degree 0 to 3); give another .ply"
+        )
 
     def stack(names: list[str]) -> Tensor:
         missing = [name for name in names if name not in columns]

@@ -8,7 +8,7 @@ makes texture coordinates for a head without any).
 
 from mien.face.loading import FaceModelInfo, add_face_model, available_face_models, load_face_model, read_added_source
 from mien.face.model import FaceModel, Landmarks
-from mien.face.params import FaceParams, concatenate
+from mien.face.params import FaceParams, concatenate, most_frontal_camera
 from mien.face.posing import head_poses
 
 __all__ = [
@@ -22,4 +22,5 @@ __all__ = [
     "concatenate",
     "head_poses",
     "load_face_model",
+    "most_frontal_camera",
 ]

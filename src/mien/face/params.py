@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.camera import Camera
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 
 
@@ -59,6 +60,15 @@ class FaceParams:
     def detach(self) -> "FaceParams":
         """Return the same values, detached from the autograd graph."""
         return FaceParams(**{name: tensor.detach() for name, tensor in self.tensors().items()})
+
+
+def most_frontal_camera(cameras: Sequence[Camera], face: FaceParams) -> int:
+    """The index of the camera that the face looks at most directly, as the median over the timesteps of `face`."""
+    ahead, origins = face.T_world_head[:, :3, 2], face.head_translation
+    facing = [
+        torch.nn.functional.cosine_similarity(ahead, camera.position - origins, dim=1).median() for camera in cameras
+    ]
+    return int(torch.stack(facing).argmax())
 
 
 def concatenate(parts: Sequence[FaceParams]) -> FaceParams:

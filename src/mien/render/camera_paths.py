@@ -86,12 +86,12 @@ def read_cameras(path: Path) -> list[Camera]:
         UserError: the file is missing or damaged, or a camera is incomplete, not finite, or not a rigid view.
     """
     if not path.is_file():
-        raise UserError(f"{path}: no such file; name a json file of cameras (docs/using.md)")
+        raise UserError(f"{path}: no such file; give a json file of cameras (docs/using.md)")
     try:
         listed = read_json(path, FORMAT, VERSION).get("cameras")
     except UserError as error:
         # The user wrote this file, so there is no stage to run again.
-        raise UserError(f"{str(error).split('; ')[0]}; write it as docs/using.md says") from None
+        raise UserError(f"{str(error).split('; ')[0]}; write it as described in docs/using.md") from None
     if not isinstance(listed, list) or not listed:
         raise UserError(f"{path}: has no list `cameras`; give one camera for every frame")
     return [_camera_of(entry, f"{path}: camera {index}") for index, entry in enumerate(listed)]

@@ -17,12 +17,12 @@ NEAR = 0.01
 """Least depth of a Gaussian that is drawn, in metres."""
 DILATION = 0.3
 """Added to the diagonal of each 2D covariance, in pixels squared, so that no splat is smaller than about a pixel."""
-ALPHA_MAX = 0.999
-ALPHA_MIN = 1 / 255
+MAX_ALPHA = 0.999
+MIN_ALPHA = 1 / 255
 """Contributions with a smaller alpha are dropped."""
-TRANSMITTANCE_MIN = 1e-4
+MIN_TRANSMITTANCE = 1e-4
 """A Gaussian that would reduce the transmittance to this or less is not blended and ends the pixel."""
-FOV_MARGIN = 0.3
+MAX_FOV_MARGIN = 0.3
 """The Jacobian is computed at a direction at most this many half-images outside the picture."""
 
 
@@ -38,7 +38,7 @@ class Splats:
     opacities: Float[Tensor, " n"]
     colors: Float[Tensor, "n 3"]
     extents: Float[Tensor, "n 2"]
-    """Half sizes of the box outside of which alpha is below ALPHA_MIN, in pixels."""
+    """Half sizes of the box outside of which alpha is below MIN_ALPHA, in pixels."""
     drawn: Bool[Tensor, " n"]
 
     def radii(self) -> Int[Tensor, " n"]:
@@ -62,11 +62,11 @@ def project_splats(gaussians: Gaussians, camera: Camera, means2d_offset: Float[T
     xx, xy, yy = covariance[:, 0, 0] + DILATION, covariance[:, 0, 1], covariance[:, 1, 1] + DILATION
     means2d = (points @ camera.K.T)[:, :2] / points[:, 2:] + means2d_offset
     with torch.no_grad():
-        cutoff = 2 * torch.log(gaussians.opacities / ALPHA_MIN)  # squared Mahalanobis distance at alpha 1/255
+        cutoff = 2 * torch.log(gaussians.opacities / MIN_ALPHA)  # squared Mahalanobis distance at alpha 1/255
         extents = torch.sqrt(cutoff.clamp_min(0)[:, None] * torch.stack([xx, yy], -1))
         size = torch.tensor([camera.width, camera.height]).to(means2d)
         on_screen = ((means2d + extents > 0) & (means2d - extents < size)).all(-1)
-        drawn = in_front & (gaussians.opacities >= ALPHA_MIN) & on_screen
+        drawn = in_front & (gaussians.opacities >= MIN_ALPHA) & on_screen
     camera_position = -(rotation.T @ translation)
     directions = torch.nn.functional.normalize(gaussians.means - camera_position, dim=-1)
     colors = torch.clamp_min(spherical_harmonics(gaussians.sh, directions) + 0.5, 0)
@@ -84,7 +84,7 @@ def projection_jacobian(points: Float[Tensor, "n 3"], camera: Camera) -> Float[T
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     x, y, z = points.unbind(-1)
     with torch.no_grad():
-        margin_x, margin_y = FOV_MARGIN * 0.5 * camera.width / fx, FOV_MARGIN * 0.5 * camera.height / fy
+        margin_x, margin_y = MAX_FOV_MARGIN * 0.5 * camera.width / fx, MAX_FOV_MARGIN * 0.5 * camera.height / fy
         left, right = -cx / fx - margin_x, (camera.width - cx) / fx + margin_x
         top, bottom = -cy / fy - margin_y, (camera.height - cy) / fy + margin_y
     clamped_x = z * torch.clamp(x / z, left, right)

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.gaussians import Gaussians
-from mien.render.projection import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Splats, project_splats
+from mien.render.projection import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Splats, project_splats
 from mien.render.rendering import Rendering
 from mien.render.validation import check_finite
 
@@ -56,10 +56,10 @@ def _blend(
     conic = torch.stack([yy, -xy, xx], -1) / determinant[:, None]
     a, b, c = conic[:, :, None, None].unbind(1)
     exponent = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    alpha = torch.clamp_max(splats.opacities[chosen, None, None] * torch.exp(-exponent), ALPHA_MAX)
-    alpha = torch.where(alpha < ALPHA_MIN, 0, alpha)
+    alpha = torch.clamp_max(splats.opacities[chosen, None, None] * torch.exp(-exponent), MAX_ALPHA)
+    alpha = torch.where(alpha < MIN_ALPHA, 0, alpha)
     # Transmittance only falls, so the test also fails for all Gaussians behind the one that ends the pixel.
-    blended = torch.cumprod(1 - alpha.detach(), dim=0) > TRANSMITTANCE_MIN
+    blended = torch.cumprod(1 - alpha.detach(), dim=0) > MIN_TRANSMITTANCE
     alpha = torch.where(blended, alpha, 0)
     transmittance = torch.cumprod(torch.cat([alpha.new_ones(1, len(ys), len(xs)), 1 - alpha]), 0)
     weights = alpha * transmittance[:-1]

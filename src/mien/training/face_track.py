@@ -45,6 +45,10 @@ class FaceTrack:
             # Step counts stay on the CPU: numbers computed from them are needed there.
             moments.step = torch.zeros(len(face))
 
+    def index_of(self, sequence: int, timestep: int) -> int:
+        """The index, in the track, of a timestep of a sequence."""
+        return sum(self._lengths[:sequence]) + timestep
+
     def face(self, index: int) -> FaceParams:
         """One timestep. With tuning, its tensors are leaves that share memory with the track."""
         return self._row(index).face

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence as Items
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,16 +16,12 @@ from mien.training.split import held_out
 _ORDER, _BACKGROUND, _DENSITY = range(3)
 
 
-@dataclass(frozen=True)
-class Frame:
-    """One picture to train on."""
+class Frame(NamedTuple):
+    """One picture: the indices of one of the run's sequences, of a timestep in it, and of the camera."""
 
     sequence: int
-    """Index into the run's sequences."""
     timestep: int
     camera: int
-    track_index: int
-    """Index of the timestep when all sequences are put one after the other."""
 
 
 def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list[Frame]:
@@ -42,14 +38,13 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
     unknown = [camera_id for camera_id in settings.held_out_cameras if camera_id not in ids]
     if unknown:
         raise UserError(f"--hold-out-cameras {unknown[0]}: no such camera; there are: {', '.join(ids)}")
-    frames, start = [], 0
+    frames = []
     for index, sequence in enumerate(sequences):
         usable = sequence.usable() & sequence.sharp()
         usable = usable & ~held_out(sequence.capture.timesteps, settings.split).numpy()[:, None]
         cameras = [camera_id not in settings.held_out_cameras for camera_id in sequence.capture.camera_ids]
         if sequence.name not in settings.held_out_sequences:
-            frames += [Frame(index, int(t), int(c), start + int(t)) for t, c in np.argwhere(usable & np.array(cameras))]
-        start += sequence.capture.timesteps
+            frames += [Frame(index, int(t), int(c)) for t, c in np.argwhere(usable & np.array(cameras))]
     if not frames:
         places = [str(sequence.folder or sequence.name) for sequence in sequences]
         raise UserError(

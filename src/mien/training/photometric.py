@@ -10,15 +10,14 @@ from torch.nn.functional import conv2d
 
 from mien import _native
 from mien.arrays import recycled, unpacked
+from mien.pictures import Box
 
 WINDOW_RADIUS = 5
 """Radius of the SSIM window in pixels: it is 11x11."""
 WINDOW_SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2
+"""Constants of SSIM for colours in 0..1 (Wang et al. 2004)."""
 _NATIVE_MIN_WIDTH = 6
-
-Box = tuple[int, int, int, int]
-"""Left, top, width and height, in pixels."""
 
 
 def photometric_loss(
@@ -57,23 +56,21 @@ def photometric_loss_reference(
     left, top, width, height = _clipped(box, image)
     inside = (slice(top, top + height), slice(left, left + width))
     difference = (image - target)[inside].abs()
-    unlikeness = 1 - ssim_map(image, target)[inside]
+    unlikeness = 1 - differentiable_ssim_map(image, target)[inside]
     return (l1_weight * difference.sum() + ssim_weight * unlikeness.sum()) / image.numel()
 
 
-def ssim_map(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
-    """Structural similarity of two pictures (0..1) at every pixel, at most 1. Windows see zeros beyond the border."""
+def differentiable_ssim_map(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
+    """Structural similarity of two pictures (0..1) at every pixel, at most 1. Windows see zeros beyond the border.
+
+    `mien.evaluation.metrics.ssim_map` computes the same for scores, faster on a CPU and without gradients.
+    """
     statistics = (image, target, image * image, target * target, image * target)
     mean_x, mean_y, square_x, square_y, product = _blur(torch.stack(statistics))
     variance_x, variance_y = square_x - mean_x * mean_x, square_y - mean_y * mean_y
     covariance = product - mean_x * mean_y
     numerator = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
     return numerator / ((mean_x * mean_x + mean_y * mean_y + C1) * (variance_x + variance_y + C2))
-
-
-def ssim(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
-    """Mean of `ssim_map`. It is 1 for equal pictures."""
-    return ssim_map(image, target).mean()
 
 
 class _PhotometricLoss(torch.autograd.Function):

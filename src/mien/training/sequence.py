@@ -13,8 +13,8 @@ from mien.camera import Camera
 from mien.capture import Capture, read_capture, read_capture_hash
 from mien.errors import UserError
 from mien.locks import read_beside_writers
+from mien.pictures import Box
 from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, read_tracking
-from mien.training.photometric import Box
 
 _CACHE_BYTES = 1 << 30
 _ON_CPU = torch.zeros(())

@@ -173,13 +173,14 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     target = targets.target(frame.timestep, frame.camera, background, keep=settings.background == "white")
     avatar, weights = state.avatar, state.avatar.config.photometric
 
-    face = state.track.face(frame.track_index)
+    index = state.track.index_of(frame.sequence, frame.timestep)
+    face = state.track.face(index)
     posed = avatar.pose(face, progress)
     rendering = rasterize(posed.gaussians.timestep(0), targets.camera(frame.camera), target.background)
     losses = picture_losses(rendering, target, weights) | avatar.regularizers(posed, rendering, progress)
     torch.autograd.backward(list(losses.values()))
 
-    groups = [*avatar.parameter_groups(), *state.track.parameter_groups(frame.track_index)]
+    groups = [*avatar.parameter_groups(), *state.track.parameter_groups(index)]
     state.density.observe(posed, rendering)
     state.adam.step(groups, progress)
     random = partial(density_random, settings, state.step)

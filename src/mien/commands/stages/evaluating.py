@@ -9,7 +9,7 @@ from mien.evaluation.compare_report import write_comparison
 from mien.evaluation.evaluate import evaluate, is_evaluated
 from mien.evaluation.metrics_file import read_figures
 from mien.evaluation.protocols import EvaluationSettings
-from mien.evaluation.words import driven_line, protocol_line
+from mien.evaluation.text import driven_line, protocol_line
 from mien.inside import check_tree
 from mien.progress import say
 from mien.training import read_run_config

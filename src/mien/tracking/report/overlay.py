@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.capture.video import write_video
-from mien.face import FaceModel
+from mien.face import FaceModel, most_frontal_camera
 from mien.parallel import stream_in_threads
 from mien.progress import track_progress
 from mien.render.mesh import Headlight, render_mesh
@@ -154,13 +154,7 @@ class OverlayPainter:
 
 def frontal_camera(tracking: Tracking) -> int:
     """The index of the camera that the tracked face looks at most directly."""
-    ahead = tracking.face.T_world_head[tracking.valid][:, :3, 2]
-    origins = tracking.face.head_translation[tracking.valid]
-    facing = [
-        torch.nn.functional.cosine_similarity(ahead, camera.position - origins, dim=1).median()
-        for camera in tracking.cameras
-    ]
-    return int(torch.stack(facing).argmax())
+    return most_frontal_camera(tracking.cameras, tracking.face[tracking.valid])
 
 
 def region_colors(face_model: FaceModel) -> Float[torch.Tensor, "f 3 3"]:

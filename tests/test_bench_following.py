@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mien.benchmarking.motion import (
+from mien.benchmarking.following import (
     LIDS,
     blink_following,
     eye_opening,

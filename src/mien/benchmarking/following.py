@@ -14,15 +14,15 @@ from mien.tracking.landmarks import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
 LIDS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS)
 """MediaPipe's pairs of landmarks across the eyes' openings (`LIDS`), and of the eyes' corners (`_CORNERS`)."""
 _CORNERS = ((33, 133), (362, 263))
-_LEAST_BLINK = 0.25
+_MIN_BLINK = 0.25
 """Smallest decrease of an eye's opening in a blink, as a part of the median. A blink begins at half of it."""
-_FAST = np.radians(15.0)
+_MIN_FAST_SPEED = np.radians(15.0)
 """Angular speed in radians per second from which a head turns fast."""
 _AROUND_SECONDS = 0.3
 """Seconds before and after an event that belong to it."""
-_MOST_LAG, _LAG_STEP = 4.0, 0.05
+_MAX_LAG, _LAG_STEP = 4.0, 0.05
 """Largest lag and step of the search, in frames."""
-_STILL = 0.02
+_MAX_STILL_SPEED = 0.02
 """Speed in pixels per frame below which true landmarks stand still."""
 
 
@@ -52,7 +52,7 @@ def following(
     parts = [part for part in windows if np.isfinite(tracked[part]).all() and part.stop - part.start > 2]
     if not parts:
         return None
-    lags = np.arange(-_MOST_LAG, _MOST_LAG + _LAG_STEP / 2, _LAG_STEP)
+    lags = np.arange(-_MAX_LAG, _MAX_LAG + _LAG_STEP / 2, _LAG_STEP)
     sums = np.array([_products(tracked, true, parts, lag) for lag in lags])
     best = int((sums[:, 0] / np.sqrt(sums[:, 1] * sums[:, 2] + 1e-30)).argmax())
     return Following(float(lags[best]), float(100 * (1 - sums[best, 0] / max(sums[best, 2], 1e-30))), len(parts))
@@ -114,9 +114,9 @@ def blink_following(
     tracked, opening = (eye_opening(points[:, camera].astype(np.float64)) for points in (projected, true))
     middle = float(np.median(opening))
     depth = middle - opening.min()
-    if depth < _LEAST_BLINK * middle:
+    if depth < _MIN_BLINK * middle:
         return None
-    closing = opening < middle - max(0.5 * depth, 0.5 * _LEAST_BLINK * middle)
+    closing = opening < middle - max(0.5 * depth, 0.5 * _MIN_BLINK * middle)
     return following(tracked[:, None], opening[:, None], closing, max(round(_AROUND_SECONDS * fps), 2))
 
 
@@ -129,7 +129,7 @@ def turn_following(tracking: Tracking, truth: Truth, fps: float) -> Following | 
     middle = mean_rotation(true)
     signals = [axis_angle_from_matrix(middle.T @ turns).numpy() for turns in (tracked @ steady, true)]
     speed = axis_angle_from_matrix(true[:-1].mT @ true[1:]).norm(dim=-1).numpy() * fps
-    fast = np.concatenate([speed > _FAST, [False]])
+    fast = np.concatenate([speed > _MIN_FAST_SPEED, [False]])
     return following(signals[0], signals[1], fast, max(round(_AROUND_SECONDS * fps), 2))
 
 
@@ -144,7 +144,7 @@ def mean_rotation(rotations: Float[torch.Tensor, "n 3 3"]) -> Float[torch.Tensor
 def still_timesteps(true: Float[np.ndarray, "t c l 2"]) -> Bool[np.ndarray, " t2"]:
     """Return, for all timesteps but the first and the last, whether true landmarks stand still around them."""
     moving = np.linalg.norm(np.diff(true[:, 0], axis=0), axis=-1).max(-1)
-    return (moving[1:] < _STILL) & (moving[:-1] < _STILL)
+    return (moving[1:] < _MAX_STILL_SPEED) & (moving[:-1] < _MAX_STILL_SPEED)
 
 
 def jitter(points: Float[np.ndarray, "t *l d"], still: Bool[np.ndarray, " t2"]) -> float | None:
