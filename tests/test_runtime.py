@@ -195,7 +195,7 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
     nan = np.full_like(whole.neutral.expression, np.nan)
     for wrong, part in (
         (replace(whole, neutral=replace(whole.neutral, expression=nan)), "NaN"),
-        (replace(whole, baked=replace(bound, face_index=bound.face_index + 10**6)), "names what does not exist"),
+        (replace(whole, baked=replace(bound, face_index=bound.face_index + 10**6)), "that does not exist"),
         (replace(whole, expression_names=("drop",)), "1 expression names"),
         (replace(whole, joint_names=()), "0 joint names"),
         (replace(whole, baked=replace(bound, rig=replace(bound.rig, joint_parents=(2, 0, 0)))), "before its parent"),
@@ -208,10 +208,10 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="version 9"):
         runtime.load(path)
     safetensors.numpy.save_file(arrays, path)
-    with pytest.raises(UserError, match=r"is no \.mien file; write one with `mien export"):
+    with pytest.raises(UserError, match=r"is not a \.mien file; write one with `mien export"):
         runtime.load(path)
     (tmp_path / "b.mien").write_text(json.dumps({}))
-    with pytest.raises(UserError, match=r"is no \.mien file, or a damaged one .*; write one with `mien export"):
+    with pytest.raises(UserError, match=r"is damaged, or not a \.mien file .*; write one with `mien export"):
         runtime.load(tmp_path / "b.mien")
     with pytest.raises(UserError, match="no such file; write one with `mien export"):
         runtime.load(tmp_path / "none.mien")

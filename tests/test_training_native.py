@@ -9,7 +9,7 @@ from torch import Tensor
 from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.avatar import Moments
-from mien.avatar.penalties import triangle_penalties, triangle_penalties_reference
+from mien.avatar.gaussian_avatars import triangle_penalties, triangle_penalties_reference
 from mien.training.adam import Update, update_all, update_reference
 from mien.training.density.gradient import observe_reference
 

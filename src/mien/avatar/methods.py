@@ -63,7 +63,7 @@ def method_named(name: str) -> Method:
         UserError: there is no method of that name.
     """
     if name not in METHODS:
-        raise UserError(f"no method {name!r}; there are: {', '.join(METHODS)}")
+        raise UserError(f"no method {name!r}; the methods are {', '.join(METHODS)}")
     return METHODS[name]
 
 

@@ -129,7 +129,7 @@ def render(
     )  # fmt: skip
     frame = _native.rasterize_forward(means, quats, scales, opacities, sh, colour, view, K, image, alpha, radii)
     if frame is None:
-        raise ValueError("render: NaN or infinity in the Gaussians, the camera or the background")
+        raise ValueError("render: the Gaussians, the camera or the background hold NaN or infinity")
     return image, alpha
 
 
@@ -153,7 +153,7 @@ def _with_named(
     else:
         values = np.asarray(given, np.float32)
         if values.shape != rest.shape:
-            raise ValueError(f"{of}s of shape {values.shape}, expected {rest.shape}")
+            raise ValueError(f"{of}s have the shape {values.shape}, expected {rest.shape}")
     if not np.isfinite(values).all():
         raise ValueError(f"{of}s are not finite: {given}")
     return values
