@@ -1,10 +1,19 @@
 """GaussianAvatars' formulas."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
+from torch import Tensor
 
+from instruction_sets import ISAS, each_isa
+from mien import _native
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, GaussianStore, Progress
-from mien.avatar.gaussian_avatars import never_empty_a_triangle
+from mien.avatar.gaussian_avatars import (
+    never_empty_a_triangle,
+    triangle_penalties,
+    triangle_penalties_reference,
+)
 from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh, world_means
 from mien.render import rasterize
@@ -83,3 +92,41 @@ def test_no_triangle_is_emptied() -> None:
     prune = torch.tensor([True, True, True, False, True])
     assert never_empty_a_triangle(store, prune).tolist() == [False, False, True, False, True]
     assert new_avatar().density().may_prune is never_empty_a_triangle
+
+
+@pytest.fixture(params=ISAS)
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    yield from each_isa(request)
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    """Standard normal numbers."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 4097])
+def test_triangle_penalties_equal_their_reference(isa: str, count: int) -> None:
+    means, log_scales = random(count, 3), random(count, 3, seed=1)
+    means[:2] = 0  # whose length has no derivative
+    radii = torch.randint(0, 3, (count,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
+    results = []
+    for function, dtype in ((triangle_penalties, torch.float32), (triangle_penalties_reference, torch.float64)):
+        inputs = [tensor.to(dtype).requires_grad_() for tensor in (means, log_scales)]
+        position, scale = function(inputs[0], inputs[1], radii, thresholds=(1.0, 0.6), weights=(0.5, 2.0))
+        gradients = torch.autograd.grad(3 * position + scale, inputs)
+        results.append([tensor.double() for tensor in (position, scale, *gradients)])
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-7)
+
+
+def test_penalties_have_the_same_bits_for_any_number_of_threads() -> None:
+    means, log_scales, radii = random(20_000, 3), random(20_000, 3, seed=1), torch.ones(20_000, dtype=torch.int32)
+    before, results = _native.thread_count(), []
+    for threads in (1, 2, 3):
+        _native.set_thread_count(threads)
+        inputs = [tensor.clone().requires_grad_() for tensor in (means, log_scales)]
+        position, scale = triangle_penalties(inputs[0], inputs[1], radii, thresholds=(1.0, 0.6), weights=(0.5, 2.0))
+        results.append((position, scale, *torch.autograd.grad(position + scale, inputs)))
+    _native.set_thread_count(before)
+    for other in results[1:]:
+        assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
