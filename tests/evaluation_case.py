@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
+from mien.avatar import DEFAULT_METHOD, METHODS, Avatar
 from mien.camera import Camera, camera_from_fov
 from mien.capture.capture import Capture
 from mien.evaluation.experiment import Experiment
@@ -27,7 +27,7 @@ def make_experiment(timesteps: int = 50, split: Split = "blocks", seed: int = 0)
     torch.manual_seed(seed)
     face_model = make_small_face_model()
     face = _motion(face_model.neutral(timesteps))
-    avatar = GaussianAvatars(GaussianAvatarsConfig(), face_model, face)
+    avatar = METHODS[DEFAULT_METHOD].avatar(METHODS[DEFAULT_METHOD].config(), face_model, face)
     _paint(avatar)
     camera = camera_from_fov(0.6, SIZE, SIZE, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     sequence = _sequence(avatar, face, camera)
@@ -57,7 +57,7 @@ def _motion(face: FaceParams) -> FaceParams:
     )
 
 
-def _paint(avatar: GaussianAvatars) -> None:
+def _paint(avatar: Avatar) -> None:
     """Make the Gaussians opaque and small, with colours that depend on the place on the head."""
     model, store = avatar.face_model, avatar.gaussian_store()
     middle = model.template[model.faces].mean(1)
@@ -69,7 +69,7 @@ def _paint(avatar: GaussianAvatars) -> None:
         store["sh_constant"].copy_(sh_from_rgb(rgb)[:, None])
 
 
-def _sequence(avatar: GaussianAvatars, face: FaceParams, camera: Camera) -> Sequence:
+def _sequence(avatar: Avatar, face: FaceParams, camera: Camera) -> Sequence:
     images = np.zeros((len(face), 1, SIZE, SIZE, 3), np.uint8)
     alphas = np.zeros((len(face), 1, SIZE, SIZE), np.uint8)
     with torch.no_grad():

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mien.avatar import FaceTuning, GaussianAvatarsConfig
+from mien.avatar import DEFAULT_METHOD, METHODS, FaceTuning
 from mien.capture import write_capture
 from mien.evaluation.experiment import Experiment
 from mien.pictures import to_uint8
@@ -66,5 +66,5 @@ def write_sequence(root: Path, experiment: Experiment, sequence: Sequence) -> Pa
 
 def write_run(run_dir: Path, experiment: Experiment, folders: list[Path], settings: TrainSettings) -> None:
     """Train some sequences for a few steps."""
-    config = GaussianAvatarsConfig(face_tuning=FaceTuning(enabled=False))
+    config = METHODS[DEFAULT_METHOD].config(face_tuning=FaceTuning(enabled=False))
     train([read_sequence(folder) for folder in folders], experiment.avatar.face_model, config, settings, run_dir)

@@ -254,7 +254,7 @@ def test_going_on_from_an_older_checkpoint_is_said(
     train_toy.main(tmp_path, train_toy.SETTINGS.steps)
     shown = capsys.readouterr()
     said = " ".join((shown.err + shown.out).split())
-    assert "going on from the older checkpoint" in said
+    assert "training continues from the older checkpoint" in said
     assert f"start {int(older.stem.removeprefix('step_'))}" in said
     result = "avatar/avatar.safetensors"
     assert (tmp_path / result).read_bytes() == (run_dir / result).read_bytes()

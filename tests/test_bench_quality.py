@@ -113,7 +113,7 @@ def test_the_table_names_key_and_baselines():
     figures = {**figures, "head": dict(figures)}
     protocols = {"novel_view": {**figures, "baselines": {"mean_frame": figures, "mesh": figures}}}
     errors = {"a": TrackingErrors(1.0, 2.0, 3.0, 0.5, None)}
-    table = markdown_table([QualityRow("ring-16", "abcd", "headgas", 10, 99, protocols, errors, {"draw": 1.0})])
+    table = markdown_table([QualityRow("ring-16", "abcd", "a_method", 10, 99, protocols, errors, {"draw": 1.0})])
     assert "ring-16 (`abcd`) | novel_view | avatar | 30.00 / 0.900 / 0.0100 / - |" in table
     assert "mean frame" in table
     assert "| mesh |" in table

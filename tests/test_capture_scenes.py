@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mien.avatar import DEFAULT_METHOD
 from mien.capture import read_capture
 from mien.capture.video import write_video
 from mien.cli import main
@@ -126,7 +127,7 @@ def test_a_clip_with_cuts_becomes_an_avatar(three_scenes: tuple[Path, np.ndarray
     # test_subject_commands tracks several scenes together by their pixels.
     arguments += ["--tracking.schedule", "landmarks", "--tracking.keyframes", "6"]
     assert main([*arguments, "--steps", "20", "--preset", "draft", "--hold-out", "scenes-2"]) == 0
-    run = tmp_path / "out/runs/gaussian_avatars"
+    run = tmp_path / "out/runs" / DEFAULT_METHOD
     trained = json.loads((run / "config.json").read_text())["data"]
     assert [entry["sequence"] for entry in trained] == ["scenes-1", "scenes-2", "scenes-3"]
     metrics = json.loads((run / "metrics.json").read_text())

@@ -17,7 +17,6 @@ from mien.avatar import (
     RefillSettings,
 )
 from mien.avatar.density import split_along_axes
-from mien.avatar.gaussian_avatars import never_empty_a_triangle
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.rotation import matrix_from_quaternion
@@ -122,15 +121,13 @@ def test_an_avatar_keeps_one_gaussian_whatever_is_pruned() -> None:
     assert store["face_index"].tolist() == [1]
 
 
-def test_no_triangle_is_emptied() -> None:
-    store = make_store([0.001] * 5, faces=[7, 7, 8, 8, 8])
-    prune = torch.tensor([True, True, True, False, True])
-    assert never_empty_a_triangle(store, prune).tolist() == [False, False, True, False, True]
-    strategy = control(store, may_prune=never_empty_a_triangle)
-    store.assign("opacity_logits", torch.logit(torch.tensor([0.001, 0.001, 0.001, 0.5, 0.001])))
-    strategy.observe(pose(store), rendering([0.0] * 5))
+def test_a_method_may_forbid_prunes() -> None:
+    store = make_store([0.001] * 3)
+    store.assign("opacity_logits", torch.logit(torch.tensor([0.001, 0.001, 0.5])))
+    strategy = control(store, may_prune=lambda store, prune: prune & (store["face_index"] != 1))
+    strategy.observe(pose(store), rendering([0.0] * 3))
     strategy.adapt(store, pose(store), Progress(0, 100), random)
-    assert store["face_index"].tolist() == [7, 7, 8]
+    assert store["face_index"].tolist() == [1, 2]
 
 
 def test_growth_stops_at_the_limit_with_those_that_pull_most() -> None:

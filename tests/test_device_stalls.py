@@ -3,18 +3,13 @@
 This needs no GPU: tensors on torch's `meta` device have no numbers, so reading one raises an error.
 """
 
+from dataclasses import fields, replace
+
 import pytest
 import torch
 from torch import Tensor
 
-from mien.avatar import (
-    GaussianAvatarsConfig,
-    HeadGasConfig,
-    MethodConfig,
-    MonoGaussianAvatarConfig,
-    Photometric,
-)
-from mien.avatar.store import Moments
+from mien.avatar import METHODS, MethodConfig, Moments
 from mien.camera import Camera
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
@@ -32,12 +27,18 @@ def test_meta_tensors_show_who_asks_for_a_number() -> None:
             ask(META + 1)
 
 
-CONFIGS = {
-    "gaussian_avatars": GaussianAvatarsConfig(photometric=Photometric(alpha_weight=0.1)),
-    "gaussian_avatars_sh3": GaussianAvatarsConfig(sh_degree=3, sh_frame="world"),
-    "headgas": HeadGasConfig(),
-    "mono_gaussian_avatar": MonoGaussianAvatarConfig(points=200),
-}
+def configs() -> dict[str, MethodConfig]:
+    """All methods, with every loss, and again with colours that depend on the view where a method has them."""
+    found = {}
+    for name, method in METHODS.items():
+        config = method.config()
+        found[name] = replace(config, photometric=replace(config.photometric, alpha_weight=0.1))
+        if "sh_degree" in {field.name for field in fields(config)}:
+            found[f"{name}-sh3"] = replace(config, sh_degree=3)
+    return found
+
+
+CONFIGS = configs()
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())

@@ -6,13 +6,14 @@ from pathlib import Path
 import pytest
 
 from mien import runtime
+from mien.avatar import DEFAULT_METHOD
 from mien.capture.video import probe_video
 from mien.cli import main
 from mien.export import read_ply
 
 DEMO = ("--seconds", "1.2", "--steps", "150")
 FRAMES = 30
-RUN = Path("runs/gaussian_avatars")
+RUN = Path("runs") / DEFAULT_METHOD
 
 
 @pytest.fixture(scope="module")

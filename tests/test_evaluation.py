@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from evaluation_case import make_experiment
+from mien.avatar import DEFAULT_METHOD
 from mien.evaluation.baselines import make_baselines
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import psnr
@@ -101,7 +102,7 @@ def _run_record() -> RunRecord:
     return RunRecord(
         name="first",
         config={
-            "method": {"kind": "gaussian_avatars"},
+            "method": {"kind": DEFAULT_METHOD},
             "settings": {"kind": "TrainSettings"},
             "data": [{"sequence": "clip"}],
             "mien": "0.1.0",

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from evaluation_case import make_experiment
-from mien.avatar import FaceTuning, GaussianAvatarsConfig
+from mien.avatar import DEFAULT_METHOD, METHODS, FaceTuning
 from mien.capture import write_capture
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, read_metrics
@@ -33,7 +33,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     write_tracking(folder / "tracking", sequence.tracking)
     write_scoring(folder / "scoring", experiment.scorings[0])
     settings = TrainSettings(steps=STEPS, record_every=1, checkpoint_every=STEPS)
-    config = GaussianAvatarsConfig(face_tuning=FaceTuning(enabled=False))
+    config = METHODS[DEFAULT_METHOD].config(face_tuning=FaceTuning(enabled=False))
     train([read_sequence(folder)], experiment.avatar.face_model, config, settings, run_dir)
     return folder, run_dir
 

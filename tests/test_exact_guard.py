@@ -9,7 +9,7 @@ import torch
 
 from exact_guard import InexactError, exact_guard
 from mien import exact
-from mien.avatar import GaussianAvatarsConfig
+from mien.avatar import DEFAULT_METHOD, METHODS
 from mien.files import file_digest, write_json
 from mien.gaussians import Gaussians
 from mien.render import rasterize
@@ -100,7 +100,7 @@ def test_a_step_of_training_adds_up_by_itself():
     """
     face_model, sequence = toy_sequence(timesteps=3, size=32)
     settings = TrainSettings(steps=100, split="none", background="random", record_every=100)
-    state = trainer.start([sequence], face_model, GaussianAvatarsConfig(), settings, torch.zeros(()))
+    state = trainer.start([sequence], face_model, METHODS[DEFAULT_METHOD].config(), settings, torch.zeros(()))
     order = FrameOrder(training_frames([sequence], settings), settings.seed)
     data = trainer.TrainingData(order, (Targets(sequence, 0),))
     trainer.step(state, data, settings)

@@ -184,7 +184,7 @@ def test_moments_of_another_type(run: Path, tmp_path: Path) -> None:
     write_tensors(tmp_path / newest.name, tensors)
     model, sequence = toy_sequence(timesteps=5, size=32)
     state = trainer.start([sequence], model, train_toy.CONFIG, train_toy.SETTINGS)
-    with pytest.raises(UserError, match="the moments of means are of another type"):
+    with pytest.raises(UserError, match="the moments of means have another type"):
         resume(tmp_path, state)
 
 

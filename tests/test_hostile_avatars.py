@@ -7,6 +7,7 @@ import shutil
 import struct
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from torch import Tensor
 import train_toy
 from damage import edit_json, nested
 from mien import runtime
-from mien.avatar import METHODS, Avatar, load_avatar, make_portable, write_avatar
+from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, load_avatar, make_portable, write_avatar
 from mien.errors import UserError
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.face.model import FaceModel
@@ -99,9 +100,17 @@ TENSORS: dict[str, Callable[[dict[str, Tensor]], object]] = {
 
 @pytest.mark.parametrize("name", TENSORS)
 def test_tensors_that_do_not_fit(name: str, avatars: dict[str, Path], tmp_path: Path) -> None:
-    folder = received(avatars, "gaussian_avatars", tmp_path)
-    change(folder, TENSORS[name])
-    refused(folder)
+    """In every method that has such tensors."""
+    changed = 0
+    for method in METHODS:
+        folder = received(avatars, method, tmp_path / method)
+        try:
+            change(folder, TENSORS[name])
+        except KeyError:
+            continue
+        changed += 1
+        refused(folder)
+    assert changed
 
 
 def of_config(**values: Any) -> Callable[[dict[str, Any]], object]:
@@ -109,42 +118,50 @@ def of_config(**values: Any) -> Callable[[dict[str, Any]], object]:
 
 
 SETTINGS: dict[str, tuple[str, Callable[[dict[str, Any]], object]]] = {
-    "degree odd": ("gaussian_avatars", of_config(sh_degree=17)),
-    "degree negative": ("gaussian_avatars", of_config(sh_degree=-1)),
-    "degree text": ("gaussian_avatars", of_config(sh_degree="2")),
-    "degree huge": ("headgas", of_config(sh_degree=HUGE)),
-    "frame": ("gaussian_avatars", of_config(sh_frame=["world"])),
-    "rate huge": ("gaussian_avatars", of_config(means_rate={"kind": "Rate", "start": HUGE})),
-    "density": ("headgas", of_config(density=[1])),
-    "hidden": ("headgas", of_config(hidden=10**9)),
-    "features": ("headgas", of_config(features=10**9)),
-    "bands": ("headgas", of_config(encoding_bands=10**9)),
-    "length": ("headgas", of_config(encoding_length=0.0)),
-    "width": ("mono_gaussian_avatar", of_config(attribute_width=10**9)),
-    "layers": ("mono_gaussian_avatar", of_config(attribute_layers=10**9)),
-    "gaussians": ("headgas", lambda c: c.update(gaussians=10**12)),
-    "gaussians huge": ("headgas", lambda c: c.update(gaussians=HUGE)),
-    "method": ("headgas", lambda c: c.update(kind="gaussian_avatars")),
-    "no method": ("headgas", lambda c: c.update(kind=["headgas"])),
-    "config": ("headgas", lambda c: c.update(config=[])),
-    "face model": ("headgas", lambda c: c.update(face_model="../../../secret")),
-    "face model of text": ("headgas", lambda c: c.update(face_model=3)),
-    "face model elsewhere": ("headgas", lambda c: c.update(face_model="../x", face_model_carried=False)),
+    "degree odd": ("sh_degree", of_config(sh_degree=17)),
+    "degree negative": ("sh_degree", of_config(sh_degree=-1)),
+    "degree text": ("sh_degree", of_config(sh_degree="2")),
+    "degree huge": ("sh_degree", of_config(sh_degree=HUGE)),
+    "frame": ("sh_frame", of_config(sh_frame=["world"])),
+    "rate huge": ("means_rate", of_config(means_rate={"kind": "Rate", "start": HUGE})),
+    "density": ("density", of_config(density=[1])),
+    "hidden": ("hidden", of_config(hidden=10**9)),
+    "features": ("features", of_config(features=10**9)),
+    "bands": ("encoding_bands", of_config(encoding_bands=10**9)),
+    "length": ("encoding_length", of_config(encoding_length=0.0)),
+    "width": ("attribute_width", of_config(attribute_width=10**9)),
+    "layers": ("attribute_layers", of_config(attribute_layers=10**9)),
+    "gaussians": ("", lambda c: c.update(gaussians=10**12)),
+    "gaussians huge": ("", lambda c: c.update(gaussians=HUGE)),
+    "method": ("", lambda c: c.update(kind=next(name for name in METHODS if name != c["kind"]))),
+    "no method": ("", lambda c: c.update(kind=[c["kind"]])),
+    "config": ("", lambda c: c.update(config=[])),
+    "face model": ("", lambda c: c.update(face_model="../../../secret")),
+    "face model of text": ("", lambda c: c.update(face_model=3)),
+    "face model elsewhere": ("", lambda c: c.update(face_model="../x", face_model_carried=False)),
 }
+"""The setting that a method has to have, and a change of avatar.json."""
+
+
+def having(setting: str) -> list[str]:
+    """The methods that have a setting; "" is had by all."""
+    return [name for name, method in METHODS.items() if setting in ("", *(f.name for f in fields(method.config)))]
 
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_settings_that_cannot_be(name: str, avatars: dict[str, Path], tmp_path: Path) -> None:
     """Impossible settings of an avatar are refused in one line."""
-    method, edit = SETTINGS[name]
-    folder = received(avatars, method, tmp_path)
-    edit_json(folder / "avatar.json", edit)
-    with pytest.raises(UserError) as error:
-        load_avatar(folder)
-    assert "\n" not in str(error.value)
+    setting, edit = SETTINGS[name]
+    assert having(setting)
+    for method in having(setting):
+        folder = received(avatars, method, tmp_path / method)
+        edit_json(folder / "avatar.json", edit)
+        with pytest.raises(UserError) as error:
+            load_avatar(folder)
+        assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("method", ["headgas", "mono_gaussian_avatar"])
+@pytest.mark.parametrize("method", having("points"))
 def test_what_counts_only_at_the_beginning_takes_no_memory(
     method: str, avatars: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -159,14 +176,14 @@ def test_what_counts_only_at_the_beginning_takes_no_memory(
 
 
 def test_an_avatar_that_is_a_link_is_not_read(avatars: dict[str, Path], tmp_path: Path) -> None:
-    folder = received(avatars, "headgas", tmp_path / "run")
+    folder = received(avatars, DEFAULT_METHOD, tmp_path / "run")
     secret = tmp_path / "secret.safetensors"
     (folder / "avatar.safetensors").rename(secret)
     (folder / "avatar.safetensors").symlink_to(secret)
     refused(folder, "a link")
     refused(folder.parent, "a link")
     shutil.rmtree(folder)
-    folder.symlink_to(avatars["headgas"])
+    folder.symlink_to(avatars[DEFAULT_METHOD])
     with pytest.raises(UserError, match="a link"):
         load_avatar(folder.parent)
 
@@ -202,7 +219,7 @@ def test_face_models_that_cannot_be(
     """Impossible face models are refused, by themselves and inside an avatar, with a matching hash."""
     monkeypatch.setattr("mien.face.model.FaceModel.__init__", unchecked_init(FaceModel))
     wrong = MODELS[name](toy_face_model())
-    folder = received(avatars, "gaussian_avatars", tmp_path)
+    folder = received(avatars, DEFAULT_METHOD, tmp_path)
     monkeypatch.setattr("mien.face.model.FaceModel.content_hash", "0123")
     write_face_model(folder / "face_model", wrong)
     edit_json(folder / "avatar.json", lambda content: content.update(face_model_hash="0123"))
@@ -266,6 +283,7 @@ def test_checkpoints_that_cannot_be(name: str, run_dir: Path, tmp_path: Path) ->
     assert "\n" not in str(error.value)
 
 
+@cache
 def new_portable(method: str) -> portable.PortableAvatar:
     face_model, sequence = toy_sequence(5, 32)
     torch.manual_seed(0)
@@ -288,51 +306,57 @@ def rewrite(path: Path, edit: Callable[[dict[str, Any], dict[str, np.ndarray]], 
 
 
 Edit = Callable[[dict[str, Any], dict[str, np.ndarray]], object]
-PORTABLES: dict[str, tuple[str, Edit]] = {
-    "array for a text": ("headgas", lambda c, a: c["about"].update(name={"tensor": "camera.K"})),
-    "array for a choice": ("headgas", lambda c, a: c["baked"]["network"].update(input={"tensor": "camera.K"})),
-    "array for a kind": ("headgas", lambda c, a: c["baked"].update(kind={"tensor": "camera.K"})),
-    "array for a number": ("headgas", lambda c, a: c["camera"].update(width={"tensor": "camera.K"})),
-    "array for a scale": ("mono_gaussian_avatar", lambda c, a: c["baked"].update(scale_gain={"tensor": "camera.K"})),
-    "tensor of a list": ("headgas", lambda c, a: c["camera"].update(K={"tensor": [1]})),
-    "content of a list": ("headgas", lambda c, a: c.update(baked=[1])),
-    "width": ("gaussian_avatars", lambda c, a: c["camera"].update(width=10**9)),
-    "width huge": ("gaussian_avatars", lambda c, a: c["camera"].update(width=HUGE)),
-    "camera": ("gaussian_avatars", lambda c, a: a["camera.K"].fill(3e38)),
-    "viewmat": ("headgas", lambda c, a: a["camera.viewmat"].fill(0)),
-    "parents of text": ("gaussian_avatars", lambda c, a: c["baked"]["rig"].update(joint_parents=["-1", "0", "0"])),
-    "parents in a circle": ("gaussian_avatars", lambda c, a: c["baked"]["rig"].update(joint_parents=[-1, 2, 1])),
-    "parents huge": ("gaussian_avatars", lambda c, a: c["baked"]["rig"].update(joint_parents=[-1, 0, HUGE])),
-    "too few parents": ("gaussian_avatars", lambda c, a: c["baked"]["rig"].update(joint_parents=[-1])),
-    "free": ("gaussian_avatars", lambda c, a: c["baked"]["rig"].update(joint_free=[True] * 3)),
-    "triangle": ("gaussian_avatars", lambda c, a: a["baked.faces"].fill(2**31 - 1)),
-    "triangle negative": ("gaussian_avatars", lambda c, a: a["baked.face_index"].fill(-1)),
-    "scales": ("gaussian_avatars", lambda c, a: a["baked.attributes.log_scales"].fill(1000)),
-    "gain": ("mono_gaussian_avatar", lambda c, a: c["baked"].update(scale_gain=1e300)),
-    "outputs twice": ("headgas", lambda c, a: c["baked"]["network"].update(outputs=["sh", "sh"])),
-    "outputs": ("headgas", lambda c, a: c["baked"]["network"].update(outputs=["means"])),
-    "no layers": ("headgas", lambda c, a: c["baked"]["network"].update(weights=[], biases=[])),
-    "sh": ("gaussian_avatars", lambda c, a: a.update({"baked.attributes.sh": np.zeros((len(
-        a["baked.attributes.quats"]), 2, 3), np.float32)})),
-    "dtype": ("gaussian_avatars", lambda c, a: a.update({"baked.means": a["baked.means"].astype(np.float64)})),
-    "shape": ("gaussian_avatars", lambda c, a: a.update({"baked.means": a["baked.means"][:3].copy()})),
-    "lines": ("gaussian_avatars", lambda c, a: c["about"].update(name="a\x1b[2Jb")),
-    "deep": ("gaussian_avatars", lambda c, a: c["about"].update(name=nested(400))),
+PORTABLES: dict[str, Edit] = {
+    "array for a text": lambda c, a: c["about"].update(name={"tensor": "camera.K"}),
+    "array for a choice": lambda c, a: c["baked"]["network"].update(input={"tensor": "camera.K"}),
+    "array for a kind": lambda c, a: c["baked"].update(kind={"tensor": "camera.K"}),
+    "array for a number": lambda c, a: c["camera"].update(width={"tensor": "camera.K"}),
+    "array for a scale": lambda c, a: c["baked"].update(scale_gain={"tensor": "camera.K"}),
+    "tensor of a list": lambda c, a: c["camera"].update(K={"tensor": [1]}),
+    "content of a list": lambda c, a: c.update(baked=[1]),
+    "width": lambda c, a: c["camera"].update(width=10**9),
+    "width huge": lambda c, a: c["camera"].update(width=HUGE),
+    "camera": lambda c, a: a["camera.K"].fill(3e38),
+    "viewmat": lambda c, a: a["camera.viewmat"].fill(0),
+    "parents of text": lambda c, a: c["baked"]["rig"].update(joint_parents=["-1", "0", "0"]),
+    "parents in a circle": lambda c, a: c["baked"]["rig"].update(joint_parents=[-1, 2, 1]),
+    "parents huge": lambda c, a: c["baked"]["rig"].update(joint_parents=[-1, 0, HUGE]),
+    "too few parents": lambda c, a: c["baked"]["rig"].update(joint_parents=[-1]),
+    "free": lambda c, a: c["baked"]["rig"].update(joint_free=[True] * 3),
+    "triangle": lambda c, a: a["baked.faces"].fill(2**31 - 1),
+    "triangle negative": lambda c, a: a["baked.face_index"].fill(-1),
+    "scales": lambda c, a: a["baked.attributes.log_scales"].fill(1000),
+    "gain": lambda c, a: c["baked"].update(scale_gain=1e300),
+    "outputs twice": lambda c, a: c["baked"]["network"].update(outputs=["sh", "sh"]),
+    "outputs": lambda c, a: c["baked"]["network"].update(outputs=["means"]),
+    "no layers": lambda c, a: c["baked"]["network"].update(weights=[], biases=[]),
+    "sh": lambda c, a: a.update({"baked.attributes.sh": np.zeros((len(
+        a["baked.attributes.quats"]), 2, 3), np.float32)}),
+    "dtype": lambda c, a: a.update({"baked.means": a["baked.means"].astype(np.float64)}),
+    "shape": lambda c, a: a.update({"baked.means": a["baked.means"][:3].copy()}),
+    "lines": lambda c, a: c["about"].update(name="a\x1b[2Jb"),
+    "deep": lambda c, a: c["about"].update(name=nested(400)),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", PORTABLES)
 def test_portable_files_that_cannot_be(name: str, tmp_path: Path) -> None:
-    method, edit = PORTABLES[name]
-    path = tmp_path / "a.mien"
-    runtime.write_portable(path, new_portable(method))
-    rewrite(path, lambda content, arrays: None)
-    runtime.read_portable(path)
-    rewrite(path, edit)
-    with pytest.raises(UserError) as error:
+    """In every method whose files have such a part."""
+    changed, path = 0, tmp_path / "a.mien"
+    for method in METHODS:
+        runtime.write_portable(path, new_portable(method))
+        rewrite(path, lambda content, arrays: None)
         runtime.read_portable(path)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
+        try:
+            rewrite(path, PORTABLES[name])
+        except (KeyError, AttributeError):
+            continue
+        changed += 1
+        with pytest.raises(UserError) as error:
+            runtime.read_portable(path)
+        assert str(path) in str(error.value)
+        assert "\n" not in str(error.value)
+    assert changed
 
 
 @pytest.mark.parametrize("method", METHODS)

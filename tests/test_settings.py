@@ -308,7 +308,6 @@ def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.
     rest = [field.name for field in fields(TrainSettings) if field.name not in DIALS]
     assert rest
     assert all(f"--training.{name.replace('_', '-')} " in shown for name in rest)
-    assert f"--method.{'density.max-gaussians' if method != 'mono_gaussian_avatar' else 'max-points'}" in shown
 
 
 def test_help_all_shows_what_a_file_asks_for(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from mien.avatar import DEFAULT_METHOD
 from mien.capture.video import read_video_frames, write_video
 from mien.cli import main
 from mien.synthetic import SyntheticRecipe, write_synthetic_video
@@ -43,7 +44,7 @@ def _identity(workspace: Path, name: str) -> torch.Tensor:
     return read_tracking(workspace / "sequences" / name / "tracking").face.identity.clone()  # not a map of the file
 
 
-def _config(workspace: Path, run: str = "gaussian_avatars") -> dict:
+def _config(workspace: Path, run: str = DEFAULT_METHOD) -> dict:
     return json.loads((workspace / "runs" / run / "config.json").read_text())
 
 
@@ -52,7 +53,7 @@ def test_two_clips_make_one_avatar(workspace: Path) -> None:
     assert torch.equal(_identity(workspace, "one"), _identity(workspace, "two"))
     assert [entry["sequence"] for entry in _config(workspace)["data"]] == ["one", "two"]
     assert _config(workspace)["settings"]["held_out_sequences"] == ["two"]
-    metrics = json.loads((workspace / "runs/gaussian_avatars/metrics.json").read_text())
+    metrics = json.loads((workspace / "runs" / DEFAULT_METHOD / "metrics.json").read_text())
     assert sum(entry["frames"] for entry in metrics["protocols"].values()) == 12
     assert all((workspace / f"sequences/{name}/tracking/overlay.mp4").is_file() for name in ("one", "two"))
 
@@ -86,7 +87,7 @@ def test_a_third_clip_gives_all_a_new_identity(
     assert main(["track", str(workspace), *TRACKING]) == 0
     shown = capsys.readouterr().err
     assert "three added: all 3 sequences are tracked again" in shown
-    assert "Trained on the previous tracking: gaussian_avatars" in shown
+    assert f"Trained on the previous tracking: {DEFAULT_METHOD}" in shown
     assert torch.equal(_identity(workspace, "one"), _identity(workspace, "three"))
     assert not torch.equal(_identity(workspace, "one"), before)
 
@@ -94,7 +95,7 @@ def test_a_third_clip_gives_all_a_new_identity(
     assert "tracked again after this run was trained" in capsys.readouterr().err
     train = ["train", str(workspace), "--steps", "20", "--preset", "draft"]
     assert main(train) == 2
-    assert "gaussian_avatars: holds a run with other settings" in capsys.readouterr().err
+    assert f"{DEFAULT_METHOD}: holds a run with other settings" in capsys.readouterr().err
     assert main([*train, "--run", "all"]) == 0
     assert [entry["sequence"] for entry in _config(workspace, "all")["data"]] == ["one", "three", "two"]
     assert main([*train, "--run", "some", "--sequences", "one", "--hold-out", "three"]) == 0

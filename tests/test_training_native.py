@@ -9,7 +9,6 @@ from torch import Tensor
 from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.avatar import Moments
-from mien.avatar.penalties import triangle_penalties, triangle_penalties_reference
 from mien.training.adam import Update, update_all, update_reference
 from mien.training.density.gradient import observe_reference
 
@@ -46,21 +45,6 @@ def test_adam_takes_what_is_not_dense_by_the_reference() -> None:
     values = torch.zeros(4, 3)
     update_all([Update(values, torch.ones(1, 3).expand(4, 3), Moments.zeros(values), 0.1)])
     torch.testing.assert_close(values, torch.full((4, 3), -0.1))
-
-
-@pytest.mark.parametrize("count", COUNTS)
-def test_triangle_penalties_equal_their_reference(isa: str, count: int) -> None:
-    means, log_scales = random(count, 3), random(count, 3, seed=1)
-    means[:2] = 0  # whose length has no derivative
-    radii = torch.randint(0, 3, (count,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
-    results = []
-    for function, dtype in ((triangle_penalties, torch.float32), (triangle_penalties_reference, torch.float64)):
-        inputs = [tensor.to(dtype).requires_grad_() for tensor in (means, log_scales)]
-        position, scale = function(inputs[0], inputs[1], radii, thresholds=(1.0, 0.6), weights=(0.5, 2.0))
-        gradients = torch.autograd.grad(3 * position + scale, inputs)
-        results.append([tensor.double() for tensor in (position, scale, *gradients)])
-    for ours, theirs in zip(*results, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -101,15 +85,13 @@ def test_mean_squared_difference(isa: str, size: tuple[int, int]) -> None:
 
 def test_the_same_bits_for_any_number_of_threads() -> None:
     """The number of threads does not change a bit."""
-    means, log_scales, radii = random(20_000, 3), random(20_000, 3, seed=1), torch.ones(20_000, dtype=torch.int32)
+    values, gradient = random(20_000, 3), random(20_000, 3, seed=1)
     before, results = _native.thread_count(), []
     for threads in (1, 2, 3):
         _native.set_thread_count(threads)
-        inputs = [tensor.clone().requires_grad_() for tensor in (means, log_scales)]
-        position, scale = triangle_penalties(inputs[0], inputs[1], radii, thresholds=(1.0, 0.6), weights=(0.5, 2.0))
-        update = Update(means.clone(), log_scales, Moments.zeros(means), 0.1)
+        update = Update(values.clone(), gradient, Moments.zeros(values), 0.1)
         update_all([update])
-        results.append((position, scale, *torch.autograd.grad(position + scale, inputs), update.values))
+        results.append((update.values, update.moments.first, update.moments.second))
     _native.set_thread_count(before)
     for other in results[1:]:
         assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))

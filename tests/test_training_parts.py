@@ -79,7 +79,7 @@ def test_calibrated_cameras_train_also_where_they_find_no_face() -> None:
 
 def test_nothing_to_train_on_is_the_users_to_mend() -> None:
     _, sequence = toy_sequence(5, 16)
-    with pytest.raises(UserError, match="no frame to train on"):
+    with pytest.raises(UserError, match="no frame is left to train on"):
         training_frames([sequence], TrainSettings(held_out_cameras=("front",)))
 
 

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from flame_like import exact_landmarks, flame_like, write_npz
-from mien.avatar import load_avatar, make_portable
-from mien.avatar.gaussian_avatars import GaussianAvatars, GaussianAvatarsConfig
+from mien.avatar import DEFAULT_METHOD, METHODS, load_avatar, make_portable
 from mien.capture import Capture, write_capture
 from mien.cli import main
 from mien.commands.stages import face_models as stage
@@ -179,6 +178,7 @@ def test_the_papers_schedule_takes_it_too(added, capture):
 
 def test_a_model_that_may_not_be_copied_is_named_with_ways_out(added):
     model = replace(load_face_model("my_head"), shareable=False)
-    avatar = GaussianAvatars(GaussianAvatarsConfig(), model, model.neutral())
+    method = METHODS[DEFAULT_METHOD]
+    avatar = method.avatar(method.config(), model, model.neutral())
     with pytest.raises(UserError, match=r"my_head.*\.ply.*--face-model.*--shareable"):
         make_portable(avatar, still_camera(), "someone")

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import torch
 
-from mien.avatar import FaceTuning, GaussianAvatarsConfig, GradientSettings
+from mien.avatar import DEFAULT_METHOD, METHODS, FaceTuning, GradientSettings
 from mien.progress import Advance
 from mien.training import TrainSettings, train
 from toy_scene import toy_sequence
 
-CONFIG = GaussianAvatarsConfig(
+CONFIG = METHODS[DEFAULT_METHOD].config(
     density=GradientSettings(start=0.2, stop=0.8, rounds=4, grow_gradient=1e-4, max_gaussians=400),
     face_tuning=FaceTuning(enabled=True),
 )

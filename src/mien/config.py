@@ -175,7 +175,7 @@ def _in_short(value: Any) -> str:
     shape = getattr(value, "shape", None)
     if shape is not None:
         return f"{value.dtype} {tuple(shape)}"
-    text = repr(value)
+    text = " ".join(repr(value).split())
     return text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "..."
 
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from mien.avatar.activation import sigmoid
     from mien.avatar.avatar import Avatar, ParameterGroup, Posed, move_avatar, network_group, neutral_of, store_group
     from mien.avatar.baking import as_array, bake_rig, make_portable
     from mien.avatar.density import DensityControl, FixedDensity, GradientDensity, RefillDensity
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
     from mien.avatar.headgas import HeadGas
     from mien.avatar.headgas_settings import HeadGasConfig
-    from mien.avatar.methods import METHODS, Method, method_named, method_of
+    from mien.avatar.methods import DEFAULT_METHOD, METHODS, Method, method_named, method_of
     from mien.avatar.mono_gaussian_avatar import MonoGaussianAvatar
     from mien.avatar.mono_gaussian_avatar_settings import MonoGaussianAvatarConfig
     from mien.avatar.schedules import TRAINED, Progress, Rate
@@ -23,6 +24,7 @@ else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
+            "activation": ["sigmoid"],
             "avatar": [
                 "Avatar",
                 "ParameterGroup",
@@ -39,7 +41,7 @@ else:
             "gaussian_avatars_settings": ["GaussianAvatarsConfig"],
             "headgas": ["HeadGas"],
             "headgas_settings": ["HeadGasConfig"],
-            "methods": ["METHODS", "Method", "method_named", "method_of"],
+            "methods": ["DEFAULT_METHOD", "METHODS", "Method", "method_named", "method_of"],
             "mono_gaussian_avatar": ["MonoGaussianAvatar"],
             "mono_gaussian_avatar_settings": ["MonoGaussianAvatarConfig"],
             "schedules": ["TRAINED", "Progress", "Rate"],
@@ -49,6 +51,7 @@ else:
     )
 
 __all__ = [
+    "DEFAULT_METHOD",
     "METHODS",
     "TRAINED",
     "Avatar",
@@ -83,6 +86,7 @@ __all__ = [
     "move_avatar",
     "network_group",
     "neutral_of",
+    "sigmoid",
     "store_group",
     "write_avatar",
 ]

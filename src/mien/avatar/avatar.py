@@ -1,6 +1,7 @@
 """The interface of avatars: an avatar is a function from face parameters to Gaussians.
 
-A new method is one file with an `Avatar`, one with its settings, and one line in `mien.avatar.methods`.
+A new method is one file with an `Avatar` and its settings, and one line in `mien.avatar.methods` (CONTRIBUTING.md, "Add
+a method"). Methods that stay keep their settings in a file of their own, which needs no torch.
 """
 
 from abc import ABC, abstractmethod

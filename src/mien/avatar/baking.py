@@ -58,9 +58,9 @@ def make_portable(avatar: Avatar, camera: Camera, name: str) -> PortableAvatar:
     model, subject = avatar.face_model, avatar.subject
     if not model.shareable:
         raise UserError(
-            f"{name}: a .mien file holds parts of the face model {model.name!r}, whose licence is not known to allow "
-            "that; export a .ply instead, train with another --face-model, or, if it does, say so: mien face-models "
-            f"--add FILE --name {model.name} --shareable"
+            f"{name}: a .mien file holds parts of the face model {model.name!r}, and its licence is not known to allow "
+            "that; export a .ply instead, or train with another --face-model; if the licence does allow it, run "
+            f"`mien face-models --add FILE --name {model.name} --shareable`"
         )
     licences = {info.name: info.licence for info in available_face_models()}
     return PortableAvatar(

@@ -1,6 +1,7 @@
 """Descriptions of a method's density control: the strategy, its settings, and hooks that only the method can provide.
 
-The strategies themselves are in `mien.training.density`. They see a `GaussianStore` and one of these descriptions.
+The strategies themselves are in `mien.training.density`, one file each. They see a `GaussianStore` and one of these
+descriptions, never the method.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,8 +16,8 @@ from mien.avatar.store import GaussianStore
 from mien.rotation import matrix_from_quaternion
 
 
-def keep_all_prunes(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """The hook of methods that allow every Gaussian to be pruned."""
+def allow_all_prunes(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """The hook of methods that let every Gaussian be pruned."""
     return prune
 
 
@@ -52,7 +53,7 @@ class GradientDensity:
     """(store, highest opacity of each Gaussian since the last round) -> the opacity to prune by."""
     split: Callable[[GaussianStore, Int[Tensor, " p"], Float[Tensor, "p 3"]], dict[str, Tensor]] = split_along_axes
     """(store, parents, standard normal noise) -> tensors, by name, in which children differ from their parents."""
-    may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = keep_all_prunes
+    may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = allow_all_prunes
     """(store, prunes requested) -> prunes allowed."""
 
 
@@ -66,7 +67,7 @@ class RefillDensity:
     from their parents."""
     judged_opacities: Callable[[GaussianStore, Float[Tensor, " n"]], Float[Tensor, " n"]] = highest_opacities_seen
     """(store, highest opacity of each Gaussian since the last round) -> the opacity to prune by."""
-    may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = keep_all_prunes
+    may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = allow_all_prunes
     """(store, prunes requested) -> prunes allowed."""
 
 

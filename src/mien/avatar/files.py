@@ -21,7 +21,7 @@ from mien.runtime.checks import baked_fault
 from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
-_LARGEST_INDEX = 2**31 - 1
+_MAX_INDEX = 2**31 - 1
 _REMEDY = "delete the run's training.json, if it is there, and train it again with `mien train`"
 
 
@@ -82,7 +82,7 @@ def _load_avatar(folder: Path) -> Avatar:
     named = {name: value for name, value in stored.items() if name not in ("format", "version")}
     content: _Content = decode(_Content, named, where, _REMEDY)
     if content.gaussians < 0:
-        raise UserError(f"{where}: {content.gaussians} Gaussians; {_REMEDY}")
+        raise UserError(f"{where}: has {content.gaussians} Gaussians; {_REMEDY}")
     try:
         method = method_named(content.kind)
     except UserError as error:
@@ -96,7 +96,7 @@ def _load_avatar(folder: Path) -> Avatar:
         face = FaceParams(**_with_prefix(tensors, "subject."))
     check_face_params(face_model, face, str(folder), _REMEDY)
     if len(face) != 1:
-        raise UserError(f"{folder}: its subject is {len(face)} timesteps at rest, not one; {_REMEDY}")
+        raise UserError(f"{folder}: its subject has {len(face)} timesteps instead of one; {_REMEDY}")
     with torch.random.fork_rng(devices=[]):
         avatar = method.avatar(for_loading(config), face_model, face)
     avatar.config = config
@@ -132,18 +132,14 @@ def _misfit(own: dict[str, Tensor], state: dict[str, Tensor], gaussians: int) ->
             return f"lacks {name!r}"
         found = state[name]
         if found.dtype != tensor.dtype or found.shape[1:] != tensor.shape[1:] or found.ndim != tensor.ndim:
-            return f"{name!r} is {found.dtype} {list(found.shape)}"
+            return f"{name!r} is of type {found.dtype} and shape {list(found.shape)}"
         if found.is_floating_point() and not (found.numel() == 0 or bool(found.abs().max() <= MAX_NUMBER)):
             return f"{name!r} holds NaN or numbers beyond {MAX_NUMBER:g}"
         # Baking narrows indices to 32 bits: what is larger would come round to one that exists.
-        if (
-            found.dtype == torch.int64
-            and found.numel() > 0
-            and not (found.min() >= 0 and found.max() <= _LARGEST_INDEX)
-        ):
-            return f"{name!r} holds numbers that are no indices"
+        if found.dtype == torch.int64 and found.numel() > 0 and not (found.min() >= 0 and found.max() <= _MAX_INDEX):
+            return f"{name!r} holds numbers that are not indices"
     known = {len(tensor) for tensor in state.values() if tensor.ndim > 0 and tensor[:1].numel() > 0}
-    return None if gaussians == 0 or gaussians in known else f"{gaussians} Gaussians, by no tensor"
+    return None if gaussians == 0 or gaussians in known else f"no tensor has {gaussians} Gaussians"
 
 
 def _face_model_of(folder: Path, content: _Content) -> FaceModel:
@@ -156,7 +152,7 @@ def _face_model_of(folder: Path, content: _Content) -> FaceModel:
     if face_model.content_hash != content.face_model_hash:
         raise UserError(
             f"{folder}: was trained with face model {name!r} {content.face_model_hash}, but the one here is "
-            f"{face_model.content_hash}; install that version of the face model, or train again"
+            f"{face_model.content_hash}; install that version of the face model, or train it again"
         )
     return face_model
 

@@ -1,4 +1,4 @@
-"""HeadGaS (Dhamo et al., ECCV 2024): Gaussians that do not move in the head frame; expressions change their appearance.
+"""HeadGaS (Dhamo et al., ECCV 2024): Gaussians at rest in the head frame; expressions change colour and opacity.
 
 No code was published, so this is written from the paper, its supplement and its equations. Each Gaussian blends a basis
 of latent features by the expression. One small network turns the result into colour and opacity, so that lips fade

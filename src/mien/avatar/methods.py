@@ -1,7 +1,6 @@
-"""The list of methods. A new method adds one line here.
+"""The list of methods. A new method adds one line here (CONTRIBUTING.md, "Add a method").
 
-Settings are imported at once, so that the command line can list and check them. Avatars need torch and are imported at
-their first use.
+This file needs no torch, because the command line lists the methods' settings and checks them.
 """
 
 import importlib
@@ -9,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mien.avatar import gaussian_avatars_settings, headgas_settings, mono_gaussian_avatar_settings
 from mien.avatar.settings import MethodConfig
 from mien.errors import UserError
 
@@ -19,12 +17,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Method:
-    """A method: its settings for each preset, and the class of its avatars."""
+    """A method: the class of its avatars, and its settings. Both are imported at their first use."""
 
-    presets: Mapping[str, MethodConfig]
-    """Settings for each preset of `mien.training.PRESETS`, all of one class."""
     avatar_class: str
     """"MODULE:CLASS"; see `avatar`."""
+    settings_module: str = ""
+    """The module that holds `PRESETS`. Default: the module of the class. A separate one that does not import torch
+    keeps `--help` and the checks of options fast."""
+
+    @property
+    def presets(self) -> Mapping[str, MethodConfig]:
+        """Settings for each preset of `mien.training.PRESETS`, all of one class."""
+        return importlib.import_module(self.settings_module or self.avatar_class.split(":")[0]).PRESETS
 
     @property
     def config(self) -> type[MethodConfig]:
@@ -39,12 +43,17 @@ class Method:
 
 
 METHODS = {
-    "gaussian_avatars": Method(gaussian_avatars_settings.PRESETS, "mien.avatar.gaussian_avatars:GaussianAvatars"),
-    "headgas": Method(headgas_settings.PRESETS, "mien.avatar.headgas:HeadGas"),
+    "gaussian_avatars": Method("mien.avatar.gaussian_avatars:GaussianAvatars", "mien.avatar.gaussian_avatars_settings"),
+    "headgas": Method("mien.avatar.headgas:HeadGas", "mien.avatar.headgas_settings"),
     "mono_gaussian_avatar": Method(
-        mono_gaussian_avatar_settings.PRESETS, "mien.avatar.mono_gaussian_avatar:MonoGaussianAvatar"
+        "mien.avatar.mono_gaussian_avatar:MonoGaussianAvatar", "mien.avatar.mono_gaussian_avatar_settings"
     ),
 }
+"""All methods by name. A method whose settings import torch comes last: looking for the method of a config goes
+through the settings in this order."""
+
+DEFAULT_METHOD = "gaussian_avatars"
+"""Method of a run that names none."""
 
 
 def method_named(name: str) -> Method:
@@ -54,7 +63,7 @@ def method_named(name: str) -> Method:
         UserError: there is no method of that name.
     """
     if name not in METHODS:
-        raise UserError(f"no method {name!r}; there are: {', '.join(METHODS)}")
+        raise UserError(f"no method {name!r}; the methods are {', '.join(METHODS)}")
     return METHODS[name]
 
 

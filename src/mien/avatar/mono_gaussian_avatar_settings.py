@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import MAX_GAUSSIANS, MethodConfig, Photometric
+from mien.avatar.settings import GAUSSIAN_COUNT, MethodConfig, Photometric
 from mien.ranges import NOT_NEGATIVE, Range, ToLoad
 
 _WIDTH = Range(1, 1024)
@@ -25,7 +25,7 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Number of Gaussians at the start, on a sphere."""
     sphere_radius: Annotated[float, Range(1e-3, 10)] = 0.125
     """Radius of the initial sphere around the origin of the head frame, in metres."""
-    max_points: Annotated[int, MAX_GAUSSIANS] = 6_000
+    max_points: Annotated[int, GAUSSIAN_COUNT] = 6_000
     """Largest number of Gaussians. Growth stops there (paper: 100,000)."""
     rounds: Annotated[int, Range(1, 100_000)] = 50
     """Number of equal parts of the run. Points are pruned and refilled after each part except the last (paper: 100
@@ -47,7 +47,7 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Learning rate of the networks, per step (paper: 1e-4, over some hundred thousand steps)."""
     face_weight: Annotated[float, NOT_NEGATIVE] = 10.0
     """Weight of the losses that keep points near the face model. It halves at 0.2, 0.3, 0.5 and 0.7 of the run."""
-    face_points: Annotated[int, MAX_GAUSSIANS] = 512
+    face_points: Annotated[int, GAUSSIAN_COUNT] = 512
     """Number of points that these losses use in each step, in turn."""
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 from mien.avatar.schedules import Rate
 from mien.ranges import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
 
-MAX_GAUSSIANS = Range(1, 10_000_000)
+GAUSSIAN_COUNT = Range(1, 10_000_000)
 """Range of a number of Gaussians. Tens of millions would not fit into memory."""
 
 
@@ -74,7 +74,7 @@ class GradientSettings:
     """Times at which opacities are lowered to `reset_opacity`, as fractions of the run."""
     reset_opacity: Annotated[float, Range(1e-6, 1)] = 0.01
     """Highest opacity that remains after a reset."""
-    max_gaussians: Annotated[int, MAX_GAUSSIANS] = 40_000
+    max_gaussians: Annotated[int, GAUSSIAN_COUNT] = 40_000
     """Largest number of Gaussians. Growth stops there; Gaussians with the largest gradients grow first."""
 
 
@@ -84,7 +84,7 @@ class RefillSettings:
 
     times: Annotated[tuple[float, ...], Range(0, 1, ascending=True)]
     """Times of the rounds, as fractions of the run."""
-    targets: Annotated[tuple[int, ...], MAX_GAUSSIANS]
+    targets: Annotated[tuple[int, ...], GAUSSIAN_COUNT]
     """Number of Gaussians after each round."""
     prune_opacity: Annotated[float, FRACTION] = 0.1
     """Gaussians are removed if their opacity stayed below this in all views since the last round."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from mien.avatar import DEFAULT_METHOD
 from mien.commands.options import MethodName
 from mien.devices import DeviceName, check_device, choose_device, like_on
 from mien.errors import UserError
@@ -120,7 +121,7 @@ class Quality:
 
     captures: tuple[CaptureName, ...] = ()
     """Names of reference captures (default: all)."""
-    method: MethodName = "gaussian_avatars"
+    method: MethodName = DEFAULT_METHOD
     """Method of the avatars."""
     steps: int = 0
     """Number of optimiser steps. 0 means each capture's own number."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin,
 
 import tyro
 
-from mien.avatar import METHODS, MethodConfig
+from mien.avatar import DEFAULT_METHOD, METHODS, MethodConfig
 from mien.commands.config_file import ConfigFile, read_config_file
 from mien.commands.help_text import subclass_with
 from mien.commands.settings_options import applied, check_names, leaves, options_type
@@ -33,7 +33,7 @@ _IN_DETAIL = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]
 class TrainOptions:
     """The main options of training. All other settings come from the preset, the file and the method."""
 
-    method: MethodName = "gaussian_avatars"
+    method: MethodName = DEFAULT_METHOD
     """Method that makes the avatar (compared in docs/results.md)."""
     config: Path | None = None
     """A .json with settings, for example the config.json of a run to repeat (docs/settings.md). Options override the

@@ -16,9 +16,8 @@ from mien.face.checks import check_face_params
 from mien.storage import expect_whole, read_tensors
 from mien.tracking import read_scoring, read_scoring_hash
 from mien.training import Sequence, TrainSettings, check_data, read_run_config
-from mien.training.frames import Frame, training_frames
+from mien.training.frames import Frame, held_out, training_frames
 from mien.training.sequence import sequence_of
-from mien.training.split import held_out
 
 
 def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Experiment]:

@@ -130,7 +130,7 @@ def render(
     arrays = _native.GaussianArrays(means, quats, scales, opacities, sh)
     task = _native.RasterizeView(arrays, colour, view, K, image, alpha, radii)
     if _native.rasterize_views([task], differentiable=False) == [None]:
-        raise ValueError("render: NaN or infinity in the Gaussians, the camera or the background")
+        raise ValueError("render: the Gaussians, the camera or the background hold NaN or infinity")
     return image, alpha
 
 
@@ -154,7 +154,7 @@ def _with_named(
     else:
         values = np.asarray(given, np.float32)
         if values.shape != rest.shape:
-            raise ValueError(f"{of}s of shape {values.shape}, expected {rest.shape}")
+            raise ValueError(f"{of}s have the shape {values.shape}, expected {rest.shape}")
     if not np.isfinite(values).all():
         raise ValueError(f"{of}s are not finite: {given}")
     return values

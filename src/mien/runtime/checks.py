@@ -21,9 +21,9 @@ from mien.runtime.baked import (
     Static,
 )
 
-MOST_SHAPES = 256
+MAX_SHAPES = 256
 """Largest number of expressions, plus nine for each free joint, that native/face.h accepts."""
-_LARGEST_LOG_SCALE = 30
+_MAX_LOG_SCALE = 30
 """Largest logarithm of a scale. Its exponential, and the square of that, still fit into float32."""
 
 
@@ -46,22 +46,22 @@ def _faults(avatar: PortableAvatar) -> Iterator[str]:
     baked, e = avatar.baked, len(avatar.expression_names)
     yield from _number_faults(avatar)
     names, free = _names(baked)
-    if len(names) + 9 * len(free) > MOST_SHAPES:
-        yield f"{len(names)} expressions and {len(free)} free joints, more than can be posed"
+    if len(names) + 9 * len(free) > MAX_SHAPES:
+        yield f"it has {len(names)} expressions and {len(free)} free joints, more than can be posed"
     yield from _baked_faults(baked)
     if avatar.expression_bounds.shape[0] != e or avatar.neutral.expression.shape[0] != e:
-        yield f"{e} expression names, but bounds of {avatar.expression_bounds.shape[0]}"
+        yield f"it has {e} expression names, but bounds of {avatar.expression_bounds.shape[0]} expressions"
     if len(avatar.joint_names) != len(avatar.neutral.joints):
-        yield f"{len(avatar.joint_names)} joint names, but {len(avatar.neutral.joints)} joints at rest"
+        yield f"it has {len(avatar.joint_names)} joint names, but {len(avatar.neutral.joints)} joints at rest"
     if (names, free) != (avatar.expression_names, avatar.joint_names):
-        yield "its parts have different expressions or joints"
+        yield "its parts name different expressions or joints"
     camera = avatar.camera
     fault = camera_fault(camera.K, camera.viewmat, camera.width, camera.height)
     if fault is not None:
-        yield f"its camera is none: {fault}"
+        yield f"its camera is not valid ({fault})"
     texts = [getattr(avatar.about, f.name) for f in fields(avatar.about)]
     if not all(map(is_one_line, (*texts, *avatar.expression_names, *avatar.joint_names))):
-        yield "a name in it is not in one line"
+        yield "a name in it has several lines"
 
 
 def _names(baked: BakedAvatar) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -77,28 +77,28 @@ def _baked_faults(baked: BakedAvatar) -> Iterator[str]:
     attributes, n = baked.attributes, len(baked.attributes.quats)
     parts = [getattr(attributes, f.name) for f in fields(attributes)]
     if any(len(part) != n for part in parts):
-        yield "its Gaussians' attributes are of different numbers"
-    if not np.abs(attributes.log_scales).max(initial=0) <= _LARGEST_LOG_SCALE:
-        yield f"a scale beyond exp({_LARGEST_LOG_SCALE})"
+        yield "its attributes have different numbers of Gaussians"
+    if not np.abs(attributes.log_scales).max(initial=0) <= _MAX_LOG_SCALE:
+        yield f"a scale is beyond exp({_MAX_LOG_SCALE})"
     if attributes.sh.shape[1] not in (1, 4, 9, 16):
-        yield f"{attributes.sh.shape[1]} SH coefficients, not 1, 4, 9 or 16"
+        yield f"it has {attributes.sh.shape[1]} SH coefficients per channel, not 1, 4, 9 or 16"
     if not isinstance(baked, Static):
         yield from _rig_faults(baked.rig)
     if isinstance(baked, MeshBound):
         if not (are_indices(baked.faces, len(baked.rig.template)) and are_indices(baked.face_index, len(baked.faces))):
-            yield "a triangle or Gaussian names what does not exist"
+            yield "a triangle refers to a vertex, or a Gaussian to a triangle, that does not exist"
         if not len(baked.face_index) == len(baked.means) == n:
-            yield "its Gaussians' places are of another number"
+            yield "its centres and its attributes have different numbers of Gaussians"
         return
     if isinstance(baked, BlendSkinned) and len(baked.rig.template) != n:
-        yield f"{len(baked.rig.template)} points, but {n} Gaussians"
+        yield f"it has {len(baked.rig.template)} points, but {n} Gaussians"
     if isinstance(baked, BlendSkinned):
         if max(abs(baked.scale_gain), abs(baked.scale_offset)) > MAX_NUMBER:
-            yield f"scales of {baked.scale_gain:g} metres"
+            yield f"its scales reach {baked.scale_gain:g} metres"
         if baked.colour_activation == "sigmoid" and attributes.sh.shape[1] != 1:
-            yield "a colour of several SH coefficients"
+            yield "its colours are sigmoids, but have several SH coefficients"
     if isinstance(baked, Static) and len(baked.means) != n:
-        yield f"{len(baked.means)} points, but {n} Gaussians"
+        yield f"it has {len(baked.means)} points, but {n} Gaussians"
     if baked.bases is not None:
         yield from _bases_faults(baked.bases, attributes, len(names), mean_moves=isinstance(baked, Static))
     if baked.network is not None:
@@ -117,9 +117,9 @@ def _bases_faults(bases: LinearBases, attributes: Attributes, e: int, mean_moves
     for f in fields(bases):
         basis = getattr(bases, f.name)
         if basis is not None and basis.shape != (e, *shapes[f.name]):
-            yield f"its basis of {f.name} does not fit"
+            yield f"the shape of its basis of {f.name} does not fit"
     if bases.means is not None and not mean_moves:
-        yield "a basis of its means, which its rig has already"
+        yield "it has a basis of its means, but its rig already moves them"
 
 
 def _rig_faults(rig: Rig) -> Iterator[str]:
@@ -134,41 +134,41 @@ def _rig_faults(rig: Rig) -> Iterator[str]:
     }  # fmt: skip
     for name, shape in shapes.items():
         if getattr(rig, name).shape != shape:
-            yield f"its rig's {name} does not fit"
+            yield f"the shape of its rig's {name} does not fit"
     if rig.pose_basis is not None and rig.pose_basis.shape[1:] != (m, 3):
-        yield "its rig's pose_basis does not fit"
+        yield "the shape of its rig's pose_basis does not fit"
     if rig.pose_basis is not None and len(rig.pose_basis) != 9 * sum(rig.joint_free):
-        yield f"{len(rig.pose_basis)} pose correctives for {sum(rig.joint_free)} free joints"
+        yield f"it has {len(rig.pose_basis)} pose correctives for {sum(rig.joint_free)} free joints"
 
 
 def _network_faults(network: AttributeNetwork, attributes: Attributes, e: int, j: int) -> Iterator[str]:
     widths = {"quats": 4, "log_scales": 3, "opacity_logits": 1, "sh": 3 * attributes.sh.shape[1]}
     if not set(network.outputs) <= set(widths):
-        yield f"its network gives {network.outputs}"
+        yield f"its network has the unknown outputs {network.outputs}"
         return
     if len(network.base) != len(attributes.quats):
-        yield "its network is of other Gaussians"
+        yield "its network has another number of Gaussians"
     if len(set(network.outputs)) != len(network.outputs):
-        yield "its network gives something twice"
+        yield "its network has the same output twice"
     if not network.weights or len(network.weights) != len(network.biases):
         yield "its network has no layers, or layers without biases"
         return
     width = network.base.shape[1] + (3 if network.input == "displacement" else 0)
     for weight, bias in zip(network.weights, network.biases, strict=True):
         if weight.shape[1] != width or len(bias) != len(weight):
-            yield "its network's layers do not fit"
+            yield "the shapes of its network's layers do not fit"
         width = len(weight)
     if width != sum(widths[name] for name in network.outputs):
-        yield "its network's outputs do not fit"
+        yield "the width of its network's outputs does not fit"
     if network.input == "features":
         features = network.basis.shape[2]
         joints, n = network.joint_basis, len(network.base)
         if network.basis.shape[1] != n or (joints is not None and joints.shape[1] != n):
-            yield "its network's bases are of other Gaussians"
+            yield "its network's bases have another number of Gaussians"
         if network.basis.shape[0] != e or features > network.base.shape[1]:
-            yield "its network's basis does not fit"
+            yield "the shape of its network's basis does not fit"
         if joints is not None and (joints.shape[0] != 3 * j or joints.shape[2] != features):
-            yield "its network's joint basis does not fit"
+            yield "the shape of its network's joint basis does not fit"
 
 
 def _free_names(rig: Rig) -> tuple[str, ...]:

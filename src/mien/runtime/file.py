@@ -54,12 +54,12 @@ def read_portable(path: Path) -> PortableAvatar:
         metadata, arrays = read_safetensors(path, _load)
     except UserError as error:
         reason = str(error).split("; ")[0].partition("file (")[2].removesuffix(")")
-        raise UserError(f"{path}: is no .mien file, or a damaged one ({reason}); {_REMEDY}") from None
+        raise UserError(f"{path}: is damaged, or not a .mien file ({reason}); {_REMEDY}") from None
     try:
         header = parse_json(metadata.get("mien", "{}"))
         found = (header.get("format"), header.get("version"))
         if found == (None, None):
-            raise UserError(f"{path}: is no .mien file; {_REMEDY}")
+            raise UserError(f"{path}: is not a .mien file; {_REMEDY}")
         if found != (FORMAT, VERSION):
             raise UserError(
                 f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {FORMAT!r} version {VERSION}; "
@@ -69,7 +69,7 @@ def read_portable(path: Path) -> PortableAvatar:
             raise UserError(f"{path}: is not what was written; copy it again, or export it again with `mien export`")
         tree = _restored(header["content"], arrays)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise UserError(f"{path}: damaged ({repr(error)[:200]}); export it again with `mien export`") from None
+        raise UserError(f"{path}: is damaged ({repr(error)[:200]}); export it again with `mien export`") from None
     with expect_whole(path, "export it again with `mien export`"), jaxtyped("context"):
         avatar: PortableAvatar = decode(PortableAvatar, tree, str(path), "export it again with `mien export`")
     check(avatar, str(path))

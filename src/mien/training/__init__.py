@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from mien.training.presets import PRESETS, Preset
+    from mien.training.frames import held_out
     from mien.training.run import (
         check_data,
         check_run,
@@ -17,14 +17,13 @@ if TYPE_CHECKING:
         run_camera,
     )
     from mien.training.sequence import Sequence, read_sequence
-    from mien.training.settings import DIALS, Split, TrainSettings, check_held_out
-    from mien.training.split import held_out
+    from mien.training.settings import DIALS, PRESETS, Preset, Split, TrainSettings, check_held_out
     from mien.training.trainer import train
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
-            "presets": ["PRESETS", "Preset"],
+            "frames": ["held_out"],
             "run": [
                 "check_data",
                 "check_run",
@@ -36,8 +35,7 @@ else:
                 "run_camera",
             ],
             "sequence": ["Sequence", "read_sequence"],
-            "settings": ["DIALS", "Split", "TrainSettings", "check_held_out"],
-            "split": ["held_out"],
+            "settings": ["DIALS", "PRESETS", "Preset", "Split", "TrainSettings", "check_held_out"],
             "trainer": ["train"],
         },
     )

@@ -79,7 +79,7 @@ def resume(folder: Path, state: TrainingState) -> None:
         with expect_whole(path, "delete it and run the same command again"):
             _restore(path, state, tensors)
         if damaged:
-            say(f"going on from the older checkpoint {path.name}, step {state.step}")
+            say(f"training continues from the older checkpoint {path.name}, step {state.step}")
         return
     if damaged:
         say(f"{folder}: no checkpoint can be read; training starts again from the first step")
@@ -110,7 +110,7 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
     state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
     curves = part("curves.")
     if state.step < 0 or state.seconds < 0 or any(curve.ndim != 1 for curve in curves.values()):
-        raise ValueError("its step or curves cannot be")
+        raise ValueError("its step, its time or a curve is not valid")
     if len({len(curve) for curve in curves.values()}) > 1 or not (curves.keys() >= CURVES or state.step == 0):
         raise ValueError("its curves are incomplete")
     state.curves = {name: curve.tolist() for name, curve in curves.items()}
@@ -121,7 +121,7 @@ def _check_like(found: dict[str, Tensor], own: dict[str, Tensor], gaussians: int
     for name, tensor in own.items():
         shape = tensor.shape if gaussians is None else (gaussians, *tensor.shape[1:])
         if found[name].dtype != tensor.dtype or found[name].shape != shape:
-            raise ValueError(f"{name} is {found[name].dtype} {list(found[name].shape)}")
+            raise ValueError(f"{name} is of type {found[name].dtype} and shape {list(found[name].shape)}")
 
 
 def _moments(tensors: dict[str, Tensor], like: Tensor, owners: dict[str, Tensor]) -> dict[str, Moments]:
@@ -131,8 +131,8 @@ def _moments(tensors: dict[str, Tensor], like: Tensor, owners: dict[str, Tensor]
         first, second = (tensors[f"{name}:{field}"].to(like.device) for field in ("first", "second"))
         step = tensors[f"{name}:step"]
         if not first.shape == second.shape == owners[name].shape or step.ndim:
-            raise ValueError(f"the moments of {name} are of another shape")
+            raise ValueError(f"the moments of {name} have another shape")
         if not (first.dtype == second.dtype == owners[name].dtype and step.dtype in (torch.float32, torch.int64)):
-            raise ValueError(f"the moments of {name} are of another type")
+            raise ValueError(f"the moments of {name} have another type")
         moments[name] = Moments(first, second, tensors[f"{name}:step"])
     return moments

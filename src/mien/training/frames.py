@@ -1,4 +1,7 @@
-"""The frame of each step. Every random draw depends only on the seed and the step, so that runs resume exactly."""
+"""Which frames are held out, and which frame each step trains on.
+
+Every random draw depends only on the seed and the step, so that runs resume exactly.
+"""
 
 import hashlib
 from collections.abc import Sequence as Items
@@ -6,14 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
+from torch import Tensor
 
 from mien.errors import UserError
 from mien.training.sequence import Sequence
-from mien.training.settings import TrainSettings, check_held_out
-from mien.training.split import held_out
+from mien.training.settings import Split, TrainSettings, check_held_out
 
 _ORDER, _BACKGROUND, _DENSITY = range(3)
+"""Purposes of random numbers."""
+_BLOCK, _EVERY = 10, 5
+_TAIL_SHARE = 0.2
 
 
 class Frame(NamedTuple):
@@ -22,6 +28,23 @@ class Frame(NamedTuple):
     sequence: int
     timestep: int
     camera: int
+
+
+def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
+    """Which of a sequence's timesteps are held out for testing.
+
+    - `blocks`: every fifth block of 10, starting with the fifth, so that test poses and expressions resemble those of
+      training. Clips of fewer than 50 timesteps have shorter blocks, so that they have a fifth one.
+    - `tail`: the last 20 %, which may show things that were never seen.
+    - `none`: nothing.
+    """
+    index = torch.arange(timesteps)
+    if split == "blocks":
+        block = min(_BLOCK, max(1, timesteps // _EVERY))
+        return index // block % _EVERY == _EVERY - 1
+    if split == "tail":
+        return index >= timesteps - round(_TAIL_SHARE * timesteps)
+    return torch.zeros(timesteps, dtype=torch.bool)
 
 
 def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list[Frame]:
@@ -48,8 +71,8 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
     if not frames:
         places = [str(sequence.folder or sequence.name) for sequence in sequences]
         raise UserError(
-            f"{', '.join(places)}: no frame to train on with split {settings.split!r} and what is held out; "
-            "a longer clip, --split none, or hold out less"
+            f"{', '.join(places)}: no frame is left to train on with --split {settings.split} and what is held out; "
+            "use a longer clip or --split none, or hold out less"
         )
     return frames
 

@@ -29,11 +29,13 @@ from mien.training.settings import TrainSettings
 _FORMAT, _VERSION = "mien.run", 1
 _SUMMARY = "mien.training"
 _REMEDY = "put a copy back, or train again under another name (--run NAME); the run's folder holds the trained avatar"
-_AGAIN = "delete the run's training.json and run the same `mien train` again, which goes on from the last checkpoint"
+_AGAIN = "delete the run's training.json and run the same `mien train` again, which continues from the last checkpoint"
 ANOTHER_RUN = f"{WAIT}, or give this run another name (--run NAME)"
 """Remedy if another process is training the run."""
-_SUMMARIES, _MOST = ("steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"), 1 << 62
-_LARGEST_OF_CURVES = 1e12
+_SUMMARY_FIELDS = ("steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb")
+_MAX_SUMMARY = 1 << 62
+"""Bound of the numbers in training.json that are read."""
+_MAX_CURVE_NUMBER = 1e12
 """Largest number in a curve that is read. Real ones stay far below, and plots cannot divide their range beyond it."""
 _FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
 """Settings that say how a run is computed, not what it computes. They may change when the run continues."""
@@ -115,7 +117,7 @@ def read_run_config(run_dir: Path) -> dict[str, Any]:
         names = [entry["sequence"] for entry in content["data"]]
         texts = [content["method"]["kind"], content["mien"], *content["command_line"]]
         if not (names and all(map(is_plain_name, names)) and all(isinstance(text, str) for text in texts)):
-            raise ValueError("a name in it is none")
+            raise ValueError("a name in it is not valid")
     return content
 
 
@@ -131,7 +133,7 @@ def run_camera(run_dir: Path) -> Camera:
         K, viewmat = (torch.tensor(stored[name], dtype=torch.float32) for name in ("K", "viewmat"))
         fault = camera_fault(K.numpy(), viewmat.numpy(), stored["width"], stored["height"])
         if fault is not None:
-            raise ValueError(f"its camera is none: {fault}")
+            raise ValueError(f"its camera is not valid: {fault}")
         return Camera(K, viewmat, stored["width"], stored["height"])
 
 
@@ -174,9 +176,9 @@ def read_training_summary(run_dir: Path) -> dict[str, Any]:
     """
     content = read_json(run_dir / "training.json", _SUMMARY, _VERSION, "`mien train`", _AGAIN)
     with expect_whole(run_dir / "training.json", _AGAIN):
-        for name in _SUMMARIES:
-            if not (isinstance(content[name], int | float) and 0 <= content[name] < _MOST):
-                raise ValueError(f"{name} is no number that could be")
+        for name in _SUMMARY_FIELDS:
+            if not (isinstance(content[name], int | float) and 0 <= content[name] < _MAX_SUMMARY):
+                raise ValueError(f"{name} is not a possible number")
     return {name: value for name, value in content.items() if name not in ("format", "version")}
 
 
@@ -190,11 +192,11 @@ def read_curves(run_dir: Path) -> dict[str, np.ndarray]:
     curves = {name: curve.numpy() for name, curve in read_tensors(path, remedy=_AGAIN).items()}
     shapes = {curve.shape for curve in curves.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1 or any(curve.dtype != np.float64 for curve in curves.values()):
-        raise UserError(f"{path}: holds no curves of one length; {_AGAIN}")
+        raise UserError(f"{path}: does not hold curves of one length; {_AGAIN}")
     if not all(np.isfinite(curve).any() for curve in curves.values()):
-        raise UserError(f"{path}: a curve holds no finite number; {_AGAIN}")
-    if any(np.abs(curve[np.isfinite(curve)]).max(initial=0.0) > _LARGEST_OF_CURVES for curve in curves.values()):
-        raise UserError(f"{path}: holds numbers beyond {_LARGEST_OF_CURVES:g}; {_AGAIN}")
+        raise UserError(f"{path}: has a curve without any finite number; {_AGAIN}")
+    if any(np.abs(curve[np.isfinite(curve)]).max(initial=0.0) > _MAX_CURVE_NUMBER for curve in curves.values()):
+        raise UserError(f"{path}: holds numbers beyond {_MAX_CURVE_NUMBER:g}; {_AGAIN}")
     if not curves.keys() >= CURVES:
         raise UserError(f"{path}: lacks {', '.join(sorted(CURVES - curves.keys()))}; {_AGAIN}")
     return curves

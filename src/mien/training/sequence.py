@@ -172,5 +172,7 @@ def sequence_of(folder: Path, scoring: Scoring) -> Sequence:
     capture, tracking = read_capture(folder / "capture"), read_tracking(folder / "tracking")
     check_tracking_of(capture, tracking, folder / "tracking")
     if scoring.masks.shape != capture.mattes.shape:
-        raise UserError(f"{folder / 'scoring'}: is not of the capture beside it; delete it and run `mien track` again")
+        raise UserError(
+            f"{folder / 'scoring'}: does not belong to the capture beside it; delete it and run `mien track` again"
+        )
     return Sequence(folder.name, capture, tracking, scoring.masks, folder)

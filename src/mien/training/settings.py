@@ -1,16 +1,18 @@
-"""TrainSettings: the settings of a run that do not depend on the method."""
+"""TrainSettings, the settings of a run that do not depend on the method, and presets of them. Needs no torch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from mien.avatar.methods import method_named
+from mien.avatar.settings import MethodConfig
 from mien.bounded import MAX_SIDE
 from mien.devices import DeviceName
 from mien.errors import UserError
 from mien.ranges import Range, check_ranges
 
 Split = Literal["blocks", "tail", "none"]
-"""Which timesteps are held out (`mien.training.split`)."""
+"""Which timesteps are held out (`mien.training.held_out`)."""
 
 
 @dataclass(frozen=True)
@@ -70,3 +72,25 @@ def check_held_out(names: Sequence[str], settings: TrainSettings) -> None:
         raise UserError(f"--hold-out {unknown[0]}: no such sequence in this run; there are: {', '.join(names)}")
     if set(names) <= set(settings.held_out_sequences):
         raise UserError(f"--hold-out {' '.join(settings.held_out_sequences)}: leaves no sequence to train on")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """The settings of a run, which are given here, and of each method, which are in the file of its settings."""
+
+    name: str
+    settings: TrainSettings
+
+    def config(self, method: str) -> MethodConfig:
+        """The settings of a method.
+
+        Raises:
+            UserError: there is no method of that name.
+        """
+        return method_named(method).presets[self.name]
+
+
+PRESETS = {
+    preset.name: preset for preset in (Preset("draft", TrainSettings(steps=8_000)), Preset("standard", TrainSettings()))
+}
+"""Presets by name, from quick to good."""

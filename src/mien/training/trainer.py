@@ -132,13 +132,13 @@ def check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
     for sequence in sequences:
         if sequence.tracking.face_model_hash != face_model.content_hash:
             raise UserError(
-                f"{sequence.name}: tracked with face model {sequence.tracking.face_model!r} "
+                f"{sequence.name}: was tracked with face model {sequence.tracking.face_model!r} "
                 f"{sequence.tracking.face_model_hash}, not {face_model.name!r} {face_model.content_hash}; track again"
             )
         check_face_params(face_model, sequence.tracking.face, str(sequence.folder or sequence.name), "track again")
         if not sequence.tracking.face.identity.equal(sequences[0].tracking.face.identity):
             raise UserError(
-                f"{sequences[0].name} and {sequence.name}: tracked apart, with two identities; "
+                f"{sequences[0].name} and {sequence.name}: were tracked apart and have two identities; "
                 "run `mien track` on their workspace"
             )
 

@@ -1,4 +1,4 @@
-"""The Gaussians that follow a face's triangles: posing, rig and opacities as one operation."""
+"""Bound Gaussians: posing of the face, frames of the triangles and opacities as one operation."""
 
 from typing import Any
 
@@ -10,8 +10,8 @@ from torch.autograd.function import once_differentiable
 from mien import _native
 from mien.arrays import unpacked
 from mien.avatar.activation import sigmoid
-from mien.avatar.rig import bind_to_world, rig_topology
 from mien.avatar.store import GaussianStore
+from mien.avatar.triangle_frames import bind_to_world, rig_topology
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.face.posing import compiled_model, has_native_posing
 from mien.gaussians import Gaussians
@@ -19,7 +19,7 @@ from mien.gaussians import Gaussians
 _LOCAL = ("means", "quats", "log_scales", "opacity_logits")
 
 
-def ride(
+def pose_bound_gaussians(
     face_model: FaceModel, face: FaceParams, store: GaussianStore, sh: Float[Tensor, "n k 3"], in_head: bool
 ) -> Gaussians:
     """The posed Gaussians of a store (`face_index`, `means, quats, log_scales` in triangle units, `opacity_logits`).
@@ -35,22 +35,24 @@ def ride(
             topology = rig_topology(len(face_model.template), face_model.faces, store["face_index"])
             pose = (face.expression, face.joints, face.head_rotation, face.head_translation)
             local = (store[name] for name in _LOCAL)
-            means, quats, scales, opacities, *head = _Ride.apply(compiled.data, topology, in_head, *rest, *pose, *local)
+            means, quats, scales, opacities, *head = _BoundGaussians.apply(
+                compiled.data, topology, in_head, *rest, *pose, *local
+            )
             return Gaussians(means, quats, scales, opacities, sh, *head)
-    return ride_reference(face_model, face, store, sh, in_head)
+    return pose_bound_gaussians_reference(face_model, face, store, sh, in_head)
 
 
-def ride_reference(
+def pose_bound_gaussians_reference(
     face_model: FaceModel, face: FaceParams, store: GaussianStore, sh: Float[Tensor, "n k 3"], in_head: bool
 ) -> Gaussians:
-    """`ride` composed from its parts, for any dtype, device and number of timesteps."""
+    """`pose_bound_gaussians` composed from its parts, for any dtype, device and number of timesteps."""
     vertices = face_model.head_vertices(face) if in_head else face_model(face)
     means, quats, log_scales, opacity_logits = (store[name] for name in _LOCAL)
     bound = bind_to_world(vertices, face_model.faces, store["face_index"], means, quats, log_scales)
     return Gaussians(*bound, sigmoid(opacity_logits), sh, head_poses(face) if in_head else None)
 
 
-class _Ride(torch.autograd.Function):
+class _BoundGaussians(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, data: Any, topology: Any, in_head: bool, *inputs: Tensor) -> tuple[Tensor, ...]:
         arrays = [tensor.detach().contiguous() for tensor in inputs]

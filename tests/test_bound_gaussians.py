@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from mien import _native
-from mien.avatar.ride import ride, ride_reference
+from mien.avatar.bound_gaussians import pose_bound_gaussians, pose_bound_gaussians_reference
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.gaussians import Gaussians
@@ -59,17 +59,17 @@ def test_it_equals_its_parts_to_the_bit(face_model: FaceModel, in_head: bool, th
     before = _native.thread_count()
     _native.set_thread_count(threads)
     try:
-        native = results(ride(face_model, face, store, store["sh"], in_head), face, store)
+        native = results(pose_bound_gaussians(face_model, face, store, store["sh"], in_head), face, store)
     finally:
         _native.set_thread_count(before)
-    expected = results(ride_reference(face_model, face, store, store["sh"], in_head), face, store)
+    expected = results(pose_bound_gaussians_reference(face_model, face, store, store["sh"], in_head), face, store)
     assert all(torch.equal(one, other) for one, other in zip(native, expected, strict=True))
     assert all(bool(tensor.abs().sum() > 0) for tensor in native)
 
 
 def test_a_fixed_face_gets_no_gradient(face_model: FaceModel) -> None:
     face, store = a_face(face_model).detach(), a_store(face_model)
-    gaussians = ride(face_model, face, store, store["sh"], in_head=True)
+    gaussians = pose_bound_gaussians(face_model, face, store, store["sh"], in_head=True)
     gaussians.means.sum().backward()
     assert store["means"].grad is not None
     assert gaussians.T_world_local is not None
@@ -78,14 +78,14 @@ def test_a_fixed_face_gets_no_gradient(face_model: FaceModel) -> None:
 
 def test_a_new_store_and_changed_indices_are_noticed(face_model: FaceModel) -> None:
     face, store = a_face(face_model).detach(), a_store(face_model)
-    before = ride(face_model, face, store, store["sh"], in_head=True).means
+    before = pose_bound_gaussians(face_model, face, store, store["sh"], in_head=True).means
     store["face_index"].copy_(store["face_index"].flip(0))
-    changed = ride(face_model, face, store, store["sh"], in_head=True).means
-    expected = ride_reference(face_model, face, store, store["sh"], in_head=True).means
+    changed = pose_bound_gaussians(face_model, face, store, store["sh"], in_head=True).means
+    expected = pose_bound_gaussians_reference(face_model, face, store, store["sh"], in_head=True).means
     assert torch.equal(changed, expected)
     assert not torch.equal(changed, before)
     store.select(torch.arange(100))
-    assert ride(face_model, face, store, store["sh"], in_head=True).means.shape == (1, 100, 3)
+    assert pose_bound_gaussians(face_model, face, store, store["sh"], in_head=True).means.shape == (1, 100, 3)
     store["face_index"][0] = len(face_model.faces)
     with pytest.raises(IndexError, match="face"):
-        ride(face_model, face, store, store["sh"], in_head=True)
+        pose_bound_gaussians(face_model, face, store, store["sh"], in_head=True)
