@@ -73,10 +73,8 @@ void screen_jacobian(const Mesh& mesh, const MeshView& view, int64_t vertex, con
   }
 }
 
-// Sums of triangles -> J^T A J and J^T b, with A J accumulated per vertex: neighbours only.
-void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian, int parameters, double scale,
-                  Workspace& w, const AlignBuffers& out) {
-  const int64_t row_size = 2 * static_cast<int64_t>(parameters);
+// Lists the vertices of the triangles that were hit.
+void list_vertices(const Mesh& mesh, Workspace& w) {
   w.row_of.assign(mesh.vertex_count, -1);
   w.vertices.clear();
   for (const int32_t face : w.hit) {
@@ -87,12 +85,13 @@ void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian,
       w.vertices.push_back(static_cast<int32_t>(vertex));
     }
   }
-  w.screen.resize(w.vertices.size() * row_size);
+}
+
+// Sums of triangles -> A J and b of every listed vertex; A has entries only between neighbours.
+void gather_products(const Mesh& mesh, int parameters, Workspace& w) {
+  const int64_t row_size = 2 * static_cast<int64_t>(parameters);
   w.product.assign(w.vertices.size() * row_size, 0.0f);
   w.force.assign(w.vertices.size() * 2, 0.0f);
-  for (size_t row = 0; row < w.vertices.size(); ++row)
-    screen_jacobian(mesh, view, w.vertices[row], jacobian, parameters, w.screen.data() + row * row_size);
-
   static constexpr int kBlockOf[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
   for (const int32_t face : w.hit) {
     const float* sums = w.sums.data() + static_cast<int64_t>(face) * kSums;
@@ -113,6 +112,17 @@ void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian,
       w.force[2 * row + 1] += sums[kBlocks + 2 * k + 1];
     }
   }
+}
+
+// J^T A J and J^T b, times `scale`.
+void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian, int parameters, double scale,
+                  Workspace& w, const AlignBuffers& out) {
+  const int64_t row_size = 2 * static_cast<int64_t>(parameters);
+  list_vertices(mesh, w);
+  w.screen.resize(w.vertices.size() * row_size);
+  for (size_t row = 0; row < w.vertices.size(); ++row)
+    screen_jacobian(mesh, view, w.vertices[row], jacobian, parameters, w.screen.data() + row * row_size);
+  gather_products(mesh, parameters, w);
   std::fill_n(out.hessian, static_cast<int64_t>(parameters) * parameters, 0.0f);
   std::fill_n(out.gradient, parameters, 0.0f);
   for (size_t row = 0; row < 2 * w.vertices.size(); ++row) {
