@@ -6,7 +6,7 @@
 #include <vector>
 
 #include "isa.h"
-#include "photometric_band.h"
+#include "photometric_kernels.h"
 #include "pool.h"
 
 namespace mien {
