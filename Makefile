@@ -78,6 +78,7 @@ lint: setup
 	$(BIN)/ruff check src tests examples benchmarks docs/site docs/pictures
 	$(BIN)/ruff format --check src tests examples benchmarks docs/site docs/pictures
 	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
+	$(BIN)/python tests/sizes.py
 	$(BIN)/typos
 	$(BIN)/lint-imports
 	$(BIN)/pyright --pythonpath $(BIN)/python

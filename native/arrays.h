@@ -11,6 +11,8 @@
 #include <limits>
 #include <stdexcept>
 #include <string>
+#include <type_traits>
+#include <utility>
 
 #include "rasterize.h"
 
@@ -26,7 +28,7 @@ class Array : public PlainArray<T, Shape...> {
   using Plain = PlainArray<T, Shape...>;
 
   Array() = default;
-  explicit Array(const Plain& plain) : Plain(plain) {}
+  explicit Array(Plain&& plain) : Plain(std::move(plain)) {}
   bool is_aligned() const { return reinterpret_cast<uintptr_t>(this->data()) % alignof(T) == 0; }
 };
 
@@ -40,7 +42,7 @@ struct type_caster<Array<T, Shape...>> {
   bool from_python(handle source, uint32_t flags, cleanup_list* cleanup) noexcept {
     Plain plain;
     if (!plain.from_python(source, flags & ~static_cast<uint32_t>(cast_flags::convert), cleanup)) return false;
-    value = Own(plain.value);
+    value = Own(std::move(plain.value));
     return value.is_aligned();
   }
 };
@@ -125,7 +127,8 @@ struct Group {
  private:
   template <typename Field>
   void read_field(size_t index, Field& field) const {
-    if (nb::try_cast<Field>(items[index], field)) return;
+    const nb::handle item = PyTuple_GET_ITEM(items.ptr(), static_cast<Py_ssize_t>(index));
+    if (nb::try_cast<Field>(item, field, std::is_arithmetic_v<Field>)) return;
     throw nb::type_error((std::string(T::kName) + "." + T::kFields[index] + " has the wrong type or shape").c_str());
   }
 };

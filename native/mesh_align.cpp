@@ -1,6 +1,7 @@
 #include "mesh_align.h"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <vector>
 
@@ -73,10 +74,8 @@ void screen_jacobian(const Mesh& mesh, const MeshView& view, int64_t vertex, con
   }
 }
 
-// Sums of triangles -> J^T A J and J^T b, with A J accumulated per vertex: neighbours only.
-void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian, int parameters, double scale,
-                  Workspace& w, const AlignBuffers& out) {
-  const int64_t row_size = 2 * static_cast<int64_t>(parameters);
+// Lists the vertices of the triangles that were hit.
+void list_vertices(const Mesh& mesh, Workspace& w) {
   w.row_of.assign(mesh.vertex_count, -1);
   w.vertices.clear();
   for (const int32_t face : w.hit) {
@@ -87,12 +86,13 @@ void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian,
       w.vertices.push_back(static_cast<int32_t>(vertex));
     }
   }
-  w.screen.resize(w.vertices.size() * row_size);
+}
+
+// Sums of triangles -> A J and b of every listed vertex; A has entries only between neighbours.
+void gather_products(const Mesh& mesh, int parameters, Workspace& w) {
+  const int64_t row_size = 2 * static_cast<int64_t>(parameters);
   w.product.assign(w.vertices.size() * row_size, 0.0f);
   w.force.assign(w.vertices.size() * 2, 0.0f);
-  for (size_t row = 0; row < w.vertices.size(); ++row)
-    screen_jacobian(mesh, view, w.vertices[row], jacobian, parameters, w.screen.data() + row * row_size);
-
   static constexpr int kBlockOf[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
   for (const int32_t face : w.hit) {
     const float* sums = w.sums.data() + static_cast<int64_t>(face) * kSums;
@@ -113,6 +113,17 @@ void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian,
       w.force[2 * row + 1] += sums[kBlocks + 2 * k + 1];
     }
   }
+}
+
+// J^T A J and J^T b, times `scale`.
+void project_sums(const Mesh& mesh, const MeshView& view, const float* jacobian, int parameters, double scale,
+                  Workspace& w, const AlignBuffers& out) {
+  const int64_t row_size = 2 * static_cast<int64_t>(parameters);
+  list_vertices(mesh, w);
+  w.screen.resize(w.vertices.size() * row_size);
+  for (size_t row = 0; row < w.vertices.size(); ++row)
+    screen_jacobian(mesh, view, w.vertices[row], jacobian, parameters, w.screen.data() + row * row_size);
+  gather_products(mesh, parameters, w);
   std::fill_n(out.hessian, static_cast<int64_t>(parameters) * parameters, 0.0f);
   std::fill_n(out.gradient, parameters, 0.0f);
   for (size_t row = 0; row < 2 * w.vertices.size(); ++row) {
@@ -260,6 +271,97 @@ AlignResult align_mesh(const Mesh& mesh, const TexturedSurface& surface, const A
   const double scale = total > 0 ? 1 / total : 0;
   if (out.hessian) project_sums(mesh, frame.view, jacobian, parameters, scale, w, out);
   return {cost * scale, total};
+}
+
+namespace {
+
+constexpr float kDepthTolerance = 0.0005f;  // metres: a texel so far behind what is seen is hidden
+
+}  // namespace
+
+void bake_texture(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
+                  const AlignOptions& options, const BakeTexels& texels, const BakeSums& out) {
+  DrawnMesh& drawn = own_drawing();
+  draw(mesh, frame.view, drawn);
+  float eye[3];
+  camera_position(frame.view.viewmat, eye);
+  const MeshView& view = frame.view;
+  const float least = options.outlier * options.outlier, inverse_variance = 1 / (options.sigma * options.sigma);
+  const int64_t count = static_cast<int64_t>(surface.texture_width) * surface.texture_height;
+  for (int64_t texel = 0; texel < count; ++texel) {
+    const int32_t face = texels.face[texel];
+    if (face < 0 || !surface.used[face]) continue;
+    const SurfacePoint point =
+        surface_point(mesh, frame, eye, mesh.faces + 3 * static_cast<int64_t>(face), texels.barycentric + 3 * texel);
+    if (point.cosine < options.least_cosine) continue;
+    float in_camera[3];
+    for (int row = 0; row < 3; ++row) {
+      const float* m = view.viewmat + 4 * row;
+      in_camera[row] = m[0] * point.position[0] + m[1] * point.position[1] + m[2] * point.position[2] + m[3];
+    }
+    if (in_camera[2] < kMeshNearPlane) continue;
+    const float x = view.K[0] * in_camera[0] / in_camera[2] + view.K[2] - 0.5f;
+    const float y = view.K[4] * in_camera[1] / in_camera[2] + view.K[5] - 0.5f;
+    if (!(x >= 0 && y >= 0 && x < view.width - 1 && y < view.height - 1)) continue;
+    const int x0 = static_cast<int>(x), y0 = static_cast<int>(y);
+    const int64_t nearest = static_cast<int64_t>(std::lround(y)) * view.width + std::lround(x);
+    // What a slope rises within a pixel does not hide it.
+    const float slope = std::sqrt(std::max(1 - point.cosine * point.cosine, 0.0f)) / std::max(point.cosine, 0.1f);
+    const float tolerance = kDepthTolerance + in_camera[2] / view.K[0] * slope;
+    if (in_camera[2] > drawn.depth[nearest] + tolerance) continue;
+    float color[3] = {}, mask = 0;
+    for (int dy = 0; dy < 2; ++dy) {
+      for (int dx = 0; dx < 2; ++dx) {
+        const float share = (dx ? x - x0 : 1 - (x - x0)) * (dy ? y - y0 : 1 - (y - y0));
+        const int64_t pixel = static_cast<int64_t>(y0 + dy) * view.width + x0 + dx;
+        mask += share * frame.mask[pixel];
+        for (int c = 0; c < 3; ++c) color[c] += share * frame.image[3 * pixel + c];
+      }
+    }
+    const Color light = shade(point.normal, frame.light);
+    float weight = mask * point.cosine * point.cosine;
+    if (surface.trust[texel] > 0) {
+      float squared = 0;
+      for (int c = 0; c < 3; ++c) {
+        const float difference = color[c] - surface.albedo[3 * texel + c] * light.c[c];
+        squared += difference * difference * inverse_variance;
+      }
+      const float fade = least / (least + squared);
+      weight *= fade * fade;
+    }
+    out.weight[texel] += weight;
+    for (int c = 0; c < 3; ++c) {
+      out.squares[3 * texel + c] += weight * light.c[c] * light.c[c];
+      out.mixed[3 * texel + c] += weight * light.c[c] * color[c];
+      out.image[3 * texel + c] += weight * color[c] * color[c];
+    }
+  }
+}
+
+void light_equations(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
+                     const AlignOptions& options, double* hessian, double* right) {
+  DrawnMesh& drawn = own_drawing();
+  draw(mesh, frame.view, drawn);
+  const float least = options.outlier * options.outlier, inverse_variance = 1 / (options.sigma * options.sigma);
+  for_pixels(
+      mesh, surface, frame, options, drawn,
+      [&](int64_t pixel, int32_t, const float*, const SurfacePoint& point, const Sample& sample, const Color& light) {
+        float b[9], squared = 0;
+        sh_basis(point.normal, b);
+        const float* seen = frame.image + 3 * pixel;
+        for (int c = 0; c < 3; ++c) {
+          const float difference = seen[c] - sample.color.c[c] * light.c[c];
+          squared += difference * difference * inverse_variance;
+        }
+        const float fade = least / (least + squared);
+        for (int c = 0; c < 3; ++c) {
+          const float albedo = sample.color.c[c], weight = frame.mask[pixel] * sample.weight * fade * fade * albedo;
+          for (int i = 0; i < 9; ++i) {
+            right[9 * c + i] += weight * b[i] * seen[c];
+            for (int j = i; j < 9; ++j) hessian[81 * c + 9 * i + j] += weight * albedo * b[i] * b[j];
+          }
+        }
+      });
 }
 
 }  // namespace mien

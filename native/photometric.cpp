@@ -6,7 +6,7 @@
 #include <vector>
 
 #include "isa.h"
-#include "photometric_band.h"
+#include "photometric_kernels.h"
 #include "pool.h"
 
 namespace mien {
@@ -67,18 +67,12 @@ void clear_beyond(const PhotometricTask& task, int first_row, int last_row, int6
   }
 }
 
-}  // namespace
-
-double photometric_loss(const PhotometricTask& task) {
+// What all bands share.
+PhotometricBand whole_band(const PhotometricTask& task, Workspace& work) {
   static const Window window;
-  const PhotometricKernels& kernels = photometric_kernels();
-  thread_local Workspace work;
   const int stride = task.width * kPhotometricChannels;
   const double count = static_cast<double>(stride) * task.height;
-  const int first_row = std::max(task.box.top - kPhotometricRadius, 0);
-  const int last_row = std::min(task.box.bottom + kPhotometricRadius, task.height);
   work.sums.assign(2 * static_cast<size_t>(task.height), 0.0);
-
   PhotometricBand whole{};
   whole.image = task.image;
   whole.target = task.target;
@@ -96,20 +90,36 @@ double photometric_loss(const PhotometricTask& task) {
   whole.weights = window.weights;
   whole.l1_sums = work.sums.data();
   whole.ssim_sums = work.sums.data() + task.height;
-  if (!task.target) {
-    work.target.resize(static_cast<size_t>(stride) * task.height);
-    float* const floats = work.target.data();
-    const int begin = std::max(first_row - kPhotometricRadius, 0);
-    const int rows = std::min(last_row + kPhotometricRadius, task.height) - begin;
-    parallel_for((rows + kRowsAtATime - 1) / kRowsAtATime, [&](int64_t piece) {
-      const int last = std::min(rows, static_cast<int>(piece + 1) * kRowsAtATime);
-      for (int row = static_cast<int>(piece) * kRowsAtATime; row < last; ++row) {
-        const int64_t from = static_cast<int64_t>(begin + row) * stride + whole.origin;
-        kernels.bytes_to_floats(task.target_bytes + from, whole.limit - whole.origin, floats + from);
-      }
-    });
-    whole.target = work.target.data();
-  }
+  return whole;
+}
+
+// A target of bytes as floats, as far as windows around first_row .. last_row - 1 reach.
+const float* target_as_floats(const PhotometricTask& task, const PhotometricBand& whole, int first_row, int last_row,
+                              Workspace& work) {
+  const PhotometricKernels& kernels = photometric_kernels();
+  work.target.resize(static_cast<size_t>(whole.stride) * task.height);
+  float* const floats = work.target.data();
+  const int begin = std::max(first_row - kPhotometricRadius, 0);
+  const int rows = std::min(last_row + kPhotometricRadius, task.height) - begin;
+  parallel_for((rows + kRowsAtATime - 1) / kRowsAtATime, [&](int64_t piece) {
+    const int last = std::min(rows, static_cast<int>(piece + 1) * kRowsAtATime);
+    for (int row = static_cast<int>(piece) * kRowsAtATime; row < last; ++row) {
+      const int64_t from = static_cast<int64_t>(begin + row) * whole.stride + whole.origin;
+      kernels.bytes_to_floats(task.target_bytes + from, whole.limit - whole.origin, floats + from);
+    }
+  });
+  return floats;
+}
+
+}  // namespace
+
+double photometric_loss(const PhotometricTask& task) {
+  const PhotometricKernels& kernels = photometric_kernels();
+  thread_local Workspace work;
+  const int first_row = std::max(task.box.top - kPhotometricRadius, 0);
+  const int last_row = std::min(task.box.bottom + kPhotometricRadius, task.height);
+  PhotometricBand whole = whole_band(task, work);
+  if (!task.target) whole.target = target_as_floats(task, whole, first_row, last_row, work);
 
   // Every row's numbers are the same in any division into bands, so there are as many bands as threads.
   const int rows = last_row - first_row;
@@ -128,6 +138,7 @@ double photometric_loss(const PhotometricTask& task) {
     l1 += whole.l1_sums[y];
     ssim += whole.ssim_sums[y];
   }
+  const double count = static_cast<double>(whole.stride) * task.height;
   const double inside = static_cast<double>(whole.right - whole.left) * (task.box.bottom - task.box.top);
   return task.l1_weight * l1 / count + task.ssim_weight * (inside - ssim) / count;
 }

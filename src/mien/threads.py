@@ -1,6 +1,8 @@
 """The number of threads. Only this module reads MIEN_THREADS in Python; `native/pool.cpp` reads it separately."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from mien.errors import UserError
 
@@ -33,3 +35,16 @@ def thread_count() -> int:
         UserError: MIEN_THREADS is not a number from 1 to `MAX_THREADS`.
     """
     return asked_threads() or os.cpu_count() or 1
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Keep torch on one thread. Its thread pool and another one, native or of Python, would wait for each other."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

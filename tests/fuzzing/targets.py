@@ -39,7 +39,7 @@ class Target:
     """Whether the message must name a file of the folder."""
 
 
-def _all() -> tuple[Target, ...]:
+def _in_workspaces() -> tuple[Target, ...]:
     run, clip, whole = RUN, SEQUENCE, ("W",)
     return (
         Target("capture.json", "capture", f"{clip}/capture/capture.json", whole, reads.read_capture,
@@ -72,6 +72,12 @@ def _all() -> tuple[Target, ...]:
                fault=faults.faulty_lines),
         Target("tracking pieces", "partial files", "pieces/*.safetensors", ("pieces",), reads.go_on_tracking,
                weight=0.3, named=False),
+    )  # fmt: skip
+
+
+def _avatars_and_given_files() -> tuple[Target, ...]:
+    run, whole = RUN, ("W",)
+    return (
         Target("avatar.json", "avatar", f"{run}/avatar/avatar.json", whole, reads.read_avatar, uses.use_avatar,
                True, weight=2),
         Target("avatar.safetensors", "avatar", f"{run}/avatar/avatar.safetensors", whole, reads.read_avatar,
@@ -107,7 +113,7 @@ def _all() -> tuple[Target, ...]:
     )  # fmt: skip
 
 
-TARGETS = {target.name: target for target in _all()}
+TARGETS = {target.name: target for target in (*_in_workspaces(), *_avatars_and_given_files())}
 
 
 def spread(total: int, names: list[str] | None = None) -> list[tuple[str, int]]:

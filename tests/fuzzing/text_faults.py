@@ -73,13 +73,8 @@ def _faulty_encoding(text: str, dice: Random) -> tuple[str, bytes]:
     ))  # fmt: skip
 
 
-def faulty_ply(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """Make one or two faults in the header of a .ply, or in its numbers."""
-    head, mark, body = data.partition(b"end_header\n")
-    lines = head.decode("latin1").splitlines()
-    kind = dice.choice(
-        ("count", "count", "type", "property", "format", "comment", "order", "numbers", "numbers", "body", "end")
-    )
+def _faulty_ply_header(lines: list[str], kind: str, dice: Random) -> None:
+    """One fault in the header's lines, which are changed."""
     places = [index for index, line in enumerate(lines) if line.startswith("property")]
     element = next(index for index, line in enumerate(lines) if line.startswith("element"))
     if kind == "count":
@@ -123,6 +118,17 @@ def faulty_ply(data: bytes, dice: Random) -> tuple[str, bytes]:
         lines.insert(dice.randrange(1, len(lines)), f"comment {words}")
     elif kind == "order":
         dice.shuffle(lines)
+
+
+def faulty_ply(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """One or two faults in the header of a .ply, or in its numbers."""
+    head, mark, body = data.partition(b"end_header\n")
+    lines = head.decode("latin1").splitlines()
+    kind = dice.choice(
+        ("count", "count", "type", "property", "format", "comment", "order", "numbers", "numbers", "body", "end")
+    )
+    if kind in ("count", "type", "property", "format", "comment", "order"):
+        _faulty_ply_header(lines, kind, dice)
     elif kind == "numbers":
         for _ in range(dice.choice((1, 30))):
             value = dice.choice(

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mien import _native
+from mien.threads import one_torch_thread
 
 
 @dataclass(frozen=True)
@@ -89,12 +90,8 @@ def measure_machine(gpu: bool = False) -> Machine:
     """Describe this machine. This takes a fifth of a second."""
     load = os.getloadavg()[0]
     matrix = torch.randn(512, 512)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_torch_thread():
         timing = time_function(lambda: matrix @ matrix, seconds=0.2)
-    finally:
-        torch.set_num_threads(threads)
     gflops = 2 * 512**3 / timing.cpu_ms / 1e6
     isa = _native.rasterize_isa()
     return Machine(_processor(), os.cpu_count() or 1, isa, round(gflops, 1), round(load, 2), _gpu() if gpu else "")

@@ -23,6 +23,7 @@ from mien.locks import hold
 from mien.progress import Advance, progress_bar
 from mien.render import rasterize
 from mien.render.validation import CannotDrawError
+from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.density import density_strategy
@@ -88,7 +89,7 @@ def _train_to_the_end(
 ) -> None:
     """Continue from the newest checkpoint, if there is one, and write the results."""
     resume(run_dir / "checkpoints", state)
-    with _one_torch_thread(), _native_threads(settings.threads), _deferred_interrupt() as interrupted:
+    with one_torch_thread(), _native_threads(settings.threads), _deferred_interrupt() as interrupted:
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
                 try:
@@ -197,17 +198,6 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     for name, value in entry.items():
         state.curves.setdefault(name, []).append(value)
     return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Keep torch on one thread: its thread pool and the native one would wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @contextmanager

@@ -1,7 +1,8 @@
 // The photometric loss on a band of rows, streaming, four rows at a time: rows of the SSIM map are made once, their
 // derivatives wait in a ring of rows until the window around a row is complete, then that row's gradient is written.
 // Columns go by strips, so that what is filtered along columns is still in the L1 cache when it is filtered along rows.
-#include "photometric_band.h"
+#include "photometric_kernels.h"
+
 #include "simd.h"
 
 namespace {
