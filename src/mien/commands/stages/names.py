@@ -45,9 +45,8 @@ def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
         if not video.exists():
             raise UserError(f"{video}: no such video or folder of pictures; check the path")
     if names and len(names) != len(videos):
-        raise UserError(
-            f"--name {' '.join(names)}: {len(names)} names, but the number of videos is {len(videos)}; give one name for each"
-        )
+        counts = f"{len(names)} names, but the number of videos is {len(videos)}"
+        raise UserError(f"--name {' '.join(names)}: {counts}; give one name for each")
     found = [sequence_name(video, name) for video, name in zip(videos, names or [None] * len(videos), strict=True)]
     twice = [name for name, count in Counter(found).items() if count > 1]
     if twice:
