@@ -148,7 +148,7 @@ def test_a_bug_keeps_its_traceback_in_a_log(
 def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "sequences" / "me" / "tracking").mkdir(parents=True)
     told = complaint(capsys, "track", str(tmp_path))
-    assert "the capture of me is gone" in told
+    assert "the capture of me is missing" in told
     assert f"mien capture VIDEO --out {tmp_path} --name me" in told
 
 

@@ -97,7 +97,7 @@ def options_type(listed: Sequence[Leaf], prefix: str) -> type:
     return make_dataclass(f"{prefix}_options", groups, frozen=True)
 
 
-def applied(settings: Settings, options: Any) -> Settings:
+def apply_options(settings: Settings, options: Any) -> Settings:
     """Settings with the values of `options`, an instance of a class from `options_type`."""
     groups = [getattr(options, group.name) for group in fields(options)]
     typed = {one.name.replace(_AS_FIELD, "."): getattr(group, one.name) for group in groups for one in fields(group)}
