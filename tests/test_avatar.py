@@ -68,7 +68,7 @@ def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="does not fit its settings"):
         load_avatar(tmp_path)
     for damage, part in (
-        ({"kind": None}, "missing \\['kind'\\]"),
+        ({"kind": None}, "lacks \\['kind'\\]"),
         ({"kind": 3}, "3 is not"),
         ({"kind": [DEFAULT_METHOD]}, "is not"),
         ({"config": "default"}, "config"),

@@ -150,7 +150,7 @@ def test_bad_json(text: str, message: str, tmp_path: Path) -> None:
 def test_huge_json_is_not_read(tmp_path: Path) -> None:
     with (tmp_path / "a.json").open("wb") as file:
         file.truncate(1 << 30)
-    with pytest.raises(UserError, match="are the most"):
+    with pytest.raises(UserError, match="and at most"):
         read_json(tmp_path / "a.json", "x", 1)
 
 

@@ -15,7 +15,7 @@ from mien.capture.people import choose_person
 from mien.capture.process import LandmarkFollower
 from mien.capture.survey import Survey
 from mien.capture.video import write_video
-from mien.commands.stages.capturing import capture_stage
+from mien.commands.stages.capturing import run_capture_stage
 from mien.errors import UserError
 from mien.workspace import Workspace
 
@@ -43,7 +43,7 @@ def shots(test_data, tmp_path_factory):
 def test_each_long_shot_becomes_a_sequence(shots, tmp_path, capsys, monkeypatch):
     workspace = Workspace(tmp_path)
     settings = CaptureSettings(size=256)
-    assert capture_stage(workspace, shots, None, settings) == ["clip-1", "clip-2"]
+    assert run_capture_stage(workspace, shots, None, settings) == ["clip-1", "clip-2"]
     said = capsys.readouterr().err
     assert "cuts to another shot at 1.2, 1.5, 2.7 s" in said
     assert "1 parts shorter than 1 s are left out, at 1.2 s" in said
@@ -57,7 +57,7 @@ def test_each_long_shot_becomes_a_sequence(shots, tmp_path, capsys, monkeypatch)
     assert first.source["crop"] != second.source["crop"]
     # Functions that would work again are not called.
     monkeypatch.setattr("mien.capture.from_video.survey_source", None)
-    assert capture_stage(workspace, shots, None, settings) == ["clip-1", "clip-2"]
+    assert run_capture_stage(workspace, shots, None, settings) == ["clip-1", "clip-2"]
 
 
 def test_cuts_can_be_ignored_and_short_parts_kept(shots, tmp_path, capsys):

@@ -79,7 +79,7 @@ def test_mattes_may_be_a_video(test_data, tmp_path):
         expected = np.interp(middles, column, ramps[2 * index])
         assert np.abs(capture.mattes[index, 0].mean(axis=0) - expected).max() < 8
     write_video(mattes, iter([np.zeros((160, 160, 3), np.uint8)] * 5), 25.0)
-    with pytest.raises(UserError, match=r"mattes.mp4: is 160x160, the source's pictures are 320x320"):
+    with pytest.raises(UserError, match=r"mattes.mp4: is 160x160, but the source's pictures are 320x320"):
         capture_video_parts(clip, tmp_path / "other", settings)
     write_video(mattes, iter([np.zeros((320, 320, 3), np.uint8)] * 4), 25.0)
     with pytest.raises(UserError, match=r"has 4 mattes, .* has 5 frames"):

@@ -1,14 +1,17 @@
 """The command line has help, exit codes and one-line messages. A real run is in test_end_to_end.py."""
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 
 from mien.capture.video import write_video
 from mien.cli import COMMANDS, main
+from mien.commands.help_text import readable
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -40,6 +43,22 @@ def test_help_of_every_command(name: str, capsys: pytest.CaptureFixture[str]) ->
         main([name, "--help"])
     assert exit_info.value.code == 0
     assert f"usage: mien {name}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_shows_no_line_breaks_of_the_source_and_no_empty_defaults(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = importlib.import_module(f"mien.commands.{name.replace('-', '_')}").Command
+    hints = get_type_hints(readable(command), include_extras=True).values()
+    texts = [mark.help for hint in hints for mark in get_args(hint)[1:] if getattr(mark, "help", None)]
+    assert texts or name == "bench"  # which has sub-commands alone
+    assert not [text for text in texts if "\n" in text]
+    with pytest.raises(SystemExit):
+        main([name, "--help-all"])
+    shown = capsys.readouterr().out
+    assert "default: None)" not in shown
+    assert "default: )" not in shown
 
 
 @pytest.mark.parametrize("name", ["create", "capture", "track"])
@@ -153,7 +172,7 @@ def test_a_bug_keeps_its_traceback_in_a_log(
 def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "sequences" / "me" / "tracking").mkdir(parents=True)
     told = complaint(capsys, "track", str(tmp_path))
-    assert "the capture of me is gone" in told
+    assert "the capture of me is missing" in told
     assert f"mien capture VIDEO --out {tmp_path} --name me" in told
 
 
@@ -166,6 +185,7 @@ def test_a_terminated_command_removes_what_is_unfinished(tmp_path: Path) -> None
 import os, signal, sys, types
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args, get_type_hints
 from mien.cli import main
 from mien.files import write_atomically
 

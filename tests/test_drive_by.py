@@ -10,7 +10,7 @@ import torch
 from mien.capture import Capture, write_capture
 from mien.capture.video import probe_video, write_video
 from mien.commands.stages import driving
-from mien.commands.stages.driving import drive_stage, open_driver
+from mien.commands.stages.driving import open_driver, run_driving_stage
 from mien.errors import UserError
 from mien.tracking import Scoring, Tracking, write_scoring, write_tracking
 from mien.workspace import Workspace
@@ -27,7 +27,7 @@ PARTS = {"clip-1": 3, "clip-2": 4, "clip-10": 2}
 def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a video whose capture and tracking are given. Each part has its own grey and its own head pose."""
 
-    def capture_stage(workspace: Workspace, *_: object) -> list[str]:
+    def run_capture_stage(workspace: Workspace, *_: object) -> list[str]:
         for number, (name, timesteps) in enumerate(PARTS.items(), 1):
             capture, tracking = part(number, timesteps)
             folder = workspace.sequence_dir(name)
@@ -37,11 +37,11 @@ def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             write_scoring(folder / "scoring", Scoring(capture.mattes, crops))
         return list(PARTS)
 
-    def tracking_stage(*_: object, **__: object) -> dict[str, Tracking]:
+    def run_tracking_stage(*_: object, **__: object) -> dict[str, Tracking]:
         return {name: part(1, PARTS[name])[1] for name in sorted(PARTS)}
 
-    monkeypatch.setattr(driving, "capture_stage", capture_stage)
-    monkeypatch.setattr(driving, "tracking_stage", tracking_stage)
+    monkeypatch.setattr(driving, "run_capture_stage", run_capture_stage)
+    monkeypatch.setattr(driving, "run_tracking_stage", run_tracking_stage)
     monkeypatch.setattr(driving, "cache_folder", lambda: tmp_path / "cache")
     path = tmp_path / "clip.mp4"
     write_video(path, [np.zeros((32, 32, 3), np.uint8)] * 2, 25.0)
@@ -78,7 +78,7 @@ def test_one_part_of_a_video_can_be_chosen(video: Path) -> None:
 def test_a_film_of_all_parts(video: Path, tmp_path: Path) -> None:
     """A driver with cuts gives one film of all its parts."""
     write_toy_workspace(tmp_path / "w")
-    drive_stage(tmp_path / "w/runs/toy", video, tmp_path / "driven.mp4")
+    run_driving_stage(tmp_path / "w/runs/toy", video, tmp_path / "driven.mp4")
     assert probe_video(tmp_path / "driven.mp4").frames == sum(PARTS.values())
 
 

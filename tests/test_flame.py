@@ -89,7 +89,7 @@ def test_it_is_posed_by_number_on_the_command_line(model):
     for assignment, message in (
         ("jaw_x=2", "from -1 to 1 radians"),
         ("jaw_w=0.1", "did you mean jaw_"),
-        ("expression_003=4", "-3 to 3; 1 is much"),
+        ("expression_003=4", "-3 to 3; 1 is strong"),
         ("smile=1", "there are: expression_000.*joint angles in radians: neck_x"),
     ):
         with pytest.raises(UserError, match=message):

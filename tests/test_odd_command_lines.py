@@ -174,7 +174,7 @@ def test_an_avatar_of_an_older_version_says_train_again(
         assert "train it again with `mien train`" in capsys.readouterr().err
         edit_json(path, lambda content: content.update(tensors_sha256="0", future=1))
         assert main(["export", "W", "--out", "a.ply"]) == 2
-        assert "unknown ['future']" in capsys.readouterr().err
+        assert "unknown entries ['future']" in capsys.readouterr().err
     finally:
         path.write_bytes(whole)
     assert main(["render", "W", "--out", "größer.png", "--size", "16"]) == 0
@@ -192,7 +192,7 @@ def test_an_unfinished_run_does_not_ask_for_its_name(tmp_path: Path):
     for run in ("good", "stopped"):
         workspace.run_dir(run).mkdir(parents=True)
         (workspace.run_dir(run) / "config.json").touch()
-    with pytest.raises(UserError, match="which run"):
+    with pytest.raises(UserError, match="has several runs"):
         workspace.pick_run(None)
     (workspace.run_dir("good") / "avatar").mkdir()
     assert workspace.pick_run(None) == "good"

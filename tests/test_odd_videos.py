@@ -56,7 +56,7 @@ def test_folders_of_pictures_with_odd_names_and_sizes(tmp_path: Path) -> None:
     assert len(source.content_hash) == 64
     frames = source.frames()
     assert [next(frames).picture().shape for _ in range(2)] == [(10, 20, 3)] * 2
-    with pytest.raises(UserError, match="is 24x10, the images before it are 20x10; give images of one size"):
+    with pytest.raises(UserError, match="is 24x10, but the images before it are 20x10; give images of one size"):
         next(frames).picture()
 
 

@@ -46,7 +46,7 @@ def choices(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     def remember(workspace: object, names: object, run: object, method: MethodConfig, settings: TrainSettings) -> None:
         asked.append((method, settings))
 
-    monkeypatch.setattr(training, "training_stage", remember)
+    monkeypatch.setattr(training, "run_training_stage", remember)
 
     def choose(line: str, file: object = None) -> Choices:
         words = ["train", str(workspace), *line.split()]
@@ -129,7 +129,7 @@ def test_face_tuning_has_two_options_that_agree(line: str, choices: Any) -> None
         ),
         ("--method.density.opacity-resets 0.4 0.1", "opacity-resets 0.4 0.1: give numbers from 0 to 1, ascending"),
         ("--method.density.max-gaussians -3", "--method.density.max-gaussians -3: give a number from 1 to 10000000"),
-        ("--method.photometric.l1-weight inf", "--method.photometric.l1-weight inf: give 0 or"),
+        ("--method.photometric.l1-weight inf", "--method.photometric.l1-weight inf: give a number from 0"),
         ("--training.resolution 3", "--training.resolution 3: give 0, or a number from 16 to 8192"),
         ("--training.record-every 0", "--training.record-every 0: give a number from 1 to"),
         ("--steps 99999999999", "--steps 99999999999: give a number from 1 to 1000000000"),

@@ -46,7 +46,7 @@ def added(cache, monkeypatch, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "My Head.npz"
     if not path.is_file():
         write_npz(path, flame_like(anny))
-    stage.add_face_model_stage(path)
+    stage.add_face_model_file(path)
     return path, calls
 
 
@@ -78,7 +78,7 @@ def test_choices_that_lead_nowhere(added, tmp_path, capsys):
         with pytest.raises(UserError, match=message):
             stage.face_model_of(choice)
     with pytest.raises(UserError, match="letters, digits"):
-        stage.add_face_model_stage(path, "../up")
+        stage.add_face_model_file(path, "../up")
     assert main(["face-models", "--name", "x"]) != 0
     assert "--add FILE" in capsys.readouterr().err
 

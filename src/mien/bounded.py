@@ -69,7 +69,7 @@ def read_bytes(path: Path, most: int) -> bytes:
     with open_ordinary(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise ValueError(f"it has {size:,} bytes, and {most:,} are the most")
+            raise ValueError(f"it has {size:,} bytes, and at most {most:,} are read")
         # Do not read to the end of the file, because the file may grow meanwhile.
         return file.read(size)
 

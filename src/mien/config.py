@@ -150,7 +150,9 @@ def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
         name for name, f in known.items() if name not in value and f.default is MISSING and f.default_factory is MISSING
     ]
     if unknown or missing:
-        raise UserError(f"{where}: has unknown entries {_in_short(sorted(unknown))} and lacks {_in_short(missing)}")
+        faults = [f"has unknown entries {_in_short(sorted(unknown))}"] if unknown else []
+        faults += [f"lacks {_in_short(missing)}"] if missing else []
+        raise UserError(f"{where}: {' and '.join(faults)}")
     return hint(**{name: _decode(hints[name], value[name], f"{where}.{name}") for name in known if name in value})
 
 

@@ -269,7 +269,7 @@ def _check_safetensors(path: Path) -> None:
     with open_ordinary(path) as file:
         whole = os.fstat(file.fileno()).st_size
         if whole > _MAX_TENSORS_BYTES:
-            raise ValueError(f"it has {whole:,} bytes, and {_MAX_TENSORS_BYTES:,} are the most")
+            raise ValueError(f"it has {whole:,} bytes, and at most {_MAX_TENSORS_BYTES:,} are read")
         size = int.from_bytes(file.read(8), "little")
         if not 2 <= size <= min(_MAX_HEADER_BYTES, whole - 8):
             raise ValueError("its header does not fit into the file")

@@ -20,7 +20,7 @@ _RIGID = 1e-2
 """Tolerance for the last rows of K and viewmat, and for the deviation of R R^T from the identity."""
 
 
-def whole(value: object, low: int, high: int) -> int:
+def checked_whole(value: object, low: int, high: int) -> int:
     """`value`, if it is a whole number from `low` to `high`.
 
     Raises:
@@ -31,13 +31,13 @@ def whole(value: object, low: int, high: int) -> int:
     return value
 
 
-def side(value: object) -> int:
+def checked_side(value: object) -> int:
     """`value`, if it can be a picture's width or height in pixels.
 
     Raises:
         ValueError: it cannot.
     """
-    return whole(value, 1, MAX_SIDE)
+    return checked_whole(value, 1, MAX_SIDE)
 
 
 def is_moderate(array: np.ndarray) -> bool:
@@ -61,7 +61,7 @@ def camera_fault(K: Any, viewmat: Any, width: object, height: object) -> str | N
     """
     for value in (width, height):
         try:
-            side(value)
+            checked_side(value)
         except ValueError:
             return f"{width!r:.40}x{height!r:.40} pixels, not whole numbers from 1 to {MAX_SIDE}"
     K, viewmat = (np.asarray(matrix, np.float64) for matrix in (K, viewmat))

@@ -20,7 +20,7 @@ from mien.picture_files import decode_png, encode_picture, write_at
 
 FRAMES, MATTES, CACHE = "frames", "mattes", "cache"
 STAGE = "`mien capture`"
-REMEDY = "run `mien capture` on its video again, which mends it"
+REMEDY = "run `mien capture` on its video again, which repairs it"
 """Remedy for a damaged capture."""
 _PNG_OPTIONS = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),

@@ -61,7 +61,7 @@ class GivenMattes:
             name, matte = self._path, frame.picture()[..., 1]
         if matte.shape[::-1] != self._size:
             raise UserError(
-                f"{name}: is {matte.shape[1]}x{matte.shape[0]}, the source's pictures are "
+                f"{name}: is {matte.shape[1]}x{matte.shape[0]}, but the source's pictures are "
                 f"{self._size[0]}x{self._size[1]}; give mattes of that size"
             )
         return crop.apply(matte)

@@ -52,8 +52,8 @@ def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     """
     cuts = find_cuts(survey.thumbnails) if settings.cuts else []
     if cuts:
-        say(f"warning: {path}: cuts to another shot at {_times(survey, cuts)}; tracking may stumble there")
-    part = _part(survey, 0, settings, name)
+        say(f"warning: {path}: cuts to another shot at {_list_times(survey, cuts)}; tracking may stumble there")
+    part = _make_part(survey, 0, settings, name)
     if part is None:
         raise no_face(path, len(survey.timestamps))
     _tell_people(path, part)
@@ -78,11 +78,11 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
         if cuts and seconds < settings.shortest_part - interval / 2:
             short.append(start)
             continue
-        part = _part(slice_survey(survey, slice(start, stop)), start, settings, name)
+        part = _make_part(slice_survey(survey, slice(start, stop)), start, settings, name)
         faceless.append(start) if part is None else found.append(part)
     if short:
         least = f"{settings.shortest_part:g} s"
-        say(f"{path}: {len(short)} parts shorter than {least} are left out, at {_times(survey, short)}")
+        say(f"{path}: {len(short)} parts shorter than {least} are left out, at {_list_times(survey, short)}")
     if not found and short:
         raise UserError(
             f"{path}: cuts {len(cuts)} times, and shows a face in no part of {settings.shortest_part:g} s or more; "
@@ -91,16 +91,16 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     if not found:
         raise no_face(path, len(survey.timestamps))
     if faceless:
-        say(f"{path}: {len(faceless)} parts without a face are left out, at {_times(survey, faceless)}")
-    parts = _named(found, name)
+        say(f"{path}: {len(faceless)} parts without a face are left out, at {_list_times(survey, faceless)}")
+    parts = _number_parts(found, name)
     if cuts:
-        say(f"{path}: cuts to another shot at {_times(survey, cuts)}: {', '.join(part.name for part in parts)}")
+        say(f"{path}: cuts to another shot at {_list_times(survey, cuts)}: {', '.join(part.name for part in parts)}")
     for part in parts:
         _tell_people(path, part)
     return parts
 
 
-def _named(parts: list[Part], name: str) -> list[Part]:
+def _number_parts(parts: list[Part], name: str) -> list[Part]:
     if len(parts) == 1:
         return parts
     return [
@@ -109,14 +109,14 @@ def _named(parts: list[Part], name: str) -> list[Part]:
     ]
 
 
-def _part(survey: Survey, start: int, settings: CaptureSettings, name: str) -> Part | None:
+def _make_part(survey: Survey, start: int, settings: CaptureSettings, name: str) -> Part | None:
     person = choose_person(survey)
     if not person.seen.any():
         return None
-    return Part(name, start, survey, person, _crop(survey, person, settings))
+    return Part(name, start, survey, person, _choose_crop(survey, person, settings))
 
 
-def _crop(survey: Survey, person: Person, settings: CaptureSettings) -> Crop:
+def _choose_crop(survey: Survey, person: Person, settings: CaptureSettings) -> Crop:
     width, height = survey.picture_size.tolist()
     if settings.crop == "none":
         return whole_picture(width, height, settings.size)
@@ -135,7 +135,7 @@ def _tell_people(path: Path, part: Part) -> None:
     )
 
 
-def _times(survey: Survey, frames: list[int]) -> str:
+def _list_times(survey: Survey, frames: list[int]) -> str:
     """List the times of up to five frames, for messages."""
     listed = ", ".join(f"{survey.timestamps[frame]:.1f}" for frame in frames[:5])
     return f"{listed}{', ...' if len(frames) > 5 else ''} s"

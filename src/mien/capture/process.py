@@ -212,15 +212,15 @@ def _read(path: Path) -> Chunk:
         return Chunk(**arrays)
 
 
-def process_part(reel: Reel, part: Part, given: GivenInputs, layout: FrameLayout, memory: Path) -> list[Chunk]:
-    """Process all frames of a part. Chunks that an interrupted call left in the folder `memory` are kept.
+def process_part(reel: Reel, part: Part, given: GivenInputs, layout: FrameLayout, work: Path) -> list[Chunk]:
+    """Process all frames of a part. Chunks that an interrupted call left in the folder `work` are kept.
 
     Raises:
         UserError: the source cannot be decoded.
         OSError: the frames cannot be written.
     """
-    memory.mkdir(exist_ok=True)
-    paths = {start: memory / f"{start:06d}.safetensors" for start in range(0, layout.timesteps, _CHUNK)}
+    work.mkdir(exist_ok=True)
+    paths = {start: work / f"{start:06d}.safetensors" for start in range(0, layout.timesteps, _CHUNK)}
     chunks = [_read(path) for path in itertools.takewhile(Path.exists, paths.values())]
     done = sum(len(chunk.valid) for chunk in chunks)
     if done == layout.timesteps:

@@ -142,7 +142,7 @@ def list_images(folder: Path) -> list[Path]:
     """
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
     if not images:
-        raise UserError(f"{folder}: holds no images; name a video or a folder of .png or .jpg files")
+        raise UserError(f"{folder}: holds no images; give a video or a folder of .png or .jpg files")
     return sorted(images, key=lambda path: [int(part) if part.isdigit() else part for part in _parts(path.name)])
 
 
@@ -172,7 +172,7 @@ def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[LazyFr
         shape = shape or image.shape
         if image.shape != shape:
             raise UserError(
-                f"{path}: is {image.shape[1]}x{image.shape[0]}, the images before it are {shape[1]}x{shape[0]}; "
+                f"{path}: is {image.shape[1]}x{image.shape[0]}, but the images before it are {shape[1]}x{shape[0]}; "
                 "give images of one size"
             )
         return shrink_to(image, longest_side) if longest_side else image

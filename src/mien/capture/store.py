@@ -17,7 +17,7 @@ from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, STAGE, Frame
 from mien.capture.quality import FrameQuality
 from mien.errors import UserError
 from mien.inside import check_tree, is_one_line, is_plain_name, remove_tree
-from mien.limits import MAX_NUMBER, camera_fault, side
+from mien.limits import MAX_NUMBER, camera_fault, checked_side
 from mien.locks import read_beside_writers
 from mien.progress import progress_bar
 from mien.storage import (
@@ -236,7 +236,7 @@ def _checked(
     camera_ids: Any = content.get("camera_ids")
     name, fps, source = content.get("name"), content.get("fps"), content.get("source")
     with expect_whole(path / JSON_NAME, REMEDY):
-        timesteps, (height, width) = content["timesteps"], (side(content[key]) for key in ("height", "width"))
+        timesteps, (height, width) = content["timesteps"], (checked_side(content[key]) for key in ("height", "width"))
     if not (
         (isinstance(camera_ids, list) and camera_ids and all(map(is_file_name, camera_ids)))
         and (len(set(camera_ids)) == len(camera_ids) and _is_count(timesteps))

@@ -57,23 +57,23 @@ class Survey:
     """Width and height of the source in pixels."""
 
 
-def survey_source(frames: FrameSource, memory: Path, landmarks: Float[np.ndarray, "n l 2"] | None = None) -> Survey:
-    """Survey all frames. Results that an earlier call left in the folder `memory` are kept.
+def survey_source(frames: FrameSource, work: Path, landmarks: Float[np.ndarray, "n l 2"] | None = None) -> Survey:
+    """Survey all frames. Results that an earlier call left in the folder `work` are kept.
 
     Args:
         frames: the source.
-        memory: the folder for the results.
+        work: the folder for the results.
         landmarks: landmarks for every frame of the source in pixels, NaN for no face. If they are given, faces are not
             searched.
 
     Raises:
         UserError: the source cannot be decoded.
     """
-    memory.mkdir(parents=True, exist_ok=True)
-    whole, done = memory / "survey.safetensors", []
+    work.mkdir(parents=True, exist_ok=True)
+    whole, done = work / "survey.safetensors", []
     if whole.is_file():
         return _read(whole)
-    for path in itertools.takewhile(Path.exists, (_chunk_path(memory, index) for index in itertools.count())):
+    for path in itertools.takewhile(Path.exists, (_chunk_path(work, index) for index in itertools.count())):
         done.append(_read(path))
     first = next(frames.frames()).picture()
     size = np.array([first.shape[1], first.shape[0]], np.int64)
@@ -83,12 +83,12 @@ def survey_source(frames: FrameSource, memory: Path, landmarks: Float[np.ndarray
         find = _search(stack.enter_context(FaceFinder())) if landmarks is None else _look_up(landmarks / size)
         advance = stack.enter_context(progress_bar(title, frames.expected_frames, len(done) * _CHUNK))
         while seen := _observe(itertools.islice(stream, _CHUNK), find, size, advance):
-            _write(_chunk_path(memory, len(done)), seen)
+            _write(_chunk_path(work, len(done)), seen)
             done.append(seen)
     survey = _join(done)
     _write(whole, survey)
     for index in range(len(done)):
-        _chunk_path(memory, index).unlink()
+        _chunk_path(work, index).unlink()
     return survey
 
 
@@ -173,8 +173,8 @@ def _mean_colours(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"
     return cv2.resize(part, (_GRID, _GRID), interpolation=cv2.INTER_AREA).ravel() / 255.0
 
 
-def _chunk_path(memory: Path, index: int) -> Path:
-    return memory / f"survey-{index:04d}.safetensors"
+def _chunk_path(work: Path, index: int) -> Path:
+    return work / f"survey-{index:04d}.safetensors"
 
 
 def _join(chunks: list[Survey]) -> Survey:

@@ -137,9 +137,9 @@ class Quality:
 
     def run(self) -> None:
         """Run every capture through all stages, then print the table."""
-        from mien.commands.stages.quality import quality_stage
+        from mien.commands.stages.quality import run_quality_stage
 
-        quality_stage(self.out, self.captures, self.method, self.steps, as_json=self.as_json)
+        run_quality_stage(self.out, self.captures, self.method, self.steps, as_json=self.as_json)
 
 
 @dataclass(frozen=True)

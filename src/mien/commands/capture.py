@@ -42,6 +42,6 @@ class Command:
 
     def run(self) -> None:
         """Capture the video and report what was found."""
-        from mien.commands.stages.capturing import capture_stage
+        from mien.commands.stages.capturing import run_capture_stage
 
-        capture_stage(Workspace(self.out), self.video, self.name, self.settings, self.replace)
+        run_capture_stage(Workspace(self.out), self.video, self.name, self.settings, self.replace)

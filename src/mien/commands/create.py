@@ -54,12 +54,12 @@ class Command:
 
     def run(self) -> None:
         """Run all stages and skip those whose results are current. All possible checks come before any work."""
-        from mien.commands.stages.capturing import capture_stage
-        from mien.commands.stages.evaluating import evaluation_stage
+        from mien.commands.stages.capturing import run_capture_stage
+        from mien.commands.stages.evaluating import run_evaluation_stage
         from mien.commands.stages.face_models import face_model_of
         from mien.commands.stages.names import doubled_videos, run_name, sequence_names
-        from mien.commands.stages.tracking import tracking_stage
-        from mien.commands.stages.training import training_stage
+        from mien.commands.stages.tracking import run_tracking_stage
+        from mien.commands.stages.training import run_training_stage
         from mien.progress import say
         from mien.training import check_held_out, check_run, check_untouched
 
@@ -75,14 +75,14 @@ class Command:
             say(f"warning: {warning}")
 
         videos = zip(self.videos, names, strict=True)
-        captured = [part for video, name in videos for part in capture_stage(workspace, video, name, self.capture)]
+        captured = [part for video, name in videos for part in run_capture_stage(workspace, video, name, self.capture)]
         check_held_out(captured, settings)
-        trackings = tracking_stage(
+        trackings = run_tracking_stage(
             workspace, self.face_model, self.tracking, overlay=self.overlay, preview=self.preview
         )
-        training_stage(workspace, [name for name in captured if name in trackings], run, method, settings)
+        run_training_stage(workspace, [name for name in captured if name in trackings], run, method, settings)
         if settings.holds_out:
-            evaluation_stage(workspace, run, again=False)
+            run_evaluation_stage(workspace, run, again=False)
         which = ["--run", run] if len(workspace.run_names()) > 1 else []
         command = shlex.join(["mien", "render", str(self.out), *which, "--out", "turntable.mp4"])
         say(f"Done in {time.monotonic() - began:.0f} s. Next: {command}")

@@ -44,11 +44,11 @@ class Command:
 
     def run(self) -> None:
         """Track the driver if necessary, then pose and render every timestep."""
-        from mien.commands.stages.driving import DriveOptions, drive_stage
+        from mien.commands.stages.driving import DriveOptions, run_driving_stage
         from mien.commands.stages.pictures import warn_of_white
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         warn_of_white(self.picture, run_dir)
         options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps)
-        drive_stage(run_dir, self.by, self.out, options, self.picture)
+        run_driving_stage(run_dir, self.by, self.out, options, self.picture)

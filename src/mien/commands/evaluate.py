@@ -80,22 +80,22 @@ class Command:
             self._evaluate()
 
     def _evaluate(self) -> None:
-        from mien.commands.stages.evaluating import evaluation_stage
+        from mien.commands.stages.evaluating import run_evaluation_stage
         from mien.evaluation import EvaluationSettings
 
         settings = EvaluationSettings(
             perceptual=self.perceptual, perceptual_frames=self.perceptual_frames, pictures=self.pictures
         )
         workspace = open_workspace(self.workspaces[0])
-        metrics = evaluation_stage(workspace, workspace.pick_run(self.run_name), settings, self.drivers)
+        metrics = run_evaluation_stage(workspace, workspace.pick_run(self.run_name), settings, self.drivers)
         if self.as_json:
             _print_json(metrics)
 
     def _compare(self) -> None:
-        from mien.commands.stages.evaluating import comparison_stage
+        from mien.commands.stages.evaluating import run_comparison
         from mien.evaluation.text import comparison_text
 
-        comparison = comparison_stage([open_workspace(folder) for folder in self.workspaces], self.run_name, self.out)
+        comparison = run_comparison([open_workspace(folder) for folder in self.workspaces], self.run_name, self.out)
         if self.as_json:
             _print_json(comparison.content())
         else:

@@ -43,9 +43,9 @@ class Command:
         from mien.face import available_face_models, load_face_model
 
         if self.add is not None:
-            from mien.commands.stages.face_models import add_face_model_stage
+            from mien.commands.stages.face_models import add_face_model_file
 
-            add_face_model_stage(self.add, self.name, self.shareable)
+            add_face_model_file(self.add, self.name, self.shareable)
         if self.bake is not None:
             load_face_model(self.bake)
         rows = [asdict(info) for info in available_face_models()]

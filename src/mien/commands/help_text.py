@@ -1,4 +1,4 @@
-"""What `mien COMMAND --help` shows: the common options, one description a line. `--help-all` shows every option."""
+"""What `mien COMMAND --help` shows: the common options, with their descriptions. `--help-all` shows every option."""
 
 import ast
 import inspect
@@ -60,8 +60,9 @@ def readable(options: Any) -> Any:
     for one in fields(options):
         kind, *marks = _unwrapped(hints[one.name])
         if isinstance(kind, type) and is_dataclass(kind):
-            changed[one.name] = Annotated[(readable(kind), *marks)] if marks else readable(kind)
-            defaults[one.name] = field(default_factory=_unwrapped(changed[one.name])[0])
+            group = readable(kind)
+            changed[one.name] = Annotated[(group, *marks)] if marks else group
+            defaults[one.name] = field(default_factory=group)
         elif get_origin(kind) in (Union, types.UnionType) and all(map(is_dataclass, map(_bare, get_args(kind)))):
             commands = [Annotated[(readable(_bare(hint)), *_unwrapped(hint)[1:])] for hint in get_args(kind)]
             changed[one.name] = Annotated[(Union[tuple(commands)], *marks)]  # noqa: UP007 (their number varies)

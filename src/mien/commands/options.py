@@ -11,7 +11,7 @@ import tyro
 from mien.avatar import DEFAULT_METHOD, METHODS, MethodConfig
 from mien.commands.config_file import ConfigFile, read_config_file
 from mien.commands.help_text import subclass_with
-from mien.commands.settings_options import applied, check_names, leaves, options_type
+from mien.commands.settings_options import apply_options, check_names, leaves, options_type
 from mien.config import overlay
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
@@ -74,7 +74,7 @@ class TrainOptions:
         self.method_config()
 
     def settings(self) -> TrainSettings:
-        """The settings of the run: those of the preset or the file, with these options applied.
+        """The settings of the run: those of the preset or the file, with these options apply_options.
 
         Raises:
             UserError: one is out of range, or CUDA is asked for without gsplat.
@@ -84,7 +84,7 @@ class TrainOptions:
             raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's number")
         preset = PRESETS[self.preset].settings
         settings = replace(
-            preset if self.training is None else applied(preset, self.training),
+            preset if self.training is None else apply_options(preset, self.training),
             split=self.split,
             background=self.background,
             seed=self.seed,
@@ -97,14 +97,14 @@ class TrainOptions:
         return settings
 
     def method_config(self) -> MethodConfig:
-        """The method's settings: those of the preset or the file, with these options applied.
+        """The method's settings: those of the preset or the file, with these options apply_options.
 
         Raises:
             UserError: one is out of range.
         """
         config = PRESETS[self.preset].config(self.method)
         if self.method_settings is not None:
-            config = applied(config, self.method_settings)
+            config = apply_options(config, self.method_settings)
         # Two options set face tuning. The one that differs from the default was typed.
         default = type(self).face_tuning
         typed = {self.face_tuning, config.face_tuning.enabled} != {default}

@@ -9,6 +9,7 @@ import difflib
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
+from functools import partial
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from mien.avatar import Rate
@@ -77,12 +78,11 @@ def options_type(listed: Sequence[Leaf], prefix: str) -> type:
     # Options that belong to no group come first.
     headings: dict[str, list[tuple[str, Any, Any]]] = {prefix: [], f"{prefix}.rates": []}
     for leaf in listed:
-        limits = "" if leaf.allowed is None else f"{leaf.allowed}; "
         marks = tyro.conf.arg(
             name=leaf.option(prefix).removeprefix("--"),
             prefix_name=False,
             help=leaf.about.replace("\n", " "),
-            help_behavior_hint=lambda default, limits=limits: f"({limits}default: {default})",
+            help_behavior_hint=partial(_range_and_default, leaf.allowed),
         )
         hint: Any = Annotated[leaf.kind, tyro.conf.FlagConversionOff, marks]
         headings.setdefault(leaf.heading, []).append((_identifier(leaf.name), hint, field(default=leaf.value)))
@@ -97,7 +97,12 @@ def options_type(listed: Sequence[Leaf], prefix: str) -> type:
     return make_dataclass(f"{prefix}_options", groups, frozen=True)
 
 
-def applied(settings: Settings, options: Any) -> Settings:
+def _range_and_default(allowed: Range | None, default: str) -> str:
+    shown = ([] if allowed is None else [str(allowed)]) + ([] if default == "None" else [f"default: {default}"])
+    return f"({'; '.join(shown)})" if shown else ""
+
+
+def apply_options(settings: Settings, options: Any) -> Settings:
     """Settings with the values of `options`, an instance of a class from `options_type`."""
     groups = [getattr(options, group.name) for group in fields(options)]
     typed = {one.name.replace(_AS_FIELD, "."): getattr(group, one.name) for group in groups for one in fields(group)}

@@ -39,8 +39,8 @@ class Command:
 
     def run(self) -> None:
         """Track, and write overlays and reports."""
-        from mien.commands.stages.tracking import tracking_stage
+        from mien.commands.stages.tracking import run_tracking_stage
 
-        tracking_stage(
+        run_tracking_stage(
             open_workspace(self.workspace), self.face_model, self.settings, self.again, self.overlay, self.preview
         )

@@ -36,7 +36,7 @@ class Command:
     def run(self) -> None:
         """Train the run to its end."""
         from mien.commands.stages.names import run_name
-        from mien.commands.stages.training import training_stage
+        from mien.commands.stages.training import run_training_stage
         from mien.training import check_run
 
         workspace = open_workspace(self.workspace)
@@ -45,7 +45,7 @@ class Command:
         names = self._names(workspace)
         check_run(workspace.run_dir(run), method, settings, names)
         self.options.say_what_is_ignored()
-        training_stage(workspace, names, run, method, settings)
+        run_training_stage(workspace, names, run, method, settings)
 
     def _names(self, workspace: Workspace) -> list[str]:
         if not self.sequences:

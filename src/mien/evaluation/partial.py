@@ -9,7 +9,7 @@ from typing import Any
 from mien.bounded import parse_json, read_bytes
 from mien.evaluation.scoring import Scores
 from mien.inside import open_to_append
-from mien.limits import whole
+from mien.limits import checked_whole
 from mien.storage import write_atomically
 from mien.training.frames import Frame
 
@@ -70,7 +70,7 @@ def _parsed(line: str) -> tuple[Frame, Scored] | None:
     """The frame and figures of a line, or None if the line is not complete."""
     try:
         content: dict[str, Any] = parse_json(line)
-        frame = Frame(*(whole(number, 0, _MAX_INDEX) for number in content["frame"]))
+        frame = Frame(*(checked_whole(number, 0, _MAX_INDEX) for number in content["frame"]))
         scores = {str(name): _figures(row) for name, row in content["scores"].items()}
         return frame, (scores, float(content["seconds"]))
     except (ValueError, LookupError, TypeError, AttributeError):

@@ -8,7 +8,7 @@ import numpy as np
 
 from mien.errors import UserError
 from mien.inside import check_tree, open_new, remove_tree
-from mien.limits import side
+from mien.limits import checked_side
 from mien.locks import read_beside_writers
 from mien.picture_files import PictureStack, decode_png, encode_picture
 from mien.storage import expect_whole, read_arrays, read_json, replace_folder, write_arrays, write_json
@@ -74,7 +74,7 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
             "to make new ones"
         )
     with expect_whole(path / "scoring.json", _REMEDY):
-        sides = side(content["height"]), side(content["width"])
+        sides = checked_side(content["height"]), checked_side(content["width"])
         counts = content["timesteps"], content["cameras"]
     crops = read_arrays(path / "crops.safetensors", _STAGE).get("crops")
     # The size of the crops bounds the number of masks that are read. The json may claim any number.

@@ -9,7 +9,7 @@ from mien.storage import check_writable
 from mien.workspace import Workspace
 
 
-def capture_stage(
+def run_capture_stage(
     workspace: Workspace, video: Path, name: str | None, settings: CaptureSettings, replace: bool = False
 ) -> list[str]:
     """Capture a video into the workspace; return the names of its sequences, one for each part.

@@ -11,9 +11,9 @@ from mien.avatar import load_avatar
 from mien.capture import CaptureSettings
 from mien.commands.options import check_driver
 from mien.commands.picture import PictureOptions
-from mien.commands.stages.capturing import capture_stage
+from mien.commands.stages.capturing import run_capture_stage
 from mien.commands.stages.pictures import draw, view
-from mien.commands.stages.tracking import tracking_stage
+from mien.commands.stages.tracking import run_tracking_stage
 from mien.driving import Driver, drive, read_recording, read_tracked_driver
 from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
@@ -55,9 +55,9 @@ def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: floa
 def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
     """The workspace of a video in this user's cache, and its sequences. They are captured and tracked if needed."""
     workspace = Workspace(cache_folder() / "drivers" / f"{video.stem}-{file_digest(video)[:12]}")
-    capture_stage(workspace, video, None, CaptureSettings())
+    run_capture_stage(workspace, video, None, CaptureSettings())
     # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
-    tracked = tracking_stage(workspace, face_model_name, TrackingSettings(), overlay="none")
+    tracked = run_tracking_stage(workspace, face_model_name, TrackingSettings(), overlay="none")
     names = sorted(tracked, key=lambda name: (len(name), name))
     say(f"{video}: tracked in {workspace.root}, kept for the next time")
     return workspace, names
@@ -75,7 +75,7 @@ class DriveOptions:
     """Frame rate of the timecode in a csv."""
 
 
-def drive_stage(
+def run_driving_stage(
     run_dir: Path, by: Path, out: Path, options: DriveOptions | None = None, picture: PictureOptions | None = None
 ) -> None:
     """Render a run's avatar as it follows a driver. Pictures of the driver are beside it, unless `alone` is set."""

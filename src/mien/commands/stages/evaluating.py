@@ -16,7 +16,7 @@ from mien.training import read_run_config
 from mien.workspace import Workspace, open_workspace
 
 
-def evaluation_stage(
+def run_evaluation_stage(
     workspace: Workspace,
     run: str,
     settings: EvaluationSettings | None = None,
@@ -50,7 +50,7 @@ def run_sequences(workspace: Workspace, run_dir: Path) -> list[Path]:
     return [workspace.sequence_dir(entry["sequence"]) for entry in read_run_config(run_dir)["data"]]
 
 
-def comparison_stage(workspaces: Items[Workspace], run: str | None, out: Path | None) -> Comparison:
+def run_comparison(workspaces: Items[Workspace], run: str | None, out: Path | None) -> Comparison:
     """Compare the runs of some workspaces and write the page to `out`, by default into the first workspace."""
     roots = [workspace.root.resolve() for workspace in workspaces]
     by_name = len({root.name for root in roots}) == len(roots)

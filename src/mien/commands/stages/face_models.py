@@ -26,7 +26,7 @@ def face_model_of(choice: str) -> FaceModel:
     """
     path = Path(choice).expanduser()
     if path.suffix.lower() in _SUFFIXES:
-        return add_face_model_stage(path)
+        return add_face_model_file(path)
     if path.is_file() or "/" in choice:
         raise UserError(
             f"--face-model {choice}: is neither the name of a face model (see `mien face-models`) nor a .npz or .pkl "
@@ -35,7 +35,7 @@ def face_model_of(choice: str) -> FaceModel:
     return load_face_model(choice)
 
 
-def add_face_model_stage(path: Path, name: str | None = None, shareable: bool = False) -> FaceModel:
+def add_face_model_file(path: Path, name: str | None = None, shareable: bool = False) -> FaceModel:
     """Add a file in FLAME's schema to this user's face models, unless it is already there.
 
     The default name is the file's. Landmarks are placed by running the landmark detector on pictures of the model (some

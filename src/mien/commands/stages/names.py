@@ -40,18 +40,17 @@ def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
             folder can have a name.
     """
     if not videos:
-        raise UserError("no video; name one or several: mien create VIDEO [VIDEO ...] --out DIR")
+        raise UserError("no video given; write mien create VIDEO [VIDEO ...] --out DIR")
     for video in videos:
         if not video.exists():
             raise UserError(f"{video}: no such video or folder of pictures; check the path")
     if names and len(names) != len(videos):
-        raise UserError(
-            f"--name {' '.join(names)}: {len(names)} names for {len(videos)} videos; give one name for each"
-        )
+        counts = f"{len(names)} names, but the number of videos is {len(videos)}"
+        raise UserError(f"--name {' '.join(names)}: {counts}; give one name for each")
     found = [sequence_name(video, name) for video, name in zip(videos, names or [None] * len(videos), strict=True)]
     twice = [name for name, count in Counter(found).items() if count > 1]
     if twice:
-        raise UserError(f"two videos would both be the sequence {twice[0]!r}; name all of them with --name")
+        raise UserError(f"two videos would both be the sequence {twice[0]!r}; give each a name with --name")
     return found
 
 

@@ -14,10 +14,10 @@ import torch
 from mien.avatar import method_named
 from mien.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
 from mien.capture import CaptureSettings, read_capture, read_capture_hash
-from mien.commands.stages.capturing import capture_stage
-from mien.commands.stages.evaluating import evaluation_stage, run_sequences
-from mien.commands.stages.tracking import tracking_stage
-from mien.commands.stages.training import training_stage
+from mien.commands.stages.capturing import run_capture_stage
+from mien.commands.stages.evaluating import run_evaluation_stage, run_sequences
+from mien.commands.stages.tracking import run_tracking_stage
+from mien.commands.stages.training import run_training_stage
 from mien.errors import UserError
 from mien.evaluation import read_metrics
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
@@ -43,7 +43,7 @@ _SHEET_SIDE, _SHEET_FRAMES = 192, 6
 _SCORED = EvaluationSettings(perceptual_frames=8, video_frames=0)
 
 
-def quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
+def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
     """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png.
 
     Raises:
@@ -81,7 +81,7 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
         for recipe in reference.sequences:
             _capture(workspace, drawn / recipe.name, recipe.name)
     with times.measured("track"):
-        trackings = tracking_stage(workspace, _FACE_MODEL, TrackingSettings(), overlay="none")
+        trackings = run_tracking_stage(workspace, _FACE_MODEL, TrackingSettings(), overlay="none")
     run = f"{method}-{steps}"
     settings = TrainSettings(
         steps=steps,
@@ -90,10 +90,10 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
         held_out_cameras=reference.held_out_cameras,
     )
     with times.measured("train"):
-        training_stage(workspace, list(trackings), run, method_named(method).config(), settings)
+        run_training_stage(workspace, list(trackings), run, method_named(method).config(), settings)
     with times.measured("evaluate"):
         scored = (workspace.run_dir(run) / "metrics.json").is_file()
-        metrics = read_metrics(workspace.run_dir(run)) if scored else evaluation_stage(workspace, run, _SCORED)
+        metrics = read_metrics(workspace.run_dir(run)) if scored else run_evaluation_stage(workspace, run, _SCORED)
     errors = {name: _errors(workspace, drawn, name) for name in trackings}
     summary = read_training_summary(workspace.run_dir(run))
     protocols = {
@@ -107,7 +107,7 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
 def _capture(workspace: Workspace, drawn: Path, name: str) -> None:
     """Capture a drawn video like a user's video, or copy the capture of calibrated cameras."""
     if (drawn / "video.mp4").is_file():
-        capture_stage(workspace, drawn / "video.mp4", name, CaptureSettings(cuts=False), replace=True)
+        run_capture_stage(workspace, drawn / "video.mp4", name, CaptureSettings(cuts=False), replace=True)
         return
     target = workspace.sequence_dir(name) / "capture"
     if target.is_dir() and read_capture_hash(target) == read_capture_hash(drawn / "capture"):

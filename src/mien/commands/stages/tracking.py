@@ -44,7 +44,7 @@ Overlay = Literal["auto", "all", "none"]
 """Frames that overlay.mp4 shows."""
 
 
-def tracking_stage(
+def run_tracking_stage(
     workspace: Workspace,
     face_model_choice: str,
     settings: TrackingSettings,

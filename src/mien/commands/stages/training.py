@@ -16,7 +16,7 @@ from mien.training.trainer import check_trackings
 from mien.workspace import Workspace
 
 
-def training_stage(
+def run_training_stage(
     workspace: Workspace, sequences: list[str], run: str, method: MethodConfig, settings: TrainSettings
 ) -> None:
     """Train a run on some sequences of the workspace. An interrupted run continues; a finished run stays as it is."""
