@@ -66,7 +66,7 @@ class SyntheticRecipe:
     beard: float = 0.0
     """Length of a full beard of strands in metres; 0 for none. It is not part of the face model."""
     off_model: float = 0.0
-    """How far head shape and expressions leave the face model's space; 1 is far, 0 not at all."""
+    """Distance of head shape and expressions from the face model's space: 1 is far, 0 is none."""
     cameras: Literal["front", "ring"] = "front"
     """front: one camera in front of the face. ring: `ring_size` calibrated cameras on half a sphere, the first in
     front."""
