@@ -1,13 +1,15 @@
 """The documentation's links point to files and headings that exist."""
 
 import re
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
 
-from mien.cli import COMMANDS
+from mien.avatar import METHODS
+from mien.cli import COMMANDS, main
 
 ROOT = Path(__file__).parent.parent
 _OUTSIDE_DOCS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md", "native/README.md")
@@ -108,6 +110,18 @@ def test_commands_that_pages_name_exist() -> None:
         for names in re.findall(r"`mien ((?:[a-z][a-z-]*(?: \| )?)+)", text):
             missing += [(page.name, name) for name in names.split(" | ") if name.split()[0] not in COMMANDS]
     assert missing == []
+
+
+def test_options_that_pages_name_exist(capsys: pytest.CaptureFixture[str]) -> None:
+    lists = [[name] for name in COMMANDS if name not in ("bench", "train")]
+    lists += [["train", "--method", method] for method in METHODS] + [["bench", name] for name in ("render", "quality")]
+    for arguments in lists:
+        with suppress(SystemExit):
+            main([*arguments, "--help-all"])
+    known = set(re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", capsys.readouterr().out))
+    option = re.compile(r"(?<![\w-])--(?:capture|tracking|training|method)\.[a-z][\w.-]*\w")
+    named = {(page.name, name) for page in CURRENT for name in option.findall(page.read_text("utf-8"))}
+    assert sorted((page, name) for page, name in named if name not in known) == []
 
 
 def test_broken_links_are_found(tmp_path: Path) -> None:

@@ -6,24 +6,28 @@ folder of `--out`, and the pictures are written beside this file.
 """
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mien.avatar import load_avatar
+from mien.camera import Camera
 from mien.capture import Capture, CaptureSettings, capture_video, write_capture
-from mien.face import FaceParams, load_face_model
+from mien.capture.video import write_video
+from mien.face import FaceModel, FaceParams, load_face_model
 from mien.render import rasterize
 from mien.synthetic import RECIPES, Segment, SyntheticRecipe, SyntheticScene, write_synthetic_video
 from mien.tracking import (
     SmoothnessSettings,
-    Tracking,
     TrackingSettings,
     make_scoring,
+    read_tracking,
     track,
     write_scoring,
     write_tracking,
@@ -37,14 +41,14 @@ QUALITY = 82
 STEPS = 3_000
 
 _BASE = replace(RECIPES["demo"], width=SIZE, height=SIZE, fps=10.0, glasses=False)
-WHOLE = replace(_BASE, name="whole", script=(Segment("expressions", 5), Segment("turns", 6.6)))
+WHOLE = replace(_BASE, name="whole", script=(Segment("expressions", 6), Segment("turns", 6.6)))
 CLIPS: dict[str, SyntheticRecipe] = {
     "whole": WHOLE,
     "closed": replace(WHOLE, name="closed", expression=0.0),
     "frontal": replace(WHOLE, name="frontal", turns=(6.0, 4.0), rotation=(6.0, 4.0, 3.0)),
 }
 """What the avatars are trained on: the whole range, the mouth always closed, the head always to the front."""
-MOTION, UNSEEN_MOTION = 7, 2
+MOTION, UNSEEN_MOTION = 8, 32
 """Seeds of the motion in the clips, and in the frames that the avatars are compared with."""
 
 
@@ -55,7 +59,7 @@ class View:
     truth: np.ndarray
     """The drawn picture over white."""
     face: FaceParams
-    camera: object
+    camera: Camera
 
 
 def write_clip(name: str, out: Path) -> Path:
@@ -93,10 +97,10 @@ def train_on(name: str, out: Path, background: str = "white") -> Path:
     return run
 
 
-def unseen(pick) -> View:
-    """The frame of a clip with other motion for which `pick` (of face and model) is largest."""
+def unseen(score: Callable[[FaceParams, FaceModel], torch.Tensor]) -> View:
+    """The frame of a clip with other motion that has the largest score."""
     scene = SyntheticScene(WHOLE, PERSON, UNSEEN_MOTION)
-    timestep = int(torch.as_tensor(pick(scene.face, scene.model)).argmax())
+    timestep = int(score(scene.face, scene.model).argmax())
     [[frame]] = scene.all_frames([timestep], (0,))
     alpha = frame.matte[..., None] / 255
     picture = (frame.image * alpha + 255 * (1 - alpha)).round().astype(np.uint8)
@@ -120,7 +124,7 @@ def write_row(name: str, panels: dict[str, np.ndarray], height: int = SIZE) -> N
     total, left = sum(widths) + gap * (len(widths) - 1), 0.0
     for (label, panel), width in zip(panels.items(), widths, strict=True):
         axes = figure.add_axes((left / total, line / (height + line), width / total, height / (height + line)))
-        axes.imshow(panel, interpolation="lanczos", aspect="auto")
+        axes.imshow(cv2.resize(panel, (round(width), height), interpolation=cv2.INTER_CUBIC), aspect="auto")
         axes.set_axis_off()
         figure.text((left + width / 2) / total, 7 / (height + line), label, ha="center", va="bottom", fontsize=8.5)
         left += width + gap
@@ -129,8 +133,6 @@ def write_row(name: str, panels: dict[str, np.ndarray], height: int = SIZE) -> N
 
 def write_figure(name: str, figure: Figure) -> None:
     """Write a figure as WebP beside this file."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     pixels = np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., 2::-1])
@@ -151,9 +153,14 @@ def mouth(out: Path) -> None:
     write_row("mouth", {label: panel[part] for label, panel in panels.items()})
 
 
+def aside(face: FaceParams, model: FaceModel) -> torch.Tensor:
+    """How near the head's turn is to 40 degrees."""
+    return -(face.head_rotation[:, 1].abs() - np.radians(40)).abs()
+
+
 def shards(out: Path) -> None:
     """A side that was never filmed, and one that was."""
-    view = unseen(lambda face, model: -(face.head_rotation[:, 1].abs() - np.radians(40)).abs())
+    view = unseen(aside)
     write_row(
         "shards",
         {
@@ -166,7 +173,7 @@ def shards(out: Path) -> None:
 
 def needles(out: Path) -> None:
     """White needles over a dark background."""
-    view = unseen(lambda face, model: -(face.head_rotation[:, 1].abs() - np.radians(40)).abs())
+    view = unseen(aside)
     write_row(
         "needles",
         {
@@ -176,36 +183,67 @@ def needles(out: Path) -> None:
     )
 
 
-def tracked(recipe: SyntheticRecipe, settings: TrackingSettings, out: Path) -> Tracking:
-    """Draw a video, capture it with the landmark detector, and track it."""
-    video = out / f"{recipe.name}.mp4"
+def nose_of(name: str, settings: TrackingSettings, out: Path) -> np.ndarray:
+    """Where the tip of the nose is in each frame of the noisy clip, in pixels from the left, as it is tracked."""
+    recipe = replace(_BASE, name="noisy", fps=25.0, noise=0.12, script=(Segment("still", 2.4),))
+    video, folder = out / "noisy.mp4", out / f"noisy-{name}"
     if not video.exists():
         write_synthetic_video(recipe, video, PERSON)
-    capture = capture_video(video, out / f"{recipe.name}-capture", CaptureSettings(size=SIZE, crop="none"))
-    return track(capture, load_face_model(recipe.face_model), settings)
-
-
-def nose_of(tracking: Tracking) -> np.ndarray:
-    """Rows [t, 2] of the tip of the nose, in pixels."""
+    if not folder.exists():
+        capture = capture_video(video, out / "noisy", CaptureSettings(size=SIZE, crop="none"))
+        write_tracking(folder, track(capture, load_face_model(recipe.face_model), settings))
+    tracking = read_tracking(folder)
     model = load_face_model(tracking.face_model)
     points = model.landmark_positions(model(tracking.face), "mediapipe")[:, 1]
-    return tracking.cameras[0].project(points)[0].numpy()
+    return tracking.cameras[0].project(points)[0][:, 0].detach().numpy()
 
 
 def jitter(out: Path) -> None:
-    """The tip of the nose while the head is still, in a clip with much noise."""
-    recipe = replace(_BASE, name="noisy", fps=25.0, noise=0.12, script=(Segment("still", 2.4),))
-    for label, settings in (
-        ("rough", TrackingSettings(schedule="landmarks", smoothness=SmoothnessSettings(10, 10, 100, 10000))),
-        ("landmarks", TrackingSettings(schedule="landmarks")),
-        ("fast", TrackingSettings()),
-        ("smooth", TrackingSettings(smoothness=SmoothnessSettings(0.05, 0.1, 1.0, 50.0))),
-    ):
-        nose = nose_of(tracked(recipe, settings, out))
-        print(label, nose.std(axis=0), np.abs(np.diff(nose, 2, axis=0)).mean(axis=0))
+    """The tip of the nose while the head does not move, in a video with much noise."""
+    rough = SmoothnessSettings(translation=10.0, depth=10.0, rotation=100.0, expression=1e4)
+    calm = SmoothnessSettings(translation=0.05, depth=0.1, rotation=1.0, expression=50.0)
+    kinds = {
+        "hardly any smoothness": ("C3", TrackingSettings(schedule="landmarks", smoothness=rough)),
+        "the defaults": ("C0", TrackingSettings()),
+        "smaller values, as below": ("C2", TrackingSettings(smoothness=calm)),
+    }
+    figure = Figure((7.8, 2.4), dpi=100)
+    axes = figure.add_axes((0.07, 0.2, 0.91, 0.68))
+    for label, (colour, settings) in kinds.items():
+        nose = nose_of(label.split()[1].strip(","), settings, out)
+        axes.plot(np.arange(len(nose)) / 25, nose - nose.mean(), colour, label=label, linewidth=1.4)
+    figure.legend(*axes.get_legend_handles_labels(), loc="upper center", ncols=3, frameon=False, fontsize=9)
+    axes.set_xlabel("seconds, in which the head does not move", fontsize=9)
+    axes.set_ylabel("nose, pixels", fontsize=9)
+    axes.tick_params(labelsize=8)
+    write_figure("jitter", figure)
 
 
-PICTURES = {function.__name__: function for function in (mouth, shards, needles, jitter)}
+def wrong_person(out: Path) -> None:
+    """A recorded video call: the capture follows the larger face. After cropping, the other one is captured."""
+    call, wanted = out / "call.mp4", out / "wanted.mp4"
+    if not wanted.exists():
+        recipe = replace(_BASE, script=(Segment("speech", 2),))
+        large = SyntheticScene(replace(recipe, distance=0.85, hair="long", glasses=True), 11)
+        small = SyntheticScene(replace(recipe, distance=1.3), PERSON)
+        left, right = ([frame.image for frame in scene.frames()] for scene in (large, small))
+        write_video(call, [np.concatenate(pair, axis=1) for pair in zip(left, right, strict=True)], recipe.fps)
+        write_video(wanted, right, recipe.fps)
+    settings = CaptureSettings(size=SIZE)
+    wrong, correct = (capture_video(video, out / video.stem, settings) for video in (call, wanted))
+    with_both = capture_video(call, out / "call-uncut", replace(settings, size=2 * SIZE, crop="none"))
+    write_row(
+        "wrong_person",
+        {
+            "the video": with_both.images[8, 0],
+            "captured: the larger face": wrong.images[8, 0],
+            "captured after cropping": correct.images[8, 0],
+        },
+        height=190,
+    )
+
+
+PICTURES = {function.__name__: function for function in (mouth, shards, needles, jitter, wrong_person)}
 
 
 if __name__ == "__main__":
