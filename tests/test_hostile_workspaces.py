@@ -363,7 +363,7 @@ TRACKINGS: dict[str, Callable[[Path], object]] = {
     "face model": lambda f: edit_json(f / "tracking.json", lambda c: c.update(face_model=["anny"])),
     "settings": lambda f: edit_json(f / "tracking.json", lambda c: c.update(settings=[1])),
     "together": lambda f: edit_json(f / "tracking.json", lambda c: c["settings"].update(tracked_together=3)),
-    "looks": lambda f: edit_json(f / "tracking.json", lambda c: c.update(appearance=[])),
+    "looks": lambda f: edit_json(f / "tracking.json", lambda c: c.update(looks=[])),
 }
 
 
