@@ -28,7 +28,7 @@ from mien.commands.settings_options import field_docs, leaves
 from mien.commands.stages import training
 from mien.errors import UserError
 from mien.ranges import FRACTION, NotBelow, Range, check_ranges
-from mien.training import DIALS, PRESETS, TrainSettings, train
+from mien.training import MAIN_SETTINGS, PRESETS, TrainSettings, train
 from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
 
@@ -419,7 +419,7 @@ def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.
         assert f" {leaf.option('method')} " in shown
     for heading in {leaf.heading for leaf in listed}:
         assert f" {heading} options " in shown
-    rest = [field.name for field in fields(TrainSettings) if field.name not in DIALS]
+    rest = [field.name for field in fields(TrainSettings) if field.name not in MAIN_SETTINGS]
     assert rest
     assert all(f"--training.{name.replace('_', '-')} " in shown for name in rest)
 
