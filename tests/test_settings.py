@@ -2,9 +2,11 @@
 
 import json
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import pytest
@@ -481,7 +483,10 @@ def test_settings_of_an_added_method_appear_by_themselves(
     choices: Any, workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     presets = {"draft": ToyConfig(dust=Dust(1)), "standard": ToyConfig()}
-    monkeypatch.setitem(METHODS, "toy", Method(presets, "toy_module:Toy"))
+    module = ModuleType("toy_settings")
+    vars(module)["PRESETS"] = presets
+    monkeypatch.setitem(sys.modules, "toy_settings", module)
+    monkeypatch.setitem(METHODS, "toy", Method("toy_module:Toy", "toy_settings"))
     shown = help_of(capsys, "train", "--method", "toy", "--help-all")
     assert "--method.dust.grains INT" in shown
     assert "Colour of the toy." in shown

@@ -1,6 +1,6 @@
 """Descriptions of a method's density control: the strategy, its settings, and hooks that only the method can provide.
 
-The strategies themselves are in `mien.training.density`, one file each. They see a `GaussianStore` and one of these
+The strategies themselves are in `mien.training.density_control`, one file each. They see a `GaussianStore` and one of these
 descriptions, never the method.
 """
 

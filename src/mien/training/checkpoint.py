@@ -12,7 +12,7 @@ from mien.errors import UserError
 from mien.progress import say
 from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.training.adam import Adam
-from mien.training.density import DensityStrategy
+from mien.training.density_control import DensityStrategy
 from mien.training.face_track import FaceTrack
 
 _KEPT_CHECKPOINTS = 2

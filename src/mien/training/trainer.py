@@ -25,7 +25,7 @@ from mien.render import rasterize
 from mien.render.validation import CannotDrawError
 from mien.training.adam import Adam
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
-from mien.training.density import density_strategy
+from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
 from mien.training.frames import FrameOrder, background_at, density_random, training_frames
 from mien.training.losses import picture_losses, train_psnr
