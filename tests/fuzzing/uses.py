@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from mien.avatar.portable import make_portable
 
 from fuzzing import content
 from fuzzing.material import CONFIG, QUICK, RUN, SEQUENCE, SETTINGS
 from mien import cli
 from mien.avatar import load_avatar
+from mien.avatar.baking import make_portable
 from mien.errors import UserError
 from mien.evaluation import evaluate
 from mien.evaluation import read_metrics as read_figures
