@@ -130,7 +130,7 @@ def render(
     arrays = _native.GaussianArrays(means, quats, scales, opacities, sh)
     task = _native.RasterizeView(arrays, colour, view, K, image, alpha, radii)
     if _native.rasterize_views([task], differentiable=False) == [None]:
-        raise ValueError("render: NaN or infinity in the Gaussians, the camera or the background")
+        raise ValueError("render: the Gaussians, the camera or the background hold NaN or infinity")
     return image, alpha
 
 
