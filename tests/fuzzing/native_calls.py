@@ -55,7 +55,7 @@ def load(path: str) -> Any:
 
 
 def bound_names(native: Any) -> set[str]:
-    """Return the names of everything that can be called, except for classes that only functions make and named tuples."""
+    """Return the names of everything that can be called, except for classes that only functions make, and groups."""
     made = {"FaceModelData", "RigTopology", "Ride", "RasterizeFrame"}
     named = {name: getattr(native, name) for name in dir(native) if not name.startswith("_")}
     return {name for name, one in named.items() if callable(one) and not hasattr(one, "_fields")} - made
