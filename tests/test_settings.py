@@ -1,8 +1,10 @@
 """Settings of methods and runs come from options and files in a known order, and wrong ones are refused before work."""
 
 import json
+import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, Literal
 
 import pytest
