@@ -390,7 +390,7 @@ def test_scorings_that_cannot_be(change: dict[str, Any], workspace: Path) -> Non
 def test_crops_out_of_the_picture(crop: list[int], workspace: Path) -> None:
     folder = workspace / "sequences/clip/scoring"
     write_arrays(folder / "crops.safetensors", {"crops": np.tile(np.array(crop, np.int32), (5, 1, 1))})
-    with pytest.raises(UserError, match="reaches out of the picture"):
+    with pytest.raises(UserError, match="extends beyond the picture"):
         read_scoring(folder)
 
 
