@@ -174,7 +174,7 @@ def test_crops_out_of_the_picture(crop: list[int], workspace: Path) -> None:
     """Crops that reach out of the picture are refused."""
     folder = workspace / "sequences/clip/scoring"
     write_arrays(folder / "crops.safetensors", {"crops": np.tile(np.array(crop, np.int32), (5, 1, 1))})
-    with pytest.raises(UserError, match="reaches out of the picture"):
+    with pytest.raises(UserError, match="extends beyond the picture"):
         read_scoring(folder)
 
 
