@@ -167,10 +167,10 @@ def test_bad_json_files(tmp_path: Path) -> None:
         ([{"blendshapes": {"jawOpen": "wide"}}], "jawOpen is 'wide'"),
         ([{"blendshapes": {"jawOpen": 60}}], "jawOpen is 60"),
         ([{"blendshapes": None}], "no frame has a face"),
-        ([{"faceBlendshapes": [{"categories": [{}]}]}], "not have the layout of a FaceLandmarker result"),
+        ([{"faceBlendshapes": [{"categories": [{}]}]}], "layout of a FaceLandmarker"),
         (
             [{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [1, 2]}]}],
-            "not have the layout of a FaceLandmarker result",
+            "layout of a FaceLandmarker",
         ),
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [0] * 16}]}], "is not a rotation"),
     ):
