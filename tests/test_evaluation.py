@@ -176,4 +176,4 @@ def test_charts_survive_gaps_and_flat_lines() -> None:
     assert flat.count("L") == 3
     assert gap.count("M") == 2
     assert "nan" not in flat + gap
-    assert "Nothing to draw" in line_chart([Series("none", x, np.full(4, np.nan))], Axes("step", "loss"))
+    assert "There are no values to draw" in line_chart([Series("none", x, np.full(4, np.nan))], Axes("step", "loss"))

@@ -112,7 +112,7 @@ def test_crops_beside_the_truth_are_found(folders: ImageFolders) -> None:
     with pytest.raises(UserError, match="no head box for b, c"):
         score_folders(folders, PLAIN)
     write_crops(folders.truth / "crops.json", {name: (99, 4, 20, 20) for name in "abc"})
-    with pytest.raises(UserError, match="outside of the picture"):
+    with pytest.raises(UserError, match="is outside the picture"):
         score_folders(folders, PLAIN)
     (folders.truth / "crops.json").write_text('{"format": "mien.crops", "version": 1, "crops": {"a": [1, 2, 3]}}')
     with pytest.raises(UserError, match="'a' has no box"):
@@ -124,7 +124,7 @@ def test_names_and_sizes_that_do_not_match(folders: ImageFolders, tmp_path: Path
     with pytest.raises(UserError, match=r"lacks 1 of the 3 pictures.*\(b; it has a, c, z\)"):
         score_folders(folders, PLAIN)
     write_pictures(folders.images, ["b"], size=(20, 20))
-    with pytest.raises(UserError, match="b has 20x20 pixels, its truth 36x40"):
+    with pytest.raises(UserError, match="b has 20x20 pixels, and its truth has 36x40"):
         score_folders(folders, PLAIN)
 
 

@@ -111,9 +111,9 @@ def test_bad_csv_files(tmp_path: Path) -> None:
         ([row("0:00:00:02.0", JawOpen="")], COLUMNS, "line 2: JawOpen is ''"),
         ([row("0:00:00:02.0", JawOpen=45)], COLUMNS, "line 2: JawOpen is 45; coefficients go from 0 to 1"),
         ([row("0:00:00:02.0", HeadYaw=20)], COLUMNS, "convert it from degrees"),
-        ([good, good], COLUMNS, "line 3: its Timecode is not after"),
+        ([good, good], COLUMNS, "line 3: its Timecode does not come after"),
         ([row("soon")], COLUMNS, "line 2: Timecode 'soon'"),
-        ([good[:30]], COLUMNS, "line 2: 30 of 63 values"),
+        ([good[:30]], COLUMNS, "line 2: has 30 of 63 values"),
         ([[*good[:1], "0"]], COLUMNS, "no row has a face"),
         ([], COLUMNS, "has no frames"),
     ):
@@ -164,15 +164,18 @@ def test_bad_json_files(tmp_path: Path) -> None:
         ([], "is not a list of frames"),
         ("jawOpen", "is not a list of frames"),
         ([{"jawOpen": 1}], 'frame 0: has no "blendshapes"'),
-        ([good, good], "frame 1: its timestamp_ms is not after"),
+        ([good, good], "frame 1: its timestamp_ms does not come after"),
         ([good, {"blendshapes": {}}], "frame 1: timestamp_ms is None"),
         ([{"blendshapes": {"jawopen": 1}}], "did you mean jawOpen"),
         ([{"blendshapes": {"jawOpen": float("nan")}}], "jawOpen is nan"),
         ([{"blendshapes": {"jawOpen": "wide"}}], "jawOpen is 'wide'"),
         ([{"blendshapes": {"jawOpen": 60}}], "jawOpen is 60"),
         ([{"blendshapes": None}], "no frame has a face"),
-        ([{"faceBlendshapes": [{"categories": [{}]}]}], "not as FaceLandmarker"),
-        ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [1, 2]}]}], "not as FaceLandmarker"),
+        ([{"faceBlendshapes": [{"categories": [{}]}]}], "layout of a FaceLandmarker"),
+        (
+            [{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [1, 2]}]}],
+            "layout of a FaceLandmarker",
+        ),
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [0] * 16}]}], "is not a rotation"),
     ):
         with pytest.raises(UserError, match=part):

@@ -97,8 +97,8 @@ def _cells(table: Table, row: Row) -> list[tuple[str, bool]]:
 def _line(cells: Sequence[tuple[str, bool]], widths: Sequence[int], bold: bool) -> str:
     texts = []
     for index, ((text, best), width) in enumerate(zip(cells, widths, strict=True)):
-        padded = f"{text:<{width}}" if index < 2 else f"{text:>{width}}"
-        texts.append(f"{_BOLD}{padded}{_PLAIN}" if bold and best else padded)
+        shown, padding = f"{_BOLD}{text}{_PLAIN}" if bold and best else text, " " * (width - len(text))
+        texts.append(shown + padding if index < 2 else padding + shown)
     return "  ".join(texts).rstrip()
 
 
