@@ -120,7 +120,7 @@ def test_indices_that_baking_would_narrow_to_some_that_exist(index: int, run: Pa
     tensors["avatar.store.face_index"][0] = index
     write_tensors(folder / "avatar.safetensors", tensors)
     seal(folder)
-    with pytest.raises(UserError, match="holds numbers that are no indices"):
+    with pytest.raises(UserError, match="holds numbers that are not indices"):
         load_avatar(folder)
 
 
@@ -164,7 +164,7 @@ def test_a_curve_without_a_number(run: Path, tmp_path: Path) -> None:
     curves = read_tensors(run / "curves.safetensors")
     curves["loss"].fill_(torch.nan)
     write_tensors(tmp_path / "curves.safetensors", curves)
-    with pytest.raises(UserError, match="a curve holds no finite number"):
+    with pytest.raises(UserError, match="has a curve without any finite number"):
         read_curves(tmp_path)
 
 
