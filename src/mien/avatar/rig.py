@@ -124,8 +124,8 @@ class _BindToWorld(torch.autograd.Function):
         frames = torch.empty(batch, len(faces), _native.TRIANGLE_FRAME_FLOATS)
         means, quats, scales = (torch.empty(batch, count, width) for width in (3, 4, 3))
         known = unpacked(*inputs, frames, means, quats, scales)
-        local, world = _native.LocalShapes(*known[3:6]), _native.WorldShapes(*known[7:])
-        _native.rig_forward(*known[:3], local, known[6], world)
+        world = _native.WorldShapes(*known[7:])
+        _native.rig_forward(*known[:3], _native.LocalShapes(*known[3:6]), known[6], world)
         vertices, _, _, *local = inputs
         ctx.faces, ctx.face_index = faces, gaussians[0]
         ctx.save_for_backward(vertices, *local, frames, scales)
