@@ -125,7 +125,7 @@ class _BindToWorld(torch.autograd.Function):
         means, quats, scales = (torch.empty(batch, count, width) for width in (3, 4, 3))
         known = unpacked(*inputs, frames, means, quats, scales)
         world = _native.WorldShapes(*known[7:])
-        _native.rig_forward(*known[:3], _native.LocalShapes(*known[3:6]), known[6], world)
+        _native.rig_forward(known[0], known[1], known[2], _native.LocalShapes(*known[3:6]), known[6], world)
         vertices, _, _, *local = inputs
         ctx.faces, ctx.face_index = faces, gaussians[0]
         ctx.save_for_backward(vertices, *local, frames, scales)
@@ -146,7 +146,8 @@ class _BindToWorld(torch.autograd.Function):
             topology,
             known[0],
             _native.LocalShapes(*known[1:4]),
-            *known[4:6],
+            known[4],
+            known[5],
             _native.WorldShapes(*known[6:9]),
             _native.LocalShapes(*known[9:12]),
             known[12],
