@@ -205,14 +205,14 @@ def adam(place: int, value: Any) -> None:
 
 
 CASES: dict[str, Callable[[], Any]] = {
-    "short view": lambda: _native.rasterize_views([wide_splats(1, 64)[:-1]], True),
+    "short view": lambda: draw(wide_splats(1, 64)[:-1]),
     "short group in a view": lambda: draw(wide_splats(1, 64)._replace(gaussians=(np.zeros((1, 3), F32),))),
     "group of other types": lambda: group_with("pose_face", 1, joint_rest=np.zeros((3, 3), np.float64)),
     "group without an array": lambda: group_with("ride", 4, log_scales=None),
     "group of a group": lambda: group_with("antialias", 0, depth=arguments("antialias")[0]),
     "list for a group": lambda: call("pose_face", _1=list(arguments("pose_face")[1])),
     "no group": lambda: call("pose_face", _1=None),
-    "empty view backward": lambda: _native.rasterize_views_backward([()]),
+    "empty view backward": lambda: call("rasterize_views_backward", _0=[()]),
     "no frame": lambda: backward_with(frame=None),
     "number for a frame": lambda: backward_with(frame=3),
     "one frame twice": one_frame_twice,

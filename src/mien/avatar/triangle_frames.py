@@ -123,9 +123,9 @@ class _BindToWorld(torch.autograd.Function):
         batch, count = len(vertices), len(gaussians[0])
         frames = torch.empty(batch, len(faces), _native.TRIANGLE_FRAME_FLOATS)
         means, quats, scales = (torch.empty(batch, count, width) for width in (3, 4, 3))
-        known = unpacked(*inputs, frames)
-        world = _native.WorldShapes(*unpacked(means, quats, scales))
-        _native.rig_forward(*known[:3], _native.LocalShapes(*known[3:6]), known[6], world)
+        known = unpacked(*inputs, frames, means, quats, scales)
+        world = _native.WorldShapes(*known[7:])
+        _native.rig_forward(known[0], known[1], known[2], _native.LocalShapes(*known[3:6]), known[6], world)
         vertices, _, _, *local = inputs
         ctx.faces, ctx.face_index = faces, gaussians[0]
         ctx.save_for_backward(vertices, *local, frames, scales)
@@ -140,15 +140,17 @@ class _BindToWorld(torch.autograd.Function):
         vertex_gradient = torch.empty_like(vertices) if ctx.needs_input_grad[0] else None
         world = [gradient.contiguous() for gradient in world_gradients]
         topology = rig_topology(vertices.shape[1], ctx.faces, ctx.face_index)
-        known = unpacked(*(tensor.detach() for tensor in (vertices, *local, frames, scales)))
+        inputs = (tensor.detach() for tensor in (vertices, *local, frames, scales, *world))
+        known = unpacked(*inputs, *local_gradients, vertex_gradient)
         _native.rig_backward(
             topology,
             known[0],
             _native.LocalShapes(*known[1:4]),
-            *known[4:],
-            _native.WorldShapes(*unpacked(*(gradient.detach() for gradient in world))),
-            _native.LocalShapes(*unpacked(*local_gradients)),
-            *unpacked(vertex_gradient),
+            known[4],
+            known[5],
+            _native.WorldShapes(*known[6:9]),
+            _native.LocalShapes(*known[9:12]),
+            known[12],
         )
         return vertex_gradient, None, None, *local_gradients
 

@@ -144,14 +144,11 @@ class _PoseVertices(torch.autograd.Function):
         grad_rest, grad_joint_rest = rest.new_empty(b, *rest.shape), rest.new_empty(b, *joint_rest.shape)
         grad_expression, grad_joints = torch.empty_like(expression), torch.empty_like(joints)
         grad_head = rest.new_empty(b, 3), rest.new_empty(b, 3)
-        known = unpacked(*(None if array is None else array.detach() for array in arrays))
+        inputs = (None if array is None else array.detach() for array in (*arrays, shaped))
+        known = unpacked(*inputs, grad_vertices.contiguous())
         found = unpacked(grad_rest, grad_joint_rest, grad_expression, grad_joints, *grad_head)
-        _native.pose_face_backward(
-            ctx.data,
-            _native.FaceArrays(*known),
-            *unpacked(shaped.detach(), grad_vertices.contiguous()),
-            _native.FaceArrays(*found),
-        )
+        face, gradients = _native.FaceArrays(*known[:6]), _native.FaceArrays(*found)
+        _native.pose_face_backward(ctx.data, face, known[6], known[7], gradients)
         needs = ctx.needs_input_grad
         return (
             None,

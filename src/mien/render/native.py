@@ -100,10 +100,10 @@ class _Rasterize(torch.autograd.Function):
             grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
             found = [torch.empty_like(t) for t in own]
             of_view = [torch.empty(len(own[0]), 2), torch.empty(4, 4), torch.empty(3, 3)]
-            known = unpacked(*own, *found, image, alpha, grad_image, grad_alpha, *of_view)
-            gaussians, of_gaussians = _native.GaussianArrays(*known[:5]), _native.GaussianArrays(*known[5:10])
-            task = _native.RasterizeGradients(frame, gaussians, *known[10:14], of_gaussians, *known[14:])
-            tasks.append(task)
+            known = unpacked(image, alpha, grad_image, grad_alpha, *own, *found, *of_view)
+            gaussians, of_gaussians = _native.GaussianArrays(*known[4:9]), _native.GaussianArrays(*known[9:14])
+            shown = known[0], known[1], known[2], known[3]  # image, alpha and their gradients
+            tasks.append(_native.RasterizeGradients(frame, gaussians, *shown, of_gaussians, *known[14:]))
             views.append((grad_image, alpha, *found, *of_view))
         _native.rasterize_views_backward(tasks)
         result: list[Tensor | None] = [None]
