@@ -81,7 +81,7 @@ def test_bad_requests_to_an_avatar(workspace: Path, tmp_path: Path, capsys: pyte
     """Bad requests to an avatar are refused with the value, and nothing is written."""
     for arguments, part in (
         (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawopen=1"], "no expression 'jawopen'"),
-        (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawOpen=wide"], "no number"),
+        (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawOpen=wide"], "is not a number"),
         (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--run", "other"], "no run 'other'"),
         (["render", str(workspace), "--out", str(tmp_path / "a.gif")], "cannot write .gif"),
         (["render", str(workspace), "--out", str(tmp_path / "a.png"), "--size", "100000"], "--size 100000"),

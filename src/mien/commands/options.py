@@ -57,8 +57,8 @@ class TrainOptions:
     """Device for training. cpu: always the same bytes; cuda: an NVIDIA GPU, through gsplat (docs/using.md says how to
     install it); auto: a GPU if there is one. A run may resume on another device."""
     face_tuning: bool = True
-    """By default, training corrects the tracking, and held-out frames get interpolated corrections. --no-face-tuning
-    keeps the tracking as it is."""
+    """--face-tuning lets training correct the tracking, with interpolated corrections for held-out frames (the
+    default). --no-face-tuning keeps the tracking as it is."""
     training: _IN_DETAIL = None
     """The other settings of the run."""
     method_settings: _IN_DETAIL = None
