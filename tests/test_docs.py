@@ -1,5 +1,6 @@
 """The documentation's links point to files and headings that exist."""
 
+import importlib
 import re
 from contextlib import suppress
 from functools import cache
@@ -128,6 +129,18 @@ def test_options_that_pages_name_exist(capsys: pytest.CaptureFixture[str]) -> No
     option = re.compile(r"(?<![\w-])--(?:capture|tracking|training|method)\.[a-z][\w.-]*\w")
     named = {(page.name, name) for page in CURRENT for name in option.findall(page.read_text("utf-8"))}
     assert sorted((page, name) for page, name in named if name not in known) == []
+
+
+def test_the_reference_finds_the_public_api(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "docs" / "site")
+    site = importlib.import_module("doors")
+    assert {"mien.camera", "mien.face", "mien.render", "mien.tracking", "mien.avatar"} <= set(site.doors())
+    public = [name for names in site.doors().values() for name in names]
+    assert [name.full for name in public if callable(name.value) and not name.doc] == []
+    assert all(site.exists(name.full) and site.exists(f"{name.home}.{name.name}") for name in public)
+    assert site.exists("mien.face.FaceParams.identity")
+    assert not site.exists("mien.face.FaceParams.nothing")
+    assert not site.exists("mien.nothing")
 
 
 def test_broken_links_are_found(tmp_path: Path) -> None:
