@@ -12,7 +12,7 @@ MIEN_CHOOSE_KERNELS(ActivationKernels, activation_kernels)
 
 namespace {
 
-constexpr int64_t kGrain = 16384;  // worth a piece of the pool's work; a whole number of vectors
+constexpr int64_t kGrain = 16384;  // in one piece of the pool's work; a whole number of vectors
 
 }  // namespace
 

@@ -12,7 +12,7 @@ void sigmoid(const float* values, int64_t count, float* out) {
     F value{};
     memcpy(&value, values + i, sizeof(float) * valid);
     const F faded = exp2_fast(clamp(value * -1.44269504f, set1(-99.0f), set1(99.0f)));
-    // Clamping made a number of NaN.
+    // Clamping turned NaN into a number; this restores it.
     const F result = select(less_equal(value, value), 1.0f / (1.0f + faded), value);
     memcpy(out + i, &result, sizeof(float) * valid);
   }

@@ -1,5 +1,5 @@
-// What the bindings share: contiguous arrays on the CPU, and checks of arguments. Nothing that Python passes may make
-// the core read or write beyond an array: sizes are compared here, indices wherever they come in.
+// The arguments of bindings: contiguous arrays on the CPU, named groups of them, and checks. No argument from Python
+// may make the core read or write beyond an array, so each binding checks all sizes and indices.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -21,7 +21,7 @@ namespace nb = nanobind;
 template <typename T, typename... Shape>
 using PlainArray = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
 
-// As nanobind's own, but aligned, and never a converted copy: what is written to a copy would be lost.
+// An array that is aligned and never a converted copy, since a result written to a copy would be lost.
 template <typename T, typename... Shape>
 class Array : public PlainArray<T, Shape...> {
  public:
@@ -91,8 +91,8 @@ PictureSize picture_size(const A& picture) {
   return {width, height};
 }
 
-// Refuses indices beyond `least` .. count - 1. Several at a time, without a branch: the highest bit is set where an
-// index, or what is left beyond it, is negative.
+// Refuses indices outside `least` .. count - 1. The loop has no branch, so that it handles several at a time: the
+// highest bit is set if index - least or count - 1 - index is negative.
 template <typename A>
 void check_indices(const A& indices, int64_t count, const char* message, int64_t least = 0) {
   const auto* const values = indices.data();

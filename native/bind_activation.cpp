@@ -26,5 +26,5 @@ void sigmoid_backward(const Array<const float>& outputs, const Array<const float
 void bind_activation(nb::module_& module) {
   module.def("sigmoid", &sigmoid, "values"_a.noconvert(), "out"_a.noconvert());
   module.def("sigmoid_backward", &sigmoid_backward, "outputs"_a.noconvert(), "gradient"_a.noconvert(),
-             "out"_a.noconvert(), "The gradient with respect to the values, from the sigmoid's outputs and theirs.");
+             "out"_a.noconvert(), "Fills the gradient of the values, from the outputs and their gradient.");
 }

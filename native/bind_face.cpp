@@ -28,15 +28,15 @@ mien::FaceModelData make_model(const In<-1, -1, 3>& expression_basis, const std:
   require(expression_basis.shape(1) == v && rotation_basis.shape(0) == e && rotation_basis.shape(1) == k &&
               translation_basis.shape(0) == e && translation_basis.shape(1) == k && parents.size() == k &&
               is_free.size() == k,
-          "the arrays of a face model do not fit together");
+          "the arrays of a face model do not belong together");
   for (size_t joint = 0; joint < k; ++joint) {
-    require(parents[joint] >= -1 && parents[joint] < static_cast<int>(joint), "a joint comes after its parent");
+    require(parents[joint] >= -1 && parents[joint] < static_cast<int>(joint), "a joint must come after its parent");
     sizes.parents.push_back(parents[joint]);
     sizes.free_index.push_back(is_free[joint] ? sizes.free_joints++ : -1);
   }
   require(
       !pose_basis || (pose_basis->shape(0) == 9 * static_cast<size_t>(sizes.free_joints) && pose_basis->shape(1) == v),
-      "the pose basis has 9 shapes a free joint");
+      "the pose basis must have 9 shapes per free joint");
   checked_length(e + 9 * static_cast<size_t>(sizes.free_joints), mien::kMostFaceShapes, "blendshapes");
   sizes.joint_rotation_basis.assign(rotation_basis.data(), rotation_basis.data() + rotation_basis.size());
   sizes.joint_translation_basis.assign(translation_basis.data(), translation_basis.data() + translation_basis.size());
@@ -48,7 +48,8 @@ void forward(const mien::FaceModelData& model, const Group<FaceArrays>& group, c
              const Out<-1, -1, 3>& vertices) {
   const FaceArrays face(model, group);
   const size_t floats = 3 * static_cast<size_t>(model.vertices);
-  require(has_shape(shaped, face.size(), model.vertices, 3) && same_shape(vertices, shaped), "the outputs do not fit");
+  require(has_shape(shaped, face.size(), model.vertices, 3) && same_shape(vertices, shaped),
+          "the outputs do not have the size of the inputs");
   const nb::gil_scoped_release release;
   mien::parallel_for(static_cast<int64_t>(face.size()), [&](int64_t b) {
     mien::pose_face(model, face.pose(b), shaped.data() + b * floats, vertices.data() + b * floats);

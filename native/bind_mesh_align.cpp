@@ -22,7 +22,7 @@ using Faces = Array<const int64_t, nb::shape<-1, 3>>;
 using Picture = Array<const float, nb::shape<-1, -1, 3>>;
 using Plane = Array<const float, nb::ndim<2>>;
 
-// What stays the same over the frames of a sequence, checked once.
+// The surface, which is the same in all frames of a sequence and is checked once.
 class AlignSurface {
  public:
   AlignSurface(const Faces& faces, In<-1, 3, 2> uv, Array<const uint8_t, nb::ndim<1>> used, Picture albedo, Plane trust,
@@ -54,14 +54,14 @@ class AlignSurface {
   const mien::AlignOptions& options() const { return options_; }
 
  private:
-  std::vector<int64_t> faces_;  // its own, so that nobody changes what was checked
+  std::vector<int64_t> faces_;  // a copy: Python cannot change it after the check
   In<-1, 3, 2> uv_;
   Array<const uint8_t, nb::ndim<1>> used_;
   Picture albedo_;
   Plane trust_;
   mien::AlignOptions options_;
   mien::TexturedSurface surface_;
-  int64_t vertices_ = 0;  // that the faces name
+  int64_t vertices_ = 0;  // number of vertices that the faces need
 };
 
 // A posed surface in a picture under a light.

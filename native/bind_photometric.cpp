@@ -18,10 +18,10 @@ namespace {
 
 template <typename T>
 using Picture = Array<T, nb::shape<-1, -1, 3>>;
-constexpr int kMargin = 6;  // pixels: one more than the window's reach
+constexpr int kMargin = 6;  // pixels: one more than the reach of the window
 
-// What is compared: the box and all of `drawn` (one number a pixel, 0 for nothing), with a margin beyond what windows
-// reach; the whole box if `drawn` is not there.
+// The part of the picture that is compared: the box and all of `drawn` (one number per pixel, 0 for nothing), with a
+// margin beyond the reach of windows. Without `drawn`, it is the box.
 mien::Box compared(const std::array<int, 4>& box, const std::optional<In<-1, -1>>& drawn, int width, int height) {
   const int left = box[0], top = box[1];
   require(left >= 0 && top >= 0 && box[2] >= 0 && box[3] >= 0 && left <= width && top <= height &&
@@ -46,11 +46,11 @@ void photometric_loss(const std::array<int, 4>& box, const std::array<double, 2>
                       const Array<float, nb::shape<>>& loss) {
   const auto [width, height] = picture_size(image);
   const bool bytes = target.dtype() == nb::dtype<uint8_t>();
-  require(bytes || target.dtype() == nb::dtype<float>(), "a target is of float32 or uint8");
-  require(bytes || reinterpret_cast<uintptr_t>(target.data()) % alignof(float) == 0, "a target must be aligned");
+  require(bytes || target.dtype() == nb::dtype<float>(), "the target must be float32 or uint8");
+  require(bytes || reinterpret_cast<uintptr_t>(target.data()) % alignof(float) == 0, "the target must be aligned");
   require(same_shape(target, image) && (!gradient || same_shape(*gradient, image)) &&
               (!drawn || has_shape(*drawn, height, width)),
-          "pictures differ in size");
+          "the pictures must be equally large");
   require(width >= 6, "a picture must be at least 6 pixels wide");
   const nb::gil_scoped_release release;
   const mien::Box inside = compared(box, drawn, width, height);
@@ -70,5 +70,6 @@ void photometric_loss(const std::array<int, 4>& box, const std::array<double, 2>
 void bind_photometric(nb::module_& module) {
   module.def("photometric_loss", &photometric_loss, "box"_a, "weights"_a, "image"_a, "target"_a.noconvert(),
              "drawn"_a.none(), "gradient"_a.none(), "loss"_a,
-             "Fills the loss of a picture, and its gradient, within a box; or within it, what is drawn, and a margin.");
+             "Fills the loss and its gradient within a box. If `drawn` is given, the box grows to hold all of it and a "
+             "margin.");
 }

@@ -17,7 +17,7 @@ using namespace nb::literals;
 
 namespace {
 
-// Keeps a forward pass's buffers until its backward pass, or until nobody can ask for one.
+// The buffers of a forward pass. Python holds it until the backward pass is done or cannot come any more.
 struct RasterizeFrame {
   mien::FramePtr frame;
   mien::View view;
@@ -168,7 +168,7 @@ std::vector<std::optional<RasterizeFrame>> draw(const std::vector<ForwardTask>& 
   return frames;
 }
 
-// A single view gets all threads; of several, each gets one.
+// A single view uses all threads; several views use one each.
 std::vector<std::optional<RasterizeFrame>> forward(const std::vector<Group<ForwardTask>>& views, bool differentiable) {
   return draw({views.begin(), views.end()}, differentiable);
 }
@@ -186,15 +186,16 @@ void bind_rasterize(nb::module_& module) {
   bind_group<ForwardTask>(module);
   bind_group<BackwardTask>(module);
   nb::class_<RasterizeFrame>(module, "RasterizeFrame", "What a backward pass needs of its forward pass.");
-  module.def("rasterize_views", &forward, "views"_a, "differentiable"_a,
-             "Fills image, alpha and radii of each view; None for a view if an input is NaN or infinite. Unless "
-             "`differentiable`, what a backward pass needs is left out.");
+  module.def(
+      "rasterize_views", &forward, "views"_a, "differentiable"_a,
+      "Fills image, alpha and radii of each view. The result is None for a view with NaN or infinity in an input. "
+      "Without `differentiable`, there can be no backward pass.");
   module.def("rasterize_views_backward", &backward, "views"_a, "Fills the gradients of each view.");
   module.def("thread_count", &mien::thread_count, "The number of threads that native operations use.");
   module.def("set_thread_count", &mien::set_thread_count, "count"_a, nb::call_guard<nb::gil_scoped_release>(),
-             "Replaces the threads; 0 for the default.");
+             "Sets the number of threads; 0 is the default.");
   module.def("rasterize_isa", &mien::rasterize_isa, "The instruction set of the rasterizer's kernels.");
   module.def(
       "set_rasterize_isa", [](const std::string& name) { return mien::set_rasterize_isa(name.c_str()); }, "name"_a,
-      "Chooses the instruction set; False if it is not there.");
+      "Chooses the instruction set. Returns False if this machine does not have it.");
 }

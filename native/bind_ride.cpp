@@ -1,5 +1,5 @@
-// What a training step poses, in one call each way: a face, and the Gaussians that ride on its triangles. One timestep;
-// only a door: the work is that of face.h, rig.h and activation.h.
+// Poses a face and the Gaussians bound to its triangles for a training step, in one call each way and for one timestep.
+// face.h, rig.h and activation.h do the work.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -20,7 +20,8 @@ namespace {
 
 // What the backward pass needs of its forward pass.
 struct Ride {
-  // Whose it is: not read, and maybe gone. Another model at the same place would have to be of the same sizes.
+  // The addresses of its model and topology. They are compared and never read, since both may be gone. Another model at
+  // the same address is accepted only if it has the same sizes.
   const void *model, *topology;
   bool in_head;
   int vertex_count;
@@ -125,7 +126,7 @@ Ride forward(const mien::FaceModelData& model, const mien::RigTopology& topology
              const Group<PosedGaussians<float>>& posed_group) {
   const Rider rider(model, topology, in_head, face_group, local_group);
   const PosedGaussians<float> posed(posed_group, rider.count());
-  require(!in_head || posed.head_pose.has_value(), "the outputs do not fit");
+  require(!in_head || posed.head_pose.has_value(), "`head_pose` is missing");
   const nb::gil_scoped_release release;
   Ride ride(model, topology, in_head);
   mien::pose_face(model, rider.pose(), ride.shaped.data(), ride.vertices.data());
@@ -188,9 +189,8 @@ void bind_ride(nb::module_& module) {
   bind_group<PosedGaussians<float>>(module);
   bind_group<FaceParameterGradients>(module);
   module.def("ride", &forward, "model"_a, "topology"_a, "in_head"_a, "face"_a, "local"_a, "posed"_a,
-             "Fills the Gaussians in world space; or with `in_head` in the head frame, and that frame's pose.");
+             "Fills the Gaussians in world space or, with `in_head`, in the head frame together with its pose.");
   module.def("ride_backward", &backward, "ride"_a, "model"_a, "topology"_a, "face"_a, "local"_a, "scales"_a,
              "opacities"_a, "by_posed"_a, "by_local"_a, "by_face"_a.none(),
-             "Fills the gradients, from the scales and opacities that `ride` filled; those of the face only if they "
-             "are given.");
+             "Fills the gradients, from the scales and opacities that `ride` filled. `by_face` may be None.");
 }

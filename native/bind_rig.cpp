@@ -125,5 +125,5 @@ void bind_rig(nb::module_& module) {
   module.def("make_rig_topology", &make_topology, "vertex_count"_a, "faces"_a, "face_index"_a);
   module.def("rig_backward", &rig_backward, "topology"_a, "vertices"_a, "local"_a, "frames"_a, "scales"_a, "by_world"_a,
              "gradients"_a, "grad_vertices"_a.none(),
-             "Fills the gradients, summed over the timesteps; those of the vertices only if they are given.");
+             "Fills the gradients, summed over the timesteps. `grad_vertices` may be None.");
 }

@@ -19,7 +19,7 @@ namespace {
 
 using Floats = Array<float, nb::ndim<1>>;
 using Rows3 = Array<const float, nb::shape<-1, 3>>;
-constexpr double kBeta1 = 0.9, kBeta2 = 0.999;  // of the bias corrections, which Python works out in the same numbers
+constexpr double kBeta1 = 0.9, kBeta2 = 0.999;  // for bias correction; the same numbers as in Python
 using Radii = Array<const int32_t, nb::ndim<1>>;
 
 // One tensor's arrays, which stay alive while this does.
@@ -64,7 +64,7 @@ void triangle_penalties(const std::array<float, 2>& thresholds, const std::array
                         const Array<float, nb::shape<>>& position, const Array<float, nb::shape<>>& scale) {
   const size_t n = means.shape(0);
   require(log_scales.shape(0) == n && radii.shape(0) == n && grad_means.shape(0) == n && grad_log_scales.shape(0) == n,
-          "one row of every array a Gaussian");
+          "every array must have one row per Gaussian");
   const mien::PenaltyTask task{
       static_cast<int64_t>(n), means.data(), log_scales.data(), radii.data(),          thresholds[0], weights[0],
       thresholds[1],           weights[1],   grad_means.data(), grad_log_scales.data()};
@@ -80,7 +80,7 @@ void observe_view(const std::array<float, 2>& scale, const Array<const float, nb
   const size_t n = radii.shape(0);
   require(grad_means2d.shape(0) == n && opacities.shape(0) == n && pull.shape(0) == n && seen.shape(0) == n &&
               radius.shape(0) == n && opacity.shape(0) == n,
-          "one entry of every array a Gaussian");
+          "every array must have one entry per Gaussian");
   const nb::gil_scoped_release release;
   mien::observe_view({static_cast<int64_t>(n), grad_means2d.data(), radii.data(), opacities.data(), scale[0], scale[1],
                       pull.data(), seen.data(), radius.data(), opacity.data()});
@@ -111,6 +111,7 @@ void bind_training(nb::module_& module) {
   module.def("observe_view", &observe_view, "scale"_a, "grad_means2d"_a, "radii"_a, "opacities"_a, "pull"_a, "seen"_a,
              "radius"_a, "opacity"_a, "Adds a step to the statistics of density control.");
   module.def("mean_squared_difference", &mean_squared_difference, "image"_a.noconvert(), "target"_a.noconvert(),
-             "Of a picture and one of bytes, where 255 is 1.");
-  module.def("box_of_nonzero", &box_of_nonzero, "values"_a.noconvert(), "Left, top, width and height; 0 where all is.");
+             "The mean squared difference of a picture and one of bytes, where 255 is 1.");
+  module.def("box_of_nonzero", &box_of_nonzero, "values"_a.noconvert(),
+             "Left, top, width and height of the box that holds all numbers other than 0.");
 }

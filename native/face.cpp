@@ -84,7 +84,7 @@ RigidTransform compose(const RigidTransform& a, const RigidTransform& b) {
   return out;
 }
 
-// Adds to the gradients of a and b that of their composition.
+// Adds the gradient of a composition to the gradients of a and b.
 void compose_backward(const RigidTransform& a, const RigidTransform& b, const RigidTransform& gradient,
                       RigidTransform& grad_a, RigidTransform& grad_b) {
   for (int row = 0; row < 3; ++row) {
@@ -100,7 +100,7 @@ void compose_backward(const RigidTransform& a, const RigidTransform& b, const Ri
   }
 }
 
-// Everything small of one timestep: how joints turn, alone and along the chain from the head.
+// The small quantities of one timestep: the joints' rotations, alone and along the chain from the head.
 struct Skeleton {
   std::vector<float> coefficients;  // [shapes]
   std::vector<float> turns;         // [k, 3] axis-angle
@@ -161,7 +161,7 @@ int part_begin(const FaceModelData& model, int64_t part) {
   return static_cast<int>(model.blocks() * part / kFaceParts);
 }
 
-// From the sums over vertices to the pose.
+// Computes the gradients of the pose from the sums over vertices.
 void skeleton_backward(const FaceModelData& model, const FacePose& pose, const Skeleton& skeleton, const FaceSums& sums,
                        const FaceGradients& out) {
   std::copy(sums.shapes, sums.shapes + model.expressions, out.expression);

@@ -11,7 +11,7 @@ constexpr int kFaceBlockFloats = 3 * kFaceBlock;  // x y z x y z ...
 constexpr int kMostFaceShapes = 256;
 constexpr int kMostFaceVertices = 1 << 24;
 constexpr int kMostFaceJoints = 127;  // joints of all vertices are listed with 32-bit numbers
-constexpr int kFaceParts = 4;         // of the vertices: sums run part by part, whoever computes which
+constexpr int kFaceParts = 4;         // parts of the vertices: sums run part by part, whichever thread computes which
 
 // A model's constants. Most blendshapes move a sixth of the vertices: only blocks with a motion are kept.
 struct FaceModelData {

@@ -7,14 +7,14 @@
 namespace mien {
 namespace {
 
-constexpr size_t kMostBytes = size_t{256} << 20;  // kept unused
+constexpr size_t kMostBytes = size_t{256} << 20;  // most unused memory that is kept
 
 struct Block {
   void* memory;
   size_t bytes;
 };
 
-// Blocks that nobody uses, the most recent last. Never destroyed: arrays may outlive static destructors.
+// Unused blocks, the most recent last. Never destroyed: arrays may outlive static destructors.
 struct Spare {
   std::mutex mutex;
   std::deque<Block> blocks;

@@ -1,4 +1,4 @@
-// Memory for large results that comes back: the kernel clears fresh pages, which takes longer than drawing on them.
+// Memory for large results, which is reused: the kernel clears fresh pages, and that takes longer than drawing on them.
 #pragma once
 
 #include <cstddef>
@@ -8,9 +8,9 @@
 
 namespace mien {
 
-// At least `bytes`, aligned to a cache line; what it holds is undefined. Null where there is no memory.
+// At least `bytes` of undefined values, aligned to a cache line; null if there is no memory.
 void* take_memory(size_t bytes);
-// Keeps it for the next `take_memory` of the same size, or frees it. `bytes` are those it was taken with.
+// Keeps memory for the next `take_memory` of the same size, or frees it. `bytes` is the number it was taken with.
 void give_memory(void* memory, size_t bytes) noexcept;
 
 // Memory for `count` values that goes back at the end of its life. Throws std::bad_alloc.

@@ -25,7 +25,7 @@ struct MeshFragmentBuffers {
   float* depth;         // [h,w], camera z in metres, +infinity where no triangle is
 };
 
-// What lies nearer than this to the camera plane is cut away, metres. The same as the Gaussians'.
+// Distance of the near plane, in metres: nearer parts are cut away. It is the same for Gaussians.
 inline constexpr double kMeshNearPlane = 0.01;
 
 // Coverage is exact on vertices snapped to 1/256 pixel with the top-left rule, so triangles that share an edge leave

@@ -180,7 +180,7 @@ void box_sums(const float* in, float* out, int count, int64_t stride, int radius
 
 // The residuals' weighted mean around each of them: two box filters in a row, which make a triangle.
 void smooth_residuals(HighPass high_pass, const AlignOptions& options, Workspace& w) {
-  const int radius = std::min(high_pass.radius, std::max(w.columns, w.rows));  // more would find nothing more
+  const int radius = std::min(high_pass.radius, std::max(w.columns, w.rows));  // a larger window covers no more
   const size_t size = 4 * static_cast<size_t>(w.columns) * w.rows;
   w.smooth.assign(size, 0.0f);
   w.rows_of_sums.resize(size);
@@ -204,7 +204,7 @@ void smooth_residuals(HighPass high_pass, const AlignOptions& options, Workspace
   }
 }
 
-// Triangles' sums and marks are zero between calls, also where one ends early for want of memory.
+// Sets the sums and marks of triangles back to zero, also if a call ends early for lack of memory.
 struct CleanTriangles {
   Workspace& w;
 
@@ -275,7 +275,7 @@ AlignResult align_mesh(const Mesh& mesh, const TexturedSurface& surface, const A
 
 namespace {
 
-constexpr float kDepthTolerance = 0.0005f;  // metres: a texel so far behind what is seen is hidden
+constexpr float kDepthTolerance = 0.0005f;  // metres: a texel is hidden if it is this far behind the visible surface
 
 }  // namespace
 
@@ -305,7 +305,7 @@ void bake_texture(const Mesh& mesh, const TexturedSurface& surface, const AlignF
     if (!(x >= 0 && y >= 0 && x < view.width - 1 && y < view.height - 1)) continue;
     const int x0 = static_cast<int>(x), y0 = static_cast<int>(y);
     const int64_t nearest = static_cast<int64_t>(std::lround(y)) * view.width + std::lround(x);
-    // What a slope rises within a pixel does not hide it.
+    // The depth that a slope gains within a pixel does not hide it.
     const float slope = std::sqrt(std::max(1 - point.cosine * point.cosine, 0.0f)) / std::max(point.cosine, 0.1f);
     const float tolerance = kDepthTolerance + in_camera[2] / view.K[0] * slope;
     if (in_camera[2] > drawn.depth[nearest] + tolerance) continue;

@@ -7,10 +7,10 @@
 
 namespace mien {
 
-// What of a mesh's surface takes part, the same for every frame.
+// The part of a mesh's surface that is aligned. It is the same for every frame.
 struct TexturedSurface {
   const float* uv;      // [f,3,2] of every triangle's corners; 0..1, v upwards
-  const uint8_t* used;  // [f] whether a triangle takes part; the others only hide what is behind them
+  const uint8_t* used;  // [f] whether a triangle is aligned; the others only hide what is behind them
   const float* albedo;  // [th,tw,3]
   const float* trust;   // [th,tw] >= 0; 0 where the texture is not known
   int texture_width;
@@ -27,12 +27,12 @@ struct AlignFrame {
 
 struct AlignOptions {
   float sigma;         // expected difference of a colour
-  float outlier;       // in sigmas: beyond, the pull fades (Geman and McClure)
+  float outlier;       // in sigmas: larger differences count less (Geman and McClure)
   float least_cosine;  // between normal and direction to the camera: steeper surfaces do not count
 };
 
-// What differs over more than about this many pixels is taken for light that the SH do not explain, and left out of
-// residuals; 0 leaves everything in.
+// A difference that is smooth over about this many pixels counts as light that the SH do not explain, and is left out
+// of residuals. With 0, nothing is left out.
 struct HighPass {
   int radius;
 };
@@ -40,7 +40,7 @@ struct HighPass {
 struct AlignBuffers {
   float* hessian;   // [p,p] half Hessian of the mean cost, or null for the cost alone
   float* gradient;  // [p] half the gradient
-  float* residual;  // [h,w,3] image less prediction, NaN where nothing counts; or null
+  float* residual;  // [h,w,3] image minus prediction, NaN where nothing counts; or null
   float* smooth;    // [h,w,3] what was left out of the residuals as light, 0 where nothing counts; or null
 };
 
@@ -67,8 +67,8 @@ struct BakeSums {
   float* image;    // [th,tw,3] weight * image^2
 };
 
-// Adds what a frame shows of every texel to the sums. Where `surface.trust` is positive, colours that differ from
-// albedo * light count less, as above.
+// Adds the colours of all texels that a frame shows to the sums. Where `surface.trust` is positive, colours that differ
+// from albedo * light count less, as above.
 void bake_texture(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,
                   const AlignOptions& options, const BakeTexels& texels, const BakeSums& out);
 

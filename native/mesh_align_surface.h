@@ -1,4 +1,4 @@
-// What alignment and texture share: the drawn mesh, points of its surface, the texture's samples and the light.
+// The drawn mesh, points on its surface, samples of the texture, and the light: mesh_align.cpp uses them throughout.
 #pragma once
 
 #include <algorithm>
@@ -35,7 +35,7 @@ inline Color shade(const float* normal, const float* light) {
 
 // Bilinear among the texels that are known; the weight is their trust.
 inline Sample sample_texture(const TexturedSurface& surface, float u, float v) {
-  if (!(u == u && v == v)) return {};  // not a number shows nothing
+  if (!(u == u && v == v)) return {};  // a NaN shows nothing
   const float x = std::clamp(u, 0.0f, 1.0f) * surface.texture_width - 0.5f;
   const float y = (1 - std::clamp(v, 0.0f, 1.0f)) * surface.texture_height - 0.5f;
   const int x0 = static_cast<int>(std::floor(x)), y0 = static_cast<int>(std::floor(y));
@@ -132,7 +132,7 @@ inline float fading(float squared, const AlignOptions& options) {
   return least / (least + squared);
 }
 
-// The calling thread's own, kept between calls: fresh pages cost as much as the work.
+// The calling thread's own buffers, kept between calls: fresh pages cost as much as the work.
 inline DrawnMesh& own_drawing() {
   thread_local DrawnMesh drawing;
   return drawing;

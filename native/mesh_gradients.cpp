@@ -95,7 +95,7 @@ struct EdgeEnds {
   double x[2], y[2], inverse_depth[2];
 };
 
-// Which way a triangle is seen, by the sign of its determinant: 0 where it is seen edge-on.
+// The sign tells which side of a triangle is seen. It is 0 if the triangle is seen edge-on.
 double facing(const ImageMesh& mesh, int64_t face) {
   const int64_t* index = mesh.faces + 3 * face;
   const float *a = mesh.points + 3 * index[0], *b = mesh.points + 3 * index[1], *c = mesh.points + 3 * index[2];
@@ -154,7 +154,7 @@ class Walker {
     };
     const int32_t inner = pixel(towards ? before : before + 1), outer = pixel(towards ? before + 1 : before);
     if (fragments_.face_index[inner] < 0) return;
-    if (!(inverse_depth * fragments_.depth[outer] > 1)) return;  // what the outer pixel sees hides the edge
+    if (!(inverse_depth * fragments_.depth[outer] > 1)) return;  // the surface at the outer pixel hides the edge
     const double beyond = at - 0.5 - before;
     out_.push_back({inner, outer, edge, vertical, towards, towards ? beyond : 1 - beyond, line + 0.5});
   }
@@ -163,7 +163,7 @@ class Walker {
   std::vector<Crossing>& out_;
 };
 
-// Of crossings between the same two pixels, in the same direction, the outermost stays.
+// Keeps the outermost of the crossings between the same two pixels in the same direction.
 void keep_outermost(std::vector<Crossing>& crossings, int64_t pixels) {
   // A pixel has at most four neighbours, so a pair in one direction is a slot of its inner pixel.
   thread_local std::vector<int32_t> best;
@@ -177,7 +177,7 @@ void keep_outermost(std::vector<Crossing>& crossings, int64_t pixels) {
   for (size_t i = 0; i < crossings.size(); ++i) {
     if (best[slot(crossings[i])] == static_cast<int32_t>(i)) crossings[count++] = crossings[i];
   }
-  // What was set is set back, so that the buffer need not be cleared in every call.
+  // Only what was set is set back, so that the buffer need not be cleared in every call.
   for (size_t i = 0; i < count; ++i) best[slot(crossings[i])] = -1;
   crossings.resize(count);
 }

@@ -7,7 +7,7 @@
 
 namespace mien {
 
-// What pixels see of a mesh (`mesh.h`), and where its corners are.
+// The triangles that pixels see (`mesh.h`).
 struct Fragments {
   const int32_t* face_index;  // [h,w], -1 where no triangle is
   const float* barycentric;   // [h,w,3]
@@ -23,8 +23,8 @@ struct ImageMesh {
   int64_t face_count;
 };
 
-// Adds to `grad_points` [v,3] what the gradient [h,w,3] of barycentrics gives. Weights that are 0 were clamped there
-// and do not move.
+// Adds the gradient of the points to `grad_points` [v,3], from that of the barycentrics [h,w,3]. Weights that were
+// clamped to 0 have no gradient.
 void barycentric_backward(const Fragments& fragments, const ImageMesh& mesh, const float* grad_barycentric,
                           double* grad_points);
 
@@ -45,8 +45,8 @@ void sample_texture(const TextureView& texture, const float* uv, int64_t count, 
 void sample_texture_backward(const TextureView& texture, const float* uv, int64_t count, const float* grad_out,
                              float* grad_texels, float* grad_uv);
 
-// The edges of a mesh with their triangles; the second is -1 at a border. An edge that counts is a silhouette where one
-// of its triangles faces the camera and the other does not, and at borders.
+// The edges of a mesh with their triangles; the second is -1 at a border. An edge is a silhouette if it is at a border,
+// or if one of its triangles faces the camera and the other does not.
 struct MeshEdges {
   const int32_t* vertices;  // [e,2]
   const int32_t* faces;     // [e,2]
@@ -70,11 +70,11 @@ struct Crossing {
 void find_crossings(const Fragments& fragments, const ImageMesh& mesh, const MeshEdges& edges,
                     std::vector<Crossing>& crossings);
 
-// Adds to `grad_points` what the gradient of a crossing's position gives.
+// Adds the gradient of the points to `grad_points`, from that of a crossing's position.
 void crossing_backward(const Crossing& crossing, const ImageMesh& mesh, const MeshEdges& edges, double grad_position,
                        double* grad_points);
 
-// The pixel that a crossing changes, and how much of its neighbour it gets, 0..1/2.
+// The pixel that a crossing changes, and the share of its neighbour that it gets, 0..1/2.
 struct Blend {
   int32_t changed, other;
   float share;

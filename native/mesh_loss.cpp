@@ -9,7 +9,7 @@
 namespace mien {
 namespace {
 
-// A pixel that shows a triangle which counts, as the forward pass leaves it for the backward pass.
+// A pixel that shows a triangle of positive weight, in the form in which the forward pass leaves it.
 struct LitPixel {
   int32_t pixel, face;
   Texel texel;

@@ -1,4 +1,4 @@
-// How far the picture of a lit, textured mesh is from a given one: value and all gradients in one pass.
+// The loss between the picture of a lit, textured mesh and a target: value and all gradients in one pass.
 #pragma once
 
 #include <cstdint>
@@ -10,15 +10,15 @@ namespace mien {
 struct LitSurface {
   const float* normals;       // [v,3] of the mesh's corners, any length but 0
   const float* uv;            // [f,3,2]
-  const float* face_weights;  // [f] how far a triangle's pixels count; 0: it hides what is behind it, and shows nothing
+  const float* face_weights;  // [f] weight of a triangle's pixels; with 0, it only hides what is behind it
   TextureView texture;        // 3 channels
   const float* light;         // [9,3]
 };
 
 struct LossTarget {
   const float* image;  // [h,w,3]
-  const float* mask;   // [h,w] how far a pixel counts
-  float epsilon;       // colours that differ by less pull less
+  const float* mask;   // [h,w] weight of each pixel
+  float epsilon;       // smaller differences of colours have smaller gradients
 };
 
 struct LossGradients {  // each is added to
@@ -33,8 +33,8 @@ struct LossValue {
   double weight;  // of the pixels that show a triangle which counts
 };
 
-// The target itself is the background, and stands for what counts for nothing: only what the mesh covers can differ,
-// and silhouettes (of `edges`) are drawn to where colours change. Gradients are of `sum`.
+// The target itself is the background, and replaces triangles of weight 0. So only pixels that the mesh covers can
+// differ, and silhouettes (of `edges`) move to where colours change. Gradients are those of `sum`.
 LossValue mesh_loss(const Fragments& fragments, const ImageMesh& mesh, const MeshEdges& edges,
                     const LitSurface& surface, const LossTarget& target, float* picture,
                     const LossGradients& gradients);

@@ -1,5 +1,5 @@
-// What happens at one pixel of a mesh's picture, forward and backward: shared by the single operations and the fused
-// loss. Internal to native/mesh_*.cpp.
+// The operations at one pixel of a mesh's picture, forward and backward. The single operations (mesh_gradients.cpp) and
+// the fused loss (mesh_loss.cpp) share them.
 #pragma once
 
 #include <algorithm>
@@ -89,7 +89,7 @@ struct Texel {
 inline void texel_axis(float coordinate, int size, int& first, int& second, float& between, float& scale) {
   const float last = static_cast<float>(size - 1);
   const float place = coordinate * static_cast<float>(size) - 0.5f;
-  const float inside = std::clamp(place == place ? place : 0.0f, 0.0f, last);  // not a number is the first texel
+  const float inside = std::clamp(place == place ? place : 0.0f, 0.0f, last);  // NaN gives the first texel
   first = std::min(static_cast<int>(inside), std::max(size - 2, 0));
   second = std::min(first + 1, size - 1);
   between = inside - static_cast<float>(first);

@@ -15,7 +15,7 @@ MIEN_CHOOSE_KERNELS(PhotometricKernels, photometric_kernels)
 
 namespace {
 
-constexpr int kRowsAtATime = 64;  // of bytes that are turned into floats: worth a piece of the pool's work
+constexpr int kRowsAtATime = 64;  // rows of bytes that one piece of the pool's work converts to floats
 constexpr int kTaps = 2 * kPhotometricRadius + 1;
 
 struct Window {
@@ -67,7 +67,7 @@ void clear_beyond(const PhotometricTask& task, int first_row, int last_row, int6
   }
 }
 
-// What all bands share.
+// The fields that all bands share.
 PhotometricBand whole_band(const PhotometricTask& task, Workspace& work) {
   static const Window window;
   const int stride = task.width * kPhotometricChannels;

@@ -1,4 +1,4 @@
-// What the photometric loss hands to its kernel, which is compiled once per instruction set.
+// The arguments of the photometric kernel, which is compiled once per instruction set.
 #pragma once
 
 #include <cstdint>
@@ -9,7 +9,7 @@ constexpr int kPhotometricRadius = 5;
 // Pictures stay interleaved: a pixel's neighbour is 3 floats away, and every step works on plain rows of floats.
 constexpr int kPhotometricChannels = 3;
 constexpr int kPhotometricReach = kPhotometricRadius * kPhotometricChannels;
-constexpr int kPhotometricRows = 4;   // are filtered at a time: each value is loaded once for all of them
+constexpr int kPhotometricRows = 4;   // filtered at a time: each value is loaded once for all of them
 constexpr int kPhotometricRing = 16;  // rows of derivatives that stay in reach of the windows; a power of two
 constexpr int kPhotometricLine = 16;  // floats in a cache line: vectors that straddle two cost twice
 constexpr int kPhotometricPad = 64;   // room at both ends of a row buffer: the window's reach and whole vectors

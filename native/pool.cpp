@@ -21,8 +21,8 @@
 namespace mien {
 namespace {
 
-// Waking a parked thread costs about 50 us, so waiting threads spin at first: the longer the more often that was of
-// use. Where others want the cores, spinning in vain would only take them away.
+// Waking a parked thread costs about 50 us, so waiting threads spin at first. They spin longer if that has helped
+// before: if other processes want the cores, spinning in vain only takes cores away.
 constexpr std::chrono::microseconds kLeastSpin{5}, kMostSpin{100};
 
 void relax() {
@@ -33,7 +33,7 @@ void relax() {
 #endif
 }
 
-// Waits until `done()`, spinning for `spin`, which follows what came of it; false if it was not done by then.
+// Spins for at most `spin` until `done()`, and adapts `spin` to the outcome. Returns false if it was not done in time.
 template <typename Done>
 bool spin_until(Done&& done, std::chrono::microseconds& spin) {
   const auto end = std::chrono::steady_clock::now() + spin;
@@ -50,12 +50,12 @@ bool spin_until(Done&& done, std::chrono::microseconds& spin) {
   return done();
 }
 
-// Whether this thread runs a loop's body: loops within it are serial.
+// Whether this thread runs the body of a loop. Loops inside that body are serial.
 thread_local bool t_in_loop = false;
 
 class Pool {
  public:
-  // With fewer threads than asked for where the system starts no more.
+  // Has fewer threads than requested if the system starts no more.
   explicit Pool(int threads) : shares_(threads) {
     workers_.reserve(threads - 1);
     try {
@@ -64,11 +64,11 @@ class Pool {
     } catch (const std::bad_alloc&) {
     }
     threads_ = static_cast<int>(workers_.size()) + 1;  // workers read it within loops only, which come later
-    // A thread that finds no memory for its own variables ends the process: better now than when a loop has taken all.
+    // A thread without memory for its own variables ends the process. Now there is more memory than within a loop.
     for (int now; (now = started_.load(std::memory_order_acquire)) < threads_ - 1;) started_.wait(now);
   }
 
-  // Ends the workers, after the loop that is running. Whoever still holds this pool runs loops on his own thread.
+  // Ends the workers after the loop that is running. Callers that still hold this pool run loops on their own thread.
   void retire() {
     const std::lock_guard<std::mutex> lock(busy_);
     stop_ = true;
@@ -96,7 +96,7 @@ class Pool {
     t_in_loop = true;
     work(0);
     t_in_loop = false;
-    // From here on no worker enters; wait for those inside.
+    // No worker enters from here on. Wait for those inside.
     state_.fetch_and(~kOpen, std::memory_order_acq_rel);
     const auto left = [this] { return state_.load(std::memory_order_acquire) == 0; };
     if (!spin_until(left, spin_)) {
@@ -115,7 +115,7 @@ class Pool {
     signal_.notify_all();
   }
 
-  // One's own share, then what is left of the others'. An exception would end the process if it left a worker.
+  // Runs the own share, then what is left of the others'. An exception that leaves a worker would end the process.
   void work(int self) noexcept {
     try {
       for (int i = 0; i < threads(); ++i) {
@@ -125,7 +125,8 @@ class Pool {
         }
       }
     } catch (...) {
-      for (Share& share : shares_) share.next.store(share.end, std::memory_order_relaxed);  // nobody begins more
+      for (Share& share : shares_)
+        share.next.store(share.end, std::memory_order_relaxed);  // no thread starts another index
       const std::lock_guard<std::mutex> lock(error_mutex_);
       if (!error_) error_ = std::current_exception();
     }
@@ -157,9 +158,8 @@ class Pool {
     }
   }
 
-  // A part of the loop's indices. Each thread has the same one in every loop of that length, so that what it wrote last
-  // time is in its own caches: between cores that share none, fetching it takes longer than most of what is done with
-  // it.
+  // A part of the loop's indices. A thread has the same part in every loop of that length, so its data is in its own
+  // caches. Fetching data from a core without a shared cache takes longer than most of the work on it.
   struct alignas(64) Share {
     std::atomic<int64_t> next{0};
     int64_t end = 0;
@@ -170,8 +170,8 @@ class Pool {
   int threads_ = 1;
   std::atomic<int> started_{0};
   std::mutex busy_, error_mutex_;
-  std::exception_ptr error_;                    // the first of a loop
-  std::chrono::microseconds spin_ = kMostSpin;  // of whoever runs a loop
+  std::exception_ptr error_;                    // the first exception of a loop
+  std::chrono::microseconds spin_ = kMostSpin;  // for the thread that runs a loop
   detail::LoopBody body_ = nullptr;
   void* context_ = nullptr;
   alignas(64) std::atomic<uint32_t> state_{0};
@@ -182,7 +182,7 @@ class Pool {
 // Never destroyed: the threads end with the process. A forked child has no workers, so it forgets its parent's pool.
 std::atomic<Pool*> g_pool{nullptr};
 std::mutex* g_creation = new std::mutex;
-// Pools that were replaced: another thread may be about to run a loop on one.
+// Pools that were replaced. They stay, since another thread may be about to run a loop on one.
 std::vector<Pool*>* g_retired = new std::vector<Pool*>;
 
 void forget_pool() {

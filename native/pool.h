@@ -5,13 +5,13 @@
 
 namespace mien {
 
-constexpr int kMostThreads = 1024;  // more would only wait for each other
+constexpr int kMostThreads = 1024;  // more threads would only wait for each other
 
-// Number of threads that parallel loops use: MIEN_THREADS, by default the number of cores. Fewer where the system
-// starts no more. Throws std::invalid_argument where MIEN_THREADS is no number from 0 to kMostThreads (0: the default).
+// Number of threads that parallel loops use: MIEN_THREADS, by default the number of cores, or fewer if the system
+// starts no more. Throws std::invalid_argument if MIEN_THREADS is not a number from 0 (the default) to kMostThreads.
 int thread_count();
-// Replaces the pool; 0 goes back to the default, other numbers than 0..kMostThreads throw std::invalid_argument. Waits
-// for a loop that is running; not to be called from within one.
+// Replaces the pool; 0 goes back to the default. Throws std::invalid_argument for numbers outside 0..kMostThreads.
+// Waits for a loop that is running, so it must not be called from within one.
 void set_thread_count(int count);
 
 namespace detail {
@@ -19,9 +19,9 @@ using LoopBody = void (*)(void* context, int64_t index);
 void run_loop(int64_t count, LoopBody body, void* context);
 }  // namespace detail
 
-// Calls body(index) for 0 <= index < count, in any order, from several threads. Serial where there is one thread, one
-// index, or the pool is busy with another thread's loop (so loops may be nested or run side by side).
-// Results must not depend on who runs which index. Where a body throws, no further indices are begun, and the first
+// Calls body(index) for 0 <= index < count, in any order, from several threads. The loop is serial if there is one
+// thread or one index, or if the pool is busy with another thread's loop; so loops may be nested or run side by side.
+// Results must not depend on which thread runs which index. If a body throws, no further index starts, and the first
 // exception reaches the caller.
 template <typename Body>
 void parallel_for(int64_t count, Body&& body) {

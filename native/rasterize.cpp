@@ -1,4 +1,4 @@
-// The two passes: who runs which kernel on what, in parallel.
+// The two passes: which kernel runs on which data, in parallel.
 #include "rasterize.h"
 
 #include <atomic>
@@ -61,7 +61,7 @@ const Isa& isa() {
   return *g_isa;
 }
 
-// Frames that nobody uses. Never destroyed, since arrays may outlive static destructors.
+// Unused frames. Never destroyed, since arrays may outlive static destructors.
 constexpr size_t kSpareFrames = 4;
 std::mutex& spare_mutex() {
   static auto* mutex = new std::mutex;
@@ -70,7 +70,7 @@ std::mutex& spare_mutex() {
 std::vector<Frame*>& spare_frames() {
   static auto* frames = [] {
     auto* const own = new std::vector<Frame*>;
-    own->reserve(kSpareFrames);  // so that a frame always finds its way back
+    own->reserve(kSpareFrames);  // so that giving a frame back never needs memory
     return own;
   }();
   return *frames;
@@ -170,7 +170,7 @@ void rasterize_backward(Frame& frame, const GaussianArrays& gaussians, const Vie
     kernels.project_backward(gaussians, view, first, last, frame.slot_begins.data(), slots, gradients,
                              view_gradients + group * kViewGradients);
   });
-  // In the order of the Gaussians, whoever computed which part.
+  // Sums run in the order of the Gaussians, whichever thread computed which part.
   std::memset(view_gradient, 0, sizeof(float) * kViewGradients);
   for (int64_t group = 0; group < parts; ++group) {
     for (int j = 0; j < kViewGradients; ++j) view_gradient[j] += view_gradients[group * kViewGradients + j];

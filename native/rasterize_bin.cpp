@@ -20,7 +20,7 @@ struct Part {
   Part(int64_t count, int64_t index, int64_t parts) : first(count * index / parts), last(count * (index + 1) / parts) {}
 };
 
-// What the first pass of the sort reads: all Gaussians, of which some are not drawn.
+// The input of the first pass of the sort: all Gaussians, including those that are not drawn.
 struct Unsorted {
   const uint32_t* keys;
   uint32_t nearest;
@@ -31,7 +31,7 @@ struct Unsorted {
   uint32_t gaussian(int64_t i) const { return static_cast<uint32_t>(i); }
 };
 
-// What later passes read: what the one before wrote.
+// The input of later passes: the output of the pass before.
 struct Sorted {
   const uint32_t *keys, *order;
 
@@ -42,7 +42,7 @@ struct Sorted {
 
 struct Digit {
   int shift, bits;
-  bool last;  // of the passes: its keys are not needed any more
+  bool last;  // whether this is the last pass, whose keys are not needed any more
 
   uint32_t of(uint32_t key) const { return key >> shift & ((1u << bits) - 1); }
 };
@@ -125,7 +125,7 @@ void find_large(const Splat& splat, uint32_t gaussian, const TileSpan& span, int
   });
 }
 
-// Counts in 64 bits, before any pair is written. Few scenes could have too many: the others are not counted.
+// Counts in 64 bits, before any pair is written, if the scene could have too many pairs at all.
 void check_pair_count(Frame& frame) {
   if (frame.drawn * frame.columns * frame.rows <= kMostPairs) return;
   std::atomic<int64_t> pairs{0};
@@ -149,7 +149,7 @@ void find_pairs(BinChunk& chunk, Frame& frame) {
   const TileSpan* spans = frame.spans.data();
   Buffer<Pair>& pairs = chunk.pairs;
   pairs.clear();
-  constexpr int64_t kAhead = 16;  // by depth, Gaussians lie anywhere in memory
+  constexpr int64_t kAhead = 16;  // in depth order, Gaussians are scattered in memory
   for (int64_t i = 0; i < count; ++i) {
     const uint32_t gaussian = order[i];
     __builtin_prefetch(&spans[order[std::min(i + kAhead, count - 1)]]);
@@ -196,11 +196,12 @@ void place_chunks(Frame& frame) {
   frame.pairs = total;
 }
 
-// Each thread's share of the tiles, equal work, in runs that get shorter, so that at the end none waits long for
-// another. What the next tile of a run needs can be fetched ahead, and much of it is in the cache already.
+// Divides the tiles into equal work for each thread, in runs that get shorter, so that no thread waits long for another
+// at the end. The data of a run's next tile can be fetched ahead, and much of it is in the cache already.
 void plan_runs(Frame& frame) {
-  constexpr int64_t kEmptyTile = 16;  // takes as long as so many pairs
-  constexpr int kRuns = 12;           // of a share: each a third of what is left of it, the last the rest
+  constexpr int64_t kEmptyTile = 16;  // takes as long as this many pairs
+  constexpr int kRuns =
+      12;  // per thread: each has a third of what is left of the thread's share, the last one the rest
   const int tiles = frame.columns * frame.rows, shares = thread_count();
   const int32_t* begins = frame.tile_begins.data();
   frame.runs = kRuns * shares;
@@ -246,7 +247,7 @@ void fill_lists(BinChunk& chunk, Frame& frame) {
   Entry* entries = frame.entries.data();
   const uint32_t* slot_begins = frame.differentiable ? frame.slot_begins.data() : nullptr;
   Pair before{UINT32_MAX, 0};
-  uint32_t earlier = 0;  // pairs of the same Gaussian, which lie side by side
+  uint32_t earlier = 0;  // earlier pairs of the same Gaussian, which are adjacent
   for (int64_t i = 0; i < chunk.pairs.size(); ++i) {
     const Pair pair = chunk.pairs[i];
     earlier = pair.gaussian == before.gaussian ? earlier + 1 : 0;
@@ -270,7 +271,7 @@ void sort_by_depth(Frame& frame, int64_t count) {
   for (auto* buffer : {&frame.sorted_keys, &frame.order, &frame.scratch_keys, &frame.scratch_order}) {
     buffer->reserve(frame.drawn);
   }
-  // As few passes as there can be, of equally many bits.
+  // As few passes as possible, with equally many bits each.
   const int bits = std::max<int>(std::bit_width(farthest - nearest), 1);
   const int passes = (bits + kMostDigitBits - 1) / kMostDigitBits, digit = (bits + passes - 1) / passes;
   for (int pass = 0; pass < passes; ++pass) {

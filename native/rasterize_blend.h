@@ -15,20 +15,20 @@ constexpr int kBlocksAhead = 4;  // blocks: how far ahead the picture is fetched
 
 struct TilePixels {
   alignas(64) float transmittance[kBlocks][kBlock * kBlock];
-  // Goes on falling where transmittance stays: at kTransmittanceMin the pixel ends. That keeps the dependence of each
-  // splat on the one before it to one multiplication.
+  // Keeps falling when transmittance stays, below kTransmittanceMin, where the pixel ends. So each splat depends on the
+  // one before it by one multiplication only.
   alignas(64) float product[kBlocks][kBlock * kBlock];
   alignas(64) float color[3][kBlocks][kBlock * kBlock];
 };
 
-// Of a tile: where it lies in the picture, and where the picture lies.
+// A tile's place in the picture, and the picture.
 struct TilePicture {
   const View& view;
   int left, top;
   float *image, *alpha;
 };
 
-// Fetches what will be written of a block into the cache; the block may lie anywhere.
+// Fetches the pixels of a block into the cache before they are written. The block may be outside the picture.
 MIEN_INLINE void prefetch_block(int block, const TilePicture& tile) {
   const int left = tile.left + kBlock * (block % kTileBlocks), top = tile.top + kBlock * (block / kTileBlocks);
   for (int y = top; y < top + kBlock; ++y) {

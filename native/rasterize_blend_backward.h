@@ -1,12 +1,12 @@
-// Backward: one tile, again front to back. The colour behind a splat is the final colour less what was blended so far,
-// so the forward pass stores nothing per pixel but the picture.
+// Backward: one tile, again front to back. The colour behind a splat is the final colour minus what was blended so far,
+// so the forward pass stores nothing per pixel except the picture.
 #pragma once
 
 #include "rasterize_blend.h"
 
 namespace {
 
-// What is known of a tile's pixels before any splat.
+// Gradients of a tile's pixels, and their state before the first splat.
 struct TileGradients {
   alignas(64) float product[kBlocks][kBlock * kBlock];   // as in the forward pass
   alignas(64) float behind[kBlocks][kBlock * kBlock];    // gradient . (colour behind what has been blended)
@@ -37,7 +37,7 @@ MIEN_INLINE I load_block(const PictureGradient& p, int64_t pixel, int width, int
     F gradient[3], color[3], behind{};
     split3(p.grad_image + 3 * pixel, 3 * width, gradient);
     split3(p.image + 3 * pixel, 3 * width, color);
-    if (p.grad_alpha) {  // without one, alpha need not come from memory
+    if (p.grad_alpha) {  // without it, alpha is not read from memory
       const F grad_alpha = load_fours(p.grad_alpha + pixel, width);
       behind = -grad_alpha * (1.0f - load_fours(p.alpha + pixel, width));
       any |= bits(grad_alpha);

@@ -21,7 +21,7 @@ class Buffer {
   Buffer& operator=(const Buffer&) = delete;
   ~Buffer() { std::free(data_); }
 
-  // At least `count` elements, never null; what they held may be lost.
+  // At least `count` elements, never null. Their values may be lost.
   T* reserve(int64_t count) {
     if (count > capacity_ || !data_) {
       std::free(data_);
@@ -77,7 +77,7 @@ struct BinChunk {
   Buffer<int32_t> counts;  // per tile; then where the chunk's next entry of that tile goes
 };
 
-constexpr int kMostDigitBits = 12;  // of a pass of the radix sort
+constexpr int kMostDigitBits = 12;  // in one pass of the radix sort
 
 // A part of the Gaussians that one thread sorts.
 struct SortPart {
@@ -85,7 +85,7 @@ struct SortPart {
 };
 
 struct Frame {
-  bool differentiable = true;  // otherwise what only a backward pass needs is left out
+  bool differentiable = true;  // without it, there can be no backward pass
   Buffer<Splat> splats;
   Buffer<TileSpan> spans;
   Buffer<uint32_t> depth_keys, sorted_keys, order, scratch_keys, scratch_order;

@@ -1,4 +1,4 @@
-// What rasterize.cpp hands to the kernels, which are compiled once per instruction set (rasterize_kernels.cpp).
+// The arguments of the kernels, which are compiled once per instruction set (rasterize_kernels.cpp).
 #pragma once
 
 #include <cstdint>
@@ -73,7 +73,7 @@ struct DepthRange {
   uint32_t nearest, farthest;
 };
 
-// What projection writes of each Gaussian.
+// What projection writes for each Gaussian.
 struct Projected {
   TileGrid grid;
   Splat* splats;

@@ -124,10 +124,10 @@ MIEN_INLINE I store_spans(const SplatShape& s, TileGrid grid, int valid, TileSpa
   store_columns<3>(rows, 3, W, words);
   memcpy(spans, rows, sizeof(TileSpan) * valid);
   const I above = high[0] - low[0] + 1, below = high[1] - low[1] + 1;
-  return (above & ~(above >> 31)) + (below & ~(below >> 31));  // none rather than fewer
+  return (above & ~(above >> 31)) + (below & ~(below >> 31));  // never negative
 }
 
-// Of the drawn Gaussians in each lane so far.
+// What is known of the drawn Gaussians in each lane so far.
 struct Depths {
   F nearest = set1(3e38f), farthest{};
   int64_t drawn = 0;

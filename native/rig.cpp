@@ -14,7 +14,7 @@ MIEN_CHOOSE_KERNELS(RigKernels, rig_kernels)
 
 namespace {
 
-constexpr int64_t kGrain = 2048;  // triangles or Gaussians that are worth a piece of the pool's work
+constexpr int64_t kGrain = 2048;  // triangles or Gaussians in one piece of the pool's work
 
 template <typename Body>
 void in_pieces(int64_t count, Body&& body) {
@@ -28,7 +28,7 @@ struct Vec {
 Vec operator+(Vec a, Vec b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 Vec operator*(float s, Vec a) { return {s * a.x, s * a.y, s * a.z}; }
 
-// What a triangle passes to its three corners.
+// The gradients of a triangle's three corners.
 struct CornerGradients {
   Vec corners[3];
 };

@@ -1,4 +1,4 @@
-// Gaussians that ride on triangles, from their triangle's frame to world space (GaussianAvatars, CVPR 2024), and back.
+// Gaussians bound to triangles, from their triangle's frame to world space (GaussianAvatars, CVPR 2024), and back.
 #pragma once
 
 #include <cstdint>
@@ -9,8 +9,8 @@ namespace mien {
 constexpr int kMostRigVertices = 1 << 24;
 constexpr int kMostRigFaces = 1 << 29;  // their corners are counted in 32 bits
 
-// Which Gaussians ride on a triangle, and which corners of triangles meet at a vertex, both in ascending order: so that
-// sums over them can run side by side and still add up in one order. Throws std::out_of_range where an index does not
+// The Gaussians bound to each triangle, and the corners of triangles that meet at each vertex, both in ascending order.
+// Sums over them can run in parallel and still add up in one order. Throws std::out_of_range if an index does not
 // exist.
 struct RigTopology {
   RigTopology(int64_t vertex_count, const int64_t* faces, int64_t face_count, const int64_t* face_index, int64_t count);

@@ -1,4 +1,4 @@
-// Compiled once per instruction set: one triangle, then one Gaussian a lane.
+// Compiled once per instruction set: one triangle per lane, then one Gaussian per lane.
 #include "rig_kernels.h"
 
 #include "simd_columns.h"
@@ -8,7 +8,7 @@ namespace {
 
 constexpr float DEGENERATE_LENGTH = 1e-7f;
 
-// Vectors of three and of four whose components are vectors of W lanes: one Gaussian a lane.
+// Vectors of three and of four whose components are vectors of W lanes: one Gaussian per lane.
 MIEN_INLINE void turn(const F* R, const F* v, F* out) {
   for (int row = 0; row < 3; ++row) out[row] = R[3 * row] * v[0] + R[3 * row + 1] * v[1] + R[3 * row + 2] * v[2];
 }
@@ -27,7 +27,7 @@ MIEN_INLINE void multiply_quaternions(const F* p, const F* q, F* out) {
   out[2] = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1];
   out[3] = p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0];
 }
-// Scales a quaternion to length 1 and returns by what; as torch's normalize: a zero quaternion stays zero.
+// Scales a quaternion to length 1 and returns the factor. As in torch's normalize, a zero quaternion stays zero.
 MIEN_INLINE F normalize(F* q) {
   const F norm = square_root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
   const F unit = 1.0f / maximum(norm, set1(1e-12f));
@@ -111,7 +111,8 @@ void frames(const RigArrays& rig, int64_t first, int64_t last, TriangleFrame* ou
   }
 }
 
-// The frames of the triangles that Gaussians i .. i + valid - 1 ride on; lanes from `valid` on repeat the last one.
+// The frames of the triangles that Gaussians i .. i + valid - 1 are bound to; lanes from `valid` on repeat the last
+// one.
 struct FrameColumns {
   F columns[sizeof(TriangleFrame) / sizeof(float)];
   const F *R = columns, *T = columns + 9, *k = columns + 12, *q = columns + 13;

@@ -1,4 +1,4 @@
-// Light on a mesh: what alignment and the differentiable renderer share.
+// The basis of the light on a mesh, which alignment and the differentiable renderer share.
 #pragma once
 
 namespace mien {

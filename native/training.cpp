@@ -13,14 +13,14 @@ MIEN_CHOOSE_KERNELS(TrainingKernels, training_kernels)
 
 namespace {
 
-constexpr int64_t kElements = 16384, kGaussians = 4096;  // worth a piece of the pool's work
+constexpr int64_t kElements = 16384, kGaussians = 4096;  // in one piece of the pool's work
 
 struct Piece {
   int task;
   int64_t first, last;
 };
 
-// The same of rows top .. bottom - 1; all 0 where they hold nothing.
+// The same for rows top .. bottom - 1; all 0 if they hold only zeros.
 PixelBox box_of_rows(const float* values, int width, int top, int bottom) {
   const auto any_nonzero = training_kernels().any_nonzero;
   const auto row = [&](int y) { return values + static_cast<int64_t>(y) * width; };

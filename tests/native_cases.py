@@ -187,14 +187,14 @@ def picture_without_rows() -> None:
 
 
 def group_with(name: str, place: int, **changes: Any) -> Any:
-    """A valid call with some fields of the group at a place replaced."""
+    """Make a valid call with some fields of the group at a place replaced."""
     given = arguments(name)
     given[place] = given[place]._replace(**changes)
     return getattr(_native, name)(*given)
 
 
 def backward_with(**changes: Any) -> None:
-    """A valid backward pass with some fields of its first view replaced."""
+    """Run a valid backward pass with some fields of its first view replaced."""
     task, *_ = arguments("rasterize_views_backward")[0]
     _native.rasterize_views_backward([task._replace(**changes)])
 

@@ -80,7 +80,7 @@ def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path: Path) -> None:
         ({"gaussians": 10**12}, "does not fit its settings"),
         ({"face_model": 7}, "face_model"),
         ({"tensors_sha256": None}, "tensors_sha256"),
-        ({"surprise": 1}, "unknown \\['surprise'\\]"),
+        ({"surprise": 1}, "unknown entries \\['surprise'\\]"),
     ):
         damaged = {name: value for name, value in (json.loads(content) | damage).items() if value is not None}
         (tmp_path / "avatar.json").write_text(json.dumps(damaged))

@@ -86,7 +86,7 @@ def test_dark_and_overexposed_clips_are_warned_of(face, tmp_path, capsys, gain, 
     said, report = capture_said(tmp_path, capsys, [np.pad(lit, ((30, 30), (60, 60), (0, 0)), mode="edge")] * 4)
     assert (report["dark"], report["overexposed"]) == flags
     warned = [line for line in said.splitlines() if line.startswith("warning:")]
-    assert [warning in line and "record it again" in line for line in warned] == ([True] if warning else [])
+    assert [warning in line and "record the video again" in line for line in warned] == ([True] if warning else [])
 
 
 def test_blurred_frames_are_named_and_not_usable(face, tmp_path, capsys):

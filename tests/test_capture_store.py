@@ -165,7 +165,7 @@ def test_only_captures_are_replaced(stored, tmp_path):
     foreign = tmp_path / "thesis"
     foreign.mkdir()
     (foreign / "chapter1.txt").write_text("do not delete")
-    with pytest.raises(UserError, match="no capture"):
+    with pytest.raises(UserError, match="not part of a capture"):
         write_capture(foreign, replacement)
     assert (foreign / "chapter1.txt").read_text() == "do not delete"
     with pytest.raises(UserError, match="is a file"):

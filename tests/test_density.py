@@ -20,7 +20,7 @@ from mien.avatar.density import split_along_axes
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.rotation import matrix_from_quaternion
-from mien.training.density import GradientStrategy, RefillStrategy, density_strategy
+from mien.training.density_control import GradientStrategy, RefillStrategy, density_strategy
 
 WIDTH, HEIGHT = 40, 20
 EVERY_STEP = GradientSettings(start=0.0, stop=1.0, rounds=101, split_size=0.0025, opacity_resets=())

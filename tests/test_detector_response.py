@@ -14,7 +14,7 @@ from mien.tracking.fitting import CameraBatch, Fit, SequenceFit, Views, batch_of
 from mien.tracking.landmarks import DetectorResponse, all_landmarks, read_response, reduce_face_model, write_response
 from mien.tracking.landmarks.detector_response import unknown_response
 from mien.tracking.landmarks.shared_fit import fit_shared
-from mien.tracking.landmarks.term import unknown_subject
+from mien.tracking.landmarks.term import move_subject, unknown_subject
 from mien.tracking.settings import TrackingSettings
 from small_face_model import make_small_face_model
 from tracking_case import still_camera
@@ -104,7 +104,7 @@ def test_derivatives_by_the_person_match_finite_differences():
     for component in range(3):
         step = torch.zeros(len(subject.shared), dtype=torch.float64)
         step[len(subject.identity) + component] = 1e-4
-        there, back = subject.moved(step, reduced.response), subject.moved(-step, reduced.response)
+        there, back = move_subject(subject, step, reduced.response), move_subject(subject, -step, reduced.response)
         numeric = [reduced.project(state, s.identity, s.bias, camera, row) for s in (there, back)]
         torch.testing.assert_close(analytic[..., component], (numeric[0] - numeric[1]) / 2e-4, atol=1e-4, rtol=1e-5)
 
@@ -120,7 +120,7 @@ def _fitted_identity(detects: DetectorResponse, expects: DetectorResponse) -> fl
     identity = torch.linspace(-1, 1, 6, dtype=torch.float64)
     person = unknown_subject(truth)
     step = torch.cat([identity, torch.linspace(-1.5, 1.5, len(person.person), dtype=torch.float64)])
-    person = person.moved(step, detects)
+    person = move_subject(person, step, detects)
     cameras: CameraBatch = batch_of((still_camera(),))
     detected = truth.project(
         state, person.identity, person.bias, cameras[torch.zeros(8, dtype=torch.long)], torch.arange(8)

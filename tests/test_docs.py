@@ -88,6 +88,12 @@ def test_the_index_names_every_page() -> None:
     assert [str(page.relative_to(ROOT)) for page in PAGES if page.resolve() not in named and page != index] == []
 
 
+def test_the_architecture_gives_every_room_its_job() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| \w", page.split("## Rooms")[1].split("## Layers")[0], re.MULTILINE)
+    assert sorted(rows) == sorted(path.parent.name for path in (ROOT / "src/mien").glob("*/__init__.py"))
+
+
 def test_pictures_are_small_and_described() -> None:
     shown = {
         (page.parent / target).resolve(): text

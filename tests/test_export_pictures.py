@@ -163,7 +163,7 @@ def test_cameras_from_a_file(tmp_path: Path) -> None:
     for wrong, part in (
         ([], "no list"),
         ([{**entry, "K": [[1]]}], "camera 0: K must be 3x3"),
-        ([entry, {**entry, "viewmat": (2 * torch.eye(4)).tolist()}], "camera 1: viewmat is no rotation"),
+        ([entry, {**entry, "viewmat": (2 * torch.eye(4)).tolist()}], "camera 1: viewmat is not a rotation"),
         ([{**entry, "width": 100000}], "100000x80"),
         ([{**entry, "K": "big"}], "needs K"),
         ([3], "needs K"),

@@ -9,9 +9,8 @@ import torch
 from mien.camera import camera_from_fov
 from mien.face import load_face_model, loading
 from mien.rotation import matrix_from_axis_angle, rigid_transform
-from mien.tracking.fitting import Views
 from mien.tracking.landmarks import LEFT_EYELIDS, RIGHT_EYELIDS, EmbeddingSettings, embed_landmarks
-from mien.tracking.landmarks.embedding import _best_point
+from mien.tracking.landmarks.embedding import DetectedViews, _best_point
 from mien.tracking.landmarks.groups import IBUG68
 from small_face_model import make_small_face_model
 
@@ -36,7 +35,7 @@ def test_a_point_on_the_surface_is_found_again():
         targets.append(camera.project(points)[0])
     # One detection in twelve is far off.
     targets[5] = targets[5] + 200
-    views = Views(torch.stack(pixels), torch.stack(depths), torch.stack(targets))
+    views = DetectedViews(torch.stack(pixels), torch.stack(depths), torch.stack(targets))
     for landmark in range(len(truth)):
         triangle, barycentric, error = _best_point(views, model.faces, allowed, landmark, clamp=10.0)
         found = barycentric @ model.template[model.faces[triangle]]

@@ -26,7 +26,7 @@ from mien.progress import Advance
 from mien.render import rasterize
 from mien.training import TrainSettings
 from mien.training.checkpoint import resume, write_checkpoint
-from mien.training.density import density_strategy
+from mien.training.density_control import density_strategy
 from mien.training.frames import FrameOrder, training_frames
 from mien.training.sequence import Targets
 from mien.training.trainer import TrainingData, start, step

@@ -1,8 +1,10 @@
 """Settings of methods and runs come from options and files in a known order, and wrong ones are refused before work."""
 
 import json
+import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -21,7 +23,7 @@ from mien.cli import main
 from mien.commands.settings_options import leaves
 from mien.commands.stages import training
 from mien.ranges import Range
-from mien.training import DIALS, PRESETS, TrainSettings
+from mien.training import MAIN_SETTINGS, PRESETS, TrainSettings
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
@@ -305,7 +307,7 @@ def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.
         assert f" {leaf.option('method')} " in shown
     for heading in {leaf.heading for leaf in listed}:
         assert f" {heading} options " in shown
-    rest = [field.name for field in fields(TrainSettings) if field.name not in DIALS]
+    rest = [field.name for field in fields(TrainSettings) if field.name not in MAIN_SETTINGS]
     assert rest
     assert all(f"--training.{name.replace('_', '-')} " in shown for name in rest)
 
@@ -355,7 +357,10 @@ def test_settings_of_an_added_method_appear_by_themselves(
     choices: Any, workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     presets = {"draft": ToyConfig(dust=Dust(1)), "standard": ToyConfig()}
-    monkeypatch.setitem(METHODS, "toy", Method(presets, "toy_module:Toy"))
+    module = ModuleType("toy_settings")
+    vars(module)["PRESETS"] = presets
+    monkeypatch.setitem(sys.modules, "toy_settings", module)
+    monkeypatch.setitem(METHODS, "toy", Method("toy_module:Toy", "toy_settings"))
     shown = help_of(capsys, "train", "--method", "toy", "--help-all")
     assert "--method.dust.grains INT" in shown
     assert "Colour of the toy." in shown

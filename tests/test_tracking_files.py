@@ -40,11 +40,11 @@ def _tracking(offsets: bool = False, pixels: bool = False) -> Tracking:
         cameras=(still_camera().to(torch.zeros(())),), neck_lines=torch.tensor([0.0, -1.0, 300.0]).expand(4, 1, 3),
         residuals=torch.tensor([[0.5], [torch.nan], [0.7], [0.6]]),
         pixel_residuals=torch.tensor([[0.02], [torch.nan], [torch.nan], [0.03]]) if pixels else None,
-        appearance=_looks(random) if pixels else None, settings={"focal": None, "keyframes": 20},
+        appearance=_appearance(random) if pixels else None, settings={"focal": None, "keyframes": 20},
     )  # fmt: skip
 
 
-def _looks(random: torch.Generator) -> Appearance:
+def _appearance(random: torch.Generator) -> Appearance:
     texture, trust, light = (torch.rand(*shape, generator=random) for shape in ((8, 6, 3), (8, 6), (9, 3)))
     return Appearance(texture, trust, light, sigma=0.03, light_extent=0.012)
 

@@ -26,14 +26,14 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float, int]]:
     """Collect stage, progress and height of every picture that is written."""
     monkeypatch.setattr(preview, "_INTERVAL_SECONDS", 0.0)
     monkeypatch.setattr(preview, "_MAX_SHARE", 1e9)
-    shown, headed = [], Preview._headed
+    shown, with_header = [], Preview._with_header
 
     def record(self: Preview, stage: str, progress: float) -> np.ndarray:
-        picture = headed(self, stage, progress)
+        picture = with_header(self, stage, progress)
         shown.append((stage, progress, len(picture)))
         return picture
 
-    monkeypatch.setattr(Preview, "_headed", record)
+    monkeypatch.setattr(Preview, "_with_header", record)
     return shown
 
 
@@ -72,7 +72,7 @@ def test_two_sequences_and_the_paper_schedule_are_shown(tmp_path, seen):
 
 
 def test_looking_takes_a_small_part_of_the_time(tmp_path, monkeypatch):
-    """The preview takes a small part of the time: a picture that takes a second is not repeated within ten."""
+    """A drawing that takes a second is not repeated within ten; the newest fit is shown then, and the end always."""
     now, drawn, written = [0.0], [], []
     monkeypatch.setattr(preview.time, "monotonic", lambda: now[0])
 

@@ -10,7 +10,7 @@ from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.avatar import Moments
 from mien.training.adam import Update, update_all, update_reference
-from mien.training.density.gradient import observe_reference
+from mien.training.density_control.gradient import observe_reference
 
 COUNTS = (0, 1, 15, 16, 4097)
 

@@ -46,8 +46,9 @@ def link_names(app: Sphinx, doctree: nodes.document) -> None:
             _LOGGER.warning("%s does not exist", name, location=literal)
         targets = places.get(name, set())
         here = {full for full in targets if page == f"reference/{full.rpartition('.')[0]}"}
-        target = _only(here) or _only(targets)
-        if target and (here or _is_telling(name)):
+        member = _member(literal, name)
+        target = member or _only(here) or _only(targets)
+        if target and (member or here or _is_telling(name)):
             link = addnodes.pending_xref("", refdomain="py", reftype="obj", reftarget=target, refdoc=page)
             literal.replace_self(link)
             link.append(literal)
@@ -71,6 +72,19 @@ def _is_linked(node: nodes.Node) -> bool:
             return True
         node = node.parent
     return False
+
+
+def _member(literal: nodes.literal, name: str) -> str | None:
+    """The full name of a field or method, if the text is that of a class which has one of this name."""
+    node = literal.parent
+    while node is not None and not (isinstance(node, addnodes.desc) and node["objtype"] == "class"):
+        node = node.parent
+    if node is None:
+        return None
+    for signature in node.findall(addnodes.desc_signature):
+        if signature["fullname"].partition(".")[2] == name:
+            return f"{signature['module']}.{signature['fullname']}"
+    return None
 
 
 def _is_format(literal: nodes.literal) -> bool:

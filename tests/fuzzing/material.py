@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from mien.avatar.portable import make_portable
 
 import train_toy
 from fuzzing.archive_faults import npy_of, npz_of
 from mien.avatar import load_avatar
+from mien.avatar.baking import make_portable
 from mien.capture.video import write_video
 from mien.evaluation import EvaluationSettings, evaluate
 from mien.evaluation.partial import PartialScores

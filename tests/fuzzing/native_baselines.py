@@ -62,7 +62,7 @@ def make_face_model(native: Any, rng: Rng, sizes: Sizes | None = None) -> Argume
 
 
 def posing(native: Any, rng: Rng) -> tuple[Any, Any, Sizes, int]:
-    """A model, the inputs of one to three timesteps, and the sizes of both."""
+    """Return a model, the inputs of one to three timesteps, and the sizes of both."""
     sizes = v, e, j = sizes_of_face(rng)
     b = int(rng.integers(1, 4))
     head = [normal(rng, b, 3), normal(rng, b, 3)] if rng.random() < 0.7 else [None, None]

@@ -55,7 +55,7 @@ def load(path: str) -> Any:
 
 
 def bound_names(native: Any) -> set[str]:
-    """Everything that can be called, less the classes that only functions make, and less the named tuples."""
+    """Return the names of everything that can be called, except for classes that only functions make, and groups."""
     made = {"FaceModelData", "RigTopology", "Ride", "RasterizeFrame"}
     named = {name: getattr(native, name) for name in dir(native) if not name.startswith("_")}
     return {name for name, one in named.items() if callable(one) and not hasattr(one, "_fields")} - made
@@ -79,7 +79,7 @@ def at(value: Any, path: tuple[int, ...]) -> Any:
 
 
 def like(value: Any, items: list[Any]) -> Any:
-    """The items as a list, a tuple, or the same named tuple if they are as many."""
+    """Return the items as a list, a tuple, or the same named tuple if the number of items is the same."""
     if hasattr(value, "_fields"):
         return type(value)(*items) if len(items) == len(value) else tuple(items)
     return type(value)(items)

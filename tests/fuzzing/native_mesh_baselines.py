@@ -51,7 +51,7 @@ def rasterize_mesh(native: Any, rng: Rng) -> Arguments:
 
 
 def fragments(native: Any, rng: Rng) -> tuple[Any, np.ndarray, np.ndarray]:
-    """A drawn mesh, its image points, and its faces."""
+    """Return a drawn mesh, its image points and its faces."""
     vertices, faces, K, viewmat, _, out = rasterize_mesh(native, rng)
     native.rasterize_mesh(vertices, faces, K, viewmat, False, out)
     points = (vertices @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
@@ -59,7 +59,7 @@ def fragments(native: Any, rng: Rng) -> tuple[Any, np.ndarray, np.ndarray]:
 
 
 def edges(native: Any, rng: Rng, faces: np.ndarray) -> Any:
-    """All edges of all faces, half of them with a second triangle."""
+    """Return all edges of all faces; half of them have a second triangle."""
     vertices = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(I32)
     opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]]).astype(I32)
     own = np.tile(np.arange(len(faces), dtype=I32), 3)
@@ -125,7 +125,7 @@ def align_surface(native: Any, rng: Rng, v: int = 0) -> Arguments:
 
 
 def sighting(native: Any, rng: Rng) -> tuple[Any, Any, tuple[int, ...], Arguments]:
-    """A surface, a picture of it, the texture's size, and the arguments that the surface was made of."""
+    """Return a surface, a picture of it, the texture's size, and the arguments that made the surface."""
     v, (h, w) = few(rng) + 2, picture(rng)
     made = align_surface(native, rng, v)
     light = normal(rng, 9, 3)

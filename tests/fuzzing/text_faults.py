@@ -74,7 +74,7 @@ def _faulty_encoding(text: str, dice: Random) -> tuple[str, bytes]:
 
 
 def _faulty_ply_header(lines: list[str], kind: str, dice: Random) -> None:
-    """One fault in the header's lines, which are changed."""
+    """Make one fault in the lines of a header, in place."""
     places = [index for index, line in enumerate(lines) if line.startswith("property")]
     element = next(index for index, line in enumerate(lines) if line.startswith("element"))
     if kind == "count":

@@ -16,7 +16,8 @@ import torch
 from fuzzing import content
 from fuzzing.material import CONFIG, QUICK, RUN, SEQUENCE, SETTINGS
 from mien import cli
-from mien.avatar import load_avatar, make_portable
+from mien.avatar import load_avatar
+from mien.avatar.baking import make_portable
 from mien.driving import Motion, drive
 from mien.errors import UserError
 from mien.evaluation import evaluate

@@ -59,9 +59,9 @@ class _BoundGaussians(torch.autograd.Function):
         count = len(arrays[-1])
         means, quats, scales = (torch.empty(1, count, width) for width in (3, 4, 3))
         opacities, head_pose = torch.empty(count), torch.empty(1, 4, 4)
-        known = unpacked(*arrays)
-        face, local = _native.FaceArrays(*known[:6]), _native.LocalGaussians(*known[6:])
-        posed = _native.PosedGaussians(*unpacked(means, quats, scales, opacities, head_pose))
+        known = unpacked(*arrays, means, quats, scales, opacities, head_pose)
+        face, local = _native.FaceArrays(*known[:6]), _native.LocalGaussians(*known[6:10])
+        posed = _native.PosedGaussians(*known[10:])
         ctx.ride = _native.ride(data, topology, in_head, face, local, posed)
         ctx.data, ctx.topology, ctx.in_head = data, topology, in_head
         ctx.save_for_backward(*arrays, scales, opacities)
@@ -74,19 +74,18 @@ class _BoundGaussians(torch.autograd.Function):
         moves_face = any(ctx.needs_input_grad[5:9])
         of_face = [torch.empty_like(tensor) if moves_face else None for tensor in saved[2:6]]
         of_gaussians = [torch.empty_like(tensor) for tensor in saved[6:]]
-        by_posed = unpacked(*(gradient.contiguous() for gradient in gradients))
-        if not ctx.in_head:
-            by_posed.append(None)
-        known = unpacked(*saved, scales.detach(), opacities.detach())
+        head_pose = () if ctx.in_head else (None,)
+        by_posed = (*(gradient.contiguous() for gradient in gradients), *head_pose)
+        known = unpacked(*saved, *by_posed, *of_gaussians, scales.detach(), opacities.detach())
         _native.ride_backward(
             ctx.ride,
             ctx.data,
             ctx.topology,
             _native.FaceArrays(*known[:6]),
             _native.LocalGaussians(*known[6:10]),
-            *known[10:],
-            _native.PosedGaussians(*by_posed),
-            _native.LocalGaussians(*unpacked(*of_gaussians)),
+            *known[19:],
+            _native.PosedGaussians(*known[10:15]),
+            _native.LocalGaussians(*known[15:19]),
             _native.FaceParameterGradients(*unpacked(*of_face)) if moves_face else None,
         )
         return None, None, None, None, None, *of_face, *of_gaussians

@@ -1,7 +1,7 @@
 """Descriptions of a method's density control: the strategy, its settings, and hooks that only the method can provide.
 
-The strategies themselves are in `mien.training.density`, one file each. They see a `GaussianStore` and one of these
-descriptions, never the method.
+The strategies themselves are in `mien.training.density_control`, one file each. They see a `GaussianStore` and one of
+these descriptions, never the method.
 """
 
 from collections.abc import Callable, Mapping

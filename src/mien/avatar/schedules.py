@@ -33,7 +33,7 @@ class Rate:
     """A learning rate over the run: constant, or log-linear from `start` to `end`."""
 
     start: Annotated[float, Range(0, 100)]
-    """The rate at the first step, or at `begin`. With 0, nothing is learned, whatever the end is."""
+    """The rate at the first step, or at `begin`. With 0, nothing is learned, whatever `end` is."""
     end: Annotated[float | None, Range(1e-12, 100)] = None
     """The rate at the last step. If it is not given, the rate is constant."""
     begin: Annotated[float, FRACTION] = 0.0

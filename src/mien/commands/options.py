@@ -15,7 +15,7 @@ from mien.commands.settings_options import apply_options, check_names, leaves, o
 from mien.config import overlay
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
-from mien.training import DIALS, PRESETS, Split, TrainSettings
+from mien.training import MAIN_SETTINGS, PRESETS, Split, TrainSettings
 from mien.workspace import open_workspace
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def _with_defaults(method: str | None, preset: str, file: ConfigFile | None, arg
         config = overlay(config, file.method_changes, f"{file.path}: method", name)
     own = leaves(config, "method")
     check_names(arguments, "method", own, name)
-    rest = [one.name for one in fields(settings) if one.name not in DIALS]
+    rest = [one.name for one in fields(settings) if one.name not in MAIN_SETTINGS]
     in_detail = {
         "training": options_type(leaves(settings, "training", rest), "training"),
         "method_settings": options_type(own, "method"),

@@ -70,8 +70,8 @@ class _Rasterize(torch.autograd.Function):
             kept += own[:5]
             count = len(own[0])
             view = (recycled(*size, 3), recycled(*size), torch.empty(count, dtype=torch.int32))
-            gaussians = _native.GaussianArrays(*unpacked(*own[:5]))
-            tasks.append(_native.RasterizeView(gaussians, *unpacked(*own[5:], *view)))
+            known = unpacked(*own, *view)
+            tasks.append(_native.RasterizeView(_native.GaussianArrays(*known[:5]), *known[5:]))
             outputs += view
         try:
             ctx.frames = _native.rasterize_views(tasks, any(ctx.needs_input_grad))
@@ -100,13 +100,9 @@ class _Rasterize(torch.autograd.Function):
             grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
             found = [torch.empty_like(t) for t in own]
             of_view = [torch.empty(len(own[0]), 2), torch.empty(4, 4), torch.empty(3, 3)]
-            task = _native.RasterizeGradients(
-                frame,
-                _native.GaussianArrays(*unpacked(*own)),
-                *unpacked(image, alpha, grad_image, grad_alpha),
-                _native.GaussianArrays(*unpacked(*found)),
-                *unpacked(*of_view),
-            )
+            known = unpacked(*own, *found, image, alpha, grad_image, grad_alpha, *of_view)
+            gaussians, of_gaussians = _native.GaussianArrays(*known[:5]), _native.GaussianArrays(*known[5:10])
+            task = _native.RasterizeGradients(frame, gaussians, *known[10:14], of_gaussians, *known[14:])
             tasks.append(task)
             views.append((grad_image, alpha, *found, *of_view))
         _native.rasterize_views_backward(tasks)

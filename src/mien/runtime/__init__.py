@@ -1,8 +1,9 @@
 """Avatars without torch: load a .mien file, pose it, render it, with numpy and the native core alone.
 
-from mien import runtime
-avatar = runtime.load("me.mien")
-image, alpha = avatar.render(avatar.pose({"jawOpen": 0.6}), avatar.camera.resized(512, 512))
+Example:
+    >>> from mien import runtime
+    >>> avatar = runtime.load("me.mien")
+    >>> image, alpha = avatar.render(avatar.pose({"jawOpen": 0.6}), avatar.camera.resized(512, 512))
 """
 
 from mien.runtime.avatar import Avatar, load, render

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
         run_camera,
     )
     from mien.training.sequence import Sequence, read_sequence
-    from mien.training.settings import DIALS, PRESETS, Preset, Split, TrainSettings, check_held_out
+    from mien.training.settings import MAIN_SETTINGS, PRESETS, Preset, Split, TrainSettings, check_held_out
     from mien.training.trainer import train
 else:
     __getattr__, __dir__ = lazy_names(
@@ -35,13 +35,13 @@ else:
                 "run_camera",
             ],
             "sequence": ["Sequence", "read_sequence"],
-            "settings": ["DIALS", "PRESETS", "Preset", "Split", "TrainSettings", "check_held_out"],
+            "settings": ["MAIN_SETTINGS", "PRESETS", "Preset", "Split", "TrainSettings", "check_held_out"],
             "trainer": ["train"],
         },
     )
 
 __all__ = [
-    "DIALS",
+    "MAIN_SETTINGS",
     "PRESETS",
     "Preset",
     "Sequence",

@@ -12,10 +12,10 @@ from mien.errors import UserError
 from mien.progress import say
 from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.training.adam import Adam
-from mien.training.density import DensityStrategy
+from mien.training.density_control import DensityStrategy
 from mien.training.face_track import FaceTrack
 
-_KEPT = 2
+_KEPT_CHECKPOINTS = 2
 CURVES = {"step", "loss", "psnr", "gaussians", "step_ms"}
 """Curves that every run has."""
 
@@ -51,7 +51,7 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
     }
     write_tensors(folder / f"step_{state.step:07d}.safetensors", tensors, {"format": "mien.checkpoint", "version": "1"})
     # Also delete unfinished files of a process that was killed while it wrote.
-    for old in (*checkpoint_files(folder)[:-_KEPT], *folder.glob(".step_*")):
+    for old in (*checkpoint_files(folder)[:-_KEPT_CHECKPOINTS], *folder.glob(".step_*")):
         old.unlink()
 
 

@@ -30,7 +30,7 @@ _FORMAT, _VERSION = "mien.run", 1
 _SUMMARY = "mien.training"
 _REMEDY = "put a copy back, or train again under another name (--run NAME); the run's folder holds the trained avatar"
 _AGAIN = "delete the run's training.json and run the same `mien train` again, which continues from the last checkpoint"
-ANOTHER_RUN = f"{WAIT}, or give this run another name (--run NAME)"
+BUSY_REMEDY = f"{WAIT}, or give this run another name (--run NAME)"
 """Remedy if another process is training the run."""
 _SUMMARY_FIELDS = ("steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb")
 _MAX_SUMMARY = 1 << 62
@@ -149,7 +149,7 @@ def check_untouched(run_dir: Path) -> None:
         BeingWrittenError: another process is.
     """
     if not is_finished(run_dir):
-        check_free(run_dir, ANOTHER_RUN)
+        check_free(run_dir, BUSY_REMEDY)
 
 
 def write_results(run_dir: Path, state: TrainingState) -> None:

@@ -108,9 +108,9 @@ class Targets:
         cameras = (camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
         self.cameras = tuple(camera.to(like) for camera in cameras)
         self._like = like
-        self._stays = like.device.type == "cpu" and like.dtype == torch.float32
-        self._kept: dict[tuple[int, int, bytes], Target] = {}
-        self._room = _CACHE_BYTES // (share * self.width * self.height * 4)
+        self._on_cpu = like.device.type == "cpu" and like.dtype == torch.float32
+        self._cache: dict[tuple[int, int, bytes], Target] = {}
+        self._max_cached = _CACHE_BYTES // (share * self.width * self.height * 4)
 
     def camera(self, camera: int) -> Camera:
         """A camera at training resolution."""
@@ -119,12 +119,12 @@ class Targets:
     def target(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool) -> Target:
         """The picture over a background. `keep` caches it, for use with the same background again."""
         key = (timestep, camera, background.tobytes())
-        target = self._kept.get(key)
+        target = self._cache.get(key)
         if target is None:
             target = self._compose(timestep, camera, background)
-            if keep and len(self._kept) < self._room:
-                self._kept[key] = target
-        return target if self._stays else target.to(self._like)
+            if keep and len(self._cache) < self._max_cached:
+                self._cache[key] = target
+        return target if self._on_cpu else target.to(self._like)
 
     def _compose(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"]) -> Target:
         image = self._resize(self._sequence.capture.images[timestep, camera])

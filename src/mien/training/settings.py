@@ -49,7 +49,7 @@ class TrainSettings:
         Raises:
             UserError: a number is out of range. The message names the first such option, its value and the range.
         """
-        check_ranges(self, lambda name: ("--" if name in DIALS else "--training.") + name.replace("_", "-"))
+        check_ranges(self, lambda name: ("--" if name in MAIN_SETTINGS else "--training.") + name.replace("_", "-"))
 
     @property
     def holds_out(self) -> bool:
@@ -57,7 +57,7 @@ class TrainSettings:
         return self.split != "none" or bool(self.held_out_sequences or self.held_out_cameras)
 
 
-DIALS = ("steps", "split", "background", "seed", "device", "held_out_sequences", "held_out_cameras")
+MAIN_SETTINGS = ("steps", "split", "background", "seed", "device", "held_out_sequences", "held_out_cameras")
 """Fields that have command-line options of their own; the others are `--training.NAME`."""
 
 

@@ -26,11 +26,11 @@ from mien.render.validation import CannotDrawError
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
-from mien.training.density import density_strategy
+from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
 from mien.training.frames import FrameOrder, background_at, density_random, training_frames
 from mien.training.losses import picture_losses, train_psnr
-from mien.training.run import ANOTHER_RUN, claim_run, is_finished, write_results
+from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Targets
 from mien.training.settings import TrainSettings
 
@@ -73,7 +73,7 @@ def train(
     if is_finished(run_dir):
         claim_run(run_dir, sequences, method_config, settings)
         return load_avatar(run_dir)
-    with hold(run_dir, remedy=ANOTHER_RUN):
+    with hold(run_dir, remedy=BUSY_REMEDY):
         claim_run(run_dir, sequences, method_config, settings)
         if is_finished(run_dir):  # another process finished it before this one got the lock
             return load_avatar(run_dir)

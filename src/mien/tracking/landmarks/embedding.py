@@ -57,7 +57,7 @@ class EmbeddingSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class DetectedViews:
     """Vertices of one face model and detected landmarks in n pictures."""
 
     vertices: Float[Tensor, "n v 2"]
@@ -156,7 +156,7 @@ def paint(model: FaceModel, generator: torch.Generator) -> Float[Tensor, "f 3 3"
     return by_region[model.face_regions][:, None].expand(-1, 3, 3).contiguous()
 
 
-def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[Views, Float[Tensor, " f"]]:
+def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[DetectedViews, Float[Tensor, " f"]]:
     """Draw the pictures and detect landmarks. Also returns the share of the pictures in which each triangle is seen."""
     seen = torch.zeros(len(model.faces))
     generator = torch.Generator().manual_seed(settings.seed)
@@ -184,7 +184,7 @@ def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[Vie
             f"the landmark detector found a face in {len(found)} of {settings.pictures} pictures of {model.name}: "
             "check the regions and the head frame of the model"
         )
-    return Views(*(torch.stack(parts) for parts in zip(*found, strict=True))), seen / len(found)
+    return DetectedViews(*(torch.stack(parts) for parts in zip(*found, strict=True))), seen / len(found)
 
 
 def _random_camera(settings: EmbeddingSettings, generator: torch.Generator) -> Camera:
@@ -204,11 +204,11 @@ def _allowed(model: FaceModel, regions: Sequence[str], seen: Float[Tensor, " f"]
 
 
 def _best_point(
-    views: Views, faces: Int[Tensor, "f 3"], allowed: Bool[Tensor, " f"], landmark: int, clamp: float
+    views: DetectedViews, faces: Int[Tensor, "f 3"], allowed: Bool[Tensor, " f"], landmark: int, clamp: float
 ) -> tuple[Tensor, Float[Tensor, " 3"], Tensor]:
     """Triangle, barycentric weights and median error of the point with the least sum of clamped pixel errors."""
     # First try few points of all triangles in some of the views, then all points of the best triangles in all views.
-    some = Views(
+    some = DetectedViews(
         *(part[:: max(1, len(part) // _COARSE_VIEWS)] for part in (views.vertices, views.depth, views.detected))
     )
     everywhere = allowed.nonzero()[:, 0]
@@ -223,7 +223,7 @@ def _best_point(
 
 
 def _errors(
-    views: Views, corners: Int[Tensor, "t 3"], weights: Float[Tensor, "p 3"], landmark: int
+    views: DetectedViews, corners: Int[Tensor, "t 3"], weights: Float[Tensor, "p 3"], landmark: int
 ) -> Float[Tensor, "n t p"]:
     """Distances in pixels of points of triangles from the detected landmark in each view."""
     # The pixel of a point on a triangle is the mean of its corners' pixels, weighted by barycentrics times depth.

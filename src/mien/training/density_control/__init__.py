@@ -11,9 +11,9 @@ but never the method. They keep statistics with one entry per Gaussian, which ch
 """
 
 from mien.avatar import DensityControl, FixedDensity, GaussianStore, GradientDensity, RefillDensity
-from mien.training.density.gradient import GradientStrategy
-from mien.training.density.refill import RefillStrategy
-from mien.training.density.strategy import DensityStrategy, FixedStrategy
+from mien.training.density_control.gradient import GradientStrategy
+from mien.training.density_control.refill import RefillStrategy
+from mien.training.density_control.strategy import DensityStrategy, FixedStrategy
 
 __all__ = ["DensityStrategy", "FixedStrategy", "GradientStrategy", "RefillStrategy", "density_strategy"]
 

@@ -30,7 +30,7 @@ from mien import _native
 from mien.arrays import unpacked
 from mien.avatar import GaussianStore, GradientDensity, Posed, Progress
 from mien.render.rendering import Rendering
-from mien.training.density.strategy import DensityStrategy, Random
+from mien.training.density_control.strategy import DensityStrategy, Random
 
 
 class GradientStrategy(DensityStrategy):

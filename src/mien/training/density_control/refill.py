@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mien.avatar import GaussianStore, Posed, Progress, RefillDensity
 from mien.render.rendering import Rendering
-from mien.training.density.strategy import DensityStrategy, Random
+from mien.training.density_control.strategy import DensityStrategy, Random
 
 
 class RefillStrategy(DensityStrategy):
