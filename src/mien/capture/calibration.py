@@ -5,16 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
 from mien.camera import Camera
 from mien.capture.store import is_file_name
 from mien.errors import UserError
-from mien.limits import camera_fault
-from mien.storage import read_json
+from mien.render.camera_paths import camera_of_entry, read_camera_entries
 
-FORMAT, VERSION = "mien.cameras", 1
 _MAX_ASPECT_ERROR = 0.01
 """Largest relative difference between the aspect ratios of a camera and of its pictures."""
 _MAX_OFFSET = 1_000_000
@@ -61,15 +56,8 @@ def read_calibration(path: Path) -> list[CalibratedCamera]:
     Raises:
         UserError: the file is missing or damaged, a camera is incomplete or impossible, or two have the same id.
     """
-    if not path.is_file():
-        raise UserError(f"--calibration {path}: no such file; name a json file of cameras (docs/using.md)")
-    try:
-        listed = read_json(path, FORMAT, VERSION).get("cameras")
-    except UserError as error:
-        raise UserError(f"{str(error).split('; ')[0]}; write it as docs/using.md says") from None
-    if not isinstance(listed, list) or not listed:
-        raise UserError(f"{path}: has no list `cameras`; give one entry for every camera")
-    found = [_camera_of(entry, f"{path}: camera {index}") for index, entry in enumerate(listed)]
+    entries = read_camera_entries(path, "give one entry for every camera")
+    found = [_calibrated_camera(entry, f"{path}: camera {index}") for index, entry in enumerate(entries)]
     ids = [camera.camera_id for camera in found]
     for camera_id in ids:
         if ids.count(camera_id) > 1:
@@ -118,19 +106,12 @@ def _listed(ids: set[str]) -> str:
     return ", ".join(ordered[:6]) + (f", ... ({len(ordered)} in all)" if len(ordered) > 6 else "")
 
 
-def _camera_of(entry: Any, where: str) -> CalibratedCamera:
-    try:
-        camera_id, offset = entry["id"], entry.get("offset", 0)
-        K, viewmat = (np.asarray(entry[name], np.float64) for name in ("K", "viewmat"))
-        width, height = entry["width"], entry["height"]
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise UserError(f"{where}: needs id, K [3][3], viewmat [4][4], width and height ({error!r})") from None
+def _calibrated_camera(entry: Any, where: str) -> CalibratedCamera:
+    if not isinstance(entry, dict) or "id" not in entry:
+        raise UserError(f"{where}: has no `id`; give each camera the name of its video, without the ending")
+    camera_id, offset = entry["id"], entry.get("offset", 0)
     if not is_file_name(camera_id):
         raise UserError(f"{where}: {camera_id!r} cannot be an id; give a text that can name a folder, as '08'")
     if not isinstance(offset, int) or isinstance(offset, bool) or not 0 <= offset <= _MAX_OFFSET:
         raise UserError(f"{where}: offset {offset!r} is no number of frames; give 0 or more")
-    fault = camera_fault(K, viewmat, width, height)
-    if fault is not None:
-        raise UserError(f"{where} ({camera_id}): {fault}")
-    tensors = (torch.from_numpy(array.astype(np.float32)) for array in (K, viewmat))
-    return CalibratedCamera(camera_id, Camera(*tensors, width, height), offset)
+    return CalibratedCamera(camera_id, camera_of_entry(entry, f"{where} ({camera_id})"), offset)
