@@ -1,4 +1,4 @@
-"""Capture: turn a video of a head into frames, mattes and landmarks.
+"""Capture: turn a video of a head, or the videos of several calibrated cameras, into frames, mattes and landmarks.
 
 `from_video` runs five steps. Each has its file, and the helpers that it needs:
 
@@ -11,6 +11,9 @@
    measures blur and light (`quality`), and writes the pictures (`frame_files`).
 5. `outcome` writes the results of all frames beside the pictures and moves the folder to its place.
 
+`from_cameras` runs the same steps for the videos of a rig: `calibration` reads its cameras, and `head_path` finds the
+head in their world and chooses the crops.
+
 `capture` has the class `Capture`, `store` writes and reads it, and `cache` has its decoded frames. `settings` has the
 settings, and `quiet_mediapipe` loads MediaPipe without its messages.
 """
@@ -21,6 +24,7 @@ from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mien.capture.capture import Capture
+    from mien.capture.from_cameras import capture_cameras
     from mien.capture.from_video import capture_video, capture_video_parts
     from mien.capture.quality import FrameQuality
     from mien.capture.settings import CaptureSettings
@@ -30,6 +34,7 @@ else:
         __name__,
         {
             "capture": ["Capture"],
+            "from_cameras": ["capture_cameras"],
             "from_video": ["capture_video", "capture_video_parts"],
             "quality": ["FrameQuality"],
             "settings": ["CaptureSettings"],
@@ -41,6 +46,7 @@ __all__ = [
     "Capture",
     "CaptureSettings",
     "FrameQuality",
+    "capture_cameras",
     "capture_video",
     "capture_video_parts",
     "read_capture",

@@ -32,7 +32,7 @@ _MAX_QUEUED = 8
 """Largest number of timesteps that wait to be written. It bounds the memory."""
 
 MakeFrames = Callable[[], tuple[np.ndarray, np.ndarray]]
-"""Computes the images [c, h, w, 3] and mattes [c, h, w] of one timestep."""
+"""Computes the images [c, h, w, 3] and mattes [c, h, w] of one timestep, for the cameras that are written."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,10 @@ class FrameWriter:
     Files of an earlier, interrupted run are overwritten frame by frame.
     """
 
-    def __init__(self, layout: FrameLayout) -> None:
+    def __init__(self, layout: FrameLayout, camera: int | None = None) -> None:
+        """Prepare to write the pictures of all cameras, or of the one with this index."""
         self.layout = layout
+        self._cameras = range(len(layout.camera_ids)) if camera is None else (camera,)
         shape = (layout.timesteps, len(layout.camera_ids))
         self.digests = {kind: np.zeros(shape, np.uint64) for kind in (FRAMES, MATTES)}
         """Digest of each picture written so far."""
@@ -110,8 +112,8 @@ class FrameWriter:
 
     def __enter__(self) -> "FrameWriter":
         for kind in (FRAMES, MATTES):
-            for camera_id in self.layout.camera_ids:
-                (self.layout.folder / kind / camera_id).mkdir(parents=True, exist_ok=True)
+            for camera in self._cameras:
+                self.layout.png(kind, 0, camera).parent.mkdir(parents=True, exist_ok=True)
         self._cache = CacheWriter(self.layout)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="frame-writer")
         return self
@@ -143,8 +145,9 @@ class FrameWriter:
 
     def _write(self, timestep: int, make: MakeFrames) -> None:
         for kind, pictures in zip((FRAMES, MATTES), make(), strict=True):
-            assert pictures.shape == self.layout.shape(kind)[1:], (kind, pictures.shape, self.layout)
-            for camera, picture in enumerate(pictures):
+            expected = (len(self._cameras), *self.layout.shape(kind)[2:])
+            assert pictures.shape == expected, (kind, pictures.shape, self.layout)
+            for camera, picture in zip(self._cameras, pictures, strict=True):
                 picture = np.ascontiguousarray(picture)
                 self.digests[kind][timestep, camera] = picture_digest(picture)
                 _write_png(self.layout.png(kind, timestep, camera), picture)

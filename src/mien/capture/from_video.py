@@ -30,13 +30,13 @@ from mien.progress import say
 from mien.storage import cannot_write, file_digest, read_json, write_json
 from mien.terminal import plain_name
 
-_RECIPE = 4
+RECIPE = 4
 """Recipe version, raised whenever the same video would give another capture, so that old ones are made again."""
-_STATE, _CHUNKS = "state.json", "chunks"
+STATE, _CHUNKS = "state.json", "chunks"
 
 
 @dataclass(frozen=True)
-class _Job:
+class CaptureJob:
     """Request of the user: a source, a name and settings."""
 
     frames: FrameSource
@@ -65,22 +65,22 @@ def capture_video(
     Raises:
         UserError: the source is no video or shows no face, or a folder cannot be written, is damaged or being written.
     """
-    job = _open_job(source, settings or CaptureSettings(), name, replace)
-    capture = _read_finished(out, _part_key(job, 1, 1), tell=False)
+    job = open_job(source, settings or CaptureSettings(), name, replace)
+    capture = read_finished(out, _part_key(job, 1, 1), tell=False)
     if capture is not None:
         return capture
     with hold(out):
         return _capture_whole(out, job)
 
 
-def _capture_whole(out: Path, job: _Job) -> Capture:
+def _capture_whole(out: Path, job: CaptureJob) -> Capture:
     # Another process may have finished it before this one got the lock.
-    capture = _read_finished(out, _part_key(job, 1, 1))
+    capture = read_finished(out, _part_key(job, 1, 1))
     if capture is not None:
         return capture
-    _check_place(out, job)
+    check_place(out, job)
     scratch = partial_folder(out).with_suffix(".survey")
-    with _tidy(out, scratch) as survey_folder:
+    with tidy(out, scratch) as survey_folder:
         given = read_given(job.settings, job.frames)
         survey = _run_survey(job, survey_folder, given)
         part = whole_part(survey, job.settings, job.frames.path, job.name)
@@ -112,7 +112,7 @@ def capture_video_parts(
     Raises:
         UserError: the source is no video or shows no face, or a folder cannot be written, is damaged or being written.
     """
-    job = _open_job(source, settings or CaptureSettings(), name, replace)
+    job = open_job(source, settings or CaptureSettings(), name, replace)
     finished = _read_finished_parts(sequences, job, tell=False)
     if finished:
         return finished
@@ -120,20 +120,20 @@ def capture_video_parts(
         return _capture_parts(sequences, job)
 
 
-def _capture_parts(sequences: Path, job: _Job) -> list[Capture]:
+def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
     # Another process may have finished them before this one got the lock.
     finished = _read_finished_parts(sequences, job)
     if finished:
         return finished
     for first in (job.name, f"{job.name}-1"):
-        _check_place(_capture_dir(sequences, first), job)
-    with _tidy(_capture_dir(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
+        check_place(_capture_dir(sequences, first), job)
+    with tidy(_capture_dir(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
         given = read_given(job.settings, job.frames)
         survey = _run_survey(job, survey_folder, given)
         parts = find_parts(survey, job.settings, job.frames.path, job.name)
         with hold(*(sequences / part.name for part in parts if part.name != job.name)):
             for part in parts:
-                _check_place(_capture_dir(sequences, part.name), job)
+                check_place(_capture_dir(sequences, part.name), job)
             reel = Reel(job.frames)
             for number, part in enumerate(parts, 1):
                 _process(job, reel, part, (number, len(parts)), given, _capture_dir(sequences, part.name))
@@ -141,7 +141,12 @@ def _capture_parts(sequences: Path, job: _Job) -> list[Capture]:
     return [read_capture(_capture_dir(sequences, part.name)) for part in parts]
 
 
-def _open_job(source: Path, settings: CaptureSettings, name: str | None, replace_others: bool) -> _Job:
+def open_job(source: Path, settings: CaptureSettings, name: str | None, replace_others: bool) -> CaptureJob:
+    """Open a source and compute the key of its capture. Its frames are not read.
+
+    Raises:
+        UserError: a setting is not allowed, or a file is missing or damaged.
+    """
     settings.check()
     selection = FrameSelection(settings.start, settings.end, settings.stride, settings.max_frames)
     frames = open_source(source, selection, settings.fps, settings.turn // 90)
@@ -153,16 +158,16 @@ def _open_job(source: Path, settings: CaptureSettings, name: str | None, replace
         "mattes": open_source(settings.mattes, FrameSelection(), 25.0).content_hash if settings.mattes else None,
     }
     content = {
-        "recipe": _RECIPE,
+        "recipe": RECIPE,
         "source": frames.content_hash,
         "name": name,
         "settings": asdict(settings) | contents,
     }
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-    return _Job(frames, settings, name, key, replace_others)
+    return CaptureJob(frames, settings, name, key, replace_others)
 
 
-def _part_key(job: _Job, number: int, count: int) -> str:
+def _part_key(job: CaptureJob, number: int, count: int) -> str:
     return f"{job.key}-{number}-{count}"
 
 
@@ -170,9 +175,9 @@ def _capture_dir(sequences: Path, name: str) -> Path:
     return sequences / name / "capture"
 
 
-def _read_finished_parts(sequences: Path, job: _Job, tell: bool = True) -> list[Capture]:
+def _read_finished_parts(sequences: Path, job: CaptureJob, tell: bool = True) -> list[Capture]:
     """Return all parts if all of them are finished, else an empty list."""
-    whole = _read_finished(_capture_dir(sequences, job.name), _part_key(job, 1, 1), tell)
+    whole = read_finished(_capture_dir(sequences, job.name), _part_key(job, 1, 1), tell)
     if whole is not None:
         return [whole]
     source = _read_source(_capture_dir(sequences, f"{job.name}-1")) or {}
@@ -182,14 +187,14 @@ def _read_finished_parts(sequences: Path, job: _Job, tell: bool = True) -> list[
         return []
     found: list[Capture] = []
     for number in range(1, count + 1):
-        capture = _read_finished(_capture_dir(sequences, f"{job.name}-{number}"), _part_key(job, number, count), tell)
+        capture = read_finished(_capture_dir(sequences, f"{job.name}-{number}"), _part_key(job, number, count), tell)
         if capture is None:
             return []
         found.append(capture)
     return found
 
 
-def _check_place(out: Path, job: _Job) -> None:
+def check_place(out: Path, job: CaptureJob) -> None:
     """Refuse to replace anything but a capture of the same source, or of any source if the user allows it.
 
     Raises:
@@ -212,7 +217,7 @@ def _check_place(out: Path, job: _Job) -> None:
 
 
 @contextmanager
-def _tidy(out: Path, survey_folder: Path) -> Iterator[Path]:
+def tidy(out: Path, survey_folder: Path) -> Iterator[Path]:
     """Yield the folder for the survey and remove it at the end. After a UserError, remove new empty folders too."""
     missing = [folder for folder in (out.parent, *out.parent.parents) if not folder.exists()]
     threads = cv2.getNumThreads()
@@ -232,16 +237,16 @@ def _tidy(out: Path, survey_folder: Path) -> Iterator[Path]:
     remove_tree(survey_folder)
 
 
-def _prepare(work: Path, key: str) -> Path:
+def prepare(work: Path, key: str) -> Path:
     """Prepare a folder for unfinished work. Its content is kept only if it belongs to the same key."""
     try:
-        kept = read_json(work / _STATE, "mien.capture_state", 1).get("key") == key
+        kept = read_json(work / STATE, "mien.capture_state", 1).get("key") == key
     except UserError:
         kept = False
     if not kept or _leads_out(work):
         remove_tree(work)
         work.mkdir(parents=True)
-        write_json(work / _STATE, "mien.capture_state", 1, {"key": key})
+        write_json(work / STATE, "mien.capture_state", 1, {"key": key})
     return work
 
 
@@ -254,27 +259,27 @@ def _leads_out(work: Path) -> bool:
         return True
 
 
-def _run_survey(job: _Job, folder: Path, given: GivenInputs) -> Survey:
+def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> Survey:
     if job.frames.hdr:
         say(f"{job.frames.path}: HDR video ({job.frames.hdr}); its pictures are tone-mapped to sRGB")
-    survey = survey_source(job.frames, _prepare(folder, job.key), given.landmarks)
+    survey = survey_source(job.frames, prepare(folder, job.key), given.landmarks)
     if given.landmarks is None:
         check_upright(job.frames, survey, job.settings.turn)
     return survey
 
 
-def _process(job: _Job, reel: Reel, part: Part, place: tuple[int, int], given: GivenInputs, out: Path) -> None:
+def _process(job: CaptureJob, reel: Reel, part: Part, place: tuple[int, int], given: GivenInputs, out: Path) -> None:
     """Capture one part, unless that has been done."""
     key = _part_key(job, *place)
-    if _read_finished(out, key) is not None:
+    if read_finished(out, key) is not None:
         return
-    work = _prepare(partial_folder(out), key)
+    work = prepare(partial_folder(out), key)
     layout = FrameLayout(work, (CAMERA_ID,), part.timesteps, part.crop.height, part.crop.width)
     chunks = process_part(reel, part, given, layout, work / _CHUNKS)
-    finish_part(layout, out, chunks, part, Origin(job.frames, key, job.name, place), (_STATE, _CHUNKS))
+    finish_part(layout, out, chunks, part, Origin(job.frames, key, job.name, place), (STATE, _CHUNKS))
 
 
-def _tell_leftovers(sequences: Path, job: _Job, names: set[str]) -> None:
+def _tell_leftovers(sequences: Path, job: CaptureJob, names: set[str]) -> None:
     """Warn about sequences that an earlier capture of the same video left under other names."""
     for path in sorted(sequences.glob(f"*/capture/{JSON_NAME}")):
         source = _read_source(path.parent) or {}
@@ -293,7 +298,7 @@ def _read_source(out: Path) -> dict[str, Any] | None:
     return source if isinstance(source, dict) else None
 
 
-def _read_finished(out: Path, key: str, tell: bool = True) -> Capture | None:
+def read_finished(out: Path, key: str, tell: bool = True) -> Capture | None:
     """Return the capture in a folder if it has this `key` and is intact. `tell` reports a damaged one."""
     source = _read_source(out)
     if source is None or source.get("key") != key:

@@ -55,7 +55,7 @@ def finish_part(
     data = CaptureData(
         name=part.name,
         camera_ids=layout.camera_ids,
-        fps=_frame_rate(timestamps, origin.frames.fps),
+        fps=frame_rate(timestamps, origin.frames.fps),
         timestamps=timestamps,
         landmarks=landmarks[:, None],
         valid=valid[:, None],
@@ -108,7 +108,7 @@ def _pace(name: str, timestamps: Float[np.ndarray, " t"]) -> dict[str, Any]:
     }
 
 
-def _frame_rate(timestamps: Float[np.ndarray, " t"], nominal: float) -> float:
+def frame_rate(timestamps: Float[np.ndarray, " t"], nominal: float) -> float:
     """Return the file's nominal rate, unless its timestamps differ from it (variable rate, dropped frames)."""
     if len(timestamps) < 2:
         return nominal

@@ -149,8 +149,8 @@ class PartProcessor:
         before = itertools.islice(self._pictures, done - begin)
         self._recent.extend((begin + index, image) for index, (_, image) in enumerate(before))
 
-    def process(self, start: int, count: int, writer: FrameWriter, advance: Advance) -> Chunk:
-        """Process the next `count` frames, the first of which is the part's timestep `start`."""
+    def process(self, start: int, count: int, writer: FrameWriter, camera: int, advance: Advance) -> Chunk:
+        """Process the next `count` frames, of the writer's camera; the first is the part's timestep `start`."""
         part = self._part
         landmarks = np.full((count, LANDMARKS, 2), np.nan, np.float32)
         quality = np.full((count, MEASURES), np.nan, np.float32)
@@ -178,7 +178,7 @@ class PartProcessor:
             writer.flush()
         if done < count:
             raise UserError(f"{self._path}: has fewer frames than before; wait until it is complete, then run it again")
-        span = slice(start, start + count)
+        span = slice(start, start + count), slice(camera, camera + 1)
         return Chunk(landmarks, quality, writer.digests[FRAMES][span], writer.digests[MATTES][span])
 
     def _cropped(self, frame: SourceFrame) -> tuple[int, np.ndarray]:
@@ -212,8 +212,12 @@ def _read(path: Path) -> Chunk:
         return Chunk(**arrays)
 
 
-def process_part(reel: Reel, part: Part, given: GivenInputs, layout: FrameLayout, work: Path) -> list[Chunk]:
-    """Process all frames of a part. Chunks that an interrupted call left in the folder `work` are kept.
+def process_part(
+    reel: Reel, part: Part, given: GivenInputs, layout: FrameLayout, work: Path, camera: int = 0
+) -> list[Chunk]:
+    """Process all frames of a part, as those of one camera of the layout.
+
+    Chunks that an interrupted call left in the folder `work` are kept.
 
     Raises:
         UserError: the source cannot be decoded.
@@ -226,9 +230,9 @@ def process_part(reel: Reel, part: Part, given: GivenInputs, layout: FrameLayout
     if done == layout.timesteps:
         return chunks
     processor = PartProcessor(reel, part, given, done)
-    with FrameWriter(layout) as writer, progress_bar(f"capture {part.name}", layout.timesteps, done) as advance:
+    with FrameWriter(layout, camera) as writer, progress_bar(f"capture {part.name}", layout.timesteps, done) as advance:
         for start, path in itertools.islice(paths.items(), len(chunks), None):
-            chunk = processor.process(start, min(_CHUNK, layout.timesteps - start), writer, advance)
+            chunk = processor.process(start, min(_CHUNK, layout.timesteps - start), writer, camera, advance)
             write_arrays(path, vars(chunk))
             chunks.append(chunk)
     return chunks

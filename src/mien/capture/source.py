@@ -32,6 +32,8 @@ class FrameSelection:
     """Take every n-th frame."""
     max_frames: int = 0
     """Stop after this many frames. 0 takes all."""
+    offset: int = 0
+    """Frames at the beginning of the source that do not exist, for a camera that started before the others."""
 
 
 class SourceFrame(NamedTuple):
@@ -72,8 +74,12 @@ class FrameSource:
             everything = _read_images(self.path, self.fps * self.selection.stride, longest_side)
         else:
             everything = read_lazily(self.path, longest_side)
-        taken, candidates, first = 0, 0, 0.0
+        taken, candidates, first, origin = 0, 0, 0.0, 0.0
         for number, (seconds, picture) in enumerate(everything):
+            if number < self.selection.offset:
+                continue
+            origin = seconds if number == self.selection.offset and number else origin
+            seconds -= origin
             if seconds < self.selection.start - 1e-6:
                 continue
             if self.selection.end and seconds >= self.selection.end - 1e-6:
@@ -123,6 +129,7 @@ def open_source(path: Path, selection: FrameSelection, fps: float, quarter_turns
         fps, total, hdr = info.fps, info.frames, info.hdr
         content_hash = _hash_files([path], with_names=False)
     last = min(total, round(selection.end * fps)) if selection.end else total
+    last = min(last, max(0, total - selection.offset))
     remaining = max(0, last - round(selection.start * fps))
     expected = -(-remaining // selection.stride)
     if selection.max_frames:

@@ -1,4 +1,4 @@
-"""`mien capture`: from a video to a capture."""
+"""`mien capture`: from a video, or the videos of several calibrated cameras, to a capture."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from mien.capture import CaptureSettings
+from mien.errors import UserError
 from mien.workspace import Workspace, check_new_workspace
 
 
@@ -20,28 +21,48 @@ class Command:
     Film half a minute or more, in even light, with the whole head in the picture: look around, talk, make faces.
 
     Example: mien capture me.mp4 --out out/me, then mien track out/me
+
+    Several calibrated cameras that filmed at the same time become one sequence: mien capture rig/*.mp4 --calibration
+    rig.json --name talk --out out/me
     """
 
-    video: Annotated[Path, tyro.conf.Positional]
-    """A video file, or a folder of pictures in order."""
+    videos: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """A video file, or a folder of pictures in order. With --calibration, one for each camera, named by the camera's
+    id, or one folder that holds them."""
     out: Path
     """Workspace folder of the person. It may be new, or hold other videos of the same person."""
     name: str | None = None
-    """Name of the sequence (default: the video's name)."""
+    """Name of the sequence (default: the name of the video or folder)."""
+    calibration: Path | None = None
+    """The cameras that filmed the videos, as json (docs/using.md)."""
     replace: bool = False
     """Replace a sequence of the same name that was made from another video."""
     settings: Annotated[CaptureSettings, tyro.conf.arg(name="capture")] = field(default_factory=CaptureSettings)
 
     def check(self) -> None:
         """Check options and paths without the libraries that capture."""
-        from mien.commands.stages.names import sequence_names
+        from mien.commands.stages.names import rig_name, sequence_names
 
-        sequence_names([self.video], () if self.name is None else (self.name,))
+        names = () if self.name is None else (self.name,)
+        if self.calibration is not None:
+            rig_name(self.videos, self.calibration, names)
+        elif len(self.videos) > 1:
+            raise UserError(
+                f"{self.videos[1]}: several videos become one capture only if their cameras are calibrated; add "
+                "--calibration FILE, or capture one at a time"
+            )
+        else:
+            sequence_names(self.videos, names)
         self.settings.check()
         check_new_workspace(self.out)
 
     def run(self) -> None:
-        """Capture the video and report what was found."""
-        from mien.commands.stages.capturing import run_capture_stage
+        """Capture the videos and report what was found."""
+        from mien.commands.stages.capturing import run_calibrated_capture_stage, run_capture_stage
 
-        run_capture_stage(Workspace(self.out), self.video, self.name, self.settings, self.replace)
+        workspace = Workspace(self.out)
+        if self.calibration is None:
+            run_capture_stage(workspace, self.videos[0], self.name, self.settings, self.replace)
+        else:
+            names = () if self.name is None else (self.name,)
+            run_calibrated_capture_stage(workspace, self.videos, self.calibration, names, self.settings, self.replace)

@@ -28,6 +28,8 @@ class Command:
     """Workspace folder, new or existing."""
     name: tuple[str, ...] = ()
     """Names of the sequences, one per video (default: the videos' names)."""
+    calibration: Path | None = None
+    """Calibrated cameras as json (docs/using.md). All videos are then one sequence, filmed at the same time."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the method's name)."""
     face_model: str = "anny"
@@ -43,10 +45,13 @@ class Command:
 
     def check(self) -> None:
         """Check options, names and paths without heavy libraries."""
-        from mien.commands.stages.names import run_name, sequence_names
+        from mien.commands.stages.names import rig_name, run_name, sequence_names
 
         self.options.check()
-        sequence_names(self.videos, self.name)
+        if self.calibration is None:
+            sequence_names(self.videos, self.name)
+        else:
+            rig_name(self.videos, self.calibration, self.name)
         run_name(self.run_name or self.options.method)
         self.capture.check()
         self.tracking.check()
@@ -54,7 +59,7 @@ class Command:
 
     def run(self) -> None:
         """Run all stages and skip those whose results are current. All possible checks come before any work."""
-        from mien.commands.stages.capturing import run_capture_stage
+        from mien.commands.stages.capturing import run_calibrated_capture_stage, run_capture_stage
         from mien.commands.stages.evaluating import run_evaluation_stage
         from mien.commands.stages.face_models import face_model_of
         from mien.commands.stages.names import doubled_videos, run_name, sequence_names
@@ -65,17 +70,21 @@ class Command:
 
         began = time.monotonic()
         method, settings = self.options.method_config(), self.options.settings()
-        names = sequence_names(self.videos, self.name)
         workspace, run = Workspace(self.out), run_name(self.run_name or self.options.method)
         check_run(workspace.run_dir(run), method, settings)
         check_untouched(workspace.run_dir(run))
         self.options.say_what_is_ignored()
         face_model_of(self.face_model)
-        for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
-            say(f"warning: {warning}")
-
-        videos = zip(self.videos, names, strict=True)
-        captured = [part for video, name in videos for part in run_capture_stage(workspace, video, name, self.capture)]
+        if self.calibration is None:
+            names = sequence_names(self.videos, self.name)
+            for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
+                say(f"warning: {warning}")
+            videos = zip(self.videos, names, strict=True)
+            captured = [
+                part for video, name in videos for part in run_capture_stage(workspace, video, name, self.capture)
+            ]
+        else:
+            captured = run_calibrated_capture_stage(workspace, self.videos, self.calibration, self.name, self.capture)
         check_held_out(captured, settings)
         trackings = run_tracking_stage(
             workspace, self.face_model, self.tracking, overlay=self.overlay, preview=self.preview

@@ -85,6 +85,16 @@ def read_cameras(path: Path) -> list[Camera]:
     Raises:
         UserError: the file is missing or damaged, or a camera is incomplete, not finite, or not a rigid view.
     """
+    entries = read_camera_entries(path, "give one camera for every frame")
+    return [camera_of_entry(entry, f"{path}: camera {index}") for index, entry in enumerate(entries)]
+
+
+def read_camera_entries(path: Path, remedy: str) -> list[Any]:
+    """Read the entries of a json file of cameras, of which `camera_of_entry` makes cameras.
+
+    Raises:
+        UserError: the file is missing or damaged, or has no entry. The message then ends with `remedy`.
+    """
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a json file of cameras (docs/using.md)")
     try:
@@ -93,11 +103,16 @@ def read_cameras(path: Path) -> list[Camera]:
         # The user wrote this file, so there is no stage to run again.
         raise UserError(f"{str(error).split('; ')[0]}; write it as described in docs/using.md") from None
     if not isinstance(listed, list) or not listed:
-        raise UserError(f"{path}: has no list `cameras`; give one camera for every frame")
-    return [_camera_of(entry, f"{path}: camera {index}") for index, entry in enumerate(listed)]
+        raise UserError(f"{path}: has no list `cameras`; {remedy}")
+    return listed
 
 
-def _camera_of(entry: Any, where: str) -> Camera:
+def camera_of_entry(entry: Any, where: str) -> Camera:
+    """Make a camera from its entry in a json file; `where` begins the messages.
+
+    Raises:
+        UserError: the camera is incomplete, not finite, or not a rigid view.
+    """
     try:
         K, viewmat = torch.tensor(entry["K"], dtype=torch.float32), torch.tensor(entry["viewmat"], dtype=torch.float32)
         width, height = _whole(entry["width"]), _whole(entry["height"])

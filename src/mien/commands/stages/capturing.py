@@ -1,9 +1,10 @@
-"""From a video to captures, as the command line runs it."""
+"""From videos to captures, as the command line runs it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from mien.capture import CaptureSettings, capture_video_parts
-from mien.commands.stages.names import sequence_name
+from mien.capture import Capture, CaptureSettings, capture_cameras, capture_video_parts
+from mien.commands.stages.names import rig_name, sequence_name
 from mien.progress import say
 from mien.storage import check_writable
 from mien.workspace import Workspace
@@ -21,9 +22,36 @@ def run_capture_stage(
     check_writable(workspace.root, folder=True)
     captures = capture_video_parts(video, workspace.root / "sequences", settings, name, replace)
     for capture in captures:
-        found, blurred = int(capture.valid.any(axis=1).sum()), int((capture.valid & ~capture.usable).sum())
-        say(
-            f"{capture.name}: {capture.timesteps} frames of {capture.width}x{capture.height}, a face in {found} of them"
-            + (f", blurred in {blurred}" if blurred else "")
-        )
+        _report(capture)
     return [capture.name for capture in captures]
+
+
+def run_calibrated_capture_stage(
+    workspace: Workspace,
+    sources: Sequence[Path],
+    calibration: Path,
+    names: Sequence[str],
+    settings: CaptureSettings,
+    replace: bool = False,
+) -> list[str]:
+    """Capture what several calibrated cameras filmed as one sequence, and return its name in a list.
+
+    Raises:
+        UserError: the calibration or a video is bad, or without `replace` a sequence of that name has other sources.
+    """
+    name = rig_name(sources, calibration, names)
+    check_writable(workspace.root, folder=True)
+    out = workspace.sequence_dir(name) / "capture"
+    _report(capture_cameras(sources, calibration, out, name, settings, replace))
+    return [name]
+
+
+def _report(capture: Capture) -> None:
+    found, blurred = int(capture.valid.any(axis=1).sum()), int((capture.valid & ~capture.usable).sum())
+    cameras = len(capture.camera_ids)
+    say(
+        f"{capture.name}: {capture.timesteps} frames of {capture.width}x{capture.height}"
+        + (f" by {cameras} cameras" if cameras > 1 else "")
+        + f", a face in {found} of them"
+        + (f", blurred in {blurred}" if blurred else "")
+    )

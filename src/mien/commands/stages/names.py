@@ -54,6 +54,26 @@ def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
     return found
 
 
+def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -> str:
+    """The name of the sequence that several calibrated cameras filmed: the given name, or that of their folder.
+
+    Raises:
+        UserError: a file is missing, more than one name is given, or there is neither a name nor a folder.
+    """
+    if not calibration.is_file():
+        raise UserError(f"--calibration {calibration}: no such file; name a json file of cameras (docs/using.md)")
+    if not sources:
+        raise UserError("--calibration: name the videos of its cameras, or a folder that holds them")
+    for source in sources:
+        if not source.exists():
+            raise UserError(f"{source}: no such video or folder of pictures; check the path")
+    if len(names) > 1:
+        raise UserError(f"--name {' '.join(names)}: all cameras together become one sequence; give one name")
+    if not names and len(sources) > 1:
+        raise UserError("--calibration: several videos become one sequence; name it with --name")
+    return sequence_name(sources[0].resolve(), names[0] if names else None)
+
+
 def doubled_videos(videos: Sequence[Path], names: Sequence[str], held_out: Sequence[str]) -> Iterator[str]:
     """Yield warnings about videos with the same content: they add nothing, or training uses held-out frames."""
 

@@ -70,7 +70,7 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
     if cameras != 1 and capture.calibration is None:
         raise UserError(
             f"{capture.name}: has {cameras} cameras without calibration; capture each video on its own "
-            "(`mien create A.mp4 B.mp4`), or give the cameras' calibration"
+            "(`mien create A.mp4 B.mp4`), or all with their calibration (`mien capture A.mp4 B.mp4 --calibration FILE`)"
         )
     detected = torch.from_numpy(np.asarray(capture.landmarks, dtype=np.float64))
     seen = _seen(capture)

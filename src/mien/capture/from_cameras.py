@@ -1,0 +1,286 @@
+"""Turn videos by several calibrated cameras into one capture, with the head at the same scale in all pictures."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mien.camera import Camera
+from mien.capture.calibration import CalibratedCamera, match_sources, read_calibration
+from mien.capture.capture import Capture
+from mien.capture.crop import Crop
+from mien.capture.faces import LANDMARKS
+from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
+from mien.capture.from_video import (
+    RECIPE,
+    STATE,
+    CaptureJob,
+    check_place,
+    open_job,
+    prepare,
+    read_finished,
+    tidy,
+)
+from mien.capture.given import read_given
+from mien.capture.head_path import HeadPath, choose_crops, disagreeing, find_head_path
+from mien.capture.outcome import frame_rate
+from mien.capture.parts import Part
+from mien.capture.people import Person, choose_person
+from mien.capture.process import Chunk, Reel, process_part
+from mien.capture.quality import FrameQuality, quality_report, relative_quality
+from mien.capture.settings import CaptureSettings
+from mien.capture.store import CaptureData, finish_capture, partial_folder, read_capture
+from mien.capture.survey import Survey, survey_source
+from mien.errors import UserError
+from mien.inside import remove_tree
+from mien.locks import hold
+from mien.progress import say
+from mien.storage import file_digest
+
+_MAX_RATE_ERROR = 0.01
+"""Largest relative difference between the cameras' frame rates."""
+_MAX_ASTRAY = 1.0
+"""Largest distance between landmarks and the projected head, in sides of the landmarks' box."""
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One camera, its video, and what is known of its pictures."""
+
+    camera_id: str
+    job: CaptureJob
+    survey: Survey
+    person: Person
+    camera: Camera
+    """The camera for the source's pictures."""
+
+
+def capture_cameras(
+    sources: Sequence[Path],
+    calibration: Path,
+    out: Path,
+    name: str,
+    settings: CaptureSettings | None = None,
+    replace_others: bool = False,
+) -> Capture:
+    """Capture a head that several calibrated cameras filmed at the same time, as one capture into the folder `out`.
+
+    Frame n of all videos is the same moment, after the offsets of the calibration file. The head's path is found from
+    the faces in all pictures, and every camera is cropped to it, so a camera behind the head needs no face. Unfinished
+    work of an interrupted run is continued.
+
+    Args:
+        sources: a video or a folder of pictures for each camera, named by the camera's id; or one folder with them.
+        calibration: json file of the cameras (`mien.capture.calibration.read_calibration`).
+        out: the capture's folder. A capture of the same sources in it is replaced; anything else is refused.
+        name: name of the sequence.
+        settings: settings of the capture. Mattes, landmarks and clean plates are folders with a file or folder for each
+            camera, named by its id. Cuts are not searched.
+        replace_others: whether a capture of other sources may be replaced.
+
+    Raises:
+        UserError: the calibration is damaged or does not fit the videos, their lengths or rates differ, no face is
+            seen, or a folder cannot be written, is damaged or being written.
+    """
+    settings = settings or CaptureSettings()
+    cameras = read_calibration(calibration)
+    paths = match_sources(list(sources), cameras, calibration)
+    jobs = [_job_of(path, camera, settings, replace_others) for path, camera in zip(paths, cameras, strict=True)]
+    whole = _joined(jobs, cameras, name, file_digest(calibration))
+    capture = read_finished(out, whole.key, tell=False)
+    if capture is not None:
+        return capture
+    with hold(out):
+        capture = read_finished(out, whole.key)
+        if capture is not None:
+            return capture
+        check_place(out, whole)
+        with tidy(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
+            views = _survey_views(jobs, cameras, prepare(survey_folder, whole.key))
+            _capture_views(views, whole, settings, out)
+    return read_capture(out)
+
+
+def _job_of(source: Path, camera: CalibratedCamera, settings: CaptureSettings, replace_others: bool) -> CaptureJob:
+    """Return the job of one camera, with its own files of those that settings name."""
+    own = {
+        option: _file_of(path, camera.camera_id, option.replace("_", "-"))
+        for option in ("clean_plate", "mattes", "landmarks")
+        if (path := getattr(settings, option)) is not None
+    }
+    job = open_job(source, replace(settings, **own), camera.camera_id, replace_others)
+    return replace(job, frames=replace(job.frames, selection=replace(job.frames.selection, offset=camera.offset)))
+
+
+def _file_of(folder: Path, camera_id: str, option: str) -> Path:
+    found = [entry for entry in folder.iterdir() if camera_id in (entry.name, entry.stem)] if folder.is_dir() else []
+    if len(found) != 1:
+        raise UserError(
+            f"--capture.{option} {folder}: has {len(found)} entries for the camera {camera_id!r}; for several cameras "
+            "give a folder with one file or folder for each, named by its id"
+        )
+    return found[0]
+
+
+def _joined(jobs: list[CaptureJob], cameras: list[CalibratedCamera], name: str, calibration: str) -> CaptureJob:
+    """Return the job of the whole: the first camera's, under the sequence's name and a key over all of them."""
+    content = {"recipe": RECIPE, "name": name, "calibration": calibration, "keys": [job.key for job in jobs]}
+    key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    contents = hashlib.sha256("".join(job.frames.content_hash for job in jobs).encode()).hexdigest()
+    frames = replace(jobs[0].frames, content_hash=contents)
+    rates = [job.frames.fps for job in jobs]
+    for camera, rate in zip(cameras, rates, strict=True):
+        if abs(rate - rates[0]) > _MAX_RATE_ERROR * rates[0]:
+            raise UserError(
+                f"camera {camera.camera_id} has {rate:g} frames a second, camera {cameras[0].camera_id} {rates[0]:g}; "
+                "frames are paired by their number, so give videos of one rate"
+            )
+    return replace(jobs[0], frames=frames, name=name, key=key)
+
+
+def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folder: Path) -> list[_View]:
+    """Find the faces in all videos.
+
+    Raises:
+        UserError: pictures do not fit their camera, or numbers of frames differ.
+    """
+    views = []
+    for job, camera in zip(jobs, cameras, strict=True):
+        landmarks = read_given(job.settings, job.frames).landmarks
+        survey = survey_source(job.frames, folder / camera.camera_id, landmarks)
+        fitted = camera.for_pictures(*(int(side) for side in survey.picture_size))
+        views.append(_View(camera.camera_id, job, survey, choose_person(survey), fitted))
+    counts = {view.camera_id: len(view.survey.timestamps) for view in views}
+    if len(set(counts.values())) > 1:
+        shortest, longest = min(counts, key=lambda key: counts[key]), max(counts, key=lambda key: counts[key])
+        raise UserError(
+            f"camera {shortest} has {counts[shortest]} frames, camera {longest} {counts[longest]}; frames are paired "
+            f"by their number: cut the videos alike, correct the offsets, or take the first {counts[shortest]} by "
+            f"--capture.max-frames {counts[shortest]}"
+        )
+    return views
+
+
+def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSettings, out: Path) -> None:
+    cameras = [view.camera for view in views]
+    boxes = np.stack([view.person.boxes * np.tile(view.survey.picture_size, 2) for view in views], axis=1)
+    path = find_head_path(boxes, cameras)
+    for index, pixels in disagreeing(path, boxes, cameras).items():
+        say(
+            f"warning: camera {views[index].camera_id}: finds the face {pixels:.0f} pixels from where the other "
+            "cameras see it; check its calibration, its id and its offset"
+        )
+    crops, (width, height) = choose_crops(path, cameras, settings.size, settings.crop == "none")
+    work = prepare(partial_folder(out), whole.key)
+    ids = tuple(view.camera_id for view in views)
+    layout = FrameLayout(work, ids, len(path.centres), height, width)
+    chunks = [
+        process_part(
+            Reel(view.job.frames),
+            Part(f"{whole.name}, camera {view.camera_id}", 0, view.survey, _agreed(view.person, path, index), crop),
+            read_given(view.job.settings, view.job.frames),
+            layout,
+            work / _chunks_of(view.camera_id),
+            index,
+        )
+        for index, (view, crop) in enumerate(zip(views, crops, strict=True))
+    ]
+    _finish(views, whole, path, crops, layout, chunks, out)
+
+
+def _agreed(person: Person, path: HeadPath, camera: int) -> Person:
+    """Return the person without faces that are somewhere else than the head."""
+    return replace(person, boxes=np.where(path.agrees[:, camera, None] | ~path.known[:, None], person.boxes, np.nan))
+
+
+def _finish(
+    views: list[_View],
+    whole: CaptureJob,
+    path: HeadPath,
+    crops: list[Crop],
+    layout: FrameLayout,
+    chunks: list[list[Chunk]],
+    out: Path,
+) -> None:
+    calibration = tuple(_cropped(view.camera, crop) for view, crop in zip(views, crops, strict=True))
+    landmarks = _joined_arrays(chunks, "landmarks")
+    _remove_astray(landmarks, path, calibration)
+    quality = _quality(chunks)
+    timestamps = views[0].survey.timestamps
+    data = CaptureData(
+        name=whole.name,
+        camera_ids=layout.camera_ids,
+        fps=frame_rate(timestamps, whole.frames.fps),
+        timestamps=timestamps,
+        landmarks=landmarks,
+        valid=np.isfinite(landmarks[..., 0, 0]),
+        principal_point=np.stack([camera.K[:2, 2].numpy() for camera in calibration]).astype(np.float64),
+        source={
+            "key": whole.key,
+            "file": ", ".join(view.job.frames.path.name for view in views),
+            "content_hash": whole.frames.content_hash,
+            "cameras": {
+                view.camera_id: {
+                    "file": view.job.frames.path.name,
+                    "picture_size": view.survey.picture_size.tolist(),
+                    "crop": {"left": crop.left, "top": crop.top, "width": crop.crop_width, "height": crop.crop_height},
+                    "first_frame": int(view.survey.numbers[0]),
+                }
+                for view, crop in zip(views, crops, strict=True)
+            },
+        },
+        calibration=calibration,
+        quality=quality,
+    )
+    found = data.valid.sum(axis=0)
+    report = {
+        "frames": len(timestamps),
+        "frames_without_face": int((~data.valid.any(axis=1)).sum()),
+        "faces_by_camera": dict(zip(layout.camera_ids, found.tolist(), strict=True)),
+        **quality_report(whole.name, quality),
+    }
+    digests = {FRAMES: _joined_arrays(chunks, "frame_digests"), MATTES: _joined_arrays(chunks, "matte_digests")}
+    digests = {kind: array.reshape(array.shape[:2]) for kind, array in digests.items()}
+    for scaffolding in (STATE, *map(_chunks_of, layout.camera_ids)):
+        remove_tree(layout.folder / scaffolding)
+    finish_capture(layout, out, data, digests, report)
+
+
+def _quality(chunks: list[list[Chunk]]) -> FrameQuality:
+    """Return the quality of all pictures, each relative to those of its own camera."""
+    each = [relative_quality(np.concatenate([chunk.quality for chunk in camera])) for camera in chunks]
+    return FrameQuality(
+        *(np.concatenate([getattr(q, field.name) for q in each], axis=1) for field in fields(FrameQuality))
+    )
+
+
+def _chunks_of(camera_id: str) -> str:
+    return f"chunks-{camera_id}"
+
+
+def _joined_arrays(chunks: list[list[Chunk]], name: str) -> np.ndarray:
+    """Join an array of all chunks over time, and of all cameras along the second axis."""
+    return np.stack([np.concatenate([getattr(chunk, name) for chunk in camera]) for camera in chunks], axis=1)
+
+
+def _cropped(camera: Camera, crop: Crop) -> Camera:
+    cut = camera.cropped(float(crop.left), float(crop.top), crop.crop_width, crop.crop_height)
+    return cut.resized(crop.width, crop.height)
+
+
+def _remove_astray(landmarks: Float[np.ndarray, "t c l 2"], path: HeadPath, cameras: tuple[Camera, ...]) -> None:
+    """Remove landmarks that were found far from the head, for example in hair seen from behind."""
+    assert landmarks.shape[2] == LANDMARKS
+    for index, camera in enumerate(cameras):
+        found = landmarks[:, index]
+        inside = path.centres @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
+        centres = (inside @ camera.K.numpy().T)[:, :2] / inside[:, 2:]
+        least, most = found.min(axis=1), found.max(axis=1)
+        side = np.maximum((most - least).max(axis=1), 1.0)
+        with np.errstate(invalid="ignore"):
+            is_astray = np.linalg.norm((least + most) / 2 - centres, axis=1) > _MAX_ASTRAY * side
+        found[is_astray] = np.nan

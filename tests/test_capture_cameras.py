@@ -1,0 +1,221 @@
+"""Several calibrated cameras: one capture, cropped to the head in every picture, and calibrations that do not fit."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from capture_helpers import scan_texture, tree_bytes
+from mien.camera import Camera, look_at
+from mien.capture import CaptureSettings
+from mien.capture.calibration import read_calibration
+from mien.capture.from_cameras import capture_cameras
+from mien.capture.head_path import choose_crops, find_head_path
+from mien.errors import UserError
+
+WIDTH, HEIGHT, FRAMES = 400, 300, 4
+FACE = 0.26
+"""Side in metres of the flat face that the cameras see."""
+
+
+def camera_at(x: float, y: float, z: float, focal: float) -> Camera:
+    viewmat = look_at(torch.tensor([x, y, z]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    return Camera(torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]]), viewmat, WIDTH, HEIGHT)
+
+
+CAMERAS = {
+    "left": camera_at(-0.25, 0.05, 1.2, 520.0),
+    "middle": camera_at(0.0, 0.0, 1.0, 430.0),
+    "right": camera_at(0.3, -0.04, 1.1, 480.0),
+    "top": camera_at(0.0, 0.3, 1.1, 480.0),
+    "back": camera_at(0.1, 0.0, -1.2, 500.0),
+}
+
+
+def corners_at(timestep: int) -> torch.Tensor:
+    """Corners of the flat face: top left, top right, bottom right, bottom left in pictures from the front."""
+    half = FACE / 2
+    square = torch.tensor([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
+    return square + torch.tensor([0.01 * timestep, 0.0, 0.0])
+
+
+def write_rig(folder: Path, texture: np.ndarray, frames: int = FRAMES) -> tuple[Path, Path]:
+    """Write the pictures of all cameras and their calibration; the back camera sees a plain board."""
+    entries = []
+    for camera_id, camera in CAMERAS.items():
+        place = folder / "pictures" / camera_id
+        place.mkdir(parents=True)
+        for timestep in range(frames):
+            picture = np.full((HEIGHT, WIDTH, 3), 170, np.uint8)
+            corners, side = camera.project(corners_at(timestep))[0].numpy(), texture.shape[0]
+            source = np.array([[0, 0], [side, 0], [side, side], [0, side]], np.float32)
+            board = np.full_like(texture, 90) if camera_id == "back" else texture
+            warp = cv2.getPerspectiveTransform(source, corners.astype(np.float32) - 0.5)
+            cv2.warpPerspective(
+                board, warp, (WIDTH, HEIGHT), picture, flags=cv2.INTER_AREA, borderMode=cv2.BORDER_TRANSPARENT
+            )
+            cv2.imwrite(str(place / f"{timestep}.png"), picture[..., ::-1])
+        entries.append(entry_of(camera_id, camera))
+    path = folder / "rig.json"
+    write_entries(path, entries)
+    return folder / "pictures", path
+
+
+def entry_of(camera_id: str, camera: Camera) -> dict:
+    return {
+        "id": camera_id,
+        "K": camera.K.tolist(),
+        "viewmat": camera.viewmat.tolist(),
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def write_entries(path: Path, entries: list[dict]) -> None:
+    path.write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": entries}))
+
+
+@pytest.fixture(scope="module")
+def rig(test_data, tmp_path_factory):
+    """Pictures and calibration of the rig."""
+    texture = cv2.resize(scan_texture(test_data), (512, 512), interpolation=cv2.INTER_AREA)
+    return write_rig(tmp_path_factory.mktemp("rig"), texture)
+
+
+def test_cameras_become_one_capture_with_the_head_at_one_scale(rig, tmp_path):
+    capture = capture_cameras([rig[0]], rig[1], tmp_path / "s" / "capture", "s", CaptureSettings(size=128))
+    assert capture.camera_ids == tuple(CAMERAS)
+    assert capture.images.shape == (FRAMES, 5, 128, 128, 3)
+    assert capture.calibration is not None
+    assert capture.valid[:, :4].all()
+    assert not capture.valid[:, 4].any()
+    sizes = []
+    for index, camera in enumerate(capture.calibration):
+        corners = camera.project(corners_at(0))[0]
+        assert ((corners > 0) & (corners < 128)).all(), capture.camera_ids[index]
+        sizes.append(float(corners[:, 1].max() - corners[:, 1].min()))
+    assert max(sizes) < 1.15 * min(sizes)
+    # The cropped cameras agree with the cropped pictures: the nose tip of all cameras is at the same place of the face.
+    for index in range(4):
+        corners = capture.calibration[index].project(corners_at(0))[0].numpy().astype(np.float32)
+        unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+        to_face = cv2.getPerspectiveTransform(corners, unit)
+        places = cv2.perspectiveTransform(capture.landmarks[0, index][None].astype(np.float32), to_face)[0]
+        if index == 0:
+            first = places
+        assert np.median(np.linalg.norm(places - first, axis=-1)) < 0.02, capture.camera_ids[index]
+
+
+def test_same_command_reads_the_capture_back_and_an_interrupted_one_continues(rig, tmp_path, monkeypatch):
+    settings = CaptureSettings(size=96, max_frames=2)
+    capture_cameras([rig[0]], rig[1], tmp_path / "whole" / "capture", "s", settings)
+    import mien.capture.from_cameras as module
+
+    process, calls = module.process_part, []
+
+    def stop_at_third(*arguments, **options):
+        calls.append(arguments)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return process(*arguments, **options)
+
+    monkeypatch.setattr(module, "process_part", stop_at_third)
+    out = tmp_path / "stopped" / "capture"
+    with pytest.raises(KeyboardInterrupt):
+        capture_cameras([rig[0]], rig[1], out, "s", settings)
+    capture_cameras([rig[0]], rig[1], out, "s", settings)
+    assert tree_bytes(out) == tree_bytes(tmp_path / "whole" / "capture")
+    done = len(calls)
+    capture_cameras([rig[0]], rig[1], out, "s", settings)
+    assert len(calls) == done
+
+
+def test_offsets_pair_frames(rig, tmp_path):
+    entries = json.loads(rig[1].read_text())["cameras"]
+    for entry in entries:
+        entry["offset"] = 1 if entry["id"] == "middle" else 0
+    write_entries(tmp_path / "rig.json", entries)
+    settings = CaptureSettings(size=96, max_frames=FRAMES - 1)
+    shifted = capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "a" / "capture", "s", settings)
+    plain = capture_cameras([rig[0]], rig[1], tmp_path / "b" / "capture", "s", CaptureSettings(size=96))
+    assert shifted.timesteps == FRAMES - 1
+    assert shifted.source["cameras"]["middle"]["first_frame"] == 1
+    assert shifted.source["cameras"]["left"]["first_frame"] == 0
+    with pytest.raises(UserError, match=r"camera middle has 3 frames, camera left 4; .* --capture.max-frames 3"):
+        capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "c" / "capture", "s", CaptureSettings(size=96))
+    assert plain.timesteps == FRAMES
+
+
+def scaled(entry: dict, factor: float) -> dict:
+    viewmat = np.array(entry["viewmat"])
+    viewmat[:3, 3] *= factor
+    return {**entry, "viewmat": viewmat.tolist()}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda e: [{**e[0], "id": "other"}, *e[1:]], "no camera 'left', it has back, middle, other, right, top"),
+        (lambda e: [*e, {**e[0], "id": "extra"}], "there is no video of the camera extra"),
+        (lambda e: [e[0], *e], "two cameras have the id 'left'"),
+        (lambda e: [{**e[0], "width": 300}, *e[1:]], "calibration is for pictures of 300x300, its video has 400x300"),
+        (lambda e: [{**e[0], "viewmat": np.zeros((4, 4)).tolist()}, *e[1:]], "viewmat is no rotation and translation"),
+        (lambda e: [{**e[0], "K": np.zeros((3, 3)).tolist()}, *e[1:]], "focal lengths 0 and 0, not above 0"),
+        (lambda e: [{**e[0], "K": [1, 2]}, *e[1:]], "K must be 3x3"),
+        (lambda e: [{"K": e[0]["K"]}, *e[1:]], "camera 0: has no `id`"),
+        (lambda e: [{**e[0], "offset": -1}, *e[1:]], "offset -1 is no number of frames"),
+        (lambda e: [{**e[0], "id": "../x"}, *e[1:]], "cannot be an id"),
+        (lambda e: [{"id": "left"}, *e[1:]], r"camera 0 \(left\): needs K"),
+        (lambda e: [], "has no list `cameras`"),
+        (lambda e: [scaled(entry, 1000.0) for entry in e], "the face is .* m wide, it should be about 0.15"),
+    ],
+)
+def test_calibration_that_does_not_fit_is_refused(rig, tmp_path, change, message):
+    entries = change(json.loads(rig[1].read_text())["cameras"])
+    write_entries(tmp_path / "rig.json", entries)
+    with pytest.raises(UserError, match=message) as found:
+        capture_cameras(
+            [rig[0]], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", CaptureSettings(size=96, max_frames=1)
+        )
+    assert "\n" not in str(found.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_camera_that_disagrees_is_reported(rig, tmp_path, capsys):
+    entries = json.loads(rig[1].read_text())["cameras"]
+    wrong = np.array(entries[0]["viewmat"])
+    wrong[0, 3] += 0.4
+    entries[0]["viewmat"] = wrong.tolist()
+    write_entries(tmp_path / "rig.json", entries)
+    capture_cameras(
+        [rig[0]], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", CaptureSettings(size=96, max_frames=2)
+    )
+    assert "warning: camera left: finds the face" in capsys.readouterr().err
+
+
+def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():
+    cameras = list(CAMERAS.values())
+    true = torch.tensor([0.02, 0.03, 0.05])
+    boxes = np.full((2, 5, 4), np.nan)
+    for index, camera in enumerate(cameras):
+        middle, side = camera.project(true)[0].numpy(), 60.0
+        boxes[:, index] = np.concatenate([middle - side / 2, middle + side / 2])
+    boxes[0, 4] += 80  # the back camera mistakes something else
+    boxes[1, :4] = np.nan
+    path = find_head_path(boxes, cameras)
+    np.testing.assert_allclose(path.centres[0], true.numpy(), atol=1e-4)
+    assert path.agrees.tolist() == [[True] * 4 + [False], [False] * 5]
+    assert not path.known[1]
+    crops, size = choose_crops(path, cameras, 512, whole=False)
+    assert size[0] == min(crop.crop_width for crop in crops)
+
+
+def test_calibration_reads_back(rig):
+    cameras = read_calibration(rig[1])
+    assert [camera.camera_id for camera in cameras] == list(CAMERAS)
+    half = cameras[0].for_pictures(WIDTH // 2, HEIGHT // 2)
+    assert half.width == WIDTH // 2
+    torch.testing.assert_close(half.K[:2], CAMERAS["left"].K[:2] / 2)
