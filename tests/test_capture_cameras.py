@@ -162,8 +162,11 @@ def scaled(entry: dict, factor: float) -> dict:
         (lambda e: [*e, {**e[0], "id": "extra"}], "there is no video of the camera extra"),
         (lambda e: [e[0], *e], "two cameras have the id 'left'"),
         (lambda e: [{**e[0], "width": 300}, *e[1:]], "calibration is for pictures of 300x300, its video has 400x300"),
-        (lambda e: [{**e[0], "viewmat": np.zeros((4, 4)).tolist()}, *e[1:]], "viewmat is no rotation and translation"),
-        (lambda e: [{**e[0], "K": np.zeros((3, 3)).tolist()}, *e[1:]], "focal lengths 0 and 0, not above 0"),
+        (
+            lambda e: [{**e[0], "viewmat": np.zeros((4, 4)).tolist()}, *e[1:]],
+            "viewmat is not a rotation and translation",
+        ),
+        (lambda e: [{**e[0], "K": np.zeros((3, 3)).tolist()}, *e[1:]], "focal lengths 0 and 0, which must be above 0"),
         (lambda e: [{**e[0], "K": [1, 2]}, *e[1:]], "K must be 3x3"),
         (lambda e: [{"K": e[0]["K"]}, *e[1:]], "camera 0: has no `id`"),
         (lambda e: [{**e[0], "offset": -1}, *e[1:]], "offset -1 is no number of frames"),

@@ -109,11 +109,11 @@ def test_interrupted_capture_goes_on_to_the_same_bytes(face_clip, tmp_path, monk
     original = process.PartProcessor.process
     starts = []
 
-    def stop_at_the_second(self, start, count, writer, advance):
+    def stop_at_the_second(self, start, count, writer, camera, advance):
         starts.append(start)
         if len(starts) == 2:
             raise KeyboardInterrupt
-        return original(self, start, count, writer, advance)
+        return original(self, start, count, writer, camera, advance)
 
     monkeypatch.setattr(process.PartProcessor, "process", stop_at_the_second)
     with pytest.raises(KeyboardInterrupt):

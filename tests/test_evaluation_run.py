@@ -108,7 +108,7 @@ def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path], tmp_p
     shutil.rmtree(folder / "scoring")
     write_scoring(folder / "scoring", make_experiment().scorings[0], capture_hash="of another capture")
     for read in (lambda: evaluate(run_dir, [folder]), lambda: read_sequence(folder)):
-        with pytest.raises(UserError, match=r"scoring: its masks are of other pictures .* run `mien track` again"):
+        with pytest.raises(UserError, match=r"scoring: its masks belong to other pictures .* run `mien track` again"):
             read()
 
 
@@ -118,4 +118,4 @@ def test_without_perceptual_metric_and_baselines(workspace: tuple[Path, Path]) -
     entry = evaluate(run_dir, [folder], EvaluationSettings(perceptual=False, baselines=False))["protocols"]
     assert entry["self_reenactment"]["perceptual"] is None
     assert entry["self_reenactment"]["baselines"] == {}
-    assert "Not scored in this evaluation" in (run_dir / "report.html").read_text()
+    assert "This evaluation did not score the baselines" in (run_dir / "report.html").read_text()
