@@ -1,6 +1,7 @@
 """Several calibrated cameras: one capture, cropped to the head in every picture, and calibrations that do not fit."""
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from mien.capture import CaptureSettings
 from mien.capture.calibration import read_calibration
 from mien.capture.from_cameras import capture_cameras
 from mien.capture.head_path import choose_crops, find_head_path
+from mien.cli import main
 from mien.errors import UserError
 
 WIDTH, HEIGHT, FRAMES = 400, 300, 4
@@ -155,6 +157,11 @@ def scaled(entry: dict, factor: float) -> dict:
     return {**entry, "viewmat": viewmat.tolist()}
 
 
+def turned_away(entry: dict) -> dict:
+    """A camera that looks the other way, as one with OpenGL's axes does."""
+    return {**entry, "viewmat": (np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.array(entry["viewmat"])).tolist()}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -169,9 +176,14 @@ def scaled(entry: dict, factor: float) -> dict:
         (lambda e: [{**e[0], "K": np.zeros((3, 3)).tolist()}, *e[1:]], "focal lengths 0 and 0, which must be above 0"),
         (lambda e: [{**e[0], "K": [1, 2]}, *e[1:]], "K must be 3x3"),
         (lambda e: [{"K": e[0]["K"]}, *e[1:]], "camera 0: has no `id`"),
-        (lambda e: [{**e[0], "offset": -1}, *e[1:]], "offset -1 is no number of frames"),
+        (lambda e: [{**e[0], "offset": -1}, *e[1:]], "offset -1 is not a number of frames"),
         (lambda e: [{**e[0], "id": "../x"}, *e[1:]], "cannot be an id"),
-        (lambda e: [{"id": "left"}, *e[1:]], r"camera 0 \(left\): needs K"),
+        (lambda e: [{"id": "left"}, *e[1:]], r"camera 0 \(left\): has no K, viewmat, width, height"),
+        (lambda e: [{**e[0], "offset": FRAMES}, *e[1:]], "its offset of 4 leaves no frame of .*left"),
+        (
+            lambda e: [e[0], turned_away(e[1]), *e[2:]],
+            "camera middle: finds a face, but the other cameras see the head behind",
+        ),
         (lambda e: [], "has no list `cameras`"),
         (lambda e: [scaled(entry, 1000.0) for entry in e], "the face is .* m wide, it should be about 0.15"),
     ],
@@ -214,6 +226,22 @@ def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():
     assert not path.known[1]
     crops, size = choose_crops(path, cameras, 512, whole=False)
     assert size[0] == min(crop.crop_width for crop in crops)
+
+
+def test_command_line_names_what_does_not_fit(rig, tmp_path, capsys):
+    out = ["--out", str(tmp_path / "out")]
+    for arguments, message in (
+        (["capture", str(rig[0]), *out], "holds no images; .* add --calibration FILE"),
+        (["capture", str(rig[0]), *out, "--calibration", str(rig[0])], "is a folder; give the json file"),
+        (["capture", str(rig[0] / "left"), str(rig[0] / "top"), *out], "several videos become one capture only if"),
+        (["create", str(rig[0]), *out, "--calibration", str(rig[1]), "--hold-out-cameras", "07"], "no such camera"),
+        (["create", str(rig[0]), *out, "--calibration", str(rig[1]), "--name", "a", "b"], "give one name"),
+    ):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err.strip()
+        assert re.search(message, error), error
+        assert "\n" not in error
+    assert not (tmp_path / "out" / "sequences").exists()
 
 
 def test_calibration_reads_back(rig):

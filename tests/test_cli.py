@@ -204,3 +204,9 @@ sys.exit(main(["demo"]))
 """
     assert subprocess.run([sys.executable, "-c", program], check=False, capture_output=True).returncode == 143
     assert list(tmp_path.iterdir()) == []
+
+
+def test_option_given_twice_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    """An option that is given twice is refused, because its first values would be dropped."""
+    assert main(["render", "DIR", "--out", "a.png", "--set", "jawOpen=1", "--set=eyeBlinkLeft=1"]) == 2
+    assert "--set is given twice" in capsys.readouterr().err

@@ -166,7 +166,7 @@ def test_cameras_from_a_file(tmp_path: Path) -> None:
         ([entry, {**entry, "viewmat": (2 * torch.eye(4)).tolist()}], "camera 1: viewmat is not a rotation"),
         ([{**entry, "width": 100000}], "100000x80"),
         ([{**entry, "K": "big"}], "needs K"),
-        ([3], "needs K"),
+        ([3], "has no K"),
     ):
         write_json(path, "mien.cameras", 1, {"cameras": wrong})
         with pytest.raises(UserError, match=part):

@@ -325,12 +325,13 @@ def test_help_stays_short_and_says_how_to_see_more(capsys: pytest.CaptureFixture
     assert short.rstrip().endswith("mien train --method headgas --help-all")
 
 
-def test_presets_are_the_same_for_all_methods() -> None:
-    for name, method in METHODS.items():
-        assert set(method.presets) == set(PRESETS)
-        assert all(type(config) is method.config for config in method.presets.values())
-        # If this fails, a preset has changed: say so in the changelog.
-        assert all(preset.config(name) == method.config() for preset in PRESETS.values())
+@pytest.mark.parametrize("name", METHODS)
+def test_presets_are_the_same_for_all_methods(name: str) -> None:
+    method = METHODS[name]
+    assert set(method.presets) == set(PRESETS), f"PRESETS of {name} needs one entry for each of {list(PRESETS)}"
+    assert all(type(config) is method.config for config in method.presets.values())
+    for preset in PRESETS.values():
+        assert preset.config(name) == method.config(), f"{preset} of {name} differs from the defaults"
 
 
 @dataclass(frozen=True)

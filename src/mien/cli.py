@@ -148,11 +148,15 @@ def _crash() -> int:
 def _run(name: str, rest: list[str]) -> int:
     import tyro
 
-    from mien.commands.help_text import readable, without_details
+    from mien.commands.help_text import list_options, readable, without_details
     from mien.commands.options import settings_groups, with_settings
 
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
+    for option in list_options(module.Command):
+        if sum(argument.partition("=")[0].replace("_", "-") == option for argument in rest) > 1:
+            # The first of its values would be dropped without a word.
+            raise UserError(f"{option} is given twice; give it once, with all of its values behind it")
     options, more = module.Command, ""
     if "--help-all" in rest:
         rest = ["--help" if argument == "--help-all" else argument for argument in rest]

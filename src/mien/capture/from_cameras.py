@@ -90,6 +90,8 @@ def capture_cameras(
     cameras = read_calibration(calibration)
     paths = match_sources(list(sources), cameras, calibration)
     jobs = [_job_of(path, camera, settings, replace_others) for path, camera in zip(paths, cameras, strict=True)]
+    for job, camera in zip(jobs, cameras, strict=True):
+        _check_size(job, camera)
     whole = _joined(jobs, cameras, name, file_digest(calibration))
     capture = read_finished(out, whole.key, tell=False)
     if capture is not None:
@@ -114,6 +116,21 @@ def _job_of(source: Path, camera: CalibratedCamera, settings: CaptureSettings, r
     }
     job = open_job(source, replace(settings, **own), camera.camera_id, replace_others)
     return replace(job, frames=replace(job.frames, selection=replace(job.frames.selection, offset=camera.offset)))
+
+
+def _check_size(job: CaptureJob, camera: CalibratedCamera) -> None:
+    """Check the first picture of a camera, before faces are searched in any.
+
+    Raises:
+        UserError: the video has no frame after the camera's offset, or pictures of another shape.
+    """
+    if camera.offset and camera.offset >= job.frames.count():
+        raise UserError(
+            f"camera {camera.camera_id}: its offset of {camera.offset} leaves no frame of {job.frames.path}; give the "
+            "number of frames by which it started before the others"
+        )
+    height, width = next(job.frames.frames()).picture().shape[:2]
+    camera.for_pictures(width, height)
 
 
 def _file_of(folder: Path, camera_id: str, option: str) -> Path:
@@ -170,6 +187,11 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
     boxes = np.stack([view.person.boxes * np.tile(view.survey.picture_size, 2) for view in views], axis=1)
     path = find_head_path(boxes, cameras)
     for index, pixels in disagreeing(path, boxes, cameras).items():
+        if not np.isfinite(pixels):
+            raise UserError(
+                f"camera {views[index].camera_id}: finds a face, but the other cameras see the head behind it; correct "
+                "its viewmat, which goes from world to camera with OpenCV axes"
+            )
         say(
             f"warning: camera {views[index].camera_id}: finds the face {pixels:.0f} pixels from where the other "
             "cameras see it; check its calibration, its id and its offset"

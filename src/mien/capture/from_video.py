@@ -251,7 +251,7 @@ def prepare(work: Path, key: str) -> Path:
 
 
 def _leads_out(work: Path) -> bool:
-    """Whether links in the unfinished work could make mien write somewhere else. Such a folder is not mien's own."""
+    """Whether links in the unfinished work could make mien write somewhere else. mien never makes such links."""
     try:
         check_tree(work)
         return work.is_symlink() or has_other_names(work)

@@ -135,7 +135,7 @@ def disagreeing(path: HeadPath, boxes: Float[np.ndarray, "t c 4"], cameras: Sequ
         if seen.sum() < 0.5 * path.known.sum() or path.agrees[seen, index].mean() >= 0.5:
             continue
         distances = np.linalg.norm(_project(path.centres[seen], camera) - centres[seen, index], axis=-1)
-        result[index] = float(np.median(distances))
+        result[index] = float(np.median(distances))  # NaN if the head is behind the camera
     return result
 
 

@@ -149,7 +149,9 @@ def list_images(folder: Path) -> list[Path]:
     """
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
     if not images:
-        raise UserError(f"{folder}: holds no images; give a video or a folder of .png or .jpg files")
+        rig = any(path.is_dir() for path in folder.iterdir())
+        cameras = "; if its folders are of calibrated cameras, add --calibration FILE" if rig else ""
+        raise UserError(f"{folder}: holds no images; give a video or a folder of .png or .jpg files{cameras}")
     return sorted(images, key=lambda path: [int(part) if part.isdigit() else part for part in _parts(path.name)])
 
 

@@ -59,7 +59,11 @@ class Command:
 
     def run(self) -> None:
         """Run all stages and skip those whose results are current. All possible checks come before any work."""
-        from mien.commands.stages.capturing import run_calibrated_capture_stage, run_capture_stage
+        from mien.commands.stages.capturing import (
+            check_camera_ids,
+            run_calibrated_capture_stage,
+            run_capture_stage,
+        )
         from mien.commands.stages.evaluating import run_evaluation_stage
         from mien.commands.stages.face_models import face_model_of
         from mien.commands.stages.names import doubled_videos, run_name, sequence_names
@@ -72,6 +76,8 @@ class Command:
         method, settings = self.options.method_config(), self.options.settings()
         workspace, run = Workspace(self.out), run_name(self.run_name or self.options.method)
         check_run(workspace.run_dir(run), method, settings)
+        if self.calibration is not None:
+            check_camera_ids(self.calibration, settings.held_out_cameras)
         check_untouched(workspace.run_dir(run))
         self.options.say_what_is_ignored()
         face_model_of(self.face_model)

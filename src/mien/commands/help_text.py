@@ -118,3 +118,16 @@ def subclass_with(parent: type, annotations: dict[str, Any], defaults: dict[str,
     # It is a subclass, because tyro finds the descriptions of the fields in the parent's source.
     namespace = {"__annotations__": annotations, "__doc__": parent.__doc__, "__module__": parent.__module__, **defaults}
     return dataclass(frozen=True)(type(parent.__name__, (parent,), namespace))
+
+
+def list_options(options: type) -> set[str]:
+    """The options of a command that take several values, as they are written: --hold-out."""
+    found: set[str] = set()
+    for name, hint in get_type_hints(options, include_extras=True).items():
+        base, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        given = [mark.name for mark in marks if getattr(mark, "name", None) is not None]
+        if is_dataclass(base) and given == [""]:
+            found |= list_options(base)
+        elif get_origin(base) is tuple:
+            found.add("--" + (given[0] if given else name.replace("_", "-")))
+    return found

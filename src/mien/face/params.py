@@ -13,7 +13,7 @@ from mien.rotation import matrix_from_axis_angle, rigid_transform
 
 @dataclass(frozen=True, eq=False)
 class FaceParams:
-    """Parameters of one subject at b timesteps (design.md section 4)."""
+    """Parameters of one subject at b timesteps."""
 
     identity: Float[Tensor, " i"]
     """Coefficients of the identity basis, unit variance over people."""

@@ -113,6 +113,9 @@ def camera_of_entry(entry: Any, where: str) -> Camera:
     Raises:
         UserError: the camera is incomplete, not finite, or not a rigid view.
     """
+    missing = [name for name in ("K", "viewmat", "width", "height") if not isinstance(entry, dict) or name not in entry]
+    if missing:
+        raise UserError(f"{where}: has no {', '.join(missing)}; give K [3][3], viewmat [4][4], width and height")
     try:
         K, viewmat = torch.tensor(entry["K"], dtype=torch.float32), torch.tensor(entry["viewmat"], dtype=torch.float32)
         width, height = _whole(entry["width"]), _whole(entry["height"])

@@ -66,7 +66,10 @@ def read_portable(path: Path) -> PortableAvatar:
                 "export it again with `mien export`"
             )
         if header["sha256"] != _digest(header["content"], arrays):
-            raise UserError(f"{path}: is not what was written; copy it again, or export it again with `mien export`")
+            raise UserError(
+                f"{path}: does not match its checksum, so it was damaged or changed; copy it again, or export it again "
+                "with `mien export`"
+            )
         tree = _restored(header["content"], arrays)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: is damaged ({repr(error)[:200]}); export it again with `mien export`") from None

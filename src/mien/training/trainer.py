@@ -133,8 +133,9 @@ def check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
     for sequence in sequences:
         if sequence.tracking.face_model_hash != face_model.content_hash:
             raise UserError(
-                f"{sequence.name}: was tracked with face model {sequence.tracking.face_model!r} "
-                f"{sequence.tracking.face_model_hash}, not {face_model.name!r} {face_model.content_hash}; track again"
+                f"{sequence.name}: was tracked with another version of face model {sequence.tracking.face_model!r} "
+                f"({sequence.tracking.face_model_hash}) than {face_model.name!r} now is ({face_model.content_hash}); "
+                "run `mien track` again"
             )
         check_face_params(face_model, sequence.tracking.face, str(sequence.folder or sequence.name), "track again")
         if not sequence.tracking.face.identity.equal(sequences[0].tracking.face.identity):

@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mien.capture import Capture, CaptureSettings, capture_cameras, capture_video_parts
+from mien.capture.calibration import read_calibration
 from mien.commands.stages.names import rig_name, sequence_name
+from mien.errors import UserError
 from mien.progress import say
 from mien.storage import check_writable
 from mien.workspace import Workspace
@@ -44,6 +46,20 @@ def run_calibrated_capture_stage(
     out = workspace.sequence_dir(name) / "capture"
     _report(capture_cameras(sources, calibration, out, name, settings, replace))
     return [name]
+
+
+def check_camera_ids(calibration: Path, ids: Sequence[str]) -> None:
+    """Check that the cameras to hold out are in the calibration, before any work.
+
+    Raises:
+        UserError: one is not, or the calibration is damaged.
+    """
+    known = [camera.camera_id for camera in read_calibration(calibration)]
+    for camera_id in ids:
+        if camera_id not in known:
+            raise UserError(
+                f"--hold-out-cameras {camera_id}: {calibration} has no such camera, it has {', '.join(known)}"
+            )
 
 
 def _report(capture: Capture) -> None:

@@ -60,6 +60,8 @@ def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -
     Raises:
         UserError: a file is missing, more than one name is given, or there is neither a name nor a folder.
     """
+    if calibration.is_dir():
+        raise UserError(f"--calibration {calibration}: is a folder; give the json file of its cameras (docs/using.md)")
     if not calibration.is_file():
         raise UserError(f"--calibration {calibration}: no such file; name a json file of cameras (docs/using.md)")
     if not sources:
