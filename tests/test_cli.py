@@ -210,3 +210,10 @@ def test_option_given_twice_is_refused(capsys: pytest.CaptureFixture[str]) -> No
     """An option that is given twice is refused, because its first values would be dropped."""
     assert main(["render", "DIR", "--out", "a.png", "--set", "jawOpen=1", "--set=eyeBlinkLeft=1"]) == 2
     assert "--set is given twice" in capsys.readouterr().err
+
+
+def test_option_with_an_empty_value_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`--out=` is refused: as a path, an empty text is the current folder (found by the fuzzer, seed 5)."""
+    assert main(["demo", "--out", str(tmp_path / "demo"), "--out="]) == 2
+    assert "--out= is empty" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

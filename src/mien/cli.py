@@ -134,6 +134,9 @@ def _dispatch(arguments: list[str]) -> int:
     if "" in rest:
         # As a path, an empty text is the current folder: an unset shell variable must not fill it with pictures.
         raise UserError(f"argument {rest.index('') + 1} after {name} is empty (an unset variable?); give it a value")
+    for argument in rest:
+        if argument.startswith("--") and argument.endswith("="):
+            raise UserError(f"{argument} is empty (an unset variable?); give it a value")
     return _run(name, rest)
 
 

@@ -126,7 +126,7 @@ def list_options(options: type) -> set[str]:
     for name, hint in get_type_hints(options, include_extras=True).items():
         base, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         given = [mark.name for mark in marks if getattr(mark, "name", None) is not None]
-        if is_dataclass(base) and given == [""]:
+        if isinstance(base, type) and is_dataclass(base) and given == [""]:
             found |= list_options(base)
         elif get_origin(base) is tuple:
             found.add("--" + (given[0] if given else name.replace("_", "-")))
