@@ -253,7 +253,7 @@ def test_paths_that_are_no_file_are_refused(workspace: Path, capsys: pytest.Capt
         (Path("/dev/null"), "is not an ordinary file"),
     ):
         assert words in complaint(capsys, ["train", str(workspace), "--config", str(path)])
-    assert "is a folder" in complaint(capsys, ["train", str(workspace), "--config="])
+    assert "--config= is empty" in complaint(capsys, ["train", str(workspace), "--config="])
 
 
 def test_a_file_of_another_method_than_asked_for_is_refused(
