@@ -28,6 +28,7 @@ KEYS = {
     "mono-short": "f72145068d96a9f4",
     "mono-long": "c8c56c81aa8d4929",
     "ring-16": "46344aaf4f9ea965",
+    "ring-16-large": "6b91a62e2ddda422",
     "beard": "d19389ae0850b3f4",
     "long-hair": "69f32fa0a3632a1e",
     "glasses": "cf70d19c2a6ef102",

@@ -25,6 +25,8 @@ class ReferenceCapture:
     held_out_cameras: tuple[str, ...] = ()
     steps: int = 2_000
     """Optimiser steps of `mien bench quality`."""
+    by_default: bool = True
+    """Whether `mien bench quality` without names includes it."""
 
     def scenes(self) -> list[SyntheticScene]:
         """Return the sequences, not yet drawn. They share the person but not the motion."""
@@ -85,6 +87,8 @@ _RING = replace(
     _PERSON, width=256, height=256, fps=10.0, cameras="ring", translation=(0.012, 0.008, 0.02),
     rotation=(8.0, 5.0, 4.0), turns=(30.0, 14.0),
 )  # fmt: skip
+_LARGE_RING = replace(_RING, width=550, height=802)
+"""The size of the pictures that GaussianAvatars was trained on (section A of its supplement)."""
 
 
 def _one(name: str, description: str, seed: int, recipe: SyntheticRecipe, steps: int = 2_000) -> ReferenceCapture:
@@ -116,6 +120,15 @@ REFERENCES = {
                 replace(_RING, name="speech", script=_script(("speech", 2.4), ("still", 0.6))),
             ),
             held_out_sequences=("speech",), held_out_cameras=("08",),
+        ),
+        ReferenceCapture(
+            "ring-16-large", "16 calibrated cameras, 550x802, 10 fps: turns, expressions, speech (held out)", 9,
+            (
+                replace(_LARGE_RING, name="turns", script=_script(("still", 0.6), ("turns", 3.4))),
+                replace(_LARGE_RING, name="expressions", script=_script(("expressions", 4.8))),
+                replace(_LARGE_RING, name="speech", script=_script(("speech", 2.6), ("still", 0.6))),
+            ),
+            held_out_sequences=("speech",), held_out_cameras=("08",), steps=15_000, by_default=False,
         ),
         _one("beard", "a full beard, 384x384", 3, replace(_BRIEF, beard=0.014)),
         _one("long-hair", "hair to the shoulders, 384x384", 6, replace(_BRIEF, hair="long")),

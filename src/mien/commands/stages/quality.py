@@ -49,12 +49,16 @@ def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: 
     Raises:
         UserError: a capture or the method is unknown, or another process is running them in the same folder.
     """
-    references = [reference_named(name) for name in captures or REFERENCES]
+    references = [reference_named(name) for name in captures or _default_captures()]
     method_named(method)
     with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
         rows = _walk(references, out, method, steps)
     show(json.dumps([row.as_json() for row in rows]) if as_json else markdown_table(rows))
     say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
+
+
+def _default_captures() -> list[str]:
+    return [name for name, reference in REFERENCES.items() if reference.by_default]
 
 
 def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int) -> list[QualityRow]:
