@@ -11,7 +11,7 @@ from mien.camera import camera_from_fov
 from mien.driving import drive
 from mien.errors import UserError
 from mien.face import FaceParams
-from mien.render.camera_paths import orbit, turntable
+from mien.render.camera_paths import aside, orbit, turntable
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 
@@ -119,3 +119,20 @@ def test_swing_stays_within_its_span() -> None:
     torch.testing.assert_close(path[2].viewmat, orbit(camera, centre, 0.5).viewmat)
     torch.testing.assert_close(path[6].viewmat, orbit(camera, centre, -0.5).viewmat)
     torch.testing.assert_close(path[4].viewmat, camera.viewmat, atol=1e-6, rtol=0)
+
+
+def test_a_camera_aside_looks_at_the_same_place() -> None:
+    """A yaw of 90 degrees looks at the person's left side, a pitch of 30 from above, and 0 changes no bit."""
+    camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+    centre = torch.tensor([0.0, 0.0, -0.6])
+    left = aside(camera, centre, math.pi / 2, 0.0).position - centre
+    torch.testing.assert_close(left, torch.tensor([0.6, 0.0, 0.0]), atol=1e-6, rtol=0)
+    above = aside(camera, centre, 0.0, math.pi / 6).position - centre
+    torch.testing.assert_close(above, torch.tensor([0.0, 0.3, 0.6 * math.sqrt(0.75)]), atol=1e-6, rtol=0)
+    both = aside(camera, centre, math.pi / 2, math.pi / 6)
+    torch.testing.assert_close(
+        both.position - centre, torch.tensor([0.6 * math.sqrt(0.75), 0.3, 0.0]), atol=1e-6, rtol=0
+    )
+    pixel, _ = both.project(centre)
+    torch.testing.assert_close(pixel, camera.project(centre)[0], atol=1e-3, rtol=0)
+    assert aside(camera, centre, 0.0, 0.0).viewmat.equal(camera.viewmat)

@@ -59,6 +59,8 @@ def test_using_the_avatar(workspace: Path, tmp_path: Path) -> None:
     assert main(["export", avatar, "--out", str(tmp_path / "open.ply"), "--set", "jawOpen=0.6"]) == 0
     assert len(read_ply(tmp_path / "open.ply")) > 1000
     assert main(["render", avatar, "--out", str(tmp_path / "still.png"), "--size", "64"]) == 0
+    assert main(["render", avatar, "--out", str(tmp_path / "aside.png"), "--size", "64", "--yaw", "30"]) == 0
+    assert (tmp_path / "aside.png").read_bytes() != (tmp_path / "still.png").read_bytes()
     assert main(["export", avatar, "--out", str(tmp_path / "me.mien")]) == 0
     assert runtime.load(tmp_path / "me.mien").render()[1].max() > 0.5
     series = ["--series", "synthetic", "--every", "12"]

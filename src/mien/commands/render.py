@@ -47,6 +47,11 @@ class Command:
     broken."""
     tilt: float = 15.0
     """Angle that orbit and sway go up and down, in degrees."""
+    yaw: float = 0.0
+    """Angle by which the camera moves around the head before anything else, in degrees: to the person's left, or to the
+    right if negative."""
+    pitch: float = 0.0
+    """The same upwards, or downwards if negative."""
     zoom: float = 1.0
     """Magnification. 1 shows what the camera saw in training."""
     sequence: str | None = None
@@ -74,6 +79,7 @@ class Command:
         from mien.export.pictures import write_pictures
         from mien.face.checks import check_face_params
         from mien.progress import say, track_progress
+        from mien.render.camera_paths import aside
         from mien.training import read_sequence, run_camera
 
         workspace = open_workspace(self.workspace)
@@ -92,8 +98,9 @@ class Command:
         check_face_params(avatar.face_model, face, f"--sequence {self.sequence}", told)
         face = with_expression(face, avatar.face_model, self.set)
         if cameras is None:
-            camera = view(self.picture, run_camera(run_dir), self.zoom)
-            cameras = self._path(camera, subject.head_translation[0], self._frames(timesteps))
+            camera, centre = view(self.picture, run_camera(run_dir), self.zoom), subject.head_translation[0]
+            camera = aside(camera, centre, math.radians(self.yaw), math.radians(self.pitch))
+            cameras = self._path(camera, centre, self._frames(timesteps))
         like = like_on(choose_device(self.device))
         move_avatar(avatar, like)
         face = face.to(like)
@@ -118,6 +125,12 @@ class Command:
             raise UserError(f"--zoom {self.zoom:g}: give a number from 0.01 to 100")
         if not math.isfinite(self.span):
             raise UserError(f"--span {self.span:g}: give a number of degrees")
+        for name, angle, limit in (("yaw", self.yaw, 180), ("pitch", self.pitch, 89)):
+            if not abs(angle) <= limit:
+                raise UserError(f"--{name} {angle:g}: give degrees between -{limit} and {limit}")
+            fixed = "--cameras" if self.cameras is not None else "--path captured" if self.path == "captured" else ""
+            if angle and fixed:
+                raise UserError(f"--{name} {angle:g}: moves a camera of mien's own; leave it out, or leave out {fixed}")
         if not abs(self.tilt) < 180:
             raise UserError(f"--tilt {self.tilt:g}: give degrees between -180 and 180")
 

@@ -44,6 +44,13 @@ def turntable(
     return [orbit(camera, centre, phase if full else 0.5 * span * math.sin(phase), up) for phase in phases]
 
 
+def aside(camera: Camera, centre: Float[Tensor, " 3"], yaw: float, pitch: float) -> Camera:
+    """`camera` moved around `centre`: first up by `pitch`, then to the subject's left by `yaw`, both in radians."""
+    sideways = invert_rigid(camera.viewmat)[:3, 0]
+    raised = orbit(camera, centre, -pitch, tuple(sideways.tolist())) if pitch else camera
+    return orbit(raised, centre, yaw) if yaw else raised
+
+
 def sway(
     camera: Camera, centre: Float[Tensor, " 3"], frames: int, span: float, tilt: float, crossing: bool = True
 ) -> list[Camera]:
@@ -59,11 +66,8 @@ def sway(
     """
     views = []
     for phase in (2 * math.pi * index / frames for index in range(frames)):
-        turned = 0.5 * span * math.sin(phase)
         raised = 0.5 * tilt * (math.sin(2 * phase) if crossing else math.cos(phase))
-        sideways = invert_rigid(camera.viewmat)[:3, 0]
-        lifted = orbit(camera, centre, -raised, tuple(sideways.tolist()))
-        views.append(orbit(lifted, centre, turned))
+        views.append(aside(camera, centre, 0.5 * span * math.sin(phase), raised))
     return views
 
 
