@@ -165,6 +165,12 @@ def paths_of_this_machine(site: Path) -> list[str]:
     ]
 
 
+def marks_in_the_reference(site: Path) -> list[str]:
+    """Pages of the reference that show the source of an annotation's marks (ranges.py takes them off)."""
+    pages = sorted((site / "reference").glob("*.html"))
+    return [str(page.relative_to(site)) for page in pages if "Annotated[" in page.read_text("utf-8")]
+
+
 def build(out: Path) -> int:
     """Build the site into `out`, and return the exit code."""
     work = out.with_name(out.name + "-pages")
@@ -179,7 +185,10 @@ def build(out: Path) -> int:
     leaks = paths_of_this_machine(out)
     for name in leaks:
         print(f"{out / name} holds a path of this machine", file=sys.stderr)
-    return code or bool(leaks)
+    marked = marks_in_the_reference(out)
+    for name in marked:
+        print(f"{out / name} shows the marks of an annotation", file=sys.stderr)
+    return code or bool(leaks) or bool(marked)
 
 
 def _write(path: Path, text: str) -> None:

@@ -13,7 +13,7 @@ version = release = re.search(r'^version = "(.+)"', (_ROOT / "pyproject.toml").r
 html_title = f"mien {release}"
 copyright = "the authors of mien, Apache-2.0"  # noqa: A001
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "docstrings", "links"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "docstrings", "links", "ranges"]
 exclude_patterns = ["**/_*"]
 nitpicky = True  # a reference that leads nowhere is a warning, and build.py lets no warning pass
 
