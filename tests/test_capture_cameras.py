@@ -146,7 +146,9 @@ def test_offsets_pair_frames(rig, tmp_path):
     assert shifted.timesteps == FRAMES - 1
     assert shifted.source["cameras"]["middle"]["first_frame"] == 1
     assert shifted.source["cameras"]["left"]["first_frame"] == 0
-    with pytest.raises(UserError, match=r"camera middle has 3 frames, camera left 4; .* --capture.max-frames 3"):
+    with pytest.raises(
+        UserError, match=r"camera middle has 3 frames, but camera left has 4; .* --capture.max-frames 3"
+    ):
         capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "c" / "capture", "s", CaptureSettings(size=96))
     assert plain.timesteps == FRAMES
 
@@ -208,7 +210,7 @@ def test_camera_that_disagrees_is_reported(rig, tmp_path, capsys):
     capture_cameras(
         [rig[0]], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", CaptureSettings(size=96, max_frames=2)
     )
-    assert "warning: camera left: finds the face" in capsys.readouterr().err
+    assert "warning: camera left sees the face" in capsys.readouterr().err
 
 
 def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():

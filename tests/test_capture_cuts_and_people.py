@@ -65,7 +65,7 @@ def test_cuts_can_be_ignored_and_short_parts_kept(shots, tmp_path, capsys):
     assert (whole.name, whole.timesteps) == ("clip", 45)
     parts = capture_video_parts(shots, tmp_path, CaptureSettings(size=64, shortest_part=0.2, max_frames=45))
     assert [(part.name, part.timesteps) for part in parts] == [("clip-1", 30), ("clip-2", 8), ("clip-3", 7)]
-    assert "sequences" not in capsys.readouterr().err.split("left from an earlier capture of clip")[0][-20:]
+    assert "sequences" not in capsys.readouterr().err.split("left over from an earlier capture of clip")[0][-20:]
     with pytest.raises(UserError, match=r"--capture.shortest-part, or --capture.no-cuts"):
         capture_video_parts(shots, tmp_path / "none", CaptureSettings(shortest_part=5.0, max_frames=45))
     assert not (tmp_path / "none").exists()

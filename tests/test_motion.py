@@ -110,7 +110,7 @@ def test_bad_csv_files(tmp_path: Path) -> None:
         ([good, row("0:00:00:02.0", JawOpen="nan")], COLUMNS, "line 3: JawOpen is nan"),
         ([row("0:00:00:02.0", JawOpen="")], COLUMNS, "line 2: JawOpen is ''"),
         ([row("0:00:00:02.0", JawOpen=45)], COLUMNS, "line 2: JawOpen is 45; coefficients go from 0 to 1"),
-        ([row("0:00:00:02.0", HeadYaw=20)], COLUMNS, "convert it from degrees"),
+        ([row("0:00:00:02.0", HeadYaw=20)], COLUMNS, "convert it if it is in degrees"),
         ([good, good], COLUMNS, "line 3: its Timecode does not come after"),
         ([row("soon")], COLUMNS, "line 2: Timecode 'soon'"),
         ([good[:30]], COLUMNS, "line 2: has 30 of 63 values"),

@@ -159,7 +159,7 @@ def _run(name: str, rest: list[str]) -> int:
     for option in list_options(module.Command):
         if sum(argument.partition("=")[0].replace("_", "-") == option for argument in rest) > 1:
             # The first of its values would be dropped without a word.
-            raise UserError(f"{option} is given twice; give it once, with all of its values behind it")
+            raise UserError(f"{option} is given twice; give it once, followed by all of its values")
     options, more = module.Command, ""
     if "--help-all" in rest:
         rest = ["--help" if argument == "--help-all" else argument for argument in rest]

@@ -89,7 +89,7 @@ def _load_avatar(folder: Path) -> Avatar:
         raise UserError(f"{where}: {error}") from None
     tensors = read_tensors(folder / "avatar.safetensors", remedy=_REMEDY)
     if file_digest(folder / "avatar.safetensors") != content.tensors_sha256:
-        raise UserError(f"{folder / 'avatar.safetensors'}: is not what was written; {_REMEDY}")
+        raise UserError(f"{folder / 'avatar.safetensors'}: was changed or damaged after it was written; {_REMEDY}")
     face_model = _face_model_of(folder, content)
     config = decode(method.config, content.config, where, _REMEDY)
     with expect_whole(folder, _REMEDY):

@@ -111,7 +111,9 @@ def _calibrated_camera(entry: Any, where: str) -> CalibratedCamera:
         raise UserError(f"{where}: has no `id`; give each camera the name of its video, without the ending")
     camera_id, offset = entry["id"], entry.get("offset", 0)
     if not is_file_name(camera_id):
-        raise UserError(f"{where}: {camera_id!r} cannot be an id; give a text that can name a folder, as '08'")
+        raise UserError(
+            f"{where}: {camera_id!r} cannot be an id; give a text that can be the name of a folder, such as '08'"
+        )
     if not isinstance(offset, int) or isinstance(offset, bool) or not 0 <= offset <= _MAX_OFFSET:
         raise UserError(f"{where} ({camera_id}): offset {offset!r} is not a number of frames; give 0 or more")
     return CalibratedCamera(camera_id, camera_of_entry(entry, f"{where} ({camera_id})"), offset)

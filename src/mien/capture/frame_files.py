@@ -167,7 +167,7 @@ def read_png(path: Path, shape: tuple[int, ...], expected_digest: int) -> UInt8[
     """
     picture = decode_png(path, shape, REMEDY)
     if picture_digest(picture) != expected_digest:
-        raise UserError(f"{path}: has other pixels than when it was captured; {REMEDY}")
+        raise UserError(f"{path}: its pixels have changed since it was captured; {REMEDY}")
     return picture
 
 

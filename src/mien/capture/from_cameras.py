@@ -175,9 +175,9 @@ def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folde
     if len(set(counts.values())) > 1:
         shortest, longest = min(counts, key=lambda key: counts[key]), max(counts, key=lambda key: counts[key])
         raise UserError(
-            f"camera {shortest} has {counts[shortest]} frames, camera {longest} {counts[longest]}; frames are paired "
-            f"by their number: cut the videos alike, correct the offsets, or take the first {counts[shortest]} by "
-            f"--capture.max-frames {counts[shortest]}"
+            f"camera {shortest} has {counts[shortest]} frames, but camera {longest} has {counts[longest]}; frames are "
+            "paired by their number: cut the videos to the same length, correct the offsets, or use only the first "
+            f"{counts[shortest]} frames with --capture.max-frames {counts[shortest]}"
         )
     return views
 
@@ -189,11 +189,11 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
     for index, pixels in disagreeing(path, boxes, cameras).items():
         if not np.isfinite(pixels):
             raise UserError(
-                f"camera {views[index].camera_id}: finds a face, but the other cameras see the head behind it; correct "
+                f"camera {views[index].camera_id} finds a face, but the other cameras see the head behind it; correct "
                 "its viewmat, which goes from world to camera with OpenCV axes"
             )
         say(
-            f"warning: camera {views[index].camera_id}: finds the face {pixels:.0f} pixels from where the other "
+            f"warning: camera {views[index].camera_id} sees the face {pixels:.0f} pixels away from where the other "
             "cameras see it; check its calibration, its id and its offset"
         )
     crops, (width, height) = choose_crops(path, cameras, settings.size, settings.crop == "none")

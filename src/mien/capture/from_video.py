@@ -286,7 +286,10 @@ def _tell_leftovers(sequences: Path, job: CaptureJob, names: set[str]) -> None:
         part = source.get("part")
         is_ours = isinstance(part, dict) and part.get("of") == job.name
         if is_ours and path.parent.parent.name not in names:
-            say(f"warning: {path.parent.parent}: left from an earlier capture of {job.name}; delete it unless needed")
+            say(
+                f"warning: {path.parent.parent}: is left over from an earlier capture of {job.name}; "
+                "delete it if you do not need it"
+            )
 
 
 def _read_source(out: Path) -> dict[str, Any] | None:

@@ -179,7 +179,9 @@ def check_mattes(path: Path, source: FrameSource) -> None:
     found = open_source(path, FrameSelection(), 25.0).count()
     expected = source.count()
     if found != expected:
-        raise UserError(f"{path}: has {found} mattes, {source.path} has {expected} frames; give one for each frame")
+        raise UserError(
+            f"{path}: has {found} mattes, but {source.path} has {expected} frames; give one matte for each frame"
+        )
 
 
 def _read_matte(path: Path) -> UInt8[np.ndarray, "h w"]:

@@ -71,7 +71,7 @@ def find_head_path(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera])
     path = HeadPath(refined, agrees)
     if not path.known.any():
         raise UserError(
-            "--calibration: at no time do two cameras see the face in the same place; check that ids and videos belong "
+            "--calibration: no two cameras ever see the face in the same place; check that ids and videos belong "
             "together, that matrices go from world to camera with OpenCV axes, and the offsets"
         )
     _check_unit(path, sides, cameras)
@@ -212,6 +212,6 @@ def _check_unit(path: HeadPath, sides: Float[np.ndarray, "t c"], cameras: Sequen
     least, most = _FACE_WIDTHS
     if not least <= width <= most:
         raise UserError(
-            f"--calibration: by these cameras the face is {width:.3g} m wide, it should be about 0.15; give positions "
-            f"in metres (multiply the last column of every viewmat by {0.15 / width:.3g})"
+            f"--calibration: according to these cameras the face is {width:.3g} m wide, but it should be about 0.15; "
+            f"give positions in metres (multiply the last column of every viewmat by {0.15 / width:.3g})"
         )

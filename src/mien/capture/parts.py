@@ -52,7 +52,7 @@ def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     """
     cuts = find_cuts(survey.thumbnails) if settings.cuts else []
     if cuts:
-        say(f"warning: {path}: cuts to another shot at {_list_times(survey, cuts)}; tracking may stumble there")
+        say(f"warning: {path}: the video cuts to another shot at {_list_times(survey, cuts)}; tracking may fail there")
     part = _make_part(survey, 0, settings, name)
     if part is None:
         raise no_face(path, len(survey.timestamps))
@@ -85,7 +85,7 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
         say(f"{path}: {len(short)} parts shorter than {least} are left out, at {_list_times(survey, short)}")
     if not found and short:
         raise UserError(
-            f"{path}: cuts {len(cuts)} times, and shows a face in no part of {settings.shortest_part:g} s or more; "
+            f"{path}: has {len(cuts)} cuts, and no part of {settings.shortest_part:g} s or more shows a face; "
             "give a smaller --capture.shortest-part, or --capture.no-cuts to keep the video whole"
         )
     if not found:

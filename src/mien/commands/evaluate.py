@@ -105,7 +105,7 @@ class Command:
         if self.images is None or self.truth is None:
             raise UserError("--images PRED and --truth TRUTH belong together; give both")
         if self.workspaces or self.compare:
-            raise UserError("--images and --truth score folders of pictures; leave the workspace and --compare out")
+            raise UserError("--images and --truth score folders of pictures; leave out the workspace and --compare")
         for path in (self.images, self.truth):
             if not path.exists():
                 raise UserError(f"{path}: no such folder; give a folder of pictures, or a video")

@@ -114,7 +114,7 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
     if name.strip().lower() in _ANGLES:
         if not abs(value) <= math.pi:
             raise UserError(
-                f"{where} is {shorten(text)}; angles are in radians, from -3.14 to 3.14; convert it from degrees"
+                f"{where} is {shorten(text)}; angles are in radians, from -3.14 to 3.14; convert it if it is in degrees"
             )
     elif not MIN_COEFFICIENT <= value <= MAX_COEFFICIENT:
         raise UserError(f"{where} is {shorten(text)}; coefficients go from 0 to 1; correct or delete the line")

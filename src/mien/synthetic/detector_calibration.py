@@ -151,7 +151,7 @@ def _principal_components(of_people: Float[Tensor, "n f"], count: int) -> Float[
 
 
 def _unexplained(of_people: Float[Tensor, "n f"], count: int) -> float:
-    """Return the RMS per axis of what the components of other people leave of a person, in a fit with unit noise."""
+    """Return the RMS per axis of what components of other people miss of a person, in a fit with unit noise."""
     squares, fold = [], torch.arange(len(of_people)) % _FOLDS
     for left_out in range(_FOLDS):
         basis, others = _principal_components(of_people[fold != left_out], count), of_people[fold == left_out]
@@ -176,7 +176,8 @@ def main(name: tyro.conf.Positional[str] = "anny", people: int = 200) -> None:
     deviation = 1e3 * float(response.by_person.square().sum(0).mean().sqrt())
     say(
         f"{response_path(name)}: mean offset {1e3 * float(response.mean.norm(dim=1).mean()):.2f} mm; people differ by "
-        f"{deviation:.2f} mm along each axis; components of other people leave {1e3 * response.rest_sigma:.2f} mm of it"
+        f"{deviation:.2f} mm along each axis; components learned from other people still miss "
+        f"{1e3 * response.rest_sigma:.2f} mm of it"
     )
 
 
