@@ -70,7 +70,7 @@ def test_cuts_can_be_ignored_and_short_parts_kept(shots, tmp_path, capsys):
         capture_video_parts(shots, tmp_path / "none", CaptureSettings(shortest_part=5.0, max_frames=45))
     assert not (tmp_path / "none").exists()
     capture_video(shots, tmp_path / "one", CaptureSettings(size=64, max_frames=45))
-    assert "tracking may stumble there" in capsys.readouterr().err
+    assert "tracking may fail there" in capsys.readouterr().err
 
 
 def test_interrupted_parts_go_on_to_the_same_bytes(shots, tmp_path, monkeypatch):
