@@ -184,10 +184,10 @@ def turned_away(entry: dict) -> dict:
         (lambda e: [{**e[0], "offset": FRAMES}, *e[1:]], "its offset of 4 leaves no frame of .*left"),
         (
             lambda e: [e[0], turned_away(e[1]), *e[2:]],
-            "camera middle: finds a face, but the other cameras see the head behind",
+            "camera middle finds a face, but the other cameras see the head behind",
         ),
         (lambda e: [], "has no list `cameras`"),
-        (lambda e: [scaled(entry, 1000.0) for entry in e], "the face is .* m wide, it should be about 0.15"),
+        (lambda e: [scaled(entry, 1000.0) for entry in e], "the face is .* m wide, but it should be about 0.15"),
     ],
 )
 def test_calibration_that_does_not_fit_is_refused(rig, tmp_path, change, message):

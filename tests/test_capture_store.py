@@ -122,9 +122,9 @@ def test_every_damage_is_named(stored, tmp_path):
         "frame": (lambda path: (path / "frames/camera1/000002.png").unlink(), "000002.png: missing"),
         "camera": (lambda path: shutil.rmtree(path / "mattes/camera1"), "missing .3 of 3 are"),
         "cut png": (truncate("mattes/camera0/000001.png", 200), "000001.png: truncated"),
-        "damaged png": (scribble, "000002.png: (damaged|has other pixels)"),
+        "damaged png": (scribble, "000002.png: (damaged|its pixels have changed)"),
         "empty png": (truncate("frames/camera0/000001.png", 0), "000001.png: truncated"),
-        "swapped png": (swap, "000000.png: has other pixels"),
+        "swapped png": (swap, "000000.png: its pixels have changed"),
     }
     for name, (damage, message) in cases.items():
         path = tmp_path / name / "capture"
