@@ -160,16 +160,25 @@ def _expression_basis(anny: FaceModel, order: np.ndarray) -> np.ndarray:
     return (mixtures @ deltas).reshape(EXPRESSIONS, -1, 3)
 
 
-def posed_as_flame(
-    arrays: dict[str, np.ndarray], pose: np.ndarray, shape: np.ndarray, shift: np.ndarray, rest: np.ndarray
-) -> np.ndarray:
-    """Return vertices [v, 3] by FLAME's own formulas.
+def shaped_as_flame(arrays: dict[str, np.ndarray], shape: np.ndarray, offsets: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return the vertices at rest [v, 3] with identity, expression and static offsets."""
+    return arrays["v_template"] + arrays["shapedirs"].astype(np.float64) @ shape + offsets
 
-    `pose` [5, 3] holds the axis-angles of root, neck, jaw and eyes; `shape` holds all coefficients. `rest` is the
-    person without expression; joints are regressed from it.
+
+def posed_as_flame(
+    arrays: dict[str, np.ndarray],
+    pose: np.ndarray,
+    shape: np.ndarray,
+    shift: np.ndarray,
+    offsets: np.ndarray | float = 0.0,
+) -> np.ndarray:
+    """Return vertices [v, 3] by the formulas of GaussianAvatars (methods.md A.1), in float64.
+
+    `pose` [5, 3] holds the axis-angles of root, neck, jaw and eyes; `shape` holds all coefficients. Joints are
+    regressed from the shaped vertices: identity, expression and static offsets [v, 3].
     """
-    shaped = arrays["v_template"] + arrays["shapedirs"].astype(np.float64) @ shape
-    joints = arrays["J_regressor"] @ rest
+    shaped = shaped_as_flame(arrays, shape, offsets)
+    joints = arrays["J_regressor"] @ shaped
     turns = matrix_from_axis_angle(torch.from_numpy(pose)).numpy()
     posed = shaped + arrays["posedirs"].astype(np.float64) @ (turns[1:] - np.eye(3)).ravel()
     chain: list[tuple[np.ndarray, np.ndarray]] = []

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from flame_like import exact_landmarks, flame_like, posed_as_flame, true_regions, write_npz, write_pickle
+from flame_like import (
+    exact_landmarks,
+    flame_like,
+    posed_as_flame,
+    shaped_as_flame,
+    true_regions,
+    write_npz,
+    write_pickle,
+)
 from mien.commands.expression import with_expression
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
@@ -36,24 +44,36 @@ def model(arrays, tmp_path_factory) -> FaceModel:
 # Posing ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("moved", ["nothing", "root", "neck", "jaw", "eyes", "identity", "expression", "all"])
+@pytest.mark.parametrize(
+    "moved", ["nothing", "root", "neck", "jaw", "eyes", "identity", "expression", "offsets", "all"]
+)
 def test_poses_as_flame_does(moved, arrays, model):
-    """Jaw, eyes and correctives move as in FLAME; its root and neck become the head's pose and an inverse neck."""
+    """Jaw, eyes and correctives move as in FLAME; its root and neck become the head's pose and an inverse neck.
+
+    Joints follow identity, expression and offsets.
+    """
     random = np.random.default_rng(1)
     columns = arrays["shapedirs"].shape[2]
     identities = len(model.identity_basis)
     pose, shape = 0.3 * random.normal(size=(5, 3)), random.normal(size=columns)
-    joints = {"root": [0], "neck": [1], "jaw": [2], "eyes": [3, 4], "all": [0, 1, 2, 3, 4]}.get(moved, [])
+    joints = {
+        "root": [0],
+        "neck": [1],
+        "jaw": [2],
+        "eyes": [3, 4],
+        "expression": [0, 1, 2, 3, 4],
+        "offsets": [0, 1, 2, 3, 4],
+        "all": [0, 1, 2, 3, 4],
+    }.get(moved, [])
     pose[[joint for joint in range(5) if joint not in joints]] = 0
     if moved not in ("identity", "all"):
         shape[:identities] = 0
     if moved not in ("expression", "all"):
         shape[identities:] = 0
     shift = np.array([0.1, -0.2, -0.9])
-    # FLAME's joints are those of the person at rest: J(beta) in the paper.
-    of_person = np.where(np.arange(columns) < identities, shape, 0)
-    rest = arrays["v_template"] + arrays["shapedirs"].astype(np.float64) @ of_person
-    root, neck = (arrays["J_regressor"] @ rest)[:2]
+    # Offsets that differ in the front and in the back move the joints.
+    offsets = 0.01 * arrays["v_template"] if moved in ("offsets", "all") else 0.0 * arrays["v_template"]
+    root, neck = (arrays["J_regressor"] @ shaped_as_flame(arrays, shape, offsets))[:2]
     origin = arrays["v_template"][0] - model.template[0].double().numpy()
     turn_root, turn_neck = matrix_from_axis_angle(torch.from_numpy(pose[:2])).numpy()
     rotation = axis_angle_from_matrix(torch.from_numpy(turn_root @ turn_neck)[None])
@@ -63,9 +83,10 @@ def test_poses_as_flame_does(moved, arrays, model):
         joints=torch.from_numpy(np.concatenate([-pose[1:2], pose[2:]]))[None],
         head_rotation=rotation,
         head_translation=torch.from_numpy(turn_root @ (turn_neck @ (origin - neck) + neck - root) + root + shift)[None],
+        vertex_offsets=torch.from_numpy(offsets),
     )
     double = torch.zeros((), dtype=torch.float64)
-    expected = posed_as_flame(arrays, pose, shape, shift, rest)
+    expected = posed_as_flame(arrays, pose, shape, shift, offsets)
     assert np.abs(model.to(double)(face)[0].numpy() - expected).max() < 2e-6
     assert np.abs(model(face.to(torch.zeros(())))[0].numpy() - expected).max() < 5e-6
 

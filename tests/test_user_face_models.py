@@ -17,6 +17,7 @@ from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, available_face_models, load_face_model
 from mien.face.cache import cache_folder
 from mien.runtime import load as load_portable
+from mien.storage import file_digest, write_json
 from mien.synthetic import SyntheticRecipe, synthesize
 from mien.tracking import TrackingSettings, read_tracking, track
 from mien.tracking.settings import PaperSettings
@@ -48,6 +49,21 @@ def added(cache, monkeypatch, tmp_path_factory):
         write_npz(path, flame_like(anny))
     stage.add_face_model_file(path)
     return path, calls
+
+
+def test_one_that_an_earlier_version_added_is_renewed_only_on_demand(added):
+    path, calls = added
+    source = cache_folder() / "face_models/added/my_head.source.json"
+    content = {"path": str(path), "sha256": file_digest(path), "recipe": 1}
+    write_json(source, "mien.face_model_source", 1, content)
+    calls.clear()
+    stage.face_model_of(str(path))
+    assert "my_head" in [info.name for info in available_face_models()]
+    assert calls == []
+    assert main(["face-models", "--add", str(path)]) == 0
+    assert len(calls) == 2
+    assert main(["face-models", "--add", str(path)]) == 0
+    assert len(calls) == 2
 
 
 def test_it_is_added_once_and_then_goes_by_its_name(added):

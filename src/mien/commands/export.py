@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -13,12 +13,16 @@ from mien.workspace import Workspace, open_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Write an avatar for other programs: .mien (all of it, for mien.runtime) or .ply (one expression, for viewers)."""
+    """Write an avatar for other programs: .mien (all of it), .ply (one expression) or GaussianAvatars' own folder."""
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Workspace folder."""
     out: Path
-    """The .mien or .ply file to write. With --series, the .ply files get numbers: NAME_000000.ply."""
+    """The .mien or .ply file to write. With --series, the .ply files get numbers: NAME_000000.ply. With --format
+    gaussian-avatars, a folder."""
+    format: Literal["mien", "ply", "gaussian-avatars"] | None = None
+    """What to write: mien, ply (default: by the ending of --out), or gaussian-avatars: a folder with point_cloud.ply,
+    whose Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's training."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()
@@ -37,8 +41,14 @@ class Command:
         workspace = open_workspace(self.workspace)
         workspace.pick_run(self.run_name)
         kind = self.out.suffix.lower()
+        if self.format == "gaussian-avatars":
+            self._check_folder()
+            return
         if kind not in (".ply", ".mien"):
-            raise UserError(f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply or .mien")
+            told = f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply or .mien"
+            raise UserError(f"{told}, or --format gaussian-avatars for a folder")
+        if self.format is not None and kind != f".{self.format}":
+            raise UserError(f"{self.out}: does not end in .{self.format}, as --format {self.format} asks; rename it")
         if kind == ".mien" and (self.set or self.series):
             raise UserError(f"{self.out}: a .mien file holds every expression; leave --set and --series out")
         if self.every < 1 or (self.every > 1 and self.series is None):
@@ -54,12 +64,40 @@ class Command:
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         avatar = load_avatar(run_dir)
-        if self.out.suffix.lower() == ".mien":
+        if self.format == "gaussian-avatars":
+            self._write_folder(avatar, run_dir)
+        elif self.out.suffix.lower() == ".mien":
             self._write_mien(avatar, run_dir)
         elif self.series is None:
             self._write_one(avatar)
         else:
             self._write_series(avatar, workspace, self.series)
+
+    def _check_folder(self) -> None:
+        from mien.files import check_writable
+
+        if self.out.suffix.lower() in (".ply", ".mien"):
+            raise UserError(f"{self.out}: --format gaussian-avatars writes a folder; give a name without an ending")
+        if self.set or self.series or self.every != 1:
+            raise UserError(
+                f"{self.out}: GaussianAvatars' folder holds every timestep; leave --set, --series and --every out"
+            )
+        check_writable(self.out, folder=True)
+
+    def _write_folder(self, avatar, run_dir: Path) -> None:
+        from mien.export import write_gaussian_avatars_folder
+        from mien.progress import say
+        from mien.training import read_face_track
+
+        face = read_face_track(run_dir, avatar.face_model)
+        face = replace(face, identity=avatar.subject.identity, vertex_offsets=avatar.subject.vertex_offsets)
+        write_gaussian_avatars_folder(self.out, avatar, face)
+        say(f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians, {len(face)} timesteps")
+        if avatar.face_model.flame_origin is None:
+            say(
+                f"note: the folder has the face model {avatar.face_model.name!r} in it; `mien import` reads it, but "
+                "GaussianAvatars' viewer opens only avatars on FLAME with teeth"
+            )
 
     def _write_mien(self, avatar, run_dir: Path) -> None:
         from mien.avatar import make_portable

@@ -45,7 +45,7 @@ class Command:
         if self.add is not None:
             from mien.commands.stages.face_models import add_face_model_file
 
-            add_face_model_file(self.add, self.name, self.shareable)
+            add_face_model_file(self.add, self.name, self.shareable, renew=True)
         if self.bake is not None:
             load_face_model(self.bake)
         rows = [asdict(info) for info in available_face_models()]

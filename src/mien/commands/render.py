@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import torch
 
     import mien.camera
+    import mien.face
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,11 @@ class Command:
     """Magnification. 1 shows what the camera saw in training."""
     sequence: str | None = None
     """Name of a sequence whose motion the avatar plays, one frame per timestep (`mien drive` can do more)."""
+    own_motion: bool = False
+    """Play the motion that the run was trained on or imported with: its sequences one after the other, one frame per
+    timestep."""
+    timestep: int | None = None
+    """Show the face at this timestep of that motion (from 0) instead of the person's neutral."""
     device: DeviceName = "cpu"
     """Device that poses and draws: cpu, cuda (an NVIDIA GPU, through gsplat), or auto (a GPU if there is one)."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
@@ -68,7 +74,9 @@ class Command:
         if self.sequence is not None or (self.path == "captured" and self.cameras is None):
             workspace.pick_sequence(self.sequence)
         self._check_numbers()
-        if self.sequence is None and self.cameras is None and self.path != "captured":
+        if sum((self.sequence is not None, self.own_motion, self.timestep is not None)) > 1:
+            raise UserError("--sequence, --own-motion and --timestep: give only one of them")
+        if self.sequence is None and not self.own_motion and self.cameras is None and self.path != "captured":
             self.picture.plan(self.out, self._frames(None))
 
     def run(self) -> None:
@@ -80,20 +88,26 @@ class Command:
         from mien.face.checks import check_face_params
         from mien.progress import say, track_progress
         from mien.render.camera_paths import aside
-        from mien.training import read_sequence, run_camera
+        from mien.training import read_face_track, read_sequence, run_camera
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
+        avatar = load_avatar(run_dir)
         motion = None
         if self.sequence is not None:
             motion = read_sequence(workspace.sequence_dir(workspace.pick_sequence(self.sequence))).tracking.face
+        elif self.own_motion:
+            motion = read_face_track(run_dir, avatar.face_model)
         timesteps = None if motion is None else len(motion)
         cameras = self._given_cameras(workspace, timesteps)
         output = self.picture.plan(self.out, self._frames(timesteps) if cameras is None else len(cameras))
         warn_of_white(self.picture, run_dir)
-        avatar = load_avatar(run_dir)
         subject = avatar.subject
-        face = replace(motion or subject, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
+        face = replace(
+            motion or self._chosen_timestep(run_dir, avatar.face_model) or subject,
+            identity=subject.identity,
+            vertex_offsets=subject.vertex_offsets,
+        )
         told = "choose a sequence that was tracked with the avatar's face model"
         check_face_params(avatar.face_model, face, f"--sequence {self.sequence}", told)
         face = with_expression(face, avatar.face_model, self.set)
@@ -115,6 +129,17 @@ class Command:
         write_pictures(output, shown, self.fps)
         count, first = len(avatar.gaussian_store()), cameras[0]
         say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
+
+    def _chosen_timestep(self, run_dir: Path, face_model: "mien.face.FaceModel") -> "mien.face.FaceParams | None":
+        """The face at --timestep, or None without that option."""
+        from mien.training import read_face_track
+
+        if self.timestep is None:
+            return None
+        face = read_face_track(run_dir, face_model)
+        if not 0 <= self.timestep < len(face):
+            raise UserError(f"--timestep {self.timestep}: {run_dir} has the timesteps 0 to {len(face) - 1}; give one")
+        return face[self.timestep]
 
     def _check_numbers(self) -> None:
         if self.frames < 1:

@@ -13,9 +13,8 @@ from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, FaceSource
 from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
-from mien.storage import expect_whole, read_tensors
 from mien.tracking import read_scoring, read_scoring_hash
-from mien.training import Sequence, TrainSettings, check_data, read_run_config
+from mien.training import Sequence, TrainSettings, check_data, read_face_track, read_run_config
 from mien.training.frames import Frame, held_out, training_frames
 from mien.training.sequence import sequence_of
 
@@ -103,11 +102,7 @@ def held_out_by_protocol(
 
 def _faces_of_run(run_dir: Path, sequences: Items[Sequence], face_model: FaceModel) -> tuple[FaceParams, ...]:
     """The face parameters at the end of training, one entry per sequence."""
-    path = run_dir / "face_track.safetensors"
-    tensors = read_tensors(path, "`mien train`")
-    with expect_whole(path, "train it again"):
-        tuned = FaceParams(**tensors)
-    check_face_params(face_model, tuned, str(path), "train it again")
+    tuned = read_face_track(run_dir, face_model)
     lengths = [sequence.capture.timesteps for sequence in sequences]
     if len(tuned) != sum(lengths):
         raise UserError(f"{run_dir}: has face parameters of {len(tuned)} timesteps, not {sum(lengths)}; train it again")

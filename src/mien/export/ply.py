@@ -20,6 +20,14 @@ _REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
 _MAX_COUNT_DIGITS = 12
 _MAX_GAUSSIANS = 2_000_000
 """Largest number of Gaussians that is read: a head has tens of thousands, and memory grows with it."""
+_TYPES = {
+    "char": "<i1", "int8": "<i1", "uchar": "<u1", "uint8": "<u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
+    "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+"""numpy's type by the name of a type in the header."""
+BINDING = "binding_0"
+"""Property of GaussianAvatars' files: the index of the triangle in whose frame a Gaussian is given."""
 _LOCAL_COMMENT = "mien frame: local"
 _WORLD_COMMENT = "mien frame: world"
 
@@ -67,13 +75,32 @@ def read_ply(path: Path) -> Gaussians:
     """Read a 3D Gaussian .ply of mien or of another program. Unknown properties are skipped.
 
     Raises:
-        UserError: the file is missing, truncated, not a ply, ASCII or big-endian, or holds NaN or no 3D Gaussians.
+        UserError: the file is missing, truncated, not a ply, ASCII or big-endian, or holds NaN or no 3D Gaussians; or
+            its Gaussians are given in the frames of triangles (`BINDING`), so that they have no place without a mesh.
+    """
+    columns, lines = read_columns(path)
+    if BINDING in columns:
+        raise UserError(
+            f"{path}: its Gaussians are in the frames of triangles ({BINDING}), as GaussianAvatars writes them, and "
+            "have no place without their mesh; import the folder that also has flame_param.npz: `mien import FOLDER "
+            "--out DIR`"
+        )
+    return _activated(columns, _pose_of(path, lines), path)
+
+
+def read_columns(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The columns of a 3D Gaussian .ply by name, and the lines of its header.
+
+    All columns are float32, except `BINDING`, which keeps its type.
+
+    Raises:
+        UserError: the file is missing, truncated, not a ply, ASCII or big-endian, or holds no 3D Gaussians.
     """
     try:
         with open_ordinary(path) as file:
             lines = _read_header(path, file)
-            count, names = _parse_header(path, lines)
-            expected, left = count * len(names) * 4, os.fstat(file.fileno()).st_size - file.tell()
+            count, row = _parse_header(path, lines)
+            expected, left = count * row.itemsize, os.fstat(file.fileno()).st_size - file.tell()
             if left < expected:
                 raise UserError(
                     f"{path}: is truncated: it has {left} of {expected} bytes of vertices; copy or export it again"
@@ -84,8 +111,40 @@ def read_ply(path: Path) -> Gaussians:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{path}: cannot be read ({reason}); give the path of a 3D Gaussian .ply") from None
-    values = np.frombuffer(body, dtype="<f4", count=count * len(names)).reshape(count, len(names))
-    return _activated({name: values[:, i] for i, name in enumerate(names)}, _pose_of(path, lines), path)
+    rows = np.frombuffer(body, dtype=row, count=count)
+    return {name: rows[name] for name in row.names or ()}, lines
+
+
+def stacked(columns: dict[str, np.ndarray], names: list[str], path: Path) -> Tensor:
+    """Some columns side by side, [n, len(names)] float32.
+
+    Raises:
+        UserError: one is missing. The message names the file, `path`.
+    """
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise UserError(f"{path}: lacks {missing[0]}; give a .ply with 3D Gaussians")
+    return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(np.float32))
+
+
+def stacked_sh(columns: dict[str, np.ndarray], path: Path) -> Tensor:
+    """The spherical harmonics, [n, k, 3].
+
+    Raises:
+        UserError: a coefficient is missing, or they are of no degree from 0 to 3.
+    """
+    rest = sum(name.startswith("f_rest_") for name in columns)
+    if rest not in _REST_COEFFICIENTS:
+        raise UserError(
+            f"{path}: has {rest} f_rest_* properties, not 0, 9, 24 or 45 (SH degree 0 to 3); give another .ply"
+        )
+    coefficients = _REST_COEFFICIENTS[rest]
+    dc = stacked(columns, [f"f_dc_{i}" for i in range(3)], path)[:, None]
+    higher = dc.new_zeros(len(dc), 0, 3)
+    if rest:
+        channels = stacked(columns, [f"f_rest_{i}" for i in range(rest)], path).reshape(-1, 3, coefficients - 1)
+        higher = channels.transpose(1, 2)
+    return torch.cat([dc, higher], dim=1).contiguous()
 
 
 def _read_header(path: Path, file: IO[bytes]) -> list[str]:
@@ -118,8 +177,8 @@ def _raw_rows(gaussians: Gaussians) -> Float32[np.ndarray, "n p"]:
     return torch.cat([column.cpu().float() for column in columns], dim=1).numpy().astype("<f4", order="C", copy=False)
 
 
-def _parse_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
-    """The number of vertices and the names of their properties. All properties must be float32."""
+def _parse_header(path: Path, lines: list[str]) -> tuple[int, np.dtype]:
+    """The number of vertices and the layout of one. All properties but `BINDING` must be float32."""
     if "format binary_little_endian 1.0" not in lines:
         found = next((line for line in lines if line.startswith("format")), "no format line")
         raise UserError(f"{path}: {found!r} is not supported; save it as binary_little_endian 1.0")
@@ -133,15 +192,25 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
             break
         if line.startswith("property"):
             properties.append(line.split())
-    others = [" ".join(entry) for entry in properties if len(entry) != 3 or entry[1] not in ("float", "float32")]
+    others = [" ".join(entry) for entry in properties if not _is_known_type(entry)]
     names = [entry[-1] for entry in properties]
     missing = [name for name in ("x", "f_dc_0", "opacity", "scale_0", "rot_0") if name not in names]
     if missing or others:
         reason = f"lacks {', '.join(missing)}" if missing else f"has {others[0]!r}, not float"
         raise UserError(f"{path}: {reason}; give a .ply with 3D Gaussians in full precision")
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UserError(f"{path}: has the property {twice!r:.60} twice; give a .ply with 3D Gaussians")
     if len(elements[0][2]) > _MAX_COUNT_DIGITS:
         raise UserError(f"{path}: has too many vertices ({elements[0][2][:_MAX_COUNT_DIGITS]}...); export it again")
-    return int(elements[0][2]), names
+    return int(elements[0][2]), np.dtype([(entry[2], _TYPES[entry[1]]) for entry in properties])
+
+
+def _is_known_type(entry: list[str]) -> bool:
+    """Whether a property line, split into words, is of a type that its name may have."""
+    if len(entry) != 3:
+        return False
+    return entry[1] in (_TYPES if entry[2] == BINDING else ("float", "float32"))
 
 
 def _pose_of(path: Path, lines: list[str]) -> Tensor | None:
@@ -160,30 +229,12 @@ def _pose_of(path: Path, lines: list[str]) -> Tensor | None:
 
 def _activated(columns: dict[str, np.ndarray], pose: Tensor | None, path: Path) -> Gaussians:
     """Gaussians from raw columns by name."""
-    rest = sum(name.startswith("f_rest_") for name in columns)
-    if rest not in _REST_COEFFICIENTS:
-        raise UserError(
-            f"{path}: has {rest} f_rest_* properties, not 0, 9, 24 or 45 (SH degree 0 to 3); give another .ply"
-        )
-
-    def stack(names: list[str]) -> Tensor:
-        missing = [name for name in names if name not in columns]
-        if missing:
-            raise UserError(f"{path}: lacks {missing[0]}; give a .ply with 3D Gaussians")
-        return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(np.float32))
-
-    coefficients = _REST_COEFFICIENTS[rest]
-    dc = stack([f"f_dc_{i}" for i in range(3)])[:, None]
-    higher = dc.new_zeros(len(dc), 0, 3)
-    if rest:
-        channels = stack([f"f_rest_{i}" for i in range(rest)]).reshape(-1, 3, coefficients - 1)
-        higher = channels.transpose(1, 2)
     gaussians = Gaussians(
-        means=stack(["x", "y", "z"]),
-        quats=stack([f"rot_{i}" for i in range(4)]),
-        scales=stack([f"scale_{i}" for i in range(3)]).exp(),
-        opacities=torch.sigmoid(stack(["opacity"])[:, 0]),
-        sh=torch.cat([dc, higher], dim=1).contiguous(),
+        means=stacked(columns, ["x", "y", "z"], path),
+        quats=stacked(columns, [f"rot_{i}" for i in range(4)], path),
+        scales=stacked(columns, [f"scale_{i}" for i in range(3)], path).exp(),
+        opacities=torch.sigmoid(stacked(columns, ["opacity"], path)[:, 0]),
+        sh=stacked_sh(columns, path),
         T_world_local=pose,
     )
     columns_read = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh.flatten(1))

@@ -27,11 +27,13 @@ LANDMARK_FORMAT, LANDMARK_VERSION = "mien.landmark_embedding", 1
 _TENSORS = (
     "template", "faces", "uv", "uv_faces", "face_regions", "identity_basis", "expression_basis", "expression_bounds",
     "joint_template", "joint_identity_basis", "joint_rotation_basis", "joint_translation_basis", "skinning_weights",
-    "pose_basis", "expression_sigmas",
+    "pose_basis", "expression_sigmas", "joint_regressor", "flame_origin",
 )  # fmt: skip
 _SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
-ADDED_RECIPE = 1
+ADDED_RECIPE = 2
 """Recipe version, raised whenever adding a user's file gives a different result."""
+_READABLE_RECIPES = (1, 2)
+"""Recipes whose results can still be used. Joints of the first do not follow expressions and offsets."""
 _PLACE_AGAIN = "delete it and add the face model again (`mien face-models --add FILE`)"
 """Remedy for landmarks that cannot be read."""
 _LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
@@ -118,12 +120,12 @@ def add_face_model(model: FaceModel, source: Path, source_sha256: str) -> None:
 
 
 def read_added_source(name: str) -> dict[str, Any] | None:
-    """Return what the user added a model from (`path`, `sha256`), or None if it was not added by the current recipe."""
+    """Return what the user added a model from (`path`, `sha256`, `recipe`), or None if its recipe cannot be used."""
     try:
         content = read_json(_source_file(_added_file(name)), _SOURCE_FORMAT, 1)
     except UserError:
         return None
-    return content if content.get("recipe") == ADDED_RECIPE and {"path", "sha256"} <= content.keys() else None
+    return content if content.get("recipe") in _READABLE_RECIPES and {"path", "sha256"} <= content.keys() else None
 
 
 def write_face_model(stem: Path, model: FaceModel) -> None:

@@ -12,9 +12,11 @@ if TYPE_CHECKING:
         check_untouched,
         outdated_sequences,
         read_curves,
+        read_face_track,
         read_run_config,
         read_training_summary,
         run_camera,
+        write_imported_run,
     )
     from mien.training.sequence import Sequence, read_sequence
     from mien.training.settings import MAIN_SETTINGS, PRESETS, Preset, Split, TrainSettings, check_held_out
@@ -30,9 +32,11 @@ else:
                 "check_untouched",
                 "outdated_sequences",
                 "read_curves",
+                "read_face_track",
                 "read_run_config",
                 "read_training_summary",
                 "run_camera",
+                "write_imported_run",
             ],
             "sequence": ["Sequence", "read_sequence"],
             "settings": ["MAIN_SETTINGS", "PRESETS", "Preset", "Split", "TrainSettings", "check_held_out"],
@@ -54,9 +58,11 @@ __all__ = [
     "held_out",
     "outdated_sequences",
     "read_curves",
+    "read_face_track",
     "read_run_config",
     "read_sequence",
     "read_training_summary",
     "run_camera",
     "train",
+    "write_imported_run",
 ]

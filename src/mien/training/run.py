@@ -13,10 +13,12 @@ import numpy as np
 import torch
 
 import mien
-from mien.avatar import MethodConfig, method_of, write_avatar
+from mien.avatar import Avatar, MethodConfig, method_of, write_avatar
 from mien.camera import Camera
 from mien.config import encode
 from mien.errors import UserError
+from mien.face import FaceModel, FaceParams
+from mien.face.checks import check_face_params
 from mien.inside import check_tree, is_plain_name
 from mien.limits import camera_fault
 from mien.locks import WAIT, check_free
@@ -32,6 +34,9 @@ _REMEDY = "put a copy back, or train again under another name (--run NAME); the 
 _AGAIN = "delete the run's training.json and run the same `mien train` again, which continues from the last checkpoint"
 BUSY_REMEDY = f"{WAIT}, or give this run another name (--run NAME)"
 """Remedy if another process is training the run."""
+_TRACK = "face_track.safetensors"
+_IMPORTED = "imported"
+"""Name, in config.json, of the frames that another program trained on."""
 _SUMMARY_FIELDS = ("steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb")
 _MAX_SUMMARY = 1 << 62
 """Bound of the numbers in training.json that are read."""
@@ -137,6 +142,42 @@ def run_camera(run_dir: Path) -> Camera:
         return Camera(K, viewmat, stored["width"], stored["height"])
 
 
+def read_face_track(run_dir: Path, face_model: FaceModel) -> FaceParams:
+    """The face parameters at the end of training: all timesteps of all sequences, one sequence after the other.
+
+    Raises:
+        UserError: they are missing or damaged, or do not belong to the face model.
+    """
+    path = run_dir / _TRACK
+    tensors = read_tensors(path, "`mien train`")
+    with expect_whole(path, "train it again"):
+        face = FaceParams(**tensors)
+    check_face_params(face_model, face, str(path), "train it again")
+    return face
+
+
+def write_imported_run(run_dir: Path, avatar: Avatar, face: FaceParams, camera: Camera, source: Path) -> None:
+    """Write a run around an avatar that another program trained. It can be rendered, driven and exported.
+
+    Args:
+        run_dir: The run's folder, which is empty or missing.
+        avatar: The avatar.
+        face: The subject at the timesteps that came with it.
+        camera: A good view of the avatar.
+        source: The place that it was imported from, for people.
+    """
+    content = {
+        **_choices(avatar.config, TrainSettings(steps=0)),
+        "data": [{"sequence": _IMPORTED, "timesteps": len(face), "camera": _camera_entry(camera)}],
+        "imported_from": str(source.absolute()),
+        "mien": mien.__version__,
+        "command_line": sys.argv,
+    }
+    write_avatar(run_dir / "avatar", avatar)
+    write_tensors(run_dir / _TRACK, face.tensors())
+    write_json(run_dir / "config.json", _FORMAT, _VERSION, content)
+
+
 def is_finished(run_dir: Path) -> bool:
     """Whether the run was trained to its end."""
     return (run_dir / "training.json").is_file()
@@ -155,7 +196,7 @@ def check_untouched(run_dir: Path) -> None:
 def write_results(run_dir: Path, state: TrainingState) -> None:
     """Write everything that is kept after training. training.json is last and marks the run as finished."""
     write_avatar(run_dir / "avatar", state.avatar)
-    write_tensors(run_dir / "face_track.safetensors", state.track.params().tensors())
+    write_tensors(run_dir / _TRACK, state.track.params().tensors())
     curves = {name: torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     write_tensors(run_dir / "curves.safetensors", curves)
     summary = {
@@ -218,12 +259,16 @@ def _fingerprint(sequence: Sequence) -> dict[str, Any]:
         "camera_ids": list(sequence.capture.camera_ids),
         "source": encode(sequence.capture.source),
         "tracking": _tracking_digest(sequence.tracking),
-        "camera": {
-            "K": first.K.tolist(),
-            "viewmat": first.viewmat.tolist(),
-            "width": first.width,
-            "height": first.height,
-        },
+        "camera": _camera_entry(first),
+    }
+
+
+def _camera_entry(camera: Camera) -> dict[str, Any]:
+    return {
+        "K": camera.K.tolist(),
+        "viewmat": camera.viewmat.tolist(),
+        "width": camera.width,
+        "height": camera.height,
     }
 
 

@@ -1,0 +1,274 @@
+"""GaussianAvatars' folders: what is written is read back and draws the same, and damage is named in one line."""
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from flame_like import posed_as_flame
+from fuzzing.material import tiny_flame
+from mien.avatar import METHODS, Avatar
+from mien.camera import camera_from_fov
+from mien.errors import UserError
+from mien.export import read_gaussian_avatars_folder, read_ply, write_gaussian_avatars_folder
+from mien.export.flame_params import read_flame_params, write_flame_params
+from mien.face import FaceModel, FaceParams
+from mien.face.flame import flame_face_model, read_flame
+from mien.render import rasterize
+from toy_scene import toy_camera, toy_face, toy_face_model
+
+SIZE = 64
+EQUAL = 1e-4
+
+
+def new_avatar(face_model: FaceModel, face: FaceParams, **config: object) -> Avatar:
+    """Return an avatar of GaussianAvatars with several Gaussians on some triangles, whose values are all random."""
+    method = METHODS["gaussian_avatars"]
+    avatar = method.avatar(replace(method.config(), **config), face_model, face)  # type: ignore[arg-type]
+    avatar.gaussian_store().append(torch.arange(0, len(face_model.faces), 3))
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in avatar.parameters():
+            parameter.add_(0.2 * torch.randn(parameter.shape, generator=generator))
+        avatar.gaussian_store()["opacity_logits"].add_(3)
+    return avatar
+
+
+@torch.no_grad()
+def drawn(avatar: Avatar, face: FaceParams, camera) -> torch.Tensor:
+    gaussians = avatar.pose(face).gaussians
+    pictures = [rasterize(gaussians.timestep(t), camera, torch.ones(3)).image for t in range(len(face))]
+    return torch.stack(pictures)
+
+
+@pytest.fixture
+def flame(tmp_path: Path) -> FaceModel:
+    """Return a small face model in FLAME's schema, with a licence that does not allow copies."""
+    path = tmp_path / "flame.npz"
+    np.savez(path, **tiny_flame())  # pyright: ignore[reportArgumentType]
+    return flame_face_model(read_flame(path), "tiny")
+
+
+def flame_face(model: FaceModel, timesteps: int = 4) -> FaceParams:
+    random = torch.Generator().manual_seed(2)
+
+    def some(*shape: int, size: float) -> torch.Tensor:
+        return size * torch.randn(*shape, generator=random)
+
+    return FaceParams(
+        some(len(model.identity_basis), size=1.0),
+        some(timesteps, len(model.expression_basis), size=1.0),
+        some(timesteps, 4, 3, size=0.15),
+        some(timesteps, 3, size=0.2),
+        some(timesteps, 3, size=0.02) + torch.tensor([0.0, 0.0, -0.6]),
+        some(len(model.template), 3, size=1e-3),
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return the folder of an avatar on the toy face model."""
+    model, face = toy_face_model(), toy_face(5)
+    write_gaussian_avatars_folder(tmp_path / "written", new_avatar(model, face), face)
+    return tmp_path / "written"
+
+
+@pytest.mark.parametrize("config", [{}, {"sh_degree": 1}, {"sh_degree": 3}, {"sh_degree": 2, "sh_frame": "head"}])
+def test_a_written_folder_draws_the_same(config: dict, tmp_path: Path) -> None:
+    """Every frame looks as before; the face model is in the folder."""
+    model, face = toy_face_model(), replace(toy_face(5), vertex_offsets=None)
+    avatar = new_avatar(model, face, **config)
+    write_gaussian_avatars_folder(tmp_path / "a", avatar, face)
+    read = read_gaussian_avatars_folder(tmp_path / "a")
+    assert len(read.avatar.gaussian_store()) == len(avatar.gaussian_store()) > len(model.faces)
+    assert read.avatar.face_model.content_hash == model.content_hash
+    pictures = drawn(avatar, face, toy_camera(SIZE))
+    assert float((pictures[0] - pictures[2]).abs().max()) > 0.05
+    assert float((drawn(read.avatar, read.face, toy_camera(SIZE)) - pictures).abs().max()) < EQUAL
+
+
+def test_a_folder_on_flame_draws_the_same(flame: FaceModel, tmp_path: Path) -> None:
+    """Parameters become FLAME's and come back; FLAME itself is not in the folder and has to be given."""
+    flame = replace(flame, shareable=False)
+    face = flame_face(flame)
+    avatar = new_avatar(flame, face, sh_degree=1)
+    write_gaussian_avatars_folder(tmp_path / "a", avatar, face)
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["flame_param.npz", "point_cloud.ply"]
+    with pytest.raises(UserError, match="has no face model in it.*--face-model"):
+        read_gaussian_avatars_folder(tmp_path / "a")
+    read = read_gaussian_avatars_folder(tmp_path / "a", flame)
+    camera = camera_from_fov(0.6, SIZE, SIZE, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+    pictures = drawn(avatar, face, camera)
+    assert float(pictures.std()) > 0.05
+    assert float((drawn(read.avatar, read.face, camera) - pictures).abs().max()) < EQUAL
+
+
+def test_parameters_are_those_of_flame(flame: FaceModel, tmp_path: Path) -> None:
+    """The arrays, posed by FLAME's formulas in float64, give the vertices of mien's face model."""
+    face = flame_face(flame)
+    write_flame_params(tmp_path / "flame_param.npz", flame, face)
+    with np.load(tmp_path / "flame_param.npz") as file:
+        stored = dict(file)
+    assert {name: array.shape for name, array in stored.items()} == {
+        "shape": (4,), "expr": (4, 3), "rotation": (4, 3), "translation": (4, 3), "neck_pose": (4, 3),
+        "jaw_pose": (4, 3), "eyes_pose": (4, 6), "static_offset": (1, len(flame.template), 3),
+    }  # fmt: skip
+    for t in range(len(face)):
+        pose = np.concatenate([stored["rotation"][t], stored["neck_pose"][t], stored["jaw_pose"][t]])
+        pose = np.concatenate([pose, stored["eyes_pose"][t]]).reshape(5, 3).astype(np.float64)
+        shape = np.concatenate([stored["shape"], stored["expr"][t]]).astype(np.float64)
+        expected = posed_as_flame(tiny_flame(), pose, shape, stored["translation"][t], stored["static_offset"][0])
+        assert np.abs(flame(face[t])[0].numpy() - expected).max() < 2e-6
+
+
+def test_offsets_without_teeth_are_padded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flame: FaceModel) -> None:
+    v = len(flame.template)
+    monkeypatch.setattr("mien.export.flame_params._TEETH", (v - 20, v))
+    path = tmp_path / "flame_param.npz"
+    write_flame_params(path, flame, flame_face(flame))
+    with np.load(path) as file:
+        stored = dict(file)
+    stored["static_offset"] = stored["static_offset"][:, : v - 20]
+    stored["dynamic_offset"] = np.zeros((4, v, 3), np.float32)
+    np.savez(path, **stored)  # pyright: ignore[reportArgumentType]
+    offsets = read_flame_params(path, flame).vertex_offsets
+    assert offsets is not None
+    assert np.array_equal(offsets[: v - 20].numpy(), stored["static_offset"][0])
+    assert not offsets[v - 20 :].any()
+
+
+# Gaussians without their mesh -------------------------------------------------------------------------------------
+
+
+def test_a_ply_with_local_means_is_refused_without_its_mesh(folder: Path) -> None:
+    with pytest.raises(UserError, match=r"frames of triangles \(binding_0\).*`mien import FOLDER --out DIR`"):
+        read_ply(folder / "point_cloud.ply")
+
+
+def with_binding(folder: Path, kind: str, numpy_kind: str, values) -> None:
+    """Write binding_0 again with another type."""
+    path = folder / "point_cloud.ply"
+    content = path.read_bytes()
+    end = content.index(b"end_header\n") + len(b"end_header\n")
+    header = content[:end].replace(b"property int binding_0", f"property {kind} binding_0".encode())
+    rows = np.frombuffer(content[end:], np.uint8).reshape(-1, (len(content) - end) // _count(header))
+    column = values(rows[:, -4:].copy().view("<i4")[:, 0]).astype(numpy_kind)
+    column = np.frombuffer(column.tobytes(), np.uint8).reshape(len(rows), -1)
+    path.write_bytes(header + np.concatenate([rows[:, :-4], column], axis=1).tobytes())
+
+
+def _count(header: bytes) -> int:
+    return int(header.split(b"element vertex ")[1].split(b"\n")[0])
+
+
+@pytest.mark.parametrize(
+    ("kind", "numpy_kind"),
+    [("int", "<i4"), ("uint", "<u4"), ("int32", "<i4"), ("short", "<i2"), ("float", "<f4"), ("double", "<f8")],
+)
+def test_the_binding_may_be_of_any_type(kind: str, numpy_kind: str, folder: Path) -> None:
+    before = read_gaussian_avatars_folder(folder).avatar.gaussian_store()["face_index"]
+    with_binding(folder, kind, numpy_kind, lambda values: values)
+    assert torch.equal(read_gaussian_avatars_folder(folder).avatar.gaussian_store()["face_index"], before)
+
+
+FIRST = {"nan": np.nan, "inf": np.inf, "half": 2.5, "negative": -1, "too_large": 1e6}
+
+
+@pytest.mark.parametrize("fault", [*FIRST, "negative int", "too large int", "too large uint", "missing"])
+def test_a_damaged_binding_is_named(fault: str, folder: Path) -> None:
+    path = folder / "point_cloud.ply"
+    if fault == "missing":
+        path.write_bytes(path.read_bytes().replace(b"int binding_0", b"float bonding_"))
+    elif fault in FIRST:
+        with_binding(folder, "float", "<f4", lambda values: np.where(np.arange(len(values)) == 3, FIRST[fault], values))
+    else:
+        number, kind = (-1, "int") if "negative" in fault else (2**31 - 1, fault.split()[-1])
+        with_binding(
+            folder, kind, "<i4" if kind == "int" else "<u4", lambda values: np.where(values == 3, number, values)
+        )
+    with pytest.raises(UserError, match=r"point_cloud.ply: (lacks )?binding_0") as error:
+        read_gaussian_avatars_folder(folder)
+    assert "\n" not in str(error.value)
+    assert "; " in str(error.value)
+
+
+# Damaged and hostile folders -------------------------------------------------------------------------------------
+
+
+def change(folder: Path, **arrays: np.ndarray | None) -> None:
+    """Replace arrays of flame_param.npz, or remove them."""
+    path = folder / "flame_param.npz"
+    with np.load(path) as file:
+        stored = dict(file)
+    stored |= {name: array for name, array in arrays.items() if array is not None}
+    stored = {name: array for name, array in stored.items() if not (name in arrays and arrays[name] is None)}
+    np.savez(path, allow_pickle=True, **stored)  # pyright: ignore[reportArgumentType]
+
+
+FAULTS = {
+    "no parameters": (lambda f: (f / "flame_param.npz").unlink(), "flame_param.npz: is missing"),
+    "no points": (lambda f: (f / "point_cloud.ply").unlink(), "has no point_cloud.ply"),
+    "half a model": (lambda f: (f / "face_model.safetensors").unlink(), "face_model.safetensors: is missing"),
+    "no archive": (lambda f: (f / "flame_param.npz").write_bytes(b"PK" * 40), "cannot be read as .npz"),
+    "an array": (lambda f: change(f, expr=None), "has no 'expr'"),
+    "a pickle": (lambda f: change(f, shape=np.array([{}], object)), "not plain numbers"),
+    "nan": (lambda f: change(f, rotation=np.full((5, 3), np.nan, np.float32)), "'rotation' holds NaN"),
+    "huge": (lambda f: change(f, translation=np.full((5, 3), 1e30, np.float32)), "'translation' holds NaN or numbers"),
+    "frames": (lambda f: change(f, jaw_pose=np.zeros((4, 3), np.float32)), r"'jaw_pose' has the shape \[4, 3\]"),
+    "no frames": (lambda f: change(f, expr=np.zeros((0, 2), np.float32)), r"'expr' has the shape \[0, 2\]"),
+    "axes": (lambda f: change(f, shape=np.zeros((1, 2), np.float32)), r"'shape' has the shape \[1, 2\]"),
+    "shape": (lambda f: change(f, shape=np.ones(3, np.float32)), "3 coefficients, but the face model has 2"),
+    "offsets": (lambda f: change(f, static_offset=np.ones((1, 9, 3), np.float32)), "'static_offset' has the shape"),
+    "moving": (lambda f: change(f, dynamic_offset=np.ones((5, 9, 3), np.float32)), "'dynamic_offset' is not zero"),
+    "scales": (lambda f: _spoil(f, "scale_0", 1e5), "cannot be posed"),
+    "means": (lambda f: _spoil(f, "x", np.nan), "means holds NaN"),
+}  # fmt: skip
+
+
+def _spoil(folder: Path, name: str, value: float) -> None:
+    path = folder / "point_cloud.ply"
+    content = bytearray(path.read_bytes())
+    end = content.index(b"end_header\n") + len(b"end_header\n")
+    names = [line.split()[-1].decode() for line in bytes(content[:end]).split(b"\n") if line.startswith(b"property")]
+    content[end + 4 * names.index(name) : end + 4 * names.index(name) + 4] = np.float32(value).tobytes()
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_damaged_folder_is_refused_in_one_line(fault: str, folder: Path) -> None:
+    damage, message = FAULTS[fault]
+    damage(folder)
+    with pytest.raises(UserError, match=message) as error:
+        read_gaussian_avatars_folder(folder)
+    assert "\n" not in str(error.value)
+    assert str(folder) in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["point_cloud.ply", "flame_param.npz", "face_model.json", "face_model.safetensors"])
+def test_links_and_pipes_are_refused(name: str, folder: Path, tmp_path: Path) -> None:
+    shutil.move(folder / name, tmp_path / name)
+    (folder / name).symlink_to(tmp_path / name)
+    with pytest.raises(UserError, match="is a link"):
+        read_gaussian_avatars_folder(folder)
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    with pytest.raises(UserError, match=name):
+        read_gaussian_avatars_folder(folder)
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_refused(folder: Path) -> None:
+    np.savez_compressed(folder / "flame_param.npz", expr=np.zeros((5, 20_000_000), np.float32))
+    with pytest.raises(UserError, match=r"400,000,000 bytes"):
+        read_gaussian_avatars_folder(folder)
+
+
+def test_methods_without_triangles_are_refused(tmp_path: Path) -> None:
+    model, face = toy_face_model(), toy_face(5)
+    avatar = METHODS["headgas"].avatar(METHODS["headgas"].config(), model, face)
+    with pytest.raises(UserError, match="bound to triangles"):
+        write_gaussian_avatars_folder(tmp_path / "a", avatar, face)
+    assert not (tmp_path / "a").exists()
