@@ -17,9 +17,10 @@ def write_chart(path: Path, chart: Chart) -> None:
     figure = Figure(figsize=(7.4, 7.4 * axes.height / axes.width), layout="constrained")
     plot = figure.subplots()
     for one in chart.series:
-        width = 1.0 if one.style == "quiet" else 2.0
-        style = {"linestyle": "none", "marker": "o", "markersize": 3} if one.points else {"linewidth": width}
-        plot.plot(one.x, one.y, label=one.label, color=_COLOURS[one.style], **style)
+        (line,) = plot.plot(one.x, one.y, label=one.label, color=_COLOURS[one.style])
+        line.set_linewidth(1.0 if one.style == "quiet" else 2.0)
+        if one.points:
+            line.set(linestyle="none", marker="o", markersize=3)
     for left, right in axes.shaded:
         plot.axvspan(left, right, color=_COLOURS["main"], alpha=0.1, linewidth=0)
     if axes.from_zero:

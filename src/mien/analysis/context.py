@@ -35,6 +35,8 @@ from mien.training import (
 )
 
 _KEPT, _VERSION = "mien.analysis.kept", 1
+_MAX_NUMBER = 1e12
+"""Bound of the numbers in a kept measurement that are read."""
 _CHECKPOINT_STEPS = 250
 """Steps between checkpoints of short trainings."""
 
@@ -110,13 +112,13 @@ class Context:
         """
         return next(iter(load_experiments(run_dir or self.run_dir, self.sequence_dirs).values()), None)
 
-    def kept(self, name: str, key: Any, measure: Callable[[], Any]) -> Any:
+    def kept(self, name: str, key: Any, measure: Callable[[], dict[str, float]]) -> dict[str, float]:
         """What `measure` returned when it last ran with this key, or else what it returns now.
 
         Args:
             name: Name of the measurement; a file of that name keeps it.
             key: Everything that the result depends on, as json can hold it.
-            measure: Returns json.
+            measure: Returns numbers by name.
         """
         path, digest = self.folder / "kept" / f"{name}.json", digest_of(key)
         if path.is_file():
@@ -124,9 +126,9 @@ class Context:
                 content = read_json(path, _KEPT, _VERSION)
             except UserError:
                 content = {}
-            if content.get("key") == digest and "result" in content:
+            if content.get("key") == digest and _are_numbers(content.get("result")):
                 return content["result"]
-        result = json.loads(json.dumps(measure()))
+        result = measure()
         write_json(path, _KEPT, _VERSION, {"key": digest, "result": result})
         return result
 
@@ -166,6 +168,12 @@ def digest_of(key: Any) -> str:
     """A hash of json, of this version of mien and of the instruction set, as hex digits."""
     text = json.dumps([key, mien.__version__, _native.rasterize_isa()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _are_numbers(result: Any) -> bool:
+    """Whether it holds only numbers that a measurement can give."""
+    values = result.values() if isinstance(result, dict) else [None]
+    return all(isinstance(value, int | float) and 0 <= value < _MAX_NUMBER for value in values)
 
 
 def mean_psnr(experiment: Experiment, frames: Sequence[Any]) -> float:

@@ -3,7 +3,6 @@
 import resource
 import time
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -16,7 +15,7 @@ from mien.threads import one_torch_thread
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-def measure_drawing(avatar: Avatar, camera: Camera, seconds: float) -> dict[str, Any]:
+def measure_drawing(avatar: Avatar, camera: Camera, seconds: float) -> dict[str, float]:
     """Draw the avatar at rest over white, at all threads, for about `seconds`, and return the figures of one row.
 
     The first picture warms up and does not count, unless it alone takes longer than `seconds`.
@@ -62,11 +61,14 @@ def measure_drawing(avatar: Avatar, camera: Camera, seconds: float) -> dict[str,
     }
 
 
-def measure_side_by_side(avatars: list[Avatar], camera: Camera, seconds: float) -> list[float]:
-    """The median times to draw several avatars in turn, in milliseconds, so that other work slows all of them alike."""
+def measure_in_turn(avatars: dict[str, Avatar], camera: Camera, seconds: float) -> dict[str, float]:
+    """The median time to draw each of some avatars, in milliseconds.
+
+    They are drawn in turn, so that other work on the machine slows all of them alike.
+    """
     white = torch.ones(3)
     with torch.no_grad(), one_torch_thread():
-        posed = [avatar.pose(avatar.subject).gaussians.timestep(0) for avatar in avatars]
+        posed = [avatar.pose(avatar.subject).gaussians.timestep(0) for avatar in avatars.values()]
         times: list[list[float]] = [[] for _ in avatars]
         end = time.perf_counter() + seconds * len(avatars)
         while len(times[0]) < 2 or time.perf_counter() < end:
@@ -74,7 +76,7 @@ def measure_side_by_side(avatars: list[Avatar], camera: Camera, seconds: float) 
                 start = time.perf_counter()
                 rasterize(gaussians, camera, white)
                 own.append(1e3 * (time.perf_counter() - start))
-    return [_median(own[1:]) for own in times]
+    return {name: _median(own[1:]) for name, own in zip(avatars, times, strict=True)}
 
 
 def _median(values: list[float]) -> float:

@@ -26,7 +26,7 @@ def write_page(path: Path, analysis: Analysis, content: Mapping[str, Any]) -> No
     body = [_heading(content)]
     for part in analysis.parts:
         if part.name in content["parts"]:
-            body.append(_section(part.summary, content["parts"][part.name], path.parent))
+            body.append(section_html(part.summary, content["parts"][part.name], path.parent))
     title = f"{content['run']} · {analysis.method}"
     text = page_html(f"analysis of {title}", "\n".join([f"<h1>{escape(title)}</h1>", *body]))
     write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
@@ -40,7 +40,8 @@ def _heading(content: Mapping[str, Any]) -> str:
     )
 
 
-def _section(title: str, part: Mapping[str, Any], folder: Path) -> str:
+def section_html(title: str, part: Mapping[str, Any], folder: Path) -> str:
+    """The section of a part, from its content in analysis.json and the pictures and films in `folder`."""
     parts = [f"<h2>{escape(title)}</h2>"]
     parts += [f"<p>{escape(text)}</p>" for text in part["findings"]]
     parts += [_table(table) for table in part["tables"]]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.evaluation.plots import Axes, Series
+from mien.evaluation.plots import Axes, Series, thin
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,10 @@ def chart_from(content: Mapping[str, Any]) -> Chart:
 
 
 def _chart_content(chart: Chart) -> dict[str, Any]:
-    series = [{**asdict(one), "x": _numbers(one.x), "y": _numbers(one.y)} for one in chart.series]
+    series = []
+    for one in chart.series:
+        x, y = (one.x, one.y) if one.points else thin(one.x, one.y)
+        series.append({**asdict(one), "x": _numbers(x), "y": _numbers(y)})
     named = {"file": f"{chart.name}.png", "title": chart.title, "caption": chart.caption}
     return {**named, "axes": asdict(chart.axes), "series": series}
 

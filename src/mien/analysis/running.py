@@ -9,7 +9,7 @@ import mien
 from mien import _native
 from mien.analysis.charts import write_chart
 from mien.analysis.context import Context, digest_of
-from mien.analysis.page import write_page
+from mien.analysis.page import section_html, write_page
 from mien.analysis.result import PartResult, file_names
 from mien.analysis.spec import Analysis, AnalysisOptions, Part
 from mien.errors import UserError
@@ -23,7 +23,6 @@ from mien.training import read_run_config, read_training_summary
 FORMAT, VERSION = "mien.analysis", 1
 PAGE, RECORD = "analysis.html", "analysis.json"
 _REMEDY = "delete it and run the same `mien analyze` again"
-_LISTS = ("findings", "tables", "charts", "pictures", "films", "notes")
 
 
 def run_analysis(
@@ -103,7 +102,7 @@ def _key(part: Part, avatar: str, options: AnalysisOptions) -> str:
 
 
 def _known(folder: Path, analysis: Analysis, avatar: str) -> dict[str, Any] | None:
-    """The content of the analysis.json that is there, with the parts that are whole; None if it is of another avatar."""
+    """The content of an analysis.json of this avatar, with the parts that are whole; None if there is none."""
     path = folder / RECORD
     if not path.is_file():
         return None
@@ -111,14 +110,19 @@ def _known(folder: Path, analysis: Analysis, avatar: str) -> dict[str, Any] | No
     with expect_whole(path, _REMEDY):
         if (content["method"], content["avatar"]) != (analysis.method, avatar):
             return None
-        content["parts"] = {name: part for name, part in content["parts"].items() if _is_whole(folder, part)}
+        content["parts"] = {
+            part.name: content["parts"][part.name]
+            for part in analysis.parts
+            if part.name in content["parts"] and _is_whole(folder, part, content["parts"][part.name])
+        }
         return {name: value for name, value in content.items() if name not in ("format", "version")}
 
 
-def _is_whole(folder: Path, part: Mapping[str, Any]) -> bool:
-    """Whether a part has everything that the page shows, and its files are there."""
-    lists = all(isinstance(part[name], list) for name in _LISTS)
-    return lists and all(inside(folder, name).is_file() for name in file_names(part))
+def _is_whole(folder: Path, part: Part, content: Mapping[str, Any]) -> bool:
+    """Whether the files of a part are there. Its section is made once, so that damaged content is found here."""
+    if not all(inside(folder, name).is_file() for name in file_names(content)):
+        return False
+    return bool(section_html(part.summary, content, folder))
 
 
 def _write_files(folder: Path, result: PartResult) -> None:

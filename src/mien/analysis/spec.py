@@ -1,4 +1,4 @@
-"""What an analysis is: a method and the parts that can be chosen. Needs no torch, because the command line checks it."""
+"""What an analysis is: a method, and parts that can be chosen. Needs no torch, because the command line checks it."""
 
 import importlib
 from collections.abc import Sequence

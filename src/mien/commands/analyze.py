@@ -47,10 +47,12 @@ class Command:
         """Check options and paths without heavy libraries."""
         from mien.analysis import ANALYSES, AnalysisOptions, chosen_parts
         from mien.files import check_writable
+        from mien.inside import check_subtrees
 
         AnalysisOptions(self.steps, self.seconds).check()
         chosen_parts(ANALYSES[self.method], self.parts, self.train)
         workspace = open_workspace(self.workspace)
+        check_subtrees(workspace.root, "analysis")
         check_writable(self._folder(workspace, workspace.pick_run(self.run_name)), folder=True)
 
     def run(self) -> None:

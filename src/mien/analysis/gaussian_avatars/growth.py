@@ -4,6 +4,8 @@ import numpy as np
 
 from mien.analysis.context import Context
 from mien.analysis.result import Chart, PartResult, Table
+from mien.avatar import GaussianAvatarsConfig
+from mien.errors import UserError
 from mien.evaluation.plots import Axes, Series
 
 _PAPER_START, _PAPER_END = 10_144, 100_000
@@ -12,6 +14,8 @@ _PAPER_SLOWER = 2.0
 """The supplement, section C: the time of a step at most doubles."""
 _NEAR = 0.05
 """Share by which a number of Gaussians may differ from the first or the largest one to count as that one."""
+_NOISY = 1.3
+"""Ratio of the third and the first quartile of step times above which they are reported as uncertain."""
 _WINDOWS = 60
 """Number of windows of a curve, each of which becomes its median."""
 _BINS = 12
@@ -20,10 +24,12 @@ _BINS = 12
 
 def growth(context: Context) -> PartResult:
     """How the number of Gaussians and the time of a step grow over the run, from its curves."""
-    steps, gaussians, times = (context.curves[name] for name in ("step", "gaussians", "step_ms"))
+    config = context.avatar.config
+    assert isinstance(config, GaussianAvatarsConfig)
+    steps, gaussians, times = _entries(context)
     start, peak = float(gaussians[0]), float(gaussians.max())
-    few = _median(times[gaussians <= start * (1 + _NEAR)])
-    many = _median(times[gaussians >= peak * (1 - _NEAR)])
+    at_start, at_peak = times[gaussians <= start * (1 + _NEAR)], times[gaussians >= peak * (1 - _NEAR)]
+    few, many = _median(at_start), _median(at_peak)
     grown, slower = peak / max(start, 1), many / max(few, 1e-9)
     memory = context.summary["peak_memory_mb"]
     ratio = f"Step time grows {slower:.1f} times while Gaussians grow {grown:.1f} times"
@@ -46,14 +52,20 @@ def growth(context: Context) -> PartResult:
         ("Step time grows, times", round(slower, 2), "at most 2"),
         ("Memory of training, most, MB", round(memory), "fits 12 GB of a GPU"),
     )
-    limit = getattr(getattr(context.avatar.config, "density", None), "max_gaussians", None)
+    limit = config.density.max_gaussians
     notes = [
         "Step times are medians: over the steps with at most 5 % more Gaussians than at the start, and over those with "
         "at least 95 % of the most. Other work on the machine during training changes them.",
         "The paper's figures are those of section C of its supplement, for 600,000 steps on a GPU.",
         "Memory of training is that of the whole process, libraries and pictures included.",
     ]
-    if limit is not None and peak >= limit * (1 - _NEAR):
+    low, high = np.percentile(at_peak, (25, 75))
+    if high > _NOISY * low:
+        notes.append(
+            f"The middle half of the steps with the most Gaussians takes {low:.1f} to {high:.1f} ms, so other work "
+            "probably ran beside the training, and the growth of the step time is uncertain."
+        )
+    if peak >= limit * (1 - _NEAR):
         notes.append(f"The number of Gaussians ends at this run's limit, --method.density.max-gaussians {limit:,}.")
     return PartResult(
         values,
@@ -67,7 +79,6 @@ def growth(context: Context) -> PartResult:
 def _charts(
     steps: np.ndarray, gaussians: np.ndarray, times: np.ndarray, start: tuple[float, float]
 ) -> tuple[Chart, ...]:
-    most = max(float(gaussians.max()), _PAPER_END)
     ends = np.array([steps[0], steps[-1]])
     paper = [
         Series("paper, at the start", ends, np.full(2, float(_PAPER_START)), "quiet"),
@@ -78,7 +89,6 @@ def _charts(
         "Fig. 3a: number of Gaussians",
         (Series("this run", steps, gaussians), *paper),
         Axes("step", "Gaussians", from_zero=True),
-        f"The axis ends at {most:,.0f}.",
     )
     time = Chart(
         "growth-step-time",
@@ -103,14 +113,26 @@ def _charts(
     return number, time, relative
 
 
+def _entries(context: Context) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Step, number of Gaussians and step time of the entries of the curves in which all are finite.
+
+    Raises:
+        UserError: there is no such entry.
+    """
+    curves = np.stack([context.curves[name] for name in ("step", "gaussians", "step_ms")])
+    finite = curves[:, np.isfinite(curves).all(0)]
+    if not finite.size:
+        raise UserError(f"{context.run_dir}: its curves have no entry that is whole; train it again")
+    return finite[0], finite[1], finite[2]
+
+
 def _median(values: np.ndarray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else 0.0
+    return float(np.median(values))
 
 
 def _without_outliers(values: np.ndarray) -> np.ndarray:
     """The values, cut at the 99th percentile, so that a few late steps do not flatten the rest."""
-    return np.minimum(values, np.nanpercentile(values, 99))
+    return np.minimum(values, np.percentile(values, 99))
 
 
 def _medians(label: str, x: np.ndarray, y: np.ndarray) -> Series:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from mien.analysis.context import Context, Variant, mean_psnr
-from mien.analysis.drawing import measure_side_by_side
+from mien.analysis.drawing import measure_in_turn
 from mien.analysis.result import Chart, PartResult, Table
 from mien.avatar import GaussianAvatarsConfig
 from mien.evaluation.experiment import spread_frames
@@ -33,9 +33,10 @@ def scale(context: Context) -> PartResult:
         context.train("scale-no-threshold", replace(config, scale_threshold=0.0)),
     ]
     key = [[file_digest(one.run_dir / "avatar" / "avatar.safetensors") for one in variants], context.options.seconds]
-    avatars = [one.avatar for one in variants]
+    avatars = {name: one.avatar for name, one in zip(("with", "without"), variants, strict=True)}
     camera = context.camera.fitted(*_SIZE)
-    draw_ms = context.kept("scale-drawing", key, lambda: measure_side_by_side(avatars, camera, context.options.seconds))
+    drawn = context.kept("scale-drawing", key, lambda: measure_in_turn(avatars, camera, context.options.seconds))
+    draw_ms = [drawn["with"], drawn["without"]]
     step_ms = [_late_step_ms(one) for one in variants]
     scores = [_score(context, one) for one in variants]
     sizes = [_scales(one) for one in variants]

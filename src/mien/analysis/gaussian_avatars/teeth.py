@@ -27,7 +27,8 @@ _FRAMES, _SHOWN = 12, 3
 """Number of frames that are compared, and of those that are shown."""
 _SIDE = 360
 """Width and height of a picture, in pixels."""
-_MOUTH = ("teeth", "lips")
+_MOUTH = ("lips", "teeth")
+"""Regions that say where the mouth is. The first one that the face model has counts."""
 _NO_TEETH = "The face model of this run has no triangles of teeth, so there is nothing to compare."
 
 
@@ -182,7 +183,8 @@ def _jaw_expression(model: FaceModel) -> int:
 
 def _mouth_box(model: FaceModel, face: FaceParams, camera: Camera) -> Box:
     """A square box around the mouth in the picture, at least 8 pixels wide."""
-    vertices = model.faces[model.region_mask(*_MOUTH)].unique()
+    mask = next(mask for mask in map(model.region_mask, _MOUTH) if bool(mask.any()))
+    vertices = model.faces[mask].unique()
     pixels, _ = camera.project(model(face)[0, vertices])
     low, high = pixels.amin(0), pixels.amax(0)
     side = max(8.0, 1.3 * float((high - low).max()))
