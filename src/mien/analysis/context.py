@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,8 +15,9 @@ from mien.avatar import Avatar, MethodConfig, load_avatar
 from mien.camera import Camera
 from mien.config import decode, encode
 from mien.errors import UserError
-from mien.evaluation.experiment import Experiment
+from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
+from mien.evaluation.metrics import psnr
 from mien.face import FaceModel
 from mien.files import read_json, write_json
 from mien.progress import say
@@ -112,7 +113,7 @@ class Context:
         """
         return next(iter(load_experiments(run_dir or self.run_dir, self.sequence_dirs).values()), None)
 
-    def kept(self, name: str, key: Any, measure: Callable[[], dict[str, float]]) -> dict[str, float]:
+    def kept(self, name: str, key: Any, measure: Callable[[], Mapping[str, float | int]]) -> dict[str, Any]:
         """What `measure` returned when it last ran with this key, or else what it returns now.
 
         Args:
@@ -128,7 +129,7 @@ class Context:
                 content = {}
             if content.get("key") == digest and _are_numbers(content.get("result")):
                 return content["result"]
-        result = measure()
+        result = dict(measure())
         write_json(path, _KEPT, _VERSION, {"key": digest, "result": result})
         return result
 
@@ -178,9 +179,6 @@ def _are_numbers(result: Any) -> bool:
 
 def mean_psnr(experiment: Experiment, frames: Sequence[Any]) -> float:
     """The mean PSNR of the head crop over some frames, in dB."""
-    from mien.evaluation.experiment import avatar_image, target_image
-    from mien.evaluation.metrics import psnr
-
     values = [
         psnr(avatar_image(experiment, frame), target_image(experiment, frame), experiment.crop(frame))
         for frame in frames

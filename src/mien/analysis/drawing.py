@@ -15,7 +15,7 @@ from mien.threads import one_torch_thread
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-def measure_drawing(avatar: Avatar, camera: Camera, seconds: float) -> dict[str, float]:
+def measure_drawing(avatar: Avatar, camera: Camera, seconds: float) -> dict[str, float | int]:
     """Draw the avatar at rest over white, at all threads, for about `seconds`, and return the figures of one row.
 
     The first picture warms up and does not count, unless it alone takes longer than `seconds`.

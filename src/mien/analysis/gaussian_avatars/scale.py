@@ -25,7 +25,9 @@ def scale(context: Context) -> PartResult:
     """The same short training with the threshold of the scale loss, and with a threshold of 0."""
     config = context.avatar.config
     assert isinstance(config, GaussianAvatarsConfig)
-    threshold = config.scale_threshold or 0.6
+    usual = GaussianAvatarsConfig()
+    threshold = config.scale_threshold or usual.scale_threshold
+    config = replace(config, scale_weight=config.scale_weight or usual.scale_weight)
     context.say_how_long("scale", 2)
     names = (f"threshold {threshold:g}", "no threshold (0)")
     variants = [
