@@ -54,17 +54,23 @@ def scale(context: Context) -> PartResult:
         "step_slower_without": round(slower_step, 3),
         "drawing_slower_without": round(slower_draw, 3),
     }
+    findings = [
+        f"Without the threshold, a step takes {slower_step:.2f} times as long at the end and drawing {slower_draw:.2f} "
+        f"times as long, after {context.options.steps:,} steps. The supplement says, without a figure, that drawing "
+        "would become substantially slower."
+    ]
+    if scores[0] is not None and scores[1] is not None:
+        findings.append(
+            f"The median of the scales is {sizes[1]:.2g} of a triangle without the threshold and {sizes[0]:.2g} with "
+            f"it; PSNR of the head crop is {scores[1]:.2f} dB without and {scores[0]:.2f} dB with it."
+        )
     heading = (
         "", "Gaussians", "Median scale, triangle units", "Step at the end, ms", "Drawing 550x802, ms",
         "PSNR of the head crop, dB",
     )  # fmt: skip
     return PartResult(
         values,
-        (
-            f"Without the threshold, a step takes {slower_step:.2f} times as long at the end and drawing "
-            f"{slower_draw:.2f} times as long, after {context.options.steps:,} steps. The supplement says, without a "
-            "figure, that drawing would become substantially slower.",
-        ),
+        tuple(findings),
         (Table(heading, rows),),
         _charts(names, variants),
         notes=(
