@@ -14,7 +14,7 @@ from mien.cli import COMMANDS
 from mien.commands.options import MethodName
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
-LAZY_ROOMS = ["avatar", "capture", "driving", "export", "tracking", "training"]
+LAZY_ROOMS = ["analysis", "avatar", "capture", "driving", "export", "tracking", "training"]
 SCRIPT = """
 import json, os, sys
 from mien.cli import main
@@ -81,6 +81,11 @@ def test_wrong_values_and_paths_import_nothing_heavy(tmp_path: Path) -> None:
         evaluate w w
         evaluate --images gone --truth gone
         evaluate w --perceptual-frames -1
+        analyze gaussian-avatars gone
+        analyze gaussian-avatars w --run nobody
+        analyze gaussian-avatars w --parts hair
+        analyze gaussian-avatars w --steps 0
+        analyze nerf w
         render gone --out a.png
         render w --out a.gif
         render w --out b.png --size 9999

@@ -1,0 +1,334 @@
+"""`mien analyze`: parts, files and page; nothing is measured twice; bad input is told in one line."""
+
+import json
+import re
+import shlex
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import torch
+
+import toy_scene
+import train_toy
+from capture_helpers import tree_bytes
+from damage import edit_json
+from mien.analysis import (
+    ANALYSES,
+    Analysis,
+    AnalysisOptions,
+    Chart,
+    Film,
+    Part,
+    PartResult,
+    Picture,
+    Table,
+    chosen_parts,
+    run_analysis,
+)
+from mien.analysis.gaussian_avatars import growth, speed
+from mien.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
+from mien.capture.video import write_video
+from mien.cli import main
+from mien.commands.analyze import AnalysisName, Command
+from mien.errors import UserError
+from mien.evaluation.plots import Axes, Series
+from mien.face import FaceModel
+from mien.storage import write_tensors
+from mien.training import read_curves
+from toy_workspace import write_toy_workspace
+
+SIZES = {(16, 24): 187, (24, 32): 95}
+TRAINED = ["--train", "--steps", "3", "--seconds", "0.01"]
+_plain = toy_scene.toy_face_model
+
+
+def toy_with_teeth(rings: int = 9, around: int = 12) -> FaceModel:
+    """Return the toy face model with teeth among the triangles of its lower front, and lips around them."""
+    model = _plain(rings, around)
+    centres = model.template[model.faces].mean(1)
+    ahead = centres[:, 2] > 0.05
+    regions = torch.zeros(len(model.faces), dtype=torch.long)
+    regions[ahead & (centres[:, 1].abs() < 0.05)] = 1
+    regions[ahead & (centres[:, 1].abs() < 0.02)] = 2
+    return replace(model, region_names=("skin", "lips", "teeth"), face_regions=regions)
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a workspace whose run has teeth."""
+    root = tmp_path_factory.mktemp("analysis") / "W"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(toy_scene, "toy_face_model", toy_with_teeth)
+        write_toy_workspace(root)
+    return root
+
+
+@pytest.fixture(autouse=True)
+def _small_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(speed, "TABLE_3", SIZES)
+
+
+@pytest.fixture
+def workspace(toy: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(toy, tmp_path / "W"))
+
+
+def analyze(root: Path, *more: str) -> int:
+    return main(["analyze", "gaussian-avatars", str(root), *more])
+
+
+def record(root: Path) -> dict[str, Any]:
+    return json.loads((root / "analysis/toy/analysis.json").read_text())
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(arguments) == 2
+    (line,) = [text for text in capsys.readouterr().err.splitlines() if text.strip()]
+    return line
+
+
+def test_every_part_end_to_end(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """All parts run, also those that train; every file is there; the runs of the workspace stay as they were."""
+    before = tree_bytes(workspace)
+    assert analyze(workspace, *TRAINED, "--json") == 0
+    shown = capsys.readouterr()
+    content = json.loads(shown.out)
+    assert list(content["parts"]) == [part.name for part in ANALYSES["gaussian-avatars"].parts]
+    assert content["parts"] == record(workspace)["parts"]
+    assert "scale: 2 trainings of 3 steps each, about" in shown.err
+    assert "not measured" not in shown.err
+    folder = workspace / "analysis/toy"
+    page = (folder / "analysis.html").read_text()
+    for part in ANALYSES["gaussian-avatars"].parts:
+        assert part.summary.split(" (")[0] in page
+        kept = content["parts"][part.name]
+        assert kept["findings"] or part.name == "teeth-trained"
+        for entry in (*kept["charts"], *kept["pictures"]):
+            assert (folder / entry["file"]).read_bytes().startswith(b"\x89PNG")
+    assert not re.search(r"<script|<link|(?:src|href)=\"(?!data:)", page), "the page is one file"
+    rows = content["parts"]["speed"]["values"]["rows"]
+    assert [(row["width"], row["height"], row["paper_fps"]) for row in rows] == [(16, 24, 187), (24, 32, 95)]
+    assert all(row["fps"] > 0 and row["peak_mb"] >= row["before_mb"] > 0 for row in rows)
+    trained = content["parts"]["scale"]["values"]["rows"]
+    assert len(trained) == 2
+    assert all(row["gaussians"] > 0 and row["head_psnr"] > 0 for row in trained)
+    teeth = content["parts"]["teeth"]["values"]
+    assert 0 < teeth["teeth_gaussians"] < teeth["gaussians"]
+    after = tree_bytes(workspace)
+    assert {name: after[name] for name in before} == before
+
+
+def test_nothing_is_measured_twice(
+    workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A stopped command keeps its rows; the same command measures nothing; other options measure again."""
+    measured: list[tuple[int, int]] = []
+    real = speed.measure_drawing
+
+    def stop_at_second(avatar: Any, camera: Any, seconds: float) -> Any:
+        measured.append((camera.width, camera.height))
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        return real(avatar, camera, seconds)
+
+    monkeypatch.setattr(speed, "measure_drawing", stop_at_second)
+    asked = ("--parts", "speed", "growth", "--seconds", "0.01")
+    assert analyze(workspace, *asked) == 130
+    assert list(record(workspace)["parts"]) == ["growth"]
+    assert analyze(workspace, *asked) == 0
+    assert measured == [(16, 24), (24, 32), (24, 32)]
+    first = record(workspace)["parts"]
+    capsys.readouterr()
+    assert analyze(workspace, *asked) == 0
+    assert len(measured) == 3
+    assert record(workspace)["parts"] == first
+    assert "speed: measured before" in capsys.readouterr().err
+    assert analyze(workspace, "--parts", "speed", "--seconds", "0.02") == 0
+    assert len(measured) == 5
+    assert list(record(workspace)["parts"]) == ["growth", "speed"], "parts that are not asked for stay"
+    (workspace / "analysis/toy/speed.png").unlink()
+    assert analyze(workspace, "--parts", "speed", "--seconds", "0.02") == 0
+    assert (workspace / "analysis/toy/speed.png").is_file()
+    assert len(measured) == 5
+
+
+def test_a_new_avatar_is_measured_again(workspace: Path) -> None:
+    assert analyze(workspace, "--parts", "growth", "teeth") == 0
+    first = record(workspace)
+    shutil.rmtree(workspace / "runs")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(toy_scene, "toy_face_model", toy_with_teeth)
+        patched.setattr(train_toy, "SETTINGS", replace(train_toy.SETTINGS, seed=7))
+        write_toy_workspace(workspace)
+    assert analyze(workspace, "--parts", "growth") == 0
+    assert list(record(workspace)["parts"]) == ["growth"]
+    assert record(workspace)["avatar"] != first["avatar"]
+
+
+def test_growth_of_known_curves(workspace: Path) -> None:
+    """Steps of 10 ms with 1,000 Gaussians and of 30 ms with 8,000 are a growth of 3 times and 8 times."""
+    path = workspace / "runs/toy/curves.safetensors"
+    curves = read_curves(workspace / "runs/toy")
+    changed = {name: torch.full((40,), 0.5, dtype=torch.float64) for name in curves}
+    changed["step"] = torch.arange(1, 41, dtype=torch.float64)
+    changed["gaussians"] = torch.linspace(1000, 8000, 20, dtype=torch.float64).repeat_interleave(2)
+    changed["step_ms"] = 10 + 20 * (changed["gaussians"] - 1000) / 7000
+    changed["step_ms"][0] = torch.nan
+    write_tensors(path, changed)
+    assert analyze(workspace, "--parts", "growth") == 0
+    part = record(workspace)["parts"]["growth"]
+    assert part["values"]["gaussians_growth"] == pytest.approx(8)
+    assert part["values"]["step_time_growth"] == pytest.approx(3, rel=0.02)
+    assert "Step time grows 3.0 times while Gaussians grow 8.0 times" in part["findings"][0]
+    changed["step_ms"][:] = torch.nan
+    changed["step_ms"][0], changed["gaussians"][0] = 1.0, torch.nan
+    write_tensors(path, changed)
+    shutil.rmtree(workspace / "analysis")
+    assert analyze(workspace, "--parts", "growth") == 2
+
+
+def test_the_jaw_opens_and_teeth_go() -> None:
+    model = toy_with_teeth()
+    face = toy_scene.toy_face(1)
+    opened = open_jaw(face, model)
+    assert float(jaw_opening(opened, model)[0]) == pytest.approx(0.7)
+    assert opened.joints.equal(face.joints)
+    free = replace(model, joint_free=(False, True, True))
+    face = replace(face, joints=torch.zeros(1, 2, 3))
+    assert float(jaw_opening(open_jaw(face, free), free)[0]) == pytest.approx(0.3)
+    jawless = replace(model, joint_names=("head", "neck", "chin"))
+    assert open_jaw(face, jawless) is face
+    less = without_teeth(model)
+    assert len(less.faces) == len(model.faces) - int(model.region_mask("teeth").sum())
+    assert not bool(less.region_mask("teeth").any())
+    assert less.template.equal(model.template)
+    assert less.content_hash != model.content_hash
+
+
+def test_a_run_without_teeth_says_so(tmp_path: Path) -> None:
+    write_toy_workspace(tmp_path / "W")
+    assert analyze(tmp_path / "W", "--parts", "teeth", "teeth-trained") == 0
+    parts = record(tmp_path / "W")["parts"]
+    assert all("no triangles of teeth" in parts[name]["findings"][0] for name in ("teeth", "teeth-trained"))
+
+
+def test_sequences_that_are_gone_cost_only_their_parts(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.rmtree(workspace / "sequences")
+    assert analyze(workspace, "--seconds", "0.01") == 0
+    assert "No frames were compared" in record(workspace)["parts"]["teeth"]["notes"][1]
+    capsys.readouterr()
+    assert "missing" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace), "--parts", "scale").replace(
+        "no such", "missing"
+    )
+
+
+def test_parts_of_another_method_give_charts_pictures_and_films(workspace: Path, tmp_path: Path) -> None:
+    """The frame knows no method: an analysis of tables, charts, pictures and films is written and read again."""
+    analysis = Analysis("gaussian_avatars", "a paper", (Part("all", "All kinds", "test_analysis:part_of_everything"),))
+    folder = tmp_path / "out"
+    arguments = (analysis, analysis.parts, workspace / "runs/toy", (), folder, AnalysisOptions())
+    first = run_analysis(*arguments)
+    page = (folder / "analysis.html").read_text()
+    for words in ("a &lt;b&gt; note", "1,234", "–", "<video", "data:video/mp4", "data:image/png", "<circle"):
+        assert words in page
+    assert {path.name for path in folder.iterdir()} >= {"dots.png", "grey.png", "film.mp4", "analysis.json"}
+    again = run_analysis(*arguments)
+    assert again["parts"] == first["parts"]
+    assert again["parts"]["all"]["charts"][0]["series"][0]["y"] == [1.0, None, 3.0]
+    assert (folder / "analysis.html").read_text() == page
+
+
+def part_of_everything(context: Any) -> PartResult:
+    grey = np.full((16, 16, 3), 128, np.uint8)
+    write_video(context.folder / "film.mp4", [grey] * 3, 25.0)
+    dots = Series("dots", np.arange(3.0), np.array([1.0, np.nan, 3.0]), points=True)
+    return PartResult(
+        {"figure": 1},
+        ("It is found.",),
+        (Table(("name", "value"), (("some", 1234), ("none", None)), "a caption"),),
+        (Chart("dots", "Dots", (dots,), Axes("x", "y", shaded=((0.0, 1.0),))),),
+        (Picture("grey", grey, "grey"),),
+        (Film("film.mp4", "a film"),),
+        ("a <b> note",),
+    )
+
+
+def test_the_command_names_every_analysis_and_part(capsys: pytest.CaptureFixture[str]) -> None:
+    assert get_args(AnalysisName) == tuple(ANALYSES)
+    with pytest.raises(SystemExit):
+        main(["analyze", "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for analysis in ANALYSES.values():
+        assert all(part.name in str(Command.__doc__) and part.name in shown for part in analysis.parts)
+        names = [part.name for part in analysis.parts]
+        assert len(set(names)) == len(names)
+        quick = [part.name for part in chosen_parts(analysis, (), False)]
+        assert quick == [part.name for part in analysis.parts if not part.trainings]
+        assert [part.name for part in chosen_parts(analysis, names[:1], True)] == [
+            part.name for part in analysis.parts if part.trainings or part.name == names[0]
+        ]
+
+
+BAD = [
+    ("analyze gaussian-avatars gone", "gone: no such folder"),
+    ("analyze gaussian-avatars W --run none", "no run 'none'; there are: begun, other, toy"),
+    ("analyze gaussian-avatars W --run begun", "training.json: missing; run `mien train` again"),
+    ("analyze gaussian-avatars W --run other", "other: is a run of headgas, not of gaussian_avatars"),
+    ("analyze gaussian-avatars W --run toy --parts speed hair", "--parts hair: no such part; there are: growth, speed"),
+    ("analyze gaussian-avatars W --run toy --steps 0", "--steps 0: give a number from 1 to 1000000"),
+    ("analyze gaussian-avatars W --run toy --seconds nan", "--seconds nan: give a number from 0.01"),
+    ("analyze gaussian-avatars W --run toy --out /proc/a", "/proc/a: cannot be written"),
+    ("analyze gaussian-avatars W --run toy --out W/runs/toy/config.json", "is a file, but a folder"),
+    ("analyze nerf W", "instead of 'nerf'"),
+]
+
+
+@pytest.mark.parametrize(("line", "words"), BAD, ids=[line for line, _ in BAD])
+def test_bad_input_is_told_in_one_line(
+    line: str, words: str, workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("begun", "other"):
+        (workspace / "runs" / name).mkdir()
+        shutil.copy(workspace / "runs/toy/config.json", workspace / "runs" / name)
+    edit_json(workspace / "runs/other/config.json", lambda content: content["method"].update(kind="headgas"))
+    monkeypatch.chdir(workspace.parent)
+    before = tree_bytes(workspace)
+    assert words in complaint(capsys, *shlex.split(line))
+    assert tree_bytes(workspace) == before
+
+
+def test_a_damaged_record_is_told_in_one_line(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert analyze(workspace, "--parts", "growth") == 0
+    path = workspace / "analysis/toy/analysis.json"
+    whole = path.read_bytes()
+    for change in (
+        lambda content: content["parts"]["growth"]["tables"].append(3),
+        lambda content: content["parts"]["growth"]["charts"][0].update(file="../../a.png"),
+        lambda content: content.update(parts=[]),
+    ):
+        path.write_bytes(whole)
+        edit_json(path, change)
+        capsys.readouterr()
+        told = complaint(capsys, "analyze", "gaussian-avatars", str(workspace), "--parts", "growth")
+        assert "analysis" in told
+    path.write_bytes(whole)
+    shutil.rmtree(workspace / "analysis")
+    (workspace / "analysis").symlink_to(workspace.parent)
+    assert "analysis" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace))
+
+
+def test_curves_that_are_binned_keep_their_ends() -> None:
+    x, y = growth._binned(np.linspace(1000, 8000, 100), np.linspace(10, 30, 100))
+    assert len(x) == 12
+    assert x[0] < 1400
+    assert y[-1] > 29
+
+
+def test_options_are_checked_in_python_too(workspace: Path) -> None:
+    analysis = ANALYSES["gaussian-avatars"]
+    with pytest.raises(UserError, match="--steps -1"):
+        run_analysis(analysis, analysis.parts, workspace / "runs/toy", (), workspace / "out", AnalysisOptions(steps=-1))
