@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -211,6 +212,20 @@ def test_camera_that_disagrees_is_reported(rig, tmp_path, capsys):
         [rig[0]], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", CaptureSettings(size=96, max_frames=2)
     )
     assert "warning: camera left sees the face" in capsys.readouterr().err
+
+
+def test_unequal_lengths_are_refused_before_faces_are_searched(rig, tmp_path, monkeypatch):
+    monkeypatch.setattr("mien.capture.from_cameras.survey_source", lambda *_: pytest.fail("faces were searched"))
+    pictures = tmp_path / "pictures"
+    shutil.copytree(rig[0], pictures)
+    (pictures / "top" / f"{FRAMES - 1}.png").unlink()
+    arguments = [pictures], rig[1], tmp_path / "out" / "capture", "s"
+    with pytest.raises(UserError, match=r"camera top has 3 frames, camera left 4; .* --capture.max-frames 3"):
+        capture_cameras(*arguments, CaptureSettings(size=96))
+    assert not (tmp_path / "out").exists()
+    monkeypatch.undo()
+    capture = capture_cameras(*arguments, CaptureSettings(size=96, max_frames=3))
+    assert capture.timesteps == 3
 
 
 def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():

@@ -275,6 +275,12 @@ def observe_view(
 def mean_squared_difference(image: Tensor, target: Tensor) -> float: ...
 def box_of_nonzero(values: Tensor) -> tuple[int, int, int, int]: ...
 
+# native/bind_composite.cpp; arrays are uint8
+def composite(
+    image: np.ndarray, matte: np.ndarray, background: Sequence[int], box: Sequence[int], picture: np.ndarray
+) -> None:
+    """Fills the last one. The box is left, top, width and height."""
+
 # native/bind_face.cpp; b timesteps first
 class FaceModelData: ...
 

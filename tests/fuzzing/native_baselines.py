@@ -232,6 +232,14 @@ def box_of_nonzero(native: Any, rng: Rng) -> Arguments:
     return [np.maximum(normal(rng, *picture(rng)) - 2, 0).astype(F32)]
 
 
+def composite(native: Any, rng: Rng) -> Arguments:
+    height, width = picture(rng)
+    image, matte = below(rng, 256, height, width, 3, dtype=U8), below(rng, 256, height, width, dtype=U8)
+    left, top = int(rng.integers(0, width)), int(rng.integers(0, height))
+    box = [left, top, int(rng.integers(0, width - left + 1)), int(rng.integers(0, height - top + 1))]
+    return [image, matte, [1, 2, 255], box, empty(height, width, 3, dtype=U8)]
+
+
 BASELINES: dict[str, Baseline] = {
     one.__name__: one
     for one in (
@@ -240,7 +248,7 @@ BASELINES: dict[str, Baseline] = {
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,
         align_mesh, bake_texture, light_equations, rig_forward, make_rig_topology, rig_backward, ride, ride_backward,
         rasterize_views, rasterize_views_backward, photometric_loss, adam_update,
-        triangle_penalties, observe_view, mean_squared_difference, box_of_nonzero,
+        triangle_penalties, observe_view, mean_squared_difference, box_of_nonzero, composite,
     )
 } | {
     "AlignSurface": align_surface,

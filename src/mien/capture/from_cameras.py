@@ -32,6 +32,7 @@ from mien.capture.parts import Part
 from mien.capture.people import Person, choose_person
 from mien.capture.process import Chunk, Reel, process_part
 from mien.capture.quality import FrameQuality, quality_report, relative_quality
+from mien.capture.room import check_room
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import CaptureData, finish_capture, partial_folder, read_capture
 from mien.capture.survey import Survey, survey_source
@@ -96,6 +97,7 @@ def capture_cameras(
     capture = read_finished(out, whole.key, tell=False)
     if capture is not None:
         return capture
+    _check_lengths(jobs, cameras)
     with hold(out):
         capture = read_finished(out, whole.key)
         if capture is not None:
@@ -131,6 +133,34 @@ def _check_size(job: CaptureJob, camera: CalibratedCamera) -> None:
         )
     height, width = next(job.frames.frames()).picture().shape[:2]
     camera.for_pictures(width, height)
+
+
+def _check_lengths(jobs: list[CaptureJob], cameras: list[CalibratedCamera]) -> None:
+    """Check the numbers of frames before faces are searched, without decoding any.
+
+    Times decide which frames are taken if there is a --capture.start or --capture.end; the survey finds those.
+
+    Raises:
+        UserError: the numbers differ.
+    """
+    selections = [job.frames.selection for job in jobs]
+    if any(selection.start or selection.end for selection in selections):
+        return
+    counts = {}
+    for job, camera, selection in zip(jobs, cameras, selections, strict=True):
+        taken = -(-max(0, job.frames.count() - selection.offset) // selection.stride)
+        counts[camera.camera_id] = min(taken, selection.max_frames) if selection.max_frames else taken
+    _check_counts(counts)
+
+
+def _check_counts(counts: dict[str, int]) -> None:
+    if len(set(counts.values())) > 1:
+        shortest, longest = min(counts, key=lambda key: counts[key]), max(counts, key=lambda key: counts[key])
+        raise UserError(
+            f"camera {shortest} has {counts[shortest]} frames, but camera {longest} has {counts[longest]}; frames are "
+            "paired by their number: cut the videos to the same length, correct the offsets, or use only the first "
+            f"{counts[shortest]} frames with --capture.max-frames {counts[shortest]}"
+        )
 
 
 def _file_of(folder: Path, camera_id: str, option: str) -> Path:
@@ -171,14 +201,7 @@ def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folde
         survey = survey_source(job.frames, folder / camera.camera_id, landmarks)
         fitted = camera.for_pictures(*(int(side) for side in survey.picture_size))
         views.append(_View(camera.camera_id, job, survey, choose_person(survey), fitted))
-    counts = {view.camera_id: len(view.survey.timestamps) for view in views}
-    if len(set(counts.values())) > 1:
-        shortest, longest = min(counts, key=lambda key: counts[key]), max(counts, key=lambda key: counts[key])
-        raise UserError(
-            f"camera {shortest} has {counts[shortest]} frames, but camera {longest} has {counts[longest]}; frames are "
-            "paired by their number: cut the videos to the same length, correct the offsets, or use only the first "
-            f"{counts[shortest]} frames with --capture.max-frames {counts[shortest]}"
-        )
+    _check_counts({view.camera_id: len(view.survey.timestamps) for view in views})
     return views
 
 
@@ -200,6 +223,7 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
     work = prepare(partial_folder(out), whole.key)
     ids = tuple(view.camera_id for view in views)
     layout = FrameLayout(work, ids, len(path.centres), height, width)
+    check_room(layout, whole.name, out)
     chunks = [
         process_part(
             Reel(view.job.frames),

@@ -19,6 +19,7 @@ from mien.capture.given import GivenInputs, read_given
 from mien.capture.outcome import CAMERA_ID, Origin, finish_part
 from mien.capture.parts import Part, find_parts, whole_part
 from mien.capture.process import Reel, process_part
+from mien.capture.room import check_room
 from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, FrameSource, open_source
 from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, partial_folder, read_capture
@@ -275,6 +276,7 @@ def _process(job: CaptureJob, reel: Reel, part: Part, place: tuple[int, int], gi
         return
     work = prepare(partial_folder(out), key)
     layout = FrameLayout(work, (CAMERA_ID,), part.timesteps, part.crop.height, part.crop.width)
+    check_room(layout, part.name, out)
     chunks = process_part(reel, part, given, layout, work / _CHUNKS)
     finish_part(layout, out, chunks, part, Origin(job.frames, key, job.name, place), (STATE, _CHUNKS))
 

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from mien import _native
 from mien.camera import Camera
 from mien.capture import Capture, read_capture, read_capture_hash
 from mien.errors import UserError
@@ -47,14 +48,39 @@ class Sequence:
 
 
 def composite(
-    image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"], background: UInt8[np.ndarray, " 3"]
+    image: UInt8[np.ndarray, "h w 3"],
+    matte: UInt8[np.ndarray, "h w"],
+    background: UInt8[np.ndarray, " 3"],
+    box: Box | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """`image` over `background`, blended by the matte and rounded to the nearest integer."""
-    alpha = matte[..., None].astype(np.uint16)
-    mixed = image * alpha + background.astype(np.uint16) * (255 - alpha)
+    """`image` over `background`, blended by the matte and rounded to the nearest integer.
+
+    `box` promises that the matte is 0 outside of it; the image is not read there.
+    """
+    height, width = matte.shape
+    picture = np.empty((height, width, 3), np.uint8)
+    image, matte = np.ascontiguousarray(image), np.ascontiguousarray(matte)
+    _native.composite(image, matte, background.tolist(), box or (0, 0, width, height), picture)
+    return picture
+
+
+def composite_reference(
+    image: UInt8[np.ndarray, "h w 3"],
+    matte: UInt8[np.ndarray, "h w"],
+    background: UInt8[np.ndarray, " 3"],
+    box: Box | None = None,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """`composite` in numpy, with the same integers."""
+    left, top, width, height = box or (0, 0, *matte.shape[::-1])
+    inside = (slice(top, top + height), slice(left, left + width))
+    alpha = matte[inside][..., None].astype(np.uint16)
+    mixed = image[inside] * alpha + background.astype(np.uint16) * (255 - alpha)
     # Rounded division by 255 in integers, exact for 16 bits.
     mixed += 128
-    return ((mixed + (mixed >> 8)) >> 8).astype(np.uint8)
+    picture = np.empty((*matte.shape, 3), np.uint8)
+    picture[:] = background
+    picture[inside] = (mixed + (mixed >> 8)) >> 8
+    return picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +136,8 @@ class Targets:
         self._like = like
         self._on_cpu = like.device.type == "cpu" and like.dtype == torch.float32
         self._cache: dict[tuple[int, int, bytes], Target] = {}
+        self._boxes: dict[tuple[int, int], Box] = {}
+        """Boxes of the mattes, by timestep and camera."""
         self._max_cached = _CACHE_BYTES // (share * self.width * self.height * 4)
 
     def camera(self, camera: int) -> Camera:
@@ -118,29 +146,39 @@ class Targets:
 
     def target(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool) -> Target:
         """The picture over a background. `keep` caches it, for use with the same background again."""
-        key = (timestep, camera, background.tobytes())
-        target = self._cache.get(key)
-        if target is None:
-            target = self._compose(timestep, camera, background)
-            if keep and len(self._cache) < self._max_cached:
-                self._cache[key] = target
+        kept = self.kept(timestep, camera, background)
+        return self.moved(self.composed(timestep, camera, background, keep) if kept is None else kept)
+
+    def kept(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"]) -> Target | None:
+        """The cached target in the CPU's memory, or None."""
+        return self._cache.get((timestep, camera, background.tobytes()))
+
+    def composed(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool) -> Target:
+        """The target, made anew in the CPU's memory. `keep` caches it. One other thread may do this."""
+        target = self._compose(timestep, camera, background)
+        if keep and len(self._cache) < self._max_cached:
+            self._cache[timestep, camera, background.tobytes()] = target
+        return target
+
+    def moved(self, target: Target) -> Target:
+        """The target with the dtype and device of the cameras."""
         return target if self._on_cpu else target.to(self._like)
 
     def _compose(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"]) -> Target:
         image = self._resize(self._sequence.capture.images[timestep, camera])
-        matte = self._resize(self._sequence.scoring[timestep, camera])
-        left, top, width, height = cv2.boundingRect(matte)
-        inside = (slice(top, top + height), slice(left, left + width))
-        picture = np.empty_like(image)
-        picture[:] = background
-        picture[inside] = composite(image[inside], matte[inside], background)
-        colour = torch.from_numpy(background) / 255
-        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), (left, top, width, height), colour)
+        # A copy: the pages of a mapped file are given back.
+        matte = np.array(self._resize(self._sequence.scoring[timestep, camera]))
+        box = self._boxes.get((timestep, camera))
+        if box is None:
+            left, top, width, height = cv2.boundingRect(matte)
+            box = self._boxes[timestep, camera] = (left, top, width, height)
+        picture, colour = composite(image, matte, background, box), torch.from_numpy(background) / 255
+        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), box, colour)
         return target.pinned() if self._like.is_cuda else target
 
     def _resize(self, picture: np.ndarray) -> np.ndarray:
         if picture.shape[:2] == (self.height, self.width):
-            return np.array(picture)
+            return picture
         return cv2.resize(np.array(picture), (self.width, self.height), interpolation=cv2.INTER_AREA)
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Items
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -25,13 +25,14 @@ from mien.render import rasterize
 from mien.render.validation import CannotDrawError
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
+from mien.training.ahead import TargetQueue, targets_ahead
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
 from mien.training.frames import FrameOrder, background_at, density_random, training_frames
 from mien.training.losses import picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
-from mien.training.sequence import Sequence, Targets
+from mien.training.sequence import Sequence, Target, Targets
 from mien.training.settings import TrainSettings
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
@@ -45,6 +46,17 @@ class TrainingData:
     order: FrameOrder
     targets: tuple[Targets, ...]
     """One entry per sequence."""
+    ahead: TargetQueue | None = None
+    """Prepares the targets of the next steps in another thread. If it is None, each step makes its own."""
+
+    def target(self, step: int, settings: TrainSettings) -> Target:
+        """The target of a step. It does not depend on `ahead`."""
+        frame, _ = self.order.at(step)
+        targets = self.targets[frame.sequence]
+        if self.ahead is not None:
+            return targets.moved(self.ahead.target(step))
+        background = background_at(settings, step)
+        return targets.target(frame.timestep, frame.camera, background, keep=settings.background == "white")
 
 
 def train(
@@ -89,7 +101,13 @@ def _train_to_the_end(
 ) -> None:
     """Continue from the newest checkpoint, if there is one, and write the results."""
     resume(run_dir / "checkpoints", state)
-    with one_torch_thread(), _native_threads(settings.threads), _deferred_interrupt() as interrupted:
+    with (
+        one_torch_thread(),
+        _native_threads(settings.threads),
+        _deferred_interrupt() as interrupted,
+        targets_ahead(data.order, data.targets, settings) as ahead,
+    ):
+        data = replace(data, ahead=ahead)
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
                 try:
@@ -170,15 +188,15 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     began = time.perf_counter()
     frame, epoch = data.order.at(state.step)
     progress = Progress(state.step, settings.steps, epoch)
-    background = background_at(settings, state.step)
-    targets = data.targets[frame.sequence]
-    target = targets.target(frame.timestep, frame.camera, background, keep=settings.background == "white")
+    target = data.target(state.step, settings)
     avatar, weights = state.avatar, state.avatar.config.photometric
 
     index = state.track.index_of(frame.sequence, frame.timestep)
     face = state.track.face(index)
     posed = avatar.pose(face, progress)
-    rendering = rasterize(posed.gaussians.timestep(0), targets.camera(frame.camera), target.background)
+    rendering = rasterize(
+        posed.gaussians.timestep(0), data.targets[frame.sequence].camera(frame.camera), target.background
+    )
     losses = picture_losses(rendering, target, weights) | avatar.regularizers(posed, rendering, progress)
     torch.autograd.backward(list(losses.values()))
 
