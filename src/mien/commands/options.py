@@ -39,7 +39,8 @@ class TrainOptions:
     """A .json with settings, for example the config.json of a run to repeat (docs/settings.md). Options override the
     file, and the file overrides the preset."""
     preset: PresetName = "standard"
-    """How thorough the training is. draft takes minutes; standard gives the figures of docs/results.md."""
+    """How thorough the training is. draft takes minutes; standard gives the figures of docs/results.md; paper repeats
+    the method's paper, if the method has it (docs/paper_preset.md), and takes days on a processor."""
     split: Split = "blocks"
     """Frames held out for scoring: every fifth block of 10 frames (blocks), the last 20 % (tail), or nothing (none)."""
     background: Literal["white", "random"] = "white"
@@ -82,7 +83,7 @@ class TrainOptions:
         check_device(self.device)
         if self.steps < 0:
             raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's number")
-        preset = PRESETS[self.preset].settings
+        preset = PRESETS[self.preset].settings_of(self.method)
         settings = replace(
             preset if self.training is None else apply_options(preset, self.training),
             split=self.split,
@@ -163,7 +164,7 @@ def _with_defaults(method: str | None, preset: str, file: ConfigFile | None, arg
             'or give a file that has only "settings"'
         )
     name = method or (file.method if file else None) or TrainOptions.method
-    settings, config = PRESETS[preset].settings, PRESETS[preset].config(name)
+    settings, config = PRESETS[preset].settings_of(name), PRESETS[preset].config(name)
     if file:
         settings = overlay(settings, file.settings_changes, f"{file.path}: settings", "a run")
         config = overlay(config, file.method_changes, f"{file.path}: method", name)

@@ -15,10 +15,10 @@ _AXES = {
     "template": "v3", "faces": "f3", "uv": "u2", "uv_faces": "f3", "face_regions": "f", "identity_basis": "iv3",
     "expression_basis": "ev3", "expression_bounds": "e2", "joint_template": "k3", "joint_identity_basis": "ik3",
     "joint_rotation_basis": "ek3", "joint_translation_basis": "ek3", "skinning_weights": "vk", "pose_basis": "pv3",
-    "expression_sigmas": "e",
+    "expression_sigmas": "e", "joint_regressor": "kv", "flame_origin": "3",
 }  # fmt: skip
 """Axes of the tensors of `FaceModel`."""
-_OPTIONAL = ("pose_basis", "expression_sigmas")
+_OPTIONAL = ("pose_basis", "expression_sigmas", "joint_regressor", "flame_origin")
 _INDICES = {"faces": "v", "uv_faces": "u", "face_regions": "r"}
 """Axis into which the values of each of these tensors are indices."""
 

@@ -12,6 +12,7 @@ R becomes a mien head turned by R (after FLAME's root), with a neck turned by th
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from jaxtyping import Float, Int
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
 from mien.face.inert_pickle import read_inert_pickle
-from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
+from mien.face.model import EYE_BACK, JOINTS, FaceModel
 from mien.face.npz import read_npz
 
 REGIONS = ("skin", "neck", "eyes", "irises")
@@ -28,6 +29,8 @@ REGIONS = ("skin", "neck", "eyes", "irises")
 
 _CHAIN = (-1, 0, 1, 1, 1)
 """Parents in FLAME's chain: the root, the neck on it, jaw and eyes on the neck."""
+_TURNED = (1, 2, 3, 4)
+"""FLAME's joints about which mien's neck, jaw and eyes turn."""
 _SPLITS = {400: 300}
 """Number of identity directions, by the number of columns of the basis: FLAME 2020 and 2023."""
 _MAX_COEFFICIENT = 3.0
@@ -105,15 +108,8 @@ def read_flame(path: Path) -> FlameFile:
 
 def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> FaceModel:
     """Convert a file in FLAME's schema to a face model without landmarks; `shareable` as in `FaceModel`."""
-    joints = flame.regressor @ flame.template
     eyes, centres = _eyeballs(flame)
     origin = _origin(centres)
-    # FLAME's root segment is mien's neck and its neck segment is mien's head. Both turn about FLAME's neck joint.
-    order = [1, 0, 2, 3, 4]
-    pivots = joints[[1, 1, 2, 3, 4]] - origin
-    pivots[0] = 0
-    basis = np.einsum("kv,ivc->ikc", flame.regressor, flame.identity)[:, [1, 1, 2, 3, 4]]
-    basis[:, 0] = 0
     correctives = flame.correctives.reshape(4, 3, 3, -1, 3).copy()
     correctives[0] = correctives[0].swapaxes(0, 1)  # for the inverse of the neck's rotation
     if flame.uv is None or flame.uv_faces is None:
@@ -121,7 +117,6 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
     else:
         uv, uv_faces = flame.uv, flame.uv_faces
     e = len(flame.expression)
-    no_motion = torch.zeros(e, len(JOINTS), 3)
     return FaceModel(
         name=name,
         template=_rounded(flame.template - origin),
@@ -135,18 +130,61 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
         expression_names=tuple(f"expression_{index:03d}" for index in range(e)),
         expression_bounds=torch.tensor([[-_MAX_COEFFICIENT, _MAX_COEFFICIENT]]).repeat(e, 1),
         expression_sigmas=torch.ones(e),
-        joint_names=JOINTS,
-        joint_parents=JOINT_PARENTS,
-        joint_free=(False, True, True, True, True),
-        joint_template=_rounded(pivots),
-        joint_identity_basis=_rounded(basis),
-        joint_rotation_basis=no_motion,
-        joint_translation_basis=no_motion.clone(),
-        skinning_weights=_tensor(flame.weights[:, order]),
         pose_basis=_tensor(correctives.reshape(36, -1, 3)),
         landmarks={},
         shareable=shareable,
+        flame_origin=_tensor(origin),
+        **_skeleton(flame, origin),
     )
+
+
+def _skeleton(flame: FlameFile, origin: Float[np.ndarray, " 3"]) -> dict[str, Any]:
+    """Return the joints of the face model and their skinning weights, as fields of `FaceModel`.
+
+    FLAME's root segment is mien's neck and its neck segment is mien's head. Both turn about FLAME's neck joint.
+
+    FLAME regresses its joints from the vertices with their expression, so that an expression moves the joint about
+    which a part turns. Three joints in a chain do that here. The first, `to_NAME`, shifts by the joint's motion m, the
+    second, NAME, turns about the joint at rest, and the third, `from_NAME`, shifts by -m and moves the skin:
+    x -> R (x - m - joint) + joint + m. The last joint, `root`, moves nothing. It is FLAME's root joint, which other
+    programs need to place the head.
+    """
+    names, parents, free = ["head"], [-1], [False]
+    sources = [None]  # FLAME's joint, and the sign of the shift by its motion; None for the head, which stays
+    for name, joint in zip(JOINTS[1:], _TURNED, strict=True):
+        first = len(names)
+        names += [f"to_{name}", name, f"from_{name}"]
+        parents += [0, first, first + 1]
+        free += [False, True, False]
+        sources += [(joint, 1), (joint, 0), (joint, -1)]
+    names, parents, free, sources = [*names, "root"], [*parents, 0], [*free, False], [*sources, (0, 1)]
+    e, i, v, k = len(flame.expression), len(flame.identity), len(flame.template), len(names)
+    template, identity, regressor = np.zeros((k, 3)), np.zeros((i, k, 3)), np.zeros((k, v))
+    shifts, weights = np.zeros((e, k, 3)), np.zeros((v, k))
+    weights[:, 0] = flame.weights[:, 1]
+    for index, (source, name) in enumerate(zip(sources, names, strict=True)):
+        if source is None:
+            continue
+        joint, sign = source
+        shifts[:, index] = sign * np.einsum("v,evc->ec", flame.regressor[joint], flame.expression)
+        # Joints that only shift need no place of their own, which would only cost precision.
+        if free[index] or name == "root":
+            template[index] = flame.regressor[joint] @ flame.template - origin
+            identity[:, index] = np.einsum("v,ivc->ic", flame.regressor[joint], flame.identity)
+            regressor[index] = flame.regressor[joint]
+        if sign == -1:
+            weights[:, index] = flame.weights[:, 0 if name == "from_neck" else joint]
+    return {
+        "joint_names": tuple(names),
+        "joint_parents": tuple(parents),
+        "joint_free": tuple(free),
+        "joint_template": _rounded(template),
+        "joint_identity_basis": _rounded(identity),
+        "joint_rotation_basis": torch.zeros(e, k, 3),
+        "joint_translation_basis": _rounded(shifts),
+        "skinning_weights": _tensor(weights),
+        "joint_regressor": _tensor(regressor),
+    }
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:

@@ -27,7 +27,7 @@ LANDMARK_FORMAT, LANDMARK_VERSION = "mien.landmark_embedding", 1
 _TENSORS = (
     "template", "faces", "uv", "uv_faces", "face_regions", "identity_basis", "expression_basis", "expression_bounds",
     "joint_template", "joint_identity_basis", "joint_rotation_basis", "joint_translation_basis", "skinning_weights",
-    "pose_basis", "expression_sigmas",
+    "pose_basis", "expression_sigmas", "joint_regressor", "flame_origin",
 )  # fmt: skip
 _SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
 ADDED_RECIPE = 1

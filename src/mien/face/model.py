@@ -85,6 +85,11 @@ class FaceModel:
     """Standard deviations of the coefficients over time, for trackers' priors. If None, the names decide (ARKit's)."""
     shareable: bool = True
     """Whether the licence lets an avatar contain a copy. If not, an avatar only names the model and is not exported."""
+    joint_regressor: Float[Tensor, "k v"] | None = None
+    """Metres that a joint at rest moves per metre of each vertex offset, in models that regress joints from the shaped
+    vertices (FLAME's). If None, offsets do not move joints."""
+    flame_origin: Float[Tensor, " 3"] | None = None
+    """Origin of the head frame in FLAME's coordinates, in metres. None for models that are not in FLAME's schema."""
 
     @cached_property
     def content_hash(self) -> str:
@@ -95,7 +100,7 @@ class FaceModel:
         digest = hashlib.sha256()
         geometry = (
             "template", "faces", "identity_basis", "expression_basis", "joint_template", "joint_identity_basis",
-            "joint_rotation_basis", "joint_translation_basis", "skinning_weights", "pose_basis",
+            "joint_rotation_basis", "joint_translation_basis", "skinning_weights", "pose_basis", "joint_regressor",
         )  # fmt: skip
         for name in geometry:
             tensor = getattr(self, name)
@@ -173,7 +178,10 @@ class FaceModel:
 
     def rest_joints(self, face: FaceParams) -> Float[Tensor, "k 3"]:
         """Return this person's joints without expression, in the head frame, in metres."""
-        return self.joint_template + torch.einsum("i,ikc->kc", face.identity, self.joint_identity_basis)
+        joints = self.joint_template + torch.einsum("i,ikc->kc", face.identity, self.joint_identity_basis)
+        if self.joint_regressor is None or face.vertex_offsets is None:
+            return joints
+        return joints + self.joint_regressor @ face.vertex_offsets
 
     def joint_transforms(self, face: FaceParams) -> Float[Tensor, "b k 4 4"]:
         """Return each joint's transform of points of the rest pose, in the head frame. The head's is the identity."""

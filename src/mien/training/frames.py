@@ -20,6 +20,13 @@ _ORDER, _BACKGROUND, _DENSITY = range(3)
 """Purposes of random numbers."""
 _BLOCK, _EVERY = 10, 5
 _TAIL_SHARE = 0.2
+_EXTENT_MARGIN = 1.1
+MIN_EXTENT = 0.5
+"""Least extent of the training cameras, in metres.
+
+A single fixed camera has an extent of 0: centres would not move, and every Gaussian would be too large. Half a metre is
+less than the extent of a ring of cameras around a head, and more than the head.
+"""
 
 
 class Frame(NamedTuple):
@@ -75,6 +82,18 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
             "use a longer clip or --split none, or hold out less"
         )
     return frames
+
+
+def camera_extent(sequences: Items[Sequence], frames: Items[Frame]) -> float:
+    """The extent of the cameras that some frames were seen by, in metres, and at least `MIN_EXTENT`.
+
+    It is 1.1 x the largest distance of a camera from the mean of all cameras (3D Gaussian Splatting, published code).
+    Each camera of each sequence counts once.
+    """
+    seen = sorted({(frame.sequence, frame.camera) for frame in frames})
+    centres = torch.stack([sequences[index].tracking.cameras[camera].position for index, camera in seen]).double()
+    distances = (centres - centres.mean(0)).norm(dim=-1)
+    return max(MIN_EXTENT, _EXTENT_MARGIN * float(distances.max()))
 
 
 class FrameOrder:

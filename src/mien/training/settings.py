@@ -1,10 +1,10 @@
 """TrainSettings, the settings of a run that do not depend on the method, and presets of them. Needs no torch."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
-from mien.avatar.methods import method_named
+from mien.avatar.methods import Method, method_named
 from mien.avatar.settings import MethodConfig
 from mien.bounded import MAX_SIDE
 from mien.devices import DeviceName
@@ -76,21 +76,42 @@ def check_held_out(names: Sequence[str], settings: TrainSettings) -> None:
 
 @dataclass(frozen=True)
 class Preset:
-    """The settings of a run, which are given here, and of each method, which are in the file of its settings."""
+    """The settings of a run, and of each method. Those of a method, and steps of its own, are in the method's file."""
 
     name: str
     settings: TrainSettings
+    """Settings of a run, for methods that have no number of steps of their own."""
+
+    def settings_of(self, method: str) -> TrainSettings:
+        """The settings of a method's run.
+
+        Raises:
+            UserError: there is no method of that name, or it does not have this preset.
+        """
+        own = self._method(method).preset_steps
+        return replace(self.settings, steps=own.get(self.name, self.settings.steps))
 
     def config(self, method: str) -> MethodConfig:
         """The settings of a method.
 
         Raises:
-            UserError: there is no method of that name.
+            UserError: there is no method of that name, or it does not have this preset.
         """
-        return method_named(method).presets[self.name]
+        return self._method(method).presets[self.name]
+
+    def _method(self, name: str) -> Method:
+        method = method_named(name)
+        if self.name not in method.presets:
+            raise UserError(f"--preset {self.name}: {name} has no such preset; it has {' and '.join(method.presets)}")
+        return method
 
 
 PRESETS = {
-    preset.name: preset for preset in (Preset("draft", TrainSettings(steps=8_000)), Preset("standard", TrainSettings()))
+    preset.name: preset
+    for preset in (
+        Preset("draft", TrainSettings(steps=8_000)),
+        Preset("standard", TrainSettings()),
+        Preset("paper", TrainSettings()),
+    )
 }
-"""Presets by name, from quick to good."""
+"""Presets by name, from quick to good. `paper` repeats the method's paper; not every method has it."""

@@ -28,7 +28,14 @@ from mien.training.adam import Adam
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
-from mien.training.frames import FrameOrder, background_at, density_random, training_frames
+from mien.training.frames import (
+    MIN_EXTENT,
+    FrameOrder,
+    background_at,
+    camera_extent,
+    density_random,
+    training_frames,
+)
 from mien.training.losses import picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Targets
@@ -45,6 +52,8 @@ class TrainingData:
     order: FrameOrder
     targets: tuple[Targets, ...]
     """One entry per sequence."""
+    extent: float = MIN_EXTENT
+    """Extent of the training cameras, in metres."""
 
 
 def train(
@@ -69,7 +78,8 @@ def train(
     method_config.check()
     settings.check()
     check_trackings(sequences, face_model)
-    order = FrameOrder(training_frames(sequences, settings), settings.seed)
+    frames = training_frames(sequences, settings)
+    order, extent = FrameOrder(frames, settings.seed), camera_extent(sequences, frames)
     if is_finished(run_dir):
         claim_run(run_dir, sequences, method_config, settings)
         return load_avatar(run_dir)
@@ -80,7 +90,7 @@ def train(
         like = like_on(choose_device(settings.device))
         targets = [Targets(sequence, settings.resolution, len(sequences), like) for sequence in sequences]
         state = start(sequences, face_model, method_config, settings, like)
-        _train_to_the_end(state, TrainingData(order, tuple(targets)), settings, run_dir, progress)
+        _train_to_the_end(state, TrainingData(order, tuple(targets), extent), settings, run_dir, progress)
     return state.avatar
 
 
@@ -169,7 +179,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     """Run one training step: pose, render, compare, update, add and prune. Returns a text for the progress bar."""
     began = time.perf_counter()
     frame, epoch = data.order.at(state.step)
-    progress = Progress(state.step, settings.steps, epoch)
+    progress = Progress(state.step, settings.steps, epoch, data.extent)
     background = background_at(settings, state.step)
     targets = data.targets[frame.sequence]
     target = targets.target(frame.timestep, frame.camera, background, keep=settings.background == "white")

@@ -47,6 +47,7 @@ class SurfaceModel:
     ) -> PosedSurface:
         """Vertices, normals and derivatives of one timestep. `state` and `identity` are float64."""
         exact = self.layout.face_params(state[None], identity)
+        exact = replace(exact, vertex_offsets=None if offsets is None else offsets.double())
         face = replace(exact.to(self.face_model.template), vertex_offsets=offsets)
         shaped = self._shaped(face)
         transforms = self.exact.joint_transforms(exact)[0, :, :3].float()
@@ -100,7 +101,8 @@ class SurfaceModel:
             expression = face.expression.expand(n, -1).index_copy(1, derived, parameters[:, len(free) :])
             head = face.head_rotation.expand(n, -1), face.head_translation.expand(n, -1)
             joints = moved.reshape(n, *face.joints.shape[1:])
-            return self.exact.joint_transforms(FaceParams(face.identity, expression, joints, *head))[:, :, :3]
+            moved_face = FaceParams(face.identity, expression, joints, *head, face.vertex_offsets)
+            return self.exact.joint_transforms(moved_face)[:, :, :3]
 
         motion = self._skinned(_derivatives(transforms, at).float(), shaped)
         return motion[..., : len(free)], motion[..., len(free) :]
