@@ -6,6 +6,7 @@ from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mien.training.frames import held_out
+    from mien.training.named_split import NAMED_SPLIT, NamedSplit, split_by_name, with_named_split
     from mien.training.run import (
         check_data,
         check_run,
@@ -17,13 +18,22 @@ if TYPE_CHECKING:
         run_camera,
     )
     from mien.training.sequence import Sequence, read_sequence
-    from mien.training.settings import MAIN_SETTINGS, PRESETS, Preset, Split, TrainSettings, check_held_out
+    from mien.training.settings import (
+        MAIN_SETTINGS,
+        PRESETS,
+        Preset,
+        Split,
+        TrainSettings,
+        check_held_out,
+        doubly_held_out,
+    )
     from mien.training.trainer import train
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
             "frames": ["held_out"],
+            "named_split": ["NAMED_SPLIT", "NamedSplit", "split_by_name", "with_named_split"],
             "run": [
                 "check_data",
                 "check_run",
@@ -35,14 +45,24 @@ else:
                 "run_camera",
             ],
             "sequence": ["Sequence", "read_sequence"],
-            "settings": ["MAIN_SETTINGS", "PRESETS", "Preset", "Split", "TrainSettings", "check_held_out"],
+            "settings": [
+                "MAIN_SETTINGS",
+                "PRESETS",
+                "Preset",
+                "Split",
+                "TrainSettings",
+                "check_held_out",
+                "doubly_held_out",
+            ],
             "trainer": ["train"],
         },
     )
 
 __all__ = [
     "MAIN_SETTINGS",
+    "NAMED_SPLIT",
     "PRESETS",
+    "NamedSplit",
     "Preset",
     "Sequence",
     "Split",
@@ -51,6 +71,7 @@ __all__ = [
     "check_held_out",
     "check_run",
     "check_untouched",
+    "doubly_held_out",
     "held_out",
     "outdated_sequences",
     "read_curves",
@@ -58,5 +79,7 @@ __all__ = [
     "read_sequence",
     "read_training_summary",
     "run_camera",
+    "split_by_name",
     "train",
+    "with_named_split",
 ]

@@ -43,7 +43,7 @@ def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
     - `blocks`: every fifth block of 10, starting with the fifth, so that test poses and expressions resemble those of
       training. Clips of fewer than 50 timesteps have shorter blocks, so that they have a fifth one.
     - `tail`: the last 20 %, which may show things that were never seen.
-    - `none`: nothing.
+    - `none` and `gaussian-avatars`: nothing. The latter holds out a whole sequence and a camera.
     """
     index = torch.arange(timesteps)
     if split == "blocks":
@@ -64,6 +64,11 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
     """
     names = [sequence.name for sequence in sequences]
     check_held_out(names, settings)
+    if settings.split == "gaussian-avatars" and not (settings.held_out_sequences and settings.held_out_cameras):
+        raise UserError(
+            "--split gaussian-avatars: the sequence and the camera to hold out are not filled in; train with `mien "
+            "train`, or give the result of mien.training.with_named_split"
+        )
     ids = dict.fromkeys(camera_id for sequence in sequences for camera_id in sequence.capture.camera_ids)
     unknown = [camera_id for camera_id in settings.held_out_cameras if camera_id not in ids]
     if unknown:

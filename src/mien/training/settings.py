@@ -11,8 +11,9 @@ from mien.devices import DeviceName
 from mien.errors import UserError
 from mien.ranges import Range, check_ranges
 
-Split = Literal["blocks", "tail", "none"]
-"""Which timesteps are held out (`mien.training.held_out`)."""
+Split = Literal["blocks", "tail", "none", "gaussian-avatars"]
+"""Which timesteps are held out (`mien.training.held_out`). gaussian-avatars holds out a sequence and a camera instead
+(`mien.training.named_split`)."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,8 @@ class TrainSettings:
     steps: Annotated[int, Range(1, 1_000_000_000)] = 15_000
     """Number of optimiser steps, one frame each. All schedules stretch with it."""
     split: Split = "blocks"
-    """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none)."""
+    """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none).
+    gaussian-avatars is the split of that paper on NeRSemble: a sequence of each subject, and camera 08."""
     background: Literal["white", "random"] = "white"
     """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
     which can show as white needles in new poses. It costs 0.1 to 0.4 dB compared with white."""
@@ -72,6 +74,16 @@ def check_held_out(names: Sequence[str], settings: TrainSettings) -> None:
         raise UserError(f"--hold-out {unknown[0]}: no such sequence in this run; there are: {', '.join(names)}")
     if set(names) <= set(settings.held_out_sequences):
         raise UserError(f"--hold-out {' '.join(settings.held_out_sequences)}: leaves no sequence to train on")
+
+
+def doubly_held_out(settings: TrainSettings) -> str | None:
+    """A warning if both the split and whole sequences withhold frames from training, or None."""
+    if settings.split not in ("blocks", "tail") or not settings.held_out_sequences:
+        return None
+    return (
+        f"--split {settings.split} holds out a fifth of each other sequence as well, beside --hold-out "
+        f"{' '.join(settings.held_out_sequences)}; add --split none to train on all of them"
+    )
 
 
 @dataclass(frozen=True)
