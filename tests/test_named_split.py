@@ -174,6 +174,7 @@ def test_train_refuses_what_does_not_fit(
     asked: list[Any], capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     root = write_subject(tmp_path / folder, names, camera)
+    capsys.readouterr()
     assert main(["train", str(root), "--split", "gaussian-avatars", *line.split()]) == 2
     (told,) = filter(str.strip, capsys.readouterr().err.splitlines())
     assert words in told
@@ -182,6 +183,7 @@ def test_train_refuses_what_does_not_fit(
 
 def test_other_commands_and_splits_say_where_it_belongs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = write_subject(tmp_path / "306", FOLDERS[:2])
+    capsys.readouterr()
     for line, words in (
         (["create", str(root), "--out", str(tmp_path / "new"), "--split", "gaussian-avatars"], "needs ten sequences"),
         (["train", str(root), "--subject", "306"], "--subject 306: is for --split gaussian-avatars"),
