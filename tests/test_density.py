@@ -216,3 +216,62 @@ def test_statistics_survive_a_checkpoint() -> None:
     other.load_state(strategy.state())
     for name, tensor in strategy.state().items():
         assert torch.equal(tensor, other.state()[name]), name
+
+
+# -- a switch for each rule -------------------------------------------------------------------------------------------
+
+
+def off(rule: str, settings: GradientSettings = EVERY_STEP, **changes: object) -> GradientSettings:
+    rules = replace(settings.rules, **{rule: False})
+    return replace(settings, rules=rules, **changes)  # type: ignore[arg-type]
+
+
+def faces_after(settings: GradientSettings, gradient: float, **hooks: object) -> list[int]:
+    """The faces of the Gaussians after a late round: 0 small, 1 large, 2 faint, 3 huge, 4 wide on screen."""
+    store = make_store([0.001, 0.004, 0.001, 0.2, 0.001])
+    store.assign("opacity_logits", torch.logit(torch.tensor([0.5, 0.5, 0.004, 0.5, 0.5])))
+    strategy = control(store, settings, **hooks)
+    strategy.observe(pose(store), rendering([gradient] * 5, radii=[3, 3, 3, 3, 50]))
+    strategy.adapt(store, pose(store), Progress(90, 100), random)
+    return sorted(store["face_index"].tolist())
+
+
+def test_each_rule_has_a_switch() -> None:
+    settings = replace(EVERY_STEP, opacity_resets=(0.5,), prune_radius=20.0)
+    assert faces_after(settings, ABOVE) == [0, 0, 1, 1]
+    assert faces_after(off("clone", settings), ABOVE) == [0, 1, 1]
+    assert faces_after(off("split", settings), ABOVE) == [0, 0, 1]
+    assert faces_after(settings, BELOW) == [0, 1]
+    assert faces_after(off("prune_faint", settings), BELOW) == [0, 1, 2]
+    assert faces_after(off("prune_large", settings), BELOW) == [0, 1, 3]
+    assert faces_after(off("prune_wide", settings), BELOW) == [0, 1, 4]
+    capped = replace(settings, max_gaussians=3)
+    assert faces_after(capped, ABOVE) == [0, 0, 1]
+    assert faces_after(off("cap", capped), ABOVE) == [0, 0, 1, 1]
+    keeps = {"may_prune": lambda store, prune: prune & (store["face_index"] != 3)}
+    assert faces_after(settings, BELOW, **keeps) == [0, 1, 3]
+    assert faces_after(off("never_empty", settings), BELOW, **keeps) == [0, 1]
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_resets_have_a_switch_that_leaves_the_time_of_size_pruning(on: bool) -> None:
+    settings = replace(EVERY_STEP, opacity_resets=(0.5,), reset_opacity=0.1)
+    settings = settings if on else off("reset_opacities", settings)
+    store = make_store([0.001, 0.2])
+    strategy = control(store, settings)
+    strategy.observe(pose(store), rendering([0.0, 0.0]))
+    strategy.adapt(store, pose(store), Progress(49, 100), random)
+    assert store["opacity_logits"].detach().sigmoid().tolist() == pytest.approx([0.1 if on else 0.5] * 2)
+    strategy.observe(pose(store), rendering([0.0, 0.0]))
+    strategy.adapt(store, pose(store), Progress(59, 100), random)
+    assert store["face_index"].tolist() == [0]
+
+
+def test_sizes_may_be_parts_of_the_extent_of_the_cameras() -> None:
+    settings = replace(EVERY_STEP, size_unit="extent", split_size=0.01, prune_size=0.1, opacity_resets=(0.5,))
+    for extent, expected in ((1.0, [0, 0, 1, 1]), (4.0, [0, 0, 1, 1, 2, 2]), (0.5, [0, 0])):
+        store = make_store([0.004, 0.08, 0.35])
+        strategy = control(store, settings)
+        strategy.observe(pose(store), rendering([ABOVE] * 3))
+        strategy.adapt(store, pose(store), Progress(90, 100, extent=extent), random)
+        assert sorted(store["face_index"].tolist()) == expected

@@ -77,6 +77,28 @@ def test_without_options_a_run_is_the_preset(choices: Any) -> None:
         assert choices(f"--method {name} --preset draft") == (method.presets["draft"], TrainSettings(steps=8000))
 
 
+def test_a_preset_gives_the_settings_of_run_and_method(choices: Any) -> None:
+    paper = METHODS["gaussian_avatars"].presets["paper"]
+    assert paper != GaussianAvatarsConfig()
+    assert choices("--preset paper") == (paper, TrainSettings(steps=600_000))
+    config, settings = choices("--preset paper --steps 3000 --method.sh-degree 1")
+    assert (config, settings) == (replace(paper, sh_degree=1), TrainSettings(steps=3000))
+    file = {"method": {"sh_degree": 2}, "settings": {"steps": 700}}
+    assert choices("--preset paper", file) == (replace(paper, sh_degree=2), TrainSettings(steps=700))
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if "paper" not in method.presets])
+def test_a_preset_that_the_method_does_not_have_is_refused(
+    name: str, workspace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = f"--preset paper: {name} has no such preset; it has draft and standard"
+    for command in (["train", str(workspace)], ["create", str(workspace), "--out", str(workspace / "new")]):
+        assert words in complaint(capsys, [*command, "--method", name, "--preset", "paper"])
+    (workspace / "file.json").write_text(json.dumps({"method": {"kind": name}}))
+    line = ["train", str(workspace), "--preset", "paper", "--config", str(workspace / "file.json")]
+    assert words in complaint(capsys, line)
+
+
 def test_options_reach_every_depth(choices: Any) -> None:
     line = """--method.sh-degree 2 --method.sh-frame head --method.density.max-gaussians=20000 --training.resolution 256
         --method.means-rate.start 4e-3 --method.means-rate.end 4e-5 --method.photometric.alpha_weight 0.1 --steps 70
@@ -328,10 +350,12 @@ def test_help_stays_short_and_says_how_to_see_more(capsys: pytest.CaptureFixture
 @pytest.mark.parametrize("name", METHODS)
 def test_presets_are_the_same_for_all_methods(name: str) -> None:
     method = METHODS[name]
-    assert set(method.presets) == set(PRESETS), f"PRESETS of {name} needs one entry for each of {list(PRESETS)}"
+    assert {"draft", "standard"} <= set(method.presets) <= set(PRESETS), f"PRESETS of {name}"
     assert all(type(config) is method.config for config in method.presets.values())
-    for preset in PRESETS.values():
-        assert preset.config(name) == method.config(), f"{preset} of {name} differs from the defaults"
+    assert set(method.preset_steps) <= set(method.presets)
+    for preset in ("draft", "standard"):
+        assert PRESETS[preset].config(name) == method.config(), f"{preset} of {name} differs from the defaults"
+        assert PRESETS[preset].settings_of(name) == PRESETS[preset].settings
 
 
 @dataclass(frozen=True)

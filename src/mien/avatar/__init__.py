@@ -18,7 +18,14 @@ if TYPE_CHECKING:
     from mien.avatar.mono_gaussian_avatar import MonoGaussianAvatar
     from mien.avatar.mono_gaussian_avatar_settings import MonoGaussianAvatarConfig
     from mien.avatar.schedules import TRAINED, Progress, Rate
-    from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, Photometric, RefillSettings
+    from mien.avatar.settings import (
+        DensityRules,
+        FaceTuning,
+        GradientSettings,
+        MethodConfig,
+        Photometric,
+        RefillSettings,
+    )
     from mien.avatar.store import GaussianStore, Moments
 else:
     __getattr__, __dir__ = lazy_names(
@@ -45,7 +52,14 @@ else:
             "mono_gaussian_avatar": ["MonoGaussianAvatar"],
             "mono_gaussian_avatar_settings": ["MonoGaussianAvatarConfig"],
             "schedules": ["TRAINED", "Progress", "Rate"],
-            "settings": ["FaceTuning", "GradientSettings", "MethodConfig", "Photometric", "RefillSettings"],
+            "settings": [
+                "DensityRules",
+                "FaceTuning",
+                "GradientSettings",
+                "MethodConfig",
+                "Photometric",
+                "RefillSettings",
+            ],
             "store": ["GaussianStore", "Moments"],
         },
     )
@@ -56,6 +70,7 @@ __all__ = [
     "TRAINED",
     "Avatar",
     "DensityControl",
+    "DensityRules",
     "FaceTuning",
     "FixedDensity",
     "GaussianAvatars",

@@ -44,11 +44,17 @@ class ParameterGroup:
     moments: dict[str, Moments] | None = None
     """State of the optimiser, by the names of `tensors`. If it is None, the optimiser keeps the state
     itself, by group and name."""
+    times_extent: bool = False
+    """Whether the rate is multiplied by the extent of the cameras (`Progress.extent`)."""
+
+    def rate_at(self, progress: Progress) -> float:
+        """The learning rate at a step."""
+        return self.rate.at(progress) * (progress.extent if self.times_extent else 1.0)
 
 
-def store_group(store: GaussianStore, name: str, rate: Rate) -> ParameterGroup:
+def store_group(store: GaussianStore, name: str, rate: Rate, *, times_extent: bool = False) -> ParameterGroup:
     """The group of one per-Gaussian tensor; its optimiser state stays in the store."""
-    return ParameterGroup(name, {name: store[name]}, rate, store.moments)
+    return ParameterGroup(name, {name: store[name]}, rate, store.moments, times_extent)
 
 
 def network_group(name: str, network: nn.Module, rate: Rate) -> ParameterGroup:

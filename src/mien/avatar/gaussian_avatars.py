@@ -76,7 +76,10 @@ class GaussianAvatars(Avatar):
         rates["opacity_logits"], rates["sh_constant"] = config.opacity_rate, config.colour_rate
         if config.sh_degree > 0:
             rates["sh_rest"] = Rate(config.colour_rate.start / 20)
-        return [store_group(self.store, name, rate) for name, rate in rates.items()]
+        extent = {"means": config.means_times_extent}
+        return [
+            store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
+        ]
 
     def gaussian_store(self) -> GaussianStore:
         """Every per-Gaussian tensor."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import GradientSettings, MethodConfig
+from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
 from mien.ranges import FRACTION, NOT_NEGATIVE, Range
 
 
@@ -21,8 +21,10 @@ class GaussianAvatarsConfig(MethodConfig):
     sh_warmup: Annotated[float, FRACTION] = 0.3
     """Fraction of the run over which the degrees of the spherical harmonics are switched on, one after the other."""
     means_rate: Rate = Rate(5e-3, 5e-5)
-    """Learning rate of the centres, in triangle units per step. The paper multiplies it by the extent of the cameras,
-    which is 0 for one camera; here the factor is 1."""
+    """Learning rate of the centres, in triangle units per step."""
+    means_times_extent: bool = False
+    """Whether the learning rate of the centres is multiplied by the extent of the training cameras in metres, as in the
+    paper."""
     log_scales_rate: Rate = Rate(0.017)
     """Learning rate of the logarithms of the scales, per step."""
     quats_rate: Rate = Rate(1e-3)
@@ -44,5 +46,48 @@ class GaussianAvatarsConfig(MethodConfig):
     """Density control: when and where Gaussians are added and removed."""
 
 
-PRESETS = {"draft": GaussianAvatarsConfig(), "standard": GaussianAvatarsConfig()}
-"""Settings of this method for each preset. They are equal: a draft is only a shorter run."""
+_STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000
+"""The paper's schedule, in steps: the run, between rounds of density control, to the first round, between resets."""
+_SH_DEGREE, _DEGREE_STEPS = 3, 1_000
+_VISIT = 30
+"""How much further the paper's optimiser moves a frame between two visits than its learning rate says.
+
+It is one dense Adam over all frames, so a frame goes on moving while others are drawn. A gradient g every T steps moves
+it by the rate times sqrt(T) a visit: the sum of the first moments is g, and the root of the second moment is g /
+sqrt(T). With more than 1,000 frames, the second moment comes to be that of the last visit alone, and the factor ends
+below 1 / sqrt(1 - 0.999) = 32: it is 15 for 250 frames, 25 for 1,000 and 30 for 2,000. Here a step moves only its own
+frame, by about the rate. The paper's subjects have nine sequences, so some 1,000 to 3,000 frames.
+"""
+
+
+def _paper() -> GaussianAvatarsConfig:
+    """The paper's settings (docs/paper_preset.md). Times are fractions, so that they fit runs of any length."""
+    resets = (_FIRST, *range(_RESET, _STEPS, _RESET))
+    return GaussianAvatarsConfig(
+        sh_degree=_SH_DEGREE,
+        sh_warmup=(_SH_DEGREE + 1) * _DEGREE_STEPS / _STEPS,
+        means_times_extent=True,
+        face_tuning=FaceTuning(
+            expression=Rate(_VISIT * 1e-3),
+            joints=Rate(_VISIT * 1e-5),
+            head_rotation=Rate(_VISIT * 1e-5),
+            head_translation=Rate(_VISIT * 1e-6),
+        ),
+        density=GradientSettings(
+            start=_FIRST / _STEPS,
+            stop=(_STEPS - _ROUND) / _STEPS,
+            rounds=(_STEPS - _ROUND - _FIRST) // _ROUND + 1,
+            size_unit="extent",
+            split_size=0.01,
+            prune_size=0.1,
+            prune_radius=20.0,
+            opacity_resets=tuple(step / _STEPS for step in resets),
+            max_gaussians=200_000,
+        ),
+    )
+
+
+PRESETS = {"draft": GaussianAvatarsConfig(), "standard": GaussianAvatarsConfig(), "paper": _paper()}
+"""Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
+PRESET_STEPS = {"paper": _STEPS}
+"""Number of steps of the presets for which the method has its own."""

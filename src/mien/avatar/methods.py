@@ -6,6 +6,7 @@ This file needs no torch, because the command line lists the methods' settings a
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from mien.avatar.settings import MethodConfig
@@ -27,13 +28,21 @@ class Method:
 
     @property
     def presets(self) -> Mapping[str, MethodConfig]:
-        """Settings for each preset of `mien.training.PRESETS`, all of one class."""
-        return importlib.import_module(self.settings_module or self.avatar_class.split(":")[0]).PRESETS
+        """Settings for the presets of `mien.training.PRESETS` that the method has, all of one class."""
+        return self._settings().PRESETS
+
+    @property
+    def preset_steps(self) -> Mapping[str, int]:
+        """Number of steps of a run, for the presets for which the method has its own number (`PRESET_STEPS`)."""
+        return getattr(self._settings(), "PRESET_STEPS", {})
 
     @property
     def config(self) -> type[MethodConfig]:
         """The class of the method's settings."""
         return type(self.presets["standard"])
+
+    def _settings(self) -> ModuleType:
+        return importlib.import_module(self.settings_module or self.avatar_class.split(":")[0])
 
     @property
     def avatar(self) -> "type[Avatar]":

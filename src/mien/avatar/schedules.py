@@ -17,6 +17,9 @@ class Progress:
     """Number of steps of the whole run."""
     epoch: int = 0
     """Number of passes over the training frames that were completed before this step."""
+    extent: float = 1.0
+    """Extent of the training cameras, in metres (`mien.training.frames.camera_extent`). The unit of some rates and
+    sizes."""
 
     @property
     def fraction(self) -> float:

@@ -4,7 +4,7 @@ Every number has its range beside it (`mien.ranges`), and every field a descript
 """
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
 from mien.ranges import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
@@ -46,6 +46,28 @@ class FaceTuning:
 
 
 @dataclass(frozen=True)
+class DensityRules:
+    """A switch for each rule of gradient-based density control. Each says what happens while it is on."""
+
+    clone: bool = True
+    """Small Gaussians with strong gradients are duplicated."""
+    split: bool = True
+    """Large Gaussians with strong gradients are split in two."""
+    prune_faint: bool = True
+    """Gaussians below `prune_opacity` are removed."""
+    prune_large: bool = True
+    """Gaussians above `prune_size` are removed."""
+    prune_wide: bool = True
+    """Gaussians above `prune_radius` on screen are removed. A `prune_radius` of 0 removes none."""
+    reset_opacities: bool = True
+    """Opacities are lowered at `opacity_resets`. The first of these times still sets when pruning by size begins."""
+    never_empty: bool = True
+    """Gaussians that the method protects are not removed (GaussianAvatars: the last one of each triangle)."""
+    cap: bool = True
+    """Growth stops at `max_gaussians`."""
+
+
+@dataclass(frozen=True)
 class GradientSettings:
     """Gradient-based density control (3D Gaussian Splatting, section 5): when and where Gaussians are added or removed.
 
@@ -61,12 +83,15 @@ class GradientSettings:
     grow_gradient: Annotated[float, NOT_NEGATIVE] = 2e-4
     """Gaussians are duplicated or split if the mean gradient with respect to their centre, in normalised device
     coordinates, reaches this."""
+    size_unit: Literal["metres", "extent"] = "metres"
+    """Unit of `split_size` and `prune_size`: metres, or the extent of the training cameras (docs/paper_preset.md)."""
     split_size: Annotated[float, NOT_NEGATIVE] = 0.0025
-    """Gaussians that grow are split in two if they are larger than this, in metres, and duplicated otherwise."""
+    """Gaussians that grow are split in two if they are larger than this, in `size_unit`, and duplicated otherwise."""
     prune_opacity: Annotated[float, FRACTION] = 0.005
     """Gaussians below this opacity are removed."""
     prune_size: Annotated[float, NOT_NEGATIVE] = 0.1
-    """Gaussians larger than this, in metres, are removed. This begins with the first opacity reset after `start`."""
+    """Gaussians larger than this, in `size_unit`, are removed. This begins with the first opacity reset after
+    `start`."""
     prune_radius: Annotated[float, NOT_NEGATIVE] = 0.0
     """Gaussians with a larger radius on screen than this, in pixels, are removed. This begins with the first opacity
     reset after `start`. 0 removes none."""
@@ -76,6 +101,8 @@ class GradientSettings:
     """Highest opacity that remains after a reset."""
     max_gaussians: Annotated[int, GAUSSIAN_COUNT] = 40_000
     """Largest number of Gaussians. Growth stops there; Gaussians with the largest gradients grow first."""
+    rules: DensityRules = field(default_factory=DensityRules)
+    """A switch for each rule."""
 
 
 @dataclass(frozen=True)

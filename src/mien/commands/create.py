@@ -10,7 +10,9 @@ import tyro
 
 from mien.capture import CaptureSettings
 from mien.commands.options import TrainOptions
+from mien.errors import UserError
 from mien.tracking import TrackingSettings
+from mien.training import NAMED_SPLIT
 from mien.workspace import Workspace, check_new_workspace
 
 
@@ -48,6 +50,11 @@ class Command:
         from mien.commands.stages.names import rig_name, run_name, sequence_names
 
         self.options.check()
+        if self.options.settings().split == NAMED_SPLIT:
+            raise UserError(
+                f"--split {NAMED_SPLIT}: needs ten sequences of calibrated cameras, and this command makes one; use "
+                f"`mien capture --calibration` for each, then `mien track` and `mien train --split {NAMED_SPLIT}`"
+            )
         if self.calibration is None:
             sequence_names(self.videos, self.name)
         else:

@@ -15,7 +15,7 @@ from mien.commands.settings_options import apply_options, check_names, leaves, o
 from mien.config import overlay
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
-from mien.training import MAIN_SETTINGS, PRESETS, Split, TrainSettings
+from mien.training import MAIN_SETTINGS, NAMED_SPLIT, PRESETS, Split, TrainSettings, doubly_held_out
 from mien.workspace import open_workspace
 
 if TYPE_CHECKING:
@@ -39,9 +39,13 @@ class TrainOptions:
     """A .json with settings, for example the config.json of a run to repeat (docs/settings.md). Options override the
     file, and the file overrides the preset."""
     preset: PresetName = "standard"
-    """How thorough the training is. draft takes minutes; standard gives the figures of docs/results.md."""
+    """How thorough the training is. draft takes minutes; standard gives the figures of docs/results.md; paper repeats
+    the method's paper, if the method has it (docs/paper_preset.md), and takes days on a processor."""
     split: Split = "blocks"
-    """Frames held out for scoring: every fifth block of 10 frames (blocks), the last 20 % (tail), or nothing (none)."""
+    """Frames held out for scoring: every fifth block of 10 frames (blocks), the last 20 % (tail), or nothing (none).
+    gaussian-avatars: the sequence and the camera that the paper holds out, for its subjects (docs/using.md)."""
+    subject: str | None = None
+    """Subject of --split gaussian-avatars, for example 306 (default: the number in the workspace's name)."""
     background: Literal["white", "random"] = "white"
     """Background of the training pictures. random suits transparent renderings (no white in skin and outlines) and
     costs 0.1 to 0.4 dB."""
@@ -80,9 +84,11 @@ class TrainOptions:
             UserError: one is out of range, or CUDA is asked for without gsplat.
         """
         check_device(self.device)
+        if self.subject is not None and self.split != NAMED_SPLIT:
+            raise UserError(f"--subject {self.subject}: is for --split {NAMED_SPLIT}; give that too, or leave it out")
         if self.steps < 0:
             raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's number")
-        preset = PRESETS[self.preset].settings
+        preset = PRESETS[self.preset].settings_of(self.method)
         settings = replace(
             preset if self.training is None else apply_options(preset, self.training),
             split=self.split,
@@ -113,9 +119,12 @@ class TrainOptions:
         return config
 
     def say_what_is_ignored(self) -> None:
-        """Report the entry of the file that the run does not use: the sequences that its own run was trained on."""
+        """Report the entry of the file that the run does not use (the sequences of its own run), and doubled splits."""
         from mien.progress import say
 
+        doubled = doubly_held_out(self.settings())
+        if doubled is not None:
+            say(f"warning: {doubled}")
         sequences = read_config_file(self.config).sequences if self.config else ()
         if sequences:
             say(f"{self.config}: method and settings are taken from it, not its sequences ({', '.join(sequences)})")
@@ -163,7 +172,7 @@ def _with_defaults(method: str | None, preset: str, file: ConfigFile | None, arg
             'or give a file that has only "settings"'
         )
     name = method or (file.method if file else None) or TrainOptions.method
-    settings, config = PRESETS[preset].settings, PRESETS[preset].config(name)
+    settings, config = PRESETS[preset].settings_of(name), PRESETS[preset].config(name)
     if file:
         settings = overlay(settings, file.settings_changes, f"{file.path}: settings", "a run")
         config = overlay(config, file.method_changes, f"{file.path}: method", name)

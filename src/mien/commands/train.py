@@ -8,7 +8,7 @@ import tyro
 
 from mien.commands.options import TrainOptions
 from mien.errors import UserError
-from mien.training import check_held_out
+from mien.training import NAMED_SPLIT, NamedSplit, check_held_out, split_by_name, with_named_split
 from mien.workspace import Workspace, open_workspace
 
 
@@ -31,21 +31,31 @@ class Command:
         self.options.check()
         workspace, settings = open_workspace(self.workspace), self.options.settings()
         run_name(self.run_name or self.options.method)
-        check_held_out(self._names(workspace), settings)
+        names = self._names(workspace)
+        if settings.split == NAMED_SPLIT:
+            split = self._named_split(names)
+            names, settings = list(split.sequences), with_named_split(settings, split)
+        check_held_out(names, settings)
 
     def run(self) -> None:
         """Train the run to its end."""
         from mien.commands.stages.names import run_name
-        from mien.commands.stages.training import run_training_stage
+        from mien.commands.stages.training import fill_in_named_split, run_training_stage
         from mien.training import check_run
 
         workspace = open_workspace(self.workspace)
         method, settings = self.options.method_config(), self.options.settings()
         run = run_name(self.run_name or self.options.method)
         names = self._names(workspace)
+        if settings.split == NAMED_SPLIT:
+            split = self._named_split(names)
+            names, settings = list(split.sequences), fill_in_named_split(workspace, settings, split)
         check_run(workspace.run_dir(run), method, settings, names)
         self.options.say_what_is_ignored()
         run_training_stage(workspace, names, run, method, settings)
+
+    def _named_split(self, names: list[str]) -> NamedSplit:
+        return split_by_name(names, self.workspace.resolve().name, self.options.subject)
 
     def _names(self, workspace: Workspace) -> list[str]:
         if not self.sequences:

@@ -6,6 +6,7 @@ from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mien.training.frames import held_out
+    from mien.training.named_split import NAMED_SPLIT, NamedSplit, split_by_name, with_named_split
     from mien.training.run import (
         check_data,
         check_run,
@@ -19,13 +20,22 @@ if TYPE_CHECKING:
         write_imported_run,
     )
     from mien.training.sequence import Sequence, read_sequence
-    from mien.training.settings import MAIN_SETTINGS, PRESETS, Preset, Split, TrainSettings, check_held_out
+    from mien.training.settings import (
+        MAIN_SETTINGS,
+        PRESETS,
+        Preset,
+        Split,
+        TrainSettings,
+        check_held_out,
+        doubly_held_out,
+    )
     from mien.training.trainer import train
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
             "frames": ["held_out"],
+            "named_split": ["NAMED_SPLIT", "NamedSplit", "split_by_name", "with_named_split"],
             "run": [
                 "check_data",
                 "check_run",
@@ -39,14 +49,24 @@ else:
                 "write_imported_run",
             ],
             "sequence": ["Sequence", "read_sequence"],
-            "settings": ["MAIN_SETTINGS", "PRESETS", "Preset", "Split", "TrainSettings", "check_held_out"],
+            "settings": [
+                "MAIN_SETTINGS",
+                "PRESETS",
+                "Preset",
+                "Split",
+                "TrainSettings",
+                "check_held_out",
+                "doubly_held_out",
+            ],
             "trainer": ["train"],
         },
     )
 
 __all__ = [
     "MAIN_SETTINGS",
+    "NAMED_SPLIT",
     "PRESETS",
+    "NamedSplit",
     "Preset",
     "Sequence",
     "Split",
@@ -55,6 +75,7 @@ __all__ = [
     "check_held_out",
     "check_run",
     "check_untouched",
+    "doubly_held_out",
     "held_out",
     "outdated_sequences",
     "read_curves",
@@ -63,6 +84,8 @@ __all__ = [
     "read_sequence",
     "read_training_summary",
     "run_camera",
+    "split_by_name",
     "train",
+    "with_named_split",
     "write_imported_run",
 ]

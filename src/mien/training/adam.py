@@ -37,7 +37,7 @@ class Adam:
         """Update every tensor that has a gradient, at its group's rate, and clear the gradients."""
         updates: list[Update] = []
         for group in groups:
-            rate = group.rate.at(progress)
+            rate = group.rate_at(progress)
             for name, tensor in group.tensors.items():
                 gradient = tensor.grad
                 if gradient is None:

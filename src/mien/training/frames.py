@@ -20,6 +20,13 @@ _ORDER, _BACKGROUND, _DENSITY = range(3)
 """Purposes of random numbers."""
 _BLOCK, _EVERY = 10, 5
 _TAIL_SHARE = 0.2
+_EXTENT_MARGIN = 1.1
+MIN_EXTENT = 0.5
+"""Least extent of the training cameras, in metres.
+
+A single fixed camera has an extent of 0: centres would not move, and every Gaussian would be too large. Half a metre is
+less than the extent of a ring of cameras around a head, and more than the head.
+"""
 
 
 class Frame(NamedTuple):
@@ -36,7 +43,7 @@ def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
     - `blocks`: every fifth block of 10, starting with the fifth, so that test poses and expressions resemble those of
       training. Clips of fewer than 50 timesteps have shorter blocks, so that they have a fifth one.
     - `tail`: the last 20 %, which may show things that were never seen.
-    - `none`: nothing.
+    - `none` and `gaussian-avatars`: nothing. The latter holds out a whole sequence and a camera.
     """
     index = torch.arange(timesteps)
     if split == "blocks":
@@ -57,6 +64,11 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
     """
     names = [sequence.name for sequence in sequences]
     check_held_out(names, settings)
+    if settings.split == "gaussian-avatars" and not (settings.held_out_sequences and settings.held_out_cameras):
+        raise UserError(
+            "--split gaussian-avatars: the sequence and the camera to hold out are not filled in; train with `mien "
+            "train`, or give the result of mien.training.with_named_split"
+        )
     ids = dict.fromkeys(camera_id for sequence in sequences for camera_id in sequence.capture.camera_ids)
     unknown = [camera_id for camera_id in settings.held_out_cameras if camera_id not in ids]
     if unknown:
@@ -75,6 +87,18 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
             "use a longer clip or --split none, or hold out less"
         )
     return frames
+
+
+def camera_extent(sequences: Items[Sequence], frames: Items[Frame]) -> float:
+    """The extent of the cameras that some frames were seen by, in metres, and at least `MIN_EXTENT`.
+
+    It is 1.1 x the largest distance of a camera from the mean of all cameras (3D Gaussian Splatting, published code).
+    Each camera of each sequence counts once.
+    """
+    seen = sorted({(frame.sequence, frame.camera) for frame in frames})
+    centres = torch.stack([sequences[index].tracking.cameras[camera].position for index, camera in seen]).double()
+    distances = (centres - centres.mean(0)).norm(dim=-1)
+    return max(MIN_EXTENT, _EXTENT_MARGIN * float(distances.max()))
 
 
 class FrameOrder:

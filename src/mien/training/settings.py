@@ -1,18 +1,19 @@
 """TrainSettings, the settings of a run that do not depend on the method, and presets of them. Needs no torch."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
-from mien.avatar.methods import method_named
+from mien.avatar.methods import Method, method_named
 from mien.avatar.settings import MethodConfig
 from mien.bounded import MAX_SIDE
 from mien.devices import DeviceName
 from mien.errors import UserError
 from mien.ranges import Range, check_ranges
 
-Split = Literal["blocks", "tail", "none"]
-"""Which timesteps are held out (`mien.training.held_out`)."""
+Split = Literal["blocks", "tail", "none", "gaussian-avatars"]
+"""Which timesteps are held out (`mien.training.held_out`). gaussian-avatars holds out a sequence and a camera instead
+(`mien.training.named_split`)."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,8 @@ class TrainSettings:
     steps: Annotated[int, Range(1, 1_000_000_000)] = 15_000
     """Number of optimiser steps, one frame each. All schedules stretch with it."""
     split: Split = "blocks"
-    """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none)."""
+    """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none).
+    gaussian-avatars is the split of that paper on NeRSemble: a sequence of each subject, and camera 08."""
     background: Literal["white", "random"] = "white"
     """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
     which can show as white needles in new poses. It costs 0.1 to 0.4 dB compared with white."""
@@ -74,23 +76,54 @@ def check_held_out(names: Sequence[str], settings: TrainSettings) -> None:
         raise UserError(f"--hold-out {' '.join(settings.held_out_sequences)}: leaves no sequence to train on")
 
 
+def doubly_held_out(settings: TrainSettings) -> str | None:
+    """A warning if both the split and whole sequences withhold frames from training, or None."""
+    if settings.split not in ("blocks", "tail") or not settings.held_out_sequences:
+        return None
+    return (
+        f"--split {settings.split} holds out a fifth of each other sequence as well, beside --hold-out "
+        f"{' '.join(settings.held_out_sequences)}; add --split none to train on all of them"
+    )
+
+
 @dataclass(frozen=True)
 class Preset:
-    """The settings of a run, which are given here, and of each method, which are in the file of its settings."""
+    """The settings of a run, and of each method. Those of a method, and steps of its own, are in the method's file."""
 
     name: str
     settings: TrainSettings
+    """Settings of a run, for methods that have no number of steps of their own."""
+
+    def settings_of(self, method: str) -> TrainSettings:
+        """The settings of a method's run.
+
+        Raises:
+            UserError: there is no method of that name, or it does not have this preset.
+        """
+        own = self._method(method).preset_steps
+        return replace(self.settings, steps=own.get(self.name, self.settings.steps))
 
     def config(self, method: str) -> MethodConfig:
         """The settings of a method.
 
         Raises:
-            UserError: there is no method of that name.
+            UserError: there is no method of that name, or it does not have this preset.
         """
-        return method_named(method).presets[self.name]
+        return self._method(method).presets[self.name]
+
+    def _method(self, name: str) -> Method:
+        method = method_named(name)
+        if self.name not in method.presets:
+            raise UserError(f"--preset {self.name}: {name} has no such preset; it has {' and '.join(method.presets)}")
+        return method
 
 
 PRESETS = {
-    preset.name: preset for preset in (Preset("draft", TrainSettings(steps=8_000)), Preset("standard", TrainSettings()))
+    preset.name: preset
+    for preset in (
+        Preset("draft", TrainSettings(steps=8_000)),
+        Preset("standard", TrainSettings()),
+        Preset("paper", TrainSettings()),
+    )
 }
-"""Presets by name, from quick to good."""
+"""Presets by name, from quick to good. `paper` repeats the method's paper; not every method has it."""

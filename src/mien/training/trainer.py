@@ -29,7 +29,14 @@ from mien.training.ahead import TargetQueue, targets_ahead
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
-from mien.training.frames import FrameOrder, background_at, density_random, training_frames
+from mien.training.frames import (
+    MIN_EXTENT,
+    FrameOrder,
+    background_at,
+    camera_extent,
+    density_random,
+    training_frames,
+)
 from mien.training.losses import picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Target, Targets
@@ -46,6 +53,8 @@ class TrainingData:
     order: FrameOrder
     targets: tuple[Targets, ...]
     """One entry per sequence."""
+    extent: float = MIN_EXTENT
+    """Extent of the training cameras, in metres."""
     ahead: TargetQueue | None = None
     """Prepares the targets of the next steps in another thread. If it is None, each step makes its own."""
 
@@ -81,7 +90,8 @@ def train(
     method_config.check()
     settings.check()
     check_trackings(sequences, face_model)
-    order = FrameOrder(training_frames(sequences, settings), settings.seed)
+    frames = training_frames(sequences, settings)
+    order, extent = FrameOrder(frames, settings.seed), camera_extent(sequences, frames)
     if is_finished(run_dir):
         claim_run(run_dir, sequences, method_config, settings)
         return load_avatar(run_dir)
@@ -92,7 +102,7 @@ def train(
         like = like_on(choose_device(settings.device))
         targets = [Targets(sequence, settings.resolution, len(sequences), like) for sequence in sequences]
         state = start(sequences, face_model, method_config, settings, like)
-        _train_to_the_end(state, TrainingData(order, tuple(targets)), settings, run_dir, progress)
+        _train_to_the_end(state, TrainingData(order, tuple(targets), extent), settings, run_dir, progress)
     return state.avatar
 
 
@@ -187,7 +197,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     """Run one training step: pose, render, compare, update, add and prune. Returns a text for the progress bar."""
     began = time.perf_counter()
     frame, epoch = data.order.at(state.step)
-    progress = Progress(state.step, settings.steps, epoch)
+    progress = Progress(state.step, settings.steps, epoch, data.extent)
     target = data.target(state.step, settings)
     avatar, weights = state.avatar, state.avatar.config.photometric
 

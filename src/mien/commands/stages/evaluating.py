@@ -1,9 +1,11 @@
 """From a run to metrics, as the command line runs it."""
 
+from collections.abc import Callable
 from collections.abc import Sequence as Items
 from pathlib import Path
 from typing import Any
 
+from mien.errors import UserError
 from mien.evaluation.compare import Comparison, compare_runs
 from mien.evaluation.compare_report import write_comparison
 from mien.evaluation.evaluate import evaluate, is_evaluated
@@ -12,7 +14,8 @@ from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.text import driven_line, protocol_line
 from mien.inside import check_tree
 from mien.progress import say
-from mien.training import read_run_config
+from mien.training import NAMED_SPLIT, read_run_config
+from mien.training.named_split import DRIVING, driving_sequences
 from mien.workspace import Workspace, open_workspace
 
 
@@ -38,7 +41,8 @@ def run_evaluation_stage(
     if not again and not drivers and is_evaluated(run_dir, folders, settings):
         metrics = read_figures(run_dir)
     else:
-        metrics = evaluate(run_dir, folders, settings, _driver_folders(drivers))
+        named = read_run_config(run_dir)["settings"]["split"] == NAMED_SPLIT
+        metrics = evaluate(run_dir, folders, settings, _driver_folders(drivers, driving_sequences if named else list))
     for name, entry in metrics["protocols"].items():
         say(driven_line(entry) if name == "cross_reenactment" else protocol_line(name, entry))
     say(f"Look at {run_dir / 'report.html'}")
@@ -69,8 +73,8 @@ def run_comparison(workspaces: Items[Workspace], run: str | None, out: Path | No
     return comparison
 
 
-def _driver_folders(drivers: Items[Path]) -> list[Path]:
-    """The folders of the given sequences, and of all sequences in the given workspaces."""
+def _driver_folders(drivers: Items[Path], chosen: Callable[[list[str]], list[str]]) -> list[Path]:
+    """The folders of the given sequences, and of the chosen sequences in the given workspaces."""
     folders: list[Path] = []
     for driver in drivers:
         if (driver / "tracking").is_dir():
@@ -78,5 +82,11 @@ def _driver_folders(drivers: Items[Path]) -> list[Path]:
             folders.append(driver)
             continue
         workspace = open_workspace(driver)
-        folders += [workspace.sequence_dir(name) for name in workspace.sequence_names()]
+        names = chosen(workspace.sequence_names())
+        if not names:
+            raise UserError(
+                f"--drivers {driver}: has no sequence {DRIVING}, which drives avatars under --split {NAMED_SPLIT}; "
+                f"capture it, or give the folder of another one, {driver}/sequences/NAME"
+            )
+        folders += [workspace.sequence_dir(name) for name in names]
     return folders

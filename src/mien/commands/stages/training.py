@@ -1,19 +1,39 @@
 """From sequences to a run, as the command line runs it."""
 
 from mien.avatar import MethodConfig
+from mien.capture import read_capture
 from mien.face import FaceModel, load_face_model
 from mien.locks import read_beside_writers
 from mien.progress import say
 from mien.training import (
+    NamedSplit,
     Sequence,
     TrainSettings,
     check_untouched,
     read_sequence,
     read_training_summary,
     train,
+    with_named_split,
 )
 from mien.training.trainer import check_trackings
 from mien.workspace import Workspace
+
+
+def fill_in_named_split(workspace: Workspace, settings: TrainSettings, split: NamedSplit) -> TrainSettings:
+    """The settings with what a named split holds out, after a message that says so.
+
+    Raises:
+        UserError: the settings hold out something else, a sequence lacks the camera of novel views, or a capture cannot
+            be read.
+    """
+    cameras = {name: read_capture(workspace.sequence_dir(name) / "capture").camera_ids for name in split.sequences}
+    settings = with_named_split(settings, split, cameras)
+    left_out = f"; not used: {', '.join(split.left_out)}" if split.left_out else ""
+    say(
+        f"subject {split.subject} of GaussianAvatars: held out are the sequence {split.held_out} and camera "
+        f"{', '.join(settings.held_out_cameras)}{left_out}"
+    )
+    return settings
 
 
 def run_training_stage(

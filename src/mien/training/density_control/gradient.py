@@ -9,12 +9,15 @@ The loop, with the names of `GradientSettings`:
    - Prune (`_to_prune`): a Gaussian goes if its opacity is below `prune_opacity`. From the first opacity reset after
      `start`, it also goes if it is larger than `prune_size`, or than `prune_radius` on screen. The method says which
      opacity counts (`judged_opacities`) and can forbid prunes (`may_prune`). One Gaussian always stays.
+     `split_size` and `prune_size` are in `size_unit`: metres, or the extent of the training cameras.
    - Grow (`_to_grow`): of the others, those grow whose mean gradient over the views that show them reaches
      `grow_gradient`, strongest first, until there are `max_gaussians`. If such a Gaussian is larger than `split_size`,
      two children from the method's hook `split` replace it. If it is smaller, a copy is added.
    - The statistics start again.
 3. After the steps at `opacity_resets`, opacities above `reset_opacity` are lowered to it, if the method has such a
    tensor (`opacity_logits`).
+
+Each rule has a switch in `rules` (`DensityRules`).
 
 The optimiser's state: Gaussians that stay keep their moments, and copies and children start with zero moments. A reset
 clears the moments of all opacities. The number of updates, which is one count per tensor, goes on.
@@ -64,7 +67,8 @@ class GradientStrategy(DensityStrategy):
             self._grow_and_prune(store, posed, progress, random())
             self._restart(len(store))
         name = self._density.opacity_logits
-        if name is not None and done in {max(1, round(time * progress.steps)) for time in settings.opacity_resets}:
+        resets = settings.opacity_resets if settings.rules.reset_opacities else ()
+        if name is not None and done in {max(1, round(time * progress.steps)) for time in resets}:
             ceiling = torch.logit(torch.tensor(settings.reset_opacity))
             store.assign(name, store[name].detach().clamp_max(float(ceiling)))
         return changed
@@ -91,14 +95,20 @@ class GradientStrategy(DensityStrategy):
         self._highest_opacities = torch.zeros(gaussians, device=self._device)
 
     def _grow_and_prune(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> None:
-        settings = self._density.settings
+        settings, rules = self._density.settings, self._density.settings.rules
         sizes = posed.gaussians.scales.detach().reshape(len(store), 3).amax(-1)
-        prune = self._density.may_prune(store, self._to_prune(store, sizes, progress))
+        if settings.size_unit == "extent":
+            sizes = sizes / progress.extent
+        prune = self._to_prune(store, sizes, progress)
+        if rules.never_empty:
+            prune = self._density.may_prune(store, prune)
         if bool(prune.all()):
             # Without any Gaussian there are no gradients to grow by, so keep the one that was most visible.
             prune[self._highest_opacities.argmax()] = False
-        grow = self._to_grow(~prune, budget=settings.max_gaussians - int((~prune).sum()))
-        split = grow & (sizes > settings.split_size)
+        large = sizes > settings.split_size
+        may_grow = ~prune & torch.where(large, rules.split, rules.clone)
+        grow = self._to_grow(may_grow, settings.max_gaussians - int((~prune).sum()) if rules.cap else len(prune))
+        split = grow & large
         parents = (grow & ~split).nonzero()[:, 0]
         store.append(parents)
         # Both children of a split replace their parent.
@@ -110,12 +120,15 @@ class GradientStrategy(DensityStrategy):
         store.select(kept)
 
     def _to_prune(self, store: GaussianStore, sizes: Float[Tensor, " n"], progress: Progress) -> Bool[Tensor, " n"]:
-        settings = self._density.settings
-        prune = self._density.judged_opacities(store, self._highest_opacities) < settings.prune_opacity
+        settings, rules = self._density.settings, self._density.settings.rules
+        prune = torch.zeros_like(sizes, dtype=torch.bool)
+        if rules.prune_faint:
+            prune = self._density.judged_opacities(store, self._highest_opacities) < settings.prune_opacity
         later_resets = [time for time in settings.opacity_resets if time > settings.start]
         if later_resets and progress.fraction > min(later_resets):
-            prune = prune | (sizes > settings.prune_size)
-            if settings.prune_radius > 0:
+            if rules.prune_large:
+                prune = prune | (sizes > settings.prune_size)
+            if rules.prune_wide and settings.prune_radius > 0:
                 prune = prune | (self._largest_radii > settings.prune_radius)
         return prune
 

@@ -1,0 +1,186 @@
+"""The preset `paper` of GaussianAvatars has the numbers of the paper, its supplement and its published code."""
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress
+from mien.camera import Camera
+from mien.errors import UserError
+from mien.training import PRESETS, TrainSettings, check_run, train
+from mien.training.adam import Adam
+from mien.training.density_control.gradient import _round_steps
+from mien.training.frames import MIN_EXTENT, Frame, camera_extent
+from mien.training.run import claim_run
+from toy_scene import toy_face, toy_face_model, toy_sequence
+
+PAGE = Path(__file__).parent.parent / "docs" / "paper_preset.md"
+PAPER: Any = PRESETS["paper"].config("gaussian_avatars")
+STEPS = 600_000
+
+
+def resets(steps: int) -> list[int]:
+    return [round(time * steps) for time in PAPER.density.opacity_resets]
+
+
+def rounds(steps: int) -> list[int]:
+    density = PAPER.density
+    return sorted(_round_steps(density.start, density.stop, density.rounds, steps))
+
+
+def test_schedule() -> None:
+    assert PRESETS["paper"].settings_of("gaussian_avatars") == TrainSettings(steps=STEPS)
+    assert rounds(STEPS) == list(range(10_000, 600_000, 2_000))
+    assert resets(STEPS) == [10_000, *range(60_000, 600_000, 60_000)]
+    assert PAPER.density.reset_opacity == 0.01
+
+
+def test_a_shorter_run_has_the_same_schedule() -> None:
+    assert rounds(3_000) == list(range(50, 3_000, 10))
+    assert resets(3_000) == [50, *range(300, 3_000, 300)]
+
+
+def test_density_control() -> None:
+    density = PAPER.density
+    assert density.grow_gradient == 2e-4
+    assert (density.size_unit, density.split_size, density.prune_size) == ("extent", 0.01, 0.1)
+    assert (density.prune_opacity, density.prune_radius) == (0.005, 20)
+    assert density.max_gaussians >= 200_000
+
+
+def test_colours_gain_a_degree_every_thousand_steps() -> None:
+    avatar = GaussianAvatars(PAPER, toy_face_model(), toy_face(5))
+    steps = (0, 999, 1_000, 1_999, 2_000, 2_999, 3_000, 599_999)
+    counts = [avatar.pose(toy_face(5)[0], Progress(step, STEPS)).gaussians.sh.shape[-2] for step in steps]
+    assert counts == [1, 1, 4, 4, 9, 9, 16, 16]
+    assert PAPER.sh_frame == "world"
+
+
+def test_rates_and_losses() -> None:
+    avatar = GaussianAvatars(PAPER, toy_face_model(), toy_face(5))
+    groups = {group.name: group for group in avatar.parameter_groups()}
+    first, last = Progress(0, STEPS, extent=2.0), Progress(STEPS, STEPS, extent=2.0)
+    assert (groups["means"].rate_at(first), groups["means"].rate_at(last)) == pytest.approx((2 * 5e-3, 2 * 5e-5))
+    expected = {
+        "sh_constant": 2.5e-3,
+        "sh_rest": 2.5e-3 / 20,
+        "opacity_logits": 0.05,
+        "log_scales": 0.017,
+        "quats": 1e-3,
+    }
+    for name, rate in expected.items():
+        assert groups[name].rate_at(first) == groups[name].rate_at(last) == pytest.approx(rate), name
+    photometric = PAPER.photometric
+    assert (photometric.l1_weight, photometric.ssim_weight, photometric.alpha_weight) == (0.8, 0.2, 0)
+    assert (PAPER.position_weight, PAPER.position_threshold) == (0.01, 1)
+    assert (PAPER.scale_weight, PAPER.scale_threshold) == (1, 0.6)
+
+
+def moved_per_visit(frames: int, rate: float) -> float:
+    """How far a dense Adam moves a value between two visits of its frame, whose gradient is always 1 then."""
+    first = second = moved = 0.0
+    visits = max(4, 8_000 // frames)
+    for step in range(visits * frames):
+        gradient = 1.0 if step % frames == 0 else 0.0
+        first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
+        if step >= (visits - 1) * frames:
+            moved += rate * (first / (1 - 0.9 ** (step + 1))) / math.sqrt(second / (1 - 0.999 ** (step + 1)))
+    return moved
+
+
+def test_face_rates_do_per_visit_what_the_papers_dense_optimiser_does() -> None:
+    tuning = PAPER.face_tuning
+    papers = {"head_rotation": 1e-5, "joints": 1e-5, "head_translation": 1e-6, "expression": 1e-3}
+    assert tuning.enabled
+    for name, rate in papers.items():
+        ours = getattr(tuning, name)
+        assert ours.end is None
+        assert ours.start == pytest.approx(moved_per_visit(2_000, rate), rel=0.1)
+    # The factors that docs/paper_preset.md names.
+    assert [round(moved_per_visit(frames, 1)) for frames in (250, 1_000, 2_000)] == [15, 25, 30]
+
+
+def test_docs_name_every_setting_that_differs_from_the_default_and_its_value() -> None:
+    table = dict(re.findall(r"^\| `([a-z_.]+)` \|(.*)\|$", PAGE.read_text(), flags=re.MULTILINE))
+    default = GaussianAvatarsConfig()
+    for name in ("sh_degree", "sh_warmup", "means_times_extent"):
+        assert getattr(PAPER, name) != getattr(default, name)
+        assert name in table
+    for group in ("density", "face_tuning"):
+        ours, other = getattr(PAPER, group), getattr(default, group)
+        for field in type(ours).__dataclass_fields__:
+            if getattr(ours, field) != getattr(other, field):
+                assert f"{group}.{field}" in table, field
+    for name, words in (("density.max_gaussians", "200,000"), ("density.rounds", "295"), ("density.split_size", ".01")):
+        assert words in table[name]
+
+
+# -- the extent of the cameras ----------------------------------------------------------------------------------------
+
+
+def camera_at(*centre: float) -> Camera:
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = -torch.tensor(centre)
+    return Camera(torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), viewmat, 16, 16)
+
+
+def test_extent_is_that_of_the_training_cameras() -> None:
+    _, sequence = toy_sequence(2, 16)
+    cameras = (camera_at(0, 0, 0), camera_at(4, 0, 0), camera_at(2, 30, 0))
+    rig = replace(sequence, tracking=replace(sequence.tracking, cameras=cameras))
+    assert camera_extent([rig], [Frame(0, 0, 0), Frame(0, 1, 0), Frame(0, 0, 1)]) == pytest.approx(1.1 * 2)
+    assert camera_extent([rig], [Frame(0, 0, 0)]) == MIN_EXTENT == 0.5
+    near = replace(sequence, tracking=replace(sequence.tracking, cameras=(camera_at(0, 0, 0), camera_at(0.1, 0, 0))))
+    assert camera_extent([near], [Frame(0, 0, 0), Frame(0, 0, 1)]) == MIN_EXTENT
+
+
+def test_extent_reaches_rates_in_its_unit_only() -> None:
+    for config, factor in ((GaussianAvatarsConfig(), 1), (GaussianAvatarsConfig(means_times_extent=True), 3)):
+        moved = []
+        for extent in (1.0, 3.0):
+            torch.manual_seed(0)
+            avatar = GaussianAvatars(config, toy_face_model(), toy_face(5))
+            store = avatar.gaussian_store()
+            (store["means"].sum() + store["log_scales"].sum()).backward()
+            Adam().step(avatar.parameter_groups(), Progress(0, 10, extent=extent))
+            moved.append((float(store["means"].detach().abs().max()), float(store["log_scales"].detach().abs().max())))
+        assert moved[1][0] == pytest.approx(factor * moved[0][0])
+        assert moved[1][1] == moved[0][1]
+
+
+def test_a_stopped_run_of_the_preset_ends_as_if_it_had_not_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mien.training.trainer.camera_extent", lambda *_: 1.7)
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    settings = TrainSettings(steps=60, checkpoint_every=20, split="none")
+    whole = train([sequence], face_model, PAPER, settings, tmp_path / "whole")
+    train([sequence], face_model, PAPER, settings, tmp_path / "stopped")
+    for file in (*(tmp_path / "stopped" / "checkpoints").glob("*60.safetensors"), tmp_path / "stopped/training.json"):
+        file.unlink()
+    again = train([sequence], face_model, PAPER, settings, tmp_path / "stopped")
+    for name, tensor in whole.state_dict().items():
+        assert torch.equal(tensor, again.state_dict()[name]), name
+
+
+# -- runs of older versions -------------------------------------------------------------------------------------------
+
+
+def test_a_run_from_before_these_settings_goes_on(tmp_path: Path) -> None:
+    _, sequence = toy_sequence(timesteps=5, size=32)
+    config, settings = GaussianAvatarsConfig(), TrainSettings()
+    claim_run(tmp_path, [sequence], config, settings)
+    written = (tmp_path / "config.json").read_text()
+    older = re.sub(r'\s*"(size_unit|means_times_extent)": [^,]*,', "", written)
+    older = re.sub(r',\s*"rules": {[^}]*}', "", older)
+    older = re.sub(r',?\s*"checksum": "[^"]*"', "", older)
+    assert len(older) < len(written) - 200
+    (tmp_path / "config.json").write_text(older)
+    assert check_run(tmp_path, config, settings)
+    with pytest.raises(UserError, match=r"holds a run with other method.density.size_unit"):
+        check_run(tmp_path, replace(config, density=replace(config.density, size_unit="extent")), settings)
