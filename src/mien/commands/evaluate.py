@@ -31,7 +31,8 @@ class Command:
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     drivers: tuple[Path, ...] = ()
-    """Also score cross-reenactment: workspaces (or their sequences/NAME folders) whose motion drives the avatar."""
+    """Also score cross-reenactment: workspaces (or their sequences/NAME folders) whose motion drives the avatar. For a
+    run with --split gaussian-avatars, only the sequence FREE of each workspace drives it."""
     pictures: bool = False
     """Also write every scored picture and its truth as png, so that other programs can be scored on them."""
     perceptual: bool = True
