@@ -82,4 +82,5 @@ def _chart(entry: Mapping[str, Any]) -> str:
 def _picture(entry: Mapping[str, Any], folder: Path) -> str:
     source = data_uri("image/png", inside(folder, entry["file"]).read_bytes())
     caption = escape(entry["caption"])
-    return f'<figure class="row"><img style="{_AT_MOST_ITS_SIZE}" alt="{caption}" src="{source}"><figcaption>{caption}</figcaption></figure>'
+    image = f'<img style="{_AT_MOST_ITS_SIZE}" alt="{caption}" src="{source}">'
+    return f'<figure class="row">{image}<figcaption>{caption}</figcaption></figure>'
