@@ -5,6 +5,7 @@ import re
 import shlex
 import shutil
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 from typing import Any, get_args
 
@@ -104,7 +105,7 @@ def test_every_part_end_to_end(workspace: Path, capsys: pytest.CaptureFixture[st
     folder = workspace / "analysis/toy"
     page = (folder / "analysis.html").read_text()
     for part in ANALYSES["gaussian-avatars"].parts:
-        assert part.summary.split(" (")[0] in page
+        assert escape(part.summary) in page
         kept = content["parts"][part.name]
         assert kept["findings"] or part.name == "teeth-trained"
         for entry in (*kept["charts"], *kept["pictures"]):
@@ -183,7 +184,7 @@ def test_growth_of_known_curves(workspace: Path) -> None:
     part = record(workspace)["parts"]["growth"]
     assert part["values"]["gaussians_growth"] == pytest.approx(8)
     assert part["values"]["step_time_growth"] == pytest.approx(3, rel=0.02)
-    assert "Step time grows 3.0 times while Gaussians grow 8.0 times" in part["findings"][0]
+    assert "Step time grows 2.9 times while Gaussians grow 8.0 times" in part["findings"][0]
     changed["step_ms"][:] = torch.nan
     changed["step_ms"][0], changed["gaussians"][0] = 1.0, torch.nan
     write_tensors(path, changed)
@@ -221,9 +222,7 @@ def test_sequences_that_are_gone_cost_only_their_parts(workspace: Path, capsys: 
     assert analyze(workspace, "--seconds", "0.01") == 0
     assert "No frames were compared" in record(workspace)["parts"]["teeth"]["notes"][1]
     capsys.readouterr()
-    assert "missing" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace), "--parts", "scale").replace(
-        "no such", "missing"
-    )
+    assert "missing" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace), "--parts", "scale")
 
 
 def test_parts_of_another_method_give_charts_pictures_and_films(workspace: Path, tmp_path: Path) -> None:
@@ -308,7 +307,7 @@ def test_a_damaged_record_is_told_in_one_line(workspace: Path, capsys: pytest.Ca
     for change in (
         lambda content: content["parts"]["growth"]["tables"].append(3),
         lambda content: content["parts"]["growth"]["charts"][0].update(file="../../a.png"),
-        lambda content: content.update(parts=[]),
+        lambda content: content.update(parts=3),
     ):
         path.write_bytes(whole)
         edit_json(path, change)

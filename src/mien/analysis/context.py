@@ -155,7 +155,12 @@ class Context:
         return Variant(run_dir, avatar, read_curves(run_dir), read_training_summary(run_dir))
 
     def say_how_long(self, part: str, trainings: int) -> None:
-        """Report beforehand how long the short trainings of a part take, from the pace of the run."""
+        """Report beforehand how long the short trainings of a part take, from the pace of the run.
+
+        Raises:
+            UserError: a sequence is missing, or was tracked again after the run was trained.
+        """
+        _ = self.sequences
         pace = self.summary["seconds"] / max(self.summary["steps"], 1)
         minutes = trainings * self.options.steps * pace / 60
         about = f"{minutes:.0f} min" if minutes >= 2 else f"{60 * minutes:.0f} s"

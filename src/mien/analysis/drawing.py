@@ -56,7 +56,7 @@ def measure_drawing(avatar: Avatar, camera: Camera, seconds: float) -> dict[str,
         "draw_ms": _median(draws[counted]),
         "pose_ms": _median(poses[counted]),
         "pictures": len(draws[counted]),
-        "peak_mb": round(_peak_mb(), 1),
+        "peak_mb": round(max(_peak_mb(), before), 1),
         "before_mb": round(before, 1),
     }
 

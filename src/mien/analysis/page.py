@@ -14,6 +14,8 @@ from mien.inside import inside
 from mien.pictures import data_uri
 from mien.storage import write_atomically
 
+_AT_MOST_ITS_SIZE = "width:auto;max-width:100%;max-height:640px"
+
 
 def write_page(path: Path, analysis: Analysis, content: Mapping[str, Any]) -> None:
     """Write the page.
@@ -47,7 +49,8 @@ def section_html(title: str, part: Mapping[str, Any], folder: Path) -> str:
     parts += [_table(table) for table in part["tables"]]
     charts = [_chart(entry) for entry in part["charts"]]
     if charts:
-        parts.append(f'<div class="grid2">{"".join(charts)}</div>')
+        narrow = ' style="max-width:560px"' if len(charts) == 1 else ""
+        parts.append(f'<div class="grid2"{narrow}>{"".join(charts)}</div>')
     parts += [_picture(entry, folder) for entry in part["pictures"]]
     parts += [video_html(inside(folder, entry["file"]), folder, entry["caption"]) for entry in part["films"]]
     parts += [f'<p class="note">{escape(note)}</p>' for note in part["notes"]]
@@ -79,4 +82,5 @@ def _chart(entry: Mapping[str, Any]) -> str:
 def _picture(entry: Mapping[str, Any], folder: Path) -> str:
     source = data_uri("image/png", inside(folder, entry["file"]).read_bytes())
     caption = escape(entry["caption"])
-    return f'<figure class="row"><img alt="{caption}" src="{source}"><figcaption>{caption}</figcaption></figure>'
+    image = f'<img style="{_AT_MOST_ITS_SIZE}" alt="{caption}" src="{source}">'
+    return f'<figure class="row">{image}<figcaption>{caption}</figcaption></figure>'

@@ -1,5 +1,6 @@
 """Run the chosen parts of an analysis, and write analysis.json, a png for each chart and picture, and the page."""
 
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -55,6 +56,7 @@ def run_analysis(
     check_tree(run_dir)
     check_tree(folder)
     with hold(folder):
+        folder.mkdir(parents=True, exist_ok=True)
         context = Context(run_dir, tuple(sequence_dirs), folder, options)
         avatar = file_digest(run_dir / "avatar" / "avatar.safetensors")
         content = _known(folder, analysis, avatar) or {
@@ -72,7 +74,7 @@ def run_analysis(
             else:
                 result = part.run(context)
                 _write_files(folder, result)
-                content["parts"][part.name] = {"key": key, **result.content()}
+                content["parts"][part.name] = {"key": key, **json.loads(json.dumps(result.content()))}
                 write_json(folder / RECORD, FORMAT, VERSION, content)
             for finding in content["parts"][part.name]["findings"]:
                 say(f"{part.name}: {finding}")

@@ -73,7 +73,7 @@ def teeth(context: Context) -> PartResult:
         notes.append(f"No frames were compared: {error}.")
     if experiment is not None:
         frames = _most_open(experiment)
-        with_teeth, without = (_mouth_psnr(experiment, frames, mask) for mask in (None, kept))
+        with_teeth, without = (_mouth_psnr(experiment, frames, avatar.face_model, mask) for mask in (None, kept))
         values |= {"mouth_psnr_with": with_teeth, "mouth_psnr_without": without, "frames": len(frames)}
         findings.append(
             f"On the mouths of the {len(frames)} held-out frames with the most open jaw, PSNR is {with_teeth:.2f} dB "
@@ -100,7 +100,7 @@ def teeth_trained(context: Context) -> PartResult:
     for name, variant in variants.items():
         experiment = context.experiment(variant.run_dir)
         frames = [] if experiment is None else _most_open(experiment)
-        mouth = _mouth_psnr(experiment, frames) if experiment is not None else None
+        mouth = _mouth_psnr(experiment, frames, model) if experiment is not None else None
         head = mean_psnr(experiment, frames) if experiment is not None else None
         rows.append((name, variant.summary["gaussians"], _rounded(mouth), _rounded(head)))
     face = open_jaw(context.avatar.subject, model)
@@ -220,14 +220,14 @@ def _image(experiment: Experiment, frame: Any, kept: Tensor | None) -> Tensor:
     return rasterize(gaussians, experiment.camera(frame), torch.ones(3)).image.clamp(0, 1)
 
 
-def _box_of(experiment: Experiment, frame: Any) -> Box:
-    model = experiment.avatar.face_model
+def _box_of(experiment: Experiment, frame: Any, model: FaceModel) -> Box:
     return _mouth_box(model, experiment.face(frame), experiment.camera(frame))
 
 
-def _mouth_psnr(experiment: Experiment, frames: Sequence[Any], kept: Tensor | None = None) -> float:
+def _mouth_psnr(experiment: Experiment, frames: Sequence[Any], model: FaceModel, kept: Tensor | None = None) -> float:
+    """The mean PSNR of the mouth, whose place is that of `model`: one without teeth would have another box."""
     values = [
-        psnr(_image(experiment, frame, kept), target_image(experiment, frame), _box_of(experiment, frame))
+        psnr(_image(experiment, frame, kept), target_image(experiment, frame), _box_of(experiment, frame, model))
         for frame in frames
     ]
     return round(sum(values) / len(values), 3)
@@ -239,7 +239,7 @@ def _beside_truth(experiment: Experiment, frame: Any, kept: Tensor, index: int) 
         _image(experiment, frame, None),
         _image(experiment, frame, kept),
     ]
-    box = _box_of(experiment, frame)
+    box = _box_of(experiment, frame, experiment.avatar.face_model)
     cut = [_enlarged(crop_to(image, box)) for image in images]
     name = experiment.sequences[frame.sequence].name
     return Picture(
