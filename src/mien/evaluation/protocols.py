@@ -86,7 +86,8 @@ def evaluate_frames(
     done = {frame: scored for frame, scored in kept.items() if _is_complete(scored[0], subjects)}
     metric = perceptual_metric(settings)
     judged = set(spread_frames(frames, settings.perceptual_frames))
-    baselines = make_baselines(experiment) if settings.baselines else None
+    threads = worker_threads(settings.threads)
+    baselines = make_baselines(experiment, threads) if settings.baselines else None
 
     def score(job: tuple[Frame, dict[str, Tensor], float]) -> tuple[Frame, dict[str, Scores], float]:
         frame, drawn, seconds = job
@@ -96,7 +97,7 @@ def evaluate_frames(
 
     with progress_bar(title, len(frames), len(done)) as advance:
         jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines)
-        for frame, row, seconds in stream_in_threads(score, jobs, worker_threads(settings.threads)):
+        for frame, row, seconds in stream_in_threads(score, jobs, threads):
             done[frame] = row, seconds
             if partial is not None:
                 partial.add(frame, row, seconds)
@@ -104,7 +105,7 @@ def evaluate_frames(
     rows = [done[frame][0] for frame in frames]
     scores = {subject: tuple(row[subject] for row in rows) for subject in rows[0]}
     seconds = sorted(done[frame][1] for frame in frames)
-    return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, _training_psnr(experiment))
+    return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, _training_psnr(experiment, threads))
 
 
 def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
@@ -138,13 +139,17 @@ def _as_tracked(experiment: Experiment) -> Experiment:
     return replace(experiment, faces=tuple(tracked))
 
 
-def _training_psnr(experiment: Experiment) -> dict[Frame, tuple[float, float]]:
+def _training_psnr(experiment: Experiment, threads: int) -> dict[Frame, tuple[float, float]]:
     """PSNR on the whole frame and on the head crop of at most `_MAX_TRAINING_FRAMES` training frames."""
-    figures = {}
-    for frame in spread_frames(experiment.training_frames, _MAX_TRAINING_FRAMES):
-        image, target = as_8_bit(avatar_image(experiment, frame)), target_image(experiment, frame)
-        figures[frame] = (psnr(image, target), psnr(image, target, experiment.crop(frame)))
-    return figures
+
+    def score(job: tuple[Frame, Tensor]) -> tuple[Frame, tuple[float, float]]:
+        frame, drawn = job
+        image, target = as_8_bit(drawn), target_image(experiment, frame)
+        return frame, (psnr(image, target), psnr(image, target, experiment.crop(frame)))
+
+    frames = spread_frames(experiment.training_frames, _MAX_TRAINING_FRAMES)
+    drawn = ((frame, avatar_image(experiment, frame)) for frame in frames)
+    return dict(stream_in_threads(score, drawn, threads))
 
 
 def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: EvaluationSettings) -> dict[str, Any]:
