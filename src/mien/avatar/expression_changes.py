@@ -1,0 +1,111 @@
+"""Changes of Gaussians with the expression, of low rank: what a mesh cannot say, such as wrinkles and pressed lips.
+
+A few activations describe the whole face (`ExpressionActivations`). Each Gaussian has a basis, whose product with the
+activations is added to one of its raw values (`expression_change`). Not part of any of the three papers.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from mien import _native
+from mien.arrays import unpacked
+from mien.face import FaceParams
+
+SEEN_SHARE = 0.02
+"""Share of the timesteps, at either end of an activation, that does not count for its range."""
+MARGIN = 0.25
+"""How far an activation can leave its range, as a share of the range's length."""
+_WEAKEST = 0.1
+"""Smallest deviation that is scaled to 1, relative to that of the first direction. Weaker ones are noise of tracking."""
+
+
+class ExpressionActivations(nn.Module):
+    """r numbers that describe an expression: how far it is from the person at rest, along r principal directions.
+
+    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. The
+    directions are scaled so that the activations of the given timesteps have a deviation of 1 or less. They are fixed:
+    training changes only the bases of the Gaussians.
+    """
+
+    rest: Tensor
+    directions: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, face: FaceParams, neutral: FaceParams, rank: int):
+        """Take the directions and the ranges from the timesteps of `face`.
+
+        Args:
+            face: Face parameters of all training timesteps.
+            neutral: One timestep: the person at rest, whose activations are 0.
+            rank: Number of activations, at least 1. Directions that the timesteps do not have are 0.
+        """
+        super().__init__()
+        rest = expression_inputs(neutral)[0]
+        directions, low, high = principal_directions(expression_inputs(face) - rest, rank)
+        for name, value in (("rest", rest), ("directions", directions), ("low", low), ("high", high)):
+            self.register_buffer(name, value.detach().clone())
+
+    def forward(self, face: FaceParams) -> Float[Tensor, "b r"]:
+        """The activations of some timesteps. Differentiable in `face`."""
+        return soft_clamp((expression_inputs(face) - self.rest) @ self.directions, self.low, self.high)
+
+
+def expression_inputs(face: FaceParams) -> Float[Tensor, "b i"]:
+    """The expression coefficients, followed by the axis-angle vectors of the free joints, in radians."""
+    return torch.cat([face.expression, face.joints.flatten(1)], dim=-1)
+
+
+def principal_directions(
+    offsets: Float[Tensor, "t i"], rank: int
+) -> tuple[Float[Tensor, "i r"], Float[Tensor, " r"], Float[Tensor, " r"]]:
+    """Directions of the largest spread, strongest first, and the range of the timesteps along each of them.
+
+    The range leaves out `SEEN_SHARE` of the timesteps at either end and always holds 0, which is the person at rest.
+    """
+    exact = offsets.detach().double().cpu()
+    centred = exact - exact.mean(0)
+    strengths, vectors = torch.linalg.eigh(centred.T @ centred / len(centred))
+    count = min(rank, len(strengths))
+    deviations, vectors = strengths.flip(0)[:count].clamp_min(0).sqrt(), vectors.flip(1)[:, :count]
+    largest = vectors.gather(0, vectors.abs().argmax(0, keepdim=True))
+    usable = deviations > 1e-6
+    scales = deviations.clamp_min(max(_WEAKEST * float(deviations[0]), 1e-6))
+    directions = exact.new_zeros(len(vectors), rank)
+    directions[:, :count] = vectors * largest.sign() * usable / scales
+    directions = directions.to(offsets)
+    along = offsets.detach() @ directions
+    ends = along.new_tensor([SEEN_SHARE, 1 - SEEN_SHARE])
+    low, high = along.quantile(ends, dim=0)
+    return directions, low.clamp_max(0), high.clamp_min(0)
+
+
+def soft_clamp(
+    values: Float[Tensor, "*b r"], low: Float[Tensor, " r"], high: Float[Tensor, " r"]
+) -> Float[Tensor, "*b r"]:
+    """`values` within their range; beyond it they approach `MARGIN` of the range's length more, and never reach it.
+
+    The slope is continuous: 1 within the range, and falling beyond.
+    """
+    margin = (MARGIN * (high - low)).clamp_min(1e-6)
+    over, under = (values - high).clamp_min(0), (low - values).clamp_min(0)
+    within = torch.minimum(torch.maximum(values, low), high)
+    return within + margin * over / (margin + over) - margin * under / (margin + under)
+
+
+def expression_change(
+    basis: Float[Tensor, "n *c r"], activations: Float[Tensor, " r"]
+) -> Float[Tensor, "n *c"]:
+    """The sum of a basis' columns, weighted by the activations. Differentiable in both."""
+    return expression_change_reference(basis, activations)
+
+
+def expression_change_reference(
+    basis: Float[Tensor, "n *c r"], activations: Float[Tensor, " r"]
+) -> Float[Tensor, "n *c"]:
+    """`expression_change` in plain PyTorch, any dtype and device."""
+    return (basis.reshape(-1, basis.shape[-1]) @ activations).view(basis.shape[:-1])
