@@ -2,6 +2,7 @@
 #include <nanobind/nanobind.h>
 
 void bind_activation(nanobind::module_& module);
+void bind_expression_change(nanobind::module_& module);
 void bind_face(nanobind::module_& module);
 void bind_memory(nanobind::module_& module);
 void bind_mesh(nanobind::module_& module);
@@ -16,6 +17,7 @@ NB_MODULE(_native, module) {
   nanobind::set_leak_warnings(false);  // a picture that lives until the interpreter ends is no leak
   module.doc() = "mien's native core. Private: only the autograd functions in mien.render and mien.avatar call it.";
   bind_activation(module);
+  bind_expression_change(module);
   bind_face(module);
   bind_memory(module);
   bind_mesh(module);

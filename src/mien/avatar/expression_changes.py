@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import unpacked
+from mien.arrays import recycled, unpacked
 from mien.face import FaceParams
 
 SEEN_SHARE = 0.02
@@ -51,8 +51,43 @@ class ExpressionActivations(nn.Module):
             self.register_buffer(name, value.detach().clone())
 
     def forward(self, face: FaceParams) -> Float[Tensor, "b r"]:
-        """The activations of some timesteps. Differentiable in `face`."""
-        return soft_clamp((expression_inputs(face) - self.rest) @ self.directions, self.low, self.high)
+        """The activations of some timesteps. Differentiable in `face`; native for float32 on a CPU."""
+        inputs = expression_inputs(face)
+        if inputs.dtype != torch.float32 or inputs.device.type != "cpu":
+            return activations_reference(inputs, self.rest, self.directions, self.low, self.high)
+        return _Activations.apply(inputs, self.rest, self.directions, self.low, self.high)
+
+
+def activations_reference(
+    inputs: Float[Tensor, "b i"],
+    rest: Float[Tensor, " i"],
+    directions: Float[Tensor, "i r"],
+    low: Float[Tensor, " r"],
+    high: Float[Tensor, " r"],
+) -> Float[Tensor, "b r"]:
+    """(inputs - rest) directions, clamped softly (`soft_clamp`), in plain PyTorch, any dtype and device."""
+    return soft_clamp((inputs - rest) @ directions, low, high)
+
+
+class _Activations(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, *fixed: Tensor) -> Tensor:
+        inputs, *fixed = (tensor.detach().contiguous() for tensor in (inputs, *fixed))
+        out = torch.empty(len(inputs), fixed[1].shape[1])
+        for row, activations in zip(inputs, out, strict=True):
+            _native.expression_activations(*unpacked(row, *fixed, activations))
+        ctx.save_for_backward(inputs, *fixed)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        inputs, rest, directions, low, high = ctx.saved_tensors
+        along = (inputs - rest) @ directions
+        margin = _margin(low, high)
+        beyond = (along - high).clamp_min(0) + (low - along).clamp_min(0)
+        slope = (margin / (margin + beyond)).square()
+        return (gradient * slope) @ directions.T, None, None, None, None
 
 
 def expression_inputs(face: FaceParams) -> Float[Tensor, "b i"]:
@@ -91,21 +126,46 @@ def soft_clamp(
 
     The slope is continuous: 1 within the range, and falling beyond.
     """
-    margin = (MARGIN * (high - low)).clamp_min(1e-6)
+    margin = _margin(low, high)
     over, under = (values - high).clamp_min(0), (low - values).clamp_min(0)
     within = torch.minimum(torch.maximum(values, low), high)
     return within + margin * over / (margin + over) - margin * under / (margin + under)
 
 
-def expression_change(
-    basis: Float[Tensor, "n *c r"], activations: Float[Tensor, " r"]
-) -> Float[Tensor, "n *c"]:
-    """The sum of a basis' columns, weighted by the activations. Differentiable in both."""
-    return expression_change_reference(basis, activations)
+def _margin(low: Tensor, high: Tensor) -> Tensor:
+    """How far activations can leave their range."""
+    return (MARGIN * (high - low)).clamp_min(1e-6)
+
+
+def expression_change(basis: Float[Tensor, "n *c r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "n *c"]:
+    """The sum of a basis' columns, weighted by 1 to 8 activations. Differentiable; native for float32 on a CPU."""
+    if basis.dtype != torch.float32 or basis.device.type != "cpu":
+        return expression_change_reference(basis, activations)
+    return _Change.apply(basis, activations)
 
 
 def expression_change_reference(
     basis: Float[Tensor, "n *c r"], activations: Float[Tensor, " r"]
 ) -> Float[Tensor, "n *c"]:
     """`expression_change` in plain PyTorch, any dtype and device."""
-    return (basis.reshape(-1, basis.shape[-1]) @ activations).view(basis.shape[:-1])
+    return (basis.flatten(0, -2) @ activations).view(basis.shape[:-1])
+
+
+class _Change(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, basis: Tensor, activations: Tensor) -> Tensor:
+        basis, activations = basis.detach().contiguous(), activations.detach().contiguous()
+        out = torch.empty(basis.shape[:-1])
+        _native.expression_change(*unpacked(basis, activations, out))
+        ctx.save_for_backward(basis, activations)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        basis, activations = ctx.saved_tensors
+        by_basis, by_activations = recycled(*basis.shape), torch.empty_like(activations)
+        _native.expression_change_backward(
+            *unpacked(basis, activations, gradient.contiguous(), by_basis, by_activations)
+        )
+        return by_basis, by_activations
