@@ -254,7 +254,8 @@ def box_of_nonzero(native: Any, rng: Rng) -> Arguments:
 BASELINES: dict[str, Baseline] = {
     one.__name__: one
     for one in (
-        sigmoid, sigmoid_backward, expression_activations, expression_change, expression_change_backward, make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
+        sigmoid, sigmoid_backward, expression_activations, expression_change, expression_change_backward,
+        make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
         compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,
         align_mesh, bake_texture, light_equations, rig_forward, make_rig_topology, rig_backward, ride, ride_backward,

@@ -20,7 +20,7 @@ SEEN_SHARE = 0.02
 MARGIN = 0.25
 """How far an activation can leave its range, as a share of the range's length."""
 _WEAKEST = 0.1
-"""Smallest deviation that is scaled to 1, relative to that of the first direction. Weaker ones are noise of tracking."""
+"""Smallest deviation that is scaled to 1, relative to that of the first direction. Weaker ones stay weak."""
 
 
 class ExpressionActivations(nn.Module):
@@ -137,16 +137,14 @@ def _margin(low: Tensor, high: Tensor) -> Tensor:
     return (MARGIN * (high - low)).clamp_min(1e-6)
 
 
-def expression_change(basis: Float[Tensor, "n *c r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "n *c"]:
+def expression_change(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:
     """The sum of a basis' columns, weighted by 1 to 8 activations. Differentiable; native for float32 on a CPU."""
     if basis.dtype != torch.float32 or basis.device.type != "cpu":
         return expression_change_reference(basis, activations)
     return _Change.apply(basis, activations)
 
 
-def expression_change_reference(
-    basis: Float[Tensor, "n *c r"], activations: Float[Tensor, " r"]
-) -> Float[Tensor, "n *c"]:
+def expression_change_reference(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:
     """`expression_change` in plain PyTorch, any dtype and device."""
     return (basis.flatten(0, -2) @ activations).view(basis.shape[:-1])
 

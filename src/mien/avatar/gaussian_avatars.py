@@ -24,10 +24,12 @@ from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import stack_timesteps
 from mien.render.rendering import Rendering
-from mien.runtime.baked import Attributes, MeshBound
+from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
 _Pair = tuple[float, float]
 """A value for centres, and one for scales."""
+_BASES = ("colour_basis", "opacity_basis", "offset_basis")
+"""Names of the bases of changes with the expression."""
 
 
 class GaussianAvatars(Avatar):
@@ -78,15 +80,15 @@ class GaussianAvatars(Avatar):
         return Posed(pose_bound_gaussians(self.face_model, face, local, sh, in_head), changes)
 
     def _basis_shapes(self) -> dict[str, tuple[int, ...]]:
-        """The shape of one Gaussian's bases of changes with the expression, by name: those that the settings ask for."""
-        config, shapes = self.config, {}
-        if config.expression_rank > 0 and config.expression_colour_rate.start > 0:
-            shapes["colour_basis"] = (3, config.expression_rank)
-        if config.expression_rank > 0 and config.expression_opacity_rate.start > 0:
-            shapes["opacity_basis"] = (config.expression_rank,)
-        if config.expression_rank > 0 and config.expression_offset_rate.start > 0:
-            shapes["offset_basis"] = (3, config.expression_rank)
-        return shapes
+        """The shapes of a Gaussian's bases of changes with the expression, by name: those that the settings ask for."""
+        rank, rates = self.config.expression_rank, self._basis_rates()
+        wanted = [name for name in _BASES if rank > 0 and rates[name].start > 0]
+        return {name: (rank,) if name == "opacity_basis" else (3, rank) for name in wanted}
+
+    def _basis_rates(self) -> dict[str, Rate]:
+        config = self.config
+        rates = (config.expression_colour_rate, config.expression_opacity_rate, config.expression_offset_rate)
+        return dict(zip(_BASES, rates, strict=True))
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units."""
@@ -115,12 +117,7 @@ class GaussianAvatars(Avatar):
         rates["opacity_logits"], rates["sh_constant"] = config.opacity_rate, config.colour_rate
         if config.sh_degree > 0:
             rates["sh_rest"] = Rate(config.colour_rate.start / 20)
-        of_bases = {
-            "colour_basis": config.expression_colour_rate,
-            "opacity_basis": config.expression_opacity_rate,
-            "offset_basis": config.expression_offset_rate,
-        }
-        rates |= {name: of_bases[name] for name in self._basis_shapes()}
+        rates |= {name: self._basis_rates()[name] for name in self._basis_shapes()}
         return [store_group(self.store, name, rate) for name, rate in rates.items()]
 
     def gaussian_store(self) -> GaussianStore:
@@ -147,7 +144,16 @@ class GaussianAvatars(Avatar):
             means=store["means"],
             attributes=Attributes(store["quats"], store["log_scales"], store["opacity_logits"], sh),
             sh_frame=self._sh_frame,
+            changes=self._bake_changes(),
         )
+
+    def _bake_changes(self) -> ExpressionChanges | None:
+        """The changes with the expression, or None if the settings ask for none."""
+        if not self._basis_shapes():
+            return None
+        fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "low", "high"))
+        bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in _BASES)
+        return ExpressionChanges(*fixed, *bases)
 
     @property
     def _sh_frame(self) -> Literal["world", "head"]:
