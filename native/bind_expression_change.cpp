@@ -22,14 +22,13 @@ int checked_rank(const Basis& basis, const Values& values, const In<-1>& activat
   return static_cast<int>(rank);
 }
 
-void expression_activations(const In<-1>& inputs, const In<-1>& rest, const In<-1, -1>& directions, const In<-1>& low,
-                            const In<-1>& high, const Out<-1>& out) {
+void expression_activations(const In<-1>& inputs, const In<-1>& rest, const In<-1, -1>& directions, const In<1>& reach,
+                            const Out<-1>& out) {
   const size_t count = inputs.shape(0), rank = out.shape(0);
-  require(rest.shape(0) == count && has_shape(directions, count, rank) && low.shape(0) == rank && high.shape(0) == rank,
-          "the arrays do not fit each other");
+  require(rest.shape(0) == count && has_shape(directions, count, rank), "the arrays do not fit each other");
   const nb::gil_scoped_release release;
-  mien::expression_activations({inputs.data(), static_cast<int64_t>(count), rest.data(), directions.data(), low.data(),
-                                high.data(), static_cast<int64_t>(rank)},
+  mien::expression_activations({inputs.data(), static_cast<int64_t>(count), rest.data(), directions.data(),
+                                static_cast<int64_t>(rank), *reach.data()},
                                out.data());
 }
 
@@ -54,7 +53,7 @@ void expression_change_backward(const Array<const float>& basis, const In<-1>& a
 
 void bind_expression_change(nb::module_& module) {
   module.def("expression_activations", &expression_activations, "inputs"_a.noconvert(), "rest"_a, "directions"_a,
-             "low"_a, "high"_a, "out"_a.noconvert(), "Fills the activations of one face.");
+             "reach"_a, "out"_a.noconvert(), "Fills the activations of one face.");
   module.def("expression_change", &expression_change, "basis"_a.noconvert(), "activations"_a, "out"_a.noconvert(),
              "Fills the changes [..] of a basis [.., r].");
   module.def("expression_change_backward", &expression_change_backward, "basis"_a.noconvert(), "activations"_a,

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <vector>
 
 #include "expression_change_kernels.h"
@@ -15,27 +16,26 @@ MIEN_CHOOSE_KERNELS(ExpressionKernels, expression_kernels)
 namespace {
 
 constexpr int64_t kGrain = 8192;  // values in one piece of the pool's work; a whole number of vectors
-constexpr float kMargin = 0.25f, kLeastMargin = 1e-6f;  // the same numbers as in Python
-
-// `value` within low .. high; beyond, it approaches a quarter of the range more. No operation here may round in two
-// ways, so this uses neither `exp` nor a kernel.
-float soft_clamp(float value, float low, float high) {
-  const float margin = std::max(kMargin * (high - low), kLeastMargin);
-  const float over = std::max(value - high, 0.0f), under = std::max(low - value, 0.0f);
-  const float within = std::min(std::max(value, low), high);
-  return within + margin * over / (margin + over) - margin * under / (margin + under);
-}
+constexpr float kMargin = 0.1f;  // the same number as in Python
 
 }  // namespace
 
+// No operation here may round in two ways, so this uses neither `exp` nor a kernel.
 void expression_activations(const ActivationArrays& arrays, float* out) {
+  float squares = 0;
   for (int64_t k = 0; k < arrays.rank; ++k) {
     float sum = 0;
     for (int64_t i = 0; i < arrays.inputs_count; ++i) {
       sum += (arrays.inputs[i] - arrays.rest[i]) * arrays.directions[i * arrays.rank + k];
     }
-    out[k] = soft_clamp(sum, arrays.low[k], arrays.high[k]);
+    out[k] = sum;
+    squares += sum * sum;
   }
+  const float length = std::sqrt(std::max(squares, 1e-12f)), over = length - arrays.reach;
+  if (!(over > 0)) return;
+  const float margin = kMargin * arrays.reach;
+  const float shorter = (arrays.reach + margin * over / std::max(margin + over, 1e-6f)) / length;
+  for (int64_t k = 0; k < arrays.rank; ++k) out[k] *= shorter;
 }
 
 void expression_change(const float* basis, const float* activations, int rank, int64_t count, float* out) {

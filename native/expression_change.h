@@ -7,15 +7,14 @@ namespace mien {
 
 constexpr int kMostExpressionRank = 8;
 
-// The activations of one face: (inputs - rest) directions, within low .. high, and softly beyond.
+// The activations of one face: (inputs - rest) directions, softly shortened to a length.
 struct ActivationArrays {
   const float* inputs;  // [inputs_count]
   int64_t inputs_count;
   const float* rest;        // [inputs_count]
   const float* directions;  // [inputs_count, rank]
-  const float* low;         // [rank], at most `high`
-  const float* high;        // [rank]
   int64_t rank;
+  float reach;  // not negative
 };
 // Fills out [rank]. Sums run in the order of the inputs, so that training and the runtime get the same bits.
 void expression_activations(const ActivationArrays& arrays, float* out);

@@ -23,7 +23,7 @@ from mien.avatar.expression_changes import (
     expression_change,
     expression_change_reference,
     principal_directions,
-    soft_clamp,
+    within_reach,
 )
 from mien.avatar.gaussian_avatars import resting_opacities
 from mien.errors import UserError
@@ -82,22 +82,21 @@ def test_changes_have_the_same_bits_for_any_number_of_threads() -> None:
 
 
 def test_activations_follow_training_within_its_range_and_stop_soon_after() -> None:
-    low, high = torch.tensor([-1.0, 0.0]), torch.tensor([3.0, 0.0])
-    margin = MARGIN * 4
-    values = torch.tensor([-1.0, 0.5, 3.0, 3.0 + margin, 1e6, -1e6])
-    clamped = soft_clamp(torch.stack([values, values], -1), low, high)
-    expected = torch.tensor([-1.0, 0.5, 3.0, 3.0 + margin / 2, 3.0 + margin, -1.0 - margin])
-    torch.testing.assert_close(clamped[:, 0], expected, rtol=0, atol=1e-5)
-    # A direction that training never saw does nothing.
-    assert clamped[:, 1].abs().max() < 2e-6
-    inputs = values.double()[:, None].requires_grad_()
-    ends = low[:1].double(), high[:1].double()
-    assert torch.autograd.gradcheck(lambda x: soft_clamp(x, *ends), inputs + 0.01)
+    reach, margin = torch.tensor([2.0]), 2.0 * MARGIN
+    along = torch.tensor([0.6, 0.8])
+    lengths = torch.tensor([0.0, 1.0, 2.0, 2.0 + margin, 1e6])
+    expected = torch.tensor([0.0, 1.0, 2.0, 2.0 + margin / 2, 2.0 + margin])
+    shortened = within_reach(lengths[:, None] * along, reach)
+    torch.testing.assert_close(shortened, expected[:, None] * along, rtol=0, atol=1e-5)
+    # Expressions that training never saw do nothing.
+    assert within_reach(lengths[:, None] * along, torch.zeros(1)).abs().max() < 1e-5
+    inputs = (lengths[1:4, None] * along).double() + 0.01
+    assert torch.autograd.gradcheck(lambda x: within_reach(x, reach.double()), inputs.requires_grad_())
 
 
 def test_native_activations_equal_their_reference() -> None:
     avatar = new_avatar()
-    fixed = [getattr(avatar.activations, name) for name in ("rest", "directions", "low", "high")]
+    fixed = [getattr(avatar.activations, name) for name in ("rest", "directions", "reach")]
     face = toy_face(5)
     face = replace(face, expression=(3 * face.expression).requires_grad_())
     inputs = torch.cat([face.expression, face.joints.flatten(1)], -1)
@@ -112,14 +111,13 @@ def test_native_activations_equal_their_reference() -> None:
 def test_directions_are_those_of_the_largest_spread() -> None:
     axes = torch.linalg.qr(random(6, 6)).Q
     offsets = (random(500, 6, seed=1) * torch.tensor([4.0, 2.0, 0, 0, 0, 0])) @ axes.T
-    directions, low, high = principal_directions(offsets, 4)
+    directions, reach = principal_directions(offsets, 4)
     along = offsets @ directions
     assert (directions[:, 0] @ axes[:, 0]).abs() * 4 == pytest.approx(1, abs=0.1)
     torch.testing.assert_close(along.std(0)[:2], torch.ones(2), rtol=0, atol=0.02)
     # There are only two directions in these timesteps; the others do nothing.
     assert directions[:, 2:].abs().max() == 0
-    assert ((along < low) | (along > high)).float().mean(0).max() <= 0.05
-    assert bool((low <= 0).all() and (high >= 0).all())
+    assert (along.norm(dim=-1) > reach).float().mean() == pytest.approx(0.02)
 
 
 def test_rank_0_is_the_method_without_changes() -> None:
@@ -236,12 +234,12 @@ def test_impossible_changes_are_refused(tmp_path: Path) -> None:
     changes = baked.changes
     assert changes is not None
     parts = {name: getattr(changes, name) for name in ("colour", "opacity_logits", "means")}
-    fixed = {name: getattr(changes, name) for name in ("rest", "directions", "low", "high")}
-    none = {name: array[..., :0] for name, array in (parts | fixed).items() if name != "rest"}
+    fixed = {name: getattr(changes, name) for name in ("rest", "directions", "reach")}
+    none = {name: array[..., :0] for name, array in (parts | fixed).items() if name not in ("rest", "reach")}
     for wrong, part in (
         (replace(changes, **{name: array[:3] for name, array in parts.items()}), "the shape of colour of its changes"),
         (replace(changes, rest=fixed["rest"][:1], directions=fixed["directions"][:1]), "the shape of rest of its"),
-        (replace(changes, low=changes.high + 1), "ends before it begins"),
+        (replace(changes, reach=-changes.reach), "is negative"),
         (replace(changes, **none), "0 activations"),
         (replace(changes, directions=changes.directions * np.float32("nan")), "NaN"),
     ):

@@ -15,10 +15,10 @@ from mien import _native
 from mien.arrays import recycled, unpacked
 from mien.face import FaceParams
 
-SEEN_SHARE = 0.02
-"""Share of the timesteps, at either end of an activation, that does not count for its range."""
-MARGIN = 0.25
-"""How far an activation can leave its range, as a share of the range's length."""
+SEEN_SHARE = 0.98
+"""Share of the training timesteps whose activations are not shortened."""
+MARGIN = 0.1
+"""How far activations can get beyond what training saw, as a share of its reach."""
 _WEAKEST = 0.1
 """Smallest deviation that is scaled to 1, relative to that of the first direction. Weaker ones stay weak."""
 
@@ -33,11 +33,10 @@ class ExpressionActivations(nn.Module):
 
     rest: Tensor
     directions: Tensor
-    low: Tensor
-    high: Tensor
+    reach: Tensor
 
     def __init__(self, face: FaceParams, neutral: FaceParams, rank: int):
-        """Take the directions and the ranges from the timesteps of `face`.
+        """Take the directions and the reach from the timesteps of `face`.
 
         Args:
             face: Face parameters of all training timesteps.
@@ -46,27 +45,26 @@ class ExpressionActivations(nn.Module):
         """
         super().__init__()
         rest = expression_inputs(neutral)[0]
-        directions, low, high = principal_directions(expression_inputs(face) - rest, rank)
-        for name, value in (("rest", rest), ("directions", directions), ("low", low), ("high", high)):
+        directions, reach = principal_directions(expression_inputs(face) - rest, rank)
+        for name, value in (("rest", rest), ("directions", directions), ("reach", reach)):
             self.register_buffer(name, value.detach().clone())
 
     def forward(self, face: FaceParams) -> Float[Tensor, "b r"]:
         """The activations of some timesteps. Differentiable in `face`; native for float32 on a CPU."""
         inputs = expression_inputs(face)
         if inputs.dtype != torch.float32 or inputs.device.type != "cpu":
-            return activations_reference(inputs, self.rest, self.directions, self.low, self.high)
-        return _Activations.apply(inputs, self.rest, self.directions, self.low, self.high)
+            return activations_reference(inputs, self.rest, self.directions, self.reach)
+        return _Activations.apply(inputs, self.rest, self.directions, self.reach)
 
 
 def activations_reference(
     inputs: Float[Tensor, "b i"],
     rest: Float[Tensor, " i"],
     directions: Float[Tensor, "i r"],
-    low: Float[Tensor, " r"],
-    high: Float[Tensor, " r"],
+    reach: Float[Tensor, " 1"],
 ) -> Float[Tensor, "b r"]:
-    """(inputs - rest) directions, clamped softly (`soft_clamp`), in plain PyTorch, any dtype and device."""
-    return soft_clamp((inputs - rest) @ directions, low, high)
+    """(inputs - rest) directions, shortened to the reach (`within_reach`), in plain PyTorch, any dtype and device."""
+    return within_reach((inputs - rest) @ directions, reach)
 
 
 class _Activations(torch.autograd.Function):
@@ -82,12 +80,10 @@ class _Activations(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        inputs, rest, directions, low, high = ctx.saved_tensors
-        along = (inputs - rest) @ directions
-        margin = _margin(low, high)
-        beyond = (along - high).clamp_min(0) + (low - along).clamp_min(0)
-        slope = (margin / (margin + beyond)).square()
-        return (gradient * slope) @ directions.T, None, None, None, None
+        inputs, *fixed = (tensor.detach() for tensor in ctx.saved_tensors)
+        with torch.enable_grad():
+            out = activations_reference(inputs.requires_grad_(), *fixed)
+        return *torch.autograd.grad(out, inputs, gradient), None, None, None
 
 
 def expression_inputs(face: FaceParams) -> Float[Tensor, "b i"]:
@@ -95,12 +91,10 @@ def expression_inputs(face: FaceParams) -> Float[Tensor, "b i"]:
     return torch.cat([face.expression, face.joints.flatten(1)], dim=-1)
 
 
-def principal_directions(
-    offsets: Float[Tensor, "t i"], rank: int
-) -> tuple[Float[Tensor, "i r"], Float[Tensor, " r"], Float[Tensor, " r"]]:
-    """Directions of the largest spread, strongest first, and the range of the timesteps along each of them.
+def principal_directions(offsets: Float[Tensor, "t i"], rank: int) -> tuple[Float[Tensor, "i r"], Float[Tensor, " 1"]]:
+    """Directions of the largest spread, strongest first, and how far along them the timesteps reach from 0.
 
-    The range leaves out `SEEN_SHARE` of the timesteps at either end and always holds 0, which is the person at rest.
+    The reach is the length of the activations that `SEEN_SHARE` of the timesteps do not exceed.
     """
     exact = offsets.detach().double().cpu()
     centred = exact - exact.mean(0)
@@ -112,29 +106,20 @@ def principal_directions(
     scales = deviations.clamp_min(max(_WEAKEST * float(deviations[0]), 1e-6))
     directions = exact.new_zeros(len(vectors), rank)
     directions[:, :count] = vectors * largest.sign() * usable / scales
-    directions = directions.to(offsets)
-    along = offsets.detach() @ directions
-    ends = along.new_tensor([SEEN_SHARE, 1 - SEEN_SHARE])
-    low, high = along.quantile(ends, dim=0)
-    return directions, low.clamp_max(0), high.clamp_min(0)
+    reach = (exact @ directions).norm(dim=-1).quantile(SEEN_SHARE, dim=0, keepdim=True)
+    return directions.to(offsets), reach.to(offsets)
 
 
-def soft_clamp(
-    values: Float[Tensor, "*b r"], low: Float[Tensor, " r"], high: Float[Tensor, " r"]
-) -> Float[Tensor, "*b r"]:
-    """`values` within their range; beyond it they approach `MARGIN` of the range's length more, and never reach it.
+def within_reach(values: Float[Tensor, "b r"], reach: Float[Tensor, " 1"]) -> Float[Tensor, "b r"]:
+    """`values` as they are up to the length `reach`. Longer ones keep their direction and get a shorter length.
 
-    The slope is continuous: 1 within the range, and falling beyond.
+    The new length approaches (1 + `MARGIN`) reach and never gets there. Its slope is continuous.
     """
-    margin = _margin(low, high)
-    over, under = (values - high).clamp_min(0), (low - values).clamp_min(0)
-    within = torch.minimum(torch.maximum(values, low), high)
-    return within + margin * over / (margin + over) - margin * under / (margin + under)
-
-
-def _margin(low: Tensor, high: Tensor) -> Tensor:
-    """How far activations can leave their range."""
-    return (MARGIN * (high - low)).clamp_min(1e-6)
+    lengths = values.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
+    over = (lengths - reach).clamp_min(0)
+    margin = MARGIN * reach
+    shortened = reach + margin * over / (margin + over).clamp_min(1e-6)
+    return values * torch.where(over > 0, shortened / lengths, 1.0)
 
 
 def expression_change(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:

@@ -151,7 +151,7 @@ class GaussianAvatars(Avatar):
         """The changes with the expression, or None if the settings ask for none."""
         if not self._basis_shapes():
             return None
-        fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "low", "high"))
+        fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "reach"))
         bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in _BASES)
         return ExpressionChanges(*fixed, *bases)
 

@@ -89,17 +89,15 @@ class AttributeNetwork:
 class ExpressionChanges:
     """Changes of the raw values with the expression, of low rank. A part that is None does not change.
 
-    The activations are (inputs - rest) directions, each within `low` .. `high`. Beyond the range they approach a
-    quarter of its length more: with margin m = max((high - low) / 4, 1e-6), a value that is d above the range gives
-    high + m d / (m + d), and the same below. `_native.expression_activations` computes this.
+    The activations are (inputs - rest) directions. If their length d is beyond `reach`, they are shortened to the
+    length reach + m o / (m + o), with o = d - reach and m = reach / 10. `_native.expression_activations` computes this.
     """
 
     rest: Float32[np.ndarray, " i"]
     """Inputs of the person at rest: expression coefficients, then axis-angle vectors of the free joints, in radians."""
     directions: Float32[np.ndarray, "i r"]
-    low: Float32[np.ndarray, " r"]
-    """Lower ends of the ranges that training saw."""
-    high: Float32[np.ndarray, " r"]
+    reach: Float32[np.ndarray, " 1"]
+    """Length of the activations up to which training saw expressions."""
     colour: Float32[np.ndarray, "n 3 r"] | None = None
     """Changes of the first SH coefficient per unit of each activation."""
     opacity_logits: Float32[np.ndarray, "n r"] | None = None

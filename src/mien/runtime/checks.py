@@ -128,18 +128,18 @@ def _bases_faults(bases: LinearBases, attributes: Attributes, e: int, mean_moves
 
 
 def _changes_faults(changes: ExpressionChanges, n: int, inputs: int) -> Iterator[str]:
-    r = len(changes.low)
+    r = changes.directions.shape[1]
     if not 1 <= r <= MAX_ACTIVATIONS:
         yield f"it has {r} activations of its changes with the expression, not 1 to {MAX_ACTIVATIONS}"
-    shapes = {"rest": (inputs,), "directions": (inputs, r), "low": (r,), "high": (r,)}
+    shapes = {"rest": (inputs,), "directions": (inputs, r), "reach": (1,)}
     shapes |= {"colour": (n, 3, r), "opacity_logits": (n, r), "means": (n, 3, r)}
     for name, shape in shapes.items():
         part = getattr(changes, name)
         if part is not None and part.shape != shape:
             yield f"the shape of {name} of its changes with the expression does not fit"
             return
-    if not bool((changes.low <= changes.high).all()):
-        yield "a range of its changes with the expression ends before it begins"
+    if changes.reach[0] < 0:
+        yield "the reach of its changes with the expression is negative"
 
 
 def _rig_faults(rig: Rig) -> Iterator[str]:

@@ -144,9 +144,8 @@ def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
 def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.ndarray]:
     """What is added to the raw values, by the names of the parts: [n, 3], [n] and [n, 3]. None adds nothing."""
     inputs = np.concatenate([face.expression, face.joints.reshape(-1)]).astype(np.float32, copy=False)
-    activations = np.empty(len(changes.low), np.float32)
-    fixed = (changes.rest, changes.directions, changes.low, changes.high)
-    _native.expression_activations(inputs, *fixed, activations)
+    activations = np.empty(changes.directions.shape[1], np.float32)
+    _native.expression_activations(inputs, changes.rest, changes.directions, changes.reach, activations)
     added = {}
     for name in ("colour", "opacity_logits", "means"):
         basis = getattr(changes, name)
