@@ -16,7 +16,7 @@ MIEN_CHOOSE_KERNELS(ExpressionKernels, expression_kernels)
 namespace {
 
 constexpr int64_t kGrain = 8192;  // values in one piece of the pool's work; a whole number of vectors
-constexpr float kMargin = 0.1f;  // the same number as in Python
+constexpr float kMargin = 0.1f;   // the same number as in Python
 
 }  // namespace
 

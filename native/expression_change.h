@@ -1,4 +1,5 @@
-// Changes of Gaussians with the expression, of low rank (src/mien/avatar/expression_changes.py has the same in PyTorch).
+// Changes of Gaussians with the expression, of low rank (src/mien/avatar/expression_changes.py has the same in
+// PyTorch).
 #pragma once
 
 #include <cstdint>

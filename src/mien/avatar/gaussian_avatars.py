@@ -2,6 +2,7 @@
 
 Written from the paper and its supplement. Comments note where the published code differs from the paper in a way that
 matters. Lengths and scales in the store are in units of the triangle's own scale (`mien.avatar.triangle_frames`).
+Changes with the expression beside those of the mesh (`expression_rank`) are not part of the paper.
 """
 
 from typing import Any, Literal
@@ -58,7 +59,7 @@ class GaussianAvatars(Avatar):
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in world space, or in the head frame (`_sh_frame`), with one batch entry per timestep."""
         sh, in_head = self._active_sh(progress), self._sh_frame == "head"
-        if self._basis_shapes():
+        if self._basis_shapes() and len(face) > 0:
             return self._pose_with_changes(face, sh, in_head)
         return Posed(pose_bound_gaussians(self.face_model, face, self.store, sh, in_head), {})
 
@@ -91,7 +92,10 @@ class GaussianAvatars(Avatar):
         return dict(zip(_BASES, rates, strict=True))
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
-        """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units."""
+        """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units.
+
+        With `expression_rank`, also the mean squared changes with the expression, over all Gaussians.
+        """
         config = self.config
         position, scale = triangle_penalties(
             self.store["means"],
