@@ -3,6 +3,7 @@
 
 void bind_activation(nanobind::module_& module);
 void bind_composite(nanobind::module_& module);
+void bind_expression_change(nanobind::module_& module);
 void bind_face(nanobind::module_& module);
 void bind_memory(nanobind::module_& module);
 void bind_mesh(nanobind::module_& module);
@@ -18,6 +19,7 @@ NB_MODULE(_native, module) {
   module.doc() = "mien's native core. Private: only the autograd functions in mien.render and mien.avatar call it.";
   bind_activation(module);
   bind_composite(module);
+  bind_expression_change(module);
   bind_face(module);
   bind_memory(module);
   bind_mesh(module);

@@ -63,6 +63,8 @@ def grown_avatar(model: FaceModel, face: FaceParams, config: MethodConfig, count
     store.assign("log_scales", 0.4 * noise(9, count, 3) - 0.7)
     store.assign("opacity_logits", 2 * noise(10, count) + 1)
     store.assign("sh_constant", noise(11, count, 1, 3))
+    for name in {"colour_basis", "opacity_basis", "offset_basis"} & set(store.names()):
+        store.assign(name, 0.1 * noise(12, *store[name].shape))
     return avatar
 
 
@@ -85,8 +87,8 @@ def rendered_without_torch(avatar: Avatar, face: FaceParams, camera: Camera, fol
 @pytest.mark.exact
 @pytest.mark.parametrize(
     "colours",
-    [{}, {"sh_degree": 2}, {"sh_degree": 1, "sh_frame": "head"}],
-    ids=["constant colours", "colours in world space", "colours in the head frame"],
+    [{}, {"sh_degree": 2}, {"sh_degree": 1, "sh_frame": "head"}, {"sh_degree": 1, "expression_rank": 7}],
+    ids=["constant colours", "colours in world space", "colours in the head frame", "changes with the expression"],
 )
 @torch.no_grad()
 def test_every_pixel_equals_that_of_training(colours: dict[str, Any], tmp_path: Path) -> None:

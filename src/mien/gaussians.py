@@ -1,12 +1,13 @@
 """Activated 3D Gaussians: the value object that renderers take."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Gaussians", "rgb_from_sh", "sh_from_rgb", "world_means"]
+__all__ = ["Gaussians", "rgb_from_sh", "sh_from_rgb", "stack_timesteps", "world_means"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +74,15 @@ class Gaussians:
         """Each tensor that is not None, with its number of axes when unbatched, in the order of the fields."""
         entries = [(self.means, 2), (self.quats, 2), (self.scales, 2), (self.opacities, 1), (self.sh, 3)]
         return entries if self.T_world_local is None else [*entries, (self.T_world_local, 2)]
+
+
+def stack_timesteps(timesteps: Sequence[Gaussians]) -> Gaussians:
+    """One batch of several timesteps, each with a batch axis of one or with none. Every tensor gets a batch axis."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    single = [gaussians.timestep(0) for gaussians in timesteps]
+    poses = [gaussians.T_world_local for gaussians in single if gaussians.T_world_local is not None]
+    stacked = (torch.stack([getattr(gaussians, name) for gaussians in single]) for name in names)
+    return Gaussians(*stacked, T_world_local=torch.stack(poses) if poses else None)
 
 
 def _entry(tensor: Tensor, index: int) -> Tensor:

@@ -42,6 +42,24 @@ def sigmoid_backward(native: Any, rng: Rng) -> Arguments:
     return [normal(rng, n), normal(rng, n), empty(n)]
 
 
+# Changes with the expression
+
+
+def expression_activations(native: Any, rng: Rng) -> Arguments:
+    i, r = few(rng), int(rng.integers(1, 9))
+    return [normal(rng, i), normal(rng, i), normal(rng, i, r), np.abs(normal(rng, 1)), empty(r)]
+
+
+def expression_change(native: Any, rng: Rng) -> Arguments:
+    shape, r = (few(rng), *([3] if rng.random() < 0.5 else [])), int(rng.integers(1, 9))
+    return [normal(rng, *shape, r), normal(rng, r), empty(*shape)]
+
+
+def expression_change_backward(native: Any, rng: Rng) -> Arguments:
+    shape, r = (few(rng), *([3] if rng.random() < 0.5 else [])), int(rng.integers(1, 9))
+    return [normal(rng, *shape, r), normal(rng, r), normal(rng, *shape), empty(*shape, r), empty(r)]
+
+
 # Faces
 
 Sizes = tuple[int, int, int]
@@ -243,7 +261,8 @@ def composite(native: Any, rng: Rng) -> Arguments:
 BASELINES: dict[str, Baseline] = {
     one.__name__: one
     for one in (
-        sigmoid, sigmoid_backward, make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
+        sigmoid, sigmoid_backward, expression_activations, expression_change, expression_change_backward,
+        make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
         compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,
         align_mesh, bake_texture, light_equations, rig_forward, make_rig_topology, rig_backward, ride, ride_backward,

@@ -1,5 +1,6 @@
 """Bound Gaussians: posing of the face, frames of the triangles and opacities as one operation."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -20,13 +21,18 @@ _LOCAL = ("means", "quats", "log_scales", "opacity_logits")
 
 
 def pose_bound_gaussians(
-    face_model: FaceModel, face: FaceParams, store: GaussianStore, sh: Float[Tensor, "n k 3"], in_head: bool
+    face_model: FaceModel,
+    face: FaceParams,
+    store: GaussianStore | Mapping[str, Tensor],
+    sh: Float[Tensor, "n k 3"],
+    in_head: bool,
 ) -> Gaussians:
-    """The posed Gaussians of a store (`face_index`, `means, quats, log_scales` in triangle units, `opacity_logits`).
+    """The posed Gaussians of a store, or of such tensors by name.
 
-    They are in world space or, with `in_head`, in the head frame together with its pose. There is one batch entry per
-    timestep. Differentiable in the store and in `face`. A single timestep on a CPU, which is the case in training,
-    takes one native call forward and one backward.
+    The tensors are `face_index`, `means, quats, log_scales` in triangle units, and `opacity_logits`. The Gaussians are
+    in world space or, with `in_head`, in the head frame together with its pose. There is one batch entry per timestep.
+    Differentiable in the store and in `face`. A single timestep on a CPU, which is the case in training, takes one
+    native call forward and one backward.
     """
     if len(face) == 1 and has_native_posing(face_model, face) and store["means"].dtype == torch.float32:
         compiled = compiled_model(face_model)
@@ -43,7 +49,11 @@ def pose_bound_gaussians(
 
 
 def pose_bound_gaussians_reference(
-    face_model: FaceModel, face: FaceParams, store: GaussianStore, sh: Float[Tensor, "n k 3"], in_head: bool
+    face_model: FaceModel,
+    face: FaceParams,
+    store: GaussianStore | Mapping[str, Tensor],
+    sh: Float[Tensor, "n k 3"],
+    in_head: bool,
 ) -> Gaussians:
     """`pose_bound_gaussians` composed from its parts, for any dtype, device and number of timesteps."""
     vertices = face_model.head_vertices(face) if in_head else face_model(face)

@@ -2,6 +2,7 @@
 
 Written from the paper and its supplement. Comments note where the published code differs from the paper in a way that
 matters. Lengths and scales in the store are in units of the triangle's own scale (`mien.avatar.triangle_frames`).
+Changes with the expression beside those of the mesh (`expression_rank`) are not part of the paper.
 """
 
 from typing import Any, Literal
@@ -16,16 +17,20 @@ from mien.arrays import unpacked
 from mien.avatar.avatar import Avatar, ParameterGroup, Posed, store_group
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.bound_gaussians import pose_bound_gaussians
-from mien.avatar.density import GradientDensity
+from mien.avatar.density import GradientDensity, highest_opacities_seen
+from mien.avatar.expression_changes import ExpressionActivations, expression_change
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
 from mien.avatar.schedules import TRAINED, Progress, Rate
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
+from mien.gaussians import stack_timesteps
 from mien.render.rendering import Rendering
-from mien.runtime.baked import Attributes, MeshBound
+from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
 _Pair = tuple[float, float]
 """A value for centres, and one for scales."""
+_BASES = ("colour_basis", "opacity_basis", "offset_basis")
+"""Names of the bases of changes with the expression."""
 
 
 class GaussianAvatars(Avatar):
@@ -46,15 +51,51 @@ class GaussianAvatars(Avatar):
         }
         if config.sh_degree > 0:
             trained["sh_rest"] = like.new_zeros(n, (config.sh_degree + 1) ** 2 - 1, 3)
+        trained |= {name: like.new_zeros(n, *shape) for name, shape in self._basis_shapes().items()}
+        if self._basis_shapes():
+            self.activations = ExpressionActivations(face, self.subject, config.expression_rank)
         self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in world space, or in the head frame (`_sh_frame`), with one batch entry per timestep."""
         sh, in_head = self._active_sh(progress), self._sh_frame == "head"
+        if self._basis_shapes() and len(face) > 0:
+            return self._pose_with_changes(face, sh, in_head)
         return Posed(pose_bound_gaussians(self.face_model, face, self.store, sh, in_head), {})
 
+    def _pose_with_changes(self, face: FaceParams, sh: Float[Tensor, "n k 3"], in_head: bool) -> Posed:
+        """The same with the changes of the expression, which are also returned, by the names of their bases."""
+        if len(face) > 1:
+            each = [self._pose_with_changes(face[timestep], sh, in_head) for timestep in range(len(face))]
+            aux = {name: torch.stack([posed.aux[name] for posed in each]) for name in self._basis_shapes()}
+            return Posed(stack_timesteps([posed.gaussians for posed in each]), aux)
+        (activations,) = self.activations(face)
+        changes = {name: expression_change(self.store[name], activations) for name in self._basis_shapes()}
+        local = {name: self.store[name] for name in ("face_index", "means", "quats", "log_scales", "opacity_logits")}
+        if "offset_basis" in changes:
+            local["means"] = local["means"] + changes["offset_basis"]
+        if "opacity_basis" in changes:
+            local["opacity_logits"] = local["opacity_logits"] + changes["opacity_basis"]
+        if "colour_basis" in changes:
+            sh = torch.cat([sh[:, :1] + changes["colour_basis"][:, None], sh[:, 1:]], dim=1)
+        return Posed(pose_bound_gaussians(self.face_model, face, local, sh, in_head), changes)
+
+    def _basis_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of a Gaussian's bases of changes with the expression, by name: those that the settings ask for."""
+        rank, rates = self.config.expression_rank, self._basis_rates()
+        wanted = [name for name in _BASES if rank > 0 and rates[name].start > 0]
+        return {name: (rank,) if name == "opacity_basis" else (3, rank) for name in wanted}
+
+    def _basis_rates(self) -> dict[str, Rate]:
+        config = self.config
+        rates = (config.expression_colour_rate, config.expression_opacity_rate, config.expression_offset_rate)
+        return dict(zip(_BASES, rates, strict=True))
+
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
-        """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units."""
+        """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units.
+
+        With `expression_rank`, also the mean squared changes with the expression, over all Gaussians.
+        """
         config = self.config
         position, scale = triangle_penalties(
             self.store["means"],
@@ -63,7 +104,11 @@ class GaussianAvatars(Avatar):
             thresholds=(config.position_threshold, config.scale_threshold),
             weights=(config.position_weight, config.scale_weight),
         )
-        return {"position": position, "scale": scale}
+        losses = {"position": position, "scale": scale}
+        if posed.aux:
+            squares = [change.square().mean() for change in posed.aux.values()]
+            losses["expression"] = config.expression_weight * torch.stack(squares).sum()
+        return losses
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group per tensor."""
@@ -76,6 +121,7 @@ class GaussianAvatars(Avatar):
         rates["opacity_logits"], rates["sh_constant"] = config.opacity_rate, config.colour_rate
         if config.sh_degree > 0:
             rates["sh_rest"] = Rate(config.colour_rate.start / 20)
+        rates |= {name: self._basis_rates()[name] for name in self._basis_shapes()}
         extent = {"means": config.means_times_extent}
         return [
             store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
@@ -90,7 +136,7 @@ class GaussianAvatars(Avatar):
         return GradientDensity(
             self.config.density,
             opacity_logits="opacity_logits",
-            judged_opacities=lambda store, seen: store["opacity_logits"].detach().sigmoid(),
+            judged_opacities=highest_opacities_seen if "opacity_basis" in self._basis_shapes() else resting_opacities,
             may_prune=never_empty_a_triangle,
         )
 
@@ -105,7 +151,16 @@ class GaussianAvatars(Avatar):
             means=store["means"],
             attributes=Attributes(store["quats"], store["log_scales"], store["opacity_logits"], sh),
             sh_frame=self._sh_frame,
+            changes=self._bake_changes(),
         )
+
+    def _bake_changes(self) -> ExpressionChanges | None:
+        """The changes with the expression, or None if the settings ask for none."""
+        if not self._basis_shapes():
+            return None
+        fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "reach"))
+        bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in _BASES)
+        return ExpressionChanges(*fixed, *bases)
 
     @property
     def _sh_frame(self) -> Literal["world", "head"]:
@@ -126,6 +181,11 @@ class GaussianAvatars(Avatar):
         active = min(degree, int(progress.fraction / warmup * (degree + 1)))
         rest = self.store["sh_rest"][:, : (active + 1) ** 2 - 1]
         return torch.cat([self.store["sh_constant"], rest], dim=1)
+
+
+def resting_opacities(store: GaussianStore, seen: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """The opacities by which Gaussians are pruned if they do not depend on the face."""
+    return store["opacity_logits"].detach().sigmoid()
 
 
 def never_empty_a_triangle(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:

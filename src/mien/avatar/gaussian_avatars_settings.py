@@ -34,6 +34,20 @@ class GaussianAvatarsConfig(MethodConfig):
     colour_rate: Rate = Rate(2.5e-3)
     """Learning rate of the constant colour coefficients, per step. Coefficients of higher degrees have a constant rate:
     a twentieth of the start of this rate."""
+    expression_rank: Annotated[int, Range(0, 8)] = 0
+    """Number of activations of the face with which colour, opacity and place of each Gaussian change, for what the mesh
+    cannot say, such as wrinkles. 0 is the paper's method, without such changes."""
+    expression_colour_rate: Rate = Rate(1e-3)
+    """Learning rate of the changes of colour with the expression, in colour coefficients per unit of an activation and
+    step. If its start is 0, colours do not change."""
+    expression_opacity_rate: Rate = Rate(0.01)
+    """Learning rate of the changes of opacity (logits) with the expression, per unit of an activation and step. If its
+    start is 0, opacities do not change."""
+    expression_offset_rate: Rate = Rate(1e-3, 1e-5)
+    """Learning rate of the changes of place with the expression, in triangle units per unit of an activation and step.
+    If its start is 0, places do not change."""
+    expression_weight: Annotated[float, NOT_NEGATIVE] = 0.1
+    """Weight of the mean squared changes with the expression, which keeps changes small that pictures do not need."""
     position_threshold: Annotated[float, NOT_NEGATIVE] = 1.0
     """Distance from the triangle's centre up to which a Gaussian's centre has no penalty, in triangle units."""
     position_weight: Annotated[float, NOT_NEGATIVE] = 0.01

@@ -3,14 +3,19 @@
 They are a small closed family, so that exporters, the web and game engines read them without knowing the method. The
 Gaussians' centres move with a mesh (`MeshBound`), move by their own blend directions and skinning weights
 (`BlendSkinned`), or do not move at all (`Static`). Their attributes are constant, or depend on the expression linearly
-(`LinearBases`) or through a small network (`AttributeNetwork`). `mien.runtime.posing` is the reference implementation
-of posing. Files hold the names of these classes and of their fields, so neither can change.
+(`LinearBases`), through a few activations (`ExpressionChanges`) or through a small network (`AttributeNetwork`).
+`mien.runtime.posing` is the reference implementation of posing. Files hold the names of these classes and of their
+fields, so neither can change.
 
 Letters in shapes mean the same in the whole file: n Gaussians, m points of the rig, f triangles, e expressions, k
-joints, j free joints, p pose correctives (9 per free joint), s SH coefficients per channel.
+joints, j free joints, p pose correctives (9 per free joint), s SH coefficients per channel, r activations, i inputs
+(e expression coefficients, then 3 j angles).
+
+A field that came with a later version of the format has that version as `since` in its metadata. It is None by default,
+and files leave it out then, so that their version stays the older one.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -81,6 +86,26 @@ class AttributeNetwork:
 
 
 @dataclass(frozen=True, eq=False)
+class ExpressionChanges:
+    """Changes of the raw values with the expression, of low rank. A part that is None does not change.
+
+    The activations are (inputs - rest) directions. If their length d is beyond `reach`, they are shortened to the
+    length reach + m o / (m + o), with o = d - reach and m = reach / 10. `_native.expression_activations` computes this.
+    """
+
+    rest: Float32[np.ndarray, " i"]
+    """Inputs of the person at rest: expression coefficients, then axis-angle vectors of the free joints, in radians."""
+    directions: Float32[np.ndarray, "i r"]
+    reach: Float32[np.ndarray, " 1"]
+    """Length of the activations up to which training saw expressions."""
+    colour: Float32[np.ndarray, "n 3 r"] | None = None
+    """Changes of the first SH coefficient per unit of each activation."""
+    opacity_logits: Float32[np.ndarray, "n r"] | None = None
+    means: Float32[np.ndarray, "n 3 r"] | None = None
+    """Changes of the centres, in the triangle's frame and units."""
+
+
+@dataclass(frozen=True, eq=False)
 class MeshBound:
     """Gaussians in the frames of a mesh's triangles."""
 
@@ -94,6 +119,8 @@ class MeshBound:
     attributes: Attributes
     sh_frame: Literal["world", "head"]
     """Frame of the view direction for spherical harmonics."""
+    changes: ExpressionChanges | None = field(default=None, metadata={"since": 2})
+    """Changes with the expression, beside those that the mesh makes."""
 
 
 @dataclass(frozen=True, eq=False)

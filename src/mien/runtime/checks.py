@@ -14,6 +14,7 @@ from mien.runtime.baked import (
     Attributes,
     BakedAvatar,
     BlendSkinned,
+    ExpressionChanges,
     LinearBases,
     MeshBound,
     PortableAvatar,
@@ -23,6 +24,8 @@ from mien.runtime.baked import (
 
 MAX_SHAPES = 256
 """Largest number of expressions, plus nine for each free joint, that native/face.h accepts."""
+MAX_ACTIVATIONS = 8
+"""Largest number of activations that native/expression_change.h accepts."""
 _MAX_LOG_SCALE = 30
 """Largest logarithm of a scale. Its exponential, and the square of that, still fit into float32."""
 
@@ -89,6 +92,8 @@ def _baked_faults(baked: BakedAvatar) -> Iterator[str]:
             yield "a triangle refers to a vertex, or a Gaussian to a triangle, that does not exist"
         if not len(baked.face_index) == len(baked.means) == n:
             yield "its centres and its attributes have different numbers of Gaussians"
+        if baked.changes is not None:
+            yield from _changes_faults(baked.changes, n, len(names) + 3 * len(free))
         return
     if isinstance(baked, BlendSkinned) and len(baked.rig.template) != n:
         yield f"it has {len(baked.rig.template)} points, but {n} Gaussians"
@@ -120,6 +125,21 @@ def _bases_faults(bases: LinearBases, attributes: Attributes, e: int, mean_moves
             yield f"the shape of its basis of {f.name} does not fit"
     if bases.means is not None and not mean_moves:
         yield "it has a basis of its means, but its rig already moves them"
+
+
+def _changes_faults(changes: ExpressionChanges, n: int, inputs: int) -> Iterator[str]:
+    r = changes.directions.shape[1]
+    if not 1 <= r <= MAX_ACTIVATIONS:
+        yield f"it has {r} activations of its changes with the expression, not 1 to {MAX_ACTIVATIONS}"
+    shapes = {"rest": (inputs,), "directions": (inputs, r), "reach": (1,)}
+    shapes |= {"colour": (n, 3, r), "opacity_logits": (n, r), "means": (n, 3, r)}
+    for name, shape in shapes.items():
+        part = getattr(changes, name)
+        if part is not None and part.shape != shape:
+            yield f"the shape of {name} of its changes with the expression does not fit"
+            return
+    if changes.reach[0] < 0:
+        yield "the reach of its changes with the expression is negative"
 
 
 def _rig_faults(rig: Rig) -> Iterator[str]:

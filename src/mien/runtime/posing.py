@@ -7,7 +7,16 @@ import numpy as np
 from jaxtyping import Float32
 
 from mien import _native
-from mien.runtime.baked import AttributeNetwork, Attributes, BakedAvatar, BlendSkinned, LinearBases, MeshBound, Rig
+from mien.runtime.baked import (
+    AttributeNetwork,
+    Attributes,
+    BakedAvatar,
+    BlendSkinned,
+    ExpressionChanges,
+    LinearBases,
+    MeshBound,
+    Rig,
+)
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * coefficient."""
@@ -108,6 +117,13 @@ def _batch(values: np.ndarray) -> np.ndarray:
 
 def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
     pose, raw = face.T_world_head, baked.attributes
+    local_means, opacity_logits, sh = baked.means, raw.opacity_logits, raw.sh
+    if baked.changes is not None:
+        changes = expression_changes(baked.changes, face)
+        local_means = local_means + changes.get("means", np.float32(0))
+        opacity_logits = opacity_logits + changes.get("opacity_logits", np.float32(0))
+        if "colour" in changes:
+            sh = np.concatenate([sh[:, :1] + changes["colour"][:, None], sh[:, 1:]], axis=1)
     in_head = baked.sh_frame == "head"
     vertices = rig_points(baked.rig, face, in_world=not in_head)
     n = len(raw.quats)
@@ -117,12 +133,26 @@ def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
         np.ascontiguousarray(vertices[None]),
         baked.faces.astype(np.int64),
         baked.face_index.astype(np.int64),
-        _native.LocalShapes(baked.means, raw.quats, raw.log_scales),
+        _native.LocalShapes(local_means, raw.quats, raw.log_scales),
         frames=frames,
         world=_native.WorldShapes(means, quats, scales),
     )
     T_world_local = pose if in_head else None
-    return _contiguous(means[0], quats[0], scales[0], sigmoid(raw.opacity_logits), raw.sh, T_world_local)
+    return _contiguous(means[0], quats[0], scales[0], sigmoid(opacity_logits), sh, T_world_local)
+
+
+def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.ndarray]:
+    """What is added to the raw values, by the names of the parts: [n, 3], [n] and [n, 3]. None adds nothing."""
+    inputs = np.concatenate([face.expression, face.joints.reshape(-1)]).astype(np.float32, copy=False)
+    activations = np.empty(changes.directions.shape[1], np.float32)
+    _native.expression_activations(inputs, changes.rest, changes.directions, changes.reach, activations)
+    added = {}
+    for name in ("colour", "opacity_logits", "means"):
+        basis = getattr(changes, name)
+        if basis is not None:
+            added[name] = np.empty(basis.shape[:-1], np.float32)
+            _native.expression_change(np.ascontiguousarray(basis), activations, added[name])
+    return added
 
 
 def _raw_values(

@@ -1,0 +1,154 @@
+"""Changes of Gaussians with the expression, of low rank: what a mesh cannot say, such as wrinkles and pressed lips.
+
+A few activations describe the whole face (`ExpressionActivations`). Each Gaussian has a basis, whose product with the
+activations is added to one of its raw values (`expression_change`). Not part of any of the three papers.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from mien import _native
+from mien.arrays import recycled, unpacked
+from mien.face import FaceParams
+
+SEEN_SHARE = 0.98
+"""Share of the training timesteps whose activations are not shortened."""
+MARGIN = 0.1
+"""How far activations can get beyond what training saw, as a share of its reach."""
+_WEAKEST = 0.1
+"""Smallest deviation that is scaled to 1, relative to that of the first direction. Weaker ones stay weak."""
+
+
+class ExpressionActivations(nn.Module):
+    """r numbers that describe an expression: how far it is from the person at rest, along r principal directions.
+
+    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. The
+    directions are scaled so that the activations of the given timesteps have a deviation of 1 or less. They are fixed:
+    training changes only the bases of the Gaussians.
+    """
+
+    rest: Tensor
+    directions: Tensor
+    reach: Tensor
+
+    def __init__(self, face: FaceParams, neutral: FaceParams, rank: int):
+        """Take the directions and the reach from the timesteps of `face`.
+
+        Args:
+            face: Face parameters of all training timesteps.
+            neutral: One timestep: the person at rest, whose activations are 0.
+            rank: Number of activations, at least 1. Directions that the timesteps do not have are 0.
+        """
+        super().__init__()
+        rest = expression_inputs(neutral)[0]
+        directions, reach = principal_directions(expression_inputs(face) - rest, rank)
+        for name, value in (("rest", rest), ("directions", directions), ("reach", reach)):
+            self.register_buffer(name, value.detach().clone())
+
+    def forward(self, face: FaceParams) -> Float[Tensor, "b r"]:
+        """The activations of some timesteps. Differentiable in `face`; native for float32 on a CPU."""
+        inputs = expression_inputs(face)
+        if inputs.dtype != torch.float32 or inputs.device.type != "cpu":
+            return activations_reference(inputs, self.rest, self.directions, self.reach)
+        return _Activations.apply(inputs, self.rest, self.directions, self.reach)
+
+
+def activations_reference(
+    inputs: Float[Tensor, "b i"],
+    rest: Float[Tensor, " i"],
+    directions: Float[Tensor, "i r"],
+    reach: Float[Tensor, " 1"],
+) -> Float[Tensor, "b r"]:
+    """(inputs - rest) directions, shortened to the reach (`within_reach`), in plain PyTorch, any dtype and device."""
+    return within_reach((inputs - rest) @ directions, reach)
+
+
+class _Activations(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, *fixed: Tensor) -> Tensor:
+        inputs, *fixed = (tensor.detach().contiguous() for tensor in (inputs, *fixed))
+        out = torch.empty(len(inputs), fixed[1].shape[1])
+        for row, activations in zip(inputs, out, strict=True):
+            _native.expression_activations(*unpacked(row, *fixed, activations))
+        ctx.save_for_backward(inputs, *fixed)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        inputs, *fixed = (tensor.detach() for tensor in ctx.saved_tensors)
+        with torch.enable_grad():
+            out = activations_reference(inputs.requires_grad_(), *fixed)
+        return *torch.autograd.grad(out, inputs, gradient), None, None, None
+
+
+def expression_inputs(face: FaceParams) -> Float[Tensor, "b i"]:
+    """The expression coefficients, followed by the axis-angle vectors of the free joints, in radians."""
+    return torch.cat([face.expression, face.joints.flatten(1)], dim=-1)
+
+
+def principal_directions(offsets: Float[Tensor, "t i"], rank: int) -> tuple[Float[Tensor, "i r"], Float[Tensor, " 1"]]:
+    """Directions of the largest spread, strongest first, and how far along them the timesteps reach from 0.
+
+    The reach is the length of the activations that `SEEN_SHARE` of the timesteps do not exceed.
+    """
+    exact = offsets.detach().double().cpu()
+    centred = exact - exact.mean(0)
+    strengths, vectors = torch.linalg.eigh(centred.T @ centred / len(centred))
+    count = min(rank, len(strengths))
+    deviations, vectors = strengths.flip(0)[:count].clamp_min(0).sqrt(), vectors.flip(1)[:, :count]
+    largest = vectors.gather(0, vectors.abs().argmax(0, keepdim=True))
+    usable = deviations > 1e-6
+    scales = deviations.clamp_min(max(_WEAKEST * float(deviations[0]), 1e-6))
+    directions = exact.new_zeros(len(vectors), rank)
+    directions[:, :count] = vectors * largest.sign() * usable / scales
+    reach = (exact @ directions).norm(dim=-1).quantile(SEEN_SHARE, dim=0, keepdim=True)
+    return directions.to(offsets), reach.to(offsets)
+
+
+def within_reach(values: Float[Tensor, "b r"], reach: Float[Tensor, " 1"]) -> Float[Tensor, "b r"]:
+    """`values` as they are up to the length `reach`. Longer ones keep their direction and get a shorter length.
+
+    The new length approaches (1 + `MARGIN`) reach and never gets there. Its slope is continuous.
+    """
+    lengths = values.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
+    over = (lengths - reach).clamp_min(0)
+    margin = MARGIN * reach
+    shortened = reach + margin * over / (margin + over).clamp_min(1e-6)
+    return values * torch.where(over > 0, shortened / lengths, 1.0)
+
+
+def expression_change(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:
+    """The sum of a basis' columns, weighted by 1 to 8 activations. Differentiable; native for float32 on a CPU."""
+    if basis.dtype != torch.float32 or basis.device.type != "cpu":
+        return expression_change_reference(basis, activations)
+    return _Change.apply(basis, activations)
+
+
+def expression_change_reference(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:
+    """`expression_change` in plain PyTorch, any dtype and device."""
+    return (basis.flatten(0, -2) @ activations).view(basis.shape[:-1])
+
+
+class _Change(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, basis: Tensor, activations: Tensor) -> Tensor:
+        basis, activations = basis.detach().contiguous(), activations.detach().contiguous()
+        out = torch.empty(basis.shape[:-1])
+        _native.expression_change(*unpacked(basis, activations, out))
+        ctx.save_for_backward(basis, activations)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        basis, activations = ctx.saved_tensors
+        by_basis, by_activations = recycled(*basis.shape), torch.empty_like(activations)
+        _native.expression_change_backward(
+            *unpacked(basis, activations, gradient.contiguous(), by_basis, by_activations)
+        )
+        return by_basis, by_activations
