@@ -18,7 +18,7 @@ from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, read_metrics
 from mien.evaluation.baselines import make_baselines
 from mien.evaluation.compare import compare_runs
-from mien.evaluation.experiment import Experiment, head_box, spread_frames, target_image
+from mien.evaluation.experiment import Experiment, head_box, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import evaluate_frames
@@ -27,7 +27,7 @@ from mien.evaluation.videos import choose_video_frames, match_sizes
 from mien.pictures import to_uint8
 from mien.storage import write_json
 from mien.training import TrainSettings
-from mien.training.frames import Frame
+from mien.training.frames import Frame, spread_frames
 
 QUICK = EvaluationSettings(perceptual=False, video_frames=40)
 STEPS = 12

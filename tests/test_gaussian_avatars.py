@@ -41,6 +41,19 @@ def test_starts_with_one_grey_faint_gaussian_a_triangle() -> None:
     assert (rgb_from_sh(gaussians.sh) - 0.5).abs().max() < 0.002
 
 
+def test_first_colours_are_the_means_of_the_triangles_corners() -> None:
+    """Every Gaussian gets its own triangle's colour, also if the Gaussians are in another order than the triangles."""
+    avatar = new_avatar(GaussianAvatarsConfig(sh_degree=1, first_colors="pictures"))
+    assert avatar.wants_first_colors
+    assert not new_avatar().wants_first_colors
+    avatar.store.select(torch.arange(len(avatar.store)).flip(0)[:20])
+    colors = torch.rand(len(avatar.face_model.template), 3)
+    avatar.paint(colors)
+    expected = colors[avatar.face_model.faces.flip(0)[:20]].mean(1)
+    torch.testing.assert_close(rgb_from_sh(avatar.store["sh_constant"][:, 0]), expected)
+    assert not avatar.store["sh_rest"].any()
+
+
 def test_losses_are_those_of_the_paper() -> None:
     avatar = new_avatar()
     store, n = avatar.store, len(avatar.store)

@@ -9,9 +9,20 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mien.avatar import FaceTuning, GaussianStore, Moments, ParameterGroup, Photometric, Progress, Rate, store_group
+from mien.avatar import (
+    FaceTuning,
+    GaussianAvatarsConfig,
+    GaussianStore,
+    Moments,
+    ParameterGroup,
+    Photometric,
+    Progress,
+    Rate,
+    store_group,
+)
 from mien.errors import UserError
 from mien.face import FaceParams
+from mien.gaussians import rgb_from_sh
 from mien.render.rendering import Rendering
 from mien.training import TrainSettings, held_out
 from mien.training.adam import Adam
@@ -20,6 +31,7 @@ from mien.training.frames import FrameOrder, background_at, density_random, trai
 from mien.training.losses import picture_losses
 from mien.training.photometric import photometric_loss
 from mien.training.sequence import Target, Targets, composite
+from mien.training.trainer import start
 from toy_scene import toy_face, toy_sequence
 
 
@@ -267,3 +279,18 @@ def test_corrections_stay_within_their_sequence() -> None:
     assert (moved[0] < 0).all()
     torch.testing.assert_close(moved[1], moved[0])
     torch.testing.assert_close(moved[2:], torch.zeros(2, 3))
+
+
+def test_first_colours_come_from_training_frames_only() -> None:
+    face_model, sequence = toy_sequence(60, 48)
+    config, settings = GaussianAvatarsConfig(first_colors="pictures"), TrainSettings(split="blocks")
+    painted = start([sequence], face_model, config, settings).avatar.gaussian_store()["sh_constant"]
+    grey = start([sequence], face_model, GaussianAvatarsConfig(), settings).avatar.gaussian_store()["sh_constant"]
+    assert float((rgb_from_sh(grey) - 0.5).abs().max()) < 0.01
+    assert float((rgb_from_sh(painted) - 0.5).abs().mean()) > 0.05
+    for timesteps, same in ((slice(40, 50), True), (slice(0, 10), False)):
+        images = sequence.capture.images.copy()
+        images[timesteps] = 0
+        darker = replace(sequence, capture=replace(sequence.capture, images=images))
+        again = start([darker], face_model, config, settings).avatar.gaussian_store()["sh_constant"]
+        assert torch.equal(again, painted) == same

@@ -98,6 +98,14 @@ class Avatar(nn.Module, ABC):
     def density(self) -> DensityControl:
         """The density control, with this method's hooks."""
 
+    @property
+    def wants_first_colors(self) -> bool:
+        """Whether `paint` is to be called before the first step. Most methods learn their colours from nothing."""
+        return False
+
+    def paint(self, colors: Float[Tensor, "v 3"]) -> None:
+        """Take the face model's vertices' mean colours in the training pictures, 0..1, as first colours."""
+
     @abstractmethod
     def bake(self) -> BakedAvatar:
         """The avatar as a record of `mien.runtime`, which works without torch and this class: for files and engines."""

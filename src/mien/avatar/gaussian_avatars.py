@@ -23,7 +23,7 @@ from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
 from mien.avatar.schedules import TRAINED, Progress, Rate
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
-from mien.gaussians import stack_timesteps
+from mien.gaussians import sh_from_rgb, stack_timesteps
 from mien.render.rendering import Rendering
 from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
@@ -139,6 +139,17 @@ class GaussianAvatars(Avatar):
             judged_opacities=highest_opacities_seen if "opacity_basis" in self._basis_shapes() else resting_opacities,
             may_prune=never_empty_a_triangle,
         )
+
+    @property
+    def wants_first_colors(self) -> bool:
+        """Whether the settings ask for colours from the pictures."""
+        return self.config.first_colors == "pictures"
+
+    @torch.no_grad()
+    def paint(self, colors: Float[Tensor, "v 3"]) -> None:
+        """Give every Gaussian the mean colour of its triangle's three vertices."""
+        own = colors.to(self.store["sh_constant"])[self.face_model.faces[self.store["face_index"]].long()].mean(1)
+        self.store.assign("sh_constant", sh_from_rgb(own)[:, None])
 
     def bake(self) -> MeshBound:
         """The mesh of this subject and the raw values of all Gaussians."""

@@ -20,6 +20,9 @@ class GaussianAvatarsConfig(MethodConfig):
     head."""
     sh_warmup: Annotated[float, FRACTION] = 0.3
     """Fraction of the run over which the degrees of the spherical harmonics are switched on, one after the other."""
+    first_colors: Literal["grey", "pictures"] = "grey"
+    """Colours of the Gaussians before the first step: almost grey, as in the paper's code, or their triangles' mean
+    colours in the training pictures, which takes about a second."""
     means_rate: Rate = Rate(5e-3, 5e-5)
     """Learning rate of the centres, in triangle units per step."""
     means_times_extent: bool = False

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar
 from mien.camera import Camera
-from mien.evaluation.scoring import evenly_spread
 from mien.face import FaceParams
 from mien.pictures import Box
 from mien.render import rasterize
@@ -62,13 +61,6 @@ class Experiment:
     def face(self, frame: Frame) -> FaceParams:
         """The face parameters of one timestep."""
         return self.faces[frame.sequence][frame.timestep]
-
-
-def spread_frames(frames: Items[Frame], max_count: int) -> list[Frame]:
-    """At most `max_count` of the frames, evenly spread over sequences, cameras and time. With 0, all of them."""
-    # Sort by camera first: a stride over the cameras of each timestep could always select the same one.
-    ordered = sorted(frames, key=lambda frame: (frame.sequence, frame.camera, frame.timestep))
-    return evenly_spread(ordered, max_count)
 
 
 def head_box(experiment: Experiment, frames: Items[Frame]) -> Box:

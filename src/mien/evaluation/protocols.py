@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from mien.evaluation.baselines import Baselines, make_baselines
-from mien.evaluation.experiment import Experiment, avatar_image, scored_on, spread_frames, target_image
+from mien.evaluation.experiment import Experiment, avatar_image, scored_on, target_image
 from mien.evaluation.metrics import psnr
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.scoring import (
@@ -25,7 +25,7 @@ from mien.evaluation.scoring import (
 )
 from mien.parallel import stream_in_threads
 from mien.progress import progress_bar
-from mien.training.frames import Frame
+from mien.training.frames import Frame, spread_frames
 
 AVATAR, AS_TRACKED, MEAN_FRAME, MESH = "avatar", "as_tracked", "mean_frame", "mesh"
 _MAX_TRAINING_FRAMES = 200

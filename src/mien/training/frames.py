@@ -101,6 +101,14 @@ def camera_extent(sequences: Items[Sequence], frames: Items[Frame]) -> float:
     return max(MIN_EXTENT, _EXTENT_MARGIN * float(distances.max()))
 
 
+def spread_frames(frames: Items[Frame], max_count: int) -> list[Frame]:
+    """At most `max_count` of the frames, evenly spread over sequences, cameras and time. With 0, all of them."""
+    # Sort by camera first: a stride over the cameras of each timestep could always select the same one.
+    ordered = sorted(frames, key=lambda frame: (frame.sequence, frame.camera, frame.timestep))
+    stride = max(1, -(-len(ordered) // max_count)) if max_count else 1
+    return ordered[::stride]
+
+
 class FrameOrder:
     """Shuffled passes over the training frames."""
 

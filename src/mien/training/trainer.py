@@ -41,6 +41,7 @@ from mien.training.losses import picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Target, Targets
 from mien.training.settings import TrainSettings
+from mien.training.vertex_colors import vertex_colors
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
 """(title, total, completed) -> a context manager whose value moves the bar on."""
@@ -185,6 +186,9 @@ def start(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
+    if avatar.wants_first_colors:
+        faces = [sequence.tracking.face for sequence in sequences]
+        avatar.paint(vertex_colors(face_model, sequences, faces, training_frames(sequences, settings)))
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
