@@ -70,7 +70,8 @@ def activations_reference(
 class _Activations(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, *fixed: Tensor) -> Tensor:
-        inputs, *fixed = (tensor.detach().contiguous() for tensor in (inputs, *fixed))
+        inputs = inputs.detach().contiguous()
+        fixed = tuple(tensor.detach().contiguous() for tensor in fixed)
         out = torch.empty(len(inputs), fixed[1].shape[1])
         for row, activations in zip(inputs, out, strict=True):
             _native.expression_activations(*unpacked(row, *fixed, activations))

@@ -9,9 +9,9 @@ from mien.analysis.context import Context, Variant, mean_psnr
 from mien.analysis.drawing import measure_in_turn
 from mien.analysis.result import Chart, PartResult, Table
 from mien.avatar import GaussianAvatarsConfig
-from mien.evaluation.experiment import spread_frames
 from mien.evaluation.plots import Axes, Series
 from mien.storage import file_digest
+from mien.training.frames import spread_frames
 
 _LAST = 0.2
 """Share of a training, at its end, that step times are taken from."""
