@@ -68,7 +68,7 @@ def test_what_the_names_do_not_say_is_told_with_the_remedy() -> None:
 
 def test_either_name_of_the_camera_is_held_out() -> None:
     split = split_by_name(SEQUENCES, "306")
-    ids = dict.fromkeys(SEQUENCES, ("07", "08", "09"))
+    ids: dict[str, tuple[str, ...]] = {name: ("07", "08", "09") for name in SEQUENCES}
     assert with_named_split(NAMED, split, ids).held_out_cameras == ("08",)
     ids["EXP-4"] = ("222200036", "222200037")
     settings = with_named_split(NAMED, split, ids)
