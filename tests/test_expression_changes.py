@@ -123,7 +123,9 @@ def test_directions_are_those_of_the_largest_spread() -> None:
 def test_rank_0_is_the_method_without_changes() -> None:
     plain, none = (
         new_avatar(0),
-        new_avatar(4, **{f"expression_{part}_rate": Rate(0.0) for part in ("colour", "opacity", "offset")}),
+        new_avatar(
+            4, expression_colour_rate=Rate(0.0), expression_opacity_rate=Rate(0.0), expression_offset_rate=Rate(0.0)
+        ),
     )
     for avatar in (plain, none):
         assert not [name for name in avatar.state_dict() if "basis" in name or "activations" in name]

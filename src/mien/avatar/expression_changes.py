@@ -70,12 +70,11 @@ def activations_reference(
 class _Activations(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, *fixed: Tensor) -> Tensor:
-        inputs = inputs.detach().contiguous()
-        fixed = tuple(tensor.detach().contiguous() for tensor in fixed)
-        out = torch.empty(len(inputs), fixed[1].shape[1])
-        for row, activations in zip(inputs, out, strict=True):
-            _native.expression_activations(*unpacked(row, *fixed, activations))
-        ctx.save_for_backward(inputs, *fixed)
+        rows, *others = [tensor.detach().contiguous() for tensor in (inputs, *fixed)]
+        out = torch.empty(len(rows), others[1].shape[1])
+        for row, activations in zip(rows, out, strict=True):
+            _native.expression_activations(*unpacked(row, *others, activations))
+        ctx.save_for_backward(rows, *others)
         return out
 
     @staticmethod

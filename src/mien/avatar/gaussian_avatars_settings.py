@@ -49,7 +49,7 @@ class GaussianAvatarsConfig(MethodConfig):
     expression_offset_rate: Rate = Rate(1e-3, 1e-5)
     """Learning rate of the changes of place with the expression, in triangle units per unit of an activation and step.
     If its start is 0, places do not change."""
-    expression_weight: Annotated[float, NOT_NEGATIVE] = 0.1
+    expression_weight: Annotated[float, NOT_NEGATIVE] = 3.0
     """Weight of the mean squared changes with the expression, which keeps changes small that pictures do not need."""
     position_threshold: Annotated[float, NOT_NEGATIVE] = 1.0
     """Distance from the triangle's centre up to which a Gaussian's centre has no penalty, in triangle units."""
