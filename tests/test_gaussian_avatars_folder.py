@@ -266,6 +266,14 @@ def test_an_archive_that_unpacks_to_gigabytes_is_refused(folder: Path) -> None:
         read_gaussian_avatars_folder(folder)
 
 
+def test_changes_with_the_expression_are_refused(tmp_path: Path) -> None:
+    """Changes with the expression would be lost silently, so nothing is written."""
+    model, face = toy_face_model(), toy_face(2)
+    with pytest.raises(UserError, match="cannot hold Gaussians that change with the expression"):
+        write_gaussian_avatars_folder(tmp_path / "out", new_avatar(model, face, expression_rank=2), face)
+    assert not (tmp_path / "out").exists()
+
+
 def test_methods_without_triangles_are_refused(tmp_path: Path) -> None:
     model, face = toy_face_model(), toy_face(5)
     avatar = METHODS["headgas"].avatar(METHODS["headgas"].config(), model, face)

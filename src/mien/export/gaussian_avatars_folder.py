@@ -54,13 +54,19 @@ def write_gaussian_avatars_folder(folder: Path, avatar: Avatar, face: FaceParams
         face: The subject at any number of timesteps.
 
     Raises:
-        UserError: the avatar's Gaussians are not bound to triangles, or a value is NaN or infinite.
+        UserError: the avatar's Gaussians are not bound to triangles, or change with the expression, or a value is NaN
+            or infinite.
     """
     baked = avatar.bake()
     if not isinstance(baked, MeshBound):
         raise UserError(
             f"{folder}: GaussianAvatars' folder holds Gaussians that are bound to triangles, and those of this run's "
             "method are not; export a .mien or a .ply instead"
+        )
+    if baked.changes is not None:
+        raise UserError(
+            f"{folder}: GaussianAvatars' folder cannot hold Gaussians that change with the expression "
+            "(--method.expression-rank); export a .mien instead, or train a run with rank 0"
         )
     model = avatar.face_model
     write_flame_params(folder / PARAMETERS, model, face)
