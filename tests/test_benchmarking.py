@@ -107,6 +107,12 @@ def test_a_training_case_trains() -> None:
     assert 0.2 < (target.matte > 127).float().mean() < 0.7  # the head fills about half of the picture
 
 
+def test_waiting_for_a_picture_is_measured_with_and_without_the_worker() -> None:
+    rows = list(train_step.waiting_rows(load_face_model(), 500, (64, 48), 0.01))
+    assert [row.name for row in rows] == ["wait_for_target", "make_target"]
+    assert all(0 < row.min_ms <= row.median_ms and row.cpu_ms > 0 for row in rows)
+
+
 def test_the_torch_tile_loop_draws_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(PEERS))
     from torch_tiles import render_tiles  # pyright: ignore[reportMissingImports]

@@ -3,7 +3,9 @@
 Run as `mien bench train-step`.
 """
 
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -12,12 +14,13 @@ from torch import Tensor
 from mien import _native
 from mien.avatar import Avatar, GaussianAvatarsConfig
 from mien.benchmarking.render import thread_counts
-from mien.benchmarking.timing import BenchmarkRow, benchmark_row, time_function
+from mien.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, time_function
 from mien.camera import Camera
 from mien.capture import Capture
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.render import rasterize
 from mien.tracking import Tracking
+from mien.training.ahead import targets_ahead
 from mien.training.checkpoint import TrainingState
 from mien.training.frames import FrameOrder, training_frames
 from mien.training.sequence import Sequence, Targets
@@ -46,6 +49,28 @@ def train_step_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
             scene = (state.avatar, face, data.targets[0].camera(0))
             timing = time_function(lambda scene=scene: pose_and_render(*scene), seconds / 3)
             yield benchmark_row("pose_and_render", count, (width, height), timing)
+    yield from waiting_rows(load_face_model(), 30_000, (550, 802), seconds / 3)
+
+
+def waiting_rows(face_model: FaceModel, count: int, size: tuple[int, int], seconds: float) -> Iterator[BenchmarkRow]:
+    """Measure what a step waits for its picture when no more pictures can be cached: ahead of it, and made by itself.
+
+    Random backgrounds are never cached. The processor time is that of the step's own thread.
+    """
+    settings = replace(SETTINGS, background="random")
+    state, data = training_case(face_model, count, *size)
+    with targets_ahead(data.order, data.targets, settings) as ahead:
+        for name, own in (("wait_for_target", replace(data, ahead=ahead)), ("make_target", data)):
+            waits, processors = [], []
+            end = time.perf_counter() + seconds
+            while len(waits) < 7 or time.perf_counter() < end:
+                processor, began = time.thread_time(), time.perf_counter()
+                own.target(state.step, settings)
+                waits.append(1e3 * (time.perf_counter() - began))
+                processors.append(1e3 * (time.thread_time() - processor))
+                step(state, data, SETTINGS)
+            timing = Timing(min(waits), sorted(waits)[len(waits) // 2], min(processors))
+            yield benchmark_row(name, count, size, timing)
 
 
 def pose_and_render(avatar: Avatar, face: FaceParams, camera: Camera) -> None:

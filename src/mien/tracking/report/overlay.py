@@ -19,6 +19,7 @@ from mien.progress import track_progress
 from mien.render.mesh import Headlight, render_mesh
 from mien.tracking.pixels import model_pictures, window_of
 from mien.tracking.report.heat import dimmed, draw_legend, heat_map, write_text
+from mien.tracking.report.rig import seen_from_front, visible_landmarks
 from mien.tracking.tracking import Tracking
 
 _REGION_COLORS = {
@@ -65,6 +66,7 @@ class OverlayPainter:
         self._capture, self._tracking, self._face_model = capture, tracking, face_model
         self._colors = region_colors(face_model)
         self._models = model_pictures(capture, tracking, face_model)
+        self._from_front = seen_from_front(tracking)
 
     def picture(self, timestep: int, camera_index: int = 0) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The panels joined into one picture: two side by side, or four in a square."""
@@ -81,9 +83,10 @@ class OverlayPainter:
     def panels(self, timestep: int, camera_index: int = 0) -> list[UInt8[np.ndarray, "h w 3"]]:
         """The two or four panels of a picture, each of the capture's size.
 
-        The first shows detected (green) and mesh (red) landmarks and the neck line, the second the mesh. If the
-        tracking was fitted to pixels, the third shows the model's own picture and the fourth the difference of its
-        colours from the capture's.
+        The first shows detected (green) and mesh (red) landmarks and the neck line, the second the mesh. With several
+        cameras, the first shows the landmarks of the side of the head that faces the camera. If the tracking was fitted
+        to pixels, the third shows the model's own picture and the fourth the difference of its colours from the
+        capture's.
         """
         image = np.asarray(self._capture.images[timestep, camera_index])
         vertices = self._face_model(self._tracking.face[timestep])[0]
@@ -110,6 +113,10 @@ class OverlayPainter:
         marks = camera.project(self._face_model.landmark_positions(vertices, "mediapipe"))[0].numpy()
         picture = image.copy()  # A capture read from disk is read-only.
         detected = np.asarray(self._capture.landmarks[timestep, camera_index])
+        if len(tracking.cameras) > 1:
+            # Landmarks on the far side of the head are guesses, which look like failures.
+            seen = visible_landmarks(self._face_model, vertices, camera).numpy()
+            detected, marks = detected[seen], marks[seen]
         if np.isfinite(detected).all():
             _draw_points(picture, detected, _GREEN)
         _draw_points(picture, marks, _RED)
@@ -121,6 +128,8 @@ class OverlayPainter:
         residual = float(tracking.residuals[timestep, camera_index])
         missing = "no face found" if tracking.valid[timestep] else "no face, interpolated"
         text = f"{timestep}: {residual:.2f} px" if np.isfinite(residual) else f"{timestep}: {missing}"
+        if np.isfinite(residual) and not self._from_front[timestep, camera_index]:
+            text = f"{timestep}: from the side"
         if tracking.pixel_residuals is not None and tracking.valid[timestep]:
             colors = float(tracking.pixel_residuals[timestep, camera_index])
             text += f", colours {100 * colors:.1f} %" if np.isfinite(colors) else ", landmarks only"

@@ -95,6 +95,11 @@ def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]
                                  f"alone determined them: {name_runs(alone)}."))  # fmt: skip
         else:
             found.append(("", f"Pixels were used in all {with_face} frames with a face."))
+    for name, row in report["cameras"].items():
+        if "others_misplaced_px" in row:
+            found.append(("odd", f"Warning: camera {name} shows the face {row['misplaced_px']:.0f} px from where the "
+                                 f"tracked head is (the other cameras: {row['others_misplaced_px']:.1f} px); check its "
+                                 "K, viewmat, id and offset in the calibration."))  # fmt: skip
     if report["flagged_frames"]:
         flagged = report["flagged_frames"]
         stand_out = "1 frame stands" if len(flagged) == 1 else f"{len(flagged)} frames stand"

@@ -16,6 +16,7 @@ from mien.tracking.landmarks import BROWS, LEFT_EYELIDS, LEFT_IRIS, LIPS, NOSE, 
 from mien.tracking.report.contact_sheet import worst_of_runs
 from mien.tracking.report.overlay import frontal_camera
 from mien.tracking.report.page import findings, write_report_page
+from mien.tracking.report.rig import cameras_that_do_not_fit, front_residuals, misplacements, seen_from_front
 from mien.tracking.tracking import Tracking
 
 if TYPE_CHECKING:
@@ -42,15 +43,17 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
 
     `mesh_distance_px` is the distance from landmarks to the mesh itself; `residual_px` allows every landmark its static
     offset. `iris_distance` is the distance of the detected irises in metres at the tracked depth, which should be
-    constant. With several cameras, jitter, irises, depth, pitch and yaw are those of the most frontal camera, and
-    `cameras` has the residuals of each camera.
+    constant. With several cameras, jitter, irises, depth, pitch and yaw are those of the most frontal camera. Residuals
+    and distances are those of pictures from the front, since landmarks of a face from the side are partly guessed.
+    `cameras` has the residuals of each camera in all its pictures, how many of them are `from_front`, and
+    `misplaced_px` (`misplacements`).
     """
     valid, frontal = tracking.valid, frontal_camera(tracking)
     marks = _landmarks(face_model, tracking)
     detected = torch.from_numpy(np.asarray(capture.landmarks, dtype=np.float32))
     distance = torch.stack(
         [(camera.project(marks)[0] - detected[:, c]).norm(dim=-1) for c, camera in enumerate(tracking.cameras)], dim=1
-    )[tracking.residuals.isfinite()]
+    )[front_residuals(tracking).isfinite()]
     pixels, depth = tracking.cameras[frontal].project(marks)
     seen = tracking.residuals[:, frontal].isfinite()
     pitch, yaw, _ = seen_rotation(tracking, frontal).unbind(1)
@@ -60,9 +63,9 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
         "frames_without_face": (~valid).nonzero()[:, 0].tolist(),
         "flagged_frames": _flagged(tracking).nonzero()[:, 0].tolist(),
         "landmarks_only_frames": _landmarks_only(tracking).nonzero()[:, 0].tolist(),
-        "residual_px": _summary(tracking.residuals),
+        "residual_px": _summary(front_residuals(tracking)),
         "residual_colors": None if tracking.pixel_residuals is None else _summary(tracking.pixel_residuals),
-        "cameras": _of_cameras(capture, tracking),
+        "cameras": _of_cameras(capture, tracking, face_model),
         "frontal_camera": capture.camera_ids[frontal],
         "mesh_distance_px": {name: float(distance[:, list(group)].median()) for name, group in _GROUPS.items()},
         "jitter": {
@@ -96,19 +99,25 @@ def _depth(tracking: Tracking, camera: int) -> Float[Tensor, " t"]:
     return tracking.cameras[camera].project(tracking.face.head_translation)[1]
 
 
-def _of_cameras(capture: Capture, tracking: Tracking) -> dict[str, dict]:
-    rows = {}
+def _of_cameras(capture: Capture, tracking: Tracking, face_model: FaceModel) -> dict[str, dict]:
+    rows, front = {}, seen_from_front(tracking)
+    misplaced = misplacements(capture, tracking, face_model)
+    odd = dict(cameras_that_do_not_fit(misplaced, max(capture.width, capture.height)))
     for index, name in enumerate(capture.camera_ids):
         found = tracking.residuals[:, index]
         rows[name] = {"frames": int(found.isfinite().sum())}
+        rows[name]["from_front"] = int((found.isfinite() & front[:, index]).sum())
         if rows[name]["frames"]:
             rows[name]["residual_px"] = _summary(found)
+            rows[name]["misplaced_px"] = float(misplaced[index])
+        if index in odd:
+            rows[name]["others_misplaced_px"] = odd[index]
     return rows
 
 
 def _timestep_residuals(tracking: Tracking) -> Float[Tensor, " t"]:
-    """Median residual over the cameras that found the face, in pixels; NaN if none did."""
-    return tracking.residuals.nanmedian(1).values
+    """Median residual over the cameras that found the face from the front, in pixels; NaN if none found it."""
+    return front_residuals(tracking).nanmedian(1).values
 
 
 def _flagged(tracking: Tracking) -> Bool[Tensor, " t"]:
