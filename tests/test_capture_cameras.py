@@ -220,7 +220,7 @@ def test_unequal_lengths_are_refused_before_faces_are_searched(rig, tmp_path, mo
     shutil.copytree(rig[0], pictures)
     (pictures / "top" / f"{FRAMES - 1}.png").unlink()
     arguments = [pictures], rig[1], tmp_path / "out" / "capture", "s"
-    with pytest.raises(UserError, match=r"camera top has 3 frames, camera left 4; .* --capture.max-frames 3"):
+    with pytest.raises(UserError, match=r"camera top has 3 frames, but camera left has 4; .* --capture.max-frames 3"):
         capture_cameras(*arguments, CaptureSettings(size=96))
     assert not (tmp_path / "out").exists()
     monkeypatch.undo()
