@@ -24,8 +24,13 @@ void composite(const Pixels& image, const Array<const uint8_t, nb::shape<-1, -1>
               across <= width - left && down <= height - top,
           "the box must lie inside the picture");
   const nb::gil_scoped_release release;
-  mien::composite({image.data(), matte.data(), width, height, {background[0], background[1], background[2]},
-                   {left, top, left + across, top + down}, picture.data()});
+  mien::composite({image.data(),
+                   matte.data(),
+                   width,
+                   height,
+                   {background[0], background[1], background[2]},
+                   {left, top, left + across, top + down},
+                   picture.data()});
 }
 
 }  // namespace
