@@ -28,7 +28,7 @@ from mien.training.adam import Adam
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
-from mien.training.frames import FrameOrder, background_at, density_random, training_frames
+from mien.training.frames import FrameOrder, background_at, density_random, expression_rarity, training_frames
 from mien.training.losses import picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Targets
@@ -70,7 +70,9 @@ def train(
     method_config.check()
     settings.check()
     check_trackings(sequences, face_model)
-    order = FrameOrder(training_frames(sequences, settings), settings.seed)
+    frames = training_frames(sequences, settings)
+    weights = expression_rarity(sequences, frames) if settings.frame_order == "rare" else None
+    order = FrameOrder(frames, settings.seed, weights)
     if is_finished(run_dir):
         claim_run(run_dir, sequences, method_config, settings)
         return load_avatar(run_dir)
