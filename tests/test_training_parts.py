@@ -27,7 +27,7 @@ from mien.render.rendering import Rendering
 from mien.training import TrainSettings, held_out
 from mien.training.adam import Adam
 from mien.training.face_track import FaceTrack, spread_corrections
-from mien.training.frames import FrameOrder, background_at, density_random, training_frames
+from mien.training.frames import FrameOrder, background_at, density_random, expression_rarity, training_frames
 from mien.training.losses import picture_losses
 from mien.training.photometric import photometric_loss
 from mien.training.sequence import Target, Targets, composite
@@ -279,6 +279,39 @@ def test_corrections_stay_within_their_sequence() -> None:
     assert (moved[0] < 0).all()
     torch.testing.assert_close(moved[1], moved[0])
     torch.testing.assert_close(moved[2:], torch.zeros(2, 3))
+
+
+def test_frames_with_rare_expressions_come_more_often() -> None:
+    """Ninety timesteps at rest and ten with other expressions: the ten come twice as often as the median."""
+    _, sequence = toy_sequence(100, 16)
+    expression = torch.zeros(100, 2)
+    expression[:90] = 0.01 * torch.rand(90, 2, generator=torch.Generator().manual_seed(0))
+    expression[90:] = torch.rand(10, 2, generator=torch.Generator().manual_seed(1))
+    tracking = replace(sequence.tracking, face=replace(sequence.tracking.face, expression=expression))
+    sequence = replace(sequence, tracking=tracking)
+    frames = training_frames([sequence], TrainSettings(split="none"))
+    weights = expression_rarity([sequence], frames)
+    assert float(weights.min()) >= 0.5
+    assert float(weights[90:].min()) == float(weights.max()) == 2
+    assert float(weights[:90].median()) < 1.2
+    order = FrameOrder(frames, 5, weights)
+    drawn = np.zeros(100)
+    for step in range(1000):
+        drawn[order.at(step)[0].timestep] += 1
+    expected = (weights / weights.sum() * 1000).numpy()
+    assert np.abs(drawn - expected).max() < 6, "ten passes, each rounded by less than one"
+    assert FrameOrder(frames, 5, weights).at(777) == order.at(777), "a function of seed and step"
+    passes = [[order.at(100 * number + step)[0] for step in range(100)] for number in range(2)]
+    assert passes[0] != passes[1]
+
+
+def test_one_expression_only_gives_even_weights() -> None:
+    _, sequence = toy_sequence(12, 16)
+    still = replace(sequence.tracking.face, expression=torch.zeros(12, 2))
+    sequence = replace(sequence, tracking=replace(sequence.tracking, face=still))
+    frames = training_frames([sequence], TrainSettings(split="none"))
+    assert len(set(expression_rarity([sequence], frames).tolist())) == 1
+    assert expression_rarity([sequence], frames[:1]).isfinite().all()
 
 
 def test_first_colours_come_from_training_frames_only() -> None:

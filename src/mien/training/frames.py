@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from mien.errors import UserError
@@ -27,6 +27,7 @@ MIN_EXTENT = 0.5
 A single fixed camera has an extent of 0: centres would not move, and every Gaussian would be too large. Half a metre is
 less than the extent of a ring of cameras around a head, and more than the head.
 """
+_MAX_RARITY, _MAX_NEIGHBOUR = 2.0, 100
 
 
 class Frame(NamedTuple):
@@ -109,12 +110,39 @@ def spread_frames(frames: Items[Frame], max_count: int) -> list[Frame]:
     return ordered[::stride]
 
 
-class FrameOrder:
-    """Shuffled passes over the training frames."""
+def expression_rarity(sequences: Items[Sequence], frames: Items[Frame]) -> Float[Tensor, " n"]:
+    """How often to draw each frame by how rare its expression is: 0.5 to 2, relative to the median timestep.
 
-    def __init__(self, frames: Items[Frame], seed: int):
+    The measure is the distance, in tracked expression coefficients, to the k-th nearest timestep of all frames, where
+    k is the square root of their number (at most 100). It is large if few timesteps have a similar expression.
+    """
+    timesteps = sorted({(frame.sequence, frame.timestep) for frame in frames})
+    expressions = torch.stack([sequences[s].tracking.face.expression[t] for s, t in timesteps]).double()
+    neighbour = min(max(1, round(len(timesteps) ** 0.5)), _MAX_NEIGHBOUR, len(timesteps) - 1)
+    # In rows of bounded memory. Without matrix products, equal expressions are exactly 0 apart.
+    rows = (
+        torch.cdist(some, expressions, compute_mode="donot_use_mm_for_euclid_dist") for some in expressions.split(512)
+    )
+    distances = torch.cat([row.kthvalue(neighbour + 1, dim=1).values for row in rows])
+    rarity = (distances / distances.median().clamp_min(1e-9)).clamp(1 / _MAX_RARITY, _MAX_RARITY)
+    index = {timestep: number for number, timestep in enumerate(timesteps)}
+    return rarity[[index[frame.sequence, frame.timestep] for frame in frames]]
+
+
+class FrameOrder:
+    """Shuffled passes over the training frames.
+
+    Args:
+        frames: The frames. A pass has as many steps.
+        seed: Seed of the shuffling.
+        weights: How often each frame is drawn, relative to the others. A pass has every frame as often as its share
+            says, rounded down or up at random. None draws every frame once.
+    """
+
+    def __init__(self, frames: Items[Frame], seed: int, weights: Float[Tensor, " n"] | None = None):
         self._frames = frames
         self._seed = seed
+        self._ends = None if weights is None else weights.cumsum(0) * (len(frames) / weights.sum())
         self._epoch = -1
         self._order: list[int] = []
 
@@ -123,7 +151,14 @@ class FrameOrder:
         epoch = step // len(self._frames)
         if epoch != self._epoch:
             generator = random_at(self._seed, _ORDER, epoch)
-            self._order = torch.randperm(len(self._frames), generator=generator).tolist()
+            order = torch.randperm(len(self._frames), generator=generator)
+            if self._ends is not None:
+                # One random shift for evenly spaced points: each frame owns an interval as long as its share.
+                shift = torch.rand((), generator=generator, dtype=torch.float64)
+                points = torch.arange(len(self._frames), dtype=torch.float64) + shift
+                drawn = torch.searchsorted(self._ends.double(), points, right=True)
+                order = drawn.clamp_max(len(self._frames) - 1)[order]
+            self._order = order.tolist()
             self._epoch = epoch
         return self._frames[self._order[step % len(self._frames)]], epoch
 

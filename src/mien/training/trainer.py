@@ -35,6 +35,7 @@ from mien.training.frames import (
     background_at,
     camera_extent,
     density_random,
+    expression_rarity,
     training_frames,
 )
 from mien.training.losses import picture_losses, train_psnr
@@ -92,7 +93,8 @@ def train(
     settings.check()
     check_trackings(sequences, face_model)
     frames = training_frames(sequences, settings)
-    order, extent = FrameOrder(frames, settings.seed), camera_extent(sequences, frames)
+    weights = expression_rarity(sequences, frames) if settings.frame_order == "rare" else None
+    order, extent = FrameOrder(frames, settings.seed, weights), camera_extent(sequences, frames)
     if is_finished(run_dir):
         claim_run(run_dir, sequences, method_config, settings)
         return load_avatar(run_dir)
