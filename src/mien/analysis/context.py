@@ -1,4 +1,4 @@
-"""What a part of an analysis may use: the run, the options, and measurements that are kept between commands."""
+"""Give the parts of an analysis what they use: the run, the options, and measurements kept between commands."""
 
 import hashlib
 import json
@@ -114,7 +114,7 @@ class Context:
         return next(iter(load_experiments(run_dir or self.run_dir, self.sequence_dirs).values()), None)
 
     def kept(self, name: str, key: Any, measure: Callable[[], Mapping[str, float | int]]) -> dict[str, Any]:
-        """What `measure` returned when it last ran with this key, or else what it returns now.
+        """Return the kept result of `measure` for this key, or run it and keep its result.
 
         Args:
             name: Name of the measurement; a file of that name keeps it.

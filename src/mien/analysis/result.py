@@ -1,4 +1,4 @@
-"""What a part of an analysis gives: values, tables, charts, pictures and films, and how they are stored as json."""
+"""Hold the results of a part of an analysis (values, tables, charts, pictures, films), and store them as json."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field

@@ -1,4 +1,4 @@
-"""What an analysis is: a method, and parts that can be chosen. Needs no torch, because the command line checks it."""
+"""An analysis has a method, and parts that can be chosen. No torch is needed, because the command line checks it."""
 
 import importlib
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AnalysisOptions:
-    """What the user chooses besides the parts."""
+    """The user chooses these options besides the parts."""
 
     steps: Annotated[int, Range(1, 1_000_000)] = 3_000
     """Number of optimiser steps of each short training."""

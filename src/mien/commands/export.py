@@ -21,8 +21,9 @@ class Command:
     """The .mien or .ply file to write. With --series, the .ply files get numbers: NAME_000000.ply. With --format
     gaussian-avatars, a folder."""
     format: Literal["mien", "ply", "gaussian-avatars"] | None = None
-    """What to write: mien, ply (default: by the ending of --out), or gaussian-avatars: a folder with point_cloud.ply,
-    whose Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's training."""
+    """Format of the output: mien, ply (default: by the ending of --out), or gaussian-avatars: a folder with
+    point_cloud.ply, whose Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's
+    training."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()

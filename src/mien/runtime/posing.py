@@ -142,7 +142,7 @@ def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
 
 
 def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.ndarray]:
-    """What is added to the raw values, by the names of the parts: [n, 3], [n] and [n, 3]. None adds nothing."""
+    """Return the changes of the raw values, by the names of the parts: [n, 3], [n] and [n, 3]. None changes nothing."""
     inputs = np.concatenate([face.expression, face.joints.reshape(-1)]).astype(np.float32, copy=False)
     activations = np.empty(changes.directions.shape[1], np.float32)
     _native.expression_activations(inputs, changes.rest, changes.directions, changes.reach, activations)

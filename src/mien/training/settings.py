@@ -12,8 +12,8 @@ from mien.errors import UserError
 from mien.ranges import Range, check_ranges
 
 Split = Literal["blocks", "tail", "none", "gaussian-avatars"]
-"""Which timesteps are held out (`mien.training.held_out`). gaussian-avatars holds out a sequence and a camera instead
-(`mien.training.named_split`)."""
+"""Name of the rule that holds out timesteps (`mien.training.held_out`). gaussian-avatars holds out a sequence and a
+camera instead (`mien.training.named_split`)."""
 
 
 @dataclass(frozen=True)

@@ -193,7 +193,7 @@ def _mouth_box(model: FaceModel, face: FaceParams, camera: Camera) -> Box:
 
 
 def _on_teeth(avatar: Avatar) -> Tensor:
-    """Which Gaussians are bound to triangles of teeth, bool [n]."""
+    """Mark the Gaussians that are bound to triangles of teeth, bool [n]."""
     return avatar.face_model.region_mask("teeth")[avatar.gaussian_store()["face_index"].long()]
 
 
