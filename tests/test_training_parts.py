@@ -24,9 +24,10 @@ from mien.errors import UserError
 from mien.face import FaceParams
 from mien.gaussians import rgb_from_sh
 from mien.render.rendering import Rendering
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.training import TrainSettings, held_out
 from mien.training.adam import Adam
-from mien.training.face_track import FaceTrack, spread_corrections
+from mien.training.face_track import FaceTrack, mean_pose_correction, spread_corrections
 from mien.training.frames import FrameOrder, background_at, density_random, expression_rarity, training_frames
 from mien.training.losses import picture_losses
 from mien.training.photometric import photometric_loss
@@ -260,25 +261,60 @@ def test_corrections_spread_to_timesteps_that_were_not_seen() -> None:
     torch.testing.assert_close(tuned - tracked, expected)
 
 
-def test_corrections_stay_within_their_sequence() -> None:
-    face = FaceParams(
-        identity=torch.zeros(1),
-        expression=torch.zeros(4, 1),
-        joints=torch.zeros(4, 1, 3),
-        head_rotation=torch.zeros(4, 3),
-        head_translation=torch.zeros(4, 3),
-    )
-    track = FaceTrack(face, FaceTuning(enabled=True), lengths=(2, 2))
-    assert [track.index_of(sequence, timestep) for sequence in (0, 1) for timestep in (0, 1)] == [0, 1, 2, 3]
-    one = track.face(0)
-    one.head_translation.grad = torch.ones(1, 3)
-    for name in ("expression", "joints", "head_rotation"):
-        getattr(one, name).grad = torch.zeros_like(getattr(one, name))
-    Adam().step(track.parameter_groups(0), Progress(0, 10))
+def test_corrections_of_a_timestep_stay_within_its_sequence() -> None:
+    """Timestep 1 takes them from timestep 0; the third sequence, which is trained as well, does not."""
+    track = FaceTrack(_still_face(6), FaceTuning(enabled=True), lengths=(2, 2, 2))
+    indices = [track.index_of(sequence, timestep) for sequence in (0, 1, 2) for timestep in (0, 1)]
+    assert indices == [0, 1, 2, 3, 4, 5]
+    _push(track, 0, 1.0)
+    _push(track, 4, -1.0)
     moved = track.params().head_translation
     assert (moved[0] < 0).all()
     torch.testing.assert_close(moved[1], moved[0])
-    torch.testing.assert_close(moved[2:], torch.zeros(2, 3))
+    torch.testing.assert_close(moved[4:], -moved[:2])
+    torch.testing.assert_close(moved[2:4], torch.zeros(2, 3))
+
+
+def test_a_held_out_sequence_gets_the_mean_correction_of_the_pose() -> None:
+    """The head of sequence 0 looks ahead, that of sequence 1, which is held out, looks aside: forward is sideways."""
+    aside = torch.zeros(3, 3)
+    aside[2, 1] = torch.pi / 2
+    face = replace(_still_face(3), head_rotation=aside)
+    track = FaceTrack(face, FaceTuning(enabled=True, head_translation=Rate(0.01), head_rotation=Rate(0.02)), (2, 1))
+    _push(track, 0, 1.0, axes=(2,))
+    tuned = track.params()
+    torch.testing.assert_close(tuned.head_translation[0], torch.tensor([0.0, 0.0, -0.01]))
+    torch.testing.assert_close(tuned.head_translation[2], torch.tensor([-0.01, 0.0, 0.0]))
+    assert torch.equal(tuned.expression, face.expression), "expressions have no part that all timesteps share"
+
+
+def test_the_mean_correction_is_given_in_the_head_frame() -> None:
+    tracked = replace(_still_face(4), head_rotation=torch.randn(4, 3, generator=torch.Generator().manual_seed(0)))
+    turn, shift = matrix_from_axis_angle(torch.tensor([0.02, -0.01, 0.03])), torch.tensor([0.001, 0.002, -0.003])
+    rotation = tracked.T_world_head[:, :3, :3]
+    tuned = replace(tracked, head_rotation=axis_angle_from_matrix(rotation @ turn), head_translation=rotation @ shift)
+    found_turn, found_shift = mean_pose_correction(tracked, tuned)
+    torch.testing.assert_close(found_turn, turn)
+    torch.testing.assert_close(found_shift, shift)
+
+
+def _still_face(timesteps: int) -> FaceParams:
+    return FaceParams(
+        identity=torch.zeros(1),
+        expression=torch.zeros(timesteps, 1),
+        joints=torch.zeros(timesteps, 1, 3),
+        head_rotation=torch.zeros(timesteps, 3),
+        head_translation=torch.zeros(timesteps, 3),
+    )
+
+
+def _push(track: FaceTrack, index: int, gradient: float, axes: tuple[int, ...] = (0, 1, 2)) -> None:
+    """One step of Adam for a timestep whose head's translation has this gradient; the rest of it has none."""
+    one = track.face(index)
+    for name in ("expression", "joints", "head_rotation", "head_translation"):
+        getattr(one, name).grad = torch.zeros_like(getattr(one, name))
+    one.head_translation.grad = torch.zeros(1, 3).index_fill(1, torch.tensor(axes), gradient)
+    Adam().step(track.parameter_groups(index), Progress(0, 10))
 
 
 def test_frames_with_rare_expressions_come_more_often() -> None:

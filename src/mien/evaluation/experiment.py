@@ -21,7 +21,8 @@ from mien.training.sequence import Sequence, composite
 
 FaceSource = Literal["as_tracked", "corrected"]
 """Face parameters of held-out frames: as the tracker left them, or corrected by what training changed in neighbouring
-frames. Corrections never use the pixels of held-out frames."""
+frames; a held-out sequence takes the mean change of the head's pose. Corrections never use the pixels of held-out
+frames."""
 
 
 _HEAD_MARGIN = 0.05

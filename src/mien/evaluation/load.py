@@ -23,7 +23,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
     """The experiments of a run, by protocol. The result is empty if nothing was held out.
 
     - `self_reenactment` (`self_reenactment_tail` for that split): held-out timesteps of the training sequences.
-    - `self_reenactment_sequence`: whole held-out sequences, posed as tracked.
+    - `self_reenactment_sequence`: whole held-out sequences, with the mean correction of the head's pose.
     - `novel_view`: held-out cameras, at timesteps that were trained with other cameras.
 
     The first two include all cameras, also held-out ones.
