@@ -10,7 +10,10 @@ from mien.ranges import FRACTION, NOT_NEGATIVE, Range
 
 @dataclass(frozen=True)
 class GaussianAvatarsConfig(MethodConfig):
-    """Settings of GaussianAvatars. The defaults suit one fixed camera and runs of some thousand steps."""
+    """Settings of GaussianAvatars. The defaults suit one fixed camera and runs of some thousand steps.
+
+    The presets `draft` and `standard` add changes of place with the expression (`expression_rank`).
+    """
 
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics for view-dependent colour. Keep 0 with a single camera, because view-dependent
@@ -38,8 +41,8 @@ class GaussianAvatarsConfig(MethodConfig):
     """Learning rate of the constant colour coefficients, per step. Coefficients of higher degrees have a constant rate:
     a twentieth of the start of this rate."""
     expression_rank: Annotated[int, Range(0, 8)] = 0
-    """Number of activations of the face with which colour, opacity and place of each Gaussian change, for what the mesh
-    cannot say, such as wrinkles. 0 is the paper's method, without such changes."""
+    """Number of activations of the face with which each Gaussian changes, for what the mesh cannot say: wrinkles, or
+    shoulders that stay while the head turns. 0 is the paper's method, without such changes."""
     expression_colour_rate: Rate = Rate(1e-3)
     """Learning rate of the changes of colour with the expression, in colour coefficients per unit of an activation and
     step. If its start is 0, colours do not change."""
@@ -66,6 +69,8 @@ class GaussianAvatarsConfig(MethodConfig):
 _STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000
 """The paper's schedule, in steps: the run, between rounds of density control, to the first round, between resets."""
 _SH_DEGREE, _DEGREE_STEPS = 3, 1_000
+_RANK = 4
+"""Rank of the changes with the expression in the presets `draft` and `standard`, where only places change."""
 _VISIT = 30
 """How much further the paper's optimiser moves a frame between two visits than its learning rate says.
 
@@ -104,7 +109,10 @@ def _paper() -> GaussianAvatarsConfig:
     )
 
 
-PRESETS = {"draft": GaussianAvatarsConfig(), "standard": GaussianAvatarsConfig(), "paper": _paper()}
+_STANDARD = GaussianAvatarsConfig(
+    expression_rank=_RANK, expression_colour_rate=Rate(0.0), expression_opacity_rate=Rate(0.0)
+)
+PRESETS = {"draft": _STANDARD, "standard": _STANDARD, "paper": _paper()}
 """Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
 PRESET_STEPS = {"paper": _STEPS}
 """Number of steps of the presets for which the method has its own."""

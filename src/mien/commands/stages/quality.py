@@ -94,7 +94,7 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
         held_out_cameras=reference.held_out_cameras,
     )
     with times.measured("train"):
-        run_training_stage(workspace, list(trackings), run, method_named(method).config(), settings)
+        run_training_stage(workspace, list(trackings), run, method_named(method).presets["standard"], settings)
     with times.measured("evaluate"):
         scored = (workspace.run_dir(run) / "metrics.json").is_file()
         metrics = read_metrics(workspace.run_dir(run)) if scored else run_evaluation_stage(workspace, run, _SCORED)
