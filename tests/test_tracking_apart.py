@@ -26,7 +26,7 @@ FAST = replace(
     LANDMARKS, schedule="fast", photometric=PhotometricSettings(texture_size=128, keyframes=4, shared_steps=1)
 )
 PAPER = replace(FAST, schedule="paper", paper=PaperSettings(texture_size=128, epochs=2))
-PAPER_ALONE = replace(PAPER, paper=replace(PAPER.paper, start="landmarks", first_steps=40, steps=5))
+PAPER_ALONE = replace(PAPER, paper=replace(PAPER.paper, start="landmarks", first_steps=40, steps=15))
 SCHEDULES = {"landmarks": LANDMARKS, "fast": FAST, "paper": PAPER, "paper from landmarks": PAPER_ALONE}
 
 
@@ -92,7 +92,10 @@ def tracked(case, shaping, apart) -> Callable[[str], Tracked]:
     return tracked_by
 
 
-@pytest.mark.parametrize("schedule", SCHEDULES)
+SLOW = [name if name in ("landmarks", "fast") else pytest.param(name, marks=pytest.mark.slow) for name in SCHEDULES]
+
+
+@pytest.mark.parametrize("schedule", SLOW)
 def test_the_person_is_the_same_whatever_the_held_out_sequences_hold(tracked, schedule: str):
     found = tracked(schedule)
     assert_same_file(found.alone, found.shaping)
@@ -111,10 +114,10 @@ def test_the_person_is_the_same_whatever_the_held_out_sequences_hold(tracked, sc
     assert (found.alone.appearance is None) == (schedule == "landmarks")
 
 
-@pytest.mark.parametrize(("schedule", "share"), [("fast", 0.5), ("paper", 0.5), ("paper from landmarks", 0.8)])
-def test_pixels_calm_the_held_out_sequence(apart, tracked, schedule: str, share: float):
+@pytest.mark.parametrize("schedule", SLOW[1:])
+def test_pixels_calm_the_held_out_sequence(apart, tracked, schedule: str):
     by_landmarks, by_pixels = tracked("landmarks").apart, tracked(schedule).apart
-    assert wobble(apart, by_pixels) < share * wobble(apart, by_landmarks)
+    assert wobble(apart, by_pixels) < 0.5 * wobble(apart, by_landmarks)
     assert turn_error(apart, by_pixels) < 0.3
     assert by_pixels.pixel_residuals is not None
     assert by_pixels.pixel_residuals.isfinite().all()
@@ -192,6 +195,7 @@ def workspace(case, shaping, apart, tmp_path, monkeypatch) -> Path:
 QUICKLY = ("--overlay", "none", "--tracking.schedule", "landmarks")
 
 
+@pytest.mark.slow
 def test_the_command_tracks_apart(case, shaping, apart, workspace, capsys):
     assert main(["track", str(workspace), "--hold-out", "apart", *QUICKLY]) == 0
     assert "apart: tracked apart; the person's shape, texture and light come from shaping" in capsys.readouterr().err

@@ -75,7 +75,9 @@ def follow_by_descent(
     cache: StageCache,
     watch: Watch,
 ) -> PhotometricFit:
-    """Run the global epochs for the motion of sequences alone. Subject, cameras, texture and light stay as they are.
+    """Run the schedule for the motion of sequences alone. Subject, cameras, texture and light stay as they are.
+
+    The pass along the frames runs if the settings start from landmarks, each frame from its own.
 
     Args:
         model: The face model reduced to its landmarks.
@@ -99,7 +101,8 @@ def follow_by_descent(
         state.offsets = person.vertex_offsets.clone()
     descent = Descent(scene, state)
     descent.resume(cache)
-    descent.done = max(descent.done, descent.frames)
+    if settings.paper.start != "landmarks":
+        descent.done = max(descent.done, descent.frames)
     total = descent.frames * (1 + settings.paper.epochs)
 
     def outcome() -> PhotometricFit:
@@ -109,6 +112,8 @@ def follow_by_descent(
     title = "Refining held-out sequences by descent"
     with torch.enable_grad(), progress_bar(title, total, min(descent.done, total)) as bar:
         advance = partial(Course("pixels", total, bar, watch, min(descent.done, total)).advance, current=outcome)
+        for sequence in range(len(shots)):
+            fit_sequence(descent, sequence, advance, cache, known_person=True)
         for epoch in range(settings.paper.epochs):
             descent.fit_epoch(epoch, advance, cache)
     return outcome()
