@@ -26,7 +26,7 @@ class Command:
 
     videos: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Video files, or folders of pictures in order."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Workspace folder, new or existing."""
     name: tuple[str, ...] = ()
     """Names of the sequences, one per video (default: the videos' names)."""
@@ -40,7 +40,7 @@ class Command:
     """Also hold the sequences of --hold-out out of the tracking: the others alone decide the person's shape, texture
     and light and the focal length."""
     preview: bool = False
-    """Show the fit of the face while it runs, in OUT/tracking_preview.html (for a browser)."""
+    """Show the fit of the face while it runs, in DIR/tracking_preview.html (for a browser)."""
     overlay: Literal["auto", "all", "none"] = "auto"
     """Frames in overlay.mp4: every frame (all), every n-th frame of long clips, at most 3,000 (auto), or no overlay
     (none)."""

@@ -18,7 +18,7 @@ class Command:
     them are tracked again. Give --hold-out again then, if you used it.
     """
 
-    workspace: Annotated[Path, tyro.conf.Positional]
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder."""
     face_model: str = "anny"
     """Name of a face model (see `mien face-models`), or a .npz or .pkl file in FLAME's schema."""

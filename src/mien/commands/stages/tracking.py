@@ -141,7 +141,7 @@ def _tracking_fingerprint(
     names: list[str],
     face_model: FaceModel,
     settings: TrackingSettings,
-    hold_out: Collection[str],
+    hold_out: Collection[str] = (),
 ) -> str:
     captures = [(name, read_capture_hash(workspace.sequence_dir(name) / "capture")) for name in names]
     content = [_TRACKING_RECIPE, captures, face_model.name, face_model.content_hash, asdict(settings.in_effect())]

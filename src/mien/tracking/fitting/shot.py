@@ -13,6 +13,7 @@ from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.errors import UserError
 from mien.rotation import invert_rigid
+from mien.terminal import counted
 from mien.tracking.fitting.views import CameraBatch, Views, batch_of
 from mien.tracking.settings import TrackingSettings
 
@@ -79,7 +80,8 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
     found = int(valid.sum())
     if found < _MIN_FRAMES:
         raise UserError(
-            f"{capture.name}: a face was found in {found} frames, but tracking needs {_MIN_FRAMES}; film longer"
+            f"{capture.name}: a face was found in {counted(found, 'frame')}, but tracking needs {_MIN_FRAMES}; film "
+            "longer"
         )
     detected = without_flicker(detected, seen)
     row, camera = seen[valid].nonzero().unbind(1)
