@@ -55,9 +55,9 @@ def speed(context: Context) -> PartResult:
     return PartResult(
         {"machine": machine, "gaussians": count, "threads": threads, "rows": rows},
         (
-            f"{count:,} Gaussians at 550x802, with {counted(threads, 'thread')} of a CPU: {second['fps']:.1f} frames/s; the "
-            f"paper reports {second['paper_fps']} on a GPU. From 225x401 to 4400x6416, pixels grow 313 times and a frame "
-            f"takes {slower:.0f} times as long (paper: {187 / 36:.1f} times).",
+            f"{count:,} Gaussians at 550x802, with {counted(threads, 'thread')} of a CPU: {second['fps']:.1f} "
+            f"frames/s; the paper reports {second['paper_fps']} on a GPU. From 225x401 to 4400x6416, pixels grow 313 "
+            f"times and a frame takes {slower:.0f} times as long (paper: {187 / 36:.1f} times).",
         ),
         (Table(columns, cells, machine),),
         (_chart(rows),),
