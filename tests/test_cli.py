@@ -96,7 +96,7 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("create", ("--out PATH", "see mien create --help")),
+        ("create", ("--out DIR", "see mien create --help")),
         ("render here --out a.mp4 --siez 3", ("--siez", "--size INT", "see mien render --help")),
         ("create a.mp4 --out here --steps many", ("--steps", "'many'")),
         ("create a.mp4 --out here --preset fast", ("'fast'", "draft")),

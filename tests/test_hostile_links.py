@@ -35,6 +35,9 @@ COMMANDS = (
     "track W",
     "capture OUT/clip.mp4 --out W",
     "create OUT/clip.mp4 --out W",
+    "export W --out OUT/folder --format gaussian-avatars",
+    "import OUT/avatar --out W",
+    "analyze gaussian-avatars W --parts growth",
 )
 FOLDERS = (
     "sequences", "runs", "sequences/clip", "sequences/clip/capture", "sequences/clip/capture/cache",
@@ -83,6 +86,7 @@ def put(link: Path, target: Path) -> None:
 def run_all(workspace: Path, out: Path, capsys: pytest.CaptureFixture[str], told: str) -> None:
     out.mkdir(exist_ok=True)
     (out / "clip.mp4").write_bytes(b"no video")
+    (out / "avatar").mkdir(exist_ok=True)
     for command in COMMANDS:
         arguments = [word.replace("W", str(workspace)) if word == "W" else word.replace("OUT", str(out))
                      for word in command.split()]  # fmt: skip
@@ -119,6 +123,46 @@ def test_a_pipe_is_not_waited_for(workspace: Path, tmp_path: Path, capsys: pytes
     with pytest.raises(UserError, match="not an ordinary file"):
         read_run_config(workspace / "runs/toy")
     assert time.monotonic() - began < 60
+
+
+ANALYSIS = (
+    "analysis", "analysis/toy", "analysis/toy/runs", "analysis/toy/analysis.json", "analysis/toy/growth-ratio.png",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("place", ANALYSIS)
+def test_an_analysis_follows_no_link(
+    place: str, workspace: Path, victim: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    analyze = ["analyze", "gaussian-avatars", str(workspace), "--parts", "growth"]
+    put(workspace / place, victim / "notes" if "." in place else victim)
+    assert main(analyze) == 2
+    assert f"mien: {workspace / place}: is a link" in capsys.readouterr().err
+    aside = shutil.copytree(workspace, tmp_path / "aside", symlinks=True)
+    if place == "analysis/toy":  # a folder that the user names may be reached by a link, but nothing in it may be one
+        return
+    folder = aside / "analysis" / "toy"
+    if folder.is_dir() and not (aside / "analysis").is_symlink():
+        assert main([*analyze, "--out", str(folder)]) == 2
+        assert "is a link" in capsys.readouterr().err
+
+
+def test_an_avatar_is_not_imported_through_links(
+    workspace: Path, victim: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = tmp_path / "avatar", tmp_path / "new"
+    assert main(["export", str(workspace), "--out", str(folder), "--format", "gaussian-avatars"]) == 0
+    capsys.readouterr()
+    for name in ("point_cloud.ply", "flame_param.npz", "face_model.json", "face_model.safetensors"):
+        put(folder / name, victim / "notes")
+        assert main(["import", str(folder), "--out", str(out)]) == 2, name
+        error = capsys.readouterr().err
+        assert f"mien: {folder / name}: is a link" in error
+        assert error.count("\n") == 1
+        assert not (out / "runs").exists()
+        assert main(["export", str(workspace), "--out", str(folder), "--format", "gaussian-avatars"]) == 0
+        capsys.readouterr()
+        assert not (folder / name).is_symlink(), "a new file takes the place of the link"
 
 
 def test_the_workspace_itself_may_be_reached_by_a_link(workspace: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from mien.cli import main
 from mien.commands.stages.names import sequence_name
 from mien.errors import UserError
 from mien.progress import progress_bar, say
-from mien.terminal import plain_name, printable, show
+from mien.terminal import counted, plain_name, printable, show
 from mien.threads import MAX_THREADS, asked_threads, thread_count
 
 NASTY = "\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\udcff.mp4"
@@ -205,3 +205,12 @@ def test_instructions_that_the_machine_lacks_are_told(tmp_path: Path) -> None:
     assert ended.stderr.startswith("mien: MIEN_ISA=mmx: this machine has ")
     assert len(ended.stderr.splitlines()) == 1
     assert not (tmp_path / "demo").exists()
+
+
+def test_a_number_agrees_with_its_noun() -> None:
+    assert [counted(count, "frame") for count in (0, 1, 2, 12_000)] == [
+        "0 frames",
+        "1 frame",
+        "2 frames",
+        "12,000 frames",
+    ]

@@ -46,6 +46,8 @@ def studio(cache: Path, both: Pair, tmp_path_factory: pytest.TempPathFactory) ->
     """Return a workspace with a run that was trained and evaluated alone."""
     made = toy_studio(tmp_path_factory.mktemp("studio") / "it", cache)
     assert main(["create", str(made.video), "--out", str(made.root), "--run", "alone", *made.create_options]) == 0
+    folder = ["--out", str(made.avatar_folder), "--format", "gaussian-avatars"]
+    assert main(["export", str(made.root), "--run", "alone", *folder]) == 0
     return made
 
 
@@ -69,6 +71,11 @@ def commands_that_write(studio: Studio, folder: Path) -> dict[str, tuple[Path, l
         "train": (runs / "new", ["train", str(root), "--run", "new", "--steps", "3"]),
         "create": (runs / "new", ["create", video, "--out", str(root), "--run", "new", *studio.create_options]),
         "evaluate": (runs / "alone", ["evaluate", str(root), "--run", "alone"]),
+        "analyze": (
+            root / "analysis" / "alone",
+            ["analyze", "gaussian-avatars", str(root), "--run", "alone", "--parts", "growth"],
+        ),
+        "import": (runs / "new", ["import", str(studio.avatar_folder), "--out", str(root), "--run", "new"]),
         "demo": (folder / "demo" / "synthetic-0-1s.mp4", ["demo", "--out", str(folder / "demo"), "--seconds", "1"]),
         "bench quality": (folder / "q" / "quality", ["bench", "quality", "--out", str(folder / "q")]),
         "face-models": (
@@ -88,7 +95,7 @@ def test_every_command_that_writes_tells_who_is_at_it(
             assert main(command) == 2, name
             (line,) = capsys.readouterr().err.splitlines()  # and no progress bar before it
             assert line.startswith(f"mien: {place}: is being written by another command (process {other.pid} on "), name
-            assert ("--run NAME" in line) == (name in ("train", "create"))
+            assert ("--run NAME" in line) == (name in ("train", "create", "import"))
             assert ("--out DIR" in line) == (name == "bench quality")
         changed = {name for name, content in tree_bytes(studio.root).items() if before.get(name) != content}
         assert all(name.endswith(".lock") for name in changed)
@@ -103,6 +110,9 @@ def test_readers_go_on_beside_every_lock(
             ["render", root, *run, "--out", str(tmp_path / "a.png"), "--size", "32"],
             ["drive", root, *run, "--by", root, "--out", str(tmp_path / "drive"), "--size", "32"],
             ["export", root, *run, "--out", str(tmp_path / "a.ply")],
+            ["export", root, *run, "--out", str(tmp_path / "folder"), "--format", "gaussian-avatars"],
+            ["import", str(tmp_path / "folder"), "--out", root, "--run", f"imported-{tmp_path.name}"],
+            ["analyze", "gaussian-avatars", root, *run, "--parts", "growth", "--out", str(tmp_path / "analysis")],
             ["evaluate", root, *run, "--compare", "--out", str(tmp_path / "a.html")],
             ["capture", str(studio.video), "--out", root, "--name", "clip", *studio.capture_options],
             ["track", root, "--face-model", "toy", "--overlay", "none"],
@@ -206,6 +216,42 @@ def test_two_captures_of_one_video(studio: Studio, both: Pair, tmp_path: Path) -
         assert sum(len(one.worked) for one in outcomes) == 1, "captured once"
         assert tree_bytes(root / "sequences") == {f"clip/capture/{name}": data for name, data in expected.items()}
     assert told > MEETINGS, "they hardly met"
+
+
+def test_two_imports_of_one_run(studio: Studio, both: Pair, tmp_path: Path) -> None:
+    """One of two imports of a run works. The other one names it, or says that the run is there."""
+    told = 0
+    for index in range(4 * ROUNDS):
+        if index >= ROUNDS and told > MEETINGS:
+            break
+        out = tmp_path / str(index)
+        command = ["import", str(studio.avatar_folder), "--out", str(out)]
+        outcomes = sorted(both.run(command, command), key=lambda outcome: outcome.code)
+        assert [outcome.code for outcome in outcomes] == [0, 2], outcomes
+        assert [len(outcome.worked) for outcome in outcomes] == [1, 0], "imported once"
+        line = outcomes[1].told.splitlines()[-1]
+        busy = f"is being written by another command (process {outcomes[0].pid} on " in line
+        assert busy or "is there already; give the imported run another name" in line
+        told += busy
+        files = tree_bytes(out / "runs" / "gaussian_avatars")
+        assert {"avatar/avatar.safetensors", "config.json", "face_track.safetensors"} <= files.keys()
+    assert told > 0, "they never met"
+
+
+def test_two_analyses_of_one_run(studio: Studio, both: Pair, tmp_path: Path) -> None:
+    """One of two analyses works at a time, and nothing is measured twice."""
+    told = 0
+    for index in range(2 * ROUNDS):
+        if index >= ROUNDS // 2 and told > 0:
+            break
+        out = tmp_path / str(index)
+        command = ["analyze", "gaussian-avatars", str(studio.root), "--run", "alone", "--parts", "growth"]
+        outcomes = both.run([*command, "--out", str(out)], [*command, "--out", str(out)])
+        told += assert_apart(outcomes, str(index))
+        assert json.loads((out / "analysis.json").read_text())["parts"].keys() == {"growth"}
+        assert (out / "analysis.html").is_file()
+        assert not lock_file(out).exists()
+    assert told > 0, "they never met"
 
 
 def test_create_beside_evaluate(studio: Studio, both: Pair) -> None:

@@ -27,6 +27,8 @@ WORK = {
     "train": ("mien.training.trainer", "_train_to_the_end"),
     "capture": ("mien.capture.from_video", "survey_source"),
     "evaluate": ("mien.evaluation.evaluate", "_evaluate"),
+    "analyze": ("mien.analysis.running", "write_page"),
+    "import": ("mien.commands.stages.importing", "write_imported_run"),
 }
 """Module and function that each command runs while it writes."""
 _TIMESTEPS, _SIZE = 5, 48
@@ -83,7 +85,7 @@ def _serve(pipe: Connection, barrier: Barrier, cache: Path, without_locks: bool)
     if without_locks:
         for module in ("mien.training.trainer", "mien.capture.from_video", "mien.evaluation.evaluate"):
             importlib.import_module(module).hold = lambda *_, **__: contextlib.nullcontext()  # type: ignore[attr-defined]
-    for kind in ("capture", "create", "evaluate", "train", "render"):
+    for kind in ("capture", "create", "evaluate", "train", "render", "analyze", "import"):
         importlib.import_module(f"mien.commands.{kind}")
     for stage in ("capturing", "evaluating", "tracking", "training", "pictures"):
         importlib.import_module(f"mien.commands.stages.{stage}")
@@ -130,6 +132,8 @@ class Studio:
     video: Path
     capture_options: list[str]
     """Options of a capture with mattes and landmarks, so that nothing has to be detected."""
+    avatar_folder: Path
+    """Place of an exported GaussianAvatars folder."""
     create_options: list[str]
     """Options of `create` with which everything up to the tracking is current and training is short."""
 
@@ -165,4 +169,4 @@ def toy_studio(folder: Path, cache: Path) -> Studio:
 
     write_scoring(sequence / "scoring", Scoring(alpha, crops), read_capture_hash(sequence / "capture"))
     create_options = ["--name", "clip", "--face-model", "toy", "--overlay", "none", "--steps", "3", "--split", "tail"]
-    return Studio(root, video, capture_options, [*create_options, *capture_options])
+    return Studio(root, video, capture_options, folder / "avatar", [*create_options, *capture_options])

@@ -36,6 +36,11 @@ def plain_name(text: str) -> str:
     return "".join("_" if _acts(character, False) else character for character in text)
 
 
+def counted(count: int, noun: str) -> str:
+    """A number with its noun: "1 frame", "2 frames", "12,000 frames"."""
+    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
 def show(text: str, *, styled: bool = False) -> None:
     """Print a result, which may have several lines, on standard output.
 

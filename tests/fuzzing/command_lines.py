@@ -30,6 +30,9 @@ BASES = (
     "evaluate --images given/mattes --truth given/mattes --no-perceptual --json --crops given/crops.json",
     "train W --steps 1 --run r", "train W --run toy", "track W", "track W --again", "face-models",
     "face-models --json", "capture none.mp4 --out new",
+    "analyze gaussian-avatars W --parts growth", "analyze gaussian-avatars W --parts growth --out o --json",
+    "import gaussian_avatars --out new", "import gaussian_avatars --out W --run other",
+    "import flame_avatars --out new", "export W --out o --format gaussian-avatars", "track W --hold-out clip",
     "bench", "bench quality --captures nobody --out o", "create none.mp4 --out new", "demo --out head.ply",
 )  # fmt: skip
 HEAVY = (
@@ -38,6 +41,8 @@ HEAVY = (
     "face-models --add flame/tiny.npz --name tiny", "face-models --add flame/tiny.pkl",
     "bench render --seconds 0.001 --json", "bench scaling --seconds 0.001",
     "drive W --by videos/clip.mp4 --out o.mp4", "track W --face-model flame/tiny.npz",
+    "analyze gaussian-avatars W --train --steps 1 --seconds 0.001",
+    "import flame_avatars --out new --face-model flame/tiny.npz",
 )  # fmt: skip
 """Commands that take longer than a case may. They are stopped, and must end as a stopped command does."""
 _NUMBERS = (
@@ -50,7 +55,8 @@ _PATHS = (
     "videos/clip.mp4", "videos/clip.mkv", "pictures", "pictures/a.png",
     "pictures/a.jpg", "given/take.csv", "given/take.json", "given/points.csv", "given/points.safetensors",
     "given/mattes", "given/crops.json", "given/cameras.json", "head.mien", "head.ply",
-    "flame/tiny.npz", "flame/tiny.pkl", "/dev/null", "/dev/zero", "/proc/self/mem", "/proc/self/environ",
+    "flame/tiny.npz", "flame/tiny.pkl", "gaussian_avatars", "flame_avatars",
+    "/dev/null", "/dev/zero", "/proc/self/mem", "/proc/self/environ",
     "/nowhere/x", "pipe", ".", "..", "~", "-", "x" * 300, "a/" * 2000 + "x",
     f"http://127.0.0.1:{PORT}/x.mp4", "a\x1b[31m.png", "a\nb.mp4", "empty", "größer.png", "\udcff.png", "%s.png",
     "%d%d.png", "%n.png", "o.png", "o.mp4", "o.webm", "o.ply", "o.mien", "o.json",

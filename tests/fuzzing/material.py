@@ -12,22 +12,30 @@ import torch
 
 import train_toy
 from fuzzing.archive_faults import npy_of, npz_of
-from mien.avatar import load_avatar
+from mien.analysis import ANALYSES, AnalysisOptions, chosen_parts, run_analysis
+from mien.avatar import METHODS, load_avatar
 from mien.avatar.baking import make_portable
 from mien.capture.video import write_video
 from mien.evaluation import EvaluationSettings, evaluate
 from mien.evaluation.partial import PartialScores
-from mien.export import in_world, write_ply
+from mien.export import in_world, write_gaussian_avatars_folder, write_ply
 from mien.face import Landmarks
 from mien.face.cache import cache_folder
+from mien.face.flame import flame_face_model, read_flame
 from mien.face.loading import load_face_model, write_face_model, write_landmarks
 from mien.runtime import write_portable
 from mien.storage import write_json
+from mien.training import read_face_track
 from toy_scene import toy_camera, toy_face_model
 from toy_workspace import write_toy_workspace
 from what_users_give import write_what_users_give
 
-RUN, SEQUENCE = "W/runs/toy", "W/sequences/clip"
+RUN, SEQUENCE, ANALYSIS = "W/runs/toy", "W/sequences/clip", "W/analysis/toy"
+GROWTH = replace(
+    ANALYSES["gaussian-avatars"],
+    parts=tuple(chosen_parts(ANALYSES["gaussian-avatars"], ("growth",), train=False)),
+)
+"""The part of an analysis that takes no time. The others draw large pictures or train."""
 QUICK = EvaluationSettings(perceptual=False, video_frames=0)
 
 
@@ -40,6 +48,9 @@ def make_material(root: Path) -> None:
     write_portable(root / "head.mien", make_portable(avatar, toy_camera(32), "toy"))
     with torch.no_grad():
         write_ply(root / "head.ply", in_world(avatar.pose(avatar.subject).gaussians.timestep(0)))
+    track = read_face_track(root / RUN, avatar.face_model)
+    write_gaussian_avatars_folder(root / "gaussian_avatars", avatar, track)
+    run_analysis(GROWTH, GROWTH.parts, root / RUN, [root / SEQUENCE], root / ANALYSIS, AnalysisOptions())
     _write_pictures(root / "pictures")
     write_what_users_give(root / "given", cv2.imread(str(root / "pictures/a.png")))  # type: ignore[arg-type]
     _write_face_models(root / "cache" / "face_models" / "added")
@@ -51,6 +62,7 @@ def make_material(root: Path) -> None:
     from flame_like import write_pickle
 
     write_pickle(root / "flame/tiny.pkl", tiny_flame())
+    _write_avatar_on_flame(root)
     _write_videos(root / "videos")
     from fuzzing.pieces import write_pieces
 
@@ -123,6 +135,14 @@ def _ball(around: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
     return points, np.concatenate(
         [np.stack([first, first + around, second], 1), np.stack([second, first + around, second + around], 1)]
     )
+
+
+def _write_avatar_on_flame(root: Path) -> None:
+    """Write GaussianAvatars' folder of an avatar on a model in FLAME's schema, whose licence forbids copies."""
+    model = flame_face_model(read_flame(root / "flame/tiny.npz"), "tiny")
+    face = replace(model.neutral(3), head_translation=torch.tensor([0.0, 0.0, -0.6]).repeat(3, 1))
+    method = METHODS["gaussian_avatars"]
+    write_gaussian_avatars_folder(root / "flame_avatars", method.avatar(method.config(), model, face), face)
 
 
 def _write_videos(folder: Path) -> None:

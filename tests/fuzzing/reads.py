@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from fuzzing import pieces
-from fuzzing.material import CONFIG, RUN, SEQUENCE, SETTINGS
+from fuzzing.material import ANALYSIS, CONFIG, GROWTH, RUN, SEQUENCE, SETTINGS
+from mien.analysis import AnalysisOptions, run_analysis
 from mien.avatar import load_avatar
 from mien.capture import read_capture as read_whole_capture
 from mien.capture.crop import whole_picture
@@ -22,8 +23,10 @@ from mien.evaluation import read_metrics as read_figures
 from mien.evaluation.image_folders import read_crops as read_boxes
 from mien.evaluation.image_source import open_pictures, read_picture
 from mien.evaluation.partial import PartialScores
+from mien.export import read_gaussian_avatars_folder
 from mien.export import read_ply as read_gaussians
 from mien.face import FaceParams, available_face_models, load_face_model
+from mien.face.flame import flame_face_model
 from mien.face.flame import read_flame as read_flame_file
 from mien.render.camera_paths import read_cameras as read_camera_path
 from mien.runtime import read_portable as read_mien
@@ -175,6 +178,21 @@ def read_workspace(root: Path, file: Path) -> Any:
     folder = workspace.sequence_dir(workspace.pick_sequence(None))
     read_sequence(folder)
     return load_avatar(workspace.run_dir(workspace.pick_run(None)))
+
+
+def read_analysis(root: Path, file: Path) -> Any:
+    """Return what an analysis keeps: the parts, without what depends on the command."""
+    options = AnalysisOptions()
+    return run_analysis(GROWTH, GROWTH.parts, root / RUN, [root / SEQUENCE], root / ANALYSIS, options)["parts"]
+
+
+def read_gaussian_avatars(root: Path, file: Path) -> Any:
+    return read_gaussian_avatars_folder(file.parent)
+
+
+def read_avatar_on_flame(root: Path, file: Path) -> Any:
+    model = flame_face_model(read_flame_file(root / "flame/tiny.npz"), "tiny")
+    return read_gaussian_avatars_folder(root / "flame_avatars", model)
 
 
 def nothing_read(root: Path, file: Path) -> Any:

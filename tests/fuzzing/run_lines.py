@@ -20,7 +20,18 @@ from fuzzing.faults import Place
 from fuzzing.judge import MEMORY, Bench, Result, judge_traces, snapshot
 from fuzzing.material import copy_of
 
-PARTS = ("W", "given", "pictures", "videos", "flame", "head.mien", "head.ply", "cache")
+PARTS = (
+    "W",
+    "given",
+    "pictures",
+    "videos",
+    "flame",
+    "gaussian_avatars",
+    "flame_avatars",
+    "head.mien",
+    "head.ply",
+    "cache",
+)
 LINES, LIGHT, HEAVY = "command lines", "line", "heavy line"
 """Name of the format in the table, and prefixes of the names of its cases."""
 FINE = frozenset({0, 2, 130, 141, 143})

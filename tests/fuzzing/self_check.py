@@ -141,6 +141,8 @@ _EDITS: dict[str, Callable[[Path], None]] = {
     "scoring.json": _edit_json("edited", value=1),
     "crops.safetensors": _edit_numbers("crops", lambda array: array + 1),
     "config.json": _edit_json("mien", value="0.0"),
+    "analysis.json": _edit_json("mien", value="0.0"),
+    "folder's face model": _edit_json("name", value="edited"),
     "metrics.json": _edit_json("training", "seconds", value=1.5),
     "curves.safetensors": _edit_numbers("loss", _bit_more),
     "face_track.safetensors": _edit_numbers("expression", _bit_more),

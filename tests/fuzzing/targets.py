@@ -9,7 +9,7 @@ from typing import Any
 
 from fuzzing import faults, reads, uses
 from fuzzing.faults import Place
-from fuzzing.material import RUN, SEQUENCE
+from fuzzing.material import ANALYSIS, RUN, SEQUENCE
 
 Read = Callable[[Path, Path], Any]
 """Reader that takes the folder with the copies and the faulty file."""
@@ -68,6 +68,9 @@ def _in_workspaces() -> tuple[Target, ...]:
                weight=2),
         Target("metrics.json", "metrics", f"{run}/metrics.json", whole, reads.read_metrics, uses.use_comparison,
                True, weight=2),
+        Target("analysis.json", "analysis", f"{ANALYSIS}/analysis.json", whole, reads.read_analysis,
+               exact=True, weight=2),
+        Target("charts of an analysis", "analysis", f"{ANALYSIS}/*.png", whole, reads.read_analysis, weight=0.3),
         Target("partial scores", "partial files", f"{run}/.*.partial", whole, reads.read_partial, uses.use_partial,
                fault=faults.faulty_lines),
         Target("tracking pieces", "partial files", "pieces/*.safetensors", ("pieces",), reads.go_on_tracking,
@@ -76,7 +79,7 @@ def _in_workspaces() -> tuple[Target, ...]:
 
 
 def _avatars_and_given_files() -> tuple[Target, ...]:
-    run, whole = RUN, ("W",)
+    run, whole, folder = RUN, ("W",), "GaussianAvatars' folder"
     return (
         Target("avatar.json", "avatar", f"{run}/avatar/avatar.json", whole, reads.read_avatar, uses.use_avatar,
                True, weight=2),
@@ -101,6 +104,16 @@ def _avatars_and_given_files() -> tuple[Target, ...]:
         Target("take.json", "motion", "given/*take.json", ("given",), reads.read_motion, uses.expect_motion, weight=2),
         Target("tiny.npz", "FLAME's schema", "flame/tiny.npz", ("flame",), reads.read_flame, uses.use_flame, weight=2),
         Target("tiny.pkl", "FLAME's schema", "flame/tiny.pkl", ("flame",), reads.read_flame, uses.use_flame, weight=2),
+        Target("point_cloud.ply", folder, "gaussian_avatars/point_cloud.ply", ("gaussian_avatars",),
+               reads.read_gaussian_avatars, uses.use_gaussian_avatars, weight=2),
+        Target("flame_param.npz", folder, "gaussian_avatars/flame_param.npz", ("gaussian_avatars",),
+               reads.read_gaussian_avatars, uses.use_gaussian_avatars, weight=2),
+        Target("folder's face model", folder, "gaussian_avatars/face_model.*", ("gaussian_avatars",),
+               reads.read_gaussian_avatars, uses.use_gaussian_avatars, True),
+        Target("folder on FLAME", folder, "flame_avatars/*", ("flame_avatars", "flame"),
+               reads.read_avatar_on_flame, uses.use_gaussian_avatars),
+        Target("imports", folder, "gaussian_avatars/*", ("gaussian_avatars", "cache"), reads.nothing_read,
+               uses.run_an_import, fault=faults.any_fault, weight=0.5, named=False),
         Target("videos", "videos", "videos/*", ("videos",), reads.read_video, weight=3),
         Target("playlists", "videos", "videos/clip.mp4", ("videos",), reads.read_no_playlist,
                fault=faults.write_playlist, weight=1),

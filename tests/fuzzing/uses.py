@@ -18,6 +18,7 @@ from fuzzing.material import CONFIG, QUICK, RUN, SEQUENCE, SETTINGS
 from mien import cli
 from mien.avatar import load_avatar
 from mien.avatar.baking import make_portable
+from mien.commands.stages.importing import front_camera
 from mien.driving import Motion, drive
 from mien.errors import UserError
 from mien.evaluation import evaluate
@@ -26,13 +27,13 @@ from mien.evaluation.compare import compare_runs
 from mien.evaluation.compare_report import comparison_html
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.text import comparison_text
-from mien.export import in_world, write_ply
+from mien.export import in_world, write_gaussian_avatars_folder, write_ply
 from mien.export import read_ply as read_gaussians
 from mien.face import FaceModel
 from mien.face.flame import flame_face_model
 from mien.render import rasterize
 from mien.runtime import Avatar, write_portable
-from mien.training import read_sequence, train
+from mien.training import read_face_track, read_sequence, train, write_imported_run
 from mien.training.run import run_camera
 from toy_scene import toy_camera, toy_face_model
 
@@ -166,6 +167,21 @@ def use_flame(root: Path, found: Any, dice: Random) -> None:
     model(model.neutral(1))
 
 
+def use_gaussian_avatars(root: Path, found: Any, dice: Random) -> None:
+    """Pose and draw what a folder holds, and write it as the run and the folder that a user would make of it."""
+    content.expect_finite(found.avatar)
+    content.expect_finite(found.face)
+    timestep = dice.randrange(len(found.face))
+    camera = front_camera(found.avatar).fitted(32, 32)
+    with torch.no_grad():
+        gaussians = found.avatar.pose(found.face[timestep]).gaussians.timestep(0)
+        assert rasterize(gaussians, camera, torch.ones(3)).image.isfinite().all(), "a picture that is not finite"
+    if dice.random() < 0.3:
+        write_imported_run(root / "I/runs/a", found.avatar, found.face, camera, root / "gaussian_avatars")
+        again = load_avatar(root / "I/runs/a")
+        write_gaussian_avatars_folder(root / "again", again, read_face_track(root / "I/runs/a", again.face_model))
+
+
 LINES = (
     "render {W} --out {root}/o.png --width 16 --height 16", "render {W} --out {root}/o.png --size 16 --path captured",
     "render {W} --out {root}/o.png --size 16 --sequence clip",
@@ -174,14 +190,29 @@ LINES = (
     "export {W} --out {root}/o.mien", "export {W} --out {root}/o.ply --series clip", "evaluate {W} --no-perceptual",
     "evaluate {W} --compare", "evaluate {W} --compare --json",
     "train {W} --steps 1 --run other", "train {W} --steps 1 --run toy", "track {W} --again", "track {W}",
-    "face-models", "face-models --json",
+    "face-models", "face-models --json", "analyze gaussian-avatars {W} --parts growth",
+    "analyze gaussian-avatars {W} --parts growth --json", "export {W} --out {root}/o --format gaussian-avatars",
+    "track {W} --hold-out clip",
+)  # fmt: skip
+IMPORTS = (
+    "import {root}/gaussian_avatars --out {root}/new", "import {root}/gaussian_avatars --out {root}/new --run other",
 )  # fmt: skip
 
 
 def run_a_line(root: Path, found: Any, dice: Random) -> None:
     """Run one command on the faulty workspace, in this process."""
+    _run(dice.choice(LINES), root)
+
+
+def run_an_import(root: Path, found: Any, dice: Random) -> None:
+    """Import the faulty folder, in this process, and draw what was made of it."""
+    _run(dice.choice(IMPORTS), root)
+    _run("render {root}/new --out {root}/o.png --size 16 --timestep 1", root)
+
+
+def _run(line: str, root: Path) -> None:
     os.environ["MIEN_CACHE"] = str(root / "cache")
-    words = [word.format(W=root / "W", root=root) for word in dice.choice(LINES).split()]
+    words = [word.format(W=root / "W", root=root) for word in line.split()]
     told = io.StringIO()
     with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()):
         try:

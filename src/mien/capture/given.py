@@ -19,6 +19,7 @@ from mien.capture.source import FrameSelection, FrameSource, list_images, open_s
 from mien.errors import UserError
 from mien.limits import MAX_NUMBER
 from mien.storage import read_arrays
+from mien.terminal import counted
 
 _MAX_SHOWN = 40
 """Characters of a csv cell that a message shows."""
@@ -180,7 +181,8 @@ def check_mattes(path: Path, source: FrameSource) -> None:
     expected = source.count()
     if found != expected:
         raise UserError(
-            f"{path}: has {found} mattes, but {source.path} has {expected} frames; give one matte for each frame"
+            f"{path}: has {counted(found, 'matte')}, but {source.path} has {counted(expected, 'frame')}; "
+            "give one matte for each frame"
         )
 
 

@@ -1,15 +1,18 @@
 """Where the head is in the world of several calibrated cameras, found from the boxes of its face in their pictures."""
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.crop import Crop, whole_picture
 from mien.errors import UserError
+from mien.rotation import invert_rigid
 
 _HEAD_RADIUS = 0.24
 """Radius in metres of the sphere about the middle of the face that a crop shows: head, hair and neck."""
@@ -23,6 +26,18 @@ _OUTLIERS = 1.0
 """Percent of the timesteps at either end that may leave the crop."""
 _SQUARISH, _MOSTLY_HEAD = 1.25, 0.7
 """As in `choose_crop`: pictures that are head crops already are kept whole."""
+_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+"""Change between OpenCV's axes of a camera (y down, z forward) and OpenGL's (y up, z backward)."""
+_MISTAKES: tuple[tuple[Callable[[Tensor], Tensor], str], ...] = (
+    (invert_rigid, "the matrices go from camera to world, so write the inverse of each viewmat"),
+    (lambda viewmat: _FLIP @ viewmat, "the axes are OpenGL's, so change the signs of rows 2 and 3 of each viewmat"),
+    (
+        lambda viewmat: _FLIP @ invert_rigid(viewmat),
+        "the matrices go from camera to world with OpenGL's axes, so change the signs of columns 2 and 3 of each, and "
+        "write its inverse as viewmat",
+    ),
+)
+"""Usual mistakes in all matrices of a calibration: how to undo each, and its remedy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +67,15 @@ def find_head_path(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera])
     Raises:
         UserError: no two cameras agree at any timestep, or the calibration is not in metres.
     """
-    centres = (boxes[..., :2] + boxes[..., 2:]) / 2
-    sides = np.sqrt(np.prod(boxes[..., 2:] - boxes[..., :2], axis=-1))
+    path = _consensus(boxes, cameras)
+    if not path.known.any():
+        raise UserError(f"--calibration: no two cameras ever see the face in the same place; {_remedy(boxes, cameras)}")
+    _check_unit(path, _sides(boxes), cameras)
+    return path
+
+
+def _consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> HeadPath:
+    centres, sides = (boxes[..., :2] + boxes[..., 2:]) / 2, _sides(boxes)
     origins = np.stack([camera.position.numpy() for camera in cameras]).astype(np.float64)
     directions = _rays(centres, cameras)
     best, best_cost = np.full((len(boxes), 3), np.nan), np.full(len(boxes), np.inf)
@@ -68,14 +90,25 @@ def find_head_path(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera])
     for timestep in np.flatnonzero(agrees.any(axis=1)):
         chosen = agrees[timestep]
         refined[timestep] = _intersection(origins[chosen], directions[timestep, chosen])
-    path = HeadPath(refined, agrees)
-    if not path.known.any():
-        raise UserError(
-            "--calibration: no two cameras ever see the face in the same place; check that ids and videos belong "
-            "together, that matrices go from world to camera with OpenCV axes, and the offsets"
-        )
-    _check_unit(path, sides, cameras)
-    return path
+    return HeadPath(refined, agrees)
+
+
+def _sides(boxes: Float[np.ndarray, "t c 4"]) -> Float[np.ndarray, "t c"]:
+    return np.sqrt(np.prod(boxes[..., 2:] - boxes[..., :2], axis=-1))
+
+
+def _remedy(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> str:
+    """The likeliest mistake in a calibration whose cameras do not agree, and what to do.
+
+    The usual mistakes in all matrices are undone in turn. If most faces then agree, that was the mistake.
+    """
+    found, best, remedy = np.isfinite(boxes[..., 0]).sum(), 0.5, ""
+    for as_meant, correction in _MISTAKES:
+        meant = [replace(camera, viewmat=as_meant(camera.viewmat.double()).float()) for camera in cameras]
+        agreeing = float(_consensus(boxes, meant).agrees.sum() / max(found, 1))
+        if agreeing > best:
+            best, remedy = agreeing, correction
+    return remedy or "check first that each video or folder has the name of its own camera's id, then the offsets"
 
 
 def choose_crops(

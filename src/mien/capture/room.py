@@ -7,6 +7,7 @@ from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
 from mien.errors import UserError
 from mien.inside import remove_tree
 from mien.progress import say
+from mien.terminal import counted
 
 _PNG_SHARE = 0.5
 """Size of lossless PNGs relative to their pixels. Footage takes 0.2 to 0.5 of them, mattes almost nothing."""
@@ -30,7 +31,7 @@ def check_room(layout: FrameLayout, name: str, out: Path) -> None:
         UserError: the volume has less room.
     """
     cameras, size = len(layout.camera_ids), f"{layout.width}x{layout.height}"
-    what = f"{layout.timesteps} frames of {size}" + (f" by {cameras} cameras" if cameras > 1 else "")
+    what = f"{counted(layout.timesteps, 'frame')} of {size}" + (f" by {cameras} cameras" if cameras > 1 else "")
     needed = capture_bytes(layout)
     free = shutil.disk_usage(layout.folder).free + _used(layout.folder)
     if free < needed:

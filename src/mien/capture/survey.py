@@ -220,7 +220,9 @@ def _best_turn(frames: FrameSource, survey: Survey) -> int:
 
 def no_face(path: Path, frames: int, remedy: str = "give a video that shows a face clearly") -> UserError:
     """Return the error for a video in which no face was found."""
-    return UserError(f"{path}: no face found in any of its {frames} frames; {remedy}")
+    return UserError(
+        f"{path}: no face found in {'its only frame' if frames == 1 else f'any of its {frames} frames'}; {remedy}"
+    )
 
 
 def _no_face_because(frames: FrameSource, survey: Survey, option: str) -> UserError:

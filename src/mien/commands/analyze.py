@@ -26,7 +26,7 @@ class Command:
 
     method: Annotated[AnalysisName, tyro.conf.Positional]
     """Method of the run."""
-    workspace: Annotated[Path, tyro.conf.Positional]
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""

@@ -13,7 +13,7 @@ from mien.workspace import Workspace, check_new_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Turn a video of one person into frames, mattes and landmarks, in OUT/sequences/NAME/capture.
+    """Turn a video of one person into frames, mattes and landmarks, in DIR/sequences/NAME/capture.
 
     Any video from a camera or phone works: upright or turned, HDR, with a variable frame rate, of any length. A video
     with cuts becomes the sequences NAME-1, NAME-2, ... A stopped command continues where it was if you run it again.
@@ -29,7 +29,7 @@ class Command:
     videos: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """A video file, or a folder of pictures in order. With --calibration, one for each camera, named by the camera's
     id, or one folder that holds them."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Workspace folder of the person. It may be new, or hold other videos of the same person."""
     name: str | None = None
     """Name of the sequence (default: the name of the video or folder)."""

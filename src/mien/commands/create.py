@@ -26,7 +26,7 @@ class Command:
 
     videos: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Video files, or folders of pictures in order."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Workspace folder, new or existing."""
     name: tuple[str, ...] = ()
     """Names of the sequences, one per video (default: the videos' names)."""
@@ -36,8 +36,11 @@ class Command:
     """Name of the run (default: the method's name)."""
     face_model: str = "anny"
     """Name of a face model (see `mien face-models`), or a .npz or .pkl file in FLAME's schema."""
+    track_apart: bool = False
+    """Also hold the sequences of --hold-out out of the tracking: the others alone decide the person's shape, texture
+    and light and the focal length."""
     preview: bool = False
-    """Show the fit of the face while it runs, in OUT/tracking_preview.html (for a browser)."""
+    """Show the fit of the face while it runs, in DIR/tracking_preview.html (for a browser)."""
     overlay: Literal["auto", "all", "none"] = "auto"
     """Frames in overlay.mp4: every frame (all), every n-th frame of long clips, at most 3,000 (auto), or no overlay
     (none)."""
@@ -55,6 +58,8 @@ class Command:
                 f"--split {NAMED_SPLIT}: needs ten sequences of calibrated cameras, and this command makes one; use "
                 f"`mien capture --calibration` for each, then `mien track` and `mien train --split {NAMED_SPLIT}`"
             )
+        if self.track_apart and not self.options.hold_out:
+            raise UserError("--track-apart: needs the sequences to track apart; add --hold-out NAME")
         if self.calibration is None:
             sequence_names(self.videos, self.name)
         else:
@@ -100,7 +105,12 @@ class Command:
             captured = run_calibrated_capture_stage(workspace, self.videos, self.calibration, self.name, self.capture)
         check_held_out(captured, settings)
         trackings = run_tracking_stage(
-            workspace, self.face_model, self.tracking, overlay=self.overlay, preview=self.preview
+            workspace,
+            self.face_model,
+            self.tracking,
+            overlay=self.overlay,
+            preview=self.preview,
+            hold_out=settings.held_out_sequences if self.track_apart else (),
         )
         run_training_stage(workspace, [name for name in captured if name in trackings], run, method, settings)
         if settings.holds_out:

@@ -15,7 +15,7 @@ from mien.workspace import open_workspace
 class Command:
     """Make an avatar follow somebody else: a video, a sequence, or a recording of a phone or of MediaPipe."""
 
-    workspace: Annotated[Path, tyro.conf.Positional]
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder of the avatar."""
     by: Path
     """The driver: a workspace (also the avatar's own), a video file (tracked first, and kept in the cache), a .csv of

@@ -26,7 +26,7 @@ class Command:
     mien evaluate --images PRED --truth TRUTH: the same figures for pictures of any origin.
     """
 
-    workspaces: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    workspaces: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[DIR [DIR ...]]")] = ()
     """Workspace folders. Give one, or several with --compare."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""

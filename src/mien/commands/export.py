@@ -15,7 +15,7 @@ from mien.workspace import Workspace, open_workspace
 class Command:
     """Write an avatar for other programs: .mien (all of it), .ply (one expression) or GaussianAvatars' own folder."""
 
-    workspace: Annotated[Path, tyro.conf.Positional]
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder."""
     out: Path
     """The .mien or .ply file to write. With --series, the .ply files get numbers: NAME_000000.ply. With --format

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Command:
     """Render an avatar: a still, or a video along a camera path, at any expression or with a sequence's motion."""
 
-    workspace: Annotated[Path, tyro.conf.Positional]
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder."""
     out: Path
     """Output: .png for a still, a folder or NAME_%06d.png for numbered pictures, .mp4 or .webm for a video."""

@@ -15,13 +15,16 @@ class Command:
     """Fit the face model to all sequences of a workspace. Writes DIR/sequences/NAME/tracking, an overlay and a report.
 
     A workspace is one person, so its sequences are tracked together, with one identity. If a sequence is added, all of
-    them are tracked again.
+    them are tracked again. Give --hold-out again then, if you used it.
     """
 
-    workspace: Annotated[Path, tyro.conf.Positional]
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder."""
     face_model: str = "anny"
     """Name of a face model (see `mien face-models`), or a .npz or .pkl file in FLAME's schema."""
+    hold_out: tuple[str, ...] = ()
+    """Sequences to track apart. The others alone decide the person's shape, texture and light and the focal length;
+    then only the motion of these is fitted. Without it, all sequences decide."""
     again: bool = False
     """Track again even if nothing has changed. The scoring masks stay as they are."""
     preview: bool = False
@@ -35,12 +38,20 @@ class Command:
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         self.settings.check()
-        open_workspace(self.workspace)
+        workspace = open_workspace(self.workspace)
+        for name in self.hold_out:
+            workspace.pick_sequence(name)
 
     def run(self) -> None:
         """Track, and write overlays and reports."""
         from mien.commands.stages.tracking import run_tracking_stage
 
         run_tracking_stage(
-            open_workspace(self.workspace), self.face_model, self.settings, self.again, self.overlay, self.preview
+            open_workspace(self.workspace),
+            self.face_model,
+            self.settings,
+            self.again,
+            self.overlay,
+            self.preview,
+            self.hold_out,
         )

@@ -16,7 +16,7 @@ from mien.workspace import Workspace, open_workspace
 class Command:
     """Train an avatar on the tracked sequences of a workspace, in DIR/runs/NAME. The same command resumes the run."""
 
-    workspace: Annotated[Path, tyro.conf.Positional]
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder."""
     sequences: tuple[str, ...] = ()
     """Names of the sequences (default: all tracked ones). Those of --hold-out belong to the run as well."""

@@ -18,7 +18,6 @@ from mien.capture.video import write_video
 from mien.driving import drive
 from mien.errors import UserError
 from mien.evaluation.redetection import MEASURED_BY, FaceReader, MeasuredMotion, measure_motion, transfer_figures
-from mien.evaluation.scoring import evenly_spread
 from mien.evaluation.videos import labelled_row, match_sizes
 from mien.face import FaceParams, most_frontal_camera
 from mien.face.checks import check_face_params
@@ -27,6 +26,7 @@ from mien.progress import track_progress
 from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import Tracking, check_tracking_of, read_tracking
+from mien.training.frames import evenly_spread
 
 _MAX_FRAMES = 100
 _MEANS = (

@@ -17,7 +17,6 @@ from mien.evaluation.scoring import (
     SSIM_WINDOW,
     Scores,
     ScoreSettings,
-    evenly_spread,
     mean_scores,
     perceptual_metric,
     score_pictures,
@@ -28,6 +27,7 @@ from mien.pictures import Box
 from mien.progress import progress_bar, say
 from mien.storage import read_json, write_json
 from mien.tracking.scoring import head_crop
+from mien.training.frames import evenly_spread
 from mien.training.sequence import composite
 
 SCORES_FORMAT, SCORES_VERSION = "mien.scores", 1

@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -22,7 +22,6 @@ SSIM_WINDOW = "11x11 Gaussian window, sigma 1.5, zeros beyond the border"
 PIXELS = "8 bits a channel, rounded"
 """The scored pixels: those that a png file would hold, so that files of any program are scored alike."""
 
-Item = TypeVar("Item")
 Scores = Mapping[str, float]
 """`psnr`, `ssim`, `l1`, `perceptual`, and the same with the prefix `head_`."""
 
@@ -84,12 +83,6 @@ def mean_scores(rows: Sequence[Scores]) -> dict[str, Any]:
 
     whole = {name: mean(name) for name in METRICS}
     return {**whole, "head": {name: mean(f"head_{name}") for name in METRICS}}
-
-
-def evenly_spread(items: Sequence[Item], max_count: int) -> list[Item]:
-    """At most `max_count` of the items, evenly spread, always with the first one. With 0, all of them."""
-    step = max(1, -(-len(items) // max_count)) if max_count else 1
-    return list(items[::step])
 
 
 def worker_threads(threads: int) -> int:

@@ -109,7 +109,8 @@ def render(
     """The picture of Gaussians over a background (RGB, 0..1, higher for bright colours), and its alpha (0..1).
 
     The picture is premultiplied: image = colours times alpha + (1 - alpha) times background. Over black, dividing it by
-    alpha gives straight colours. The kernel and its constants are those of `mien.render.rasterize`.
+    alpha gives straight colours. Bright colours may exceed 1 a little, so clip them before they become 8 bits. The
+    kernel and its constants are those of `mien.render.rasterize`.
 
     Raises:
         ValueError: an input holds NaN or infinity.

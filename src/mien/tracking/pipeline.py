@@ -16,11 +16,14 @@ from mien.tracking.fitting import (
     Fit,
     Shot,
     StageCache,
+    Watch,
+    explaining_singular,
     ignore_progress,
     layout_of,
     lenses_of,
     shot_of,
 )
+from mien.tracking.held_out import Stages, follow_held_out
 from mien.tracking.landmarks import (
     DetectorResponse,
     LandmarkModel,
@@ -31,7 +34,7 @@ from mien.tracking.landmarks import (
     reduce_face_model,
     without_turn_habits,
 )
-from mien.tracking.pixels import PhotometricFit, refine_photometrically, with_pixels
+from mien.tracking.pixels import refine_photometrically, with_pixels
 from mien.tracking.report import DONE, Preview
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.tracking import Tracking
@@ -50,6 +53,7 @@ def track_subject(
     settings: TrackingSettings = DEFAULTS,
     keep: Path | None = None,
     preview: Path | None = None,
+    held_out: Sequence[Capture] = (),
 ) -> list[Tracking]:
     """Fit a face model to landmarks and pixels of all sequences of one person, with one identity.
 
@@ -62,6 +66,9 @@ def track_subject(
     (`Capture.calibration`). They stay as they are and give the metric scale, and a camera that found no face at a
     timestep adds nothing to it. With one uncalibrated camera, the metric scale comes from the identity prior.
 
+    Held-out sequences have no part in identity, offsets of landmarks and vertices, texture, light and focal length. The
+    result for `captures` has the same bytes as without them. Then only their motion is fitted (`follow_held_out`).
+
     Args:
         captures: The sequences of one person.
         face_model: The face model.
@@ -71,6 +78,10 @@ def track_subject(
             tracking starts again.
         preview: An .html file (with a .png beside it) that shows the state of the fit. It is written again every few
             seconds.
+        held_out: Further sequences of the person, which are tracked apart.
+
+    Returns:
+        The trackings of `captures`, then those of `held_out`.
 
     Raises:
         UserError: A capture has several cameras without calibration, too few timesteps with a face, or landmarks that
@@ -80,13 +91,13 @@ def track_subject(
     settings.check()
     begun = keep is not None and keep.is_dir()
     try:
-        return _track_subject(captures, face_model, settings, keep, preview)
+        return _track_subject(captures, face_model, settings, keep, preview, held_out)
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError):
         if keep is None or not begun:
             raise
     say("The stored pieces of an interrupted tracking cannot be used, so tracking starts again")
     remove_tree(keep)
-    return _track_subject(captures, face_model, settings, keep, preview)
+    return _track_subject(captures, face_model, settings, keep, preview, held_out)
 
 
 def _track_subject(
@@ -95,37 +106,66 @@ def _track_subject(
     settings: TrackingSettings,
     keep: Path | None,
     preview: Path | None,
+    held_out: Sequence[Capture],
 ) -> list[Tracking]:
     if "mediapipe" not in face_model.landmarks:
         raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; place them on it first")
     shots, cache = [shot_of(capture, settings) for capture in captures], StageCache(keep)
+    others = [shot_of(capture, settings) for capture in held_out]
     with torch.no_grad():
-        model = reduce_face_model(face_model, layout_of(face_model), _response(face_model, shots, settings))
-        lenses = lenses_of(captures, settings)
+        layout = layout_of(face_model)
+        model = reduce_face_model(face_model, layout, _response(face_model, shots, settings))
         watch = ignore_progress if preview is None else Preview(preview, face_model, model, shots, settings)
-        try:
-            fit = fit_landmarks(model, shots, lenses, settings, cache, watch)
-        except torch.linalg.LinAlgError:
-            names = ", ".join(capture.name for capture in captures)
-            raise UserError(
-                f"{names}: no face fits the landmarks; check the pictures, then capture the video again"
-            ) from None
-        refined: PhotometricFit | None = None
-        if settings.schedule == "fast" or (settings.schedule == "paper" and settings.paper.start == "fast"):
-            refined = refine_photometrically(model, shots, lenses, fit, settings, cache, watch)
-        if settings.schedule == "paper":
-            start = fit if refined is None else refined.fit
-            refined = fit_by_descent(model, shots, lenses, start, settings, cache, watch, refined)
-        fit = _without_turn_habits(model, shots, fit if refined is None else refined.fit, settings)
-        refined = None if refined is None else replace(refined, fit=fit)
-        watch(DONE, 1.0, lambda: refined or fit)
-        trackings = [
-            as_tracking(shot, face_model, model, fit.subject, own, settings)
-            for shot, own in zip(shots, fit.sequences, strict=True)
-        ]
-        if refined is not None and (refined.texture.trust > 0).any():
-            trackings = with_pixels(trackings, shots, refined, face_model, settings)
+        found = _fit(model, shots, lenses_of(captures, settings), settings, cache, watch)
+        trackings = _trackings(face_model, model, shots, found, settings, ignore_progress if others else watch)
+        if others:
+            both = reduce_face_model(face_model, layout, _response(face_model, [*shots, *others], settings))
+            watch = ignore_progress if preview is None else Preview(preview, face_model, both, others, settings)
+            apart = StageCache(None if keep is None else keep / "held_out", resumed=cache.resumed)
+            followed = follow_held_out(both, others, shots, found, settings, apart, watch)
+            trackings += _trackings(face_model, both, others, followed, settings, watch)
     cache.forget()
+    return trackings
+
+
+def _fit(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    lenses: Sequence[int | None],
+    settings: TrackingSettings,
+    cache: StageCache,
+    watch: Watch,
+) -> Stages:
+    """Run the stages of the schedule."""
+    with explaining_singular(shots):
+        landmarks = fit_landmarks(model, shots, lenses, settings, cache, watch)
+    pixels, descent = None, None
+    if settings.schedule == "fast" or (settings.schedule == "paper" and settings.paper.start == "fast"):
+        pixels = refine_photometrically(model, shots, lenses, landmarks, settings, cache, watch)
+    if settings.schedule == "paper":
+        start = landmarks if pixels is None else pixels.fit
+        descent = fit_by_descent(model, shots, lenses, start, settings, cache, watch, pixels)
+    return Stages(landmarks, pixels, descent)
+
+
+def _trackings(
+    face_model: FaceModel,
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    found: Stages,
+    settings: TrackingSettings,
+    watch: Watch,
+) -> list[Tracking]:
+    """The results as trackings, after the last correction. The watch receives the end."""
+    fit = _without_turn_habits(model, shots, found.fit, settings)
+    refined = None if found.refined is None else replace(found.refined, fit=fit)
+    watch(DONE, 1.0, lambda: refined or fit)
+    trackings = [
+        as_tracking(shot, face_model, model, fit.subject, own, settings)
+        for shot, own in zip(shots, fit.sequences, strict=True)
+    ]
+    if refined is not None and (refined.texture.trust > 0).any():
+        trackings = with_pixels(trackings, shots, refined, face_model, settings)
     return trackings
 
 

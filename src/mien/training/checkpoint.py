@@ -12,6 +12,7 @@ from mien.errors import UserError
 from mien.progress import say
 from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.training.adam import Adam
+from mien.training.camera_colors import CameraColors
 from mien.training.density_control import DensityStrategy
 from mien.training.face_track import FaceTrack
 
@@ -29,6 +30,8 @@ class TrainingState:
     density: DensityStrategy
     track: FaceTrack
     curves: dict[str, list[float]]
+    colors: CameraColors | None = None
+    """Colour transforms of the cameras, if the settings ask for them."""
     step: int = 0
     """Number of steps done."""
     seconds: float = 0.0
@@ -40,6 +43,8 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
     tensors = {f"avatar.{name}": tensor for name, tensor in state.avatar.state_dict().items()}
     tensors |= {f"density.{name}": tensor for name, tensor in state.density.state().items()}
     tensors |= {f"track.{name}": tensor for name, tensor in state.track.state().items()}
+    if state.colors is not None:
+        tensors |= {f"colors.{name}": tensor for name, tensor in state.colors.state().items()}
     tensors |= {f"curves.{name}": torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     for owner, moments in (("store", state.avatar.gaussian_store().moments), ("adam", state.adam.state())):
         for name, own in moments.items():
@@ -107,6 +112,9 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
     state.density.load_state(part("density."))
     _check_like(part("track."), state.track.state(), None)
     state.track.load_state(part("track."))
+    if state.colors is not None:
+        _check_like(part("colors."), state.colors.state(), None)
+        state.colors.load_state(part("colors."))
     state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
     curves = part("curves.")
     if state.step < 0 or state.seconds < 0 or any(curve.ndim != 1 for curve in curves.values()):

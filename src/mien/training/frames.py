@@ -5,7 +5,7 @@ Every random draw depends only on the seed and the step, so that runs resume exa
 
 import hashlib
 from collections.abc import Sequence as Items
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from mien.errors import UserError
 from mien.training.sequence import Sequence
 from mien.training.settings import Split, TrainSettings, check_held_out
 
+Item = TypeVar("Item")
 _ORDER, _BACKGROUND, _DENSITY = range(3)
 """Purposes of random numbers."""
 _BLOCK, _EVERY = 10, 5
@@ -102,12 +103,17 @@ def camera_extent(sequences: Items[Sequence], frames: Items[Frame]) -> float:
     return max(MIN_EXTENT, _EXTENT_MARGIN * float(distances.max()))
 
 
+def evenly_spread(items: Items[Item], max_count: int) -> list[Item]:
+    """At most `max_count` of the items, evenly spread, always with the first one. With 0, all of them."""
+    stride = max(1, -(-len(items) // max_count)) if max_count else 1
+    return list(items[::stride])
+
+
 def spread_frames(frames: Items[Frame], max_count: int) -> list[Frame]:
     """At most `max_count` of the frames, evenly spread over sequences, cameras and time. With 0, all of them."""
     # Sort by camera first: a stride over the cameras of each timestep could always select the same one.
     ordered = sorted(frames, key=lambda frame: (frame.sequence, frame.camera, frame.timestep))
-    stride = max(1, -(-len(ordered) // max_count)) if max_count else 1
-    return ordered[::stride]
+    return evenly_spread(ordered, max_count)
 
 
 def expression_rarity(sequences: Items[Sequence], frames: Items[Frame]) -> Float[Tensor, " n"]:

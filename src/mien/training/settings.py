@@ -9,7 +9,7 @@ from mien.avatar.settings import MethodConfig
 from mien.bounded import MAX_SIDE
 from mien.devices import DeviceName
 from mien.errors import UserError
-from mien.ranges import Range, check_ranges
+from mien.ranges import POSITIVE, Range, check_ranges
 
 Split = Literal["blocks", "tail", "none", "gaussian-avatars"]
 """Name of the rule that holds out timesteps (`mien.training.held_out`). gaussian-avatars holds out a sequence and a
@@ -31,6 +31,12 @@ class TrainSettings:
     frame_order: Literal["even", "rare"] = "even"
     """How often frames are drawn: each equally often, or those with a rare expression up to four times as often as
     those with a common one."""
+    camera_colors: Literal["none", "first", "mean"] = "none"
+    """Whether a change of colours is learned for each camera, for rigs whose cameras differ in exposure or white
+    balance. It is used only in training: the avatar has the colours of the first camera (first), or those between all
+    cameras (mean). A step takes longer with it."""
+    camera_color_rate: Annotated[float, POSITIVE] = 1e-3
+    """Learning rate of these changes, per step. It ends at a tenth."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0

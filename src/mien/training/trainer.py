@@ -26,6 +26,7 @@ from mien.render.validation import CannotDrawError
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.ahead import TargetQueue, targets_ahead
+from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
@@ -94,6 +95,7 @@ def train(
     check_trackings(sequences, face_model)
     frames = training_frames(sequences, settings)
     weights = expression_rarity(sequences, frames) if settings.frame_order == "rare" else None
+    camera_colors(sequences, frames, settings, torch.zeros(()))  # raises before anything is written
     order, extent = FrameOrder(frames, settings.seed, weights), camera_extent(sequences, frames)
     if is_finished(run_dir):
         claim_run(run_dir, sequences, method_config, settings)
@@ -188,15 +190,17 @@ def start(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
+    frames = training_frames(sequences, settings)
     if avatar.wants_first_colors:
         faces = [sequence.tracking.face for sequence in sequences]
-        avatar.paint(vertex_colors(face_model, sequences, faces, training_frames(sequences, settings)))
+        avatar.paint(vertex_colors(face_model, sequences, faces, frames))
+    colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
     density = density_strategy(avatar.density(), avatar.gaussian_store())
     track = FaceTrack(face, method_config.face_tuning, [len(sequence.tracking.face) for sequence in sequences])
-    return TrainingState(avatar, Adam(), density, track, {})
+    return TrainingState(avatar, Adam(), density, track, {}, colors)
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
@@ -213,10 +217,12 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     rendering = rasterize(
         posed.gaussians.timestep(0), data.targets[frame.sequence].camera(frame.camera), target.background
     )
-    losses = picture_losses(rendering, target, weights) | avatar.regularizers(posed, rendering, progress)
+    shown = rendering if state.colors is None else state.colors.seen_by(rendering, target.background, frame)
+    losses = picture_losses(shown, target, weights) | avatar.regularizers(posed, rendering, progress)
     torch.autograd.backward(list(losses.values()))
 
     groups = [*avatar.parameter_groups(), *state.track.parameter_groups(index)]
+    groups += [] if state.colors is None else state.colors.parameter_groups()
     state.density.observe(posed, rendering)
     state.adam.step(groups, progress)
     random = partial(density_random, settings, state.step)
@@ -228,7 +234,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     if state.step % settings.record_every != 0 and state.step != settings.steps:
         return ""
     entry = {name: float(value.detach()) for name, value in losses.items()}
-    entry |= {"step": state.step, "loss": sum(entry.values()), "psnr": train_psnr(rendering, target)}
+    entry |= {"step": state.step, "loss": sum(entry.values()), "psnr": train_psnr(shown, target)}
     entry |= {"gaussians": len(avatar.gaussian_store()), "step_ms": elapsed * 1000}
     for name, value in entry.items():
         state.curves.setdefault(name, []).append(value)

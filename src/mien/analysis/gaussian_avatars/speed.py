@@ -13,6 +13,7 @@ from mien.pictures import to_uint8
 from mien.progress import track_progress
 from mien.render import rasterize
 from mien.storage import file_digest
+from mien.terminal import counted
 
 TABLE_3 = {(225, 401): 187, (550, 802): 187, (1100, 1604): 156, (2200, 3208): 95, (4400, 6416): 36}
 """Width and height in pixels (the paper writes height x width) -> frames per second, for subject 306."""
@@ -54,9 +55,9 @@ def speed(context: Context) -> PartResult:
     return PartResult(
         {"machine": machine, "gaussians": count, "threads": threads, "rows": rows},
         (
-            f"{count:,} Gaussians at 550x802, with {threads} threads of a CPU: {second['fps']:.1f} frames/s; the paper "
-            f"reports {second['paper_fps']} on a GPU. From 225x401 to 4400x6416, pixels grow 313 times and a frame "
-            f"takes {slower:.0f} times as long (paper: {187 / 36:.1f} times).",
+            f"{count:,} Gaussians at 550x802, with {counted(threads, 'thread')} of a CPU: {second['fps']:.1f} "
+            f"frames/s; the paper reports {second['paper_fps']} on a GPU. From 225x401 to 4400x6416, pixels grow 313 "
+            f"times and a frame takes {slower:.0f} times as long (paper: {187 / 36:.1f} times).",
         ),
         (Table(columns, cells, machine),),
         (_chart(rows),),

@@ -9,6 +9,7 @@ from mien.commands.stages.names import rig_name, sequence_name
 from mien.errors import UserError
 from mien.progress import say
 from mien.storage import check_writable
+from mien.terminal import counted
 from mien.workspace import Workspace
 
 
@@ -66,7 +67,7 @@ def _report(capture: Capture) -> None:
     found, blurred = int(capture.valid.any(axis=1).sum()), int((capture.valid & ~capture.usable).sum())
     cameras = len(capture.camera_ids)
     say(
-        f"{capture.name}: {capture.timesteps} frames of {capture.width}x{capture.height}"
+        f"{capture.name}: {counted(capture.timesteps, 'frame')} of {capture.width}x{capture.height}"
         + (f" by {cameras} cameras" if cameras > 1 else "")
         + f", a face in {found} of them"
         + (f", blurred in {blurred}" if blurred else "")

@@ -8,10 +8,12 @@ import torch
 from mien.avatar import Avatar
 from mien.camera import Camera, camera_from_fov, look_at
 from mien.commands.stages.face_models import face_model_of
+from mien.commands.stages.names import check_new_run
 from mien.export import GaussianAvatarsFolder, read_gaussian_avatars_folder
 from mien.inside import remove_tree
-from mien.locks import hold
+from mien.locks import check_free, hold
 from mien.training import write_imported_run
+from mien.training.run import BUSY_REMEDY
 
 _DISTANCE = 1.2
 """Distance of the camera from the middle of the head, in metres."""
@@ -30,9 +32,12 @@ def import_gaussian_avatars(folder: Path, run_dir: Path, face_model: str | None)
 
     Raises:
         UserError: the folder or the face model cannot be read, or the run cannot be written.
+        BeingWrittenError: another process is writing the run.
     """
+    check_free(run_dir, BUSY_REMEDY)
     content = read_gaussian_avatars_folder(folder, None if face_model is None else face_model_of(face_model))
-    with hold(run_dir):
+    with hold(run_dir, remedy=BUSY_REMEDY):
+        check_new_run(run_dir)  # another process may have written it meanwhile
         try:
             write_imported_run(run_dir, content.avatar, content.face, front_camera(content.avatar), folder)
         except BaseException:

@@ -23,6 +23,16 @@ def sequence_name(video: Path, name: str | None) -> str:
     return name
 
 
+def check_new_run(run_dir: Path) -> None:
+    """Check that there is no run of this name yet.
+
+    Raises:
+        UserError: there is one.
+    """
+    if run_dir.exists():
+        raise UserError(f"{run_dir}: is there already; give the imported run another name (--run NAME)")
+
+
 def run_name(name: str) -> str:
     """`name`, if a folder can have it.
 

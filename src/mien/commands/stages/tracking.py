@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -51,12 +51,14 @@ def run_tracking_stage(
     again: bool = False,
     overlay: Overlay = "auto",
     preview: bool = False,
+    hold_out: Collection[str] = (),
 ) -> dict[str, Tracking]:
     """Track all sequences of a workspace together, with one identity; return the trackings by name.
 
     Current trackings are read back. The face model is a name or a file (`face_model_of`). Writes overlays and, only
-    once, the scoring masks. Sequences with too few faces are left out, unless that would leave none. No other process
-    may write a sequence meanwhile, unless everything is current and nothing is written.
+    once, the scoring masks. Sequences with too few faces are left out, unless that would leave none. Held-out sequences
+    have no part in what the sequences share (`track_subject`). No other process may write a sequence meanwhile, unless
+    everything is current and nothing is written.
 
     Raises:
         BeingWrittenError: another process is writing one of the sequences.
@@ -65,27 +67,46 @@ def run_tracking_stage(
     names = workspace.sequence_names()
     if not names:
         raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")
-    finished = None if again else _finished_trackings(workspace, names, face_model, settings, overlay)
+    check_apart(names, hold_out)
+    finished = None if again else _finished_trackings(workspace, names, face_model, settings, overlay, hold_out)
     if finished is not None:
         say(f"{', '.join(finished)}: the tracking is current, nothing to do")
         return finished
     with hold(*(workspace.sequence_dir(name) for name in names)):
-        fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
+        fingerprint = _tracking_fingerprint(workspace, names, face_model, settings, hold_out)
         trackings = None if again else _current_trackings(workspace, names, fingerprint, face_model)
         if trackings is None:
-            trackings = _track(workspace, names, face_model, settings, fingerprint, preview)
+            trackings = _track(workspace, names, face_model, settings, fingerprint, preview, hold_out)
         else:
             say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
         _write_what_follows(workspace, trackings, face_model, overlay)
     return trackings
 
 
+def check_apart(names: Collection[str], hold_out: Collection[str]) -> None:
+    """Check that the sequences to track apart exist, and that others remain.
+
+    Raises:
+        UserError: one does not exist, or none remains.
+    """
+    unknown = [name for name in hold_out if name not in names]
+    if unknown:
+        raise UserError(f"--hold-out {unknown[0]}: no such sequence; there are: {', '.join(names)}")
+    if set(names) <= set(hold_out):
+        raise UserError(f"--hold-out {' '.join(hold_out)}: leaves no sequence that could show the person's shape")
+
+
 def _finished_trackings(
-    workspace: Workspace, names: list[str], face_model: FaceModel, settings: TrackingSettings, overlay: Overlay
+    workspace: Workspace,
+    names: list[str],
+    face_model: FaceModel,
+    settings: TrackingSettings,
+    overlay: Overlay,
+    hold_out: Collection[str],
 ) -> dict[str, Tracking] | None:
     """The trackings, if all results of the stage exist and are current."""
     try:
-        fingerprint = _tracking_fingerprint(workspace, names, face_model, settings)
+        fingerprint = _tracking_fingerprint(workspace, names, face_model, settings, hold_out)
         trackings = _current_trackings(workspace, names, fingerprint, face_model, tell=False)
         for name, tracking in (trackings or {}).items():
             folder = workspace.sequence_dir(name)
@@ -116,10 +137,15 @@ def _write_what_follows(
 
 
 def _tracking_fingerprint(
-    workspace: Workspace, names: list[str], face_model: FaceModel, settings: TrackingSettings
+    workspace: Workspace,
+    names: list[str],
+    face_model: FaceModel,
+    settings: TrackingSettings,
+    hold_out: Collection[str] = (),
 ) -> str:
     captures = [(name, read_capture_hash(workspace.sequence_dir(name) / "capture")) for name in names]
     content = [_TRACKING_RECIPE, captures, face_model.name, face_model.content_hash, asdict(settings.in_effect())]
+    content += [sorted(set(hold_out))] if hold_out else []
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
@@ -163,11 +189,15 @@ def _track(
     settings: TrackingSettings,
     fingerprint: str,
     preview: bool,
+    hold_out: Collection[str],
 ) -> dict[str, Tracking]:
     captures = {name: read_capture(workspace.sequence_dir(name) / "capture") for name in names}
     usable = {name: capture for name, capture in captures.items() if has_enough_faces(capture)} or captures
     for name in captures.keys() - usable.keys():
         say(f"{name}: left out, because too few of its frames show a face")
+    apart = {name: capture for name, capture in usable.items() if name in hold_out}
+    shaping = {name: capture for name, capture in usable.items() if name not in hold_out}
+    check_apart(list(usable), list(apart))
     keep = workspace.root / "sequences" / f".tracking-{fingerprint}"
     for other in workspace.root.glob("sequences/.tracking-*"):
         if other != keep and other.is_dir():
@@ -175,10 +205,13 @@ def _track(
     page = workspace.root / "tracking_preview.html" if preview else None
     if page is not None:
         say(f"Open {page} in a browser to watch the fit")
-    tracked = track_subject(list(usable.values()), face_model, settings, keep, page)
-    trackings = {}
-    for name, tracking in zip(usable, tracked, strict=True):
-        made_from = {"fingerprint": fingerprint, "tracked_together": list(usable)}
+    if apart:
+        say(f"{', '.join(apart)}: tracked apart; the person's shape, texture and light come from {', '.join(shaping)}")
+    tracked = track_subject(list(shaping.values()), face_model, settings, keep, page, list(apart.values()))
+    by_name, trackings = dict(zip([*shaping, *apart], tracked, strict=True)), {}
+    for name, tracking in ((name, by_name[name]) for name in usable):
+        made_from: dict[str, object] = {"fingerprint": fingerprint, "tracked_together": list(usable)}
+        made_from |= {"held_out": list(apart)} if apart else {}
         trackings[name] = replace(tracking, settings={**tracking.settings, **made_from})
         write_tracking(workspace.sequence_dir(name) / "tracking", trackings[name])
         say(f"{name}: tracked with a median landmark residual of {tracking.residuals.nanmedian():.2f} pixels")

@@ -83,21 +83,27 @@ def _step_appearance(descent: Descent, target: Target, moments: dict[str, Moment
         apply_adam(of_light, light, by_light, rate * rates.light)
 
 
-def fit_sequence(descent: Descent, sequence: int, advance: Advance, cache: StageCache) -> None:
-    """Fit the first frame to convergence, then each next frame from the one before it, moved as its landmarks moved."""
+def fit_sequence(
+    descent: Descent, sequence: int, advance: Advance, cache: StageCache, known_person: bool = False
+) -> None:
+    """Fit the first frame to convergence, then each next frame from the one before it, moved as its landmarks moved.
+
+    If person and texture are known, each frame is fitted from its own landmarks.
+    """
     rows, start = descent.state.frames[sequence], descent.start[sequence]
     before = sum(len(own) for own in descent.state.frames[:sequence])
     for row in range(max(descent.done - before, 0), len(rows)):
         target = [read_target(descent.scene, sequence, row, camera) for camera in descent.cameras(sequence, row)]
-        if row == 0:
+        if row == 0 and not known_person:
             _fit_first(descent, target[0], first_of_all=sequence == 0)
         else:
-            rows[row] = descent.within(rows[row - 1] + start[row] - start[row - 1])
+            if not known_person:
+                rows[row] = descent.within(rows[row - 1] + start[row] - start[row - 1])
             _fit_row(descent, target, descent.scene.settings.steps)
             if _is_lost(descent, target[0]):
                 rows[row] = start[row]
                 descent.lost.append((sequence, row))
-        for one in target:
+        for one in [] if known_person else target:
             _learn_texture(descent, one)
         descent.done += 1
         advance(status=f"frame {row + 1} of {len(rows)}")

@@ -66,6 +66,59 @@ def fit_by_descent(
     return outcome()
 
 
+def follow_by_descent(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    start: PhotometricFit,
+    known: PhotometricFit,
+    settings: TrackingSettings,
+    cache: StageCache,
+    watch: Watch,
+) -> PhotometricFit:
+    """Run the schedule for the motion of sequences alone. Subject, cameras, texture and light stay as they are.
+
+    The pass along the frames runs if the settings start from landmarks, each frame from its own.
+
+    Args:
+        model: The face model reduced to its landmarks.
+        shots: The sequences.
+        start: Their fit so far, with the cameras and lights to keep. The bias of its subject is without the effect of
+            vertex offsets.
+        known: The result of `fit_by_descent` for other sequences of the person: subject and texture.
+        settings: Settings of the whole tracking.
+        cache: Keeps the state from which an interrupted fit of the same input resumes.
+        watch: Receives the progress.
+    """
+    rates = replace(settings.paper.rates, identity=0.0, offsets=0.0, texture=0.0, light=0.0, focal=0.0)
+    still = replace(settings, paper=replace(settings.paper, rates=rates))
+    person, lenses = known.fit.subject, [None] * len(shots)
+    fit = replace(start.fit, subject=replace(start.fit.subject, identity=person.identity))
+    shown = replace(start, fit=fit, texture=known.texture)
+    scene = paper_scene(model, shots, lenses, fit, still, shown)
+    state = first_state(scene, fit, lenses, shown)
+    state.visibility = torch.ones_like(state.visibility)  # The trust of the known texture is in the scene's weights.
+    if person.vertex_offsets is not None:
+        state.offsets = person.vertex_offsets.clone()
+    descent = Descent(scene, state)
+    descent.resume(cache)
+    if settings.paper.start != "landmarks":
+        descent.done = max(descent.done, descent.frames)
+    total = descent.frames * (1 + settings.paper.epochs)
+
+    def outcome() -> PhotometricFit:
+        moved = _as_photometric(scene, descent, fit, shown)
+        return replace(moved, fit=replace(moved.fit, subject=person), texture=known.texture, lights=start.lights)
+
+    title = "Refining held-out sequences by descent"
+    with torch.enable_grad(), progress_bar(title, total, min(descent.done, total)) as bar:
+        advance = partial(Course("pixels", total, bar, watch, min(descent.done, total)).advance, current=outcome)
+        for sequence in range(len(shots)):
+            fit_sequence(descent, sequence, advance, cache, known_person=True)
+        for epoch in range(settings.paper.epochs):
+            descent.fit_epoch(epoch, advance, cache)
+    return outcome()
+
+
 def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: PhotometricFit | None) -> PhotometricFit:
     """The fit with texture and light. Each texel has the trust of its triangle."""
     state, fit = descent.state, _as_fit(scene, descent.state, fit)

@@ -15,7 +15,7 @@ from mien.tracking.fitting.fit import (
 )
 from mien.tracking.fitting.parameters import ParameterLayout, layout_of, pose_only
 from mien.tracking.fitting.resume import StageCache
-from mien.tracking.fitting.shot import Shot, has_enough_faces, lenses_of, shot_of
+from mien.tracking.fitting.shot import Shot, explaining_singular, has_enough_faces, lenses_of, shot_of
 from mien.tracking.fitting.solver import (
     Bounds,
     NormalEquations,
@@ -48,6 +48,7 @@ __all__ = [
     "Watch",
     "batch_of",
     "choose_keyframes",
+    "explaining_singular",
     "fit_of",
     "has_enough_faces",
     "ignore_progress",

@@ -1,6 +1,7 @@
 """A capture as input of a fit: detected landmarks without flicker, known or assumed cameras, the frame of the fit."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.errors import UserError
 from mien.rotation import invert_rigid
+from mien.terminal import counted
 from mien.tracking.fitting.views import CameraBatch, Views, batch_of
 from mien.tracking.settings import TrackingSettings
 
@@ -78,7 +80,8 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
     found = int(valid.sum())
     if found < _MIN_FRAMES:
         raise UserError(
-            f"{capture.name}: a face was found in {found} frames, but tracking needs {_MIN_FRAMES}; film longer"
+            f"{capture.name}: a face was found in {counted(found, 'frame')}, but tracking needs {_MIN_FRAMES}; film "
+            "longer"
         )
     detected = without_flicker(detected, seen)
     row, camera = seen[valid].nonzero().unbind(1)
@@ -90,6 +93,22 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
         T_world_fit = invert_rigid(batch.viewmat[int(seen.sum(0).argmax())]) @ _FACING
         batch = CameraBatch(batch.K, batch.viewmat @ T_world_fit)
     return Shot(views, valid, batch, capture.fps, capture, T_world_fit)
+
+
+@contextmanager
+def explaining_singular(shots: Sequence[Shot]) -> Iterator[None]:
+    """Turn equations of landmarks that have no solution into an error that names the sequences.
+
+    Raises:
+        UserError: The equations have no solution.
+    """
+    try:
+        yield
+    except torch.linalg.LinAlgError:
+        names = ", ".join(shot.capture.name for shot in shots)
+        raise UserError(
+            f"{names}: no face fits the landmarks; check the pictures, then capture the video again"
+        ) from None
 
 
 def _seen(capture: Capture) -> Bool[Tensor, "t c"]:

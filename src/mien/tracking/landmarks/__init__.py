@@ -19,7 +19,7 @@ from mien.tracking.landmarks.model import LandmarkModel, reduce_face_model
 from mien.tracking.landmarks.outcome import as_tracking
 from mien.tracking.landmarks.regions import with_regions_by_landmarks
 from mien.tracking.landmarks.shared_fit import fit_bias
-from mien.tracking.landmarks.stages import fit_landmarks
+from mien.tracking.landmarks.stages import fit_landmarks, follow_landmarks
 from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, move_subject, quiet_landmarks
 from mien.tracking.landmarks.turn_habits import without_turn_habits
 
@@ -44,6 +44,7 @@ __all__ = [
     "embed_landmarks",
     "fit_bias",
     "fit_landmarks",
+    "follow_landmarks",
     "move_subject",
     "quiet_landmarks",
     "read_response",

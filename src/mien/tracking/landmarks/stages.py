@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mien.progress import progress_bar
 from mien.tracking.fitting import (
+    CameraBatch,
     Course,
     Fit,
     SequenceFit,
@@ -69,22 +70,61 @@ def fit_landmarks(
         course = Course("landmarks", total, bar, watch)
         known = fit_of(cache.get_or_compute("identity", lambda: _identify(model, shots, lenses, settings, course)))
         course.advance(frames * _COSTS["identity"], "identity")
+        cameras = [key.cameras for key in known.sequences]
+        return _fit_motion(model, shots, cameras, known.subject, settings, cache, course)
 
-        terms, sequences = [], []
-        for number, (shot, key) in enumerate(zip(shots, known.sequences, strict=True)):
-            pose = fit_head_pose(model, shot.views, key.cameras, known.subject, settings)
-            own = SequenceFit(key.cameras, widen(pose, model.layout))
-            terms.append(all_landmarks(model, shot.views, own, settings))
-            advance_frames, name = partial(_advance, course, "frames", 1), f"frames-{number}"
-            sequences.append(fit_frames(terms[-1], known.subject, own, advance_frames, cache, name))
 
-        alone = Fit(known.subject, tuple(sequences))
-        course.show("sequence", lambda: alone)
-        smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
-                      for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
-        return fit_sequences(
-            terms, alone, smoothness, partial(_advance, course, "sequence", _SEQUENCE_ITERATIONS), cache
-        )
+def follow_landmarks(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    cameras: Sequence[CameraBatch],
+    subject: Subject,
+    settings: TrackingSettings,
+    cache: StageCache,
+    watch: Watch,
+) -> Fit:
+    """Fit only the motion of sequences to their landmarks. The subject and the cameras stay as they are.
+
+    Args:
+        model: The face model reduced to its landmarks.
+        shots: The sequences.
+        cameras: The cameras of each sequence, in the frame of its shot.
+        subject: The person, as other sequences show them.
+        settings: Settings of the whole tracking.
+        cache: Keeps the pieces from which an interrupted fit of the same input resumes.
+        watch: Receives the progress.
+    """
+    total = sum(int(shot.valid.sum()) for shot in shots) * (_COSTS["frames"] + _COSTS["sequence"])
+    with progress_bar("Tracking held-out sequences", total=total) as bar:
+        course = Course("landmarks", total, bar, watch)
+        return _fit_motion(model, shots, cameras, subject, settings, cache, course, fixed_subject=True)
+
+
+def _fit_motion(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    cameras: Sequence[CameraBatch],
+    subject: Subject,
+    settings: TrackingSettings,
+    cache: StageCache,
+    course: Course,
+    fixed_subject: bool = False,
+) -> Fit:
+    """Fit every timestep alone, then all timesteps of each sequence together."""
+    terms, sequences = [], []
+    for number, (shot, own_cameras) in enumerate(zip(shots, cameras, strict=True)):
+        pose = fit_head_pose(model, shot.views, own_cameras, subject, settings)
+        own = SequenceFit(own_cameras, widen(pose, model.layout))
+        terms.append(all_landmarks(model, shot.views, own, settings))
+        advance_frames, name = partial(_advance, course, "frames", 1), f"frames-{number}"
+        sequences.append(fit_frames(terms[-1], subject, own, advance_frames, cache, name))
+
+    alone = Fit(subject, tuple(sequences))
+    course.show("sequence", lambda: alone)
+    smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
+                  for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
+    advance = partial(_advance, course, "sequence", _SEQUENCE_ITERATIONS)
+    return fit_sequences(terms, alone, smoothness, advance, cache, fixed_subject)
 
 
 def _advance(course: Course, stage: str, parts: int, timesteps: int) -> None:
@@ -146,15 +186,17 @@ def fit_sequences(
     smoothness: Sequence[Smoothness],
     advance: Callable[[int], None] = lambda timesteps: None,
     cache: StageCache | None = None,
+    fixed_subject: bool = False,
 ) -> Fit:
     """Fit all timesteps of each sequence together under its smoothness cost, in turn with the landmarks' bias.
 
-    `advance` receives the number of finished timesteps in each of the `_SEQUENCE_ITERATIONS` iterations.
+    `advance` receives the number of finished timesteps in each of the `_SEQUENCE_ITERATIONS` iterations. If the subject
+    is fixed, the bias stays as it is.
     """
     cache = cache or StageCache()
 
     def round_from(fit: Fit) -> dict[str, Tensor]:
-        fit = fit_bias(terms, fit)
+        fit = fit if fixed_subject else fit_bias(terms, fit)
         parts = zip(terms, fit.sequences, smoothness, strict=True)
         chains = tuple(_fit_chain(term, fit.subject, own, smooth, advance) for term, own, smooth in parts)
         return replace(fit, sequences=chains).tensors()

@@ -193,13 +193,60 @@ def refine_photometrically(
                 name = model.face_model.name
                 say(f"{name}: the pictures show no part of its texture, so the fit to landmarks is kept")
                 return replace(at, fit=fit)
-            advance = partial(course.advance, status=f"{status}, frames")
-            step_all = partial(_step_sequences, now, at, settings, cache, f"step-{number}", advance)
-            at = keep(f"round-{number}", status, step_all)
-            cache.drop(f"step-{number}")
+            at = _step_round(now, at, number, status, settings, cache, course)
         at = keep("lids", "lids", lambda: replace(at, fit=place_lids(model, shots, at.fit, own_settings.lids)))
         course.advance(frames // _LIDS_PART, "lids")
     return _with_residuals(rounds[0], rounds[0].update_appearance(at))
+
+
+def follow_photometrically(
+    model: LandmarkModel,
+    shots: Sequence[Shot],
+    start: PhotometricFit,
+    settings: TrackingSettings,
+    cache: StageCache,
+    watch: Watch,
+) -> PhotometricFit:
+    """Refine only the motion of sequences by pixels. The subject, cameras, texture and light of `start` stay.
+
+    Args:
+        model: The face model reduced to its landmarks.
+        shots: The sequences.
+        start: Their fit to landmarks, with a texture that other sequences show, and the light of each sequence.
+        settings: Settings of the whole tracking.
+        cache: Keeps the pieces from which an interrupted fit of the same input resumes.
+        watch: Receives the progress.
+    """
+    rounds = _rounds(model, shots, [None] * len(shots), start.fit, settings)
+    frames, at = sum(len(own.state) for own in start.fit.sequences), start
+    total = len(rounds) * frames + frames // _LIDS_PART
+    with progress_bar("Fitting held-out sequences to pixels", total=total) as bar:
+        course = Course("pixels", total, bar, watch)
+        for number, now in enumerate(rounds):
+            at = _step_round(now, at, number, f"round {number + 1} of {len(rounds)}", settings, cache, course)
+        lids, before = settings.photometric.lids, at
+        at = _keep(
+            cache, course, "lids", "lids", lambda: replace(before, fit=place_lids(model, shots, before.fit, lids))
+        )
+        course.advance(frames // _LIDS_PART, "lids")
+    return _with_residuals(rounds[0], at)
+
+
+def _step_round(
+    now: _Round,
+    at: PhotometricFit,
+    number: int,
+    status: str,
+    settings: TrackingSettings,
+    cache: StageCache,
+    course: Course,
+) -> PhotometricFit:
+    """Take the step of all timesteps that ends a round."""
+    advance = partial(course.advance, status=f"{status}, frames")
+    step_all = partial(_step_sequences, now, at, settings, cache, f"step-{number}", advance)
+    at = _keep(cache, course, f"round-{number}", status, step_all)
+    cache.drop(f"step-{number}")
+    return at
 
 
 def _keep(

@@ -1,0 +1,231 @@
+"""Held-out sequences that are tracked apart have no part in what they share with the others, and are followed well."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mien.capture import Capture, write_capture
+from mien.cli import main
+from mien.tracking import Tracking, TrackingSettings, read_tracking, track, track_subject
+from mien.tracking.fitting import Fit, StageCache, Subject, shot_of
+from mien.tracking.held_out import mean_light
+from mien.tracking.pixels import PhotometricFit, SkinTexture, turn_light
+from mien.tracking.settings import PaperSettings, PhotometricSettings
+from photometric_case import PhotometricCase, assert_alike, make_photometric_case
+from test_photometric_tracking import turn_error, wobble
+
+LANDMARKS = TrackingSettings(schedule="landmarks")
+"""Settings with an unknown focal length, because the held-out sequence must not decide it."""
+FAST = replace(
+    LANDMARKS, schedule="fast", photometric=PhotometricSettings(texture_size=128, keyframes=4, shared_steps=1)
+)
+PAPER = replace(FAST, schedule="paper", paper=PaperSettings(texture_size=128, epochs=2))
+PAPER_ALONE = replace(PAPER, paper=replace(PAPER.paper, start="landmarks", first_steps=40, steps=15))
+SCHEDULES = {"landmarks": LANDMARKS, "fast": FAST, "paper": PAPER, "paper from landmarks": PAPER_ALONE}
+
+
+@pytest.fixture(scope="module")
+def case() -> PhotometricCase:
+    return make_photometric_case(timesteps=10)
+
+
+@pytest.fixture(scope="module")
+def shaping(case: PhotometricCase) -> Capture:
+    return part_of(case, slice(0, 6), "shaping").capture
+
+
+@pytest.fixture(scope="module")
+def apart(case: PhotometricCase) -> PhotometricCase:
+    return part_of(case, slice(6, 10), "apart")
+
+
+def part_of(case: PhotometricCase, frames: slice, name: str) -> PhotometricCase:
+    """Return some frames of a case as one of their own."""
+    capture = case.capture
+    arrays = ("timestamps", "images", "mattes", "landmarks", "valid")
+    capture = replace(capture, name=name, **{key: getattr(capture, key)[frames] for key in arrays})
+    return replace(case, face=case.face[frames], landmarks=case.landmarks[frames], capture=capture)
+
+
+def another_person(capture: Capture) -> Capture:
+    """Return other pictures of a wider face by a longer lens."""
+    middle = capture.landmarks.mean((0, 2), keepdims=True)
+    landmarks = middle + (capture.landmarks - middle) * np.array([1.15, 0.95], np.float32)
+    return replace(capture, landmarks=landmarks.astype(np.float32), images=255 - capture.images)
+
+
+def assert_same_file(expected: Tracking, found: Tracking) -> None:
+    """Check that two trackings are the same to the bit, with or without a fit to pixels."""
+    if expected.appearance is not None:
+        assert_alike(expected, found)
+    for name, tensor in expected.face.tensors().items():
+        assert torch.equal(tensor, found.face.tensors()[name]), name
+    assert torch.equal(expected.cameras[0].K, found.cameras[0].K)
+    assert torch.equal(expected.residuals, found.residuals)
+    assert expected.settings == found.settings
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """Trackings of the shaping sequence alone, then of all with two held-out ones: of this person and of another."""
+
+    alone: Tracking
+    shaping: Tracking
+    apart: Tracking
+    other: Tracking
+
+
+@pytest.fixture(scope="module")
+def tracked(case, shaping, apart) -> Callable[[str], Tracked]:
+    @cache
+    def tracked_by(schedule: str) -> Tracked:
+        settings, held_out = SCHEDULES[schedule], [apart.capture, another_person(apart.capture)]
+        alone = track(shaping, case.model, settings)
+        return Tracked(alone, *track_subject([shaping], case.model, settings, held_out=held_out))
+
+    return tracked_by
+
+
+SLOW = [name if name in ("landmarks", "fast") else pytest.param(name, marks=pytest.mark.slow) for name in SCHEDULES]
+
+
+@pytest.mark.parametrize("schedule", SLOW)
+def test_the_person_is_the_same_whatever_the_held_out_sequences_hold(tracked, schedule: str):
+    found = tracked(schedule)
+    assert_same_file(found.alone, found.shaping)
+    for own in (found.apart, found.other):
+        assert torch.equal(own.face.identity, found.alone.face.identity)
+        assert torch.equal(own.cameras[0].K, found.alone.cameras[0].K)
+        assert len(own.face) == 4
+        assert (own.face.vertex_offsets is None) == (found.alone.face.vertex_offsets is None)
+        if found.alone.face.vertex_offsets is not None:
+            assert torch.equal(own.face.vertex_offsets, found.alone.face.vertex_offsets)
+        if found.alone.appearance is not None:
+            assert own.appearance is not None
+            for name in ("texture", "trust", "light"):
+                assert torch.equal(getattr(own.appearance, name), getattr(found.alone.appearance, name)), name
+            assert own.appearance.sigma == found.alone.appearance.sigma
+    assert (found.alone.appearance is None) == (schedule == "landmarks")
+
+
+@pytest.mark.parametrize("schedule", SLOW[1:])
+def test_pixels_calm_the_held_out_sequence(apart, tracked, schedule: str):
+    by_landmarks, by_pixels = tracked("landmarks").apart, tracked(schedule).apart
+    assert wobble(apart, by_pixels) < 0.5 * wobble(apart, by_landmarks)
+    assert turn_error(apart, by_pixels) < 0.3
+    assert by_pixels.pixel_residuals is not None
+    assert by_pixels.pixel_residuals.isfinite().all()
+
+
+def test_several_held_out_sequences_do_not_know_each_other(case, shaping, apart, tracked):
+    alone = track_subject([shaping], case.model, FAST, held_out=[apart.capture])[1]
+    assert_same_file(alone, tracked("fast").apart)
+
+
+def test_an_unknown_focal_length_changes_as_the_others_did(case, shaping, apart):
+    small = replace(
+        apart.capture, landmarks=apart.capture.landmarks / 2, images=apart.capture.images[:, :, ::2, ::2],
+        mattes=apart.capture.mattes[:, :, ::2, ::2], principal_point=apart.capture.principal_point / 2,
+    )  # fmt: skip
+    first, second = track_subject([shaping], case.model, LANDMARKS, held_out=[small])
+    assert float(second.cameras[0].K[0, 0]) == pytest.approx(float(first.cameras[0].K[0, 0]) / 2, rel=1e-6)
+    assert turn_error(apart, second) < 1.5
+
+
+def test_the_light_is_the_mean_of_the_others_in_the_world(shaping):
+    """Sequences of a rig have frames of their own, so a light is turned twice on its way."""
+    random = torch.Generator().manual_seed(0)
+    shot, straight = shot_of(shaping, LANDMARKS), torch.eye(4, dtype=torch.float64)
+    turn = torch.tensor([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    lights = tuple(torch.randn(9, 3, generator=random) for _ in range(3))
+    nothing = Fit(Subject(torch.zeros(1), torch.zeros(1, 3)), ())
+    shown = PhotometricFit(nothing, SkinTexture(torch.zeros(1, 1, 3), torch.zeros(1, 1), 0.1), lights, ())
+    turned, level = replace(shot, T_world_fit=turn), replace(shot, T_world_fit=straight)
+    others, to_world = [turned, level, shot], turn[:3, :3].float()
+    expected = (turn_light(lights[0], to_world) + lights[1]) / 2
+    torch.testing.assert_close(mean_light(level, others, shown), expected, atol=1e-5, rtol=0)
+    found = turn_light(mean_light(turned, others, shown), to_world)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+    assert torch.equal(mean_light(shot, others, shown), lights[2]), "other kinds of sequences do not count"
+
+
+@pytest.mark.parametrize(("pieces", "last"), [(3, "sequence-1"), (6, "lids")])
+def test_an_interrupted_tracking_goes_on(
+    case, shaping, apart, tracked, tmp_path, monkeypatch, capsys, pieces: int, last: str
+):
+    expected = [tracked("fast").shaping, tracked("fast").apart]
+    write, names = StageCache._write, []
+
+    def write_then_stop(self: StageCache, name: str, tensors: dict) -> None:
+        write(self, name, tensors)
+        assert self.folder is not None
+        names.extend([name] if self.folder.name == "held_out" and "equations" not in name else [])
+        if len(names) == pieces:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(StageCache, "_write", write_then_stop)
+        with pytest.raises(KeyboardInterrupt):
+            track_subject([shaping], case.model, FAST, tmp_path / "kept", held_out=[apart.capture])
+    assert names[-1] == last
+    found = track_subject([shaping], case.model, FAST, tmp_path / "kept", held_out=[apart.capture])
+    assert capsys.readouterr().err.count("continues where it was interrupted") == 1
+    assert not (tmp_path / "kept").exists()
+    for one, other in zip(expected, found, strict=True):
+        assert_same_file(one, other)
+
+
+# The command line -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def workspace(case, shaping, apart, tmp_path, monkeypatch) -> Path:
+    monkeypatch.setattr("mien.commands.stages.tracking.face_model_of", lambda choice: case.model)
+    for capture in (apart.capture, shaping):
+        write_capture(tmp_path / "out/sequences" / capture.name / "capture", capture)
+    return tmp_path / "out"
+
+
+QUICKLY = ("--overlay", "none", "--tracking.schedule", "landmarks")
+
+
+@pytest.mark.slow
+def test_the_command_tracks_apart(case, shaping, apart, workspace, capsys):
+    assert main(["track", str(workspace), "--hold-out", "apart", *QUICKLY]) == 0
+    assert "apart: tracked apart; the person's shape, texture and light come from shaping" in capsys.readouterr().err
+    expected = track_subject([shaping], case.model, LANDMARKS, held_out=[apart.capture])
+    for capture, tracking in zip((shaping, apart.capture), expected, strict=True):
+        found = read_tracking(workspace / "sequences" / capture.name / "tracking")
+        assert torch.equal(found.face.head_rotation, tracking.face.head_rotation)
+        assert found.settings["held_out"] == ["apart"]
+
+    assert main(["track", str(workspace), "--hold-out", "apart", *QUICKLY]) == 0
+    assert "the tracking is current, nothing to do" in capsys.readouterr().err
+    assert main(["track", str(workspace), *QUICKLY]) == 0
+    assert "tracked again, so that they share one identity" in capsys.readouterr().err
+    stored = json.loads((workspace / "sequences/apart/tracking/tracking.json").read_text())
+    assert "held_out" not in stored["settings"]
+
+
+@pytest.mark.parametrize(
+    ("names", "complaint"),
+    [(["nobody"], "nobody"), (["apart", "shaping"], "--hold-out apart shaping: leaves no sequence")],
+)
+def test_wrong_names_are_refused(workspace, capsys, names: list[str], complaint: str):
+    assert main(["track", str(workspace), "--hold-out", *names, *QUICKLY]) == 2
+    error = capsys.readouterr().err.strip()
+    assert complaint in error
+    assert "\n" not in error
+    assert not list(workspace.glob("sequences/*/tracking"))
+
+
+def test_create_needs_names_to_track_apart(tmp_path, capsys):
+    (tmp_path / "a.mp4").touch()
+    assert main(["create", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out"), "--track-apart"]) == 2
+    assert "--track-apart: needs the sequences to track apart; add --hold-out NAME" in capsys.readouterr().err
