@@ -24,7 +24,7 @@ export class DepthSorter {
     }
     const scale = far > near ? (KEYS - 1) / (far - near) : 0;
     starts.fill(0);
-    for (let i = 0; i < count; ++i) ++starts[(keys[i] = (far - depths[i]) * scale)];
+    for (let i = 0; i < count; ++i) ++starts[(keys[i] = ((far - depths[i]) * scale) | 0)];
     for (let key = 0, sum = 0; key < KEYS; ++key) {
       const here = starts[key];
       starts[key] = sum;
