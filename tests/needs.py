@@ -27,8 +27,8 @@ _REMEDIES = {
     NO_PROC: "run them on Linux",
     NO_PACKAGE: "run `make setup`; some packages exist on some platforms only",
     NO_INSTRUCTIONS: "run them on one that has",
-    NO_NODE_PACKAGES: "run `make web`",
-    NO_NODE: "install Node.js 20 or newer with npm, then run `make web`",
+    NO_NODE_PACKAGES: "run `make web-packages`",
+    NO_NODE: "install Node.js 20 or newer with npm, then run `make web-packages`",
     NO_CHROMIUM: "run `apt-get install chromium`, or set MIEN_CHROMIUM to a Chromium's path",
     HAS_GPU: "run them with CUDA_VISIBLE_DEVICES=",
 }
