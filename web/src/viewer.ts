@@ -33,6 +33,7 @@ export class Viewer {
   private renderer: Renderer;
   private posed = false;
   private waiting = 0;
+  private stale = true;
   private before = 0;
   private since = 0;
 
@@ -98,7 +99,8 @@ export class Viewer {
   look(): void {
     this.pitch = Math.min(Math.max(this.pitch, -MOST_PITCH), MOST_PITCH);
     this.zoom = Math.min(Math.max(this.zoom, 0.2), 8);
-    if (!this.waiting) this.waiting = requestAnimationFrame((now) => this.tick(now));
+    this.stale = true;
+    this.wait();
   }
 
   /** The view for a picture of that size: the whole first camera's picture fits into it. */
@@ -129,6 +131,7 @@ export class Viewer {
   /** Draws now, at the canvas's size. */
   draw(): void {
     const began = performance.now(), { width, height } = this.canvas;
+    this.stale = false;
     if (!this.posed) {
       this.poser.pose(this.face);
       this.renderer.upload();
@@ -140,6 +143,10 @@ export class Viewer {
     this.milliseconds = performance.now() - began;
   }
 
+  private wait(): void {
+    if (!this.waiting) this.waiting = requestAnimationFrame((now) => this.tick(now));
+  }
+
   private tick(now: number): void {
     this.waiting = 0;
     if (this.playing && this.motion) {
@@ -149,9 +156,9 @@ export class Viewer {
       const steps = Math.floor(this.since / period);
       this.since -= steps * period;
       if (steps) this.seek((this.timestep + steps) % motionLength(this.motion));
-      this.look();
+      this.wait();
     }
-    this.draw();
+    if (this.stale) this.draw();
   }
 }
 
