@@ -64,7 +64,7 @@ def drawn_head(count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head") -
     def some(spread: float, *shape: int) -> np.ndarray:
         return (spread * random.standard_normal((count, *shape))).astype(np.float32)
 
-    attributes = runtime.Attributes(some(1, 4), some(0.5, 3) - np.float32(0.7), some(2), some(0.7, sh, 3))
+    attributes = runtime.Attributes(some(1, 4), some(0.3, 3) - np.float32(1), some(2), some(0.7, sh, 3))
     inputs = len(portable.neutral.expression) + portable.neutral.joints.size
     changes = None
     if rank:
@@ -74,7 +74,7 @@ def drawn_head(count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head") -
         changes = runtime.ExpressionChanges(rest, directions, reach, *parts)
     face_index = random.integers(0, len(baked.faces), count).astype(np.int32)
     baked = replace(
-        baked, face_index=face_index, means=some(0.3, 3), attributes=attributes, sh_frame=sh_frame, changes=changes
+        baked, face_index=face_index, means=some(0.2, 3), attributes=attributes, sh_frame=sh_frame, changes=changes
     )
     K = np.array([[1300, 0, 256], [0, 1300, 256], [0, 0, 1]], np.float32)
     neutral = replace(
