@@ -1,4 +1,4 @@
-# make setup | demo | test | test-312 | test-exact | sanitize | fuzz | lint | docs | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# make setup | web-packages | web | demo | test | test-312 | test-exact | sanitize | fuzz | lint | docs | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 PYTHON312 ?= $(shell for python in python3.12 $(HOME)/.pyenv/versions/3.12*/bin/python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UV_VERSION := 0.13.8
 
-.PHONY: setup build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native lint format docs bench gpu lock clean
+.PHONY: setup web-packages web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native lint format docs bench gpu lock clean
 setup: $(VENV)/.built
 
 $(VENV)/.packages: requirements/lock.txt
@@ -28,6 +28,18 @@ $(VENV)/.built: $(VENV)/.packages pyproject.toml $(NATIVE)
 	touch $@
 
 build: setup
+
+# The web runtime's packages, for its build and its tests. Without npm, the tests that need them are skipped.
+web/node_modules/.installed: web/package-lock.json
+	npm ci --prefix web --ignore-scripts --no-audit --no-fund
+	touch $@
+
+web-packages:
+	@if command -v npm >/dev/null; then $(MAKE) web/node_modules/.installed; else echo "No npm: web/ cannot be built or tested. Install Node.js 20 or newer."; fi
+
+# dist/mien.js, and the page that `mien export` fills, which is committed.
+web: web/node_modules/.installed
+	npm run build --prefix web
 
 demo: setup
 	$(BIN)/mien demo --out out/demo

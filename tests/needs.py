@@ -16,6 +16,9 @@ NO_PROC = "no /proc"
 NO_PACKAGE = "could not import"
 NO_INSTRUCTIONS = "this processor has no "
 HAS_GPU = "there is a GPU"
+NO_NODE = "no Node.js"
+NO_NODE_PACKAGES = "no packages in web/node_modules"
+NO_CHROMIUM = "no Chromium"
 
 _REMEDIES = {
     NO_GPU: "run `make gpu` on a machine with an NVIDIA GPU and the CUDA toolkit",
@@ -24,6 +27,9 @@ _REMEDIES = {
     NO_PROC: "run them on Linux",
     NO_PACKAGE: "run `make setup`; some packages exist on some platforms only",
     NO_INSTRUCTIONS: "run them on one that has",
+    NO_NODE_PACKAGES: "run `make web-packages`",
+    NO_NODE: "install Node.js 20 or newer with npm, then run `make web-packages`",
+    NO_CHROMIUM: "run `apt-get install chromium`, or set MIEN_CHROMIUM to a Chromium's path",
     HAS_GPU: "run them with CUDA_VISIBLE_DEVICES=",
 }
 

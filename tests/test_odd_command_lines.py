@@ -85,7 +85,7 @@ ODD = [
     ("drive W --by W --out a.mp4 --fps 30", "--fps 30: is for the timecode of a .csv"),
     ("drive W --by empty.csv --out a.mp4 --fps 0", "--fps 0"),
     ("drive W --by list.json --out a.mp4 --sequence clip", "--sequence clip"),
-    ("export W --out a.obj", "cannot write .obj; use .ply or .mien"),
+    ("export W --out a.obj", "cannot write .obj; use .ply, .mien or .html"),
     ("export W --out a.mien --set drop=1", "leave --set and --series out"),
     ("export W --out a.mien --every 3", "--every 3"),
     ("export W --out a.ply --series none", "none: no such file or folder"),

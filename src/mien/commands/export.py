@@ -13,15 +13,15 @@ from mien.workspace import Workspace, open_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Write an avatar for other programs: .mien (all of it), .ply (one expression) or GaussianAvatars' own folder."""
+    """Write an avatar as .mien (all of it), .html (a page to send), .ply (one pose) or GaussianAvatars' folder."""
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder."""
     out: Path
-    """The .mien or .ply file to write. With --series, the .ply files get numbers: NAME_000000.ply. With --format
+    """The .mien, .html or .ply file to write. With --series, the .ply files get numbers: NAME_000000.ply. With --format
     gaussian-avatars, a folder."""
-    format: Literal["mien", "ply", "gaussian-avatars"] | None = None
-    """Format of the output: mien, ply (default: by the ending of --out), or gaussian-avatars: a folder with
+    format: Literal["mien", "html", "ply", "gaussian-avatars"] | None = None
+    """Format of the output: mien, html, ply (default: by the ending of --out), or gaussian-avatars: a folder with
     point_cloud.ply, whose Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's
     training."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
@@ -30,10 +30,10 @@ class Command:
     """Expressions by name, and joint angles in radians, for example --set jawOpen=0.6 mouthSmileLeft=0.4 left_eye_y=0.2
     (default: the person's neutral)."""
     series: str | None = None
-    """Write a .ply for every frame of a motion: the name of a sequence of the workspace, or anything that `mien drive
-    --by` takes. The head stays at the origin."""
+    """A motion: the name of a sequence of the workspace, or anything that `mien drive --by` takes. A page plays it. For
+    .ply, every frame becomes a file, and the head stays at the origin."""
     every: int = 1
-    """With --series, write only every n-th frame."""
+    """With --series, take only every n-th frame."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
@@ -45,18 +45,20 @@ class Command:
         if self.format == "gaussian-avatars":
             self._check_folder()
             return
-        if kind not in (".ply", ".mien"):
-            told = f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply or .mien"
+        if kind not in (".ply", ".mien", ".html"):
+            told = f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply, .mien or .html"
             raise UserError(f"{told}, or --format gaussian-avatars for a folder")
         if self.format is not None and kind != f".{self.format}":
             raise UserError(f"{self.out}: does not end in .{self.format}, as --format {self.format} asks; rename it")
         if kind == ".mien" and (self.set or self.series):
             raise UserError(f"{self.out}: a .mien file holds every expression; leave --set and --series out")
+        if kind == ".html" and self.set:
+            raise UserError(f"{self.out}: a page has a slider for every expression; leave --set out")
         if self.every < 1 or (self.every > 1 and self.series is None):
             raise UserError(f"--every {self.every}: give 1 or more, together with --series")
         if self.series is not None and self.series not in workspace.sequence_names():
             check_driver(Path(self.series), None)
-        check_writable(self.out if self.series is None else self._numbered(0))
+        check_writable(self._numbered(0) if self.series is not None and kind == ".ply" else self.out)
 
     def run(self) -> None:
         """Pose the avatar and write the files."""
@@ -69,6 +71,8 @@ class Command:
             self._write_folder(avatar, run_dir)
         elif self.out.suffix.lower() == ".mien":
             self._write_mien(avatar, run_dir)
+        elif self.out.suffix.lower() == ".html":
+            self._write_page(avatar, run_dir, workspace)
         elif self.series is None:
             self._write_one(avatar)
         else:
@@ -77,7 +81,7 @@ class Command:
     def _check_folder(self) -> None:
         from mien.files import check_writable
 
-        if self.out.suffix.lower() in (".ply", ".mien"):
+        if self.out.suffix.lower() in (".ply", ".mien", ".html"):
             raise UserError(f"{self.out}: --format gaussian-avatars writes a folder; give a name without an ending")
         if self.set or self.series or self.every != 1:
             raise UserError(
@@ -110,6 +114,25 @@ class Command:
         write_portable(self.out, make_portable(avatar, run_camera(run_dir), name))
         say(f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians, {self.out.stat().st_size / 1e6:.1f} MB")
 
+    def _write_page(self, avatar, run_dir: Path, workspace: Workspace) -> None:
+        from mien.avatar import make_portable
+        from mien.export import Motion, write_page
+        from mien.progress import say
+        from mien.training import run_camera
+
+        portable = make_portable(avatar, run_camera(run_dir), self.workspace.resolve().name)
+        motion = None
+        if self.series is not None:
+            driven, fps = self._driven(avatar, workspace, self.series, with_head_pose=True)
+            fields = (driven.expression, driven.joints, driven.head_rotation, driven.head_translation)
+            motion = Motion(*(tensor.detach().float().numpy() for tensor in fields), fps=fps / self.every)
+        page = write_page(self.out, portable, motion)
+        moves = "" if motion is None else f", a motion of {len(motion):,} frames"
+        say(
+            f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians{moves}, {page.size / 1e6:.1f} MB; compression "
+            f"changes the picture little ({page.psnr:.0f} dB)"
+        )
+
     def _write_one(self, avatar) -> None:
         from mien.commands.expression import with_expression
         from mien.progress import say
@@ -118,19 +141,24 @@ class Command:
         say(f"{self.out}: {_write_ply(self.out, avatar, face):,} Gaussians")
 
     def _write_series(self, avatar, workspace: Workspace, series: str) -> None:
+        from mien.progress import say, track_progress
+
+        driven, _ = self._driven(avatar, workspace, series, with_head_pose=False)
+        for index in track_progress(range(len(driven)), "Exporting", len(driven)):
+            _write_ply(self._numbered(index), avatar, driven[index])
+        say(f"{self._numbered(0)} ... {self._numbered(len(driven) - 1).name}: {len(driven)} files")
+
+    def _driven(self, avatar, workspace: Workspace, series: str, with_head_pose: bool):
+        """The face parameters of --series for this avatar, and the motion's frames per second before --every."""
         from mien.commands.expression import with_expression
         from mien.commands.stages.driving import open_driver
         from mien.driving import drive
-        from mien.progress import say, track_progress
 
         own = series in workspace.sequence_names()
         driver = open_driver(workspace.root if own else Path(series), series if own else None, avatar.face_model)
         bounds = avatar.face_model.expression_bounds
-        driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, False, series)
-        driven = with_expression(driven[:: self.every], avatar.face_model, self.set)
-        for index in track_progress(range(len(driven)), "Exporting", len(driven)):
-            _write_ply(self._numbered(index), avatar, driven[index])
-        say(f"{self._numbered(0)} ... {self._numbered(len(driven) - 1).name}: {len(driven)} files")
+        driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, with_head_pose, series)
+        return with_expression(driven[:: self.every], avatar.face_model, self.set), driver.fps
 
     def _numbered(self, index: int) -> Path:
         return self.out.with_name(f"{self.out.stem}_{index:06d}.ply")

@@ -10,7 +10,9 @@ if TYPE_CHECKING:
         read_gaussian_avatars_folder,
         write_gaussian_avatars_folder,
     )
+    from mien.export.packed import Motion, pack, unpacked
     from mien.export.ply import read_ply, write_ply
+    from mien.export.web_page import WrittenPage, write_page
     from mien.export.world_space import in_world
 else:
     __getattr__, __dir__ = lazy_names(
@@ -20,15 +22,22 @@ else:
                 "GaussianAvatarsFolder", "read_gaussian_avatars_folder", "write_gaussian_avatars_folder",
             ],
             "world_space": ["in_world"],
+            "packed": ["Motion", "pack", "unpacked"],
             "ply": ["read_ply", "write_ply"],
+            "web_page": ["WrittenPage", "write_page"],
         },
     )  # fmt: skip
 
 __all__ = [
     "GaussianAvatarsFolder",
+    "Motion",
+    "WrittenPage",
     "in_world",
+    "pack",
     "read_gaussian_avatars_folder",
     "read_ply",
+    "unpacked",
     "write_gaussian_avatars_folder",
+    "write_page",
     "write_ply",
 ]

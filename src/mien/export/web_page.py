@@ -1,0 +1,62 @@
+"""One web page that shows an avatar: it opens from a file, and makes no request (docs/web.md).
+
+page.html beside this file is built from web/ and committed, so that writing a page needs no node.
+"""
+
+import base64
+import html
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mien import runtime
+from mien.export.packed import Motion, pack, unpacked
+from mien.files import check_writable, write_atomically
+from mien.runtime import PortableAvatar
+
+TEMPLATE = Path(__file__).with_name("page.html")
+_SIDE = 512
+"""Sides of the pictures that the loss is measured on, in pixels."""
+_SHARE = 0.25
+"""Share of its range that each expression has in the second picture."""
+_MOST_PSNR = 120.0
+"""Figure for equal pictures, in dB."""
+
+
+@dataclass(frozen=True)
+class WrittenPage:
+    """A page on disk."""
+
+    size: int
+    """Size in bytes."""
+    psnr: float
+    """Pictures of the packed avatar against those of the exact one, in dB: the lower of the person at rest and a face
+    with all expressions at a quarter of their range, 512x512, over white."""
+
+
+def write_page(path: Path, avatar: PortableAvatar, motion: Motion | None = None) -> WrittenPage:
+    """Write a page with an avatar, and a motion that it can play, as one file.
+
+    Raises:
+        UserError: the avatar is not `MeshBound`, or the path cannot be written.
+    """
+    check_writable(path)
+    packed = base64.b64encode(pack(avatar, motion)).decode()
+    page = TEMPLATE.read_text(encoding="utf-8").replace("{{title}}", html.escape(avatar.about.name))
+    content = page.replace("{{avatar}}", packed).encode()
+    write_atomically(path, lambda temporary: temporary.write_bytes(content))
+    return WrittenPage(len(content), _psnr(avatar))
+
+
+def _psnr(avatar: PortableAvatar) -> float:
+    exact, read = runtime.Avatar(avatar), runtime.Avatar(unpacked(avatar))
+    camera = avatar.camera.resized(_SIDE, _SIDE)
+    low, high = avatar.expression_bounds.T
+    rest = avatar.neutral.expression
+    errors = []
+    for expression in (rest, (low + _SHARE * (high - low)).astype(np.float32)):
+        first, second = (a.render(a.pose(expression), camera)[0].clip(0, 1) for a in (exact, read))
+        errors.append(float(np.square(first - second, dtype=np.float64).mean()))
+    worst = max(errors)
+    return _MOST_PSNR if worst == 0 else min(_MOST_PSNR, -10 * float(np.log10(worst)))

@@ -1,0 +1,257 @@
+"""The web runtime poses and draws as `mien.runtime` does, and the page of an avatar works alone."""
+
+import base64
+import gzip
+import json
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from mien import runtime
+from mien.avatar import make_portable
+from mien.cli import main
+from mien.errors import UserError
+from mien.export import Motion, pack, unpacked, write_page
+from mien.export.web_page import TEMPLATE
+from mien.runtime.posing import expression_changes, rig_points
+from test_runtime import new_avatar
+from toy_scene import toy_camera
+from toy_workspace import write_toy_workspace
+from web_case import WEB, as_json, browse, build, chromium, drawn_head, faces_of, node
+
+SIDE = 512
+EQUAL = 1e-5
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("built"))
+
+
+def test_the_committed_page_is_that_of_a_fresh_build(built: Path) -> None:
+    fresh = (built / "page.html").read_text()
+    assert fresh == TEMPLATE.read_text(), "page.html is older than web/: run `make web`, and commit it"
+
+
+def test_the_package_is_small(built: Path) -> None:
+    assert len(gzip.compress((built / "mien.js").read_bytes())) <= 10_000
+
+
+def posed_by_node(built: Path, path: Path, portable: runtime.PortableAvatar, faces: list[runtime.Face]) -> list[Any]:
+    """Return points, centres, raw opacities and first colours of each face, as the web runtime computes them."""
+    given, out = path.with_suffix(".json"), path.with_suffix(".out")
+    given.write_text(json.dumps(as_json(faces)))
+    script = str(WEB / "tests" / "pose.mjs")
+    subprocess.run([node(), script, str(built / "mien.js"), str(path), str(given), str(out)], check=True)
+    baked = portable.baked
+    assert isinstance(baked, runtime.MeshBound)
+    n = len(baked.face_index)
+    sizes = (baked.rig.template.size, 3 * n, n, 3 * n)
+    rows = np.fromfile(out, np.float32).reshape(len(faces), sum(sizes))
+    return [np.split(row, np.cumsum(sizes)[:-1]) for row in rows]
+
+
+@pytest.mark.parametrize("form", ["mien", "packed"])
+@pytest.mark.parametrize("rank", [0, 3])
+def test_faces_are_posed_as_in_python(built: Path, tmp_path: Path, form: str, rank: int) -> None:
+    portable = drawn_head(2000, rank)
+    path = tmp_path / f"head.{form}"
+    if form == "mien":
+        runtime.write_portable(path, portable)
+    else:
+        path.write_bytes(pack(portable))
+        portable = unpacked(portable)
+    baked, faces = portable.baked, faces_of(portable, 3)
+    assert isinstance(baked, runtime.MeshBound)
+    for face, found in zip(faces, posed_by_node(built, path, portable, faces), strict=True):
+        in_head = replace(face, head_rotation=np.zeros(3, np.float32), head_translation=np.zeros(3, np.float32))
+        changes = expression_changes(baked.changes, face) if baked.changes else {}
+        expected = (
+            rig_points(baked.rig, face),
+            runtime.pose(baked, in_head).means,
+            baked.attributes.opacity_logits + changes.get("opacity_logits", 0),
+            baked.attributes.sh[:, 0] + changes.get("colour", 0),
+        )
+        for ours, theirs in zip(found, expected, strict=True):
+            np.testing.assert_allclose(ours, theirs.reshape(-1), rtol=0, atol=EQUAL)
+
+
+def test_a_hundred_thousand_are_posed_and_sorted_in_time(built: Path, tmp_path: Path) -> None:
+    """At most 8 ms in Node, taken as the least of 60 faces, because other work may run beside the tests."""
+    portable = drawn_head(100_000)
+    runtime.write_portable(tmp_path / "a.mien", portable)
+    (tmp_path / "faces.json").write_text(json.dumps(as_json(faces_of(portable, 10))))
+    script = [str(WEB / "tests" / "pose.mjs"), str(built / "mien.js"), str(tmp_path / "a.mien")]
+    done = subprocess.run([node(), *script, str(tmp_path / "faces.json")], check=True, capture_output=True, text=True)
+    assert float(done.stdout) <= 8
+
+
+def psnr(first: np.ndarray, second: np.ndarray) -> float:
+    return float(-10 * np.log10(np.square(first.clip(0, 1) - second.clip(0, 1), dtype=np.float64).mean()))
+
+
+POSE = """(async () => {
+  const viewer = await mien, canvas = viewer.canvas, face = %s;
+  canvas.width = canvas.height = 512;
+  viewer.background = [1, 1, 1, 1];
+  viewer.take(Object.fromEntries(Object.entries(face).map(([name, values]) => [name, Float32Array.from(values)])));
+  viewer.draw();
+  return canvas.toDataURL("image/png");
+})()"""
+"""Poses the avatar and returns a picture over white."""
+
+SLIDE = """(async () => {
+  const viewer = await mien, slider = document.getElementById("jawOpen");
+  slider.value = slider.max;
+  slider.dispatchEvent(new Event("input", { bubbles: true }));
+  viewer.draw();
+  return viewer.canvas.toDataURL("image/png");
+})()"""
+
+REST = """(async () => {
+  const viewer = await mien;
+  document.getElementById("reset").click();
+  viewer.background = [1, 1, 1, 1];
+  viewer.draw();
+  return viewer.canvas.toDataURL("image/png");
+})()"""
+
+CLEAR = """(async () => {
+  const viewer = await mien, background = document.getElementById("background");
+  background.value = "none";
+  background.dispatchEvent(new Event("change"));
+  viewer.draw();
+  return viewer.canvas.toDataURL("image/png");
+})()"""
+
+TURN = """(async () => {
+  const viewer = await mien;
+  viewer.background = [1, 1, 1, 1];
+  for (let i = 0; i < 4; ++i) viewer.canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowLeft" }));
+  viewer.draw();
+  return [viewer.yaw, viewer.canvas.toDataURL("image/png")];
+})()"""
+
+PLAY = """(async () => {
+  const viewer = await mien;
+  document.getElementById("reset").click();
+  document.getElementById("play").click();
+  const began = performance.now();
+  while (viewer.timestep < 2 && performance.now() - began < 20000) await new Promise((done) => setTimeout(done, 50));
+  viewer.play(false);
+  return [viewer.timestep, Array.from(viewer.face.expression), document.getElementById("time").value];
+})()"""
+
+
+def picture(address: str) -> np.ndarray:
+    """Decode the picture that a page returned, as RGB or RGBA, 0 to 1."""
+    data = np.frombuffer(base64.b64decode(address.partition(",")[2]), np.uint8)
+    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
+    return pixels[..., [2, 1, 0, 3][: pixels.shape[-1]]].astype(np.float32) / 255
+
+
+@pytest.mark.slow
+def test_a_page_works_alone(tmp_path: Path) -> None:
+    chromium()
+    portable = without_changes_of_jaw(drawn_head(12_000, rank=2, sh=4, sh_frame="world"))
+    faces = [runtime.Face(**{k: v for k, v in vars(portable.neutral).items()}), *faces_of(portable, 2)]
+    motion = Motion(*(np.stack([getattr(face, name) for face in faces]) for name in vars(faces[0])), fps=5.0)
+    page = tmp_path / "drawn.html"
+    written = write_page(page, portable, motion)
+    assert written.size == page.stat().st_size
+    scripts = [*(POSE % json.dumps(face) for face in as_json(faces)), REST, SLIDE, REST, CLEAR, TURN, PLAY]
+    told = browse(page, scripts)
+    assert told["requests"] == []
+    assert told["messages"] == []
+    *posed, rest, open_, again, clear, turned, played = told["results"]
+
+    exact = runtime.Avatar(portable)
+    camera = exact.camera.resized(SIDE, SIDE)
+    for face, address in zip(faces, posed, strict=True):
+        expected, _ = exact.render(runtime.pose(portable.baked, face), camera)
+        assert psnr(picture(address)[..., :3], expected) >= 45
+
+    np.testing.assert_array_equal(picture(rest), picture(again))
+    changed = np.abs(picture(open_) - picture(rest)).max(-1) > 4 / 255
+    mouth, (_, alpha) = mouth_region(portable, camera), exact.render(camera=camera)
+    assert mouth[alpha > 0.5].mean() < 0.7
+    assert changed[mouth].mean() > 0.2
+    assert not changed[~mouth].any()
+    assert np.abs(picture(clear)[..., 3] - alpha).max() < 0.02
+    assert turned[0] == pytest.approx(0.4)
+    assert np.abs(picture(turned[1]) - picture(rest)).max(-1).mean() > 0.02
+    timestep, expression, time = played
+    assert (timestep, time) == (2, "2")
+    np.testing.assert_allclose(expression, faces[2].expression, atol=1e-4)
+
+
+def without_changes_of_jaw(portable: runtime.PortableAvatar) -> runtime.PortableAvatar:
+    """Return the avatar with changes that do not depend on jawOpen, so that jawOpen moves nothing beside the mesh."""
+    baked = portable.baked
+    assert isinstance(baked, runtime.MeshBound)
+    assert baked.changes is not None
+    directions = baked.changes.directions.copy()
+    directions[portable.expression_names.index("jawOpen")] = 0
+    return replace(portable, baked=replace(baked, changes=replace(baked.changes, directions=directions)))
+
+
+def mouth_region(portable: runtime.PortableAvatar, camera: runtime.Camera) -> np.ndarray:
+    """Return the pixels of the Gaussians whose triangles jawOpen moves, at rest or with an open mouth."""
+    baked, index = portable.baked, portable.expression_names.index("jawOpen")
+    assert isinstance(baked, runtime.MeshBound)
+    open_ = {"jawOpen": float(portable.expression_bounds[index, 1])}
+    avatar = runtime.Avatar(portable)
+    rest, moved = (rig_points(baked.rig, face) for face in (avatar.face(), avatar.face(open_)))
+    triangles = (np.abs(moved - rest).max(1) > 1e-6)[baked.faces].any(1)
+    keep = triangles[baked.face_index]
+    attributes = runtime.Attributes(**{name: values[keep] for name, values in vars(baked.attributes).items()})
+    # Opaque, so that every pixel that they can reach counts.
+    attributes = replace(attributes, opacity_logits=np.full(keep.sum(), 9, np.float32))
+    part = replace(
+        baked, face_index=baked.face_index[keep], means=baked.means[keep], attributes=attributes, changes=None
+    )
+    only = runtime.Avatar(replace(portable, baked=part))
+    return np.maximum(*(only.render(only.pose(given), camera)[1] for given in ({}, open_))) > 0
+
+
+def test_forty_thousand_fit_into_three_megabytes(tmp_path: Path) -> None:
+    """Random numbers compress worst, so an avatar of a person is smaller."""
+    page = write_page(tmp_path / "a.html", drawn_head(40_000))
+    assert page.size <= 3_000_000
+    assert page.psnr >= 50
+
+
+def test_a_page_opens_other_pages_never(tmp_path: Path) -> None:
+    """The page's own policy forbids every request, and names of people are escaped."""
+    portable = drawn_head(10)
+    named = replace(portable, about=replace(portable.about, name='<b>"&'))
+    write_page(tmp_path / "a.html", named)
+    text = (tmp_path / "a.html").read_text()
+    assert "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:" in text
+    assert "<title>&lt;b&gt;&quot;&amp;</title>" in text
+    assert "<b>" not in text
+    assert "http://" not in text
+    assert "https://" not in text
+    write_page(tmp_path / "b.html", named)
+    assert (tmp_path / "b.html").read_bytes() == (tmp_path / "a.html").read_bytes()
+
+
+def test_other_methods_are_refused_in_one_line(tmp_path: Path) -> None:
+    portable = make_portable(new_avatar("headgas"), toy_camera(64), "toy")
+    with pytest.raises(UserError, match="a page draws avatars of gaussian_avatars, not of headgas"):
+        write_page(tmp_path / "a.html", portable)
+
+
+def test_export_writes_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_toy_workspace(tmp_path / "W")
+    page = str(tmp_path / "a.html")
+    assert main(["export", str(tmp_path / "W"), "--out", page, "--series", "clip", "--every", "2"]) == 0
+    assert "a motion of 3 frames" in capsys.readouterr().out
+    assert main(["export", str(tmp_path / "W"), "--out", page, "--set", "drop=1"]) == 2
+    assert "a page has a slider for every expression" in capsys.readouterr().err

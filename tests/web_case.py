@@ -1,0 +1,108 @@
+"""Avatars without a person for the tests of web pages, and programs that these tests need."""
+
+import json
+import os
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mien import runtime
+from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, make_portable
+from mien.face import load_face_model
+from needs import NO_CHROMIUM, NO_NODE, NO_NODE_PACKAGES
+from toy_scene import toy_camera
+
+WEB = Path(__file__).parent.parent / "web"
+
+
+def node() -> str:
+    """Return the path of node, or skip the test."""
+    found = shutil.which("node")
+    if found is None:
+        pytest.skip(NO_NODE)
+    if not (WEB / "node_modules" / "esbuild").is_dir():
+        pytest.skip(NO_NODE_PACKAGES)
+    return found
+
+
+def chromium() -> str:
+    """Return the path of Chromium, or skip the test."""
+    given = os.environ.get("MIEN_CHROMIUM")
+    found = given or next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if found is None:
+        pytest.skip(NO_CHROMIUM)
+    return found
+
+
+def build(folder: Path) -> Path:
+    """Build mien.js and page.html into a folder, and return it."""
+    subprocess.run([node(), str(WEB / "build.mjs"), str(folder)], check=True, capture_output=True)
+    return folder
+
+
+def browse(page: Path, scripts: list[str], size: tuple[int, int] = (900, 600)) -> dict[str, Any]:
+    """Run scripts in a page, one after the other: their `results`, all `requests`, and `messages` of the console."""
+    told = json.dumps({"width": size[0], "height": size[1], "scripts": scripts})
+    command = [node(), str(WEB / "tests" / "browser.mjs"), chromium(), str(page)]
+    done = subprocess.run(command, input=told, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def drawn_head(count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head") -> runtime.PortableAvatar:
+    """Return `count` Gaussians in random colours on the mean head of anny, 0.9 m in front of the camera."""
+    model = load_face_model("anny")
+    portable = make_portable(GaussianAvatars(GaussianAvatarsConfig(), model, model.neutral()), toy_camera(512), "drawn")
+    baked, random = portable.baked, np.random.default_rng(0)
+    assert isinstance(baked, runtime.MeshBound)
+
+    def some(spread: float, *shape: int) -> np.ndarray:
+        return (spread * random.standard_normal((count, *shape))).astype(np.float32)
+
+    attributes = runtime.Attributes(some(1, 4), some(0.3, 3) - np.float32(1), some(2), some(0.7, sh, 3))
+    inputs = len(portable.neutral.expression) + portable.neutral.joints.size
+    changes = None
+    if rank:
+        directions = random.standard_normal((inputs, rank)).astype(np.float32)
+        rest, reach = np.zeros(inputs, np.float32), np.ones(1, np.float32)
+        parts = (some(0.3, 3, rank), some(0.3, rank), some(0.1, 3, rank))
+        changes = runtime.ExpressionChanges(rest, directions, reach, *parts)
+    face_index = random.integers(0, len(baked.faces), count).astype(np.int32)
+    baked = replace(
+        baked, face_index=face_index, means=some(0.2, 3), attributes=attributes, sh_frame=sh_frame, changes=changes
+    )
+    K = np.array([[1300, 0, 256], [0, 1300, 256], [0, 0, 1]], np.float32)
+    neutral = replace(
+        portable.neutral,
+        head_rotation=np.array([0.05, -0.1, 0.02], np.float32),
+        head_translation=np.array([0.01, 0.02, -0.9], np.float32),
+    )
+    return replace(portable, baked=baked, neutral=neutral, camera=replace(portable.camera, K=K))
+
+
+def faces_of(portable: runtime.PortableAvatar, count: int) -> list[runtime.Face]:
+    """Return random faces of an avatar."""
+    random, neutral = np.random.default_rng(1), portable.neutral
+
+    def some(like: np.ndarray, spread: float) -> np.ndarray:
+        return (spread * random.standard_normal(like.shape)).astype(np.float32)
+
+    return [
+        runtime.Face(
+            np.abs(some(neutral.expression, 0.4)),
+            some(neutral.joints, 0.2),
+            neutral.head_rotation + some(neutral.head_rotation, 0.1),
+            neutral.head_translation,
+        )
+        for _ in range(count)
+    ]
+
+
+def as_json(faces: list[runtime.Face]) -> list[dict[str, list[float]]]:
+    """Return faces in the form that a page takes."""
+    return [{name: values.reshape(-1).tolist() for name, values in vars(face).items()} for face in faces]

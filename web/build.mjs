@@ -1,0 +1,35 @@
+// Builds dist/mien.js (the package) and src/mien/export/page.html (the page that `mien export` fills; it is committed,
+// so that the Python package needs no node). `node build.mjs FOLDER` writes both into FOLDER instead.
+import { build } from "esbuild";
+import { mkdir, readFile, writeFile } from "node:fs/promises";
+import { dirname, join } from "node:path";
+import { fileURLToPath } from "node:url";
+import { gzipSync } from "node:zlib";
+
+const here = dirname(fileURLToPath(import.meta.url));
+const folder = process.argv[2];
+const options = { bundle: true, minify: true, target: "es2022", charset: "ascii", legalComments: "none", write: false, absWorkingDir: here };
+/** Shaders without comments and indentation. */
+const shaders = {
+  name: "shaders",
+  setup: (on) =>
+    on.onLoad({ filter: /shaders\.ts$/ }, async ({ path }) => ({
+      contents: (await readFile(path, "utf8")).replace(/(?<!:)\/\/ .*$/gm, "").replace(/^ +/gm, ""),
+      loader: "ts",
+    })),
+};
+const bundle = async (entry, format) => {
+  const result = await build({ ...options, plugins: [shaders], entryPoints: [entry], format });
+  return result.outputFiles[0].text.trimEnd();
+};
+const write = async (path, text) => {
+  await mkdir(dirname(path), { recursive: true });
+  await writeFile(path, text);
+  console.log(`${path}: ${text.length} bytes, ${gzipSync(text, { level: 9 }).length} gzipped`);
+};
+
+const script = await bundle("src/page.ts", "iife");
+if (script.includes("</script")) throw new Error("the script would end its own element");
+const template = await readFile(join(here, "src/page.html"), "utf8");
+await write(folder ? join(folder, "mien.js") : join(here, "dist/mien.js"), (await bundle("src/index.ts", "esm")) + "\n");
+await write(folder ? join(folder, "page.html") : join(here, "../src/mien/export/page.html"), template.replace("{{script}}", () => script));

@@ -1,0 +1,104 @@
+// What a .mien file holds, as src/mien/runtime/baked.py documents it. Only bound Gaussians (`MeshBound`) are known here.
+
+/** m points of one person that move with expressions and joints. Arrays are row by row. */
+export interface Rig {
+  template: Float32Array; // [m, 3], metres, head frame
+  expression_names: string[];
+  expression_basis: Float32Array; // [e, m, 3]
+  joint_names: string[];
+  joint_parents: number[];
+  joint_free: boolean[];
+  joint_template: Float32Array; // [k, 3]
+  joint_rotation_basis: Float32Array; // [e, k, 3]
+  joint_translation_basis: Float32Array; // [e, k, 3]
+  skinning_weights: Float32Array; // [m, k]
+  pose_basis: Float32Array | null; // [9 j, m, 3]
+}
+
+/** Raw values of n Gaussians, in the frames of their triangles. */
+export interface Attributes {
+  quats: Float32Array; // [n, 4], wxyz, not of unit length
+  log_scales: Float32Array; // [n, 3]
+  opacity_logits: Float32Array; // [n]
+  sh: Float32Array; // [n, s, 3]
+}
+
+/** Changes of the raw values with the expression, of low rank r. */
+export interface ExpressionChanges {
+  rest: Float32Array; // [i]
+  directions: Float32Array; // [i, r]
+  reach: Float32Array; // [1]
+  colour: Float32Array | null; // [n, 3, r]
+  opacity_logits: Float32Array | null; // [n, r]
+  means: Float32Array | null; // [n, 3, r]
+}
+
+export interface MeshBound {
+  kind: "MeshBound";
+  rig: Rig;
+  faces: Int32Array; // [f, 3]
+  face_index: Int32Array; // [n]
+  means: Float32Array; // [n, 3], in the triangle's frame and units
+  attributes: Attributes;
+  sh_frame: "world" | "head";
+  changes?: ExpressionChanges;
+}
+
+/** A pinhole camera, OpenCV convention: +x right, +y down, +z forward. */
+export interface Camera {
+  K: Float32Array; // [3, 3], pixels
+  viewmat: Float32Array; // [4, 4], world to camera
+  width: number;
+  height: number;
+}
+
+/** Face parameters of one timestep. */
+export interface Face {
+  expression: Float32Array; // [e]
+  joints: Float32Array; // [j, 3], axis-angle, radians
+  head_rotation: Float32Array; // [3], axis-angle, radians
+  head_translation: Float32Array; // [3], metres
+}
+
+/** Timesteps of a packed motion: every array of `Face` with a leading axis. */
+export interface Motion extends Face {
+  fps: number;
+}
+
+export interface Avatar {
+  baked: MeshBound;
+  expression_names: string[];
+  expression_bounds: Float32Array; // [e, 2]
+  joint_names: string[];
+  neutral: Face;
+  camera: Camera;
+  about: { name: string; method: string; face_model: string; licence: string };
+}
+
+/** A copy of a face, so that changing it leaves the original alone. */
+export function copyFace(face: Face): Face {
+  return {
+    expression: face.expression.slice(),
+    joints: face.joints.slice(),
+    head_rotation: face.head_rotation.slice(),
+    head_translation: face.head_translation.slice(),
+  };
+}
+
+/** Number of timesteps of a motion. */
+export const motionLength = (motion: Motion): number => motion.head_rotation.length / 3;
+
+/** One timestep of a motion. Its arrays are views. */
+export function motionFace(motion: Motion, timestep: number): Face {
+  const count = motionLength(motion);
+  const row = (values: Float32Array) => {
+    const width = values.length / count;
+    return values.subarray(timestep * width, (timestep + 1) * width);
+  };
+  return {
+    expression: row(motion.expression),
+    joints: row(motion.joints),
+    head_rotation: row(motion.head_rotation),
+    head_translation: row(motion.head_translation),
+  };
+}

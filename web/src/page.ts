@@ -1,0 +1,193 @@
+// The page that `mien export --out NAME.html` writes: the avatar on a canvas, sliders by group, the packed motion.
+
+import { motionLength } from "./avatar";
+import { AvatarError, readPacked } from "./format";
+import { Viewer } from "./viewer";
+
+const GROUPS: [string, RegExp][] = [
+  ["Jaw", /^jaw|^tongue/],
+  ["Mouth", /^mouth/],
+  ["Eyes", /^eye/],
+  ["Brows", /^brow/],
+  ["Cheeks and nose", /^cheek|^nose/],
+  ["Other", /./],
+];
+const AXES = ["nod", "turn", "tilt"];
+/** Most pixels of a picture: more would make telephones stutter. */
+const MOST_PIXELS = 1_600_000;
+/** Largest angle of a slider of a joint, in radians. */
+const MOST_ANGLE = 0.5;
+
+const find = <T extends HTMLElement>(id: string) => document.getElementById(id) as T;
+
+function element<K extends keyof HTMLElementTagNameMap>(name: K, attributes: Record<string, string>, ...inside: (Node | string)[]) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.append(...inside);
+  return made;
+}
+
+/** jawOpen -> jaw open. */
+const readable = (name: string) => name.replace(/_/g, " ").replace(/([a-z])([A-Z])/g, (_, a, b) => `${a} ${b.toLowerCase()}`);
+
+/** Sliders of all expressions and joints. Returns a function that moves them to the face that is shown. */
+function addSliders(viewer: Viewer, place: HTMLElement): () => void {
+  const updates: (() => void)[] = [];
+  const slider = (label: string, id: string, [least, most]: number[], get: () => number, set: (value: number) => void) => {
+    const input = element("input", { type: "range", id, min: `${least}`, max: `${most}`, step: "0.01" });
+    input.addEventListener("input", () => {
+      viewer.play(false);
+      set(Number(input.value));
+      viewer.change();
+    });
+    updates.push(() => (input.value = `${get()}`));
+    return element("label", { for: id }, element("span", {}, label), input);
+  };
+  const { avatar, face } = viewer, names = avatar.expression_names;
+  const taken = new Set<string>();
+  for (const [title, pattern] of GROUPS) {
+    const rows: HTMLElement[] = [];
+    names.forEach((name, index) => {
+      const bounds = [...avatar.expression_bounds.subarray(2 * index, 2 * index + 2)];
+      if (taken.has(name) || !pattern.test(name) || bounds[0] === bounds[1]) return;
+      taken.add(name);
+      rows.push(slider(readable(name), name, bounds, () => face.expression[index], (value) => (face.expression[index] = value)));
+    });
+    if (rows.length) place.append(element("details", {}, element("summary", {}, title), ...rows));
+  }
+  const joints = avatar.joint_names.flatMap((name, joint) =>
+    AXES.map((axis, k) => {
+      const at = 3 * joint + k, id = `${name}_${"xyz"[k]}`;
+      return slider(`${readable(name)} ${axis}`, id, [-MOST_ANGLE, MOST_ANGLE], () => face.joints[at], (value) => (face.joints[at] = value));
+    }),
+  );
+  if (joints.length) place.append(element("details", {}, element("summary", {}, "Joints"), ...joints));
+  place.querySelector("details")?.setAttribute("open", "");
+  return () => updates.forEach((update) => update());
+}
+
+/** One finger or the mouse turns, two fingers or the wheel zoom, arrow keys turn. */
+function addTurning(viewer: Viewer): void {
+  const { canvas } = viewer, pointers = new Map<number, { x: number; y: number }>();
+  const span = () => {
+    const [a, b] = [...pointers.values()];
+    return Math.hypot(a.x - b.x, a.y - b.y);
+  };
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  });
+  for (const name of ["pointerup", "pointercancel"] as const) canvas.addEventListener(name, (event) => pointers.delete(event.pointerId));
+  canvas.addEventListener("pointermove", (event) => {
+    const last = pointers.get(event.pointerId);
+    if (!last) return;
+    const apart = pointers.size === 2 ? span() : 0;
+    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    if (apart) viewer.zoom *= span() / apart;
+    else {
+      viewer.yaw -= (event.clientX - last.x) * 0.008;
+      viewer.pitch += (event.clientY - last.y) * 0.008;
+    }
+    viewer.look();
+  });
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    viewer.zoom *= Math.exp(-0.0015 * event.deltaY);
+    viewer.look();
+  }, { passive: false });
+  canvas.addEventListener("keydown", (event) => {
+    const turns: Record<string, () => void> = {
+      ArrowLeft: () => (viewer.yaw += 0.1), ArrowRight: () => (viewer.yaw -= 0.1),
+      ArrowUp: () => (viewer.pitch -= 0.1), ArrowDown: () => (viewer.pitch += 0.1),
+      "+": () => (viewer.zoom *= 1.1), "-": () => (viewer.zoom /= 1.1),
+    };
+    if (!turns[event.key]) return;
+    event.preventDefault();
+    turns[event.key]();
+    viewer.look();
+  });
+}
+
+/** Play, pause, and a time line, if there is a motion. */
+function addMotion(viewer: Viewer, moveSliders: () => void): void {
+  const { motion } = viewer;
+  if (!motion) return;
+  const button = find<HTMLButtonElement>("play"), time = find<HTMLInputElement>("time");
+  find("motion").hidden = false;
+  time.max = `${motionLength(motion) - 1}`;
+  const show = () => (button.textContent = viewer.playing ? "Pause" : "Play");
+  viewer.onMotion = () => {
+    time.value = `${viewer.timestep}`;
+    moveSliders();
+    show();
+  };
+  const toggle = () => {
+    viewer.play(!viewer.playing);
+    show();
+  };
+  button.addEventListener("click", toggle);
+  viewer.canvas.addEventListener("keydown", (event) => {
+    if (event.key !== " ") return;
+    event.preventDefault();
+    toggle();
+  });
+  time.addEventListener("input", () => {
+    viewer.play(false);
+    viewer.seek(Number(time.value));
+  });
+  find("panel").addEventListener("input", show);
+}
+
+function addRest(viewer: Viewer, moveSliders: () => void): void {
+  find("reset").addEventListener("click", () => {
+    viewer.play(false);
+    viewer.reset();
+    moveSliders();
+    find("play").textContent = "Play";
+  });
+  const background = find<HTMLSelectElement>("background");
+  const show = () => {
+    const grey = { white: 1, black: 0 }[background.value];
+    viewer.background = grey === undefined ? [0, 0, 0, 0] : [grey, grey, grey, 1];
+    viewer.look();
+  };
+  background.addEventListener("change", show);
+  // NAME.html#transparent shows the head alone, for a frame in another page.
+  if (location.hash === "#transparent") {
+    document.body.classList.add("bare");
+    background.value = "none";
+  }
+  show();
+  find("full").addEventListener("click", () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()));
+}
+
+function fit(viewer: Viewer): void {
+  const { canvas } = viewer, { width, height } = canvas.getBoundingClientRect();
+  const ratio = Math.min(devicePixelRatio, 2, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1)));
+  const [w, h] = [width, height].map((size) => Math.max(1, Math.round(size * ratio)));
+  if (canvas.width !== w || canvas.height !== h) {
+    canvas.width = w;
+    canvas.height = h;
+    viewer.look();
+  }
+}
+
+async function open(): Promise<Viewer> {
+  const text = find("avatar").textContent!.trim();
+  const { avatar, motion } = await readPacked(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)));
+  const viewer = new Viewer(find<HTMLCanvasElement>("view"), avatar, motion);
+  const moveSliders = addSliders(viewer, find("sliders"));
+  moveSliders();
+  addTurning(viewer);
+  addMotion(viewer, moveSliders);
+  addRest(viewer, moveSliders);
+  new ResizeObserver(() => fit(viewer)).observe(viewer.canvas);
+  fit(viewer);
+  return viewer;
+}
+
+/** Scripts of the page reach the viewer by `await mien`. */
+(window as unknown as { mien: Promise<Viewer> }).mien = open().catch((error) => {
+  find("message").textContent = error instanceof AvatarError ? `This avatar ${error.message}.` : `This page cannot show its avatar: ${error.message ?? error}`;
+  throw error;
+});

@@ -1,0 +1,175 @@
+// An avatar on a canvas: face, camera, a packed motion, and drawing when something has changed.
+
+import { copyFace, motionFace, motionLength, type Avatar, type Face, type Motion } from "./avatar";
+import { Renderer, type Colour, type View } from "./renderer";
+import { Poser } from "./rig";
+import { chained, moved, rigid, rotationMatrix } from "./rigid";
+import { DepthSorter } from "./sort";
+
+/** Turns beyond this would show the head upside down, in radians. */
+const MOST_PITCH = 1.4;
+
+export class Viewer {
+  /** The face that is drawn. After changing it, call `change`. */
+  readonly face: Face;
+  /** Turn of the camera about the head, in radians, and its zoom. */
+  yaw = 0;
+  pitch = 0;
+  zoom = 1;
+  /** Colour behind the head; alpha 0 is transparent. */
+  background: Colour = [0, 0, 0, 0];
+  /** Timestep of the motion, and whether it runs. */
+  timestep = 0;
+  playing = false;
+  /** Called after each timestep of the motion, so that a page can move its sliders. */
+  onMotion: () => void = () => {};
+  /** Time to pose, sort and hand over the last picture, in milliseconds. */
+  milliseconds = 0;
+
+  private readonly poser: Poser;
+  private readonly sorter: DepthSorter;
+  private readonly depths: Float32Array;
+  private readonly middle: number[];
+  private renderer: Renderer;
+  private posed = false;
+  private waiting = 0;
+  private stale = true;
+  private before = 0;
+  private since = 0;
+
+  constructor(readonly canvas: HTMLCanvasElement, readonly avatar: Avatar, readonly motion: Motion | null = null) {
+    this.face = copyFace(avatar.neutral);
+    this.poser = new Poser(avatar.baked);
+    const count = avatar.baked.face_index.length;
+    this.sorter = new DepthSorter(count);
+    this.depths = new Float32Array(count);
+    this.middle = middleOf(avatar.baked.rig.template);
+    this.renderer = new Renderer(canvas, avatar, this.poser);
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+    canvas.addEventListener("webglcontextrestored", () => {
+      this.renderer = new Renderer(canvas, avatar, this.poser);
+      this.change();
+    });
+  }
+
+  /** Sets one expression by name, clamped to its bounds. False if the avatar has none of that name. */
+  setExpression(name: string, value: number): boolean {
+    const index = this.avatar.expression_names.indexOf(name);
+    if (index < 0) return false;
+    const [least, most] = this.avatar.expression_bounds.subarray(2 * index, 2 * index + 2);
+    this.face.expression[index] = Math.min(Math.max(value, least), most);
+    this.change();
+    return true;
+  }
+
+  /** Goes back to the person at rest, seen by the first camera. */
+  reset(): void {
+    this.take(this.avatar.neutral);
+    this.yaw = this.pitch = 0;
+    this.zoom = 1;
+  }
+
+  /** Shows a face. */
+  take(face: Face): void {
+    for (const part of ["expression", "joints", "head_rotation", "head_translation"] as const) this.face[part].set(face[part]);
+    this.change();
+  }
+
+  /** Shows a timestep of the motion. */
+  seek(timestep: number): void {
+    if (!this.motion) return;
+    this.timestep = timestep;
+    this.take(motionFace(this.motion, timestep));
+    this.onMotion();
+  }
+
+  play(playing = true): void {
+    this.playing = playing && this.motion !== null;
+    this.before = 0;
+    this.look();
+  }
+
+  /** Draws soon, because the face has changed. */
+  change(): void {
+    this.posed = false;
+    this.look();
+  }
+
+  /** Draws soon, because the camera, the background or the size has changed. */
+  look(): void {
+    this.pitch = Math.min(Math.max(this.pitch, -MOST_PITCH), MOST_PITCH);
+    this.zoom = Math.min(Math.max(this.zoom, 0.2), 8);
+    this.stale = true;
+    this.wait();
+  }
+
+  /** The view for a picture of that size: the whole first camera's picture fits into it. */
+  view(width: number, height: number): View {
+    const { K, viewmat, width: w, height: h } = this.avatar.camera, scale = Math.min(width / w, height / h);
+    const pose = rigid(rotationMatrix(this.face.head_rotation, 0), this.face.head_translation);
+    const { head_rotation, head_translation } = this.avatar.neutral;
+    const rest = rigid(rotationMatrix(head_rotation, 0), head_translation);
+    // The camera turns about the middle of the head at rest, seen from where the first camera stands.
+    const pivot = moved(viewmat, moved(rest, this.middle));
+    const turn = chained(rigid(rotationMatrix([this.pitch, 0, 0], 0), [0, 0, 0]), rigid(rotationMatrix([0, this.yaw, 0], 0), [0, 0, 0]));
+    const to = moved(turn, pivot);
+    turn[3] = pivot[0] - to[0];
+    turn[7] = pivot[1] - to[1];
+    turn[11] = pivot[2] - to[2];
+    const worldDirections = this.avatar.baked.sh_frame === "world";
+    const p = pose;
+    return {
+      head: chained(turn, chained(viewmat, pose)),
+      directions: worldDirections ? [p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]] : [1, 0, 0, 0, 1, 0, 0, 0, 1],
+      focal: [K[0] * scale * this.zoom, K[4] * scale * this.zoom],
+      centre: [width / 2 + (K[2] - w / 2) * scale * this.zoom, height / 2 + (K[5] - h / 2) * scale * this.zoom],
+      width,
+      height,
+    };
+  }
+
+  /** Draws now, at the canvas's size. */
+  draw(): void {
+    const began = performance.now(), { width, height } = this.canvas;
+    this.stale = false;
+    if (!this.posed) {
+      this.poser.pose(this.face);
+      this.renderer.upload();
+      this.posed = true;
+    }
+    const view = this.view(width, height);
+    this.poser.depths(Array.prototype.slice.call(view.head, 8, 12), this.depths);
+    this.renderer.draw(this.sorter.sort(this.depths), view, this.background);
+    this.milliseconds = performance.now() - began;
+  }
+
+  private wait(): void {
+    if (!this.waiting) this.waiting = requestAnimationFrame((now) => this.tick(now));
+  }
+
+  private tick(now: number): void {
+    this.waiting = 0;
+    if (this.playing && this.motion) {
+      const period = 1000 / this.motion.fps;
+      this.since += this.before ? Math.min(now - this.before, 1000) : period;
+      this.before = now;
+      const steps = Math.floor(this.since / period);
+      this.since -= steps * period;
+      if (steps) this.seek((this.timestep + steps) % motionLength(this.motion));
+      this.wait();
+    }
+    if (this.stale) this.draw();
+  }
+}
+
+/** The middle of the box around points. */
+function middleOf(points: Float32Array): number[] {
+  return [0, 1, 2].map((axis) => {
+    let least = Infinity, most = -Infinity;
+    for (let i = axis; i < points.length; i += 3) {
+      least = Math.min(least, points[i]);
+      most = Math.max(most, points[i]);
+    }
+    return (least + most) / 2;
+  });
+}
