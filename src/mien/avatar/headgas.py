@@ -7,16 +7,21 @@ appended to the expression vector, because nothing else would move the gaze; the
 length unit of the encoding; and the opacity to prune by. The perceptual loss is not implemented yet.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mien.adam import FactoredGradient
 from mien.avatar.activation import sigmoid
-from mien.avatar.avatar import Avatar, ParameterGroup, Posed, network_group, store_group
+from mien.avatar.avatar import Avatar, ParameterGroup, Posed, factored_group, network_group, store_group
 from mien.avatar.baking import as_array
 from mien.avatar.density import GradientDensity
 from mien.avatar.encoding import positional_encoding
+from mien.avatar.expression_changes import expression_inputs, principal_directions
+from mien.avatar.feature_network import Layers, feature_network
 from mien.avatar.headgas_settings import HeadGasConfig
 from mien.avatar.schedules import TRAINED, Progress
 from mien.avatar.store import GaussianStore
@@ -26,6 +31,7 @@ from mien.render.rendering import Rendering
 from mien.runtime.baked import AttributeNetwork, Attributes, Static
 
 _CHUNK = 512
+_OLD_BASES = "feature_bases"
 
 
 class HeadGas(Avatar):
@@ -37,16 +43,18 @@ class HeadGas(Avatar):
         super().__init__(config, face_model, face)
         n, width = config.points, config.features
         means = sample_surface(face_model.head_vertices(self.subject)[0], face_model.faces, n)
-        inputs = face.expression.shape[1] + face.joints[0].numel()
+        rest, directions = input_directions(face, self.subject, config.directions)
+        self.rest, self.directions = (nn.Buffer(tensor) for tensor in (rest, directions))
         trained = {
             "means": means,
             "quats": means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             "log_scales": neighbour_distances(means).clamp_min(1e-6).log()[:, None].repeat(1, 3),
-            # The bases start at zero, as in the paper. With the inputs last, blending is one matrix-vector product.
-            "feature_bases": means.new_zeros(n, width, inputs),
+            # The bases start at zero, as in the paper.
+            "bases": means.new_zeros(n, directions.shape[1], width),
             "neutral_features": means.new_zeros(n, width),
         }
         self.store = GaussianStore(trained)
+        self._bases_gradient = FactoredGradient()
         self.network = nn.Sequential(
             nn.Linear(width + 3 + 6 * config.encoding_bands, config.hidden),
             nn.LeakyReLU(0.01),
@@ -60,11 +68,15 @@ class HeadGas(Avatar):
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in the head frame, one batch entry per timestep. Only their colours and opacities differ."""
         store = self.store
-        features = blend_features(store["feature_bases"], store["neutral_features"], face)
-        encoding = self._encoding().expand(len(face), -1, -1)
-        output = self.network(torch.cat([features, encoding], dim=-1))
-        sh = output[..., :-1].unflatten(-1, (self._coefficients, 3))
-        opacities = sigmoid(output[..., -1])
+        encoding, layers = self._encoding(), self._layers()
+        inputs = ((expression_inputs(face) - self.rest) @ self.directions).unbind(0)
+        outputs = [
+            feature_network(store["bases"], e, store["neutral_features"], encoding, layers, self._bases_gradient)
+            for e in inputs
+        ]
+        colours, opacity_logits = (_stacked(parts) for parts in zip(*outputs, strict=True))
+        sh = colours.unflatten(-1, (self._coefficients, 3))
+        opacities = sigmoid(opacity_logits)
         gaussians = Gaussians(
             store["means"], store["quats"], store["log_scales"].exp(), opacities, sh, head_poses(face)
         )
@@ -78,13 +90,24 @@ class HeadGas(Avatar):
         """One group per tensor, and one for the network."""
         config = self.config
         rates = {"means": config.means_rate, "log_scales": config.log_scales_rate, "quats": config.quats_rate}
-        rates |= {"feature_bases": config.features_rate, "neutral_features": config.features_rate}
+        rates |= {"neutral_features": config.features_rate}
         groups = [store_group(self.store, name, rate) for name, rate in rates.items()]
+        groups.append(factored_group(self.store, "bases", config.features_rate, self._bases_gradient))
         return [*groups, network_group("network", self.network, config.network_rate)]
 
     def gaussian_store(self) -> GaussianStore:
         """Every per-Gaussian tensor."""
         return self.store
+
+    def upgraded(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Older versions kept one basis per input and feature [n, f, i], without directions."""
+        old = f"store.trained.{_OLD_BASES}"
+        if old not in state or state[old].ndim != 3:
+            return state
+        bases = state[old]
+        rest, directions = bases.new_zeros(bases.shape[2]), torch.eye(bases.shape[2]).to(bases)
+        kept = {name: tensor for name, tensor in state.items() if name != old}
+        return kept | {"store.trained.bases": bases.mT.contiguous(), "rest": rest, "directions": directions}
 
     def density(self) -> GradientDensity:
         """Gradient-based control. Children copy features. Pruning uses the highest opacity since the last round."""
@@ -93,16 +116,18 @@ class HeadGas(Avatar):
     def bake(self) -> Static:
         """Static points, with the bases of the features and the network."""
         store = {name: as_array(self.store[name]) for name in self.store.names()}
-        layers = [layer for layer in self.network if isinstance(layer, nn.Linear)]
-        bases = self.store["feature_bases"].permute(2, 0, 1)
+        layers = self._layers()
+        # The directions expand exactly: each input of the face has its own basis.
+        bases = torch.einsum("ik,nkf->inf", self.directions, self.store["bases"])
+        neutral = self.store["neutral_features"] - torch.einsum("i,inf->nf", self.rest, bases)
         e = self.subject.expression.shape[1]
         network = AttributeNetwork(
             input="features",
-            base=np.concatenate([store["neutral_features"], as_array(self._encoding())], axis=1),
+            base=np.concatenate([as_array(neutral), as_array(self._encoding())], axis=1),
             basis=as_array(bases[:e]),
             joint_basis=as_array(bases[e:]),
-            weights=tuple(as_array(layer.weight) for layer in layers),
-            biases=tuple(as_array(layer.bias) for layer in layers),
+            weights=(as_array(layers.weight1), as_array(layers.weight2)),
+            biases=(as_array(layers.bias1), as_array(layers.bias2)),
             activation="leaky_relu",
             outputs=("sh", "opacity_logits"),
         )
@@ -122,6 +147,11 @@ class HeadGas(Avatar):
         assert isinstance(last, nn.Linear)
         return last
 
+    def _layers(self) -> Layers:
+        first, last = self.network[0], self._last_layer
+        assert isinstance(first, nn.Linear)
+        return Layers(first.weight, first.bias, last.weight, last.bias)
+
     def _encoding(self) -> Float[Tensor, "n c"]:
         # Detached, so that centres move only by their effect on the picture, not through the encoding of their
         # position.
@@ -129,13 +159,23 @@ class HeadGas(Avatar):
         return positional_encoding(points, self.config.encoding_bands)
 
 
-def blend_features(
-    bases: Float[Tensor, "n f i"], neutral: Float[Tensor, "n f"], face: FaceParams
-) -> Float[Tensor, "b n f"]:
-    """F = F^T e + f0, where e is the expression followed by the axis-angle vectors of the free joints, in radians."""
-    inputs = torch.cat([face.expression, face.joints.flatten(1)], dim=-1)
-    blended = bases.flatten(0, 1) @ inputs.T
-    return neutral + blended.T.unflatten(-1, tuple(neutral.shape))
+def input_directions(
+    face: FaceParams, neutral: FaceParams, count: int
+) -> tuple[Float[Tensor, " i"], Float[Tensor, "i k"]]:
+    """The inputs of the person at rest, and the directions along which the bases of features are weighted.
+
+    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. The
+    directions are those of the largest spread over the timesteps of `face`, at most `count` (0: as many as inputs),
+    scaled to a deviation of about 1. So one second moment serves the bases of all of them.
+    """
+    rest, inputs = expression_inputs(neutral)[0].detach(), expression_inputs(face)
+    directions, _ = principal_directions(inputs - rest, min(count or len(rest), len(rest)))
+    return rest.clone(), directions
+
+
+def _stacked(parts: Sequence[Tensor]) -> Tensor:
+    # Training poses one timestep at a time, and needs no copy.
+    return parts[0][None] if len(parts) == 1 else torch.stack(tuple(parts))
 
 
 def sample_surface(vertices: Float[Tensor, "v 3"], faces: Tensor, count: int) -> Float[Tensor, "n 3"]:

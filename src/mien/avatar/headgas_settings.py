@@ -20,6 +20,10 @@ class HeadGasConfig(MethodConfig):
     """Number of Gaussians at the start, sampled on the subject's mesh."""
     features: Annotated[int, Range(1, 1024)] = 16
     """Number of latent features per Gaussian (paper: 32). More features need more memory and time per step."""
+    directions: Annotated[int, Range(0, 1024)] = 0
+    """Number of directions of the face along which features change: those of the largest spread over the training
+    timesteps. 0 means as many as the face has inputs (expression coefficients and angles of joints), as in the paper.
+    Fewer need less memory and time per step; a finished avatar follows all inputs either way."""
     hidden: Annotated[int, Range(1, 4096)] = 64
     """Width of the network's only hidden layer."""
     encoding_bands: Annotated[int, Range(0, 24)] = 4
@@ -44,5 +48,5 @@ class HeadGasConfig(MethodConfig):
     reset. The first of `opacity_resets` after `start` still sets when large Gaussians are removed."""
 
 
-PRESETS = {"draft": HeadGasConfig(), "standard": HeadGasConfig()}
+PRESETS = {"draft": HeadGasConfig(directions=20), "standard": HeadGasConfig(directions=20)}
 """Settings of this method for each preset. They are equal: a draft is only a shorter run."""

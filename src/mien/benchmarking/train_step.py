@@ -89,7 +89,7 @@ def training_case(
 
     Both have the float dtype and the device of `like`.
     """
-    sequence = _sequence(face_model, width, height)
+    sequence = benchmark_sequence(face_model, width, height)
     state = start([sequence], face_model, GaussianAvatarsConfig(), SETTINGS, like)
     _grow(state.avatar, count)
     order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
@@ -102,7 +102,7 @@ def training_case(
             "opacity": torch.zeros(count),
         }
     )
-    _paint_targets(sequence, state.avatar, like)
+    paint_targets(sequence, state.avatar, like)
     return state, TrainingData(order, (Targets(sequence, 0, like=like),))
 
 
@@ -119,7 +119,7 @@ def _grow(avatar: Avatar, count: int) -> None:
     store.assign("sh_constant", 0.5 * torch.randn(count, 1, 3, generator=generator))
 
 
-def _sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
+def benchmark_sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
     """Return a head that turns and opens its mouth a little, with pictures that are still black."""
     time = torch.linspace(0, 2 * torch.pi, TIMESTEPS + 1)[:-1]
     neutral = face_model.neutral(TIMESTEPS)
@@ -147,7 +147,7 @@ def _sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
     return Sequence("benchmark", capture, tracking, np.zeros(pictures.shape[:-1], np.uint8))
 
 
-def _paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor) -> None:
+def paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor) -> None:
     """Paint pictures of the same head in noisy colours, so that every loss has a gradient."""
     noise = np.random.default_rng(0)
     for timestep in range(TIMESTEPS):
