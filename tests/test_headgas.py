@@ -7,13 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from mien.avatar import HeadGas, HeadGasConfig
+from mien.avatar import HeadGas, HeadGasConfig, Progress
 from mien.avatar.avatar import neutral_of
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.files import overwrite
-from mien.avatar.headgas import input_directions, neighbour_distances, sample_surface
+from mien.avatar.headgas import input_directions, neighbour_distances, sample_surface, spread_out
+from mien.avatar.headgas_settings import PRESET_STEPS, PRESETS
+from mien.avatar.settings import Photometric
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.runtime import pose
+from mien.training.density_control.gradient import _round_steps
 from toy_scene import runtime_face, toy_face, toy_face_model
 
 SMALL = HeadGasConfig(points=40, features=5, sh_degree=1)
@@ -135,9 +138,52 @@ def test_opacity_has_no_reset_and_counts_by_the_highest_seen() -> None:
     avatar = new_avatar()
     density = avatar.density()
     assert density.opacity_logits is None
-    assert density.settings.opacity_resets == ()
+    assert all(preset.density.opacity_resets == () for preset in PRESETS.values())
     seen = torch.rand(40)
     assert torch.equal(density.judged_opacities(avatar.store, seen), seen)
+
+
+def test_opacities_count_at_expressions_that_no_step_drew() -> None:
+    avatar, face = new_avatar(replace(SMALL, judged_expressions=5)), toy_face(5)
+    fill(avatar.store["bases"])
+    expected = avatar.pose(face).gaussians.opacities.amax(0)
+    found = avatar.density().judged_opacities(avatar.store, torch.zeros(40))
+    torch.testing.assert_close(found, expected.detach())
+    assert torch.equal(avatar.density().judged_opacities(avatar.store, torch.ones(40)), torch.ones(40))
+
+
+def test_judged_expressions_are_far_from_each_other() -> None:
+    points = torch.tensor([[0.0, 0], [0.1, 0], [5, 0], [0, 1], [5.1, 0], [0.1, 0.1]])
+    assert torch.equal(spread_out(points, 3), points[[4, 0, 3]])
+    assert torch.equal(spread_out(points, 0), points[:0])
+    assert len(spread_out(points, 100)) == 6
+
+
+def test_higher_degrees_learn_slower_and_begin_later() -> None:
+    config = replace(SMALL, sh_degree=3, sh_warmup=0.4, sh_higher_share=0.05)
+    avatar, face = new_avatar(config), toy_face(5)[1]
+    for parameter in avatar.network.parameters():
+        fill(parameter)
+    full = avatar.pose(face).gaussians.sh[0]
+    for step, active in ((0, 1), (99, 1), (100, 4), (200, 9), (300, 16), (1000, 16)):
+        sh = avatar.pose(face, Progress(step, 1000)).gaussians.sh[0]
+        torch.testing.assert_close(sh[:, :active], full[:, :active])
+        assert not bool(sh[:, active:].any())
+    plain = new_avatar(replace(config, sh_higher_share=1.0))
+    plain.load_state_dict(avatar.state_dict())
+    expected = plain.pose(face).gaussians.sh[0]
+    torch.testing.assert_close(full[:, :1], expected[:, :1])
+    torch.testing.assert_close(full[:, 1:], 0.05 * expected[:, 1:])
+    torch.testing.assert_close(torch.from_numpy(pose(avatar.bake(), runtime_face(face)).sh), full)
+
+
+def test_the_papers_schedule() -> None:
+    config, steps = PRESETS["paper"], PRESET_STEPS["paper"]
+    density = config.density
+    rounds = sorted(_round_steps(density.start, density.stop, density.rounds, steps))
+    assert (steps, rounds) == (50_000, list(range(500, 15_001, 100)))
+    assert (config.points, config.features, config.hidden, config.sh_degree, config.directions) == (2500, 32, 64, 3, 0)
+    assert config.photometric == Photometric(0.8, 0.2)
 
 
 def test_points_are_on_the_mesh_evenly_by_area() -> None:

@@ -23,7 +23,7 @@ from mien.avatar.encoding import positional_encoding
 from mien.avatar.expression_changes import expression_inputs, principal_directions
 from mien.avatar.feature_network import Layers, feature_network
 from mien.avatar.headgas_settings import HeadGasConfig
-from mien.avatar.schedules import TRAINED, Progress
+from mien.avatar.schedules import TRAINED, Progress, active_degree
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians
@@ -53,6 +53,9 @@ class HeadGas(Avatar):
             "bases": means.new_zeros(n, directions.shape[1], width),
             "neutral_features": means.new_zeros(n, width),
         }
+        spread = spread_out((expression_inputs(face) - rest) @ directions, config.judged_expressions)
+        # Not in files: only training needs it, and makes it anew.
+        self.judged = nn.Buffer(spread.detach().clone(), persistent=False)
         self.store = GaussianStore(trained)
         self._bases_gradient = FactoredGradient()
         self.network = nn.Sequential(
@@ -68,7 +71,7 @@ class HeadGas(Avatar):
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in the head frame, one batch entry per timestep. Only their colours and opacities differ."""
         store = self.store
-        encoding, layers = self._encoding(), self._layers()
+        encoding, layers = self._encoding(), self._layers(progress)
         inputs = ((expression_inputs(face) - self.rest) @ self.directions).unbind(0)
         outputs = [
             feature_network(store["bases"], e, store["neutral_features"], encoding, layers, self._bases_gradient)
@@ -91,7 +94,10 @@ class HeadGas(Avatar):
         config = self.config
         rates = {"means": config.means_rate, "log_scales": config.log_scales_rate, "quats": config.quats_rate}
         rates |= {"neutral_features": config.features_rate}
-        groups = [store_group(self.store, name, rate) for name, rate in rates.items()]
+        extent = {"means": config.means_times_extent}
+        groups = [
+            store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
+        ]
         groups.append(factored_group(self.store, "bases", config.features_rate, self._bases_gradient))
         return [*groups, network_group("network", self.network, config.network_rate)]
 
@@ -110,8 +116,23 @@ class HeadGas(Avatar):
         return kept | {"store.trained.bases": bases.mT.contiguous(), "rest": rest, "directions": directions}
 
     def density(self) -> GradientDensity:
-        """Gradient-based control. Children copy features. Pruning uses the highest opacity since the last round."""
-        return GradientDensity(self.config.density, opacity_logits=None)
+        """Gradient-based control. Children copy features. `judged_opacities` says which opacity counts."""
+        return GradientDensity(self.config.density, opacity_logits=None, judged_opacities=self.judged_opacities)
+
+    @torch.no_grad()
+    def judged_opacities(self, store: GaussianStore, seen: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """The highest opacity of each Gaussian at the judged expressions and in the steps since the last round.
+
+        The judged expressions are spread over those of training, so that Gaussians which rare expressions need, such as
+        teeth, are not pruned while these are not drawn.
+        """
+        highest, encoding, layers = seen, self._encoding(), self._layers()
+        for inputs in self.judged:
+            _, opacity_logits = feature_network(
+                store["bases"], inputs, store["neutral_features"], encoding, layers, self._bases_gradient
+            )
+            highest = torch.maximum(highest, sigmoid(opacity_logits))
+        return highest
 
     def bake(self) -> Static:
         """Static points, with the bases of the features and the network."""
@@ -147,10 +168,19 @@ class HeadGas(Avatar):
         assert isinstance(last, nn.Linear)
         return last
 
-    def _layers(self) -> Layers:
+    def _layers(self, progress: Progress = TRAINED) -> Layers:
         first, last = self.network[0], self._last_layer
         assert isinstance(first, nn.Linear)
-        return Layers(first.weight, first.bias, last.weight, last.bias)
+        shares = self._output_shares(progress).to(last.weight)
+        return Layers(first.weight, first.bias, last.weight * shares[:, None], last.bias * shares)
+
+    def _output_shares(self, progress: Progress) -> Float[Tensor, " o"]:
+        """Factors of the network's outputs: of the colours' higher degrees, a share, and 0 before they begin."""
+        config = self.config
+        shares = torch.ones(self._coefficients, 3)
+        shares[1:] = config.sh_higher_share
+        shares[(active_degree(config.sh_degree, config.sh_warmup, progress) + 1) ** 2 :] = 0
+        return torch.cat([shares.flatten(), torch.ones(1)])
 
     def _encoding(self) -> Float[Tensor, "n c"]:
         # Detached, so that centres move only by their effect on the picture, not through the encoding of their
@@ -176,6 +206,17 @@ def input_directions(
 def _stacked(parts: Sequence[Tensor]) -> Tensor:
     # Training poses one timestep at a time, and needs no copy.
     return parts[0][None] if len(parts) == 1 else torch.stack(tuple(parts))
+
+
+def spread_out(points: Float[Tensor, "t k"], count: int) -> Float[Tensor, "c k"]:
+    """At most `count` of the points: each is the farthest from those before it, the first from the mean."""
+    chosen: list[int] = []
+    distances = (points - points.mean(0)).norm(dim=-1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(distances.argmax()))
+        from_it = (points - points[chosen[-1]]).norm(dim=-1)
+        distances = from_it if len(chosen) == 1 else torch.minimum(distances, from_it)
+    return points[chosen]
 
 
 def sample_surface(vertices: Float[Tensor, "v 3"], faces: Tensor, count: int) -> Float[Tensor, "n 3"]:
