@@ -38,6 +38,9 @@ class HeadGas(Avatar):
     """Static Gaussians in the head frame, with colour and opacity from blended features."""
 
     config: HeadGasConfig
+    rest: Tensor
+    directions: Tensor
+    judged: Tensor
 
     def __init__(self, config: HeadGasConfig, face_model: FaceModel, face: FaceParams):
         super().__init__(config, face_model, face)
