@@ -28,7 +28,8 @@ struct NetworkArrays {
     group.read(neutral, own, weight1, bias1, weight2, bias2);
     const size_t features = neutral.shape(1), hidden = bias1.shape(0), width = bias2.shape(0);
     require(features >= 1 && hidden >= 1 && width >= 1, "features, hidden values and outputs must not be empty");
-    for (const size_t length : {features, own.shape(1), hidden, width}) checked_length(length, kMostWidth, "numbers in a row");
+    for (const size_t length : {features, own.shape(1), hidden, width})
+      checked_length(length, kMostWidth, "numbers in a row");
     require(own.shape(0) == neutral.shape(0), "every array must have one row per Gaussian");
     require(has_shape(weight1, hidden, features + own.shape(1)) && has_shape(weight2, width, hidden),
             "the layers do not fit each other");
@@ -86,7 +87,7 @@ struct KeptArrays {
 
 struct GradientArrays {
   static constexpr char kName[] = "FeatureGradients";
-  static constexpr const char* kFields[] = {"outputs", "last",  "features", "weight1",
+  static constexpr const char* kFields[] = {"outputs", "last",    "features", "weight1",
                                             "bias1",   "weight2", "bias2",    "inputs"};
   In<-1, -1> outputs;
   In<-1> last;
@@ -114,8 +115,8 @@ std::vector<mien::FeatureInput> inputs_of(const std::vector<BasesArrays>& arrays
   return items;
 }
 
-void feature_network(const Group<NetworkArrays>& group, const Bases& bases, const std::optional<Group<KeptArrays>>& keep,
-                     const Out<-1, -1>& outputs, const Out<-1>& last) {
+void feature_network(const Group<NetworkArrays>& group, const Bases& bases,
+                     const std::optional<Group<KeptArrays>>& keep, const Out<-1, -1>& outputs, const Out<-1>& last) {
   const NetworkArrays own(group);
   const std::vector<BasesArrays> arrays(bases.begin(), bases.end());
   const std::vector<mien::FeatureInput> items = inputs_of(arrays, own);
@@ -139,10 +140,10 @@ void feature_network_backward(const Group<NetworkArrays>& group, const Bases& ba
   const KeptArrays kept(keep, network);
   const GradientArrays out(gradients, own, items.size());
   const nb::gil_scoped_release release;
-  mien::feature_network_backward(
-      network, {items.data(), static_cast<int64_t>(items.size())}, {kept.features.data(), kept.hidden.data()},
-      {out.outputs.data(), out.last.data(), out.features.data(), out.weight1.data(), out.bias1.data(),
-       out.weight2.data(), out.bias2.data(), out.inputs.data()});
+  mien::feature_network_backward(network, {items.data(), static_cast<int64_t>(items.size())},
+                                 {kept.features.data(), kept.hidden.data()},
+                                 {out.outputs.data(), out.last.data(), out.features.data(), out.weight1.data(),
+                                  out.bias1.data(), out.weight2.data(), out.bias2.data(), out.inputs.data()});
 }
 
 void factored_update(const Out<-1, -1, -1>& values, const In<-1, -1>& rows, const In<-1>& columns,

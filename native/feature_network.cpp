@@ -118,8 +118,8 @@ void feature_network(const FeatureNetwork& network, const FeatureInputs& inputs,
   });
 }
 
-void feature_network_backward(const FeatureNetwork& network, const FeatureInputs& inputs,
-                              const FeatureKept& kept, const FeatureGradients& gradients) {
+void feature_network_backward(const FeatureNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
+                              const FeatureGradients& gradients) {
   const PaddedNetwork own = pad(network, true);
   const SumsLayout at = layout_of(own, inputs.count);
   const int64_t pieces = (network.count + kPiece - 1) / kPiece;
@@ -131,8 +131,8 @@ void feature_network_backward(const FeatureNetwork& network, const FeatureInputs
     float* const part = sums + (piece + 1) * at.size;
     std::fill_n(part, at.size, 0.0f);
     const FeatureSums into{part, part + at.first_bias, part + at.second, part + at.second_bias, part + at.inputs};
-    kernels.backward(own, inputs, kept, gradients, into, scratch_of(own),
-                     piece * kPiece, std::min((piece + 1) * kPiece, network.count));
+    kernels.backward(own, inputs, kept, gradients, into, scratch_of(own), piece * kPiece,
+                     std::min((piece + 1) * kPiece, network.count));
   });
   std::fill_n(sums, at.size, 0.0f);
   for (int64_t piece = 1; piece <= pieces; ++piece) {  // in the order of the Gaussians

@@ -47,8 +47,8 @@ struct FeatureGradients {
 };
 // Gaussians whose outputs have no gradient are not read. The gradient of the bases is never made: that of input k's
 // column is its value times `features`. The result does not depend on the number of threads. Runs on the pool.
-void feature_network_backward(const FeatureNetwork& network, const FeatureInputs& inputs,
-                              const FeatureKept& kept, const FeatureGradients& gradients);
+void feature_network_backward(const FeatureNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
+                              const FeatureGradients& gradients);
 
 // Adam without a first moment and with one second moment per row of factors, for values [n, k, f] whose gradient is the
 // outer product of `rows` [n, f] and `columns` [k].

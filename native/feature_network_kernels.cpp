@@ -85,8 +85,7 @@ void blend_one(const FeatureInputs& inputs, int64_t index, int width, float* to)
 }
 
 // The blended features of a block go into the first columns of `rows`.
-void blend(const PaddedNetwork& network, const FeatureInputs& inputs, int64_t first, int64_t count,
-           float* rows) {
+void blend(const PaddedNetwork& network, const FeatureInputs& inputs, int64_t first, int64_t count, float* rows) {
   const int width = network.own->features;
   for (int64_t i = 0; i < count; ++i) {
     memcpy(rows + i * network.in_stride, network.own->neutral + (first + i) * width, sizeof(float) * width);
@@ -95,7 +94,8 @@ void blend(const PaddedNetwork& network, const FeatureInputs& inputs, int64_t fi
   if (inputs.count > 0 && inputs.items[0].stride == width) {
     for (int64_t k = 0; k < inputs.count; ++k) {
       for (int64_t i = 0; i < count; ++i) {
-        add_scaled(inputs.items[k].column + (first + i) * width, inputs.items[k].value, width, rows + i * network.in_stride);
+        add_scaled(inputs.items[k].column + (first + i) * width, inputs.items[k].value, width,
+                   rows + i * network.in_stride);
       }
     }
   } else {
@@ -112,8 +112,8 @@ MIEN_INLINE void fill_own(const PaddedNetwork& network, int64_t index, float* ro
   for (int64_t c = features + own; c < network.in_stride; ++c) row[c] = 0;
 }
 
-void forward(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
-             float* outputs, float* last, float* scratch, int64_t first, int64_t end) {
+void forward(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept, float* outputs,
+             float* last, float* scratch, int64_t first, int64_t end) {
   [[maybe_unused]] const NoDenormals guard;
   const FeatureNetwork& own = *network.own;
   float* const rows = scratch;
@@ -193,8 +193,8 @@ void gather(const PaddedNetwork& network, const FeatureKept& kept, const Feature
   for (int64_t c = own.width; c < network.out_stride; ++c) by_out[c] = 0;
 }
 
-void backward_block(const PaddedNetwork& network, const FeatureInputs& inputs,
-                    const FeatureGradients& gradients, const FeatureSums& sums, const float* zeros, Block& block) {
+void backward_block(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureGradients& gradients,
+                    const FeatureSums& sums, const float* zeros, Block& block) {
   const FeatureNetwork& own = *network.own;
   multiply({block.by_out, network.out_stride, 1}, block.count, network.second_back, network.hidden_stride, own.width,
            zeros, 0, block.by_hidden);

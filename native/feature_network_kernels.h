@@ -28,8 +28,8 @@ struct FeatureSums {
 
 struct FeatureKernels {
   // `scratch` holds kFeatureBlock rows of each stride.
-  void (*forward)(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
-                  float* outputs, float* last, float* scratch, int64_t first, int64_t end);
+  void (*forward)(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept, float* outputs,
+                  float* last, float* scratch, int64_t first, int64_t end);
   void (*backward)(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
                    const FeatureGradients& gradients, const FeatureSums& sums, float* scratch, int64_t first,
                    int64_t end);

@@ -35,8 +35,9 @@ NetworkResult run(const Sizes& s, bool by_input) {
   const Floats own = random.normal(s.count * s.own), weight1 = random.normal(s.hidden * in);
   const Floats bias1 = random.normal(s.hidden), weight2 = random.normal(s.width * s.hidden);
   const Floats bias2 = random.normal(s.width);
-  const mien::FeatureNetwork network{s.count,        s.features,   s.own,          s.hidden,     s.width,       neutral.data(),
-                                     own.data(),     weight1.data(), bias1.data(), weight2.data(), bias2.data()};
+  const mien::FeatureNetwork network{s.count,      s.features,     s.own,       s.hidden,
+                                     s.width,      neutral.data(), own.data(),  weight1.data(),
+                                     bias1.data(), weight2.data(), bias2.data()};
   const auto items = inputs_of(s, bases, values, by_input);
   const mien::FeatureInputs inputs{items.data(), s.inputs};
   Floats features(s.count * s.features), hidden(s.count * mien::hidden_stride(s.hidden));
@@ -54,10 +55,9 @@ NetworkResult run(const Sizes& s, bool by_input) {
   }
   r.by_features.resize(neutral.size()), r.by_weight1.resize(weight1.size()), r.by_bias1.resize(s.hidden);
   r.by_weight2.resize(weight2.size()), r.by_bias2.resize(s.width), r.by_inputs.resize(s.inputs);
-  mien::feature_network_backward(
-      network, inputs, {features.data(), hidden.data()},
-      {by_outputs.data(), by_last.data(), r.by_features.data(), r.by_weight1.data(), r.by_bias1.data(),
-       r.by_weight2.data(), r.by_bias2.data(), r.by_inputs.data()});
+  mien::feature_network_backward(network, inputs, {features.data(), hidden.data()},
+                                 {by_outputs.data(), by_last.data(), r.by_features.data(), r.by_weight1.data(),
+                                  r.by_bias1.data(), r.by_weight2.data(), r.by_bias2.data(), r.by_inputs.data()});
   return r;
 }
 
@@ -83,7 +83,8 @@ void check_update() {
       Random random(5);
       const int64_t count = 1700, columns_count = 3;
       Floats values = random.normal(count * columns_count * width), second = random.uniform(count * width);
-      Floats weights = random.uniform(count), rows = random.normal(count * width), columns = random.normal(columns_count);
+      Floats weights = random.uniform(count), rows = random.normal(count * width),
+             columns = random.normal(columns_count);
       std::fill_n(rows.begin(), 5 * width, 0.0f);
       columns[1] = 0;
       mien::factored_update({values.data(), count, columns_count, width, rows.data(), columns.data(), second.data(),
