@@ -247,9 +247,9 @@ void backward(const PaddedNetwork& network, const FeatureInputs& inputs, const F
 
 // The step of each factor of one Gaussian, and its moments.
 MIEN_INLINE void factor_steps(const FactoredUpdate& task, float mean_square, int64_t index, float* steps) {
-  const float beta = 0.999f, weight = task.weights[index] * beta + (1 - beta);
+  const float beta = 0.999f, rest = 0.001f, weight = task.weights[index] * beta + rest;
   task.weights[index] = weight;
-  const float unbiased = 1 / weight, share = (1 - beta) * mean_square;
+  const float unbiased = 1 / weight, share = rest * mean_square;
   const float* factors = task.rows + index * task.width;
   float* second = task.second + index * task.width;
   int i = 0;

@@ -154,7 +154,7 @@ def test_opacities_count_at_expressions_that_no_step_drew() -> None:
 
 def test_judged_expressions_are_far_from_each_other() -> None:
     points = torch.tensor([[0.0, 0], [0.1, 0], [5, 0], [0, 1], [5.1, 0], [0.1, 0.1]])
-    assert torch.equal(spread_out(points, 3), points[[4, 0, 3]])
+    assert torch.equal(spread_out(points, 3), points[[4, 3, 1]])
     assert torch.equal(spread_out(points, 0), points[:0])
     assert len(spread_out(points, 100)) == 6
 
@@ -165,7 +165,7 @@ def test_higher_degrees_learn_slower_and_begin_later() -> None:
     for parameter in avatar.network.parameters():
         fill(parameter)
     full = avatar.pose(face).gaussians.sh[0]
-    for step, active in ((0, 1), (99, 1), (100, 4), (200, 9), (300, 16), (1000, 16)):
+    for step, active in ((0, 1), (99, 1), (100, 4), (200, 9), (301, 16), (1000, 16)):
         sh = avatar.pose(face, Progress(step, 1000)).gaussians.sh[0]
         torch.testing.assert_close(sh[:, :active], full[:, :active])
         assert not bool(sh[:, active:].any())

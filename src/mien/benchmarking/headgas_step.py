@@ -18,6 +18,7 @@ from mien.benchmarking.train_step import (
     SETTINGS,
     TIMESTEPS,
     benchmark_sequence,
+    empty_statistics,
     paint_targets,
     pose_and_render,
 )
@@ -29,6 +30,8 @@ from mien.training.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 
 COUNT, SIZE = 30_000, (512, 512)
+POINTS = 3_000
+"""Number of points on the mesh, of which the Gaussians are copies nearby."""
 
 
 def headgas_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
@@ -64,10 +67,11 @@ def headgas_case(
 ) -> tuple[TrainingState, TrainingData]:
     """Return a state in the middle of a run with `count` Gaussians, and its pictures of (width, height) `size`."""
     sequence = benchmark_sequence(face_model, *size)
-    state = start([sequence], face_model, replace(config, points=count), SETTINGS)
+    state = start([sequence], face_model, replace(config, points=POINTS), SETTINGS)
     avatar = state.avatar
     assert isinstance(avatar, HeadGas)
     _fill(avatar, count)
+    state.density.load_state(empty_statistics(count))
     paint_targets(sequence, avatar, torch.zeros(()))
     order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
     return state, TrainingData(order, (Targets(sequence, 0),))
@@ -77,6 +81,8 @@ def headgas_case(
 def _fill(avatar: HeadGas, count: int) -> None:
     """Give an avatar small and mostly opaque Gaussians that change with the expression, as training would."""
     store, generator = avatar.gaussian_store(), torch.Generator().manual_seed(0)
+    store.select(torch.arange(count) % len(store))
+    store.assign("means", store["means"] + 0.002 * torch.randn(count, 3, generator=generator))
     store.assign("quats", torch.randn(count, 4, generator=generator))
     spread = 0.35 * torch.randn(count, 3, generator=generator)
     store.assign("log_scales", spread - 7.5 - 0.5 * torch.tensor(count / 30_000).log())

@@ -94,16 +94,15 @@ def training_case(
     _grow(state.avatar, count)
     order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
     state = TrainingState(state.avatar, state.adam, state.density, state.track, {})
-    state.density.load_state(
-        {
-            "pull": torch.zeros(count),
-            "seen": torch.zeros(count),
-            "radius": torch.zeros(count, dtype=torch.int32),
-            "opacity": torch.zeros(count),
-        }
-    )
+    state.density.load_state(empty_statistics(count))
     paint_targets(sequence, state.avatar, like)
     return state, TrainingData(order, (Targets(sequence, 0, like=like),))
+
+
+def empty_statistics(count: int) -> dict[str, Tensor]:
+    """The statistics of density control for `count` Gaussians that no step has seen."""
+    floats = {name: torch.zeros(count) for name in ("pull", "seen", "opacity")}
+    return floats | {"radius": torch.zeros(count, dtype=torch.int32)}
 
 
 def _grow(avatar: Avatar, count: int) -> None:
