@@ -5,6 +5,7 @@ void bind_activation(nanobind::module_& module);
 void bind_composite(nanobind::module_& module);
 void bind_expression_change(nanobind::module_& module);
 void bind_face(nanobind::module_& module);
+void bind_feature_network(nanobind::module_& module);
 void bind_memory(nanobind::module_& module);
 void bind_mesh(nanobind::module_& module);
 void bind_mesh_align(nanobind::module_& module);
@@ -21,6 +22,7 @@ NB_MODULE(_native, module) {
   bind_composite(module);
   bind_expression_change(module);
   bind_face(module);
+  bind_feature_network(module);
   bind_memory(module);
   bind_mesh(module);
   bind_mesh_align(module);

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,10 @@ import pytest
 import torch
 
 from mien import _native
+from mien.avatar.headgas_settings import PRESETS as HEADGAS_PRESETS
 from mien.benchmarking import device as device_benchmark
+from mien.benchmarking import headgas_step, train_step
 from mien.benchmarking import render as render_benchmark
-from mien.benchmarking import train_step
 from mien.benchmarking.charts import write_scaling_chart
 from mien.benchmarking.scenes import head_scene
 from mien.benchmarking.timing import BenchmarkRow, measure_machine, time_function
@@ -105,6 +107,17 @@ def test_a_training_case_trains() -> None:
     assert not torch.equal(before, state.avatar.gaussian_store()["sh_constant"])
     target = data.targets[0].target(0, 0, np.full(3, 255, np.uint8), keep=False)
     assert 0.2 < (target.matte > 127).float().mean() < 0.7  # the head fills about half of the picture
+
+
+def test_a_headgas_case_trains() -> None:
+    config = replace(HEADGAS_PRESETS["standard"], features=4)
+    state, data = headgas_step.headgas_case(load_face_model(), config, 500, (96, 80))
+    before = state.avatar.gaussian_store()["bases"].detach().clone()
+    assert 0.2 < (data.targets[0].target(0, 0, np.full(3, 255, np.uint8), False).matte > 127).float().mean() < 0.8
+    for _ in range(3):
+        step(state, data, train_step.SETTINGS)
+    assert before.shape == (500, 20, 4)
+    assert not torch.equal(before, state.avatar.gaussian_store()["bases"])
 
 
 def test_waiting_for_a_picture_is_measured_with_and_without_the_worker() -> None:

@@ -267,6 +267,12 @@ def test_resets_have_a_switch_that_leaves_the_time_of_size_pruning(on: bool) -> 
     assert store["face_index"].tolist() == [0]
 
 
+@pytest.mark.parametrize(("begin", "kept"), [(0.0, [0, 1]), (0.99, [0, 1, 3, 4])])
+def test_pruning_by_size_may_begin_without_resets(begin: float, kept: list[int]) -> None:
+    settings = replace(EVERY_STEP, size_start=begin, prune_radius=20.0)
+    assert faces_after(settings, BELOW) == kept
+
+
 def test_sizes_may_be_parts_of_the_extent_of_the_cameras() -> None:
     settings = replace(EVERY_STEP, size_unit="extent", split_size=0.01, prune_size=0.1, opacity_resets=(0.5,))
     for extent, expected in ((1.0, [0, 0, 1, 1]), (4.0, [0, 0, 1, 1, 2, 2]), (0.5, [0, 0])):

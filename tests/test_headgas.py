@@ -1,15 +1,22 @@
 """HeadGaS follows its formulas."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import pytest
 import torch
 from torch import Tensor
 
-from mien.avatar import HeadGas, HeadGasConfig
+from mien.avatar import HeadGas, HeadGasConfig, Progress
+from mien.avatar.avatar import neutral_of
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.headgas import blend_features, neighbour_distances, sample_surface
+from mien.avatar.files import overwrite
+from mien.avatar.headgas import input_directions, neighbour_distances, sample_surface, spread_out
+from mien.avatar.headgas_settings import PRESET_STEPS, PRESETS
+from mien.avatar.settings import Photometric
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.runtime import pose
+from mien.training.density_control.gradient import _round_steps
 from toy_scene import runtime_face, toy_face, toy_face_model
 
 SMALL = HeadGasConfig(points=40, features=5, sh_degree=1)
@@ -29,34 +36,57 @@ def inputs_of(face: FaceParams) -> Tensor:
     return torch.cat([face.expression, face.joints.reshape(len(face), -1)], dim=-1)
 
 
-def test_features_blend_linearly() -> None:
+def blended(avatar: HeadGas, face: FaceParams) -> Tensor:
+    """The features [b, n, f] by the formula."""
+    inputs = (inputs_of(face) - avatar.rest) @ avatar.directions
+    return avatar.store["neutral_features"] + torch.einsum("bk,nkf->bnf", inputs, avatar.store["bases"])
+
+
+def test_the_person_at_rest_has_the_neutral_features() -> None:
+    avatar = new_avatar()
+    fill(avatar.store["bases"])
+    assert torch.equal(blended(avatar, avatar.subject)[0], avatar.store["neutral_features"])
+
+
+def test_all_directions_span_the_inputs_and_few_the_largest_spread() -> None:
+    face = toy_face(50)
+    rest, every = input_directions(face, neutral_of(face), 0)
+    _, two = input_directions(face, neutral_of(face), 2)
+    assert torch.equal(rest, inputs_of(neutral_of(face))[0])
+    assert every.shape == (5, 5)
+    assert two.shape == (5, 2)
+    assert torch.equal(every[:, :2], two)
+    offsets = inputs_of(face) - rest
+    deviations = (offsets @ every).std(0)
+    assert float(deviations.max()) == pytest.approx(1, abs=0.05)
+    # Two angles never change and the third follows an expression, so three directions are 0. The others lose nothing.
+    used = every[:, every.abs().sum(0) > 0]
+    assert used.shape[1] == 2
+    torch.testing.assert_close((offsets - offsets.mean(0)) @ used @ torch.linalg.pinv(used), offsets - offsets.mean(0))
+
+
+def test_avatars_of_older_versions_have_the_same_features() -> None:
     avatar, face = new_avatar(), toy_face(5)
-    fill(avatar.store["feature_bases"])
-    fill(avatar.store["neutral_features"], 2)
-    F, f0 = avatar.store["feature_bases"].detach(), avatar.store["neutral_features"].detach()
-    e = inputs_of(face)
-    for timestep in range(5):
-        for index in (0, 17):
-            expected = f0[index] + sum(e[timestep, k] * F[index, :, k] for k in range(e.shape[1]))
-            torch.testing.assert_close(blend_features(F, f0, face)[timestep, index], expected)
-
-
-def test_zero_expression_gives_the_neutral_features() -> None:
-    face_model = toy_face_model()
-    F, f0 = torch.randn(7, 4, 5), torch.randn(7, 4)
-    assert torch.equal(blend_features(F, f0, face_model.neutral(2)), f0.expand(2, 7, 4))
+    old = {name: tensor.clone() for name, tensor in avatar.state_dict().items()}
+    bases = torch.randn(40, 5, 5)
+    for name in ("store.trained.bases", "rest", "directions"):
+        del old[name]
+    old["store.trained.feature_bases"] = bases
+    overwrite(avatar, old, 40, Path("old"))
+    expected = avatar.store["neutral_features"] + torch.einsum("nfi,bi->bnf", bases, inputs_of(face))
+    torch.testing.assert_close(blended(avatar, face), expected)
 
 
 def test_colour_and_opacity_are_the_networks_of_features_and_place() -> None:
     avatar, face = new_avatar(), toy_face(5)[2]
-    fill(avatar.store["feature_bases"])
+    fill(avatar.store["bases"])
     fill(avatar.store["neutral_features"], 2)
     gaussians = avatar.pose(face).gaussians
     first, _, last = avatar.network
     assert isinstance(first, torch.nn.Linear)
     assert isinstance(last, torch.nn.Linear)
     points = avatar.store["means"].detach() / SMALL.encoding_length
-    features = (avatar.store["feature_bases"] @ inputs_of(face)[0]) + avatar.store["neutral_features"]
+    features = blended(avatar, face)[0]
     values = torch.cat([features, positional_encoding(points, SMALL.encoding_bands)], dim=-1) @ first.weight.T
     values = values + first.bias
     values = torch.where(values < 0, 0.01 * values, values) @ last.weight.T + last.bias
@@ -66,7 +96,7 @@ def test_colour_and_opacity_are_the_networks_of_features_and_place() -> None:
 
 def test_nothing_moves_in_the_head_frame() -> None:
     avatar, face = new_avatar(), toy_face(5)
-    fill(avatar.store["feature_bases"])
+    fill(avatar.store["bases"])
     gaussians = avatar.pose(face).gaussians
     assert gaussians.means.shape == gaussians.scales.shape == (40, 3)
     assert gaussians.T_world_local is not None
@@ -83,7 +113,7 @@ def test_starts_grey_faint_and_the_same_for_all_expressions() -> None:
 
 def test_joints_change_colours_also_when_baked() -> None:
     avatar, face = new_avatar(), toy_face(5)
-    fill(avatar.store["feature_bases"])
+    fill(avatar.store["bases"])
     turned = replace(face, joints=face.joints + 0.2)
     ours, baked = avatar.pose(turned).gaussians, avatar.bake()
     assert not torch.allclose(ours.sh, avatar.pose(face).gaussians.sh)
@@ -95,11 +125,11 @@ def test_joints_change_colours_also_when_baked() -> None:
 
 def test_children_of_a_split_copy_features() -> None:
     avatar = new_avatar()
-    fill(avatar.store["feature_bases"])
+    fill(avatar.store["bases"])
     fill(avatar.store["neutral_features"])
     parents = torch.tensor([3, 3, 9])
     avatar.store.append(parents, avatar.density().split(avatar.store, parents, torch.randn(3, 3)))
-    for name in ("feature_bases", "neutral_features"):
+    for name in ("bases", "neutral_features"):
         assert torch.equal(avatar.store[name][-3:], avatar.store[name][parents])
     assert not torch.equal(avatar.store["means"][-3:], avatar.store["means"][parents])
 
@@ -108,9 +138,52 @@ def test_opacity_has_no_reset_and_counts_by_the_highest_seen() -> None:
     avatar = new_avatar()
     density = avatar.density()
     assert density.opacity_logits is None
-    assert density.settings.opacity_resets == ()
+    assert all(preset.density.opacity_resets == () for preset in PRESETS.values())
     seen = torch.rand(40)
     assert torch.equal(density.judged_opacities(avatar.store, seen), seen)
+
+
+def test_opacities_count_at_expressions_that_no_step_drew() -> None:
+    avatar, face = new_avatar(replace(SMALL, judged_expressions=5)), toy_face(5)
+    fill(avatar.store["bases"])
+    expected = avatar.pose(face).gaussians.opacities.amax(0)
+    found = avatar.density().judged_opacities(avatar.store, torch.zeros(40))
+    torch.testing.assert_close(found, expected.detach())
+    assert torch.equal(avatar.density().judged_opacities(avatar.store, torch.ones(40)), torch.ones(40))
+
+
+def test_judged_expressions_are_far_from_each_other() -> None:
+    points = torch.tensor([[0.0, 0], [0.1, 0], [5, 0], [0, 1], [5.1, 0], [0.1, 0.1]])
+    assert torch.equal(spread_out(points, 3), points[[4, 3, 1]])
+    assert torch.equal(spread_out(points, 0), points[:0])
+    assert len(spread_out(points, 100)) == 6
+
+
+def test_higher_degrees_learn_slower_and_begin_later() -> None:
+    config = replace(SMALL, sh_degree=3, sh_warmup=0.4, sh_higher_share=0.05)
+    avatar, face = new_avatar(config), toy_face(5)[1]
+    for parameter in avatar.network.parameters():
+        fill(parameter)
+    full = avatar.pose(face).gaussians.sh[0]
+    for step, active in ((0, 1), (99, 1), (100, 4), (200, 9), (301, 16), (1000, 16)):
+        sh = avatar.pose(face, Progress(step, 1000)).gaussians.sh[0]
+        torch.testing.assert_close(sh[:, :active], full[:, :active])
+        assert not bool(sh[:, active:].any())
+    plain = new_avatar(replace(config, sh_higher_share=1.0))
+    plain.load_state_dict(avatar.state_dict())
+    expected = plain.pose(face).gaussians.sh[0]
+    torch.testing.assert_close(full[:, :1], expected[:, :1])
+    torch.testing.assert_close(full[:, 1:], 0.05 * expected[:, 1:])
+    torch.testing.assert_close(torch.from_numpy(pose(avatar.bake(), runtime_face(face)).sh), full)
+
+
+def test_the_papers_schedule() -> None:
+    config, steps = PRESETS["paper"], PRESET_STEPS["paper"]
+    density = config.density
+    rounds = sorted(_round_steps(density.start, density.stop, density.rounds, steps))
+    assert (steps, rounds) == (50_000, list(range(500, 15_001, 100)))
+    assert (config.points, config.features, config.hidden, config.sh_degree, config.directions) == (2500, 32, 64, 3, 0)
+    assert config.photometric == Photometric(0.8, 0.2)
 
 
 def test_points_are_on_the_mesh_evenly_by_area() -> None:

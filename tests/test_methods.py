@@ -16,6 +16,7 @@ from mien.avatar import (
     Avatar,
     FixedDensity,
     MethodConfig,
+    ParameterGroup,
     Progress,
     load_avatar,
     make_portable,
@@ -78,7 +79,7 @@ def test_density_control_keeps_all_tensors_equally_long(method: str) -> None:
         step(state, data, SETTINGS)
         store = state.avatar.gaussian_store()
         lengths = {len(store[name]) for name in store.names()}
-        lengths |= {len(m.first) for m in store.moments.values()} | {len(m.second) for m in store.moments.values()}
+        lengths |= {len(getattr(m, field)) for m in store.moments.values() for field in m.PER_ROW}
         lengths |= {len(tensor) for tensor in state.density.state().values()}
         assert lengths == {len(store)}
         counts.add(len(store))
@@ -130,10 +131,12 @@ def test_gradients_are_finite_and_reach_everything_that_is_trained(method: str) 
     ((rendering.image - 0.3).square().mean() + sum(losses.values())).backward()
     assert rendering.means2d_offset.grad is not None
     for group in avatar.parameter_groups():
-        for name, tensor in group.tensors.items():
-            assert tensor.grad is not None, f"{group.name}/{name} has no gradient"
-            assert tensor.grad.isfinite().all(), f"{group.name}/{name}"
-        assert any(bool((tensor.grad != 0).any()) for tensor in group.tensors.values()), f"{group.name} has no effect"
+        gradients = {name: _gradient_of(group, name) for name in group.tensors}
+        for name, gradient in gradients.items():
+            assert gradient is not None, f"{group.name}/{name} has no gradient"
+            assert gradient.shape == group.tensors[name].shape
+            assert gradient.isfinite().all(), f"{group.name}/{name}"
+        assert any(bool((gradient != 0).any()) for gradient in gradients.values()), f"{group.name} has no effect"
 
 
 @method
@@ -178,6 +181,14 @@ def test_density_description_is_one_that_the_trainer_knows(method: str) -> None:
     avatar = new_avatar(method)
     strategy = density_strategy(avatar.density(), avatar.gaussian_store())
     assert all(len(tensor) == len(avatar.gaussian_store()) for tensor in strategy.state().values())
+
+
+def _gradient_of(group: ParameterGroup, name: str) -> torch.Tensor | None:
+    """The gradient of a tensor; one of factors is multiplied out."""
+    if name not in group.factored:
+        return group.tensors[name].grad
+    products = [rows[:, None] * columns[:, None] for rows, columns in group.factored[name].terms]
+    return torch.stack(products).sum(0) if products else None
 
 
 def _disturb(avatar: Avatar) -> None:

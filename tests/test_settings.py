@@ -141,7 +141,7 @@ def test_face_tuning_has_two_options_that_agree(line: str, choices: Any) -> None
         ("--method.max-gaussians 2", "did you mean --method.density.max-gaussians?"),
         ("--method.density.split 2", "did you mean --method.density.split-size? there are: --method.density.start"),
         ("--method.density 2", "--method.density: is a group of settings of gaussian_avatars; there are: --method.de"),
-        ("--method headgas --method.sh-warmup 1", "headgas has no such setting"),
+        ("--method headgas --method.sh-frame head", "headgas has no such setting"),
         ("--training.resolutions 3", "--training.resolution"),
         ("--method.sh-degree 4", "--method.sh-degree 4: give a number from 0 to 3"),
         ("--method.sh-degree 1.5", "--method.sh-degree"),
@@ -197,7 +197,10 @@ def test_options_win_over_the_file_and_the_file_over_the_preset(choices: Any) ->
     config, settings = choices("--hold-out --method.features 8 --steps 50 --preset draft --seed 0", file)
     assert (config, settings) == (HeadGasConfig(features=8, density=density), TrainSettings(steps=50, record_every=7))
     assert choices("--preset draft", {"settings": {"split": "tail"}})[1] == TrainSettings(steps=8000, split="tail")
-    assert choices("--method headgas", {"settings": {"seed": 1}}) == (HeadGasConfig(), TrainSettings(seed=1))
+    assert choices("--method headgas", {"settings": {"seed": 1}}) == (
+        METHODS["headgas"].presets["standard"],
+        TrainSettings(seed=1),
+    )
     assert choices("", {}) == choices("")
 
 

@@ -245,6 +245,21 @@ def test_face_track_is_still_where_tuning_is_off() -> None:
     assert track.state() == {}
 
 
+def test_tuned_expressions_stay_within_their_bounds_or_where_they_were_tracked() -> None:
+    start, adam = toy_face(6), Adam()
+    bounds = torch.tensor([[0.0, 1.0], [0.3, 0.4]])
+    assert float(start.expression[0, 1]) < 0.3
+    for within, lowest in ((True, [0.495, 0.0]), (False, None)):
+        tuning = FaceTuning(expression=Rate(0.1), within_bounds=within)
+        track = FaceTrack(start, tuning, bounds=bounds + torch.tensor([[0.495, 0.0], [0.0, 0.0]]))
+        for step in range(4):
+            track.face(0).expression.sum().backward()
+            adam.step(track.parameter_groups(0), Progress(step, 10))
+            track.confine(0)
+        expected = torch.tensor(lowest) if lowest else start.expression[0] - 0.4
+        torch.testing.assert_close(track.face(0).expression[0].detach(), expected)
+
+
 def test_moments_begin_at_zero() -> None:
     moments = Moments.zeros(torch.ones(3))
     assert moments.first.eq(0).all()

@@ -51,6 +51,7 @@ void check_pool();
 void check_rasterizer();
 void check_training_step();
 void check_face();
+void check_feature_network();
 void check_mesh();
 
 }  // namespace checks

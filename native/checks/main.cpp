@@ -12,6 +12,7 @@ int main() {
     checks::check_rasterizer();
     checks::check_training_step();
     checks::check_face();
+    checks::check_feature_network();
   }
   mien::set_thread_count(1);  // joins the workers
   std::printf("all checks passed\n");

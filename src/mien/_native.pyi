@@ -380,3 +380,50 @@ def expression_change_backward(
 # native/bind_activation.cpp; any shape
 def sigmoid(values: Tensor, out: Tensor) -> None: ...
 def sigmoid_backward(outputs: Tensor, gradient: Tensor, out: Tensor) -> None: ...
+
+# native/bind_feature_network.cpp; n Gaussians, k inputs, f features, x own numbers, h hidden values, o outputs
+class FeatureNetwork(NamedTuple):
+    neutral: Tensor
+    own: Tensor
+    weight1: Tensor
+    bias1: Tensor
+    weight2: Tensor
+    bias2: Tensor
+
+class FeatureBases(NamedTuple):
+    values: Tensor
+    """[n, k, f], or [k, n, f] with `by_input`."""
+    inputs: Tensor
+    by_input: bool
+
+class FeatureKept(NamedTuple):
+    features: Tensor
+    """[n, f]"""
+    hidden: Tensor
+    """[n, h], with h rounded up to a multiple of 16."""
+
+class FeatureGradients(NamedTuple):
+    """The gradients of the two outputs, and those that are filled. `features` is also the gradient of `neutral`."""
+
+    outputs: Tensor
+    last: Tensor
+    features: Tensor
+    weight1: Tensor
+    bias1: Tensor
+    weight2: Tensor
+    bias2: Tensor
+    inputs: Tensor
+    """Of the inputs of all bases, in their order."""
+
+def feature_network(
+    network: FeatureNetwork, bases: Sequence[FeatureBases], kept: FeatureKept | None, outputs: Tensor, last: Tensor
+) -> None:
+    """Fills `kept`, `outputs` [n, o - 1] and `last` [n]."""
+
+def feature_network_backward(
+    network: FeatureNetwork, bases: Sequence[FeatureBases], kept: FeatureKept, gradients: FeatureGradients
+) -> None: ...
+def factored_update(
+    values: Tensor, rows: Tensor, columns: Tensor, second: Tensor, weights: Tensor, rate: float
+) -> None:
+    """Updates `values` [n, k, f], `second` [n, f] and `weights` [n]. The gradient is rows [n, f] times columns [k]."""

@@ -1,6 +1,7 @@
 """Adam's state for one tensor, which training and the paper's tracking share. Each has its own update."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -14,6 +15,9 @@ BETA1, BETA2 = 0.9, 0.999
 class Moments:
     """Adam's state for one tensor. Mutable."""
 
+    PER_ROW: ClassVar = ("first", "second")
+    """Fields with the first axis of the tensor."""
+
     first: Tensor
     """Running mean of the gradient."""
     second: Tensor
@@ -26,3 +30,41 @@ class Moments:
         """The state before the first update of a tensor."""
         # The step count stays on the CPU: numbers computed from it are needed there and must not wait for a GPU.
         return Moments(torch.zeros_like(like), torch.zeros_like(like), torch.zeros((), dtype=like.dtype))
+
+
+@dataclass(eq=False)
+class FactoredMoments:
+    """The optimiser's state for a tensor [n, k, f] with a `FactoredGradient`. Mutable.
+
+    There is no running mean of the gradient, and one second moment for all k. A row of the tensor without a gradient
+    keeps its state, so each row has its own bias correction.
+    """
+
+    PER_ROW: ClassVar = ("second", "weights")
+    """Fields with the first axis of the tensor."""
+
+    second: Float[Tensor, "n f"]
+    """Running mean of the squared gradient, which is itself a mean over the axis of k."""
+    weights: Float[Tensor, " n"]
+    """Running mean of 1, which `second` is divided by: 1 - BETA2 to the number of updates of the row."""
+
+    @staticmethod
+    def zeros(like: Float[Tensor, "n k f"]) -> "FactoredMoments":
+        """The state before the first update of a tensor."""
+        return FactoredMoments(torch.zeros_like(like[:, 0]), like.new_zeros(len(like)))
+
+
+@dataclass(eq=False)
+class FactoredGradient:
+    """The gradient of a tensor [n, k, f] as a sum of outer products, so that it is never made. Mutable.
+
+    A backward pass adds to it and the optimiser clears it, like `Tensor.grad`.
+    """
+
+    terms: list[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]] = field(default_factory=list)
+    """Rows and columns: each term adds rows[n, f] columns[k]."""
+
+    def take(self) -> list[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]]:
+        """Return the terms, and clear them."""
+        terms, self.terms = self.terms, []
+        return terms

@@ -60,6 +60,42 @@ def expression_change_backward(native: Any, rng: Rng) -> Arguments:
     return [normal(rng, *shape, r), normal(rng, r), normal(rng, *shape), empty(*shape, r), empty(r)]
 
 
+# Blended features
+
+
+def network_of(native: Any, rng: Rng) -> tuple[Any, list[Any], tuple[int, ...]]:
+    """Return a network, bases in both orders, and the numbers of Gaussians, features, hidden values and outputs."""
+    n, f, x, h, o = few(rng), *(int(rng.integers(1, 20)) for _ in range(4))
+    layers = normal(rng, h, f + x), normal(rng, h), normal(rng, o, h), normal(rng, o)
+    k, j = int(rng.integers(0, 5)), int(rng.integers(0, 4))
+    bases = [
+        native.FeatureBases(normal(rng, n, k, f), normal(rng, k), False),
+        native.FeatureBases(normal(rng, j, n, f), normal(rng, j), True),
+    ]
+    return native.FeatureNetwork(normal(rng, n, f), normal(rng, n, x), *layers), bases, (n, f, h, o)
+
+
+def feature_network(native: Any, rng: Rng) -> Arguments:
+    network, bases, (n, f, h, o) = network_of(native, rng)
+    kept = native.FeatureKept(empty(n, f), empty(n, -(-h // 16) * 16)) if rng.random() < 0.5 else None
+    return [network, bases, kept, empty(n, o - 1), empty(n)]
+
+
+def feature_network_backward(native: Any, rng: Rng) -> Arguments:
+    network, bases, (n, f, h, o) = network_of(native, rng)
+    kept = native.FeatureKept(normal(rng, n, f), normal(rng, n, -(-h // 16) * 16))
+    by_layers = [np.empty_like(array) for array in network[2:]]
+    by_inputs = empty(sum(len(one.inputs) for one in bases))
+    gradients = native.FeatureGradients(normal(rng, n, o - 1), normal(rng, n), empty(n, f), *by_layers, by_inputs)
+    return [network, bases, kept, gradients]
+
+
+def factored_update(native: Any, rng: Rng) -> Arguments:
+    n, k, f = few(rng), int(rng.integers(0, 5)), int(rng.integers(1, 20))
+    moments = np.abs(normal(rng, n, f)), np.abs(normal(rng, n))
+    return [normal(rng, n, k, f), normal(rng, n, f), normal(rng, k), *moments, 0.01]
+
+
 # Faces
 
 Sizes = tuple[int, int, int]
@@ -262,6 +298,7 @@ BASELINES: dict[str, Baseline] = {
     one.__name__: one
     for one in (
         sigmoid, sigmoid_backward, expression_activations, expression_change, expression_change_backward,
+        feature_network, feature_network_backward, factored_update,
         make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
         compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,

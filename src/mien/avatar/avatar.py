@@ -6,15 +6,16 @@ a method"). Methods that stay keep their settings in a file of their own, which 
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mien.adam import FactoredGradient, FactoredMoments, Moments
 from mien.avatar.density import DensityControl
 from mien.avatar.schedules import TRAINED, Progress, Rate
 from mien.avatar.settings import MethodConfig
-from mien.avatar.store import GaussianStore, Moments
+from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
@@ -41,11 +42,13 @@ class ParameterGroup:
     tensors: Mapping[str, Tensor]
     """Leaves of the autograd graph, by name."""
     rate: Rate
-    moments: dict[str, Moments] | None = None
+    moments: dict[str, Moments | FactoredMoments] | None = None
     """State of the optimiser, by the names of `tensors`. If it is None, the optimiser keeps the state
     itself, by group and name."""
     times_extent: bool = False
     """Whether the rate is multiplied by the extent of the cameras (`Progress.extent`)."""
+    factored: Mapping[str, FactoredGradient] = field(default_factory=dict)
+    """Gradients, by the names of `tensors`, that `Tensor.grad` does not hold."""
 
     def rate_at(self, progress: Progress) -> float:
         """The learning rate at a step."""
@@ -55,6 +58,11 @@ class ParameterGroup:
 def store_group(store: GaussianStore, name: str, rate: Rate, *, times_extent: bool = False) -> ParameterGroup:
     """The group of one per-Gaussian tensor; its optimiser state stays in the store."""
     return ParameterGroup(name, {name: store[name]}, rate, store.moments, times_extent)
+
+
+def factored_group(store: GaussianStore, name: str, rate: Rate, gradient: FactoredGradient) -> ParameterGroup:
+    """The group of one per-Gaussian tensor [n, k, f] whose gradient is a sum of outer products."""
+    return ParameterGroup(name, {name: store[name]}, rate, store.moments, factored={name: gradient})
 
 
 def network_group(name: str, network: nn.Module, rate: Rate) -> ParameterGroup:
@@ -105,6 +113,10 @@ class Avatar(nn.Module, ABC):
 
     def paint(self, colors: Float[Tensor, "v 3"]) -> None:
         """Take the face model's vertices' mean colours in the training pictures, 0..1, as first colours."""
+
+    def upgraded(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the tensors of a file that an older version wrote, as this version names them. Most need no change."""
+        return state
 
     @abstractmethod
     def bake(self) -> BakedAvatar:

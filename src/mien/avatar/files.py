@@ -111,6 +111,7 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
     Raises:
         UserError: `state`, which was read from `source`, does not belong to this method and config, or cannot be posed.
     """
+    state = avatar.upgraded(state)
     misfit = _misfit(avatar.state_dict(), state, gaussians)
     if misfit is not None:
         raise UserError(f"{source}: does not fit its settings ({misfit}); train it again")

@@ -20,7 +20,7 @@ from mien.avatar.bound_gaussians import pose_bound_gaussians
 from mien.avatar.density import GradientDensity, highest_opacities_seen
 from mien.avatar.expression_changes import ExpressionActivations, expression_change
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
-from mien.avatar.schedules import TRAINED, Progress, Rate
+from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import sh_from_rgb, stack_timesteps
@@ -188,8 +188,7 @@ class GaussianAvatars(Avatar):
         degree = self.config.sh_degree
         if degree == 0:
             return self.store["sh_constant"]
-        warmup = max(self.config.sh_warmup, 1e-9)
-        active = min(degree, int(progress.fraction / warmup * (degree + 1)))
+        active = active_degree(degree, self.config.sh_warmup, progress)
         rest = self.store["sh_rest"][:, : (active + 1) ** 2 - 1]
         return torch.cat([self.store["sh_constant"], rest], dim=1)
 

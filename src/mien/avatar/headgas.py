@@ -7,18 +7,23 @@ appended to the expression vector, because nothing else would move the gaze; the
 length unit of the encoding; and the opacity to prune by. The perceptual loss is not implemented yet.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mien.adam import FactoredGradient
 from mien.avatar.activation import sigmoid
-from mien.avatar.avatar import Avatar, ParameterGroup, Posed, network_group, store_group
+from mien.avatar.avatar import Avatar, ParameterGroup, Posed, factored_group, network_group, store_group
 from mien.avatar.baking import as_array
 from mien.avatar.density import GradientDensity
 from mien.avatar.encoding import positional_encoding
+from mien.avatar.expression_changes import expression_inputs, principal_directions
+from mien.avatar.feature_network import Layers, feature_network
 from mien.avatar.headgas_settings import HeadGasConfig
-from mien.avatar.schedules import TRAINED, Progress
+from mien.avatar.schedules import TRAINED, Progress, active_degree
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians
@@ -26,27 +31,36 @@ from mien.render.rendering import Rendering
 from mien.runtime.baked import AttributeNetwork, Attributes, Static
 
 _CHUNK = 512
+_OLD_BASES = "feature_bases"
 
 
 class HeadGas(Avatar):
     """Static Gaussians in the head frame, with colour and opacity from blended features."""
 
     config: HeadGasConfig
+    rest: Tensor
+    directions: Tensor
+    judged: Tensor
 
     def __init__(self, config: HeadGasConfig, face_model: FaceModel, face: FaceParams):
         super().__init__(config, face_model, face)
         n, width = config.points, config.features
         means = sample_surface(face_model.head_vertices(self.subject)[0], face_model.faces, n)
-        inputs = face.expression.shape[1] + face.joints[0].numel()
+        rest, directions = input_directions(face, self.subject, config.directions)
+        self.rest, self.directions = (nn.Buffer(tensor) for tensor in (rest, directions))
         trained = {
             "means": means,
             "quats": means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             "log_scales": neighbour_distances(means).clamp_min(1e-6).log()[:, None].repeat(1, 3),
-            # The bases start at zero, as in the paper. With the inputs last, blending is one matrix-vector product.
-            "feature_bases": means.new_zeros(n, width, inputs),
+            # The bases start at zero, as in the paper.
+            "bases": means.new_zeros(n, directions.shape[1], width),
             "neutral_features": means.new_zeros(n, width),
         }
+        spread = spread_out((expression_inputs(face) - rest) @ directions, config.judged_expressions)
+        # Not in files: only training needs it, and makes it anew.
+        self.judged = nn.Buffer(spread.detach().clone(), persistent=False)
         self.store = GaussianStore(trained)
+        self._bases_gradient = FactoredGradient()
         self.network = nn.Sequential(
             nn.Linear(width + 3 + 6 * config.encoding_bands, config.hidden),
             nn.LeakyReLU(0.01),
@@ -60,11 +74,15 @@ class HeadGas(Avatar):
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in the head frame, one batch entry per timestep. Only their colours and opacities differ."""
         store = self.store
-        features = blend_features(store["feature_bases"], store["neutral_features"], face)
-        encoding = self._encoding().expand(len(face), -1, -1)
-        output = self.network(torch.cat([features, encoding], dim=-1))
-        sh = output[..., :-1].unflatten(-1, (self._coefficients, 3))
-        opacities = sigmoid(output[..., -1])
+        encoding, layers = self._encoding(), self._layers(progress)
+        inputs = ((expression_inputs(face) - self.rest) @ self.directions).unbind(0)
+        outputs = [
+            feature_network(store["bases"], e, store["neutral_features"], encoding, layers, self._bases_gradient)
+            for e in inputs
+        ]
+        colours, opacity_logits = (_stacked(parts) for parts in zip(*outputs, strict=True))
+        sh = colours.unflatten(-1, (self._coefficients, 3))
+        opacities = sigmoid(opacity_logits)
         gaussians = Gaussians(
             store["means"], store["quats"], store["log_scales"].exp(), opacities, sh, head_poses(face)
         )
@@ -78,31 +96,62 @@ class HeadGas(Avatar):
         """One group per tensor, and one for the network."""
         config = self.config
         rates = {"means": config.means_rate, "log_scales": config.log_scales_rate, "quats": config.quats_rate}
-        rates |= {"feature_bases": config.features_rate, "neutral_features": config.features_rate}
-        groups = [store_group(self.store, name, rate) for name, rate in rates.items()]
+        rates |= {"neutral_features": config.features_rate}
+        extent = {"means": config.means_times_extent}
+        groups = [
+            store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
+        ]
+        groups.append(factored_group(self.store, "bases", config.features_rate, self._bases_gradient))
         return [*groups, network_group("network", self.network, config.network_rate)]
 
     def gaussian_store(self) -> GaussianStore:
         """Every per-Gaussian tensor."""
         return self.store
 
+    def upgraded(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Older versions kept one basis per input and feature [n, f, i], without directions."""
+        old = f"store.trained.{_OLD_BASES}"
+        if old not in state or state[old].ndim != 3:
+            return state
+        bases = state[old]
+        rest, directions = bases.new_zeros(bases.shape[2]), torch.eye(bases.shape[2]).to(bases)
+        kept = {name: tensor for name, tensor in state.items() if name != old}
+        return kept | {"store.trained.bases": bases.mT.contiguous(), "rest": rest, "directions": directions}
+
     def density(self) -> GradientDensity:
-        """Gradient-based control. Children copy features. Pruning uses the highest opacity since the last round."""
-        return GradientDensity(self.config.density, opacity_logits=None)
+        """Gradient-based control. Children copy features. `judged_opacities` says which opacity counts."""
+        return GradientDensity(self.config.density, opacity_logits=None, judged_opacities=self.judged_opacities)
+
+    @torch.no_grad()
+    def judged_opacities(self, store: GaussianStore, seen: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """The highest opacity of each Gaussian at the judged expressions and in the steps since the last round.
+
+        The judged expressions are spread over those of training, so that Gaussians which rare expressions need, such as
+        teeth, are not pruned while these are not drawn.
+        """
+        highest, encoding, layers = seen, self._encoding(), self._layers()
+        for inputs in self.judged:
+            _, opacity_logits = feature_network(
+                store["bases"], inputs, store["neutral_features"], encoding, layers, self._bases_gradient
+            )
+            highest = torch.maximum(highest, sigmoid(opacity_logits))
+        return highest
 
     def bake(self) -> Static:
         """Static points, with the bases of the features and the network."""
         store = {name: as_array(self.store[name]) for name in self.store.names()}
-        layers = [layer for layer in self.network if isinstance(layer, nn.Linear)]
-        bases = self.store["feature_bases"].permute(2, 0, 1)
+        layers = self._layers()
+        # The directions expand exactly: each input of the face has its own basis.
+        bases = torch.einsum("ik,nkf->inf", self.directions, self.store["bases"])
+        neutral = self.store["neutral_features"] - torch.einsum("i,inf->nf", self.rest, bases)
         e = self.subject.expression.shape[1]
         network = AttributeNetwork(
             input="features",
-            base=np.concatenate([store["neutral_features"], as_array(self._encoding())], axis=1),
+            base=np.concatenate([as_array(neutral), as_array(self._encoding())], axis=1),
             basis=as_array(bases[:e]),
             joint_basis=as_array(bases[e:]),
-            weights=tuple(as_array(layer.weight) for layer in layers),
-            biases=tuple(as_array(layer.bias) for layer in layers),
+            weights=(as_array(layers.weight1), as_array(layers.weight2)),
+            biases=(as_array(layers.bias1), as_array(layers.bias2)),
             activation="leaky_relu",
             outputs=("sh", "opacity_logits"),
         )
@@ -122,6 +171,20 @@ class HeadGas(Avatar):
         assert isinstance(last, nn.Linear)
         return last
 
+    def _layers(self, progress: Progress = TRAINED) -> Layers:
+        first, last = self.network[0], self._last_layer
+        assert isinstance(first, nn.Linear)
+        shares = self._output_shares(progress).to(last.weight)
+        return Layers(first.weight, first.bias, last.weight * shares[:, None], last.bias * shares)
+
+    def _output_shares(self, progress: Progress) -> Float[Tensor, " o"]:
+        """Factors of the network's outputs: of the colours' higher degrees, a share, and 0 before they begin."""
+        config = self.config
+        shares = torch.ones(self._coefficients, 3)
+        shares[1:] = config.sh_higher_share
+        shares[(active_degree(config.sh_degree, config.sh_warmup, progress) + 1) ** 2 :] = 0
+        return torch.cat([shares.flatten(), torch.ones(1)])
+
     def _encoding(self) -> Float[Tensor, "n c"]:
         # Detached, so that centres move only by their effect on the picture, not through the encoding of their
         # position.
@@ -129,13 +192,34 @@ class HeadGas(Avatar):
         return positional_encoding(points, self.config.encoding_bands)
 
 
-def blend_features(
-    bases: Float[Tensor, "n f i"], neutral: Float[Tensor, "n f"], face: FaceParams
-) -> Float[Tensor, "b n f"]:
-    """F = F^T e + f0, where e is the expression followed by the axis-angle vectors of the free joints, in radians."""
-    inputs = torch.cat([face.expression, face.joints.flatten(1)], dim=-1)
-    blended = bases.flatten(0, 1) @ inputs.T
-    return neutral + blended.T.unflatten(-1, tuple(neutral.shape))
+def input_directions(
+    face: FaceParams, neutral: FaceParams, count: int
+) -> tuple[Float[Tensor, " i"], Float[Tensor, "i k"]]:
+    """The inputs of the person at rest, and the directions along which the bases of features are weighted.
+
+    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. The
+    directions are those of the largest spread over the timesteps of `face`, at most `count` (0: as many as inputs),
+    scaled to a deviation of about 1. So one second moment serves the bases of all of them.
+    """
+    rest, inputs = expression_inputs(neutral)[0].detach(), expression_inputs(face)
+    directions, _ = principal_directions(inputs - rest, min(count or len(rest), len(rest)))
+    return rest.clone(), directions
+
+
+def _stacked(parts: Sequence[Tensor]) -> Tensor:
+    # Training poses one timestep at a time, and needs no copy.
+    return parts[0][None] if len(parts) == 1 else torch.stack(tuple(parts))
+
+
+def spread_out(points: Float[Tensor, "t k"], count: int) -> Float[Tensor, "c k"]:
+    """At most `count` of the points: each is the farthest from those before it, the first from the mean."""
+    chosen: list[int] = []
+    distances = (points - points.mean(0)).norm(dim=-1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(distances.argmax()))
+        from_it = (points - points[chosen[-1]]).norm(dim=-1)
+        distances = from_it if len(chosen) == 1 else torch.minimum(distances, from_it)
+    return points[chosen]
 
 
 def sample_surface(vertices: Float[Tensor, "v 3"], faces: Tensor, count: int) -> Float[Tensor, "n 3"]:

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import GradientSettings, MethodConfig
-from mien.ranges import Range, ToLoad
+from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
+from mien.ranges import FRACTION, Range, ToLoad
 
 
 def _density() -> GradientSettings:
@@ -20,6 +20,10 @@ class HeadGasConfig(MethodConfig):
     """Number of Gaussians at the start, sampled on the subject's mesh."""
     features: Annotated[int, Range(1, 1024)] = 16
     """Number of latent features per Gaussian (paper: 32). More features need more memory and time per step."""
+    directions: Annotated[int, Range(0, 1024)] = 0
+    """Number of directions of the face along which features change: those of the largest spread over the training
+    timesteps. 0 means as many as the face has inputs (expression coefficients and angles of joints), as in the paper.
+    Fewer need less memory and time per step; a finished avatar follows all inputs either way."""
     hidden: Annotated[int, Range(1, 4096)] = 64
     """Width of the network's only hidden layer."""
     encoding_bands: Annotated[int, Range(0, 24)] = 4
@@ -29,8 +33,16 @@ class HeadGasConfig(MethodConfig):
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics for view-dependent colour (paper: 3). Keep 0 with a single camera, because
     view-dependent colours then absorb the head's pose."""
+    sh_warmup: Annotated[float, FRACTION] = 0.0
+    """Fraction of the run over which the degrees of the spherical harmonics are switched on, one after the other."""
+    sh_higher_share: Annotated[float, FRACTION] = 1.0
+    """Factor of the coefficients of higher degrees. The network learns them at this share of the constant colour's
+    rate; 3D Gaussian Splatting uses a twentieth."""
     means_rate: Rate = Rate(1e-4, 1e-6)
     """Learning rate of the centres, in metres per step."""
+    means_times_extent: bool = False
+    """Whether the learning rate of the centres is multiplied by the extent of the training cameras in metres, as in
+    3D Gaussian Splatting."""
     log_scales_rate: Rate = Rate(5e-3)
     """Learning rate of the logarithms of the scales, per step."""
     quats_rate: Rate = Rate(1e-3)
@@ -39,10 +51,55 @@ class HeadGasConfig(MethodConfig):
     """Learning rate of the feature bases and of the neutral features, per step."""
     network_rate: Rate = Rate(2e-3, 2e-4)
     """Learning rate of the network, per step."""
+    judged_expressions: Annotated[int, Range(0, 10_000)] = 0
+    """Number of training expressions, as different as possible, at which each round of density control computes the
+    opacities to prune by. With 0, only the opacities in the steps since the last round count."""
     density: GradientSettings = field(default_factory=_density)
     """Density control: when and where Gaussians are added and removed. Opacities come from the network and are never
     reset. The first of `opacity_resets` after `start` still sets when large Gaussians are removed."""
 
 
-PRESETS = {"draft": HeadGasConfig(), "standard": HeadGasConfig()}
-"""Settings of this method for each preset. They are equal: a draft is only a shorter run."""
+_STEPS, _ROUND, _FIRST, _LAST, _DEGREE_STEPS = 50_000, 100, 500, 15_000, 1_000
+"""The paper's run, in steps. The schedule of density control and of degrees is that of 3D Gaussian Splatting."""
+
+
+def _standard() -> HeadGasConfig:
+    """The settings for runs of some thousand steps on a CPU (docs/history/2026-11-22-headgas.md)."""
+    return HeadGasConfig(
+        face_tuning=FaceTuning(within_bounds=True),
+        features=32,
+        directions=20,
+        judged_expressions=64,
+        density=GradientSettings(opacity_resets=(), size_start=0.1, prune_size=0.03, max_gaussians=20_000),
+    )
+
+
+def _paper() -> HeadGasConfig:
+    """The paper's settings (docs/paper_preset.md). Times are fractions, so that they fit runs of any length."""
+    return HeadGasConfig(
+        face_tuning=FaceTuning(enabled=False),
+        features=32,
+        sh_degree=3,
+        sh_warmup=4 * _DEGREE_STEPS / _STEPS,
+        sh_higher_share=1 / 20,
+        means_rate=Rate(1.6e-4, 1.6e-6),
+        means_times_extent=True,
+        judged_expressions=64,
+        density=GradientSettings(
+            start=_FIRST / _STEPS,
+            stop=_LAST / _STEPS,
+            rounds=(_LAST - _FIRST) // _ROUND + 1,
+            size_unit="extent",
+            split_size=0.01,
+            prune_size=0.1,
+            size_start=_FIRST / _STEPS,
+            opacity_resets=(),
+            max_gaussians=45_000,
+        ),
+    )
+
+
+PRESETS = {"draft": _standard(), "standard": _standard(), "paper": _paper()}
+"""Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
+PRESET_STEPS = {"paper": _STEPS}
+"""Number of steps of the presets for which the method has its own."""

@@ -27,6 +27,11 @@ class Progress:
         return self.step / self.steps
 
 
+def active_degree(degree: int, warmup: float, progress: Progress) -> int:
+    """Highest degree of spherical harmonics that is switched on, of `degree`, if all are from the time `warmup` on."""
+    return min(degree, int(progress.fraction / max(warmup, 1e-9) * (degree + 1)))
+
+
 TRAINED = Progress(step=1, steps=1, epoch=1_000_000)
 """Progress after training: every schedule is at its end."""
 

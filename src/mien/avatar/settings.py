@@ -43,6 +43,9 @@ class FaceTuning:
     """Learning rate of the head's rotation, in radians per step."""
     head_translation: Rate = Rate(3e-4)
     """Learning rate of the head's position, in metres per step."""
+    within_bounds: bool = False
+    """Whether expression coefficients stay within the face model's bounds. Those that were tracked beyond a bound may
+    stay there."""
 
 
 @dataclass(frozen=True)
@@ -91,10 +94,13 @@ class GradientSettings:
     """Gaussians below this opacity are removed."""
     prune_size: Annotated[float, NOT_NEGATIVE] = 0.1
     """Gaussians larger than this, in `size_unit`, are removed. This begins with the first opacity reset after
-    `start`."""
+    `start`, or at `size_start`."""
     prune_radius: Annotated[float, NOT_NEGATIVE] = 0.0
     """Gaussians with a larger radius on screen than this, in pixels, are removed. This begins with the first opacity
-    reset after `start`. 0 removes none."""
+    reset after `start`, or at `size_start`. 0 removes none."""
+    size_start: Annotated[float | None, FRACTION] = None
+    """Time after which Gaussians are removed by their size, as a fraction of the run. If it is not given, this begins
+    with the first opacity reset after `start`."""
     opacity_resets: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = (0.1, 0.4)
     """Times at which opacities are lowered to `reset_opacity`, as fractions of the run."""
     reset_opacity: Annotated[float, Range(1e-6, 1)] = 0.01

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from mien.adam import Moments
+from mien.adam import FactoredMoments, Moments
 
 
 class GaussianStore(nn.Module):
@@ -23,7 +23,7 @@ class GaussianStore(nn.Module):
         self.fixed_names = tuple(fixed or ())
         for name, tensor in (fixed or {}).items():
             self.register_buffer(name, tensor.detach().clone())
-        self.moments: dict[str, Moments] = {}
+        self.moments: dict[str, Moments | FactoredMoments] = {}
         lengths = {name: self[name].shape[0] for name in self.names()}
         assert len(set(lengths.values())) == 1, f"per-Gaussian tensors differ in length: {lengths}"
 
@@ -46,7 +46,8 @@ class GaussianStore(nn.Module):
         kept = kept.nonzero()[:, 0] if kept.dtype == torch.bool else kept
         self._replace({name: self[name].detach()[kept] for name in self.names()})
         for state in self.moments.values():
-            state.first, state.second = state.first[kept], state.second[kept]
+            for field in state.PER_ROW:
+                setattr(state, field, getattr(state, field)[kept])
 
     def append(self, parents: Tensor, overrides: Mapping[str, Tensor] | None = None) -> None:
         """Add one child for each index in `parents` [c]: a copy of its parent except for the tensors in `overrides`."""
@@ -59,8 +60,9 @@ class GaussianStore(nn.Module):
             grown[name] = torch.cat([own, overrides[name].detach().to(own) if name in overrides else own[parents]])
         self._replace(grown)
         for state in self.moments.values():
-            new = state.first.new_zeros((parents.shape[0], *state.first.shape[1:]))
-            state.first, state.second = torch.cat([state.first, new]), torch.cat([state.second, new])
+            for field in state.PER_ROW:
+                own = getattr(state, field)
+                setattr(state, field, torch.cat([own, own.new_zeros((parents.shape[0], *own.shape[1:]))]))
 
     def assign(self, name: str, value: Tensor) -> None:
         """Overwrite a tensor outside the optimiser, as an opacity reset does. Its moments restart from zero."""
@@ -68,7 +70,8 @@ class GaussianStore(nn.Module):
             self[name].copy_(value)
         if name in self.moments:
             state = self.moments[name]
-            state.first, state.second = torch.zeros_like(state.first), torch.zeros_like(state.second)
+            for field in state.PER_ROW:
+                setattr(state, field, torch.zeros_like(getattr(state, field)))
 
     def resize(self, length: int) -> None:
         """Make room for `length` Gaussians whose values will be loaded next. Moments are dropped."""

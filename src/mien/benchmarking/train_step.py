@@ -89,21 +89,20 @@ def training_case(
 
     Both have the float dtype and the device of `like`.
     """
-    sequence = _sequence(face_model, width, height)
+    sequence = benchmark_sequence(face_model, width, height)
     state = start([sequence], face_model, GaussianAvatarsConfig(), SETTINGS, like)
     _grow(state.avatar, count)
     order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
     state = TrainingState(state.avatar, state.adam, state.density, state.track, {})
-    state.density.load_state(
-        {
-            "pull": torch.zeros(count),
-            "seen": torch.zeros(count),
-            "radius": torch.zeros(count, dtype=torch.int32),
-            "opacity": torch.zeros(count),
-        }
-    )
-    _paint_targets(sequence, state.avatar, like)
+    state.density.load_state(empty_statistics(count))
+    paint_targets(sequence, state.avatar, like)
     return state, TrainingData(order, (Targets(sequence, 0, like=like),))
+
+
+def empty_statistics(count: int) -> dict[str, Tensor]:
+    """The statistics of density control for `count` Gaussians that no step has seen."""
+    floats = {name: torch.zeros(count) for name in ("pull", "seen", "opacity")}
+    return floats | {"radius": torch.zeros(count, dtype=torch.int32)}
 
 
 def _grow(avatar: Avatar, count: int) -> None:
@@ -119,7 +118,7 @@ def _grow(avatar: Avatar, count: int) -> None:
     store.assign("sh_constant", 0.5 * torch.randn(count, 1, 3, generator=generator))
 
 
-def _sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
+def benchmark_sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
     """Return a head that turns and opens its mouth a little, with pictures that are still black."""
     time = torch.linspace(0, 2 * torch.pi, TIMESTEPS + 1)[:-1]
     neutral = face_model.neutral(TIMESTEPS)
@@ -147,7 +146,7 @@ def _sequence(face_model: FaceModel, width: int, height: int) -> Sequence:
     return Sequence("benchmark", capture, tracking, np.zeros(pictures.shape[:-1], np.uint8))
 
 
-def _paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor) -> None:
+def paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor) -> None:
     """Paint pictures of the same head in noisy colours, so that every loss has a gradient."""
     noise = np.random.default_rng(0)
     for timestep in range(TIMESTEPS):

@@ -87,7 +87,10 @@ class Scaling:
 
 @dataclass(frozen=True)
 class TrainStep:
-    """Measure a training step of `gaussian_avatars` (no footage is needed), and posing together with drawing."""
+    """Measure a training step (no footage is needed), and posing together with drawing."""
+
+    method: Literal["gaussian_avatars", "headgas"] = "gaussian_avatars"
+    """Method to measure. headgas is measured on the CPU, with the paper's features and colours, at 512x512."""
 
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the machine and all rows as json, for programs."""
@@ -100,11 +103,17 @@ class TrainStep:
         """Check that CUDA has gsplat and that there is time to measure."""
         check_device(self.device)
         _check_seconds(self.seconds)
+        if self.method == "headgas" and self.device == "cuda":
+            raise UserError("--device cuda: headgas is measured on the CPU only; leave out --device")
 
     def run(self) -> None:
         """Measure and print the rows."""
+        from mien.benchmarking.headgas_step import headgas_suite
         from mien.benchmarking.train_step import train_step_suite
 
+        if self.method == "headgas":
+            show_rows(headgas_suite(self.seconds), self.as_json)
+            return
         like = _gpu(self.device)
         if like is None:
             show_rows(train_step_suite(self.seconds), self.as_json)

@@ -170,7 +170,13 @@ def _raw_values(
             basis = getattr(bases, f.name)
             if basis is not None:
                 raw[f.name] = raw[f.name] + np.tensordot(face.expression, basis, 1)
-    if network is not None:
+    if network is not None and _has_native(network):
+        outputs = _run_native(network, face)
+        for name, values in zip(network.outputs, outputs, strict=True):
+            values = values.reshape(raw[name].shape)
+            values += raw[name]
+            raw[name] = values
+    elif network is not None:
         outputs, start = run_network(network, displacement, face), 0
         for name in network.outputs:
             width = raw[name][0].size if len(raw[name]) else 0
@@ -179,10 +185,46 @@ def _raw_values(
     return raw
 
 
+def _has_native(network: AttributeNetwork) -> bool:
+    """Whether this is the network of `_native.feature_network`, as headgas has it: two layers on blended features."""
+    return (
+        network.input == "features"
+        and len(network.weights) == 2
+        and network.activation == "leaky_relu"
+        and network.outputs == ("sh", "opacity_logits")
+    )
+
+
+def _run_native(network: AttributeNetwork, face: Face) -> tuple[np.ndarray, np.ndarray]:
+    """The outputs of such a network, by the same operation as in training, as two arrays."""
+    prepared = _networks.get(network)
+    if prepared is None:
+        width = network.basis.shape[2]
+        rows = [np.ascontiguousarray(part, np.float32) for part in (network.base[:, :width], network.base[:, width:])]
+        layers = zip(network.weights, network.biases, strict=True)
+        arrays = [np.ascontiguousarray(array, np.float32) for layer in layers for array in layer]
+        prepared = _networks[network] = _native.FeatureNetwork(*rows, *arrays)
+    bases = [_native.FeatureBases(np.ascontiguousarray(network.basis), _contiguous_row(face.expression), True)]
+    if network.joint_basis is not None:
+        joints = np.ascontiguousarray(network.joint_basis)
+        bases.append(_native.FeatureBases(joints, _contiguous_row(face.joints.reshape(-1)), True))
+    n, outputs = len(network.base), len(network.biases[-1])
+    sh, opacity_logits = np.empty((n, outputs - 1), np.float32), np.empty(n, np.float32)
+    _native.feature_network(prepared, bases, None, sh, opacity_logits)
+    return sh, opacity_logits
+
+
+_networks: "WeakKeyDictionary[AttributeNetwork, _native.FeatureNetwork]" = WeakKeyDictionary()
+
+
+def _contiguous_row(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, np.float32)
+
+
 def run_network(
     network: AttributeNetwork, displacement: Float32[np.ndarray, "n 3"], face: Face
 ) -> Float32[np.ndarray, "n _"]:
-    """The outputs of an attribute network."""
+    """The outputs of an attribute network, in numpy. This is the reference of `_native.feature_network`."""
     if network.input == "features":
         blended = _combined(network.basis, face.expression)
         if network.joint_basis is not None:

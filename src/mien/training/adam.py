@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from mien import _native
-from mien.adam import BETA1, BETA2
+from mien.adam import BETA1, BETA2, FactoredMoments
 from mien.arrays import unpacked
 from mien.avatar import Moments, ParameterGroup, Progress
 
@@ -24,14 +25,28 @@ class Update(NamedTuple):
     rate: float
 
 
+class FactoredUpdate(NamedTuple):
+    """The change of one tensor [n, k, f] in one step, by a sum of outer products."""
+
+    values: Float[Tensor, "n k f"]
+    terms: Sequence[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]]
+    """Rows and columns of the gradient (`mien.adam.FactoredGradient`)."""
+    moments: FactoredMoments
+    rate: float
+
+
+_State = TypeVar("_State", Moments, FactoredMoments)
+
+
 class Adam:
     """Adam (Kingma and Ba 2015) with the constants of 3D Gaussian Splatting. One native call updates all tensors.
 
-    The state of per-Gaussian tensors is in their store, that of networks is here.
+    A tensor with a factored gradient has an update of its own (`factored_update`). The state of per-Gaussian tensors is
+    in their store, that of networks is here.
     """
 
     def __init__(self) -> None:
-        self._moments: dict[str, dict[str, Moments]] = {}
+        self._moments: dict[str, dict[str, Moments | FactoredMoments]] = {}
 
     def step(self, groups: Iterable[ParameterGroup], progress: Progress) -> None:
         """Update every tensor that has a gradient, at its group's rate, and clear the gradients."""
@@ -39,30 +54,38 @@ class Adam:
         for group in groups:
             rate = group.rate_at(progress)
             for name, tensor in group.tensors.items():
+                if name in group.factored:
+                    terms = group.factored[name].take()
+                    if terms and rate > 0:
+                        state = self._state(group, name, tensor, FactoredMoments)
+                        factored_update(FactoredUpdate(tensor, terms, state, rate))
+                    continue
                 gradient = tensor.grad
                 if gradient is None:
                     continue
                 tensor.grad = None
                 if rate > 0:
-                    updates.append(Update(tensor, gradient, self._state(group, name, tensor), rate))
+                    updates.append(Update(tensor, gradient, self._state(group, name, tensor, Moments), rate))
         update_all(updates)
 
-    def state(self) -> dict[str, Moments]:
+    def state(self) -> dict[str, Moments | FactoredMoments]:
         """The state of all tensors that have no store, by group and tensor."""
         return {f"{group}/{name}": state for group, own in self._moments.items() for name, state in own.items()}
 
-    def load_state(self, state: Mapping[str, Moments]) -> None:
+    def load_state(self, state: Mapping[str, Moments | FactoredMoments]) -> None:
         """Restore what `state` returned."""
         self._moments = {}
         for key, moments in state.items():
             group, name = key.split("/", 1)
             self._moments.setdefault(group, {})[name] = moments
 
-    def _state(self, group: ParameterGroup, name: str, tensor: Tensor) -> Moments:
+    def _state(self, group: ParameterGroup, name: str, tensor: Tensor, kind: type[_State]) -> _State:
         own = self._moments.setdefault(group.name, {}) if group.moments is None else group.moments
         if name not in own:
-            own[name] = Moments.zeros(tensor.detach())
-        return own[name]
+            own[name] = kind.zeros(tensor.detach())
+        state = own[name]
+        assert isinstance(state, kind)
+        return state
 
 
 def update_all(updates: Sequence[Update]) -> None:
@@ -98,3 +121,34 @@ def _native_task(update: Update) -> tuple[Any, Any, Any, Any, Any, float] | None
         if not (tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous()):
             return None
     return *unpacked(*arrays), rate
+
+
+def factored_update(update: FactoredUpdate) -> None:
+    """Apply an update in place: natively for one term, if tensors are float32, contiguous and on a CPU.
+
+    It is Adam's without the running mean of the gradient, and with one second moment for all k: the running mean of the
+    squared gradient's mean over k (the idea of Adafactor, Shazeer and Stern 2018). A row whose gradient is 0 keeps its
+    values and its state, and a column that is 0 changes nothing. So the tensor is read and written once, where it
+    changes, and its state is smaller by the number of columns.
+    """
+    if len(update.terms) == 1:
+        (rows, columns), moments = update.terms[0], update.moments
+        arrays = (update.values.detach(), rows, columns.detach(), moments.second, moments.weights)
+        if all(tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous() for tensor in arrays):
+            _native.factored_update(*unpacked(*arrays), update.rate)
+            return
+    factored_update_reference(update)
+
+
+@torch.no_grad()
+def factored_update_reference(update: FactoredUpdate) -> None:
+    """`factored_update` in plain PyTorch, any number of terms, dtype and device."""
+    values, terms, moments, rate = update
+    gradient = sum(rows[:, None, :] * columns[:, None] for rows, columns in terms)
+    assert isinstance(gradient, Tensor)
+    squares = gradient.square().mean(1)
+    touched = (gradient != 0).flatten(1).any(1)
+    moments.second[touched] = moments.second[touched] * BETA2 + squares[touched] * (1 - BETA2)
+    moments.weights[touched] = moments.weights[touched] * BETA2 + (1 - BETA2)
+    deviations = (moments.second[touched] / moments.weights[touched, None]).sqrt() + _EPSILON
+    values[touched] -= rate * gradient[touched] / deviations[:, None]

@@ -1,11 +1,12 @@
 """Checkpoints: everything that the rest of a run depends on. Each is one file, written atomically."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from mien.adam import FactoredMoments
 from mien.avatar import Avatar, Moments
 from mien.avatar.files import overwrite
 from mien.errors import UserError
@@ -48,7 +49,7 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
     tensors |= {f"curves.{name}": torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     for owner, moments in (("store", state.avatar.gaussian_store().moments), ("adam", state.adam.state())):
         for name, own in moments.items():
-            tensors |= {f"{owner}.{name}:{field}": getattr(own, field) for field in ("first", "second", "step")}
+            tensors |= {f"{owner}.{name}:{field.name}": getattr(own, field.name) for field in fields(own)}
     tensors |= {
         "step": torch.tensor(state.step),
         "seconds": torch.tensor(state.seconds, dtype=torch.float64),
@@ -132,15 +133,31 @@ def _check_like(found: dict[str, Tensor], own: dict[str, Tensor], gaussians: int
             raise ValueError(f"{name} is of type {found[name].dtype} and shape {list(found[name].shape)}")
 
 
-def _moments(tensors: dict[str, Tensor], like: Tensor, owners: dict[str, Tensor]) -> dict[str, Moments]:
+def _moments(
+    tensors: dict[str, Tensor], like: Tensor, owners: dict[str, Tensor]
+) -> dict[str, Moments | FactoredMoments]:
     """The moments by name, on the device of `like`, except for the step counts, which stay on the CPU."""
     moments = {}
     for name in dict.fromkeys(key.rpartition(":")[0] for key in tensors):
-        first, second = (tensors[f"{name}:{field}"].to(like.device) for field in ("first", "second"))
-        step = tensors[f"{name}:step"]
-        if not first.shape == second.shape == owners[name].shape or step.ndim:
-            raise ValueError(f"the moments of {name} have another shape")
-        if not (first.dtype == second.dtype == owners[name].dtype and step.dtype in (torch.float32, torch.int64)):
-            raise ValueError(f"the moments of {name} have another type")
-        moments[name] = Moments(first, second, tensors[f"{name}:step"])
+        factored = f"{name}:weights" in tensors
+        moments[name] = (_factored_moments if factored else _full_moments)(name, tensors, like, owners[name])
     return moments
+
+
+def _full_moments(name: str, tensors: dict[str, Tensor], like: Tensor, owner: Tensor) -> Moments:
+    first, second = (tensors[f"{name}:{field}"].to(like.device) for field in ("first", "second"))
+    step = tensors[f"{name}:step"]
+    if not first.shape == second.shape == owner.shape or step.ndim:
+        raise ValueError(f"the moments of {name} have another shape")
+    if not (first.dtype == second.dtype == owner.dtype and step.dtype in (torch.float32, torch.int64)):
+        raise ValueError(f"the moments of {name} have another type")
+    return Moments(first, second, step)
+
+
+def _factored_moments(name: str, tensors: dict[str, Tensor], like: Tensor, owner: Tensor) -> FactoredMoments:
+    second, weights = (tensors[f"{name}:{field}"].to(like.device) for field in ("second", "weights"))
+    if owner.ndim != 3 or second.shape != owner[:, 0].shape or weights.shape != owner.shape[:1]:
+        raise ValueError(f"the moments of {name} have another shape")
+    if not second.dtype == weights.dtype == owner.dtype:
+        raise ValueError(f"the moments of {name} have another type")
+    return FactoredMoments(second, weights)

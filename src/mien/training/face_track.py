@@ -32,10 +32,21 @@ class FaceTrack:
         face: All timesteps of all sequences, one sequence after the other.
         tuning: Whether and how fast they change.
         lengths: Number of timesteps of each sequence. Default: one sequence.
+        bounds: Range of each expression coefficient, for settings that keep to it. Default: no bounds.
     """
 
-    def __init__(self, face: FaceParams, tuning: FaceTuning, lengths: Items[int] = ()):
+    def __init__(
+        self,
+        face: FaceParams,
+        tuning: FaceTuning,
+        lengths: Items[int] = (),
+        bounds: Float[Tensor, "e 2"] | None = None,
+    ):
         self._start = face.detach()
+        self._bounds = None
+        if tuning.enabled and tuning.within_bounds and bounds is not None:
+            low, high = bounds.to(self._start.expression).unbind(-1)
+            self._bounds = self._start.expression.minimum(low), self._start.expression.maximum(high)
         self._lengths = tuple(lengths) or (len(face),)
         assert sum(self._lengths) == len(face), "timesteps of the sequences"
         self._tuning = tuning
@@ -58,6 +69,12 @@ class FaceTrack:
     def parameter_groups(self, index: int) -> list[ParameterGroup]:
         """The parameter groups of one timestep. Their tensors are those of `face(index)`."""
         return self._row(index).groups
+
+    def confine(self, index: int) -> None:
+        """Bring the expression of one timestep back within its bounds, if settings ask for it."""
+        if self._bounds is not None:
+            low, high = (bound[index] for bound in self._bounds)
+            self._fields["expression"][index].clamp_(low, high)
 
     def _row(self, index: int) -> "_Row":
         # Cached, because a dozen views would otherwise be made in every step. The track's tensors are never replaced.

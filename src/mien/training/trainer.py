@@ -199,7 +199,8 @@ def start(
         move_avatar(avatar, like)
         face = face.to(like)
     density = density_strategy(avatar.density(), avatar.gaussian_store())
-    track = FaceTrack(face, method_config.face_tuning, [len(sequence.tracking.face) for sequence in sequences])
+    lengths = [len(sequence.tracking.face) for sequence in sequences]
+    track = FaceTrack(face, method_config.face_tuning, lengths, face_model.expression_bounds)
     return TrainingState(avatar, Adam(), density, track, {}, colors)
 
 
@@ -225,6 +226,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     groups += [] if state.colors is None else state.colors.parameter_groups()
     state.density.observe(posed, rendering)
     state.adam.step(groups, progress)
+    state.track.confine(index)
     random = partial(density_random, settings, state.step)
     state.density.adapt(avatar.gaussian_store(), posed, progress, random)
 

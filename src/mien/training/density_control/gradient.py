@@ -7,9 +7,9 @@ The loop, with the names of `GradientSettings`:
    its highest opacity.
 2. After `rounds` steps, evenly spread from `start` to `stop`, `adapt` runs a round:
    - Prune (`_to_prune`): a Gaussian goes if its opacity is below `prune_opacity`. From the first opacity reset after
-     `start`, it also goes if it is larger than `prune_size`, or than `prune_radius` on screen. The method says which
-     opacity counts (`judged_opacities`) and can forbid prunes (`may_prune`). One Gaussian always stays.
-     `split_size` and `prune_size` are in `size_unit`: metres, or the extent of the training cameras.
+     `start`, or from `size_start`, it also goes if it is larger than `prune_size`, or than `prune_radius` on screen.
+     The method says which opacity counts (`judged_opacities`) and can forbid prunes (`may_prune`). One Gaussian always
+     stays. `split_size` and `prune_size` are in `size_unit`: metres, or the extent of the training cameras.
    - Grow (`_to_grow`): of the others, those grow whose mean gradient over the views that show them reaches
      `grow_gradient`, strongest first, until there are `max_gaussians`. If such a Gaussian is larger than `split_size`,
      two children from the method's hook `split` replace it. If it is smaller, a copy is added.
@@ -23,6 +23,7 @@ The optimiser's state: Gaussians that stay keep their moments, and copies and ch
 clears the moments of all opacities. The number of updates, which is one count per tensor, goes on.
 """
 
+import math
 from functools import lru_cache
 
 import torch
@@ -124,8 +125,10 @@ class GradientStrategy(DensityStrategy):
         prune = torch.zeros_like(sizes, dtype=torch.bool)
         if rules.prune_faint:
             prune = self._density.judged_opacities(store, self._highest_opacities) < settings.prune_opacity
-        later_resets = [time for time in settings.opacity_resets if time > settings.start]
-        if later_resets and progress.fraction > min(later_resets):
+        begin = settings.size_start
+        if begin is None:
+            begin = min((time for time in settings.opacity_resets if time > settings.start), default=math.inf)
+        if progress.fraction > begin:
             if rules.prune_large:
                 prune = prune | (sizes > settings.prune_size)
             if rules.prune_wide and settings.prune_radius > 0:

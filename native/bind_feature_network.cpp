@@ -1,0 +1,175 @@
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/vector.h>
+
+#include <optional>
+#include <vector>
+
+#include "arrays.h"
+#include "feature_network.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+constexpr int64_t kMostWidth = 1 << 20;  // so that products of widths fit
+
+struct NetworkArrays {
+  static constexpr char kName[] = "FeatureNetwork";
+  static constexpr const char* kFields[] = {"neutral", "own", "weight1", "bias1", "weight2", "bias2"};
+  In<-1, -1> neutral, own, weight1;
+  In<-1> bias1;
+  In<-1, -1> weight2;
+  In<-1> bias2;
+
+  explicit NetworkArrays(const Group<NetworkArrays>& group) {
+    group.read(neutral, own, weight1, bias1, weight2, bias2);
+    const size_t features = neutral.shape(1), hidden = bias1.shape(0), width = bias2.shape(0);
+    require(features >= 1 && hidden >= 1 && width >= 1, "features, hidden values and outputs must not be empty");
+    for (const size_t length : {features, own.shape(1), hidden, width})
+      checked_length(length, kMostWidth, "numbers in a row");
+    require(own.shape(0) == neutral.shape(0), "every array must have one row per Gaussian");
+    require(has_shape(weight1, hidden, features + own.shape(1)) && has_shape(weight2, width, hidden),
+            "the layers do not fit each other");
+  }
+  size_t count() const { return neutral.shape(0); }
+  size_t features() const { return neutral.shape(1); }
+  mien::FeatureNetwork network() const {
+    return {static_cast<int64_t>(count()),
+            static_cast<int>(features()),
+            static_cast<int>(own.shape(1)),
+            static_cast<int>(bias1.shape(0)),
+            static_cast<int>(bias2.shape(0)),
+            neutral.data(),
+            own.data(),
+            weight1.data(),
+            bias1.data(),
+            weight2.data(),
+            bias2.data()};
+  }
+};
+
+struct BasesArrays {
+  static constexpr char kName[] = "FeatureBases";
+  static constexpr const char* kFields[] = {"values", "inputs", "by_input"};
+  In<-1, -1, -1> values;
+  In<-1> inputs;
+  bool by_input = false;
+
+  explicit BasesArrays(const Group<BasesArrays>& group) { group.read(values, inputs, by_input); }
+
+  void append(size_t count, size_t features, std::vector<mien::FeatureInput>& items) const {
+    const size_t k = inputs.shape(0);
+    require(by_input ? has_shape(values, k, count, features) : has_shape(values, count, k, features),
+            "bases must have one row per Gaussian and input, as long as its features");
+    checked_length(k, kMostWidth, "inputs");
+    const size_t between = by_input ? count * features : features, stride = by_input ? features : k * features;
+    for (size_t i = 0; i < k; ++i) {
+      items.push_back({values.data() + i * between, static_cast<int64_t>(stride), inputs.data()[i]});
+    }
+  }
+};
+
+struct KeptArrays {
+  static constexpr char kName[] = "FeatureKept";
+  static constexpr const char* kFields[] = {"features", "hidden"};
+  Out<-1, -1> features, hidden;
+
+  KeptArrays(const Group<KeptArrays>& group, const mien::FeatureNetwork& network) {
+    group.read(features, hidden);
+    require(has_shape(features, network.count, network.features) &&
+                has_shape(hidden, network.count, mien::hidden_stride(network.hidden)),
+            "what is kept must have one row per Gaussian");
+  }
+};
+
+struct GradientArrays {
+  static constexpr char kName[] = "FeatureGradients";
+  static constexpr const char* kFields[] = {"outputs", "last",    "features", "weight1",
+                                            "bias1",   "weight2", "bias2",    "inputs"};
+  In<-1, -1> outputs;
+  In<-1> last;
+  Out<-1, -1> features, weight1;
+  Out<-1> bias1;
+  Out<-1, -1> weight2;
+  Out<-1> bias2, inputs;
+
+  GradientArrays(const Group<GradientArrays>& group, const NetworkArrays& own, size_t inputs_count) {
+    group.read(outputs, last, features, weight1, bias1, weight2, bias2, inputs);
+    require(has_shape(outputs, own.count(), own.bias2.shape(0) - 1) && has_shape(last, own.count()),
+            "outputs must have one row per Gaussian");
+    require(same_shape(features, own.neutral) && same_shape(weight1, own.weight1) && same_shape(bias1, own.bias1) &&
+                same_shape(weight2, own.weight2) && same_shape(bias2, own.bias2) && has_shape(inputs, inputs_count),
+            "a gradient must have the shape of its array");
+  }
+};
+
+using Bases = std::vector<Group<BasesArrays>>;
+
+// All inputs, whose arrays stay alive while `arrays` does.
+std::vector<mien::FeatureInput> inputs_of(const std::vector<BasesArrays>& arrays, const NetworkArrays& own) {
+  std::vector<mien::FeatureInput> items;
+  for (const BasesArrays& one : arrays) one.append(own.count(), own.features(), items);
+  return items;
+}
+
+void feature_network(const Group<NetworkArrays>& group, const Bases& bases,
+                     const std::optional<Group<KeptArrays>>& keep, const Out<-1, -1>& outputs, const Out<-1>& last) {
+  const NetworkArrays own(group);
+  const std::vector<BasesArrays> arrays(bases.begin(), bases.end());
+  const std::vector<mien::FeatureInput> items = inputs_of(arrays, own);
+  const mien::FeatureNetwork network = own.network();
+  require(has_shape(outputs, own.count(), network.width - 1) && has_shape(last, own.count()),
+          "outputs must have one row per Gaussian");
+  std::optional<KeptArrays> kept;
+  if (keep) kept.emplace(*keep, network);
+  const nb::gil_scoped_release release;
+  mien::feature_network(network, {items.data(), static_cast<int64_t>(items.size())},
+                        kept ? mien::FeatureKept{kept->features.data(), kept->hidden.data()} : mien::FeatureKept{},
+                        outputs.data(), last.data());
+}
+
+void feature_network_backward(const Group<NetworkArrays>& group, const Bases& bases, const Group<KeptArrays>& keep,
+                              const Group<GradientArrays>& gradients) {
+  const NetworkArrays own(group);
+  const std::vector<BasesArrays> arrays(bases.begin(), bases.end());
+  const std::vector<mien::FeatureInput> items = inputs_of(arrays, own);
+  const mien::FeatureNetwork network = own.network();
+  const KeptArrays kept(keep, network);
+  const GradientArrays out(gradients, own, items.size());
+  const nb::gil_scoped_release release;
+  mien::feature_network_backward(network, {items.data(), static_cast<int64_t>(items.size())},
+                                 {kept.features.data(), kept.hidden.data()},
+                                 {out.outputs.data(), out.last.data(), out.features.data(), out.weight1.data(),
+                                  out.bias1.data(), out.weight2.data(), out.bias2.data(), out.inputs.data()});
+}
+
+void factored_update(const Out<-1, -1, -1>& values, const In<-1, -1>& rows, const In<-1>& columns,
+                     const Out<-1, -1>& second, const Out<-1>& weights, float rate) {
+  const size_t count = values.shape(0), inputs = values.shape(1), width = values.shape(2);
+  require(has_shape(rows, count, width) && has_shape(columns, inputs) && same_shape(second, rows) &&
+              has_shape(weights, count),
+          "factors and moments must fit the values");
+  const int columns_count = checked_length(inputs, kMostWidth, "inputs");
+  const int row_width = checked_length(width, kMostWidth, "numbers in a row");
+  const nb::gil_scoped_release release;
+  mien::factored_update({values.data(), static_cast<int64_t>(count), columns_count, row_width, rows.data(),
+                         columns.data(), second.data(), weights.data(), rate});
+}
+
+}  // namespace
+
+void bind_feature_network(nb::module_& module) {
+  bind_group<NetworkArrays>(module);
+  bind_group<BasesArrays>(module);
+  bind_group<KeptArrays>(module);
+  bind_group<GradientArrays>(module);
+  module.def("feature_network", &feature_network, "network"_a, "bases"_a, "kept"_a.none(), "outputs"_a.noconvert(),
+             "last"_a.noconvert(), "Fills the network's outputs, the last of each Gaussian apart.");
+  module.def("feature_network_backward", &feature_network_backward, "network"_a, "bases"_a, "kept"_a, "gradients"_a,
+             "Fills the gradients of features, layers and inputs.");
+  module.def("factored_update", &factored_update, "values"_a.noconvert(), "rows"_a, "columns"_a, "second"_a,
+             "weights"_a, "rate"_a, "Updates values [n, k, f] by a gradient of factors, in place.");
+}

@@ -1,0 +1,284 @@
+// Compiled once per instruction set: products of small matrices, a block of Gaussians at a time.
+#include "feature_network_kernels.h"
+
+#include "simd.h"
+
+namespace mien::MIEN_ISA {
+namespace {
+
+constexpr int kRows = W == 16 ? 6 : 3;  // rows of a tile, so that tile and factors fit into the registers
+constexpr float kSlope = 0.01f;
+
+struct Matrix {
+  const float* values;
+  int64_t row, column;  // strides
+};
+
+// A tile of the product a b [R, V * W], added to `start` (a row stride of 0 repeats one row).
+template <int R, int V>
+MIEN_INLINE void tile(Matrix a, const float* b, int64_t b_row, int64_t depth, const float* start, int64_t start_row,
+                      float* out, int64_t out_row) {
+  F sums[R][V];
+  for (int r = 0; r < R; ++r)
+    for (int v = 0; v < V; ++v) sums[r][v] = load(start + r * start_row + v * W);
+  for (int64_t k = 0; k < depth; ++k) {
+    F factors[V];
+    for (int v = 0; v < V; ++v) factors[v] = load(b + k * b_row + v * W);
+    for (int r = 0; r < R; ++r) {
+      const F own = set1(a.values[r * a.row + k * a.column]);
+      for (int v = 0; v < V; ++v) sums[r][v] = sums[r][v] + own * factors[v];
+    }
+  }
+  for (int r = 0; r < R; ++r)
+    for (int v = 0; v < V; ++v) store(out + r * out_row + v * W, sums[r][v]);
+}
+
+template <int V>
+void panel(Matrix a, int64_t rows, const float* b, int64_t b_row, int64_t depth, const float* start, int64_t start_row,
+           float* out, int64_t out_row) {
+  int64_t r = 0;
+  for (; r + kRows <= rows; r += kRows) {
+    tile<kRows, V>({a.values + r * a.row, a.row, a.column}, b, b_row, depth, start + r * start_row, start_row,
+                   out + r * out_row, out_row);
+  }
+  for (; r < rows; ++r) {
+    tile<1, V>({a.values + r * a.row, a.row, a.column}, b, b_row, depth, start + r * start_row, start_row,
+               out + r * out_row, out_row);
+  }
+}
+
+// out [rows, width] = start + a b, with `width` a whole number of vectors.
+void multiply(Matrix a, int64_t rows, const float* b, int64_t width, int64_t depth, const float* start,
+              int64_t start_row, float* out) {
+  int64_t c = 0;
+  for (; c + 4 * W <= width; c += 4 * W) panel<4>(a, rows, b + c, width, depth, start + c, start_row, out + c, width);
+  for (; c + 2 * W <= width; c += 2 * W) panel<2>(a, rows, b + c, width, depth, start + c, start_row, out + c, width);
+  for (; c < width; c += W) panel<1>(a, rows, b + c, width, depth, start + c, start_row, out + c, width);
+}
+
+MIEN_INLINE void add_scaled(const float* from, float factor, int width, float* to) {
+  int i = 0;
+  for (; i + W <= width; i += W) store(to + i, load(to + i) + factor * load(from + i));
+  for (; i < width; ++i) to[i] += factor * from[i];
+}
+
+// As `add_scaled` for all inputs of one Gaussian, with the sums in registers.
+template <int V>
+MIEN_INLINE void blend_vectors(const FeatureInputs& inputs, int64_t offset, int place, float* to) {
+  F sums[V];
+  for (int v = 0; v < V; ++v) sums[v] = load(to + v * W);
+  for (int64_t k = 0; k < inputs.count; ++k) {
+    const float* row = inputs.items[k].column + offset + place;
+    for (int v = 0; v < V; ++v) sums[v] = sums[v] + inputs.items[k].value * load(row + v * W);
+  }
+  for (int v = 0; v < V; ++v) store(to + v * W, sums[v]);
+}
+
+void blend_one(const FeatureInputs& inputs, int64_t index, int width, float* to) {
+  if (inputs.count == 0) return;
+  const int64_t offset = index * inputs.items[0].stride;
+  int i = 0;
+  for (; i + 2 * W <= width; i += 2 * W) blend_vectors<2>(inputs, offset, i, to + i);
+  for (; i + W <= width; i += W) blend_vectors<1>(inputs, offset, i, to + i);
+  for (; i < width; ++i)
+    for (int64_t k = 0; k < inputs.count; ++k) to[i] += inputs.items[k].value * inputs.items[k].column[offset + i];
+}
+
+// The blended features of a block go into the first columns of `rows`.
+void blend(const PaddedNetwork& network, const FeatureInputs& inputs, int64_t first, int64_t count, float* rows) {
+  const int width = network.own->features;
+  for (int64_t i = 0; i < count; ++i) {
+    memcpy(rows + i * network.in_stride, network.own->neutral + (first + i) * width, sizeof(float) * width);
+  }
+  // Memory is read in its order: a Gaussian's inputs may lie together, or an input's Gaussians.
+  if (inputs.count > 0 && inputs.items[0].stride == width) {
+    for (int64_t k = 0; k < inputs.count; ++k) {
+      for (int64_t i = 0; i < count; ++i) {
+        add_scaled(inputs.items[k].column + (first + i) * width, inputs.items[k].value, width,
+                   rows + i * network.in_stride);
+      }
+    }
+  } else {
+    for (int64_t i = 0; i < count; ++i) {
+      blend_one(inputs, first + i, width, rows + i * network.in_stride);
+    }
+  }
+}
+
+// The columns beyond the features: the Gaussian's own numbers, then zeros.
+MIEN_INLINE void fill_own(const PaddedNetwork& network, int64_t index, float* row) {
+  const int features = network.own->features, own = network.own->own;
+  for (int c = 0; c < own; ++c) row[features + c] = network.own->owns[index * own + c];
+  for (int64_t c = features + own; c < network.in_stride; ++c) row[c] = 0;
+}
+
+void forward(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept, float* outputs,
+             float* last, float* scratch, int64_t first, int64_t end) {
+  [[maybe_unused]] const NoDenormals guard;
+  const FeatureNetwork& own = *network.own;
+  float* const rows = scratch;
+  float* const values = rows + kFeatureBlock * network.in_stride;
+  float* const out = values + kFeatureBlock * network.hidden_stride;
+  for (int64_t begin = first; begin < end; begin += kFeatureBlock) {
+    const int64_t count = end - begin < kFeatureBlock ? end - begin : kFeatureBlock;
+    blend(network, inputs, begin, count, rows);
+    for (int64_t i = 0; i < count; ++i) {
+      float* const row = rows + i * network.in_stride;
+      fill_own(network, begin + i, row);
+      if (kept.features) memcpy(kept.features + (begin + i) * own.features, row, sizeof(float) * own.features);
+    }
+    float* const hidden = kept.hidden ? kept.hidden + begin * network.hidden_stride : values;
+    multiply({rows, network.in_stride, 1}, count, network.first, network.hidden_stride, own.features + own.own,
+             network.first_bias, 0, hidden);
+    for (int64_t i = 0; i < count * network.hidden_stride; i += W) {
+      const F value = load(hidden + i);
+      store(hidden + i, maximum(value, kSlope * value));
+    }
+    multiply({hidden, network.hidden_stride, 1}, count, network.second, network.out_stride, own.hidden,
+             network.second_bias, 0, out);
+    for (int64_t i = 0; i < count; ++i) {
+      const float* row = out + i * network.out_stride;
+      memcpy(outputs + (begin + i) * (own.width - 1), row, sizeof(float) * (own.width - 1));
+      last[begin + i] = row[own.width - 1];
+    }
+  }
+}
+
+MIEN_INLINE bool all_zero(const float* values, int64_t count) {
+  int64_t i = 0;
+  I seen{};  // NaN counts as a value
+  for (; i + W <= count; i += W) seen = seen | bits(load(values + i));
+  bool zero = !any(less(F{}, to_float(seen & 0x7fffffff)));
+  for (; i < count; ++i) zero = zero && values[i] == 0;
+  return zero;
+}
+
+// Adds the columns' sums over `count` rows to `sums`.
+MIEN_INLINE void add_rows(const float* rows, int64_t count, int64_t width, float* sums) {
+  for (int64_t c = 0; c < width; c += W) {
+    F total = load(sums + c);
+    for (int64_t i = 0; i < count; ++i) total = total + load(rows + i * width + c);
+    store(sums + c, total);
+  }
+}
+
+MIEN_INLINE F dot(const float* a, const float* b, int width) {
+  F total{};
+  int i = 0;
+  for (; i + W <= width; i += W) total = total + load(a + i) * load(b + i);
+  for (; i < width; ++i) total[0] += a[i] * b[i];
+  return total;
+}
+
+// A block of Gaussians that have gradients: their indices and, in scratch, their rows.
+struct Block {
+  int64_t index[kFeatureBlock];
+  int64_t count = 0;
+  float *rows, *hidden, *by_out, *by_hidden, *by_features;
+};
+
+void gather(const PaddedNetwork& network, const FeatureKept& kept, const FeatureGradients& gradients, int64_t index,
+            Block& block) {
+  const FeatureNetwork& own = *network.own;
+  const int64_t i = block.count++;
+  block.index[i] = index;
+  float* const row = block.rows + i * network.in_stride;
+  memcpy(row, kept.features + index * own.features, sizeof(float) * own.features);
+  fill_own(network, index, row);
+  memcpy(block.hidden + i * network.hidden_stride, kept.hidden + index * network.hidden_stride,
+         sizeof(float) * network.hidden_stride);
+  float* const by_out = block.by_out + i * network.out_stride;
+  memcpy(by_out, gradients.outputs + index * (own.width - 1), sizeof(float) * (own.width - 1));
+  by_out[own.width - 1] = gradients.last[index];
+  for (int64_t c = own.width; c < network.out_stride; ++c) by_out[c] = 0;
+}
+
+void backward_block(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureGradients& gradients,
+                    const FeatureSums& sums, const float* zeros, Block& block) {
+  const FeatureNetwork& own = *network.own;
+  multiply({block.by_out, network.out_stride, 1}, block.count, network.second_back, network.hidden_stride, own.width,
+           zeros, 0, block.by_hidden);
+  for (int64_t i = 0; i < block.count * network.hidden_stride; i += W) {
+    const F gradient = load(block.by_hidden + i);
+    store(block.by_hidden + i, select(less(F{}, load(block.hidden + i)), gradient, kSlope * gradient));
+  }
+  multiply({block.by_hidden, network.hidden_stride, 1}, block.count, network.first_back, network.feature_stride,
+           own.hidden, zeros, 0, block.by_features);
+  multiply({block.by_out, 1, network.out_stride}, own.width, block.hidden, network.hidden_stride, block.count,
+           sums.second, network.hidden_stride, sums.second);
+  multiply({block.by_hidden, 1, network.hidden_stride}, own.hidden, block.rows, network.in_stride, block.count,
+           sums.first, network.in_stride, sums.first);
+  add_rows(block.by_out, block.count, network.out_stride, sums.second_bias);
+  add_rows(block.by_hidden, block.count, network.hidden_stride, sums.first_bias);
+  for (int64_t i = 0; i < block.count; ++i) {
+    const float* by_features = block.by_features + i * network.feature_stride;
+    memcpy(gradients.features + block.index[i] * own.features, by_features, sizeof(float) * own.features);
+    if (!gradients.inputs) continue;
+    for (int64_t k = 0; k < inputs.count; ++k) {
+      const float* row = inputs.items[k].column + block.index[i] * inputs.items[k].stride;
+      store(sums.inputs + 16 * k, load(sums.inputs + 16 * k) + dot(row, by_features, own.features));
+    }
+  }
+  block.count = 0;
+}
+
+void backward(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
+              const FeatureGradients& gradients, const FeatureSums& sums, float* scratch, int64_t first, int64_t end) {
+  [[maybe_unused]] const NoDenormals guard;
+  const FeatureNetwork& own = *network.own;
+  Block block;
+  block.rows = scratch;
+  block.hidden = block.rows + kFeatureBlock * network.in_stride;
+  block.by_out = block.hidden + kFeatureBlock * network.hidden_stride;
+  block.by_hidden = block.by_out + kFeatureBlock * network.out_stride;
+  block.by_features = block.by_hidden + kFeatureBlock * network.hidden_stride;
+  float* const zeros = block.by_features + kFeatureBlock * network.feature_stride;
+  memset(zeros, 0, sizeof(float) * (network.hidden_stride + network.feature_stride));
+  for (int64_t index = first; index < end; ++index) {
+    if (gradients.last[index] == 0 && all_zero(gradients.outputs + index * (own.width - 1), own.width - 1)) {
+      memset(gradients.features + index * own.features, 0, sizeof(float) * own.features);
+      continue;
+    }
+    gather(network, kept, gradients, index, block);
+    if (block.count == kFeatureBlock) backward_block(network, inputs, gradients, sums, zeros, block);
+  }
+  if (block.count > 0) backward_block(network, inputs, gradients, sums, zeros, block);
+}
+
+// The step of each factor of one Gaussian, and its moments.
+MIEN_INLINE void factor_steps(const FactoredUpdate& task, float mean_square, int64_t index, float* steps) {
+  const float beta = 0.999f, rest = 0.001f, weight = task.weights[index] * beta + rest;
+  task.weights[index] = weight;
+  const float unbiased = 1 / weight, share = rest * mean_square;
+  const float* factors = task.rows + index * task.width;
+  float* second = task.second + index * task.width;
+  int i = 0;
+  for (; i + W <= task.width; i += W) {
+    const F factor = load(factors + i), mean = load(second + i) * beta + factor * factor * share;
+    store(second + i, mean);
+    store(steps + i, task.rate * factor / (square_root(mean * unbiased) + 1e-15f));
+  }
+  for (; i < task.width; ++i) {
+    second[i] = second[i] * beta + factors[i] * factors[i] * share;
+    steps[i] = task.rate * factors[i] / (__builtin_sqrtf(second[i] * unbiased) + 1e-15f);
+  }
+}
+
+void update(const FactoredUpdate& task, float mean_square, float* steps, int64_t first, int64_t end) {
+  [[maybe_unused]] const NoDenormals guard;
+  for (int64_t index = first; index < end; ++index) {
+    if (all_zero(task.rows + index * task.width, task.width)) continue;
+    factor_steps(task, mean_square, index, steps);
+    float* values = task.values + index * task.columns_count * task.width;
+    for (int k = 0; k < task.columns_count; ++k, values += task.width) {
+      if (task.columns[k] != 0) add_scaled(steps, -task.columns[k], task.width, values);
+    }
+  }
+}
+
+}  // namespace
+
+extern const FeatureKernels feature_kernels;
+const FeatureKernels feature_kernels = {forward, backward, update};
+
+}  // namespace mien::MIEN_ISA

@@ -1,0 +1,130 @@
+"""Features of Gaussians, blended by the inputs of a face, through a network of two layers (HeadGaS, section 3.2).
+
+A Gaussian's features are f = f0 + sum over k of e_k F_k: its neutral features f0, and its bases F weighted by the
+inputs e. The network takes the features and some numbers of the Gaussian's own. It is the same for all Gaussians and
+has one hidden layer with leaky ReLU. Native for float32 on a CPU: one call forward and one backward.
+
+The bases are by far the largest tensor of an avatar. Their gradient by F_k is e_k times that by f, so it is given to a
+`FactoredGradient` as these two factors, and never made.
+"""
+
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mien import _native
+from mien.adam import FactoredGradient
+from mien.arrays import recycled, unpacked
+
+SLOPE = 0.01
+"""Slope of the leaky ReLU below 0."""
+_LANES = 16
+
+
+class Layers(NamedTuple):
+    """Weights and biases of the two layers."""
+
+    weight1: Float[Tensor, "h i"]
+    """i: the features, then the Gaussian's own numbers."""
+    bias1: Float[Tensor, " h"]
+    weight2: Float[Tensor, "o h"]
+    bias2: Float[Tensor, " o"]
+
+
+def feature_network(
+    bases: Float[Tensor, "n k f"],
+    inputs: Float[Tensor, " k"],
+    neutral: Float[Tensor, "n f"],
+    own: Float[Tensor, "n x"],
+    layers: Layers,
+    gradient: FactoredGradient,
+) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
+    """All outputs but the last, and the last. Differentiable in everything but `own`.
+
+    Args:
+        bases: Bases of the features. Their gradient goes to `gradient`.
+        inputs: Weights of the bases at one timestep.
+        neutral: Features where all inputs are 0.
+        own: Numbers of each Gaussian that go into the network beside its features.
+        layers: The network.
+        gradient: Takes the gradient of the bases, if they require one.
+    """
+    if bases.dtype != torch.float32 or bases.device.type != "cpu":
+        features = _Blend.apply(gradient, bases, inputs, neutral)
+        return _network(features, own, layers)
+    return _Network.apply(gradient, bases, inputs, neutral, own, *layers)
+
+
+def feature_network_reference(
+    bases: Float[Tensor, "n k f"],
+    inputs: Float[Tensor, " k"],
+    neutral: Float[Tensor, "n f"],
+    own: Float[Tensor, "n x"],
+    layers: Layers,
+) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
+    """`feature_network` in plain PyTorch, whose bases have a common gradient."""
+    return _network(neutral + torch.einsum("nkf,k->nf", bases, inputs), own, layers)
+
+
+def _network(features: Tensor, own: Tensor, layers: Layers) -> tuple[Tensor, Tensor]:
+    hidden = torch.cat([features, own], dim=-1) @ layers.weight1.T + layers.bias1
+    outputs = torch.nn.functional.leaky_relu(hidden, SLOPE) @ layers.weight2.T + layers.bias2
+    return outputs[:, :-1], outputs[:, -1]
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, gradient: FactoredGradient, bases: Tensor, inputs: Tensor, neutral: Tensor) -> Tensor:
+        ctx.gradient = gradient
+        ctx.save_for_backward(bases, inputs)
+        return neutral + torch.einsum("nkf,k->nf", bases, inputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_features: Tensor) -> tuple[Tensor | None, ...]:
+        bases, inputs = ctx.saved_tensors
+        if ctx.needs_input_grad[1]:
+            ctx.gradient.terms.append((by_features, inputs))
+        by_inputs = torch.einsum("nkf,nf->k", bases, by_features) if ctx.needs_input_grad[2] else None
+        return None, None, by_inputs, by_features
+
+
+class _Network(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, gradient: FactoredGradient, *arguments: Tensor) -> tuple[Tensor, Tensor]:
+        bases, inputs, neutral, *rest = (tensor.detach().contiguous() for tensor in arguments)
+        n, outputs = len(neutral), len(rest[-1])
+        last, others = torch.empty(n), recycled(n, outputs - 1)
+        kept: tuple[Tensor, ...] = ()
+        if any(ctx.needs_input_grad):
+            kept = (recycled(*neutral.shape), recycled(n, -(-len(rest[2]) // _LANES) * _LANES))
+        _native.feature_network(
+            _native.FeatureNetwork(*unpacked(neutral, *rest)),
+            [_native.FeatureBases(*unpacked(bases, inputs), by_input=False)],
+            _native.FeatureKept(*unpacked(*kept)) if kept else None,
+            *unpacked(others, last),
+        )
+        ctx.gradient = gradient
+        ctx.save_for_backward(bases, inputs, neutral, *rest, *kept)
+        return others, last
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_others: Tensor, by_last: Tensor) -> tuple[Tensor | None, ...]:
+        bases, inputs, neutral, own, *layers = ctx.saved_tensors[:8]
+        by_features, by_inputs = recycled(*neutral.shape), torch.empty_like(inputs)
+        by_layers = [torch.empty_like(tensor) for tensor in layers]
+        _native.feature_network_backward(
+            _native.FeatureNetwork(*unpacked(neutral, own, *layers)),
+            [_native.FeatureBases(*unpacked(bases, inputs), by_input=False)],
+            _native.FeatureKept(*unpacked(*ctx.saved_tensors[8:])),
+            _native.FeatureGradients(
+                *unpacked(by_others.contiguous(), by_last.contiguous(), by_features, *by_layers, by_inputs)
+            ),
+        )
+        if ctx.needs_input_grad[1]:
+            ctx.gradient.terms.append((by_features, inputs))
+        return None, None, by_inputs, by_features, None, *by_layers

@@ -1,0 +1,159 @@
+"""The network of blended features, and the update of its bases: native against PyTorch, finite differences."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from instruction_sets import ISAS, each_isa
+from mien import _native
+from mien.adam import FactoredGradient, FactoredMoments
+from mien.avatar.feature_network import Layers, feature_network, feature_network_reference
+from mien.training.adam import FactoredUpdate, factored_update, factored_update_reference
+
+Sizes = tuple[int, int, int, int, int, int]
+"""Gaussians, inputs, features, own numbers, hidden values, outputs."""
+SIZES: list[Sizes] = [
+    (100, 20, 32, 27, 64, 49), (1, 1, 1, 0, 1, 1), (0, 3, 4, 5, 6, 7), (2000, 5, 17, 3, 70, 5), (97, 3, 8, 27, 33, 4),
+]  # fmt: skip
+
+
+@pytest.fixture(params=ISAS)
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    yield from each_isa(request)
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    """Standard normal numbers."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def arguments(sizes: Sizes, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+    """Bases, inputs, neutral features, own numbers and layers. One input is 0."""
+    n, k, f, x, h, o = sizes
+    inputs = random(k, seed=1)
+    inputs[k // 2 :: 7] = 0
+    made = [
+        random(n, k, f), inputs, random(n, f, seed=2), random(n, x, seed=3), random(h, f + x, seed=4) / 4,
+        random(h, seed=5), random(o, h, seed=6) / 4, random(o, seed=7),
+    ]  # fmt: skip
+    return [tensor.to(dtype) for tensor in made]
+
+
+def gradients_of(sizes: Sizes) -> tuple[Tensor, Tensor]:
+    """Gradients of the outputs. Every third Gaussian has none."""
+    others, last = random(sizes[0], sizes[5] - 1, seed=8), random(sizes[0], seed=9)
+    others[::3], last[::3] = 0, 0
+    return others, last
+
+
+def ours(given: list[Tensor], by: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """Outputs and gradients of `feature_network`, that of the bases multiplied out."""
+    gradient = FactoredGradient()
+    leaves = [tensor.clone().requires_grad_() for tensor in given]
+    bases, inputs, neutral, own, *layers = leaves
+    outputs = feature_network(bases, inputs, neutral, own.detach(), Layers(*layers), gradient)
+    by = (by[0].to(outputs[0]), by[1].to(outputs[1]))
+    found = torch.autograd.grad(outputs, [inputs, neutral, *layers], by)
+    (rows, columns), *others = gradient.take()
+    assert not others
+    return [tensor.detach() for tensor in (*outputs, rows[:, None] * columns[:, None], *found)]
+
+
+def theirs(given: list[Tensor], by: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """The same in float64 by `feature_network_reference`."""
+    leaves = [tensor.double().requires_grad_() for tensor in given]
+    bases, inputs, neutral, own, *layers = leaves
+    outputs = feature_network_reference(bases, inputs, neutral, own, Layers(*layers))
+    found = torch.autograd.grad(outputs, [bases, inputs, neutral, *layers], (by[0].double(), by[1].double()))
+    return [tensor.detach() for tensor in (*outputs, *found)]
+
+
+@pytest.mark.parametrize("sizes", SIZES, ids=str)
+def test_native_outputs_and_gradients_equal_their_reference(isa: str, sizes: Sizes) -> None:
+    given, by = arguments(sizes), gradients_of(sizes)
+    for index, (own, expected) in enumerate(zip(ours(given, by), theirs(given, by), strict=True)):
+        error = (own.double() - expected).norm() / expected.norm().clamp_min(1e-6)
+        assert own.shape == expected.shape
+        assert float(error) < 1e-5, index
+
+
+def test_other_dtypes_have_factored_gradients_too() -> None:
+    given, by = arguments(SIZES[0], torch.float64), gradients_of(SIZES[0])
+    for own, expected in zip(ours(given, by), theirs(given, by), strict=True):
+        torch.testing.assert_close(own, expected)
+
+
+def test_reference_has_the_gradients_of_finite_differences() -> None:
+    given = [tensor.requires_grad_() for tensor in arguments((3, 4, 5, 2, 6, 7), torch.float64)]
+    assert torch.autograd.gradcheck(
+        lambda bases, inputs, neutral, own, *layers: feature_network_reference(
+            bases, inputs, neutral, own, Layers(*layers)
+        ),
+        given,
+    )
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    before, results = _native.thread_count(), []
+    for threads in (1, 3):
+        _native.set_thread_count(threads)
+        results.append(ours(arguments(SIZES[3]), gradients_of(SIZES[3])))
+    _native.set_thread_count(before)
+    assert all(torch.equal(one, two) for one, two in zip(*results, strict=True))
+
+
+def test_without_gradients_the_outputs_are_the_same() -> None:
+    given = arguments(SIZES[0])
+    with torch.no_grad():
+        alone = feature_network(*given[:4], Layers(*given[4:]), FactoredGradient())
+    assert all(torch.equal(a, b) for a, b in zip(alone, ours(given, gradients_of(SIZES[0])), strict=False))
+
+
+def update_of(dtype: torch.dtype = torch.float32, n: int = 2000, k: int = 5, f: int = 19) -> FactoredUpdate:
+    rows, columns = random(n, f, seed=1), random(k, seed=2)
+    rows[::3], columns[1] = 0, 0
+    moments = FactoredMoments(0.1 * random(n, f, seed=3).square(), random(n, seed=4).square() / 10)
+    moments.weights[1::2], moments.second[1::2] = 0, 0  # rows without an update so far
+    tensors = [tensor.to(dtype) for tensor in (random(n, k, f), rows, columns, moments.second, moments.weights)]
+    return FactoredUpdate(tensors[0], [(tensors[1], tensors[2])], FactoredMoments(*tensors[3:]), 0.01)
+
+
+@pytest.mark.parametrize("f", [1, 16, 19, 32])
+def test_native_update_equals_its_reference(isa: str, f: int) -> None:
+    native, plain = update_of(f=f), update_of(torch.float64, f=f)
+    for _ in range(3):
+        factored_update(native)
+        factored_update_reference(plain)
+    torch.testing.assert_close(native.values.double(), plain.values, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(native.moments.second.double(), plain.moments.second, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(native.moments.weights.double(), plain.moments.weights, rtol=1e-5, atol=1e-7)
+
+
+def test_first_update_of_a_row_moves_by_about_the_rate() -> None:
+    update = update_of(torch.float64)
+    before, columns = update.values.clone(), update.terms[0][1]
+    factored_update(update)
+    moved = (update.values - before)[1::6].abs()  # no update so far, and a gradient now
+    expected = update.rate * columns.abs() / columns.square().mean().sqrt()
+    torch.testing.assert_close(moved, expected[:, None].expand_as(moved))
+
+
+def test_rows_and_columns_without_gradient_stay() -> None:
+    update = update_of()
+    before, second, weights = update.values.clone(), update.moments.second.clone(), update.moments.weights.clone()
+    factored_update(update)
+    assert torch.equal(update.values[::3], before[::3])
+    assert torch.equal(update.values[:, 1], before[:, 1])
+    assert torch.equal(update.moments.second[::3], second[::3])
+    assert torch.equal(update.moments.weights[::3], weights[::3])
+    assert not torch.equal(update.values[1::3], before[1::3])
+
+
+def test_several_terms_add_up() -> None:
+    one, parts = update_of(torch.float64), update_of(torch.float64)
+    ((rows, columns),) = parts.terms
+    factored_update(one)
+    factored_update(parts._replace(terms=[(0.25 * rows, columns), (rows, 0.75 * columns)]))
+    torch.testing.assert_close(one.values, parts.values)
