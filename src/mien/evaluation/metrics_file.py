@@ -17,6 +17,8 @@ COLUMNS = (
     ("perceptual", "ST-LPIPS", 3, False),
 )  # fmt: skip
 """Metric, heading, number of digits, whether higher is better."""
+PART_NAMES = {"eyes": "Eyes", "mouth": "Mouth"}
+"""Headings of the parts of the face that have figures of their own, by their keys in metrics.json."""
 BASELINE_NAMES = {"mean_frame": "mean training picture", "mesh": "coloured mesh"}
 """Names of the baselines, by their keys in metrics.json."""
 FACE_SOURCE_NAMES = {"corrected": "corrected", "as_tracked": "as tracked"}

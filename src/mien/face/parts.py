@@ -15,7 +15,8 @@ _REGIONS = {"eyes": ("eyelids", "eyes", "irises"), "mouth": ("lips",)}
 _MARGINS = {"eyes": 0.12, "mouth": 0.2}
 """Margin around the regions on each side, relative to the width of the part."""
 _MIN_COSINE = 0.3
-"""Smallest cosine between the part's mean normal and the direction to the camera at which the part counts as seen."""
+"""Smallest cosine between the direction from the head's middle to the part and that from the part to the camera at
+which the part counts as seen."""
 _MIN_SIDE = 8
 """Smallest side of a box, in pixels. Smaller parts show nothing."""
 
@@ -42,12 +43,12 @@ def part_boxes(face_model: FaceModel, vertices: Float[Tensor, "v 3"], camera: Ca
 
 def _box_of(vertices: Float[Tensor, "v 3"], triangles: Tensor, camera: Camera, margin: float) -> Box | None:
     corners = vertices[triangles]
-    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(0)
     points, depth = camera.project(corners.reshape(-1, 3))
-    towards = camera.position - corners.reshape(-1, 3).mean(0)
+    middle = corners.reshape(-1, 3).mean(0)
+    outward, towards = middle - (vertices.amin(0) + vertices.amax(0)) / 2, camera.position - middle
     if not (depth > 0).all() or not torch.isfinite(points).all():
         return None
-    if float((normal * towards).sum()) < _MIN_COSINE * float(normal.norm() * towards.norm()):
+    if float((outward * towards).sum()) < _MIN_COSINE * float(outward.norm() * towards.norm()):
         return None
     low, high = points.amin(0), points.amax(0)
     beyond = margin * (high[0] - low[0])
