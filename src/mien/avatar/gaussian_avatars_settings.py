@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
+from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, PerceptualLoss, Photometric
 from mien.ranges import FRACTION, NOT_NEGATIVE, Range
 
 
@@ -104,7 +104,12 @@ def _paper() -> GaussianAvatarsConfig:
     )
 
 
-PRESETS = {"draft": GaussianAvatarsConfig(), "standard": GaussianAvatarsConfig(), "paper": _paper()}
-"""Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
+def _standard() -> GaussianAvatarsConfig:
+    """The defaults, with eyes and mouth weighed more and a perceptual loss, which take a third more time."""
+    return GaussianAvatarsConfig(photometric=Photometric(part_weight=1.0, perceptual=PerceptualLoss(weight=4.0)))
+
+
+PRESETS = {"draft": GaussianAvatarsConfig(), "standard": _standard(), "paper": _paper()}
+"""Settings of this method for each preset. `draft` has the defaults, and is a shorter run than `standard`."""
 PRESET_STEPS = {"paper": _STEPS}
 """Number of steps of the presets for which the method has its own."""
