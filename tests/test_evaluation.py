@@ -13,11 +13,13 @@ from evaluation_case import make_experiment
 from mien.avatar import DEFAULT_METHOD
 from mien.evaluation.baselines import make_baselines
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
-from mien.evaluation.metrics import psnr
+from mien.evaluation.metrics import crop_to, psnr
 from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
 from mien.evaluation.report import RunRecord, report_html
 from mien.evaluation.report_sections import spans
+from mien.evaluation.scoring import PART_SIDE, as_8_bit, enlarged, mean_scores, score_pictures
+from mien.perceptual import load_perceptual
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +87,28 @@ def test_metrics_have_the_documented_layout_and_order(experiment: Experiment, ev
     assert ranked == sorted(ranked)
 
 
+def test_eyes_have_figures_of_their_own(experiment: Experiment, evaluation: Evaluation) -> None:
+    content = protocol_content(experiment, evaluation, EvaluationSettings())
+    frame = experiment.held_out_frames[0]
+    (box,) = experiment.parts(frame).values()
+    image, target = as_8_bit(avatar_image(experiment, frame)), target_image(experiment, frame)
+    assert content["per_frame"]["eyes_psnr"][0] == pytest.approx(psnr(image, target, box), abs=1e-4)
+    cut, goal = (enlarged(crop_to(picture, box), PART_SIDE) for picture in (image, target))
+    assert min(cut.shape[:2]) == PART_SIDE
+    assert content["per_frame"]["eyes_perceptual"][0] == pytest.approx(load_perceptual()(cut, goal), abs=1e-4)
+    assert content["eyes"]["psnr"] == pytest.approx(np.mean(content["per_frame"]["eyes_psnr"]), abs=1e-4)
+    assert content["baselines"]["mesh"]["eyes"]["psnr"] < content["eyes"]["psnr"]
+    assert "mouth" not in content, "the face model has no lips"
+
+
+def test_frames_that_show_no_eyes_are_left_out_of_their_figures() -> None:
+    pictures, target = {"image": torch.full((40, 50, 3), 0.5)}, torch.full((40, 50, 3), 0.6)
+    with_eyes = score_pictures(pictures, target, None, None, {"eyes": (5, 6, 20, 10)})["image"]
+    without = score_pictures(pictures, target, None, None)["image"]
+    assert mean_scores([without, with_eyes])["eyes"]["psnr"] == pytest.approx(20.0, abs=1e-3)
+    assert "eyes" not in mean_scores([without])
+
+
 def test_figures_do_not_depend_on_threads_or_on_other_subjects(experiment: Experiment) -> None:
     few = replace(experiment, held_out_frames=experiment.held_out_frames[:5])
     alone = evaluate_frames(few, EvaluationSettings(perceptual=False, baselines=False, threads=1))
@@ -122,7 +146,16 @@ def test_report_stands_alone_and_shows_everything(experiment: Experiment, evalua
     for forbidden in ("http://", "https://", "<script", "<link", "url(", "/somewhere"):
         assert forbidden not in page
     assert "mien create &#x27;&lt;clip&gt;.mp4&#x27;" in page, "the command must be there, quoted and escaped"
-    for wanted in ("Held-out frames", "best", "median", "worst", "Mean training picture", "Gaussians", "1 min 11 s"):
+    for wanted in (
+        "Held-out frames",
+        "best",
+        "median",
+        "worst",
+        "Mean training picture",
+        "Gaussians",
+        "1 min 11 s",
+        ">Eyes<",
+    ):
         assert wanted in page
     figures = _Tags()
     figures.feed(page)

@@ -248,6 +248,7 @@ METRICS: dict[str, Callable[[dict[str, Any]], object]] = {
     "list": of_protocol(lambda e: e.update(ssim=[1])),
     "head": of_protocol(lambda e: e.update(head=None)),
     "no head": of_protocol(lambda e: e.pop("head")),
+    "eyes": of_protocol(lambda e: e.update(eyes={"psnr": "high"})),
     "faces": of_protocol(lambda e: e.update(face_params="guessed")),
     "frames": of_protocol(lambda e: e.update(frames="1")),
     "split": of_protocol(lambda e: e.update(split={})),

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from mien.errors import UserError
-from mien.evaluation import perceptual
 from mien.evaluation.metrics import MAX_PSNR, crop_to, l1, psnr, ssim, ssim_map
-from mien.evaluation.perceptual import load_perceptual
+from mien.perceptual import distance, load_perceptual, weights
 
 
 @pytest.fixture
@@ -102,17 +101,17 @@ def test_st_lpips_orders_small_shift_below_blur(test_data) -> None:
 def test_first_map_in_one_step_equals_two(size: tuple[int, int]) -> None:
     metric = load_perceptual()
     values = torch.randn(1, 3, *size, generator=torch.Generator().manual_seed(1))
-    two_steps = perceptual._halve(metric._convolve(0, values, padding=2))
+    two_steps = distance._halve(metric._convolve(0, values, padding=2))
     torch.testing.assert_close(metric._first_map(values), two_steps, atol=2e-5, rtol=1e-4)
 
 
 def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path) -> None:
     load_perceptual.cache_clear()
-    monkeypatch.setattr(perceptual, "_PACKAGE", "no_such_package_here")
+    monkeypatch.setattr(weights, "_PACKAGE", "no_such_package_here")
     with pytest.raises(UserError, match="pip install stlpips-pytorch"):
         load_perceptual()
     path = tmp_path / "alex.pth"
-    monkeypatch.setattr(perceptual, "weights_path", lambda backbone: path)
+    monkeypatch.setattr(weights, "weights_path", lambda backbone: path)
     with pytest.raises(UserError, match="missing"):
         load_perceptual()
     torch.save({"scaling_layer.shift": torch.zeros(1)}, path)

@@ -132,3 +132,27 @@ def test_threads_do_not_change_a_bit(isa: str):
     for loss, gradient in results[1:]:
         assert torch.equal(loss, results[0][0])
         assert torch.equal(gradient, results[0][1])
+
+
+@pytest.mark.parametrize("bytes_given", [False, True])
+def test_parts_count_again_as_pictures_of_their_own(isa: str, bytes_given: bool) -> None:
+    image, target = pair(37, 53)
+    target = (target.clamp(0, 1) * 255).to(torch.uint8) if bytes_given else target
+    parts = [(5, 7, 20, 11), (40, 20, 30, 30), (2, 2, 4, 9)]  # the second reaches beyond the picture
+    wanted = image.double().requires_grad_()
+    goal = target.double() / (255 if bytes_given else 1)
+    loss = photometric_loss_reference(wanted, goal, parts=parts, part_weight=1.5)
+    by_hand = photometric_loss_reference(wanted, goal)
+    for left, top, width, height in parts:
+        rows, columns = slice(top, top + height), slice(left, left + width)
+        cut = photometric_loss_reference(wanted[rows, columns], goal[rows, columns])
+        by_hand = by_hand + 1.5 * cut * wanted[rows, columns].numel() / wanted.numel()
+    assert float(loss.detach()) == pytest.approx(float(by_hand.detach()), rel=1e-12)
+
+    parts = parts[:2]  # the third is too narrow for the native path
+    loss = photometric_loss_reference(wanted, goal, parts=parts, part_weight=1.5)
+    found = image.clone().requires_grad_()
+    native = photometric_loss(found, target, parts=parts, part_weight=1.5)
+    assert float(native.detach()) == pytest.approx(float(loss.detach()), rel=1e-5)
+    gradient = torch.autograd.grad(native, found)[0]
+    assert relative_error(gradient, torch.autograd.grad(loss, wanted)[0]) < 1e-4

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         FaceTuning,
         GradientSettings,
         MethodConfig,
+        PerceptualLoss,
         Photometric,
         RefillSettings,
     )
@@ -57,6 +58,7 @@ else:
                 "FaceTuning",
                 "GradientSettings",
                 "MethodConfig",
+                "PerceptualLoss",
                 "Photometric",
                 "RefillSettings",
             ],
@@ -86,6 +88,7 @@ __all__ = [
     "MonoGaussianAvatar",
     "MonoGaussianAvatarConfig",
     "ParameterGroup",
+    "PerceptualLoss",
     "Photometric",
     "Posed",
     "Progress",

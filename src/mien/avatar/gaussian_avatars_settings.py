@@ -1,10 +1,10 @@
 """The settings of GaussianAvatars."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
+from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, PerceptualLoss, Photometric
 from mien.ranges import FRACTION, NOT_NEGATIVE, Range
 
 
@@ -109,10 +109,19 @@ def _paper() -> GaussianAvatarsConfig:
     )
 
 
-_STANDARD = GaussianAvatarsConfig(
-    expression_rank=_RANK, expression_colour_rate=Rate(0.0), expression_opacity_rate=Rate(0.0)
-)
-PRESETS = {"draft": _STANDARD, "standard": _STANDARD, "paper": _paper()}
-"""Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
+def _draft() -> GaussianAvatarsConfig:
+    """The defaults, with places that change with the expression."""
+    return GaussianAvatarsConfig(
+        expression_rank=_RANK, expression_colour_rate=Rate(0.0), expression_opacity_rate=Rate(0.0)
+    )
+
+
+def _standard() -> GaussianAvatarsConfig:
+    """A draft with eyes and mouth weighed more and a perceptual loss, which take a third more time."""
+    return replace(_draft(), photometric=Photometric(part_weight=1.0, perceptual=PerceptualLoss(weight=4.0)))
+
+
+PRESETS = {"draft": _draft(), "standard": _standard(), "paper": _paper()}
+"""Settings of this method for each preset. `draft` lacks some losses of `standard`, and is a shorter run."""
 PRESET_STEPS = {"paper": _STEPS}
 """Number of steps of the presets for which the method has its own."""

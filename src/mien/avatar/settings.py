@@ -14,6 +14,31 @@ GAUSSIAN_COUNT = Range(1, 10_000_000)
 
 
 @dataclass(frozen=True)
+class PerceptualLoss:
+    """A loss of trained features (the first blocks of a VGG16) on small crops, which keeps details sharp.
+
+    Each crop is drawn at random: around the eyes, around the mouth, or anywhere in the scoring mask's box. A crop is
+    compared by other features than those of the scored metric (ST-LPIPS).
+    """
+
+    weight: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Weight of the distance of features, for a crop as large as the picture. A smaller crop counts by its share of
+    the pixels, so that the weight of one pixel does not depend on the crop. 0 switches the loss off."""
+    start: Annotated[float, FRACTION] = 0.3
+    """Time of the first step with this loss, as a fraction of the run."""
+    every: Annotated[int, Range(1, 1_000)] = 8
+    """Number of steps from one step with this loss to the next."""
+    crop: Annotated[int, Range(16, 512)] = 64
+    """Side of the crops, in pixels of the training pictures. The cost grows with its square."""
+    blocks: Annotated[int, Range(1, 3)] = 2
+    """Number of blocks of the network, from fine to coarse features. Each block more doubles the cost, or more."""
+
+    def due(self, step: int, steps: int) -> bool:
+        """Whether a step of a run of `steps` has this loss."""
+        return self.weight > 0 and step % self.every == 0 and step >= self.start * steps
+
+
+@dataclass(frozen=True)
 class Photometric:
     """Weights of the losses that compare a rendering with its target."""
 
@@ -23,6 +48,15 @@ class Photometric:
     """Weight of 1 - SSIM (11x11 window, sigma 1.5)."""
     alpha_weight: Annotated[float, NOT_NEGATIVE] = 0.0
     """Weight of the mean absolute difference between the rendering's alpha and the matte."""
+    part_weight: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Additional weight of L1 and SSIM in the boxes around eyes and mouth. With 1, these pixels count twice."""
+    perceptual: PerceptualLoss = field(default_factory=PerceptualLoss)
+    """A loss of trained features on small crops."""
+
+    @property
+    def needs_parts(self) -> bool:
+        """Whether a loss needs the boxes around eyes and mouth."""
+        return self.part_weight > 0 or self.perceptual.weight > 0
 
 
 @dataclass(frozen=True)

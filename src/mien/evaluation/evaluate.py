@@ -22,7 +22,7 @@ from mien.locks import hold
 from mien.storage import file_digest, write_json
 from mien.training import read_curves, read_run_config, read_training_summary
 
-_RECIPE = 2
+_RECIPE = 3
 """Version of the scoring. It is raised whenever the same frame would get other figures."""
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar
 from mien.camera import Camera
-from mien.face import FaceParams
+from mien.face import FaceParams, part_boxes
 from mien.pictures import Box
 from mien.render import rasterize
 from mien.render.validation import drawable
@@ -58,6 +58,13 @@ class Experiment:
         """The head crop that was frozen together with the scoring mask."""
         left, top, width, height = (int(value) for value in self.scorings[frame.sequence].crops[frame[1:]])
         return left, top, width, height
+
+    @torch.no_grad()
+    def parts(self, frame: Frame) -> dict[str, Box]:
+        """The boxes of eyes and mouth, by the tracked mesh as the tracker left it, so that runs share them."""
+        face_model = self.avatar.face_model
+        vertices = face_model(self.sequences[frame.sequence].tracking.face[frame.timestep])[0]
+        return part_boxes(face_model, vertices, self.camera(frame))
 
     def face(self, frame: Frame) -> FaceParams:
         """The face parameters of one timestep."""

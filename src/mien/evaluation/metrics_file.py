@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mien.evaluation.scoring import METRICS
+from mien.face import PARTS
 from mien.inside import is_one_line
 from mien.storage import expect_whole, read_json
 
@@ -16,6 +17,8 @@ COLUMNS = (
     ("perceptual", "ST-LPIPS", 3, False),
 )  # fmt: skip
 """Metric, heading, number of digits, whether higher is better."""
+PART_NAMES = {"eyes": "Eyes", "mouth": "Mouth"}
+"""Headings of the parts of the face that have figures of their own, by their keys in metrics.json."""
 BASELINE_NAMES = {"mean_frame": "mean training picture", "mesh": "coloured mesh"}
 """Names of the baselines, by their keys in metrics.json."""
 FACE_SOURCE_NAMES = {"corrected": "corrected", "as_tracked": "as tracked"}
@@ -74,7 +77,7 @@ def _check_protocol(entry: Mapping[str, Any]) -> None:
     for name, row in entry["baselines"].items():
         _require(name in BASELINE_NAMES, "a baseline's name")
         _check_row(row)
-    for name in ("perceptual_backbone", "pixels"):
+    for name in ("perceptual_backbone", "pixels", "part_crops"):
         _require(entry.get(name) is None or is_one_line(entry[name]), name)
     _require(isinstance(entry.get("perceptual_frames"), int | None), "perceptual_frames")
     for name, digests in entry.get("scored_on", {}).items():
@@ -93,8 +96,11 @@ def _check_frames(frames: Mapping[str, Sequence[Any]]) -> None:
 
 
 def _check_row(row: Mapping[str, Any]) -> None:
-    """Check the figures of the whole frame and of the head crop. Only PSNR is required."""
-    for part in (row, row["head"]):
+    """Check the figures of the whole frame, of the head crop, and of eyes and mouth if there are any.
+
+    Only PSNR is required.
+    """
+    for part in (row, row["head"], *(row[name] for name in PARTS if name in row)):
         for name in METRICS:
             _require(_is_number(part.get(name)) or (name != "psnr" and part.get(name) is None), name)
 

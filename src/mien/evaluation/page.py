@@ -30,6 +30,10 @@ GLOSSARY = {
         "A white background raises the PSNR of the whole frame by several dB, so compare clips by their head crops. "
         "The head crop is the box of the mask."
     ),
+    "Eyes, mouth": (
+        "Boxes around the lids and around the lips of the tracked mesh, with a margin, in frames in which it faces the "
+        "camera. ST-LPIPS enlarges them if a side is shorter than 64 pixels."
+    ),
     "Baselines": (
         "An avatar must beat both: the mean of all training pictures, and the tracked mesh with the colours that "
         "training frames show on it. The green figure is the avatar's lead over the better one, in dB."
@@ -69,10 +73,11 @@ def glossary_html(terms: Mapping[str, str] = GLOSSARY) -> str:
     return f'<details class="card"><summary>How to read this</summary><dl>{entries}</dl></details>'
 
 
-def metric_headings() -> str:
-    """The heading cells of all metrics, for the whole frame and then for the head crop."""
+def metric_headings(crops: int | None = None) -> str:
+    """The heading cells of all metrics, for the whole frame and then for the head crop, or for a number of crops."""
     names = "".join(f"<th>{name} {'↑' if higher else '↓'}</th>" for _, name, _, higher in COLUMNS)
-    return names + names.replace("<th>", '<th class="head">', 1)
+    crop = names.replace("<th>", '<th class="head">', 1)
+    return names + crop if crops is None else crops * crop
 
 
 def metric_groups() -> str:

@@ -1,7 +1,7 @@
 """Protocols with true pictures: the avatar and both baselines on the same held-out frames, by the same metrics."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
@@ -13,6 +13,7 @@ from mien.evaluation.experiment import Experiment, avatar_image, scored_on, targ
 from mien.evaluation.metrics import psnr
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.scoring import (
+    PART_SIDE,
     PIXELS,
     SSIM_WINDOW,
     Scores,
@@ -33,6 +34,7 @@ _ALWAYS = {f"{part}{metric}" for part in ("", "head_") for metric in ("psnr", "s
 """Figures that every frame has."""
 _MASK = "frozen scoring mask: matte cut below the neck line, over white"
 _CROP = "frozen head box of each frame"
+_PART_CROPS = f"boxes of the tracked mesh; enlarged to {PART_SIDE} pixels for ST-LPIPS if a side is shorter"
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,8 @@ def evaluate_frames(
         frame, drawn, seconds = job
         pictures = {name: as_8_bit(picture) for name, picture in drawn.items()}
         truth, crop = target_image(experiment, frame), experiment.crop(frame)
-        return frame, score_pictures(pictures, truth, crop, metric if frame in judged else None), seconds
+        judge = metric if frame in judged else None
+        return frame, score_pictures(pictures, truth, crop, judge, experiment.parts(frame)), seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:
         jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines)
@@ -163,6 +166,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "split": experiment.split,
         "mask": _MASK,
         "crop": _CROP,
+        "part_crops": _PART_CROPS,
         "ssim_window": SSIM_WINDOW,
         "pixels": PIXELS,
         "face_params": experiment.face_source,
@@ -178,9 +182,14 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
             "sequence": [experiment.sequences[frame.sequence].name for frame in evaluation.frames],
             "timestep": [frame.timestep for frame in evaluation.frames],
             "camera_id": [experiment.camera_id(frame) for frame in evaluation.frames],
-            **{name: [_rounded(row.get(name)) for row in own_rows] for name in own_rows[0]},
+            **{name: [_rounded(row.get(name)) for row in own_rows] for name in _figure_names(own_rows)},
         },
     }
+
+
+def _figure_names(rows: Sequence[Scores]) -> list[str]:
+    """The names of all figures that any frame has. A frame in which the eyes are not seen has no figures of them."""
+    return list(dict.fromkeys(name for row in rows for name in row))
 
 
 def _training_means(evaluation: Evaluation) -> dict[str, Any]:

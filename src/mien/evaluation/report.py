@@ -13,7 +13,7 @@ import numpy as np
 
 from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
-from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, figure
+from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, PART_NAMES, figure
 from mien.evaluation.page import GLOSSARY, ReportVideo, glossary_html, metric_groups, metric_headings, page_html
 from mien.evaluation.protocols import Evaluation
 from mien.storage import write_atomically
@@ -145,7 +145,36 @@ def _table(protocols: Mapping[str, Any]) -> str:
             f'<div class="card table"><div class="scroll"><table>{_table_head()}<tbody>{rows}</tbody></table></div>'
             f'<p class="note">{escape(caption)}</p></div>'
         )
+        parts.append(_parts_table(subjects))
     return "".join(parts) or '<p class="note">No frame was held out, so nothing was scored.</p>'
+
+
+def _parts_table(subjects: Mapping[str, Any]) -> str:
+    """Every metric on the crops of eyes and mouth, or nothing if no frame shows them."""
+    shown = [part for part in PART_NAMES if part in subjects["avatar"]]
+    if not shown:
+        return ""
+    groups = "".join(f'<th class="group head" colspan="{len(COLUMNS)}">{PART_NAMES[part]}</th>' for part in shown)
+    rows = "".join(
+        f'<tr class="{"own" if key == "avatar" else ""}"><td>{label}</td>{_part_cells(subjects[key], shown)}</tr>'
+        for key, label in _ROWS.items()
+        if key in subjects
+    )
+    head = f'<tr><th class="blank"></th>{groups}</tr><tr><th></th>{metric_headings(len(shown))}</tr>'
+    return (
+        f'<div class="card table"><div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
+        f'<p class="note">Crops of eyes and mouth, in the frames that show them</p></div>'
+    )
+
+
+def _part_cells(entry: Mapping[str, Any], parts: Sequence[str]) -> str:
+    cells = []
+    for part in parts:
+        for index, (metric, _, digits, _) in enumerate(COLUMNS):
+            value = figure(entry, part, metric) if part in entry else None
+            text = "–" if value is None else f"{value:.{digits}f}"
+            cells.append(f"<td{' class=head' if index == 0 else ''}>{text}</td>")
+    return "".join(cells)
 
 
 def _table_head() -> str:

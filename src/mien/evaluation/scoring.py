@@ -4,14 +4,18 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from types import MappingProxyType
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mien.evaluation.metrics import crop_to, l1, psnr, ssim
-from mien.evaluation.perceptual import MIN_SIDE, Backbone, PerceptualDistance, load_perceptual
+from mien.face import PARTS
+from mien.perceptual import MIN_SIDE, Backbone, PerceptualDistance, load_perceptual
 from mien.pictures import Box, to_uint8
 from mien.threads import asked_threads
 
@@ -22,8 +26,11 @@ SSIM_WINDOW = "11x11 Gaussian window, sigma 1.5, zeros beyond the border"
 PIXELS = "8 bits a channel, rounded"
 """The scored pixels: those that a png file would hold, so that files of any program are scored alike."""
 
+PART_SIDE = 64
+"""Smallest side at which ST-LPIPS compares the crops of eyes and mouth, in pixels. Smaller crops are enlarged."""
+
 Scores = Mapping[str, float]
-"""`psnr`, `ssim`, `l1`, `perceptual`, and the same with the prefix `head_`."""
+"""`psnr`, `ssim`, `l1`, `perceptual`, and the same with the prefixes `head_`, `eyes_` and `mouth_`."""
 
 
 @dataclass(frozen=True)
@@ -57,32 +64,57 @@ def score_pictures(
     target: Float[Tensor, "h w 3"],
     crop: Box | None,
     metric: PerceptualDistance | None,
+    parts: Mapping[str, Box] = MappingProxyType({}),
 ) -> dict[str, Scores]:
-    """The figures of several pictures against one target, on the whole frame and on the head crop if it is given."""
+    """The figures of several pictures against one target, on the whole frame and on the crops that are given.
+
+    Args:
+        pictures: The pictures by name, 0..1.
+        target: The true picture.
+        crop: The box of the head.
+        metric: ST-LPIPS, or None. It skips a picture or a head that is too small for it.
+        parts: The boxes of eyes and mouth, by name. ST-LPIPS enlarges those with a side below `PART_SIDE` to it.
+    """
     rows: dict[str, dict[str, float]] = {name: {} for name in pictures}
-    parts = [("", None), *([("head_", crop)] if crop is not None else [])]
-    for prefix, box in parts:
+    boxes = [("", None, 0), *([("head_", crop, 0)] if crop is not None else [])]
+    boxes += [(f"{name}_", box, PART_SIDE) for name, box in parts.items()]
+    for prefix, box, least in boxes:
         cut = crop_to(target, box)
-        small = min(cut.shape[:2]) < MIN_SIDE
-        reference = metric.features(cut) if metric is not None and not small else None
+        judged = enlarged(cut, least)
+        reference = metric.features(judged) if metric is not None and min(judged.shape[:2]) >= MIN_SIDE else None
         for name, picture in pictures.items():
             image, row = crop_to(picture, box), rows[name]
             row[f"{prefix}psnr"], row[f"{prefix}ssim"] = psnr(image, cut), ssim(image, cut)
             row[f"{prefix}l1"] = l1(image, cut)
             if metric is not None and reference is not None:
-                row[f"{prefix}perceptual"] = metric.between(metric.features(image), reference)
+                row[f"{prefix}perceptual"] = metric.between(metric.features(enlarged(image, least)), reference)
     return dict(rows)
 
 
 def mean_scores(rows: Sequence[Scores]) -> dict[str, Any]:
-    """Means over the frames that have a figure, or None if no frame has it. Head-crop figures are under `head`."""
+    """Means over the frames that have a figure, or None if no frame has it.
+
+    Figures of the head crop are under `head`. Those of the crops of eyes and mouth are under `eyes` and `mouth`, if any
+    frame has them.
+    """
 
     def mean(name: str) -> float | None:
         known = [row[name] for row in rows if name in row]
         return fmean(known) if known else None
 
     whole = {name: mean(name) for name in METRICS}
-    return {**whole, "head": {name: mean(f"head_{name}") for name in METRICS}}
+    seen = [part for part in PARTS if any(f"{part}_psnr" in row for row in rows)]
+    return {**whole, **{part: {name: mean(f"{part}_{name}") for name in METRICS} for part in ("head", *seen)}}
+
+
+def enlarged(image: Float[Tensor, "h w 3"], least: int) -> Float[Tensor, "y x 3"]:
+    """The image, enlarged by bicubic interpolation until its shorter side has at least `least` pixels."""
+    factor = least / min(image.shape[:2])
+    if factor <= 1:
+        return image
+    size = (max(round(image.shape[1] * factor), least), max(round(image.shape[0] * factor), least))
+    larger = cv2.resize(np.ascontiguousarray(image.numpy()), size, interpolation=cv2.INTER_CUBIC)
+    return torch.from_numpy(larger).clamp(0, 1)
 
 
 def worker_threads(threads: int) -> int:

@@ -1,6 +1,7 @@
 """Face models: parameters in, vertices out.
 
-`model` and `params` are the classes; `posing` computes vertices natively. `loading` finds models by name and keeps them
+`model` and `params` are the classes; `posing` computes vertices natively, and `parts` finds eyes and mouth in pictures.
+`loading` finds models by name and keeps them
 in the user's `cache`, and `checks` tests what is read. Models come from two sources: `anny` (with `anny_source`,
 `anny_topology` and `anny_identity`), and files in the schema of `flame` (with `npz`, `inert_pickle` and `chart`, which
 makes texture coordinates for a head without any).
@@ -9,9 +10,11 @@ makes texture coordinates for a head without any).
 from mien.face.loading import FaceModelInfo, add_face_model, available_face_models, load_face_model, read_added_source
 from mien.face.model import FaceModel, Landmarks
 from mien.face.params import FaceParams, concatenate, most_frontal_camera
+from mien.face.parts import PARTS, part_boxes
 from mien.face.posing import head_poses
 
 __all__ = [
+    "PARTS",
     "FaceModel",
     "FaceModelInfo",
     "FaceParams",
@@ -23,4 +26,5 @@ __all__ = [
     "head_poses",
     "load_face_model",
     "most_frontal_camera",
+    "part_boxes",
 ]

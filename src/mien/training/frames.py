@@ -17,7 +17,7 @@ from mien.training.sequence import Sequence
 from mien.training.settings import Split, TrainSettings, check_held_out
 
 Item = TypeVar("Item")
-_ORDER, _BACKGROUND, _DENSITY = range(3)
+_ORDER, _BACKGROUND, _DENSITY, _CROP = range(4)
 """Purposes of random numbers."""
 _BLOCK, _EVERY = 10, 5
 _TAIL_SHARE = 0.2
@@ -180,6 +180,11 @@ def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]
 def density_random(settings: TrainSettings, step: int) -> torch.Generator:
     """The random numbers for a step's density control."""
     return random_at(settings.seed, _DENSITY, step)
+
+
+def crop_random(settings: TrainSettings, step: int) -> torch.Generator:
+    """The random numbers for a step's crop of the perceptual loss."""
+    return random_at(settings.seed, _CROP, step)
 
 
 def random_at(seed: int, purpose: int, step: int) -> torch.Generator:

@@ -7,7 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien import _native
-from mien.avatar import Photometric
+from mien.avatar import PerceptualLoss, Photometric
+from mien.perceptual import load_training_features
+from mien.pictures import Box
 from mien.render.rendering import Rendering
 from mien.training.photometric import photometric_loss
 from mien.training.sequence import Target
@@ -17,13 +19,41 @@ def picture_losses(rendering: Rendering, target: Target, weights: Photometric) -
     """The weighted losses of one picture, by name. Differentiable in the rendering."""
     # Outside the target's box and the drawn pixels, both pictures show only the background.
     photometric = photometric_loss(
-        rendering.image, target.picture, weights.l1_weight, weights.ssim_weight, target.box, drawn=rendering.alpha
-    )
+        rendering.image, target.picture, weights.l1_weight, weights.ssim_weight, target.box,
+        rendering.alpha, target.parts, weights.part_weight,
+    )  # fmt: skip
     losses = {"photometric": photometric}
     if weights.alpha_weight > 0:
         difference = rendering.alpha - target.matte.to(rendering.alpha.dtype) / 255
         losses["alpha"] = weights.alpha_weight * difference.abs().mean()
     return losses
+
+
+def perceptual_loss(
+    rendering: Rendering, target: Target, settings: PerceptualLoss, random: torch.Generator
+) -> Float[Tensor, ""]:
+    """The weighted distance of trained features on one crop, drawn at random. Differentiable in the rendering."""
+    left, top, width, height = drawn_crop(target, settings.crop, random)
+    inside = (slice(top, top + height), slice(left, left + width))
+    image = rendering.image[inside]
+    features = load_training_features(str(image.device), image.dtype, settings.blocks)
+    share = image.numel() / rendering.image.numel()
+    return settings.weight * share * features(image, target.picture[inside].to(image) / 255)
+
+
+def drawn_crop(target: Target, side: int, random: torch.Generator) -> Box:
+    """A square of `side` pixels inside the picture, or less if the picture is smaller.
+
+    Each part of the target, and the box of what is not background, is chosen equally often. The square's centre is
+    anywhere in the chosen box; a square that reaches beyond the picture's border is moved inside.
+    """
+    full_height, full_width = target.picture.shape[:2]
+    boxes = [*target.parts, target.box]
+    choice, across, down = torch.rand(3, generator=random, dtype=torch.float64).tolist()
+    left, top, width, height = boxes[int(choice * len(boxes))]
+    side_x, side_y = min(side, full_width), min(side, full_height)
+    x, y = int(left + across * width - side / 2), int(top + down * height - side / 2)
+    return min(max(x, 0), full_width - side_x), min(max(y, 0), full_height - side_y), side_x, side_y
 
 
 def train_psnr(rendering: Rendering, target: Target) -> float:

@@ -1,5 +1,6 @@
 """The photometric loss of Gaussian splatting: L1 and SSIM (Wang et al. 2004; Kerbl et al. 2023, section 5)."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -27,6 +28,8 @@ def photometric_loss(
     ssim_weight: float = 0.2,
     box: Box | None = None,
     drawn: Float[Tensor, "h w"] | None = None,
+    parts: Sequence[Box] = (),
+    part_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
     """`l1_weight` * mean |image - target| + `ssim_weight` * (1 - mean SSIM), fused and native on a CPU.
 
@@ -34,14 +37,20 @@ def photometric_loss(
     pictures, although the windows of pixels inside still see them, and the means stay over the whole picture. Value and
     gradient are the same as without the box, in a fraction of the time, if the pictures differ only where they are at
     least 5 pixels inside the box. `drawn` promises that the pictures are equal where it is 0 and outside the box; the
-    native loss skips these pixels.
+    native loss skips these pixels. Each box in `parts` counts again, with `part_weight`, as the same loss of both
+    pictures cut to the box, but divided by the pixels of the whole picture: a pixel has the same weight in all boxes.
     """
     assert image.shape == target.shape, (image.shape, target.shape)
     assert not target.requires_grad
     native_types = image.dtype == torch.float32 and target.dtype in (torch.float32, torch.uint8)
     if not native_types or image.device.type != "cpu" or image.shape[1] < _NATIVE_MIN_WIDTH:
-        return photometric_loss_reference(image, target, l1_weight, ssim_weight, box if drawn is None else None)
-    return _PhotometricLoss.apply(image, target, _clipped(box, image), drawn, (l1_weight, ssim_weight))
+        return photometric_loss_reference(
+            image, target, l1_weight, ssim_weight, box if drawn is None else None, parts, part_weight
+        )
+    boxes = [_clipped(part, image) for part in parts if part_weight > 0]
+    return _PhotometricLoss.apply(
+        image, target, _clipped(box, image), drawn, (l1_weight, ssim_weight), boxes, part_weight
+    )
 
 
 def photometric_loss_reference(
@@ -50,14 +59,20 @@ def photometric_loss_reference(
     l1_weight: float = 0.8,
     ssim_weight: float = 0.2,
     box: Box | None = None,
+    parts: Sequence[Box] = (),
+    part_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
     """`photometric_loss` in plain PyTorch, for any dtype and device."""
     target = target.to(image) / 255 if target.dtype == torch.uint8 else target
-    left, top, width, height = _clipped(box, image)
-    inside = (slice(top, top + height), slice(left, left + width))
+    inside = _slices(_clipped(box, image))
     difference = (image - target)[inside].abs()
     unlikeness = 1 - differentiable_ssim_map(image, target)[inside]
-    return (l1_weight * difference.sum() + ssim_weight * unlikeness.sum()) / image.numel()
+    loss = (l1_weight * difference.sum() + ssim_weight * unlikeness.sum()) / image.numel()
+    for part in parts if part_weight > 0 else ():
+        rows, columns = _slices(_clipped(part, image))
+        cut = photometric_loss_reference(image[rows, columns], target[rows, columns], l1_weight, ssim_weight)
+        loss = loss + part_weight * cut * (image[rows, columns].numel() / image.numel())
+    return loss
 
 
 def differentiable_ssim_map(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
@@ -78,13 +93,22 @@ class _PhotometricLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, target: Tensor, box: Box, drawn: Tensor | None, weights: tuple[float, float]
+        ctx: Any,
+        image: Tensor,
+        target: Tensor,
+        box: Box,
+        drawn: Tensor | None,
+        weights: tuple[float, float],
+        parts: Sequence[Box],
+        part_weight: float,
     ) -> Tensor:
         gradient = recycled(*image.shape) if ctx.needs_input_grad[0] else None
         drawn = None if drawn is None else drawn.detach().contiguous()
         loss = torch.empty(())
         pictures = unpacked(image.detach().contiguous(), target.contiguous(), drawn, gradient, loss)
         _native.photometric_loss(box, weights, *pictures)
+        for part in parts:
+            loss += _add_part(part, image.detach(), target, weights, part_weight, gradient)
         ctx.save_for_backward(gradient)
         return loss
 
@@ -92,7 +116,37 @@ class _PhotometricLoss(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        return gradient if float(grad_loss) == 1 else gradient * grad_loss, None, None, None, None
+        return gradient if float(grad_loss) == 1 else gradient * grad_loss, *[None] * 6
+
+
+def _add_part(
+    part: Box,
+    image: Float[Tensor, "h w 3"],
+    target: Tensor,
+    weights: tuple[float, float],
+    part_weight: float,
+    gradient: Float[Tensor, "h w 3"] | None,
+) -> Float[Tensor, ""]:
+    """The weighted loss of the pictures cut to a box. Its gradient is added to that of the whole picture."""
+    _, _, width, height = part
+    loss = torch.zeros(())
+    if width < _NATIVE_MIN_WIDTH or height < 1:
+        return loss
+    rows, columns = _slices(part)
+    cut = image[rows, columns].contiguous()
+    own = None if gradient is None else torch.empty_like(cut)
+    share = part_weight * cut.numel() / image.numel()
+    pictures = unpacked(cut, target[rows, columns].contiguous(), None, own, loss)
+    _native.photometric_loss((0, 0, width, height), (weights[0] * share, weights[1] * share), *pictures)
+    if gradient is not None and own is not None:
+        gradient[rows, columns] += own
+    return loss
+
+
+def _slices(box: Box) -> tuple[slice, slice]:
+    """The rows and the columns of a box."""
+    left, top, width, height = box
+    return slice(top, top + height), slice(left, left + width)
 
 
 def _blur(images: Float[Tensor, "s h w c"]) -> Float[Tensor, "s h w c"]:

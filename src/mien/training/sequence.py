@@ -13,6 +13,7 @@ from mien import _native
 from mien.camera import Camera
 from mien.capture import Capture, read_capture, read_capture_hash
 from mien.errors import UserError
+from mien.face import FaceModel, part_boxes
 from mien.locks import read_beside_writers
 from mien.pictures import Box
 from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, read_tracking
@@ -95,6 +96,8 @@ class Target:
     """Left, top, width and height of a box, in pixels. Outside it there is only background."""
     background: Float[Tensor, " 3"]
     """Colour of the background, 0..1."""
+    parts: tuple[Box, ...] = ()
+    """Boxes around eyes and mouth, as far as they are seen. Empty if no loss needs them."""
 
     def pinned(self) -> "Target":
         """This target in pinned memory, which a GPU can read asynchronously."""
@@ -123,9 +126,17 @@ class Targets:
         resolution: Longer side in pixels, or 0 for the capture's own.
         share: Number of sequences that share the memory for cached pictures.
         like: Cameras and targets have its float dtype and its device.
+        face_model: The face model, on the CPU, if targets shall have the boxes around eyes and mouth.
     """
 
-    def __init__(self, sequence: Sequence, resolution: int, share: int = 1, like: Tensor = _ON_CPU):
+    def __init__(
+        self,
+        sequence: Sequence,
+        resolution: int,
+        share: int = 1,
+        like: Tensor = _ON_CPU,
+        face_model: FaceModel | None = None,
+    ):
         self._sequence = sequence
         longest = max(sequence.capture.width, sequence.capture.height)
         scale = min(1.0, resolution / longest) if resolution > 0 else 1.0
@@ -136,8 +147,9 @@ class Targets:
         self._like = like
         self._on_cpu = like.device.type == "cpu" and like.dtype == torch.float32
         self._cache: dict[tuple[int, int, bytes], Target] = {}
-        self._boxes: dict[tuple[int, int], Box] = {}
-        """Boxes of the mattes, by timestep and camera."""
+        self._face_model = face_model
+        self._boxes: dict[tuple[int, int], tuple[Box, tuple[Box, ...]]] = {}
+        """Boxes of the mattes and of the parts, by timestep and camera."""
         self._max_cached = _CACHE_BYTES // (share * self.width * self.height * 4)
 
     def camera(self, camera: int) -> Camera:
@@ -168,13 +180,23 @@ class Targets:
         image = self._resize(self._sequence.capture.images[timestep, camera])
         # A copy: the pages of a mapped file are given back.
         matte = np.array(self._resize(self._sequence.scoring[timestep, camera]))
-        box = self._boxes.get((timestep, camera))
-        if box is None:
+        boxes = self._boxes.get((timestep, camera))
+        if boxes is None:
             left, top, width, height = cv2.boundingRect(matte)
-            box = self._boxes[timestep, camera] = (left, top, width, height)
-        picture, colour = composite(image, matte, background, box), torch.from_numpy(background) / 255
-        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), box, colour)
+            boxes = self._boxes[timestep, camera] = (left, top, width, height), self._parts(timestep, camera)
+        picture, colour = composite(image, matte, background, boxes[0]), torch.from_numpy(background) / 255
+        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), boxes[0], colour, boxes[1])
         return target.pinned() if self._like.is_cuda else target
+
+    @torch.no_grad()
+    def _parts(self, timestep: int, camera: int) -> tuple[Box, ...]:
+        """The boxes around eyes and mouth, by the tracking. What training corrects of it does not move them."""
+        if self._face_model is None:
+            return ()
+        tracking = self._sequence.tracking
+        vertices = self._face_model(tracking.face[timestep])[0]
+        view = tracking.cameras[camera].resized(self.width, self.height)
+        return tuple(part_boxes(self._face_model, vertices, view).values())
 
     def _resize(self, picture: np.ndarray) -> np.ndarray:
         if picture.shape[:2] == (self.height, self.width):

@@ -20,6 +20,7 @@ from mien.errors import UserError
 from mien.face import FaceModel, concatenate
 from mien.face.checks import check_face_params
 from mien.locks import hold
+from mien.perceptual import load_training_features
 from mien.progress import Advance, progress_bar
 from mien.render import rasterize
 from mien.render.validation import CannotDrawError
@@ -35,11 +36,12 @@ from mien.training.frames import (
     FrameOrder,
     background_at,
     camera_extent,
+    crop_random,
     density_random,
     expression_rarity,
     training_frames,
 )
-from mien.training.losses import picture_losses, train_psnr
+from mien.training.losses import perceptual_loss, picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Target, Targets
 from mien.training.settings import TrainSettings
@@ -85,9 +87,9 @@ def train(
     same bytes as without the stop. If that run is finished, its avatar is loaded.
 
     Raises:
-        UserError: a setting is out of range, or training diverges; `run_dir` holds another run, or another process
-            writes it; the face model differs from that of the tracking; the sequences were not tracked together; or no
-            frame is left to train on.
+        UserError: a setting is out of range, or training diverges; trained features are not installed; `run_dir` holds
+            another run, or another process writes it; the face model differs from that of the tracking; the sequences
+            were not tracked together; or no frame is left to train on.
         KeyboardInterrupt: after Ctrl-C, once a checkpoint is written.
     """
     method_config.check()
@@ -97,6 +99,8 @@ def train(
     weights = expression_rarity(sequences, frames) if settings.frame_order == "rare" else None
     camera_colors(sequences, frames, settings, torch.zeros(()))  # raises before anything is written
     order, extent = FrameOrder(frames, settings.seed, weights), camera_extent(sequences, frames)
+    if method_config.photometric.perceptual.weight > 0:
+        load_training_features()  # Missing weights must not stop a run in its middle.
     if is_finished(run_dir):
         claim_run(run_dir, sequences, method_config, settings)
         return load_avatar(run_dir)
@@ -105,7 +109,8 @@ def train(
         if is_finished(run_dir):  # another process finished it before this one got the lock
             return load_avatar(run_dir)
         like = like_on(choose_device(settings.device))
-        targets = [Targets(sequence, settings.resolution, len(sequences), like) for sequence in sequences]
+        parts_of = face_model if method_config.photometric.needs_parts else None
+        targets = [Targets(sequence, settings.resolution, len(sequences), like, parts_of) for sequence in sequences]
         state = start(sequences, face_model, method_config, settings, like)
         _train_to_the_end(state, TrainingData(order, tuple(targets), extent), settings, run_dir, progress)
     return state.avatar
@@ -220,6 +225,9 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     )
     shown = rendering if state.colors is None else state.colors.seen_by(rendering, target.background, frame)
     losses = picture_losses(shown, target, weights) | avatar.regularizers(posed, rendering, progress)
+    perceptual = weights.perceptual
+    if perceptual.due(state.step, settings.steps):
+        losses["perceptual"] = perceptual_loss(shown, target, perceptual, crop_random(settings, state.step))
     torch.autograd.backward(list(losses.values()))
 
     groups = [*avatar.parameter_groups(), *state.track.parameter_groups(index)]
@@ -236,6 +244,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     if state.step % settings.record_every != 0 and state.step != settings.steps:
         return ""
     entry = {name: float(value.detach()) for name, value in losses.items()}
+    if perceptual.weight > 0:
+        entry.setdefault("perceptual", 0.0)
     entry |= {"step": state.step, "loss": sum(entry.values()), "psnr": train_psnr(shown, target)}
     entry |= {"gaussians": len(avatar.gaussian_store()), "step_ms": elapsed * 1000}
     for name, value in entry.items():

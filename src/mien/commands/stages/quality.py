@@ -33,7 +33,7 @@ from mien.storage import read_json, replace_folder, write_atomically, write_json
 from mien.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
 from mien.terminal import show
 from mien.tracking import TrackingSettings, read_tracking
-from mien.training import TrainSettings, read_training_summary
+from mien.training import PRESETS, TrainSettings, read_training_summary
 from mien.workspace import Workspace
 
 _FORMAT, _VERSION = "mien.bench_quality", 1
@@ -94,7 +94,7 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
         held_out_cameras=reference.held_out_cameras,
     )
     with times.measured("train"):
-        run_training_stage(workspace, list(trackings), run, method_named(method).presets["standard"], settings)
+        run_training_stage(workspace, list(trackings), run, PRESETS["standard"].config(method), settings)
     with times.measured("evaluate"):
         scored = (workspace.run_dir(run) / "metrics.json").is_file()
         metrics = read_metrics(workspace.run_dir(run)) if scored else run_evaluation_stage(workspace, run, _SCORED)

@@ -4,23 +4,14 @@ Only the trained numbers of `stlpips-pytorch` are read. The network is written h
 the shapes in that file. The package's own code needs torchvision and is never imported.
 """
 
-import importlib.util
 from functools import lru_cache
-from pathlib import Path
-from pickle import UnpicklingError
-from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mien.errors import UserError
+from mien.perceptual.weights import Backbone, build_from_weights
 
-Backbone = Literal["st-lpips-alex"]
-"""Names of backbones, as written into metrics.json."""
-
-_WEIGHTS = {"st-lpips-alex": "weights/vST0.0/alex_shift_tolerant.pth"}
-_PACKAGE = "stlpips_pytorch"
 _BLUR = torch.tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])[None, None] / 16
 _STRIP = 16
 MIN_SIDE = 32
@@ -122,22 +113,4 @@ def load_perceptual(backbone: Backbone = "st-lpips-alex") -> PerceptualDistance:
     Raises:
         UserError: the package with the weights is not installed, or its file is missing or damaged.
     """
-    path = weights_path(backbone)
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        metric = PerceptualDistance(state)
-    except FileNotFoundError:
-        raise UserError(f"{path}: missing; reinstall it with: pip install stlpips-pytorch==0.0.2") from None
-    except (KeyError, EOFError, OSError, RuntimeError, ValueError, UnpicklingError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"{path}: damaged weights ({reason}); reinstall stlpips-pytorch==0.0.2") from None
-    return metric.eval().requires_grad_(False)
-
-
-def weights_path(backbone: Backbone) -> Path:
-    """The path of a backbone's weights in the installed package, which is found without importing it."""
-    spec = importlib.util.find_spec(_PACKAGE)
-    folders = spec.submodule_search_locations if spec is not None else None
-    if not folders:
-        raise UserError("no perceptual weights: install them with: pip install stlpips-pytorch==0.0.2")
-    return Path(folders[0]) / _WEIGHTS[backbone]
+    return build_from_weights(backbone, PerceptualDistance).eval().requires_grad_(False)

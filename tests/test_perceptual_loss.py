@@ -1,0 +1,191 @@
+"""The perceptual loss: its features, its crops, its steps, and runs that resume with the same bytes."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn.functional import avg_pool2d, conv2d, interpolate, max_pool2d
+
+import train_toy
+from mien.avatar import PerceptualLoss, Photometric
+from mien.errors import UserError
+from mien.face import FaceModel
+from mien.perceptual import load_training_features, weights
+from mien.perceptual.weights import weights_path
+from mien.progress import Advance
+from mien.render.rendering import Rendering
+from mien.training import Sequence, TrainSettings, read_curves, train
+from mien.training.frames import crop_random
+from mien.training.losses import drawn_crop, perceptual_loss
+from mien.training.sequence import Target, Targets
+from toy_scene import toy_sequence
+
+RESULTS = ("avatar/avatar.safetensors", "face_track.safetensors")
+
+
+def some_picture(seed: int, side: int = 32) -> torch.Tensor:
+    coarse = torch.rand(1, 3, side // 4, side // 4, generator=torch.Generator().manual_seed(seed))
+    return interpolate(coarse, (side, side), mode="bilinear")[0].permute(1, 2, 0).contiguous()
+
+
+def by_torchs_layers(image: torch.Tensor, target: torch.Tensor) -> float:
+    """Return the distance by two blocks, with torch's own pooling and the blur kernel from the file."""
+    state = torch.load(weights_path("st-lpips-vgg"), map_location="cpu", weights_only=True)
+
+    def maps(picture: torch.Tensor) -> list[torch.Tensor]:
+        values = (picture.permute(2, 0, 1)[None] * 2 - 1 - state["scaling_layer.shift"]) / state["scaling_layer.scale"]
+        found = []
+        for slice_, layers in ((1, (0, 2)), (2, (6, 8))):
+            if slice_ == 2:
+                values = conv2d(max_pool2d(values, 2, 1), state["net.slice2.5.filt"], stride=2, groups=64)
+            for layer in layers:
+                name = f"net.slice{slice_}.{layer}"
+                values = conv2d(values, state[f"{name}.weight"], state[f"{name}.bias"], padding=1).relu()
+            found.append(values / values.norm(dim=1, keepdim=True).clamp_min(1e-5))
+        return found
+
+    pairs = zip(maps(image), maps(target), strict=True)
+    factors = (state[f"lin{index}.model.1.weight"] for index in range(2))
+    return sum(float(conv2d((a - b).square(), factor).mean()) for (a, b), factor in zip(pairs, factors, strict=True))
+
+
+def test_distance_is_that_of_the_networks_layers() -> None:
+    features = load_training_features(blocks=2)
+    image, target = some_picture(0), some_picture(1)
+    assert float(features(target, target)) == 0
+    assert float(features(image, target)) == pytest.approx(by_torchs_layers(image, target), rel=1e-3)
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 3])
+def test_gradient_is_the_slope_of_the_distance(blocks: int) -> None:
+    features = load_training_features(dtype=torch.float64, blocks=blocks)
+    image, target = some_picture(0, 16).double().requires_grad_(), some_picture(1, 16).double()
+    (gradient,) = torch.autograd.grad(features(image, target), image)
+    direction = torch.randn(image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    with torch.no_grad():
+        ahead, behind = (float(features(image + sign * 1e-6 * direction, target)) for sign in (1, -1))
+    assert float((gradient * direction).sum()) == pytest.approx((ahead - behind) / 2e-6, rel=1e-3)
+
+
+def test_blur_costs_more_than_light_of_the_same_error() -> None:
+    features = load_training_features()
+    target = (some_picture(3) + 0.1 * torch.randn(32, 32, 3, generator=torch.Generator().manual_seed(0))).clamp(0, 1)
+    blurred = avg_pool2d(target.permute(2, 0, 1)[None], 3, 1, 1, count_include_pad=False)[0].permute(1, 2, 0)
+    shift = (blurred - target).square().mean().sqrt()
+    assert float(features(target + shift, target)) < 0.5 * float(features(blurred, target))
+
+
+def some_target(parts: tuple[tuple[int, int, int, int], ...], height: int = 60, width: int = 80) -> Target:
+    picture = torch.zeros(height, width, 3, dtype=torch.uint8)
+    return Target(picture, picture[..., 0], (10, 5, 50, 50), torch.ones(3), parts)
+
+
+def test_crops_lie_in_the_picture_and_visit_every_part() -> None:
+    target, settings = some_target(((20, 10, 30, 10), (70, 50, 8, 8))), TrainSettings()
+    crops = [drawn_crop(target, 24, crop_random(settings, step)) for step in range(200)]
+    assert crops == [drawn_crop(target, 24, crop_random(settings, step)) for step in range(200)]
+    assert all(x >= 0 and y >= 0 and x + 24 <= 80 and y + 24 <= 60 for x, y, _, _ in crops)
+    assert {crop[2:] for crop in crops} == {(24, 24)}
+    near_mouth = sum(crop[:2] == (56, 36) for crop in crops)
+    assert 30 < near_mouth < 110, "a third of the crops is drawn around the part at the corner"
+    assert len(set(crops)) > 80, "the others differ"
+    assert drawn_crop(target, 512, crop_random(settings, 0)) == (0, 0, 80, 60)
+
+
+def test_weight_of_a_pixel_is_that_of_the_whole_picture() -> None:
+    """The same crop counts half as much in a picture that is twice as large."""
+    losses = []
+    for width in (64, 128):
+        image = torch.full((64, width, 3), 0.5)
+        rendering = Rendering(image, torch.ones(64, width), torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
+        target = replace(some_target((), 64, width), picture=torch.full((64, width, 3), 90, dtype=torch.uint8))
+        settings = PerceptualLoss(weight=2.0, crop=32)
+        losses.append(float(perceptual_loss(rendering, target, settings, crop_random(TrainSettings(), 0))))
+    crop, goal = torch.full((32, 32, 3), 0.5), torch.full((32, 32, 3), 90 / 255)
+    assert losses[0] == pytest.approx(2.0 / 4 * float(load_training_features()(crop, goal)), rel=1e-5)
+    assert losses[1] == pytest.approx(losses[0] / 2, rel=1e-5)
+
+
+def test_steps_that_have_the_loss() -> None:
+    loss = PerceptualLoss(weight=1.0, start=0.25, every=3)
+    assert [step for step in range(24) if loss.due(step, 24)] == [6, 9, 12, 15, 18, 21]
+    assert not any(replace(loss, weight=0.0).due(step, 24) for step in range(24))
+
+
+def with_mouth(face_model: FaceModel) -> FaceModel:
+    """Return the toy head with lips: its triangles in front and below."""
+    middle = face_model.template[face_model.faces].mean(1)
+    lips = (middle[:, 2] > 0.05) & (middle[:, 1] < 0)
+    return replace(face_model, region_names=("skin", "lips"), face_regions=lips.long())
+
+
+CONFIG = replace(
+    train_toy.CONFIG, photometric=Photometric(part_weight=1.0, perceptual=PerceptualLoss(0.5, 0.1, 2, 16, 1))
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[FaceModel, Sequence]:
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    return with_mouth(face_model), sequence
+
+
+def test_targets_have_parts_if_they_are_asked_for(scene: tuple[FaceModel, Sequence]) -> None:
+    face_model, sequence = scene[0], toy_sequence(timesteps=2, size=64)[1]
+    background = torch.full((3,), 255, dtype=torch.uint8).numpy()
+    assert Targets(sequence, 0).target(0, 0, background, keep=False).parts == ()
+    (mouth,) = Targets(sequence, 0, face_model=face_model).target(0, 0, background, keep=False).parts
+    (half,) = Targets(sequence, 32, face_model=face_model).target(0, 0, background, keep=False).parts
+    assert [abs(2 * small - large) <= 1 for small, large in zip(half, mouth, strict=True)] == [True] * 4
+
+
+class StoppedError(Exception):
+    """Ends a run in the middle of a step's report."""
+
+
+def stopped_at(step: int):
+    @contextmanager
+    def progress(title: str, total: int, completed: int) -> Iterator[Advance]:
+        done = completed
+
+        def advance(amount: int = 1, status: str = "") -> None:
+            nonlocal done
+            done += amount
+            if done == step:
+                raise StoppedError
+
+        yield advance
+
+    return progress
+
+
+def test_a_stopped_run_resumes_with_the_same_bytes(scene: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
+    face_model, sequence = scene
+    whole, parted, plain = tmp_path / "whole", tmp_path / "parted", tmp_path / "plain"
+    train([sequence], face_model, CONFIG, train_toy.SETTINGS, whole, stopped_at(-1))
+    for stop in (7, 14):
+        with pytest.raises(StoppedError):
+            train([sequence], face_model, CONFIG, train_toy.SETTINGS, parted, stopped_at(stop))
+    train([sequence], face_model, CONFIG, train_toy.SETTINGS, parted, stopped_at(-1))
+    train([sequence], face_model, train_toy.CONFIG, train_toy.SETTINGS, plain, stopped_at(-1))
+    for name in RESULTS:
+        assert (parted / name).read_bytes() == (whole / name).read_bytes(), f"{name} differs"
+        assert (plain / name).read_bytes() != (whole / name).read_bytes(), f"{name}: the loss does nothing"
+    curves = read_curves(whole)
+    assert curves["perceptual"].tolist() == read_curves(parted)["perceptual"].tolist()
+    assert (curves["perceptual"] > 0).sum() == 4, "it is recorded at the steps that have it, and 0 at the others"
+    assert "perceptual" not in read_curves(plain)
+
+
+def test_missing_features_are_told_before_the_run_begins(
+    scene: tuple[FaceModel, Sequence], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load_training_features.cache_clear()
+    monkeypatch.setattr(weights, "_PACKAGE", "no_such_package_here")
+    face_model, sequence = scene
+    with pytest.raises(UserError, match="pip install stlpips-pytorch"):
+        train([sequence], face_model, CONFIG, train_toy.SETTINGS, tmp_path / "run", stopped_at(-1))
+    assert not (tmp_path / "run").exists()
