@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mien.avatar.density import DensityControl
@@ -105,6 +105,19 @@ class Avatar(nn.Module, ABC):
 
     def paint(self, colors: Float[Tensor, "v 3"]) -> None:
         """Take the face model's vertices' mean colours in the training pictures, 0..1, as first colours."""
+
+    def triangles(self) -> Int[Tensor, " n"] | None:
+        """The triangle that each Gaussian is bound to. None for methods that bind none, which train on all pixels."""
+        return None
+
+    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> None:
+        """Replace what training did not draw, after the last step, if `triangles` gives something.
+
+        Args:
+            share: How much of each triangle's Gaussians training drew: their opacities were multiplied by it.
+            opacity: Opacity of the fill of each triangle; 0 for none.
+            colors: Colours of the fills, 0..1.
+        """
 
     @abstractmethod
     def bake(self) -> BakedAvatar:

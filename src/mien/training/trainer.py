@@ -42,6 +42,7 @@ from mien.training.losses import picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Target, Targets
 from mien.training.settings import TrainSettings
+from mien.training.unseen import unseen_of
 from mien.training.vertex_colors import vertex_colors
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
@@ -133,6 +134,8 @@ def _train_to_the_end(
                     write_checkpoint(run_dir / "checkpoints", state)
                 if interrupted():
                     raise KeyboardInterrupt
+        if state.unseen is not None:
+            state.unseen.fill(state.avatar)
         _check_finite(run_dir, state)
         write_results(run_dir, state)
 
@@ -188,15 +191,17 @@ def start(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
+    faces, unseen = [sequence.tracking.face for sequence in sequences], None
     if avatar.wants_first_colors:
-        faces = [sequence.tracking.face for sequence in sequences]
         avatar.paint(vertex_colors(face_model, sequences, faces, training_frames(sequences, settings)))
+    if settings.unseen == "filled":
+        unseen = unseen_of(avatar, sequences, faces, training_frames(sequences, settings))
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
     density = density_strategy(avatar.density(), avatar.gaussian_store())
     track = FaceTrack(face, method_config.face_tuning, [len(sequence.tracking.face) for sequence in sequences])
-    return TrainingState(avatar, Adam(), density, track, {})
+    return TrainingState(avatar, Adam(), density, track, {}, unseen=unseen)
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
@@ -210,6 +215,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     index = state.track.index_of(frame.sequence, frame.timestep)
     face = state.track.face(index)
     posed = avatar.pose(face, progress)
+    if state.unseen is not None:
+        posed = state.unseen.hide(posed, avatar)
     rendering = rasterize(
         posed.gaussians.timestep(0), data.targets[frame.sequence].camera(frame.camera), target.background
     )
