@@ -67,7 +67,8 @@ def test_what_the_mask_or_the_neck_line_cuts_off_is_not_seen(toy: tuple[FaceMode
     middle = torch.tensor([0.0, -1.0, 24.0]).expand_as(sequence.tracking.neck_lines)
     above = covered((model, replace(sequence, tracking=replace(sequence.tracking, neck_lines=middle)))).above
     heights = model.template[model.faces].mean(1)[:, 1]
-    assert (above[heights > 0.04] == 1).all() and (above[heights < -0.04] == 0).all()
+    assert (above[heights > 0.04] == 1).all()
+    assert (above[heights < -0.04] == 0).all()
 
 
 def test_a_triangle_behind_another_is_hidden(toy: tuple[FaceModel, Sequence]) -> None:
@@ -101,7 +102,8 @@ def test_only_what_is_seen_is_drawn_and_trained(toy: tuple[FaceModel, Sequence])
     torch.testing.assert_close(hidden.gaussians.opacities, posed.gaussians.opacities * unseen.share)
     rasterize(hidden.gaussians.timestep(0), sequence.tracking.cameras[0], torch.ones(3)).image.sum().backward()
     gradient = avatar.store["opacity_logits"].grad
-    assert gradient is not None and gradient[unseen.share > 0.5].any()
+    assert gradient is not None
+    assert gradient[unseen.share > 0.5].any()
     assert not gradient[unseen.share == 0].any()
 
 
@@ -113,7 +115,8 @@ def test_other_methods_train_on_everything(toy: tuple[FaceModel, Sequence]) -> N
     posed = avatar.pose(sequence.tracking.face[0])
     before = len(avatar.gaussian_store())
     unseen.fill(avatar)
-    assert unseen.hide(posed, avatar) is posed and len(avatar.gaussian_store()) == before
+    assert unseen.hide(posed, avatar) is posed
+    assert len(avatar.gaussian_store()) == before
 
 
 def test_the_fill_closes_the_head(toy: tuple[FaceModel, Sequence]) -> None:
@@ -140,7 +143,8 @@ def test_a_fill_of_nothing_removes_what_was_not_drawn(toy: tuple[FaceModel, Sequ
     share = torch.linspace(0, 1, len(model.faces))
     avatar.fill(share, torch.zeros_like(share), torch.zeros(len(share), 3))
     left = avatar.store["face_index"]
-    assert len(left) < len(share) and (share[left] > 0.03).all()
+    assert len(left) < len(share)
+    assert (share[left] > 0.03).all()
     torch.testing.assert_close(avatar.store["opacity_logits"].sigmoid(), 0.1 * share[left])
 
 
@@ -167,7 +171,8 @@ def test_a_run_keeps_its_coverage_and_resumes_exactly(toy: tuple[FaceModel, Sequ
     config = GaussianAvatarsConfig()
     whole = train([sequence], model, config, SETTINGS, tmp_path / "whole")
     kept = read_coverage(tmp_path / "whole", model)
-    assert kept is not None and torch.equal(kept.seen, covered(toy).seen)
+    assert kept is not None
+    assert torch.equal(kept.seen, covered(toy).seen)
     loaded = load_avatar(tmp_path / "whole")
     assert torch.equal(loaded.gaussian_store()["opacity_logits"], whole.gaussian_store()["opacity_logits"])
     train([sequence], model, config, SETTINGS, tmp_path / "cut")
@@ -185,7 +190,8 @@ def test_damaged_coverage_is_named(toy: tuple[FaceModel, Sequence], tmp_path: Pa
     found = covered(toy)
     write_coverage(tmp_path, found)
     known = read_coverage(tmp_path, model)
-    assert known is not None and torch.equal(known.colors, found.colors)
+    assert known is not None
+    assert torch.equal(known.colors, found.colors)
     write_coverage(tmp_path, replace(found, seen=found.seen + 1))
     with pytest.raises(UserError, match=FILE):
         read_coverage(tmp_path, model)
@@ -215,4 +221,5 @@ def test_the_inside_of_the_mouth_is_always_drawn(toy: tuple[FaceModel, Sequence]
     regions = (torch.arange(len(model.faces)) % 2).to(model.face_regions)
     mouth = replace(model, region_names=("skin", "mouth"), face_regions=regions)
     share = drawn_share(mouth, covered(toy))
-    assert (share[regions == 1] == 1).all() and torch.equal(share[regions == 0], covered(toy).seen[regions == 0])
+    assert (share[regions == 1] == 1).all()
+    assert torch.equal(share[regions == 0], covered(toy).seen[regions == 0])
