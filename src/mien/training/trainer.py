@@ -199,6 +199,7 @@ def start(
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
+        unseen = None if unseen is None else replace(unseen, share=unseen.share.to(like))
     density = density_strategy(avatar.density(), avatar.gaussian_store())
     track = FaceTrack(face, method_config.face_tuning, [len(sequence.tracking.face) for sequence in sequences])
     return TrainingState(avatar, Adam(), density, track, {}, unseen=unseen)
