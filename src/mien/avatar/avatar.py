@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mien.adam import FactoredGradient, FactoredMoments, Moments
@@ -117,6 +117,19 @@ class Avatar(nn.Module, ABC):
     def upgraded(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the tensors of a file that an older version wrote, as this version names them. Most need no change."""
         return state
+
+    def triangles(self) -> Int[Tensor, " n"] | None:
+        """The triangle that each Gaussian is bound to. None for methods that bind none, which train on all pixels."""
+        return None
+
+    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> None:
+        """Replace what training did not draw, after the last step, if `triangles` gives something.
+
+        Args:
+            share: How much of each triangle's Gaussians training drew: their opacities were multiplied by it.
+            opacity: Opacity of the fill of each triangle; 0 for none.
+            colors: Colours of the fills, 0..1.
+        """
 
     @abstractmethod
     def bake(self) -> BakedAvatar:

@@ -22,6 +22,7 @@ from mien.avatar.expression_changes import ExpressionActivations, expression_cha
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
+from mien.avatar.triangle_frames import triangle_ellipses
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import sh_from_rgb, stack_timesteps
 from mien.render.rendering import Rendering
@@ -29,6 +30,8 @@ from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
 _Pair = tuple[float, float]
 """A value for centres, and one for scales."""
+_LEAST_OPACITY = 1 / 255
+"""Gaussians below this opacity are never drawn."""
 _BASES = ("colour_basis", "opacity_basis", "offset_basis")
 """Names of the bases of changes with the expression."""
 
@@ -150,6 +153,33 @@ class GaussianAvatars(Avatar):
         """Give every Gaussian the mean colour of its triangle's three vertices."""
         own = colors.to(self.store["sh_constant"])[self.face_model.faces[self.store["face_index"]].long()].mean(1)
         self.store.assign("sh_constant", sh_from_rgb(own)[:, None])
+
+    def triangles(self) -> Int[Tensor, " n"]:
+        """The triangle that each Gaussian is bound to."""
+        return self.store["face_index"]
+
+    @torch.no_grad()
+    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> None:
+        """Remove Gaussians that were not drawn, and add a flat one of the triangle's shape where there is a fill."""
+        store, bound = self.store, self.store["face_index"]
+        drawn = store["opacity_logits"].sigmoid() * share.to(bound.device)[bound]
+        store.assign("opacity_logits", torch.logit(drawn.clamp(1e-6, 1 - 1e-6)))
+        filled = (opacity > _LEAST_OPACITY).nonzero()[:, 0].to(bound.device)
+        count, kept = len(store), drawn > _LEAST_OPACITY
+        vertices = self.face_model.head_vertices(self.subject)[0]
+        quats, log_scales = triangle_ellipses(vertices, self.face_model.faces)
+        like = store["means"]
+        zeros = {name: like.new_zeros(len(filled), *store[name].shape[1:]) for name in store.trained}
+        own = {
+            **zeros,
+            "face_index": filled,
+            "quats": quats[filled],
+            "log_scales": log_scales[filled],
+            "opacity_logits": torch.logit(opacity.to(like)[filled].clamp(1e-6, 1 - 1e-6)),
+            "sh_constant": sh_from_rgb(colors.to(like)[filled])[:, None],
+        }
+        store.append(torch.zeros(len(filled), dtype=torch.long, device=bound.device), own)
+        store.select(torch.cat([kept, torch.ones(len(store) - count, dtype=torch.bool, device=bound.device)]))
 
     def bake(self) -> MeshBound:
         """The mesh of this subject and the raw values of all Gaussians."""

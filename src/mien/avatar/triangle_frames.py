@@ -16,6 +16,10 @@ DEGENERATE_LENGTH = 1e-7
 """Shortest first edge or height of a triangle that has a frame of its own, in metres."""
 
 
+_WIDENING, _FLATNESS = 2.5, 0.05
+"""Scales of Gaussians that cover a triangle: those in its plane, in its standard deviations, and the other one."""
+
+
 @dataclass(frozen=True, eq=False)
 class TriangleFrames:
     """Position, orientation and size of triangles: world = k R local + T."""
@@ -44,6 +48,26 @@ def triangle_frames(vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]
     across = torch.linalg.cross(along, normal)
     R = torch.stack([along, normal, across], dim=-1)
     return TriangleFrames(R, (v0 + v1 + v2) / 3, (edge_length + height) / 2)
+
+
+def triangle_ellipses(
+    vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
+) -> tuple[Float[Tensor, "f 4"], Float[Tensor, "f 3"]]:
+    """Quats (wxyz) and log scales of flat Gaussians that cover triangles, in the triangles' frames and units.
+
+    In the plane, they have the triangle's own second moments, widened so that neighbours overlap without a gap.
+    """
+    frames = triangle_frames(vertices, faces)
+    corners = vertices[faces.long()] - frames.T[:, None]
+    local = torch.einsum("fji,fcj->fci", frames.R, corners) / frames.k[:, None, None]
+    x, z = local[..., 0], local[..., 2]
+    xx, zz, xz = ((a * b).sum(-1) / 12 for a, b in ((x, x), (z, z), (x, z)))
+    middle, half = (xx + zz) / 2, torch.hypot((xx - zz) / 2, xz)
+    angle = -0.5 * torch.atan2(2 * xz, xx - zz)
+    zero, flat = torch.zeros_like(angle), torch.full_like(angle, _FLATNESS)
+    quats = torch.stack([(angle / 2).cos(), zero, (angle / 2).sin(), zero], dim=-1)
+    wide, narrow = ((middle + sign * half).clamp_min(1e-6).sqrt() * _WIDENING for sign in (1, -1))
+    return quats, torch.stack([wide, flat, narrow], dim=-1).log()
 
 
 def frames_to_world(

@@ -88,11 +88,12 @@ class Command:
         from mien.face.checks import check_face_params
         from mien.progress import say, track_progress
         from mien.render.camera_paths import aside
-        from mien.training import read_face_track, read_sequence, run_camera
+        from mien.training import filmed_words, read_coverage, read_face_track, read_sequence, run_camera
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         avatar = load_avatar(run_dir)
+        covered = read_coverage(run_dir, avatar.face_model)
         motion = None
         if self.sequence is not None:
             motion = read_sequence(workspace.sequence_dir(workspace.pick_sequence(self.sequence))).tracking.face
@@ -129,6 +130,9 @@ class Command:
         write_pictures(output, shown, self.fps)
         count, first = len(avatar.gaussian_store()), cameras[0]
         say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
+        if covered is not None:
+            neutral = avatar.face_model.head_vertices(subject)[0].detach().cpu().float()
+            say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
 
     def _chosen_timestep(self, run_dir: Path, face_model: "mien.face.FaceModel") -> "mien.face.FaceParams | None":
         """The face at --timestep, or None without that option."""

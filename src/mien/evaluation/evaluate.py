@@ -20,7 +20,7 @@ from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.inside import check_tree
 from mien.locks import hold
 from mien.storage import file_digest, write_json
-from mien.training import read_curves, read_run_config, read_training_summary
+from mien.training import read_coverage, read_curves, read_run_config, read_training_summary
 
 _RECIPE = 3
 """Version of the scoring. It is raised whenever the same frame would get other figures."""
@@ -85,7 +85,9 @@ def _evaluate(
     for name, experiment in experiments.items():
         if settings.pictures:
             write_scored_pictures(run_dir / "pictures" / name, experiment)
-    run = RunRecord(run_dir.name, read_run_config(run_dir), summary, read_curves(run_dir))
+    avatars = [experiment.avatar for experiment in experiments.values()]
+    covered = read_coverage(run_dir, avatars[0].face_model) if avatars else None
+    run = RunRecord(run_dir.name, read_run_config(run_dir), summary, read_curves(run_dir), covered)
     section = cross_section(driven["cross_reenactment"], driven_videos, run_dir) if driven else ""
     write_report(run_dir / "report.html", run, protocols, results, videos, section)
     write_json(run_dir / "metrics.json", FORMAT, VERSION, content)

@@ -17,6 +17,7 @@ from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, PART_NAMES, fi
 from mien.evaluation.page import GLOSSARY, ReportVideo, glossary_html, metric_groups, metric_headings, page_html
 from mien.evaluation.protocols import Evaluation
 from mien.storage import write_atomically
+from mien.training.coverage import Coverage
 
 _TITLES = {
     "self_reenactment": "Self-reenactment",
@@ -41,6 +42,8 @@ class RunRecord:
     summary: Mapping[str, Any]
     """Content of training.json: steps, seconds, gaussians, step_ms_median, peak_memory_mb."""
     curves: Mapping[str, np.ndarray]
+    coverage: Coverage | None = None
+    """What the training pictures show of the head, if the run kept it."""
 
 
 def write_report(
@@ -87,6 +90,8 @@ def report_html(
     body.append(driven)
     body += ["<h2>Training</h2>", sections.training_curves(run.curves)]
     first = next(iter(results.values()), None)
+    if first is not None and run.coverage is not None:
+        body += ["<h2>Filmed and made up</h2>", sections.confidence(first[0].avatar, run.coverage)]
     if first is not None:
         body += ["<h2>Tracking</h2>", sections.tracking_overlays(first[0])]
     body.append(_settings(run))

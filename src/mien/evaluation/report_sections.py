@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mien.avatar import Avatar
 from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import BASELINE_NAMES
@@ -16,6 +17,8 @@ from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import AVATAR, MESH, Evaluation
 from mien.pictures import Box, error_heat, to_uint8
 from mien.render.mesh import render_mesh
+from mien.training.coverage import Coverage
+from mien.training.filmed import confidence_picture, filmed_words
 from mien.training.frames import Frame
 
 _PICTURE_SIZE = 400
@@ -23,6 +26,12 @@ _OVERLAY_SIZE = 300
 _ROWS = 6
 _OVERLAYS = 6
 _SMOOTHING = 15
+_SIDES = {-90: "right side", -45: "45 degrees to the right", 0: "front", 45: "45 degrees to the left",
+          90: "left side", 180: "back"}  # fmt: skip
+_CONFIDENCE_NOTE = (
+    "Blue surfaces were seen squarely by the camera in some training pictures. Orange ones were never seen; their "
+    "colours are spread or mirrored from seen ones. Grey ones are below the neck line and are not shown."
+)
 _CROSS_COLUMNS = (
     ("expression_error", "Expression ↓", 4), ("expression_error_still", "if still", 4),
     ("head_rotation_error_degrees", "Head, ° ↓", 2), ("head_rotation_error_still_degrees", "if still", 2),
@@ -185,6 +194,21 @@ def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> str:
         for name, picture in pictures.items()
     )
     return f'<div class="strip">{"".join(figures)}</div>'
+
+
+@torch.no_grad()
+def confidence(avatar: Avatar, coverage: Coverage) -> str:
+    """The neutral head coloured by how well training pictures show it, from the front, from aside and from behind."""
+    neutral = avatar.face_model.head_vertices(avatar.subject)[0].cpu().float()
+    model = avatar.face_model.to(neutral)
+    figures = []
+    for yaw, name in _SIDES.items():
+        picture = picture_html(
+            to_uint8(confidence_picture(model, neutral, coverage, yaw, _OVERLAY_SIZE)), name, _OVERLAY_SIZE
+        )
+        figures.append(f"<figure>{picture}<figcaption>{name}</figcaption></figure>")
+    note = f"{filmed_words(model, neutral, coverage)}. {_CONFIDENCE_NOTE}"
+    return f'<div class="strip">{"".join(figures)}</div><p class="note">{escape(note[0].upper() + note[1:])}</p>'
 
 
 def cross_section(entry: Mapping[str, Any], videos: Sequence[Path], page_folder: Path) -> str:

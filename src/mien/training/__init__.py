@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from mien.training.filmed import confidence_picture, filmed_words, read_coverage
     from mien.training.frames import held_out
     from mien.training.named_split import NAMED_SPLIT, NamedSplit, split_by_name, with_named_split
     from mien.training.run import (
@@ -34,6 +35,7 @@ else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
+            "filmed": ["confidence_picture", "filmed_words", "read_coverage"],
             "frames": ["held_out"],
             "named_split": ["NAMED_SPLIT", "NamedSplit", "split_by_name", "with_named_split"],
             "run": [
@@ -75,9 +77,12 @@ __all__ = [
     "check_held_out",
     "check_run",
     "check_untouched",
+    "confidence_picture",
     "doubly_held_out",
+    "filmed_words",
     "held_out",
     "outdated_sequences",
+    "read_coverage",
     "read_curves",
     "read_face_track",
     "read_run_config",

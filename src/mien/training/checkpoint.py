@@ -16,6 +16,7 @@ from mien.training.adam import Adam
 from mien.training.camera_colors import CameraColors
 from mien.training.density_control import DensityStrategy
 from mien.training.face_track import FaceTrack
+from mien.training.unseen import Unseen
 
 _KEPT_CHECKPOINTS = 2
 CURVES = {"step", "loss", "psnr", "gaussians", "step_ms"}
@@ -37,6 +38,8 @@ class TrainingState:
     """Number of steps done."""
     seconds: float = 0.0
     """Time spent on these steps, in seconds."""
+    unseen: Unseen | None = None
+    """What no training picture shows, if it is filled. It depends on the data alone, so checkpoints lack it."""
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:

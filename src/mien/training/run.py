@@ -1,4 +1,4 @@
-"""A run's folder: config.json, avatar/, checkpoints/, curves.safetensors, face_track.safetensors, training.json."""
+"""A run's folder: config.json, avatar/, checkpoints/, curves, coverage and face_track (safetensors), training.json."""
 
 import hashlib
 import json
@@ -25,6 +25,7 @@ from mien.locks import WAIT, check_free
 from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
 from mien.tracking import Tracking
 from mien.training.checkpoint import CURVES, TrainingState
+from mien.training.filmed import write_coverage
 from mien.training.sequence import Sequence
 from mien.training.settings import TrainSettings
 
@@ -198,6 +199,8 @@ def write_results(run_dir: Path, state: TrainingState) -> None:
     """Write everything that is kept after training. training.json is last and marks the run as finished."""
     write_avatar(run_dir / "avatar", state.avatar)
     write_tensors(run_dir / _TRACK, state.track.params().tensors())
+    if state.unseen is not None:
+        write_coverage(run_dir, state.unseen.coverage)
     curves = {name: torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     write_tensors(run_dir / "curves.safetensors", curves)
     summary = {

@@ -45,6 +45,7 @@ from mien.training.losses import perceptual_loss, picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Target, Targets
 from mien.training.settings import TrainSettings
+from mien.training.unseen import unseen_of
 from mien.training.vertex_colors import vertex_colors
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
@@ -140,6 +141,8 @@ def _train_to_the_end(
                     write_checkpoint(run_dir / "checkpoints", state)
                 if interrupted():
                     raise KeyboardInterrupt
+        if state.unseen is not None:
+            state.unseen.fill(state.avatar)
         _check_finite(run_dir, state)
         write_results(run_dir, state)
 
@@ -195,18 +198,19 @@ def start(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
-    frames = training_frames(sequences, settings)
+    frames, faces = training_frames(sequences, settings), [sequence.tracking.face for sequence in sequences]
     if avatar.wants_first_colors:
-        faces = [sequence.tracking.face for sequence in sequences]
         avatar.paint(vertex_colors(face_model, sequences, faces, frames))
     colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
+    unseen = unseen_of(avatar, sequences, faces, frames) if settings.unseen == "filled" else None
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
+        unseen = None if unseen is None else replace(unseen, share=unseen.share.to(like))
     density = density_strategy(avatar.density(), avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     track = FaceTrack(face, method_config.face_tuning, lengths, face_model.expression_bounds)
-    return TrainingState(avatar, Adam(), density, track, {}, colors)
+    return TrainingState(avatar, Adam(), density, track, {}, colors, unseen=unseen)
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
@@ -220,6 +224,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     index = state.track.index_of(frame.sequence, frame.timestep)
     face = state.track.face(index)
     posed = avatar.pose(face, progress)
+    if state.unseen is not None:
+        posed = state.unseen.hide(posed, avatar)
     rendering = rasterize(
         posed.gaussians.timestep(0), data.targets[frame.sequence].camera(frame.camera), target.background
     )

@@ -71,8 +71,8 @@ def _seen_colors(
     target = torch.from_numpy(composite(picture, mask, np.full(3, 255, np.uint8))).float() / 255
     person = torch.from_numpy(sequence.capture.mattes[frame[1:]].astype(np.float32))[..., None] / 255
     nearest = rasterize_mesh(vertices, faces, camera).depth[..., None]
-    colors, alpha = (_sample(picture, grid, "bilinear") for picture in (target, person))
-    front = _sample(nearest.nan_to_num(posinf=1e3), grid, "nearest")[:, 0]
+    colors, alpha = (sample_picture(picture, grid, "bilinear") for picture in (target, person))
+    front = sample_picture(nearest.nan_to_num(posinf=1e3), grid, "nearest")[:, 0]
     to_camera = normalize(camera.position - vertices, dim=-1)
     facing = (vertex_normals(vertices, faces) * to_camera).sum(-1).clamp_min(0)
     inside = (grid.abs() < 1).all(-1) & (depth > 0)
@@ -80,7 +80,7 @@ def _seen_colors(
     return colors, torch.where(seen, facing**2, torch.zeros_like(facing))
 
 
-def _sample(picture: Float[Tensor, "h w c"], grid: Float[Tensor, "v 2"], mode: str) -> Float[Tensor, "v c"]:
+def sample_picture(picture: Float[Tensor, "h w c"], grid: Float[Tensor, "v 2"], mode: str) -> Float[Tensor, "v c"]:
     """Values of a picture at points in -1..1."""
     safe = grid.nan_to_num(2.0).clamp(-2, 2)[None, None]
     values = grid_sample(picture.permute(2, 0, 1)[None], safe, mode=mode, padding_mode="border", align_corners=False)
