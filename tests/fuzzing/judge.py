@@ -72,8 +72,9 @@ class Bench:
             (self.folder / name).mkdir(parents=True)
         outside_of(self.canary)
         os.environ.update(
-            HOME=str(self.folder / "home"), TMPDIR=str(self.folder / "tmp"), MIEN_CACHE=str(self.folder / "cache")
-        )
+            HOME=str(self.folder / "home"), TMPDIR=str(self.folder / "tmp"), MIEN_CACHE=str(self.folder / "cache"),
+            MPLCONFIGDIR=str(self.material.parent / "matplotlib"),  # charts need a list of fonts, which all cases share
+        )  # fmt: skip
         tempfile.tempdir = None
         os.chdir(self.folder / "here")
 

@@ -176,7 +176,7 @@ def use_gaussian_avatars(root: Path, found: Any, dice: Random) -> None:
     with torch.no_grad():
         gaussians = found.avatar.pose(found.face[timestep]).gaussians.timestep(0)
         assert rasterize(gaussians, camera, torch.ones(3)).image.isfinite().all(), "a picture that is not finite"
-    if dice.random() < 0.3:
+    if found.avatar.face_model.shareable and dice.random() < 0.3:  # the others need the user's own copy of the model
         write_imported_run(root / "I/runs/a", found.avatar, found.face, camera, root / "gaussian_avatars")
         again = load_avatar(root / "I/runs/a")
         write_gaussian_avatars_folder(root / "again", again, read_face_track(root / "I/runs/a", again.face_model))
