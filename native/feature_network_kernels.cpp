@@ -9,6 +9,11 @@ namespace {
 constexpr int kRows = W == 16 ? 6 : 3;  // rows of a tile, so that tile and factors fit into the registers
 constexpr float kSlope = 0.01f;
 
+// The addresses may be null if there is nothing to copy.
+MIEN_INLINE void copy(float* to, const float* from, int64_t count) {
+  if (count > 0) memcpy(to, from, sizeof(float) * count);
+}
+
 struct Matrix {
   const float* values;
   int64_t row, column;  // strides
@@ -88,7 +93,7 @@ void blend_one(const FeatureInputs& inputs, int64_t index, int width, float* to)
 void blend(const PaddedNetwork& network, const FeatureInputs& inputs, int64_t first, int64_t count, float* rows) {
   const int width = network.own->features;
   for (int64_t i = 0; i < count; ++i) {
-    memcpy(rows + i * network.in_stride, network.own->neutral + (first + i) * width, sizeof(float) * width);
+    copy(rows + i * network.in_stride, network.own->neutral + (first + i) * width, width);
   }
   // Memory is read in its order: a Gaussian's inputs may lie together, or an input's Gaussians.
   if (inputs.count > 0 && inputs.items[0].stride == width) {
@@ -125,7 +130,7 @@ void forward(const PaddedNetwork& network, const FeatureInputs& inputs, const Fe
     for (int64_t i = 0; i < count; ++i) {
       float* const row = rows + i * network.in_stride;
       fill_own(network, begin + i, row);
-      if (kept.features) memcpy(kept.features + (begin + i) * own.features, row, sizeof(float) * own.features);
+      if (kept.features) copy(kept.features + (begin + i) * own.features, row, own.features);
     }
     float* const hidden = kept.hidden ? kept.hidden + begin * network.hidden_stride : values;
     multiply({rows, network.in_stride, 1}, count, network.first, network.hidden_stride, own.features + own.own,
@@ -138,7 +143,7 @@ void forward(const PaddedNetwork& network, const FeatureInputs& inputs, const Fe
              network.second_bias, 0, out);
     for (int64_t i = 0; i < count; ++i) {
       const float* row = out + i * network.out_stride;
-      memcpy(outputs + (begin + i) * (own.width - 1), row, sizeof(float) * (own.width - 1));
+      copy(outputs + (begin + i) * (own.width - 1), row, own.width - 1);
       last[begin + i] = row[own.width - 1];
     }
   }
@@ -183,12 +188,11 @@ void gather(const PaddedNetwork& network, const FeatureKept& kept, const Feature
   const int64_t i = block.count++;
   block.index[i] = index;
   float* const row = block.rows + i * network.in_stride;
-  memcpy(row, kept.features + index * own.features, sizeof(float) * own.features);
+  copy(row, kept.features + index * own.features, own.features);
   fill_own(network, index, row);
-  memcpy(block.hidden + i * network.hidden_stride, kept.hidden + index * network.hidden_stride,
-         sizeof(float) * network.hidden_stride);
+  copy(block.hidden + i * network.hidden_stride, kept.hidden + index * network.hidden_stride, network.hidden_stride);
   float* const by_out = block.by_out + i * network.out_stride;
-  memcpy(by_out, gradients.outputs + index * (own.width - 1), sizeof(float) * (own.width - 1));
+  copy(by_out, gradients.outputs + index * (own.width - 1), own.width - 1);
   by_out[own.width - 1] = gradients.last[index];
   for (int64_t c = own.width; c < network.out_stride; ++c) by_out[c] = 0;
 }
@@ -212,7 +216,7 @@ void backward_block(const PaddedNetwork& network, const FeatureInputs& inputs, c
   add_rows(block.by_hidden, block.count, network.hidden_stride, sums.first_bias);
   for (int64_t i = 0; i < block.count; ++i) {
     const float* by_features = block.by_features + i * network.feature_stride;
-    memcpy(gradients.features + block.index[i] * own.features, by_features, sizeof(float) * own.features);
+    copy(gradients.features + block.index[i] * own.features, by_features, own.features);
     if (!gradients.inputs) continue;
     for (int64_t k = 0; k < inputs.count; ++k) {
       const float* row = inputs.items[k].column + block.index[i] * inputs.items[k].stride;

@@ -19,7 +19,9 @@ from mien.runtime import pose
 from mien.training.density_control.gradient import _round_steps
 from toy_scene import runtime_face, toy_face, toy_face_model
 
-SMALL = HeadGasConfig(points=40, features=5, sh_degree=1)
+SMALL = HeadGasConfig(
+    points=40, features=5, directions=0, sh_degree=1, sh_warmup=0.0, sh_higher_share=1.0, judged_expressions=0
+)
 
 
 def new_avatar(config: HeadGasConfig = SMALL, face_model: FaceModel | None = None) -> HeadGas:
@@ -75,6 +77,9 @@ def test_avatars_of_older_versions_have_the_same_features() -> None:
     overwrite(avatar, old, 40, Path("old"))
     expected = avatar.store["neutral_features"] + torch.einsum("nfi,bi->bnf", bases, inputs_of(face))
     torch.testing.assert_close(blended(avatar, face), expected)
+    before = {"features": 5, "sh_degree": 1}
+    assert HeadGasConfig(**HeadGasConfig.upgraded({"points": 40, **before, "judged_expressions": 0})) == SMALL
+    assert HeadGasConfig.upgraded({"directions": 20}) == {"directions": 20}
 
 
 def test_colour_and_opacity_are_the_networks_of_features_and_place() -> None:

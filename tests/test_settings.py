@@ -197,10 +197,7 @@ def test_options_win_over_the_file_and_the_file_over_the_preset(choices: Any) ->
     config, settings = choices("--hold-out --method.features 8 --steps 50 --preset draft --seed 0", file)
     assert (config, settings) == (HeadGasConfig(features=8, density=density), TrainSettings(steps=50, record_every=7))
     assert choices("--preset draft", {"settings": {"split": "tail"}})[1] == TrainSettings(steps=8000, split="tail")
-    assert choices("--method headgas", {"settings": {"seed": 1}}) == (
-        METHODS["headgas"].presets["standard"],
-        TrainSettings(seed=1),
-    )
+    assert choices("--method headgas", {"settings": {"seed": 1}}) == (HeadGasConfig(), TrainSettings(seed=1))
     assert choices("", {}) == choices("")
 
 

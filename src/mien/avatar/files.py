@@ -91,7 +91,7 @@ def _load_avatar(folder: Path) -> Avatar:
     if file_digest(folder / "avatar.safetensors") != content.tensors_sha256:
         raise UserError(f"{folder / 'avatar.safetensors'}: was changed or damaged after it was written; {_REMEDY}")
     face_model = _face_model_of(folder, content)
-    config = decode(method.config, content.config, where, _REMEDY)
+    config = decode(method.config, method.config.upgraded(content.config), where, _REMEDY)
     with expect_whole(folder, _REMEDY):
         face = FaceParams(**_with_prefix(tensors, "subject."))
     check_face_params(face_model, face, str(folder), _REMEDY)

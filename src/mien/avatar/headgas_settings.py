@@ -1,7 +1,8 @@
 """The settings of HeadGaS."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
@@ -9,18 +10,30 @@ from mien.ranges import FRACTION, Range, ToLoad
 
 
 def _density() -> GradientSettings:
-    return GradientSettings(opacity_resets=(), max_gaussians=8_000)
+    return GradientSettings(opacity_resets=(), size_start=0.1, prune_size=0.03, max_gaussians=20_000)
+
+
+def _face_tuning() -> FaceTuning:
+    return FaceTuning(within_bounds=True)
+
+
+_BEFORE = {
+    "directions": 0, "sh_warmup": 0.0, "sh_higher_share": 1.0, "means_times_extent": False, "judged_expressions": 0
+}  # fmt: skip
+"""What avatars of versions without these settings have."""
 
 
 @dataclass(frozen=True)
 class HeadGasConfig(MethodConfig):
     """Settings of HeadGaS. The defaults suit a CPU and runs of some thousand steps."""
 
+    face_tuning: FaceTuning = field(default_factory=_face_tuning)
+    """Whether and how fast training changes the tracked face parameters of each frame."""
     points: Annotated[int, Range(4, 1_000_000), ToLoad(4)] = 2500
     """Number of Gaussians at the start, sampled on the subject's mesh."""
-    features: Annotated[int, Range(1, 1024)] = 16
-    """Number of latent features per Gaussian (paper: 32). More features need more memory and time per step."""
-    directions: Annotated[int, Range(0, 1024)] = 0
+    features: Annotated[int, Range(1, 1024)] = 32
+    """Number of latent features per Gaussian, as in the paper. More features need more memory and time per step."""
+    directions: Annotated[int, Range(0, 1024)] = 20
     """Number of directions of the face along which features change: those of the largest spread over the training
     timesteps. 0 means as many as the face has inputs (expression coefficients and angles of joints), as in the paper.
     Fewer need less memory and time per step; a finished avatar follows all inputs either way."""
@@ -33,9 +46,9 @@ class HeadGasConfig(MethodConfig):
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics for view-dependent colour (paper: 3). Keep 0 with a single camera, because
     view-dependent colours then absorb the head's pose."""
-    sh_warmup: Annotated[float, FRACTION] = 0.0
+    sh_warmup: Annotated[float, FRACTION] = 0.3
     """Fraction of the run over which the degrees of the spherical harmonics are switched on, one after the other."""
-    sh_higher_share: Annotated[float, FRACTION] = 1.0
+    sh_higher_share: Annotated[float, FRACTION] = 0.05
     """Factor of the coefficients of higher degrees. The network learns them at this share of the constant colour's
     rate; 3D Gaussian Splatting uses a twentieth."""
     means_rate: Rate = Rate(1e-4, 1e-6)
@@ -51,40 +64,32 @@ class HeadGasConfig(MethodConfig):
     """Learning rate of the feature bases and of the neutral features, per step."""
     network_rate: Rate = Rate(2e-3, 2e-4)
     """Learning rate of the network, per step."""
-    judged_expressions: Annotated[int, Range(0, 10_000)] = 0
+    judged_expressions: Annotated[int, Range(0, 10_000)] = 64
     """Number of training expressions, as different as possible, at which each round of density control computes the
     opacities to prune by. With 0, only the opacities in the steps since the last round count."""
     density: GradientSettings = field(default_factory=_density)
     """Density control: when and where Gaussians are added and removed. Opacities come from the network and are never
-    reset. The first of `opacity_resets` after `start` still sets when large Gaussians are removed."""
+    reset, so `size_start` sets when large Gaussians are removed."""
+
+    @classmethod
+    def upgraded(cls, stored: Mapping[str, Any]) -> dict[str, Any]:
+        """Avatars of versions without directions have a basis for each input."""
+        return dict(stored) if "directions" in stored else {**_BEFORE, **stored}
 
 
 _STEPS, _ROUND, _FIRST, _LAST, _DEGREE_STEPS = 50_000, 100, 500, 15_000, 1_000
 """The paper's run, in steps. The schedule of density control and of degrees is that of 3D Gaussian Splatting."""
 
 
-def _standard() -> HeadGasConfig:
-    """The settings for runs of some thousand steps on a CPU (docs/history/2026-11-22-headgas.md)."""
-    return HeadGasConfig(
-        face_tuning=FaceTuning(within_bounds=True),
-        features=32,
-        directions=20,
-        judged_expressions=64,
-        density=GradientSettings(opacity_resets=(), size_start=0.1, prune_size=0.03, max_gaussians=20_000),
-    )
-
-
 def _paper() -> HeadGasConfig:
     """The paper's settings (docs/paper_preset.md). Times are fractions, so that they fit runs of any length."""
     return HeadGasConfig(
         face_tuning=FaceTuning(enabled=False),
-        features=32,
+        directions=0,
         sh_degree=3,
         sh_warmup=4 * _DEGREE_STEPS / _STEPS,
-        sh_higher_share=1 / 20,
         means_rate=Rate(1.6e-4, 1.6e-6),
         means_times_extent=True,
-        judged_expressions=64,
         density=GradientSettings(
             start=_FIRST / _STEPS,
             stop=_LAST / _STEPS,
@@ -99,7 +104,7 @@ def _paper() -> HeadGasConfig:
     )
 
 
-PRESETS = {"draft": _standard(), "standard": _standard(), "paper": _paper()}
+PRESETS = {"draft": HeadGasConfig(), "standard": HeadGasConfig(), "paper": _paper()}
 """Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
 PRESET_STEPS = {"paper": _STEPS}
 """Number of steps of the presets for which the method has its own."""
