@@ -81,7 +81,7 @@ def coverage(
     known = weights > 1e-3
     colors = torch.where(known[:, None], colors / weights.clamp_min(1e-3)[:, None], torch.tensor(0.5))
     seen = torch.where(known, smoothstep(weights / _ENOUGH), 0.0)
-    return Coverage(seen, colors, smoothstep(2 * above / len(chosen) - 0.5))
+    return Coverage(seen, colors, smoothstep(2 * above / len(chosen) - 1))
 
 
 def telling_frames(faces: Items[FaceParams], sequences: Items[Sequence], frames: Items[Frame]) -> list[Frame]:
@@ -146,5 +146,8 @@ def _seen_colors(
     inside = (grid.abs() < 1).all(-1) & (depth > 0)
     weight = cosine.clamp_min(0) ** 2 * facing * visible * smoothstep(2 * head[:, 0] - 1)
     line = sequence.tracking.neck_lines[frame.timestep, frame.camera]
-    above = (pixels @ line[:2] + line[2] + 0.5).clamp(0, 1)
+    corners, _ = camera.project(vertices)
+    # A triangle has to be above with a margin of its own size: what hangs over the line is scored as background.
+    heights = (corners @ line[:2] + line[2])[faces.long()]
+    above = (2 * heights.amin(1) - heights.amax(1)).clamp(0, 1)
     return colors, torch.where(inside, weight, 0.0), above

@@ -10,12 +10,14 @@ from torch import Tensor
 from mien.avatar import Avatar, Posed
 from mien.face import FaceParams
 from mien.training.completion import complete_colors
-from mien.training.coverage import Coverage, coverage, drawn_share
+from mien.training.coverage import Coverage, coverage, drawn_share, smoothstep
 from mien.training.frames import Frame
 from mien.training.sequence import Sequence
 
 _OPAQUE = 0.97
 """Opacity of a fill."""
+_FADE = 4.0
+"""Inverse of the share from which a triangle has no fill: what training draws covers it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +43,8 @@ class Unseen:
         found = self.coverage
         neutral = avatar.face_model.head_vertices(avatar.subject)[0].detach().cpu().float()
         colors = complete_colors(avatar.face_model.to(neutral), neutral, found.seen, found.colors)
-        avatar.fill(self.share, _OPAQUE * (1 - self.share.cpu()) * found.above, colors)
+        rare = 1 - smoothstep(self.share.cpu().float() * _FADE)
+        avatar.fill(self.share, _OPAQUE * rare * found.above, colors)
 
 
 @torch.no_grad()
