@@ -85,8 +85,8 @@ export class Viewer {
 
   play(playing = true): void {
     this.playing = playing && this.motion !== null;
-    this.before = 0;
-    this.look();
+    this.before = this.since = 0;
+    if (this.playing) this.seek(this.timestep);
   }
 
   /** Draws soon, because the face has changed. */
@@ -151,7 +151,7 @@ export class Viewer {
     this.waiting = 0;
     if (this.playing && this.motion) {
       const period = 1000 / this.motion.fps;
-      this.since += this.before ? Math.min(now - this.before, 1000) : period;
+      this.since += this.before ? Math.min(now - this.before, 1000) : 0;
       this.before = now;
       const steps = Math.floor(this.since / period);
       this.since -= steps * period;
