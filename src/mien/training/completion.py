@@ -1,15 +1,35 @@
-"""Colours of triangles that no training picture shows. A simple stand-in: mirrored, else nearest."""
+"""Colours for the triangles of a head that no training picture shows.
+
+Where the other side was seen, a triangle takes its mirror image's colour. Elsewhere colours spread over the surface
+from what was seen: hair over the scalp, skin over face, ears and neck. The inside of the mouth has colours of its own.
+"""
+
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.face import FaceModel
+from mien.face import FaceModel, mirror_triangles
+from mien.face.mirror import triangle_geometry
+from mien.render.mesh import shade
+from mien.training.head_parts import HeadParts, head_parts, mouth_colors
 
-_MIRROR_DISTANCE = 0.006
-"""Distance in metres up to which a seen triangle counts as a mirror image."""
-_ROWS = 512
-"""Triangles whose distances are in memory at a time."""
+_NEAREST = 24
+"""Number of seen triangles that a colour spreads from before it is smoothed."""
+_SOFT = 0.004
+"""Distance in metres within which seen triangles count alike."""
+_SMOOTHING_ROUNDS = 80
+_HOLD = 4.0
+"""Weight of a seen colour against the mean of its neighbours while colours spread."""
+_COLOR_SPREAD = 0.12
+"""Distance between colours (0..1) over which a colour stops counting as skin or as hair."""
+_DIFFERENT = 0.10
+"""Distance between the medians of skin and hair from which their colours can be told apart."""
+_LARGEST_OFFSET = 0.25
+"""Largest difference of brightness between a triangle and its mirror image that counts as light."""
+_LEAST_LIGHT = 0.1
+_CHUNK = 512
 
 
 def complete_colors(
@@ -17,27 +37,174 @@ def complete_colors(
     template_vertices: Float[Tensor, "v 3"],
     seen: Float[Tensor, " f"],
     colors: Float[Tensor, "f 3"],
+    light: Float[Tensor, "9 3"] | None = None,
+    texture: float = 0.0,
 ) -> Float[Tensor, "f 3"]:
-    """A colour for every triangle: `colors` where `seen` is 1, blended with a guess below.
+    """Return a colour for every triangle: its own as far as it was seen, else one that is made up.
 
-    The guess is the colour of the mirror image if that is seen, and else of the nearest seen triangle.
+    A colour is made up from the mirror image as far as that was seen. The difference between both sides, measured where
+    both were seen, is spread over the head and added, so that no border shows. What neither side shows spreads from the
+    nearest seen triangles of the same kind: scalp from scalp that looks like hair, face and ears from what looks like
+    skin, neck from either (so that long hair goes on behind). Mouth, teeth and tongue get dark, light and red colours
+    that fade with the depth behind the lips.
 
     Args:
         face_model: The face model.
-        template_vertices: Vertices of the person's neutral head, in the head frame, in metres.
-        seen: Confidence of each triangle, 0..1.
-        colors: Mean colours in the pictures, 0..1.
+        template_vertices: The person's neutral head in the head frame, in metres.
+        seen: Confidence in each triangle's colour, 0..1. Values that are not finite count as 0.
+        colors: Colours in the pictures, 0..1. A triangle whose colour is not finite counts as not seen.
+        light: Spherical harmonics of the light over normals of the head frame (`mien.render.mesh.shade`). It is taken
+            out before colours are made up, and put back after. None leaves colours as they are.
+        texture: Share of the seen triangles' contrast that made-up colours of hair and skin get as noise, 0..1.
+
+    Returns:
+        Finite colours, 0..1. They equal `colors` where `seen` is 1.
     """
-    centres = template_vertices[face_model.faces.long()].mean(1)
-    known, unsure = (seen > 0.5).nonzero()[:, 0], (seen < 1).nonzero()[:, 0]
-    out = colors.clone()
-    if len(known) == 0:
-        return out
-    mirror = centres.new_tensor([-1.0, 1.0, 1.0])
-    for rows in unsure.split(_ROWS):
-        own = centres[rows]
-        apart, image = torch.cdist(own * mirror, centres[known]).min(1)
-        nearest = torch.cdist(own, centres[known]).argmin(1)
-        guess = colors[known[torch.where(apart < _MIRROR_DISTANCE, image, nearest)]]
-        out[rows] = torch.lerp(guess, colors[rows], seen[rows, None])
-    return out
+    seen, colors = _cleaned(seen, colors)
+    vertices = template_vertices.detach().to(colors)
+    parts = head_parts(face_model)
+    mesh = _Mesh(triangle_geometry(vertices, face_model.faces)[0], face_model.faces.long().cpu(), len(vertices))
+    shading = torch.ones_like(colors) if light is None else _shading(vertices, face_model.faces, light)
+    albedo = colors / shading
+    known = seen * _trust(parts, mesh.middles, seen, colors)
+    made_up = _spread_by_part(parts, mesh, known, albedo)
+    if texture > 0:
+        made_up = made_up + texture * _noise(parts, mesh, known, albedo)
+    mirrored, share = _mirrored(face_model, mesh, known, albedo)
+    made_up = torch.lerp(made_up, mirrored, share[:, None]) * shading
+    brightness = _brightness(parts, seen, colors)
+    made_up = torch.where(parts.interior[:, None], brightness * mouth_colors(parts, mesh.middles), made_up)
+    return torch.where(seen[:, None] >= 1, colors, torch.lerp(made_up.clamp(0, 1), colors, seen[:, None]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Mesh:
+    """Triangles and how values spread over them."""
+
+    middles: Float[Tensor, "f 3"]
+    faces: Int[Tensor, "f 3"]
+    vertices: int
+
+    def around(self, values: Float[Tensor, "f c"], weights: Float[Tensor, " f"]) -> Float[Tensor, "f c"]:
+        """Return weighted means over the triangles that share a corner with each triangle, itself included."""
+        own = torch.cat([values * weights[:, None], weights[:, None]], dim=1)
+        total = own.new_zeros(self.vertices, own.shape[1]).index_add(0, self.faces.T.flatten(), own.repeat(3, 1))
+        total = total[self.faces].sum(1)
+        return torch.where(total[:, -1:] > 0, total[:, :-1] / total[:, -1:].clamp_min(1e-12), values)
+
+    def spread(
+        self, values: Float[Tensor, "f c"], known: Float[Tensor, " f"], among: Bool[Tensor, " f"]
+    ) -> Float[Tensor, "f c"]:
+        """Return `values` continued smoothly from where they are known (0..1) over the triangles of one part."""
+        sources = (among & (known > 0.05)).nonzero()[:, 0]
+        if not len(sources):
+            return values
+        begun = values.clone()
+        targets = among.nonzero()[:, 0]
+        for part in targets.split(_CHUNK):
+            distance, index = torch.cdist(self.middles[part], self.middles[sources]).topk(
+                min(_NEAREST, len(sources)), largest=False
+            )
+            weight = known[sources[index]] / (distance**2 + _SOFT**2)
+            begun[part] = (weight[..., None] * values[sources[index]]).sum(1) / weight.sum(1, keepdim=True)
+        held, inside = _HOLD * (known * among)[:, None], among.to(values)
+        smooth = begun
+        for _ in range(_SMOOTHING_ROUNDS):
+            smooth = (held * values + self.around(smooth, inside)) / (held + 1)
+        return torch.where(among[:, None], smooth, values)
+
+
+def _cleaned(seen: Tensor, colors: Tensor) -> tuple[Float[Tensor, " f"], Float[Tensor, "f 3"]]:
+    """Return both on the CPU and finite. What is damaged is not seen."""
+    seen, colors = seen.detach().float().cpu(), colors.detach().float().cpu()
+    whole = seen.isfinite() & colors.isfinite().all(1)
+    colors = torch.where(whole[:, None], colors, 0.5).clamp(0, 1)
+    return torch.where(whole, seen, 0.0).clamp(0, 1), colors
+
+
+def _shading(
+    vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], light: Float[Tensor, "9 3"]
+) -> Float[Tensor, "f 3"]:
+    normals = triangle_geometry(vertices, faces)[2]
+    shading = shade(normals, light.detach().to(vertices)).clamp_min(_LEAST_LIGHT)
+    return torch.where(shading.isfinite(), shading, 1.0)
+
+
+def _median(values: Float[Tensor, "f 3"], chosen: Bool[Tensor, " f"]) -> Float[Tensor, " 3"] | None:
+    return values[chosen].median(0).values if bool(chosen.any()) else None
+
+
+def _trust(
+    parts: HeadParts, middles: Float[Tensor, "f 3"], seen: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]
+) -> Float[Tensor, " f"]:
+    """Return how far each triangle's colour belongs to its part, 0..1: hair over the face, or a collar, does not."""
+    sure = seen > 0.5
+    skin = _median(colors, sure & parts.face)
+    top = sure & parts.scalp
+    if bool(top.any()):
+        top &= middles[:, 1] >= middles[top, 1].median()
+    hair = _median(colors, top)
+
+    def like(color: Tensor | None) -> Tensor:
+        if color is None:
+            return torch.ones_like(seen)
+        return torch.exp(-0.5 * ((colors - color) ** 2).sum(1) / _COLOR_SPREAD**2)
+
+    trust = torch.ones_like(seen)
+    skin_like, hair_like = like(skin), like(hair)
+    trust = torch.where(parts.skin, skin_like, trust)
+    trust = torch.where(parts.neck, torch.maximum(skin_like, hair_like if hair is not None else skin_like), trust)
+    if skin is not None and hair is not None and float((skin - hair).norm()) > _DIFFERENT:
+        trust = torch.where(parts.scalp, hair_like / (hair_like + skin_like + 1e-3), trust)
+    return trust
+
+
+def _spread_by_part(
+    parts: HeadParts, mesh: _Mesh, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
+) -> Float[Tensor, "f 3"]:
+    """Return smooth colours for all triangles, each from those of its own kind."""
+    sure = known > 0.05
+    anything = albedo[sure].mean(0) if bool(sure.any()) else albedo.new_full((3,), 0.5)
+    filled = anything.expand_as(albedo).clone()
+    for part, sources in parts.kinds():
+        own = torch.where(sources, known, 0.0)
+        if bool((own > 0.05).any()):
+            whole = mesh.spread(albedo, own, part | sources)
+            filled = torch.where(part[:, None], whole, filled)
+    return filled
+
+
+def _mirrored(
+    face_model: FaceModel, mesh: _Mesh, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
+) -> tuple[Float[Tensor, "f 3"], Float[Tensor, " f"]]:
+    """Return the mirror images' colours, fitted to this side's light, and how far the mirror images were seen."""
+    images = mirror_triangles(face_model)
+    has, image = images >= 0, images.clamp_min(0)
+    share = torch.where(has, known[image], 0.0)
+    both = known * share
+    offset = (albedo - albedo[image]).clamp(-_LARGEST_OFFSET, _LARGEST_OFFSET)
+    offset = torch.where((both > 0.05)[:, None], offset, 0.0)
+    return albedo[image] + mesh.spread(offset, both, torch.ones_like(has)), share
+
+
+def _noise(
+    parts: HeadParts, mesh: _Mesh, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
+) -> Float[Tensor, "f 3"]:
+    """Return the seen triangles' differences from their neighbours, dealt out to all triangles of their part."""
+    noise = torch.zeros_like(albedo)
+    random = torch.Generator().manual_seed(0)
+    for part in (parts.scalp, parts.skin | parts.neck):
+        sources = (part & (known > 0.8)).nonzero()[:, 0]
+        targets = part.nonzero()[:, 0]
+        if len(sources):
+            detail = (albedo - mesh.around(albedo, known * part))[sources].clamp(-_LARGEST_OFFSET, _LARGEST_OFFSET)
+            noise[targets] = detail[torch.randint(len(sources), (len(targets),), generator=random)]
+    return noise
+
+
+def _brightness(parts: HeadParts, seen: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> float:
+    """Return how bright the pictures are: the median luminance of seen skin over that of skin in daylight."""
+    skin = _median(colors, (seen > 0.5) & parts.face)
+    if skin is None:
+        return 1.0
+    return float((skin @ torch.tensor([0.2126, 0.7152, 0.0722]) / 0.6).clamp(0.4, 1.3))

@@ -1,0 +1,117 @@
+"""Which triangles of a face model are hair, skin, neck, eyes and the inside of the mouth, and colours of the latter."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.face import FaceModel
+from mien.face.chart import find_outside
+from mien.face.mirror import triangle_geometry
+
+_FACE = ("skin", "face", "nose")
+_SKIN = (*_FACE, "ears", "eyelids", "eye_sockets")
+_PAINTED = ("lips", "brows")
+_MOUTH, _TEETH, _TONGUE = (0.30, 0.12, 0.11), (0.84, 0.80, 0.72), (0.62, 0.34, 0.33)
+"""Colours of the mouth's lining, of teeth and of the tongue at the lips, in daylight."""
+_MOUTH_FADE, _TEETH_FADE = 0.016, 0.030
+"""Depths behind the lips, in metres, over which light in the mouth falls to 1 / e."""
+_DARKEST = 0.08
+"""Share of light that reaches the bottom of the mouth."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeadParts:
+    """Parts of a face model. Each triangle belongs to exactly one of scalp, skin, painted, neck, eyes and interior."""
+
+    scalp: Bool[Tensor, " f"]
+    """Where hair grows."""
+    skin: Bool[Tensor, " f"]
+    """Face, ears, eyelids and eye sockets."""
+    face: Bool[Tensor, " f"]
+    """The part of `skin` whose colour stands for skin: cheeks, chin, forehead and nose."""
+    painted: tuple[Bool[Tensor, " f"], ...]
+    """Lips and brows."""
+    neck: Bool[Tensor, " f"]
+    eyes: tuple[Bool[Tensor, " f"], ...]
+    """The white of the eyes, and the irises."""
+    mouth: Bool[Tensor, " f"]
+    """The lining of the mouth."""
+    teeth: Bool[Tensor, " f"]
+    tongue: Bool[Tensor, " f"]
+    front: float
+    """Depth coordinate (z) of the lips' front in the template, in metres."""
+
+    @property
+    def interior(self) -> Bool[Tensor, " f"]:
+        """Everything inside the mouth."""
+        return self.mouth | self.teeth | self.tongue
+
+    def kinds(self) -> list[tuple[Bool[Tensor, " f"], Bool[Tensor, " f"]]]:
+        """Return parts that are coloured alike, each with the triangles that its colours may spread from."""
+        near_neck = self.neck | self.skin
+        return [
+            (self.scalp, self.scalp),
+            (self.skin, self.skin),
+            (self.neck, near_neck),
+            *((part, part) for part in (*self.painted, *self.eyes)),
+        ]
+
+
+def head_parts(face_model: FaceModel) -> HeadParts:
+    """Return the parts of a face model: by its regions, and by position for regions that it lacks."""
+    middles, _, _ = triangle_geometry(face_model.template.cpu().float(), face_model.faces.cpu())
+
+    def region(*names: str) -> Tensor:
+        return face_model.region_mask(*names).cpu()
+
+    eyes, irises = region("eyes"), region("irises")
+    teeth, tongue, mouth = region("teeth"), region("tongue"), region("mouth")
+    neck = region("neck")
+    free = ~(eyes | irises | teeth | tongue | mouth | neck)
+    if not bool(mouth.any()):
+        mouth = free & _inside_mouth(face_model, middles)
+        free = free & ~mouth
+    scalp = region("scalp") if bool(region("scalp").any()) else free & _above_hairline(middles)
+    painted = tuple(region(name) & free & ~scalp for name in _PAINTED)
+    skin = free & ~scalp & ~torch.stack(painted).any(0)
+    lips = region("lips")
+    front = middles[lips if bool(lips.any()) else skin, 2].max() if bool(skin.any()) else middles[:, 2].max()
+    face = region(*_FACE) & skin
+    return HeadParts(scalp, skin, face, painted, neck, (eyes, irises), mouth, teeth, tongue, float(front))
+
+
+def _above_hairline(middles: Float[Tensor, "f 3"]) -> Bool[Tensor, " f"]:
+    """Return the triangles above a slanted plane over temples and nape and a level one over the forehead, without ears.
+
+    The eyes are at a height of about 0 and a depth of 0.08 m in every face model's head frame.
+    """
+    x, y, z = middles.unbind(1)
+    ears = (x.abs() > 0.062) & (y > -0.06) & (y < 0.015) & (z > -0.03) & (z < 0.03)
+    return ((0.55 * (y - 0.026) > z - 0.073) & (y > -0.08) | (y > 0.054)) & ~ears
+
+
+def _inside_mouth(face_model: FaceModel, middles: Float[Tensor, "f 3"]) -> Bool[Tensor, " f"]:
+    """Return the hidden triangles near the mouth of a model without a region for them."""
+    outside = find_outside(face_model.template.cpu().numpy(), face_model.faces.cpu().numpy())
+    x, y, z = middles.unbind(1)
+    near = (x.abs() < 0.042) & (y > -0.12) & (y < -0.03) & (z > -0.01)
+    return torch.from_numpy(~outside) & near
+
+
+def mouth_colors(parts: HeadParts, middles: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
+    """Return colours for the inside of a mouth in daylight, which get darker with the depth behind the lips.
+
+    They are meaningful where `parts.interior` is true. Teeth stay lighter than what surrounds them.
+
+    Args:
+        parts: Parts of the face model.
+        middles: Middles of the triangles of the neutral head, in metres.
+    """
+    depth = (parts.front - middles[:, 2:3]).clamp_min(0)
+    light = torch.exp(-depth / torch.where(parts.teeth[:, None], _TEETH_FADE, _MOUTH_FADE)).clamp_min(_DARKEST)
+    colors = middles.new_tensor(_MOUTH).expand_as(middles)
+    for part, color in ((parts.teeth, _TEETH), (parts.tongue, _TONGUE)):
+        colors = torch.where(part[:, None], middles.new_tensor(color), colors)
+    return colors * light
