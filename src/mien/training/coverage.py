@@ -147,7 +147,6 @@ def _seen_colors(
     weight = cosine.clamp_min(0) ** 2 * facing * visible * smoothstep(2 * head[:, 0] - 1)
     line = sequence.tracking.neck_lines[frame.timestep, frame.camera]
     corners, _ = camera.project(vertices)
-    # A triangle has to be above with a margin of its own size: what hangs over the line is scored as background.
-    heights = (corners @ line[:2] + line[2])[faces.long()]
-    above = (2 * heights.amin(1) - heights.amax(1)).clamp(0, 1)
+    # All of the triangle has to be above: what hangs over the line is scored as background.
+    above = (corners @ line[:2] + line[2]).clamp(0, 1)[faces.long()].amin(1)
     return colors, torch.where(inside, weight, 0.0), above
