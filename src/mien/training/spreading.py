@@ -12,6 +12,8 @@ _NEAREST = 24
 """Number of known triangles that a value spreads from before it is smoothed."""
 _SOFT = 0.004
 """Distance in metres within which known triangles count alike."""
+_OWN = 0.7
+"""Knowledge (0..1) from which smoothing begins with a triangle's own value."""
 _SMOOTHING_ROUNDS = 80
 _HOLD = 4.0
 """Weight of a known value against the mean of its neighbours while values spread."""
@@ -48,7 +50,7 @@ class Surface:
         if not len(sources):
             return values
         begun = values.clone()
-        targets = among.nonzero()[:, 0]
+        targets = (among & (known < _OWN)).nonzero()[:, 0]
         for part in targets.split(_CHUNK):
             distance, index = torch.cdist(self.middles[part], self.middles[sources]).topk(
                 min(_NEAREST, len(sources)), largest=False
