@@ -26,15 +26,16 @@ def mirror_triangles(face_model: FaceModel) -> Int[Tensor, " f"]:
     middles, areas, normals = triangle_geometry(template, faces)
     flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     reach = _REACH * areas.sqrt()
-    region = face_model.face_regions.cpu()
     images = torch.full((len(faces),), -1, dtype=torch.int64)
-    for start in range(0, len(faces), _CHUNK):
-        own = slice(start, start + _CHUNK)
-        distance = torch.cdist(middles[own] * flip, middles, compute_mode="donot_use_mm_for_euclid_dist")
-        aligned = (normals[own] * flip) @ normals.T > _ALIGNED
-        allowed = aligned & (region[own, None] == region)
-        nearest, index = distance.masked_fill(~allowed, torch.inf).min(1)
-        images[own] = torch.where(nearest <= torch.maximum(reach[own], reach[index]), index, -1)
+    for region in face_model.face_regions.unique().tolist():
+        members = (face_model.face_regions.cpu() == region).nonzero()[:, 0]
+        for own in members.split(_CHUNK):
+            # Without matrix products, which lose the digits that tell neighbours apart.
+            distance = torch.cdist(middles[own] * flip, middles[members], compute_mode="donot_use_mm_for_euclid_dist")
+            aligned = (normals[own] * flip) @ normals[members].T > _ALIGNED
+            nearest, index = distance.masked_fill(~aligned, torch.inf).min(1)
+            image = members[index]
+            images[own] = torch.where(nearest <= torch.maximum(reach[own], reach[image]), image, -1)
     return images
 
 

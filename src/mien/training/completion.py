@@ -4,8 +4,6 @@ Where the other side was seen, a triangle takes its mirror image's colour. Elsew
 from what was seen: hair over the scalp, skin over face, ears and neck. The inside of the mouth has colours of its own.
 """
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -14,14 +12,8 @@ from mien.face import FaceModel, mirror_triangles
 from mien.face.mirror import triangle_geometry
 from mien.render.mesh import shade
 from mien.training.head_parts import HeadParts, head_parts, mouth_colors
+from mien.training.spreading import Surface
 
-_NEAREST = 24
-"""Number of seen triangles that a colour spreads from before it is smoothed."""
-_SOFT = 0.004
-"""Distance in metres within which seen triangles count alike."""
-_SMOOTHING_ROUNDS = 80
-_HOLD = 4.0
-"""Weight of a seen colour against the mean of its neighbours while colours spread."""
 _COLOR_SPREAD = 0.12
 """Distance between colours (0..1) over which a colour stops counting as skin or as hair."""
 _DIFFERENT = 0.10
@@ -29,7 +21,6 @@ _DIFFERENT = 0.10
 _LARGEST_OFFSET = 0.25
 """Largest difference of brightness between a triangle and its mirror image that counts as light."""
 _LEAST_LIGHT = 0.1
-_CHUNK = 512
 
 
 def complete_colors(
@@ -63,8 +54,8 @@ def complete_colors(
     seen, colors = _cleaned(seen, colors)
     vertices = template_vertices.detach().to(colors)
     parts = head_parts(face_model)
-    mesh = _Mesh(triangle_geometry(vertices, face_model.faces)[0], face_model.faces.long().cpu(), len(vertices))
-    shading = torch.ones_like(colors) if light is None else _shading(vertices, face_model.faces, light)
+    mesh = Surface.of(vertices, face_model.faces.cpu())
+    shading = torch.ones_like(colors) if light is None else _shading(vertices, face_model.faces.cpu(), light)
     albedo = colors / shading
     known = seen * _trust(parts, mesh.middles, seen, colors)
     made_up = _spread_by_part(parts, mesh, known, albedo)
@@ -77,41 +68,15 @@ def complete_colors(
     return torch.where(seen[:, None] >= 1, colors, torch.lerp(made_up.clamp(0, 1), colors, seen[:, None]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Mesh:
-    """Triangles and how values spread over them."""
+def vertex_means(face_model: FaceModel, colors: Float[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
+    """Return the mean colour of the triangles around each vertex, for drawing a completed mesh (`render_mesh`).
 
-    middles: Float[Tensor, "f 3"]
-    faces: Int[Tensor, "f 3"]
-    vertices: int
-
-    def around(self, values: Float[Tensor, "f c"], weights: Float[Tensor, " f"]) -> Float[Tensor, "f c"]:
-        """Return weighted means over the triangles that share a corner with each triangle, itself included."""
-        own = torch.cat([values * weights[:, None], weights[:, None]], dim=1)
-        total = own.new_zeros(self.vertices, own.shape[1]).index_add(0, self.faces.T.flatten(), own.repeat(3, 1))
-        total = total[self.faces].sum(1)
-        return torch.where(total[:, -1:] > 0, total[:, :-1] / total[:, -1:].clamp_min(1e-12), values)
-
-    def spread(
-        self, values: Float[Tensor, "f c"], known: Float[Tensor, " f"], among: Bool[Tensor, " f"]
-    ) -> Float[Tensor, "f c"]:
-        """Return `values` continued smoothly from where they are known (0..1) over the triangles of one part."""
-        sources = (among & (known > 0.05)).nonzero()[:, 0]
-        if not len(sources):
-            return values
-        begun = values.clone()
-        targets = among.nonzero()[:, 0]
-        for part in targets.split(_CHUNK):
-            distance, index = torch.cdist(self.middles[part], self.middles[sources]).topk(
-                min(_NEAREST, len(sources)), largest=False
-            )
-            weight = known[sources[index]] / (distance**2 + _SOFT**2)
-            begun[part] = (weight[..., None] * values[sources[index]]).sum(1) / weight.sum(1, keepdim=True)
-        held, inside = _HOLD * (known * among)[:, None], among.to(values)
-        smooth = begun
-        for _ in range(_SMOOTHING_ROUNDS):
-            smooth = (held * values + self.around(smooth, inside)) / (held + 1)
-        return torch.where(among[:, None], smooth, values)
+    Vertices without a triangle are grey.
+    """
+    colors, corners = colors.detach().float().cpu(), face_model.faces.long().cpu().T.flatten()
+    own = torch.cat([colors, torch.ones(len(colors), 1)], dim=1).repeat(3, 1)
+    total = torch.zeros(len(face_model.template), 4).index_add(0, corners, own)
+    return torch.where(total[:, 3:] > 0, total[:, :3] / total[:, 3:].clamp_min(1), 0.5)
 
 
 def _cleaned(seen: Tensor, colors: Tensor) -> tuple[Float[Tensor, " f"], Float[Tensor, "f 3"]]:
@@ -160,7 +125,7 @@ def _trust(
 
 
 def _spread_by_part(
-    parts: HeadParts, mesh: _Mesh, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
+    parts: HeadParts, mesh: Surface, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
 ) -> Float[Tensor, "f 3"]:
     """Return smooth colours for all triangles, each from those of its own kind."""
     sure = known > 0.05
@@ -175,7 +140,7 @@ def _spread_by_part(
 
 
 def _mirrored(
-    face_model: FaceModel, mesh: _Mesh, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
+    face_model: FaceModel, mesh: Surface, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
 ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, " f"]]:
     """Return the mirror images' colours, fitted to this side's light, and how far the mirror images were seen."""
     images = mirror_triangles(face_model)
@@ -188,7 +153,7 @@ def _mirrored(
 
 
 def _noise(
-    parts: HeadParts, mesh: _Mesh, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
+    parts: HeadParts, mesh: Surface, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
 ) -> Float[Tensor, "f 3"]:
     """Return the seen triangles' differences from their neighbours, dealt out to all triangles of their part."""
     noise = torch.zeros_like(albedo)

@@ -1,0 +1,102 @@
+"""How far hair stands out from the scalp of a face model, measured on the outlines of the mattes."""
+
+from collections.abc import Sequence as Items
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import grid_sample, normalize
+
+from mien.face import FaceModel, FaceParams
+from mien.face.mirror import triangle_geometry
+from mien.parallel import stream_in_threads
+from mien.render.mesh import rasterize_mesh
+from mien.training.frames import Frame, spread_frames
+from mien.training.head_parts import head_parts
+from mien.training.sequence import Sequence
+from mien.training.spreading import Surface
+
+_MAX_FRAMES = 60
+_STEP, _HIGHEST = 0.002, 0.08
+"""Distance between the points that are tested above the scalp, and the largest height that counts, in metres."""
+_GRAZING = 0.4
+"""Cosine between a triangle's normal and the direction to the camera up to which the outline tells its height."""
+_CLEAR = 0.008
+"""Height in metres at which nothing of the mesh may be behind or in front of a triangle at the outline."""
+_QUANTILE = 0.3
+"""Share of the measured heights below the one that counts. Single strands and other things behind make some higher."""
+_FADING_ROUNDS = 6
+"""Rings of triangles over which the height fades to 0 at the hairline."""
+
+
+@torch.no_grad()
+def hair_height(
+    face_model: FaceModel,
+    sequences: Items[Sequence],
+    faces: Items[FaceParams],
+    frames: Items[Frame],
+    threads: int | None = None,
+) -> Float[Tensor, " f"]:
+    """Return the height of hair above each triangle along its normal, in metres, 0..0.08; 0 outside of the scalp.
+
+    A triangle of the scalp is measured in frames in which it is on the outline of the mesh: its height is the distance
+    along its normal to the border of the matte. Triangles that are never on the outline take the height of those
+    around them. The height fades to 0 at the hairline. Without any measurement it is 0.
+
+    Args:
+        face_model: The face model, float32 on the CPU.
+        sequences: The sequences that the frames count in.
+        faces: Face parameters of each sequence, with all its timesteps.
+        frames: The frames to look at. At most 60 of them, evenly spread, are used.
+        threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no bit.
+    """
+    scalp = head_parts(face_model).scalp
+    chosen = scalp.nonzero()[:, 0]
+
+    def measured_in(frame: Frame) -> Tensor:
+        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
+        return _measured(sequences[frame.sequence], frame, vertices, face_model.faces, chosen)
+
+    used = spread_frames(frames, _MAX_FRAMES)
+    heights = torch.stack(list(stream_in_threads(measured_in, used, threads))) if used else torch.zeros(0, len(chosen))
+    height = torch.zeros(len(scalp), 1)
+    known = torch.zeros(len(scalp))
+    found = heights.isfinite().any(0)
+    height[chosen[found], 0] = heights[:, found].nanquantile(_QUANTILE, dim=0) if bool(found.any()) else 0.0
+    known[chosen[found]] = heights.isfinite().sum(0)[found].clamp_max(3) / 3
+    if not bool(found.any()):
+        return height[:, 0]
+    surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
+    height = surface.spread(height, known, scalp)
+    for _ in range(_FADING_ROUNDS):
+        height = torch.minimum(height, surface.around(height, torch.ones_like(known)))
+        height[~scalp] = 0
+    return height[:, 0].clamp(0, _HIGHEST)
+
+
+def _measured(
+    sequence: Sequence, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Tensor, chosen: Tensor
+) -> Float[Tensor, " n"]:
+    """Return the height of the matte's border above some triangles in one frame; NaN where the frame does not tell."""
+    camera = sequence.tracking.cameras[frame.camera]
+    matte = torch.from_numpy(sequence.capture.mattes[frame[1:]].astype(np.float32)) / 255
+    empty = rasterize_mesh(vertices, faces, camera).face_index < 0
+    middles, _, normals = (values[chosen] for values in triangle_geometry(vertices, faces))
+    cosine = (normals * normalize(camera.position - middles, dim=-1)).sum(-1)
+    steps = torch.arange(0.0, _HIGHEST + _STEP / 2, _STEP)
+    pixels, depth = camera.project(middles[:, None] + steps[:, None] * normals[:, None])
+    grid = pixels / torch.tensor([camera.width, camera.height]) * 2 - 1
+    inside = _sample(matte, grid) > 0.5
+    framed = (grid.abs() < 1).all(-1) & (depth > 0)
+    clear = _sample(empty.float(), grid[:, round(_CLEAR / _STEP) :][:, :1])[:, 0] > 0.5
+    count = inside.int().cumprod(1).sum(1)
+    ends = (count < len(steps)) & framed.all(1)
+    tells = (cosine.abs() < _GRAZING) & clear & ends
+    height = _STEP * (count - 1).clamp_min(0).float()
+    return torch.where(tells, height, torch.nan)
+
+
+def _sample(picture: Float[Tensor, "h w"], grid: Float[Tensor, "n s 2"]) -> Float[Tensor, "n s"]:
+    """Return values of a picture at points in -1..1; 0 outside."""
+    return grid_sample(picture[None, None], grid.nan_to_num(2.0).clamp(-2, 2)[None], align_corners=False)[0, 0]
