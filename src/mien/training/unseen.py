@@ -25,8 +25,9 @@ _FADE = 4.0
 
 TRIM_STEPS = 600
 """Number of steps that fit the fills' opacities to training pictures."""
-_TRIM_RATE = 0.1
-"""Learning rate of the fills' opacities (logits), per step."""
+_TRIM_RATE, _TRIM_EPSILON = 0.1, 3e-5
+"""Learning rate of the fills' opacities (logits), and the epsilon of Adam, below which gradients have no say: a fill
+that shines through what hides it must not fade."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,7 @@ def trim_fills(avatar: Avatar, count: int, views: Iterable[tuple[FaceParams, Cam
     store = avatar.gaussian_store()
     logits = store[name].detach()
     fills = logits[-count:].clone().requires_grad_()
-    adam = torch.optim.Adam([fills], lr=_TRIM_RATE)
+    adam = torch.optim.Adam([fills], lr=_TRIM_RATE, eps=_TRIM_EPSILON)
     for face, camera, target in views:
         with torch.no_grad():
             gaussians = avatar.pose(face).gaussians.timestep(0)
