@@ -33,6 +33,8 @@ KEYS = {
     "long-hair": "69f32fa0a3632a1e",
     "glasses": "cf70d19c2a6ef102",
     "off-model": "87621466675cf748",
+    "mono-sides": "49c0f1a14644d29e",
+    "mono-sides-long-hair": "67640321020edf29",
 }
 """Keys of the references. A change means that figures on the capture cannot be compared any more.
 
@@ -131,7 +133,7 @@ def test_damaged_truth_is_refused(ring, tmp_path):
 
 def test_an_interrupted_drawing_goes_on(tmp_path):
     scene = SyntheticScene(SMALL, 3)
-    store = _Pictures(tmp_path / ".drawing", SMALL)
+    store = _Pictures(tmp_path / ".drawing", SMALL, SMALL.timesteps)
     store.resume(inputs_hash(scene))
     for timestep in range(5):
         frame = scene.frame(timestep)

@@ -122,14 +122,17 @@ class Avatar(nn.Module, ABC):
         """The triangle that each Gaussian is bound to. None for methods that bind none, which train on all pixels."""
         return None
 
-    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> None:
+    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> int:
         """Replace what training did not draw, after the last step, if `triangles` gives something.
+
+        Returns the number of fills, which are the last Gaussians of the store.
 
         Args:
             share: How much of each triangle's Gaussians training drew: their opacities were multiplied by it.
             opacity: Opacity of the fill of each triangle; 0 for none.
             colors: Colours of the fills, 0..1.
         """
+        return 0
 
     @abstractmethod
     def bake(self) -> BakedAvatar:

@@ -159,7 +159,7 @@ class GaussianAvatars(Avatar):
         return self.store["face_index"]
 
     @torch.no_grad()
-    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> None:
+    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> int:
         """Remove Gaussians that were not drawn, and add a flat one of the triangle's shape where there is a fill."""
         store, bound = self.store, self.store["face_index"]
         drawn = store["opacity_logits"].sigmoid() * share.to(bound.device)[bound]
@@ -180,6 +180,7 @@ class GaussianAvatars(Avatar):
         }
         store.append(torch.zeros(len(filled), dtype=torch.long, device=bound.device), own)
         store.select(torch.cat([kept, torch.ones(len(store) - count, dtype=torch.bool, device=bound.device)]))
+        return len(filled)
 
     def bake(self) -> MeshBound:
         """The mesh of this subject and the raw values of all Gaussians."""

@@ -1,6 +1,6 @@
 """Errors of a tracking against the truth of a synthetic capture, and rows and tables of `mien bench quality`."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -159,6 +159,8 @@ class QualityRow:
     """Tracking errors by sequence."""
     seconds: dict[str, float]
     """Seconds of each stage when it last ran."""
+    unseen_views: dict[str, Any] = field(default_factory=dict)
+    """Figures by angle (`mien.benchmarking.unseen_views`). Empty if the capture has no pictures from aside."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the row as a json object."""
@@ -186,11 +188,26 @@ def markdown_table(rows: list[QualityRow]) -> str:
     ]
     for row in rows:
         lines += [f"| {row.capture} | {name} | {tracking_cells(errors)} |" for name, errors in row.tracking.items()]
+    for row in rows:
+        lines += ["", *unseen_lines(row.capture, row.unseen_views)] if row.unseen_views else []
     lines += ["", "| capture | steps | Gaussians | seconds by stage |", "|---|---|---|---|"]
     for row in rows:
         seconds = ", ".join(f"{name} {value:.0f}" for name, value in row.seconds.items())
         lines.append(f"| {row.capture} | {row.steps:,} | {row.gaussians:,} | {seconds} |")
     return "\n".join(lines) + "\n"
+
+
+def unseen_lines(name: str, views: dict[str, Any]) -> list[str]:
+    """Return a table of the head crop by angle in markdown, line by line."""
+    lines = [
+        f"| {name}: degrees aside | avatar: PSNR / SSIM / ST-LPIPS of the head crop | mesh with its colours |",
+        "|---|---|---|",
+    ]
+    for angle, row in views.items():
+        heads = [row[what]["head"] for what in ("avatar", "mesh")]
+        cells = [f"{head['psnr']:.2f} / {head['ssim']:.3f} / {_known(head['perceptual'], '{:.3f}')}" for head in heads]
+        lines.append(f"| {angle} | {' | '.join(cells)} |")
+    return lines
 
 
 def tracking_cells(errors: TrackingErrors) -> str:

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
 
 CaptureName = Literal[
-    "mono-short", "mono-long", "ring-16", "ring-16-large", "beard", "long-hair", "glasses", "off-model"
-]
+    "mono-short", "mono-long", "ring-16", "ring-16-large", "beard", "long-hair", "glasses", "off-model", "mono-sides",
+    "mono-sides-long-hair",
+]  # fmt: skip
 """The keys of `mien.synthetic.REFERENCES`, written out because options are read before torch. A test compares them."""
 
 

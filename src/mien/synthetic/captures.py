@@ -123,6 +123,7 @@ def scene_key(scene: SyntheticScene) -> str:
             marks.faces.tolist(),
             [[round(1e4 * weight) for weight in row] for row in marks.barycentric.tolist()],
         ],
+        **scene.extent,
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -139,14 +140,14 @@ def inputs_hash(scene: SyntheticScene) -> str:
 def hash_scene(scene: SyntheticScene) -> str:
     """Return the hash over the bytes of a scene, drawn in memory; for small scenes."""
     pictures = _Hasher(scene)
-    for frames in scene.all_frames(range(scene.recipe.timesteps)):
+    for frames in scene.all_frames(range(scene.timesteps)):
         pictures.add(np.stack([f.image for f in frames]), np.stack([f.matte for f in frames]))
     return pictures.finish(scene)
 
 
 class _Hasher:
     def __init__(self, scene: SyntheticScene) -> None:
-        self._digest = hashlib.sha256(repr((scene.recipe.timesteps, scene.recipe.camera_ids)).encode())
+        self._digest = hashlib.sha256(repr((scene.timesteps, scene.recipe.camera_ids)).encode())
 
     def add(self, images: np.ndarray, mattes: np.ndarray) -> None:
         self._digest.update(images.tobytes())
@@ -166,12 +167,12 @@ def _is_current(folder: Path, inputs: str) -> bool:
 
 def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
     (folder / _JSON).unlink(missing_ok=True)
-    store = _Pictures(folder / _WORK, scene.recipe)
+    store = _Pictures(folder / _WORK, scene.recipe, scene.timesteps)
     store.resume(inputs)
     _draw_missing(scene, store, inputs)
     images, mattes = store.maps()
     pictures = _Hasher(scene)
-    for timestep in range(scene.recipe.timesteps):
+    for timestep in range(scene.timesteps):
         pictures.add(images[timestep], mattes[timestep])
     content_hash = pictures.finish(scene)
     recipe = scene.recipe
@@ -190,6 +191,7 @@ def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
         "seed": scene.seed,
         "motion_seed": scene.motion_seed,
         "recipe": asdict(recipe),
+        **scene.extent,
     }
     write_json(folder / _JSON, FORMAT, VERSION, content)
     del images, mattes
@@ -203,11 +205,12 @@ class _Pictures:
 
     folder: Path
     recipe: SyntheticRecipe
+    timesteps: int
 
     @property
     def _shape(self) -> tuple[int, int, int, int]:
         recipe = self.recipe
-        return (recipe.timesteps, len(recipe.camera_ids), recipe.height, recipe.width)
+        return (self.timesteps, len(recipe.camera_ids), recipe.height, recipe.width)
 
     def resume(self, inputs: str) -> None:
         """Continue a drawing of the same inputs, else start again."""
@@ -247,7 +250,7 @@ class _Pictures:
 
 
 def _draw_missing(scene: SyntheticScene, store: _Pictures, inputs: str) -> None:
-    total, done = scene.recipe.timesteps, store.done()
+    total, done = scene.timesteps, store.done()
     with progress_bar(f"Drawing {scene.recipe.name}", total, done) as advance:
         drawn = scene.all_frames(range(done, total)) if done < total else iter(())
         for timestep, frames in enumerate(drawn, done):
@@ -270,7 +273,7 @@ def _make_capture(
         name=recipe.name,
         camera_ids=recipe.camera_ids,
         fps=recipe.fps,
-        timestamps=np.arange(recipe.timesteps) / recipe.fps,
+        timestamps=np.array(scene.moments or range(scene.timesteps)) / recipe.fps,
         images=images,
         mattes=mattes,
         landmarks=landmarks,

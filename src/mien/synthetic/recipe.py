@@ -3,6 +3,13 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+SIDES: dict[str, tuple[float, float]] = {
+    **{f"{side}-{angle}": (sign * angle, 0.0) for angle in (15, 30, 45, 60, 90)
+       for side, sign in (("left", 1.0), ("right", -1.0))},
+    "behind-180": (180.0, 0.0), "above-25": (0.0, 25.0), "below-25": (0.0, -25.0),
+}  # fmt: skip
+"""Cameras aside: azimuth towards the subject's left and elevation above the face, in degrees from the front camera."""
+
 SegmentKind = Literal["still", "speech", "expressions", "turns", "free"]
 
 
@@ -67,9 +74,9 @@ class SyntheticRecipe:
     """Length of a full beard of strands in metres; 0 for none. It is not part of the face model."""
     off_model: float = 0.0
     """Distance of head shape and expressions from the face model's space: 1 is far, 0 is none."""
-    cameras: Literal["front", "ring"] = "front"
+    cameras: Literal["front", "ring", "sides"] = "front"
     """front: one camera in front of the face. ring: `ring_size` calibrated cameras on half a sphere, the first in
-    front."""
+    front. sides: the front camera and those of `SIDES`, calibrated."""
     ring_size: int = 16
     """Number of cameras in a ring."""
     script: tuple[Segment, ...] = ()
@@ -101,7 +108,9 @@ class SyntheticRecipe:
     @property
     def camera_ids(self) -> tuple[str, ...]:
         """Names of the cameras."""
-        return ("front",) if self.cameras == "front" else tuple(f"{index:02d}" for index in range(self.ring_size))
+        if self.cameras == "ring":
+            return tuple(f"{index:02d}" for index in range(self.ring_size))
+        return ("front", *(SIDES if self.cameras == "sides" else ()))
 
 
 RECIPES: dict[str, SyntheticRecipe] = {

@@ -3,11 +3,29 @@
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from mien.errors import UserError
 from mien.synthetic.captures import scene_key, write_scene
 from mien.synthetic.recipe import Segment, SyntheticRecipe
 from mien.synthetic.scene import SyntheticScene
+
+
+@dataclass(frozen=True)
+class SideViews:
+    """True pictures of one sequence from the cameras of `SIDES`, at some of its timesteps. Training never sees them."""
+
+    sequence: str
+    """Name of the sequence. Its own pictures are those of the front camera."""
+    every: int
+    """Every n-th timestep has views."""
+    first: int = 0
+    """The first timestep that has views."""
+
+    @property
+    def name(self) -> str:
+        """Name of the drawn folder."""
+        return f"{self.sequence}-views"
 
 
 @dataclass(frozen=True)
@@ -27,12 +45,20 @@ class ReferenceCapture:
     """Optimiser steps of `mien bench quality`."""
     by_default: bool = True
     """Whether `mien bench quality` without names includes it."""
+    views: SideViews | None = None
+    """True pictures from aside for the protocol `unseen_view`. None if there are none."""
 
     def scenes(self) -> list[SyntheticScene]:
-        """Return the sequences, not yet drawn. They share the person but not the motion."""
+        """Return the sequences and the side views, not yet drawn. They share the person but not the motion."""
         scenes: list[SyntheticScene] = []
         for index, recipe in enumerate(self.sequences):
             scenes.append(SyntheticScene(recipe, self.seed, 1000 * self.seed + index, scenes[0] if scenes else None))
+        for recipe in self.sequences if self.views else ():
+            if recipe.name == self.views.sequence:
+                seen = replace(recipe, name=self.views.name, cameras="sides")
+                moments = range(self.views.first, recipe.timesteps, self.views.every)
+                of = scenes[self.sequences.index(recipe)]
+                scenes.append(SyntheticScene(seen, self.seed, of.motion_seed, scenes[0], moments))
         return scenes
 
     def write(self, folder: Path) -> str:
@@ -55,7 +81,8 @@ class ReferenceCapture:
             )
             for recipe in self.sequences
         ]  # fmt: skip
-        return replace(self, sequences=tuple(small))
+        views = None if self.views is None else replace(self.views, first=1, every=1)
+        return replace(self, sequences=tuple(small), views=views)
 
 
 def _combined(keys: list[str]) -> str:
@@ -87,12 +114,30 @@ _RING = replace(
     _PERSON, width=256, height=256, fps=10.0, cameras="ring", translation=(0.012, 0.008, 0.02),
     rotation=(8.0, 5.0, 4.0), turns=(30.0, 14.0),
 )  # fmt: skip
+_SIDES = replace(_PERSON, width=320, height=320, fps=15.0)
+_SIDES_TRAINED = replace(
+    _SIDES, name="front", turns=(25.0, 12.0), rotation=(12.0, 8.0, 5.0),
+    script=_script(("still", 0.6), ("turns", 3.6), ("free", 5.8)),
+)  # fmt: skip
+_SIDES_SCORED = replace(
+    _SIDES, name="aside", rotation=(6.0, 4.0, 3.0), translation=(0.01, 0.006, 0.02),
+    script=_script(("free", 1.8), ("expressions", 3.6)),
+)  # fmt: skip
 _LARGE_RING = replace(_RING, width=550, height=802)
 """The size of the pictures that GaussianAvatars was trained on (section A of its supplement)."""
 
 
 def _one(name: str, description: str, seed: int, recipe: SyntheticRecipe, steps: int = 2_000) -> ReferenceCapture:
     return ReferenceCapture(name, description, seed, (replace(recipe, name=name),), steps=steps)
+
+
+def _sides(name: str, description: str, seed: int, hair: Literal["short", "long"]) -> ReferenceCapture:
+    """A person trained from the front, and scored from all sides at expressions like and unlike those of training."""
+    return ReferenceCapture(
+        name, description, seed,
+        (replace(_SIDES_TRAINED, hair=hair), replace(_SIDES_SCORED, hair=hair)),
+        held_out_sequences=("aside",), steps=4_000, views=SideViews("aside", every=6, first=3),
+    )  # fmt: skip
 
 
 REFERENCES = {
@@ -134,6 +179,8 @@ REFERENCES = {
         _one("long-hair", "hair to the shoulders, 384x384", 6, replace(_BRIEF, hair="long")),
         _one("glasses", "glasses, 384x384", 11, replace(_BRIEF, glasses=True)),
         _one("off-model", "shape and expressions beyond the face model, 384x384", 7, replace(_BRIEF, off_model=1.0)),
+        _sides("mono-sides", "one front camera, 320x320, 15 fps; scored from 13 cameras all around", 21, "short"),
+        _sides("mono-sides-long-hair", "the same for a person with hair to the shoulders", 22, "long"),
     )
 }  # fmt: skip
 """Reference captures by name."""

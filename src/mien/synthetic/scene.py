@@ -13,13 +13,13 @@ from jaxtyping import Float, UInt8
 
 from mien import exact
 from mien.camera import Camera, look_at
-from mien.face import FaceModel, load_face_model
+from mien.face import FaceModel, FaceParams, load_face_model
 from mien.parallel import stream_in_threads
 from mien.synthetic.motion import generate_motion
 from mien.synthetic.off_model import bend_off_model
 from mien.synthetic.painter import develop, draw, paint_wall, to_uint8
 from mien.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
-from mien.synthetic.recipe import SyntheticRecipe
+from mien.synthetic.recipe import SIDES, SyntheticRecipe
 from mien.synthetic.subject import Subject, build_subject, pose_subject
 from mien.tracking import Tracking
 from mien.tracking.neck_line import fit_neck_lines
@@ -49,6 +49,7 @@ class SyntheticScene:
         seed: int,
         motion_seed: int | None = None,
         same_person: "SyntheticScene | None" = None,
+        moments: Sequence[int] | None = None,
     ) -> None:
         """Prepare a scene; nothing is drawn yet.
 
@@ -57,6 +58,7 @@ class SyntheticScene:
             seed: Decides the person, the light and the room.
             motion_seed: Decides the motion; None for `seed`. Sequences of one subject share only `seed`.
             same_person: Another scene with the same person, so that the person is built only once.
+            moments: Timesteps of the recipe that the scene consists of; None for all.
         """
         self.recipe, self.seed, self.motion_seed = recipe, seed, seed if motion_seed is None else motion_seed
         self._same_person = same_person
@@ -64,13 +66,23 @@ class SyntheticScene:
         count = self.model.identity_basis.shape[0]
         coefficients = np.random.default_rng([seed, 0]).standard_normal(count).astype(np.float32)
         self.identity = torch.from_numpy(recipe.identity_scale * np.clip(coefficients, -2, 2)).float()
-        self.face = generate_motion(self.model, self.identity, recipe, self.motion_seed)
+        self.moments = None if moments is None else tuple(moments)
+        self.face = self._chosen(generate_motion(self.model, self.identity, recipe, self.motion_seed))
         self.drawn_model, self._drawn_face = self.model, self.face
         if recipe.off_model > 0:
             bent = bend_off_model(self.model, self.identity, recipe.off_model, seed)
+            assert moments is None, "expressions beyond the face model follow time without gaps"
             self.drawn_model, self._drawn_face = bent.model, bent.face(self.face, recipe.fps, seed)
             self.face = replace(self.face, vertex_offsets=bent.offsets)
         self.cameras = _place_cameras(recipe)
+
+    def _chosen(self, face: FaceParams) -> FaceParams:
+        return face if self.moments is None else face[list(self.moments)]
+
+    @property
+    def timesteps(self) -> int:
+        """The number of timesteps that the scene consists of."""
+        return self.recipe.timesteps if self.moments is None else len(self.moments)
 
     @property
     def camera(self) -> Camera:
@@ -125,7 +137,7 @@ class SyntheticScene:
 
     def frames(self) -> Iterator[SyntheticFrame]:
         """Yield the front camera's pictures in order."""
-        for frames in self.all_frames(range(self.recipe.timesteps), (0,)):
+        for frames in self.all_frames(range(self.timesteps), (0,)):
             yield frames[0]
 
     def all_frames(
@@ -147,14 +159,14 @@ class SyntheticScene:
         Hidden points are included.
         """
         projected = []
-        for timestep in range(self.recipe.timesteps):
+        for timestep in range(self.timesteps):
             points = landmark_positions(self.model, self.vertices(timestep).numpy())
             projected.append(project(self.cameras[camera], points)[0])
         return np.stack(projected)
 
     def tracking(self) -> Tracking:
         """Return the true tracking. With `recipe.off_model` only head pose, cameras and the neutral shape are true."""
-        timesteps = self.recipe.timesteps
+        timesteps = self.timesteps
         return Tracking(
             face_model=self.model.name,
             face_model_hash=self.model.content_hash,
@@ -168,8 +180,14 @@ class SyntheticScene:
                 "seed": self.seed,
                 "motion_seed": self.motion_seed,
                 "recipe": asdict(self.recipe),
+                **self.extent,
             },
         )
+
+    @property
+    def extent(self) -> dict:
+        """The moments for keys and records. It is empty for whole recipes, whose keys are older than moments."""
+        return {} if self.moments is None else {"moments": list(self.moments)}
 
     @property
     def source(self) -> dict:
@@ -182,6 +200,7 @@ class SyntheticScene:
             "motion_seed": self.motion_seed,
             "face_model": self.model.content_hash,
             "landmarks": hashlib.sha256(embedding).hexdigest()[:16],
+            **self.extent,
         }
         digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
         return {"kind": "synthetic", "content_hash": digest, **content}
@@ -191,17 +210,18 @@ def _place_cameras(recipe: SyntheticRecipe) -> tuple[Camera, ...]:
     """Return one camera per camera_id, all in one world frame.
 
     The first is at the world's origin and looks along -z at the head, `recipe.distance` away. The others of a ring look
-    at the same point from the same distance. They are spread evenly from one side to the other, in three rows.
+    at the same point from the same distance. They are spread evenly from one side to the other, in three rows. Those
+    of `SIDES` look at it from the same distance as well.
     """
     focal = recipe.focal * recipe.width
     K = torch.tensor([[focal, 0, recipe.width / 2], [0, focal, recipe.height / 2], [0, 0, 1.0]])
     front = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
     viewmats = [front]
     target = torch.tensor([0.0, 0.0, -recipe.distance])
-    for index in range(1, len(recipe.camera_ids)):
+    for index, name in enumerate(recipe.camera_ids[1:], 1):
         share = (index - 1) / max(len(recipe.camera_ids) - 2, 1)
-        azimuth = math.radians(_MAX_AZIMUTH * (2 * share - 1))
-        elevation = math.radians(_ELEVATIONS[index % len(_ELEVATIONS)])
+        around = _MAX_AZIMUTH * (2 * share - 1), _ELEVATIONS[index % len(_ELEVATIONS)]
+        azimuth, elevation = map(math.radians, SIDES[name] if recipe.cameras == "sides" else around)
         away = torch.tensor([
             math.sin(azimuth) * math.cos(elevation),
             math.sin(elevation),

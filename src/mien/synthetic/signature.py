@@ -32,7 +32,7 @@ def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
     flat list: means and spreads of colours and means of mattes in grey levels, landmarks in pixels, vertices in
     millimetres.
     """
-    timesteps = sorted({0, scene.recipe.timesteps // 2, scene.recipe.timesteps - 1})
+    timesteps = sorted({0, scene.timesteps // 2, scene.timesteps - 1})
     cameras = sorted({0, len(scene.cameras) - 1})
     frames = [frame for step in timesteps for frame in scene.timestep_frames(step, cameras)]
     images, mattes = (np.stack([getattr(frame, part) for frame in frames]) for part in ("image", "matte"))

@@ -56,7 +56,7 @@ def surface_of(
     """Return `vertex_index`, `vertices` and `landmarks` of the truth."""
     index = face_region(measure_anatomy(scene.model, scene.identity))
     chosen = torch.from_numpy(index)
-    vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.recipe.timesteps)])
+    vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.timesteps)])
     landmarks = np.stack([scene.landmarks(camera) for camera in range(len(scene.cameras))], axis=1)
     return index, _unpacked(_packed(vertices, _METRE), _METRE), _unpacked(_packed(landmarks, _PIXEL), _PIXEL)
 

@@ -10,14 +10,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from mien import _native
 from mien.avatar import Avatar, MethodConfig, Progress, load_avatar, method_named, method_of, move_avatar
+from mien.camera import Camera
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
-from mien.face import FaceModel, concatenate
+from mien.face import FaceModel, FaceParams, concatenate
 from mien.face.checks import check_face_params
 from mien.locks import hold
 from mien.perceptual import load_training_features
@@ -45,7 +47,7 @@ from mien.training.losses import perceptual_loss, picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Target, Targets
 from mien.training.settings import TrainSettings
-from mien.training.unseen import unseen_of
+from mien.training.unseen import TRIM_STEPS, trim_fills, unseen_of
 from mien.training.vertex_colors import vertex_colors
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
@@ -142,9 +144,20 @@ def _train_to_the_end(
                 if interrupted():
                     raise KeyboardInterrupt
         if state.unseen is not None:
-            state.unseen.fill(state.avatar)
+            trim_fills(state.avatar, state.unseen.fill(state.avatar), _trim_views(state, data))
         _check_finite(run_dir, state)
         write_results(run_dir, state)
+
+
+def _trim_views(state: TrainingState, data: TrainingData) -> Iterator[tuple[FaceParams, Camera, Target]]:
+    """Training pictures for `trim_fills`, in the order in which training would go on, over white."""
+    white = np.full(3, 255, np.uint8)
+    face = state.track.params()
+    for step in range(TRIM_STEPS):
+        frame, _ = data.order.at(step)
+        targets = data.targets[frame.sequence]
+        target = targets.moved(targets.composed(frame.timestep, frame.camera, white, keep=False))
+        yield face[state.track.index_of(frame.sequence, frame.timestep)], targets.camera(frame.camera), target
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:

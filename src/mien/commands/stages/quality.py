@@ -13,6 +13,7 @@ import torch
 
 from mien.avatar import method_named
 from mien.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
+from mien.benchmarking.unseen_views import Figures, SidePictures, score_side_views, write_unseen_chart
 from mien.capture import CaptureSettings, read_capture, read_capture_hash
 from mien.commands.stages.capturing import run_capture_stage
 from mien.commands.stages.evaluating import run_evaluation_stage, run_sequences
@@ -24,6 +25,7 @@ from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import EvaluationSettings
+from mien.evaluation.scoring import ScoreSettings
 from mien.face import load_face_model
 from mien.inside import remove_tree
 from mien.locks import WAIT, hold
@@ -41,6 +43,7 @@ _TIMES = "seconds.json"
 _FACE_MODEL = "anny"
 _SHEET_SIDE, _SHEET_FRAMES = 192, 6
 _SCORED = EvaluationSettings(perceptual_frames=8, video_frames=0)
+_UNSEEN = ScoreSettings(perceptual_frames=2)
 
 
 def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
@@ -104,8 +107,26 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
         name: {key: value for key, value in entry.items() if key != "per_frame"}
         for name, entry in metrics["protocols"].items()
     }
-    row = QualityRow(reference.name, key, method, steps, summary["gaussians"], protocols, errors, times.seconds)
+    with times.measured("views"):
+        unseen = _unseen_views(reference, drawn, workspace, run)
+    row = QualityRow(reference.name, key, method, steps, summary["gaussians"], protocols, errors, times.seconds, unseen)
     return row, _strip(workspace, run)
+
+
+def _unseen_views(reference: ReferenceCapture, drawn: Path, workspace: Workspace, run: str) -> Figures:
+    """Score a run on true pictures from all sides, if there are any. Writes a sheet and a chart beside its report."""
+    views = reference.views
+    if views is None:
+        return {}
+    run_dir = workspace.run_dir(run)
+    experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
+    capture, truth = read_capture(drawn / views.name / "capture"), read_truth(drawn / views.name / "truth")
+    moments = tuple(views.first + views.every * index for index in range(capture.timesteps))
+    figures, sheet = score_side_views(experiment, views.sequence, SidePictures(capture, truth, moments), _UNSEEN)
+    write_png(run_dir / "unseen_view.png", sheet)
+    write_unseen_chart(run_dir / "unseen_view_chart.png", figures)
+    write_json(run_dir / "unseen_view.json", "mien.unseen_view", 1, {"angles": figures})
+    return figures
 
 
 def _capture(workspace: Workspace, drawn: Path, name: str) -> None:

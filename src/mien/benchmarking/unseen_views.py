@@ -1,0 +1,190 @@
+"""The protocol `unseen_view`: an avatar of one front camera against true pictures of the person from all sides."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.capture import Capture
+from mien.evaluation.baselines import make_baselines
+from mien.evaluation.experiment import Experiment
+from mien.evaluation.metrics import crop_to
+from mien.evaluation.scoring import Scores, ScoreSettings, as_8_bit, mean_scores, perceptual_metric, score_pictures
+from mien.files import write_atomically
+from mien.parallel import stream_in_threads
+from mien.pictures import Box
+from mien.progress import track_progress
+from mien.render import rasterize
+from mien.render.mesh import render_mesh
+from mien.rotation import align_centred
+from mien.synthetic import Truth
+from mien.synthetic.recipe import SIDES
+from mien.tracking import make_scoring
+from mien.training.sequence import composite
+
+AVATAR, MESH = "avatar", "mesh"
+Figures = dict[str, dict[str, Any]]
+"""Mean figures (`mean_scores`) by angle and by what is scored."""
+
+
+@dataclass(frozen=True, eq=False)
+class SidePictures:
+    """True pictures of one sequence from the front and from `SIDES`, at some of its timesteps."""
+
+    capture: Capture
+    """The pictures and exact mattes of all cameras; the first one is in front."""
+    truth: Truth
+    timesteps: tuple[int, ...]
+    """The timestep of the sequence that each picture shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One picture to score."""
+
+    camera: int
+    moment: int
+
+    @cached_property
+    def label(self) -> str:
+        """The row that the view counts in: left and right count together."""
+        return angle_names()[self.camera]
+
+
+_Job = tuple[_View, dict[str, Tensor], Tensor, Box]
+"""A view, its pictures to score, the truth, and the head crop."""
+
+
+def angle_names() -> list[str]:
+    """The name of each camera's row, the front camera's first, such as `15` for both cameras 15 degrees aside."""
+    names = ["front"]
+    for azimuth, elevation in SIDES.values():
+        upright = "above" if elevation > 0 else "below"
+        names.append(f"{abs(azimuth):g}" if elevation == 0 else f"{upright} {abs(elevation):g}")
+    return names
+
+
+def camera_beside(camera: Camera, tracked: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> Camera:
+    """A true camera in the world of a tracking, whose face may have another place and size.
+
+    Args:
+        camera: The camera in the true world.
+        tracked: Vertices of the tracked face in the tracking's world, in its metres.
+        true: The same vertices in the true world, in metres.
+    """
+    source, target = tracked.astype(np.float64), true.astype(np.float64)
+    middle, goal = source.mean(0), target.mean(0)
+    rotation, scale = align_centred(source - middle, target - goal)
+    view = camera.viewmat.double().numpy()
+    moved = np.eye(4)
+    moved[:3, :3] = view[:3, :3] @ rotation
+    # Dividing by the scale changes no projected point, and keeps the matrix rigid.
+    moved[:3, 3] = (view[:3, :3] @ (goal - scale * rotation @ middle) + view[:3, 3]) / scale
+    return replace(camera, viewmat=torch.from_numpy(moved).to(camera.viewmat))
+
+
+@torch.no_grad()
+def score_side_views(
+    experiment: Experiment, sequence: str, pictures: SidePictures, settings: ScoreSettings
+) -> tuple[Figures, Float[np.ndarray, "h w 3"]]:
+    """Figures by angle for the avatar and for the coloured mesh, and a sheet: truth, avatar and mesh by angle.
+
+    The pictures are cut and cropped as in every other protocol: over white, above the neck line of the true head. An
+    avatar is posed as in `experiment`, and seen by the true camera at the place that it has relative to the tracked
+    face.
+
+    Args:
+        experiment: The trained avatar with its sequences.
+        sequence: Name of the sequence that the pictures show.
+        pictures: The true pictures.
+        settings: Which figures. ST-LPIPS is computed for one of `settings.perceptual_frames` moments per camera.
+    """
+    index = [one.name for one in experiment.sequences].index(sequence)
+    model, truth = experiment.avatar.face_model, pictures.truth
+    scoring = make_scoring(pictures.capture, truth.tracking, model)
+    colors = make_baselines(experiment, settings.threads or None).vertex_colors
+    metric, judged = perceptual_metric(settings), _judged(len(pictures.timesteps), settings.perceptual_frames)
+    tracked, used = experiment.sequences[index].tracking.face, experiment.faces[index]
+    true_points = truth.vertices_world
+
+    def drawn(view: _View) -> _Job:
+        timestep = pictures.timesteps[view.moment]
+        points = model(tracked[timestep])[0].numpy()[truth.vertex_index]
+        camera = camera_beside(truth.tracking.cameras[view.camera], points, true_points[view.moment])
+        gaussians = experiment.avatar.pose(used[timestep]).gaussians.timestep(0)
+        place = (view.moment, view.camera)
+        white = np.full(3, 255, np.uint8)
+        picture = composite(np.asarray(pictures.capture.images[place]), np.asarray(scoring.masks[place]), white)
+        vertices = model(used[timestep])[0]
+        images = {
+            AVATAR: rasterize(gaussians, camera, torch.ones(3)).image.clamp(0, 1),
+            MESH: render_mesh(vertices, model.faces, camera, colors, supersample=2)[0].clamp(0, 1),
+        }
+        left, top, width, height = (int(value) for value in scoring.crops[place])
+        return view, images, torch.from_numpy(picture).float() / 255, (left, top, width, height)
+
+    def score(job: _Job) -> tuple[_View, dict[str, Scores]]:
+        view, images, target, crop = job
+        eight = {name: as_8_bit(image) for name, image in images.items()}
+        return view, score_pictures(eight, target, crop, metric if view.moment in judged else None)
+
+    views = [_View(camera, moment) for camera in range(len(SIDES) + 1) for moment in range(len(pictures.timesteps))]
+    shown: list[list[np.ndarray]] = []
+
+    def jobs() -> Iterator[_Job]:
+        for view in track_progress(views, "unseen views", len(views)):
+            job = drawn(view)
+            if view.moment == len(pictures.timesteps) // 2:
+                shown.append([_tile(crop_to(image, job[3])) for image in (job[2], job[1][AVATAR], job[1][MESH])])
+            yield job
+
+    rows = list(stream_in_threads(score, jobs(), settings.threads or None))
+    figures: Figures = {}
+    for label in dict.fromkeys(angle_names()):
+        own = [scored for view, scored in rows if view.label == label]
+        figures[label] = {name: mean_scores([row[name] for row in own]) for name in (AVATAR, MESH)}
+    sheet = np.concatenate([np.concatenate(row, 0) for row in shown], 1)
+    return figures, sheet
+
+
+def write_unseen_chart(path: Path, figures: Figures) -> None:
+    """Write a chart of the head crop's PSNR over the angle aside. The file's ending decides its format."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for subject, style in ((AVATAR, "o-"), (MESH, "s--")):
+        level = {0.0 if label == "front" else float(label): row for label, row in figures.items() if _is_level(label)}
+        axes.plot(list(level), [row[subject]["head"]["psnr"] for row in level.values()], style, label=subject)
+    axes.set(xlabel="degrees from the front camera", ylabel="PSNR of the head crop, dB", title="unseen views")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    write_atomically(path, lambda part: figure.savefig(part, format=path.suffix.lstrip("."), dpi=130))
+
+
+def _is_level(label: str) -> bool:
+    return label == "front" or label.isdigit()
+
+
+def _judged(moments: int, count: int) -> set[int]:
+    """The moments for which ST-LPIPS is computed: `count` of them, evenly spread; all with 0."""
+    return set(range(0, moments, max(1, -(-moments // count)) if count else 1))
+
+
+def _tile(image: Tensor, side: int = 160) -> np.ndarray:
+    """The picture scaled into a white square."""
+    import cv2
+
+    scale = side / max(image.shape[:2])
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    square = np.full((side, side, 3), 255, np.uint8)
+    scaled = cv2.resize(np.asarray(image), size, interpolation=cv2.INTER_AREA)
+    square[: size[1], : size[0]] = np.clip(np.rint(scaled * 255), 0, 255).astype(np.uint8)
+    return square
