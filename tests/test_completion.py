@@ -70,7 +70,8 @@ def test_mirror_images_of_another_topology_and_of_a_mesh_that_is_not_quite_symme
 
 def test_a_triangle_without_a_counterpart_has_no_mirror_image(anny):
     middles = _middles(anny)
-    half = replace(anny, faces=anny.faces[middles[:, 0] > 0.03], face_regions=anny.face_regions[middles[:, 0] > 0.03])
+    left = middles[:, 0] > 0.03
+    half = replace(anny, faces=anny.faces[left], uv_faces=anny.uv_faces[left], face_regions=anny.face_regions[left])
     assert (mirror_triangles(half) == -1).all()
 
 
@@ -91,7 +92,8 @@ def test_an_unseen_side_gets_the_mirror_images_colours(anny):
     """A mole on one cheek appears on the other, which the camera did not see."""
     colors = _painted(anny)
     middles = _middles(anny)
-    mole = head_parts(anny).face & ((middles - torch.tensor([0.045, -0.03, 0.08])).norm(dim=1) < 0.008)
+    away = (middles - torch.tensor([0.045, -0.03, 0.08])).norm(dim=1)
+    mole = head_parts(anny).face & (away < away[head_parts(anny).face].kthvalue(12).values)
     assert mole.sum() > 5
     colors[mole] = torch.tensor([0.4, 0.25, 0.2])
     seen = (middles[:, 0] > -0.01).float()

@@ -4,6 +4,8 @@ Where the other side was seen, a triangle takes its mirror image's colour. Elsew
 from what was seen: hair over the scalp, skin over face, ears and neck. The inside of the mouth has colours of its own.
 """
 
+import math
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -16,6 +18,8 @@ from mien.training.spreading import Surface
 
 _COLOR_SPREAD = 0.12
 """Distance between colours (0..1) over which a colour stops counting as skin or as hair."""
+_TINT_SPREAD, _LIGHT_SPREAD = 0.06, 0.25
+"""The same for colours of equal brightness, and for the logarithm of their brightness beyond half or twice."""
 _DIFFERENT = 0.10
 """Distance between the medians of skin and hair from which their colours can be told apart."""
 _LARGEST_OFFSET = 0.25
@@ -61,7 +65,7 @@ def complete_colors(
     made_up = _spread_by_part(parts, mesh, known, albedo)
     if texture > 0:
         made_up = made_up + texture * _noise(parts, mesh, known, albedo)
-    mirrored, share = _mirrored(face_model, mesh, known, albedo)
+    mirrored, share = _mirrored(face_model, mesh, seen, known, albedo)
     made_up = torch.lerp(made_up, mirrored, share[:, None]) * shading
     brightness = _brightness(parts, seen, colors)
     made_up = torch.where(parts.interior[:, None], brightness * mouth_colors(parts, mesh.middles), made_up)
@@ -110,18 +114,29 @@ def _trust(
         top &= middles[:, 1] >= middles[top, 1].median()
     hair = _median(colors, top)
 
-    def like(color: Tensor | None) -> Tensor:
-        if color is None:
-            return torch.ones_like(seen)
-        return torch.exp(-0.5 * ((colors - color) ** 2).sum(1) / _COLOR_SPREAD**2)
-
     trust = torch.ones_like(seen)
-    skin_like, hair_like = like(skin), like(hair)
+    hair_like = trust if hair is None else _close(colors, hair)
+    if skin is None:
+        return trust
+    skin_like = _close_but_for_light(colors, skin)
     trust = torch.where(parts.skin, skin_like, trust)
-    trust = torch.where(parts.neck, torch.maximum(skin_like, hair_like if hair is not None else skin_like), trust)
-    if skin is not None and hair is not None and float((skin - hair).norm()) > _DIFFERENT:
-        trust = torch.where(parts.scalp, hair_like / (hair_like + skin_like + 1e-3), trust)
+    trust = torch.where(parts.neck, skin_like if hair is None else torch.maximum(skin_like, hair_like), trust)
+    if hair is not None and float((skin - hair).norm()) > _DIFFERENT:
+        trust = torch.where(parts.scalp, hair_like / (hair_like + _close(colors, skin) + 1e-3), trust)
     return trust
+
+
+def _close(colors: Float[Tensor, "f 3"], color: Float[Tensor, " 3"]) -> Float[Tensor, " f"]:
+    """Return how close colours are to one colour, 0..1."""
+    return torch.exp(-0.5 * ((colors - color) ** 2).sum(1) / _COLOR_SPREAD**2)
+
+
+def _close_but_for_light(colors: Float[Tensor, "f 3"], color: Float[Tensor, " 3"]) -> Float[Tensor, " f"]:
+    """Return how close colours are to one colour in half to twice the light, 0..1."""
+    light = (colors @ color) / (color @ color).clamp_min(1e-6)
+    tint = ((colors - light[:, None] * color) ** 2).sum(1) / _TINT_SPREAD**2
+    beyond = (light.clamp_min(1e-3).log().abs() - math.log(2)).clamp_min(0)
+    return torch.exp(-0.5 * (tint + (beyond / _LIGHT_SPREAD) ** 2))
 
 
 def _spread_by_part(
@@ -140,16 +155,19 @@ def _spread_by_part(
 
 
 def _mirrored(
-    face_model: FaceModel, mesh: Surface, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
+    face_model: FaceModel,
+    mesh: Surface,
+    seen: Float[Tensor, " f"],
+    known: Float[Tensor, " f"],
+    albedo: Float[Tensor, "f 3"],
 ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, " f"]]:
     """Return the mirror images' colours, fitted to this side's light, and how far the mirror images were seen."""
     images = mirror_triangles(face_model)
     has, image = images >= 0, images.clamp_min(0)
-    share = torch.where(has, known[image], 0.0)
-    both = known * share
+    both = torch.where(has, known * known[image], 0.0)
     offset = (albedo - albedo[image]).clamp(-_LARGEST_OFFSET, _LARGEST_OFFSET)
     offset = torch.where((both > 0.05)[:, None], offset, 0.0)
-    return albedo[image] + mesh.spread(offset, both, torch.ones_like(has)), share
+    return albedo[image] + mesh.spread(offset, both, torch.ones_like(has)), torch.where(has, seen[image], 0.0)
 
 
 def _noise(

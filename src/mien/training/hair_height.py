@@ -26,6 +26,8 @@ _CLEAR = 0.008
 """Height in metres at which nothing of the mesh may be behind or in front of a triangle at the outline."""
 _QUANTILE = 0.3
 """Share of the measured heights below the one that counts. Single strands and other things behind make some higher."""
+_SAME_HAIR = 1.3
+"""Largest height where nothing was measured, as a multiple of the median height on top of the head."""
 _FADING_ROUNDS = 6
 """Rings of triangles over which the height fades to 0 at the hairline."""
 
@@ -68,11 +70,19 @@ def hair_height(
     if not bool(found.any()):
         return height[:, 0]
     surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
-    height = surface.spread(height, known, scalp)
+    spread = surface.spread(height, known, scalp)
+    height = torch.where(known[:, None] > 0, spread, spread.clamp_max(_SAME_HAIR * _on_top(surface, height, known)))
     for _ in range(_FADING_ROUNDS):
         height = torch.minimum(height, surface.around(height, torch.ones_like(known)))
         height[~scalp] = 0
     return height[:, 0].clamp(0, _HIGHEST)
+
+
+def _on_top(surface: Surface, height: Float[Tensor, "f 1"], known: Float[Tensor, " f"]) -> float:
+    """Return the median height in the upper half of what was measured. Lower down, long hair hangs off the head."""
+    measured = known > 0
+    level = surface.middles[measured, 1].median()
+    return float(height[measured & (surface.middles[:, 1] >= level)].median())
 
 
 def _measured(
