@@ -343,7 +343,7 @@ def test_kept_pieces_of_a_tracking_that_are_of_no_use(
     keep, seen = tmp_path / ".tracking-0123", []
     keep.mkdir()
 
-    def fit(captures: object, face_model: object, settings: object, keep: Path, page: object) -> list[object]:
+    def fit(captures: object, model: object, settings: object, keep: Path, *others: object) -> list[object]:
         seen.append(keep.exists())
         if keep.exists():
             raise KeyError("rows")

@@ -12,7 +12,7 @@ from capture_helpers import tree_bytes
 from mien.cli import main
 from mien.locks import lock_file
 from other_process import Holder
-from two_commands import Outcome, Pair, Studio, pair, toy_studio
+from two_commands import RANK, Outcome, Pair, Studio, pair, toy_studio
 
 ROUNDS = 30
 MEETINGS = ROUNDS // 4  # a pair that meets less often goes on, up to four times as many rounds
@@ -116,7 +116,7 @@ def test_readers_go_on_beside_every_lock(
             ["evaluate", root, *run, "--compare", "--out", str(tmp_path / "a.html")],
             ["capture", str(studio.video), "--out", root, "--name", "clip", *studio.capture_options],
             ["track", root, "--face-model", "toy", "--overlay", "none"],
-            ["train", root, *run, "--steps", "3", "--split", "tail"],
+            ["train", root, *run, "--steps", "3", "--split", "tail", *RANK],
             ["create", str(studio.video), "--out", root, *run, *studio.create_options],
         ):
             assert main(command) == 0, (command, capsys.readouterr().err)
@@ -153,7 +153,7 @@ def test_a_workspace_whose_first_capture_is_at_work(
 def test_the_command_after_a_kill_goes_on_at_once(
     mortal: Holder, studio: Studio, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train = ["train", str(studio.root), "--run", "killed", "--steps", "3", "--split", "tail"]
+    train = ["train", str(studio.root), "--run", "killed", "--steps", "3", "--split", "tail", *RANK]
     with mortal.holding(studio.root / "runs" / "killed"):
         assert main(train) == 2
         mortal.kill()
@@ -194,7 +194,7 @@ def test_two_trainings_of_one_run(studio: Studio, both: Pair) -> None:
     for index in range(4 * ROUNDS):
         if index >= ROUNDS and told > MEETINGS:
             break
-        command = ["train", str(studio.root), "--run", f"t{index}", "--steps", "3", "--split", "tail"]
+        command = ["train", str(studio.root), "--run", f"t{index}", "--steps", "3", "--split", "tail", *RANK]
         outcomes = both.run(command, command)
         told += assert_apart(outcomes, f"t{index}")
         assert sum(len(one.worked) for one in outcomes) == 1, "trained once"

@@ -138,6 +138,10 @@ class Studio:
     """Options of `create` with which everything up to the tracking is current and training is short."""
 
 
+RANK = ["--method.expression-rank", "0"]
+"""Options without changes with the expression, which GaussianAvatars' own files cannot hold."""
+
+
 def toy_studio(folder: Path, cache: Path) -> Studio:
     """Film, capture and track the toy head without any detector. MIEN_CACHE has to be `cache`."""
     from mien.commands.stages.tracking import _tracking_fingerprint
@@ -169,4 +173,8 @@ def toy_studio(folder: Path, cache: Path) -> Studio:
 
     write_scoring(sequence / "scoring", Scoring(alpha, crops), read_capture_hash(sequence / "capture"))
     create_options = ["--name", "clip", "--face-model", "toy", "--overlay", "none", "--steps", "3", "--split", "tail"]
+    create_options += [
+        "--method.expression-rank",
+        "0",
+    ]  # GaussianAvatars' own files hold no changes with the expression
     return Studio(root, video, capture_options, folder / "avatar", [*create_options, *capture_options])

@@ -37,8 +37,7 @@ class Command:
     face_model: str = "anny"
     """Name of a face model (see `mien face-models`), or a .npz or .pkl file in FLAME's schema."""
     track_apart: bool = False
-    """Also hold the sequences of --hold-out out of the tracking: the others alone decide the person's shape, texture
-    and light and the focal length."""
+    """Hold the sequences of --hold-out out of the tracking as well (docs/using.md)."""
     preview: bool = False
     """Show the fit of the face while it runs, in DIR/tracking_preview.html (for a browser)."""
     overlay: Literal["auto", "all", "none"] = "auto"

@@ -6,8 +6,9 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.face.model import FaceModel
-from mien.pictures import Box
 
+Box = tuple[int, int, int, int]
+"""Left, top, width and height in pixels: `mien.pictures.Box`, without its import of OpenCV."""
 PARTS = ("eyes", "mouth")
 """Names of the parts. The eyes are one part."""
 _REGIONS = {"eyes": ("eyelids", "eyes", "irises"), "mouth": ("lips",)}

@@ -148,7 +148,10 @@ def factored_update_reference(update: FactoredUpdate) -> None:
     assert isinstance(gradient, Tensor)
     squares = gradient.square().mean(1)
     touched = (gradient != 0).flatten(1).any(1)
-    moments.second[touched] = moments.second[touched] * BETA2 + squares[touched] * (1 - BETA2)
-    moments.weights[touched] = moments.weights[touched] * BETA2 + (1 - BETA2)
-    deviations = (moments.second[touched] / moments.weights[touched, None]).sqrt() + _EPSILON
-    values[touched] -= rate * gradient[touched] / deviations[:, None]
+    # Selecting the touched rows would wait for a GPU to count them.
+    second = moments.second * BETA2 + squares * (1 - BETA2)
+    moments.second.copy_(torch.where(touched[:, None], second, moments.second))
+    moments.weights.copy_(torch.where(touched, moments.weights * BETA2 + (1 - BETA2), moments.weights))
+    weights = torch.where(touched, moments.weights, torch.ones_like(moments.weights))
+    deviations = (moments.second / weights[:, None]).sqrt() + _EPSILON
+    values.sub_(rate * gradient / deviations[:, None])
