@@ -173,8 +173,5 @@ def toy_studio(folder: Path, cache: Path) -> Studio:
 
     write_scoring(sequence / "scoring", Scoring(alpha, crops), read_capture_hash(sequence / "capture"))
     create_options = ["--name", "clip", "--face-model", "toy", "--overlay", "none", "--steps", "3", "--split", "tail"]
-    create_options += [
-        "--method.expression-rank",
-        "0",
-    ]  # GaussianAvatars' own files hold no changes with the expression
+    create_options += RANK
     return Studio(root, video, capture_options, folder / "avatar", [*create_options, *capture_options])
