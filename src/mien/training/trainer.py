@@ -14,7 +14,16 @@ import torch
 from torch import Tensor
 
 from mien import _native
-from mien.avatar import Avatar, MethodConfig, Progress, load_avatar, method_named, method_of, move_avatar
+from mien.avatar import (
+    Avatar,
+    MethodConfig,
+    Progress,
+    load_avatar,
+    measure_filmed,
+    method_named,
+    method_of,
+    move_avatar,
+)
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
 from mien.face import FaceModel, concatenate
@@ -184,13 +193,17 @@ def start(
     like: Tensor | None = None,
 ) -> TrainingState:
     """The state before the first step, with the float dtype and device of `like` (default: float32 on the CPU)."""
-    face = concatenate([sequence.tracking.face for sequence in sequences])
+    faces = [sequence.tracking.face for sequence in sequences]
+    face, frames = concatenate(faces), training_frames(sequences, settings)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
+    starts = [sum(map(len, faces[:index])) for index in range(len(faces))]
+    seen = face[[starts[frame.sequence] + frame.timestep for frame in frames]]
+    eyes = torch.stack([sequences[frame.sequence].tracking.cameras[frame.camera].position for frame in frames])
+    avatar.filmed = measure_filmed(seen, avatar.subject, eyes)
     if avatar.wants_first_colors:
-        faces = [sequence.tracking.face for sequence in sequences]
-        avatar.paint(vertex_colors(face_model, sequences, faces, training_frames(sequences, settings)))
+        avatar.paint(vertex_colors(face_model, sequences, faces, frames))
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
