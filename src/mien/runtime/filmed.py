@@ -20,7 +20,7 @@ LEAST_JOINT = 0.1
 LEAST_HEAD = np.radians(8.0)
 """Least of this room for the head's yaw and pitch, in radians."""
 
-Array = Float[np.ndarray, "*b"]
+Array = Float[np.ndarray, "..."]
 
 
 def soft_limits(values: Array, lowest: Array, highest: Array, rest: Array, least: Array | float) -> Array:
@@ -67,7 +67,7 @@ def within_filmed_inputs(
 
 
 def head_angles(
-    rotation: Float[np.ndarray, "t 3"], translation: Float[np.ndarray, "t 3"], eye: Float[np.ndarray, "*t 3"]
+    rotation: Float[np.ndarray, "t 3"], translation: Float[np.ndarray, "t 3"], eye: Float[np.ndarray, "... 3"]
 ) -> Float[np.ndarray, "t 2"]:
     """Yaw and pitch of the camera as the head sees it, in radians: to the subject's left, and upwards.
 
