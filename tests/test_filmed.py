@@ -128,7 +128,11 @@ def test_a_range_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     face = toy_sequence()[1].tracking.face
     avatar = _avatar(face)
     good = measure_filmed(face, avatar.subject, torch.ones(len(face), 3))
-    for change in ({"lowest": good.highest + 1}, {"reach": -np.ones(1, np.float32)}, {"head_angles": good.head_angles[:, ::-1].copy()}):
+    for change in (
+        {"lowest": good.highest + 1},
+        {"reach": -np.ones(1, np.float32)},
+        {"head_angles": good.head_angles[:, ::-1].copy()},
+    ):
         avatar.filmed = replace(good, **change)
         write_avatar(tmp_path / "a", avatar)
         with pytest.raises(UserError, match="filmed"):
