@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from mien.avatar.baking import as_array, bake_rig, make_portable
     from mien.avatar.density import DensityControl, FixedDensity, GradientDensity, RefillDensity
     from mien.avatar.files import load_avatar, write_avatar
+    from mien.avatar.filmed import measure_filmed
     from mien.avatar.gaussian_avatars import GaussianAvatars
     from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
     from mien.avatar.headgas import HeadGas
@@ -45,6 +46,7 @@ else:
             "baking": ["as_array", "bake_rig", "make_portable"],
             "density": ["DensityControl", "FixedDensity", "GradientDensity", "RefillDensity"],
             "files": ["load_avatar", "write_avatar"],
+            "filmed": ["measure_filmed"],
             "gaussian_avatars": ["GaussianAvatars"],
             "gaussian_avatars_settings": ["GaussianAvatarsConfig"],
             "headgas": ["HeadGas"],
@@ -99,6 +101,7 @@ __all__ = [
     "bake_rig",
     "load_avatar",
     "make_portable",
+    "measure_filmed",
     "method_named",
     "method_of",
     "move_avatar",

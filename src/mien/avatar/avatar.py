@@ -19,7 +19,7 @@ from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
-from mien.runtime.baked import BakedAvatar
+from mien.runtime.baked import BakedAvatar, Filmed
 
 _CALM_SHARE = 0.1
 """Share of the timesteps that are used to estimate the expression at rest."""
@@ -85,6 +85,8 @@ class Avatar(nn.Module, ABC):
         self.face_model = face_model
         self.subject = neutral_of(face)
         """One timestep: this person's identity and offsets, and the face at rest."""
+        self.filmed: Filmed | None = None
+        """What training saw of the face. None if it is not known, as for older and imported avatars."""
 
     @abstractmethod
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:

@@ -83,4 +83,5 @@ def make_portable(avatar: Avatar, camera: Camera, name: str) -> PortableAvatar:
             licence=licences.get(model.name, "unknown"),
             mien=mien.__version__,
         ),
+        filmed=avatar.filmed,
     )

@@ -1,6 +1,6 @@
 """Avatars on disk: a folder with avatar.json, avatar.safetensors and, if its licence allows it, the face model."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.inside import check_subtrees, check_tree
 from mien.limits import MAX_NUMBER
 from mien.locks import read_beside_writers
-from mien.runtime.checks import baked_fault
+from mien.runtime.baked import Filmed
+from mien.runtime.checks import baked_fault, filmed_fault
 from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
@@ -43,6 +44,8 @@ def write_avatar(folder: Path, avatar: Avatar) -> None:
     """Write an avatar. avatar.json is written last, so a folder that has it is complete."""
     tensors = {f"avatar.{name}": tensor for name, tensor in avatar.state_dict().items()}
     tensors |= {f"subject.{name}": tensor for name, tensor in avatar.subject.tensors().items()}
+    if avatar.filmed is not None:
+        tensors |= {f"filmed.{f.name}": torch.from_numpy(getattr(avatar.filmed, f.name)) for f in fields(avatar.filmed)}
     write_tensors(folder / "avatar.safetensors", tensors)
     carried = avatar.face_model.shareable
     if carried:
@@ -101,7 +104,20 @@ def _load_avatar(folder: Path) -> Avatar:
         avatar = method.avatar(for_loading(config), face_model, face)
     avatar.config = config
     overwrite(avatar, _with_prefix(tensors, "avatar."), content.gaussians, folder)
+    avatar.filmed = _filmed(_with_prefix(tensors, "filmed."), avatar, folder)
     return avatar
+
+
+def _filmed(tensors: dict[str, Tensor], avatar: Avatar, folder: Path) -> Filmed | None:
+    """What training saw of the face, or None if the file does not say."""
+    if not tensors:
+        return None
+    with expect_whole(folder, _REMEDY):
+        filmed = Filmed(**{name: tensor.numpy() for name, tensor in tensors.items()})
+        fault = filmed_fault(filmed, len(avatar.face_model.expression_names) + avatar.subject.joints[0].numel())
+        if fault is not None:
+            raise ValueError(fault)
+    return filmed
 
 
 @torch.no_grad()

@@ -28,6 +28,9 @@ class Command:
     """Name of the driver's sequence (default: the only one)."""
     head_pose: bool = True
     """By default, the head follows the driver's head. With --no-head-pose it stays still, and only the face moves."""
+    unlimited: bool = False
+    """Follow the driver however far. By default, expressions and turns of the head that go beyond what the avatar was
+    filmed in are softened, because it has never seen them."""
     alone: bool = False
     """Show only the avatar, without the driver's pictures beside it."""
     fps: float | None = None
@@ -50,5 +53,5 @@ class Command:
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         warn_of_white(self.picture, run_dir)
-        options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps)
+        options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps, self.unlimited)
         run_driving_stage(run_dir, self.by, self.out, options, self.picture)

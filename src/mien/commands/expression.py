@@ -6,6 +6,8 @@ from dataclasses import replace
 
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
+from mien.progress import say
+from mien.runtime.baked import Filmed
 
 _MAX_ANGLE = 1.0
 """Largest angle of a joint in either direction, in radians."""
@@ -45,6 +47,18 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
             raise UserError(f"--set {assignment}: {name} goes from {lower:g} to {upper:g}; 1 is {unit}")
         expression[:, index] = value
     return replace(face, expression=expression, joints=joints.reshape(face.joints.shape))
+
+
+def tell_of_unfilmed(assignments: tuple[str, ...], model: FaceModel, filmed: Filmed) -> None:
+    """Name the assignments, which `with_expression` accepted, that go beyond what was filmed."""
+    names, beyond = (*model.expression_names, *_angle_names(model)), []
+    for name, _, text in (assignment.partition("=") for assignment in assignments):
+        index = names.index(name)
+        lowest, highest = min(0.0, float(filmed.lowest[index])), max(0.0, float(filmed.highest[index]))
+        if not lowest <= float(text) <= highest:
+            beyond.append(f"{name}={text} ({lowest:.2f} to {highest:.2f})")
+    if beyond:
+        say(f"beyond what was filmed, so it may look wrong: {', '.join(beyond)}")
 
 
 def _angle_names(model: FaceModel) -> tuple[str, ...]:

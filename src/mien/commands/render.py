@@ -16,8 +16,13 @@ if TYPE_CHECKING:
     import numpy
     import torch
 
+    import mien.avatar
     import mien.camera
+    import mien.export.output
     import mien.face
+
+
+_MAX_STRENGTH = 3.0
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,12 @@ class Command:
     path: Literal["turntable", "orbit", "sway", "still", "captured"] = "turntable"
     """Path of the camera: to both sides (turntable), an oval (orbit), a figure eight (sway), no motion (still), or from
     camera to camera of the capture (captured). A .png is always a still."""
+    sheet: Literal["none", "expressions", "filmed", "turntable"] = "none"
+    """Many pictures in one .png, each with its name: every expression at --strength (expressions), every expression at
+    --strength times the most that was filmed (filmed), or sides of the head, --span degrees from end to end
+    (turntable). --size is that of one of them."""
+    strength: float = 1.0
+    """Strength of the expressions on a sheet, from 0 to 3."""
     cameras: Path | None = None
     """A json file of cameras, one per frame (format: docs/using.md), instead of --path. The cameras keep their own
     sizes."""
@@ -44,8 +55,8 @@ class Command:
     fps: float = 25.0
     """Frames per second of the video."""
     span: float = 40.0
-    """Angle that the camera swings through, in degrees. 360 goes all the way round, but sides that were not filmed look
-    broken."""
+    """Angle that the camera swings through, in degrees, up to 360, which goes all the way round. 40 is about what one
+    camera films; sides that were not filmed look broken."""
     tilt: float = 15.0
     """Angle that orbit and sway go up and down, in degrees."""
     yaw: float = 0.0
@@ -74,6 +85,8 @@ class Command:
         if self.sequence is not None or (self.path == "captured" and self.cameras is None):
             workspace.pick_sequence(self.sequence)
         self._check_numbers()
+        if self.sheet != "none":
+            self._check_sheet()
         if sum((self.sequence is not None, self.own_motion, self.timestep is not None)) > 1:
             raise UserError("--sequence, --own-motion and --timestep: give only one of them")
         if self.sequence is None and not self.own_motion and self.cameras is None and self.path != "captured":
@@ -82,13 +95,12 @@ class Command:
     def run(self) -> None:
         """Pose and render frame by frame, after a check of everything that depends on files."""
         from mien.avatar import load_avatar, move_avatar
-        from mien.commands.expression import with_expression
-        from mien.commands.stages.pictures import draw, view, warn_of_white
+        from mien.commands.expression import tell_of_unfilmed, with_expression
+        from mien.commands.stages.pictures import draw, warn_of_white
         from mien.export.pictures import write_pictures
         from mien.face.checks import check_face_params
         from mien.progress import say, track_progress
-        from mien.render.camera_paths import aside
-        from mien.training import filmed_words, read_coverage, read_face_track, read_sequence, run_camera
+        from mien.training import filmed_range, filmed_words, read_coverage, read_face_track, read_sequence
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
@@ -112,10 +124,13 @@ class Command:
         told = "choose a sequence that was tracked with the avatar's face model"
         check_face_params(avatar.face_model, face, f"--sequence {self.sequence}", told)
         face = with_expression(face, avatar.face_model, self.set)
+        if self.set:
+            tell_of_unfilmed(self.set, avatar.face_model, filmed_range(run_dir, avatar))
+        if self.sheet != "none":
+            self._draw_sheet(run_dir, avatar, face, output)
+            return
         if cameras is None:
-            camera, centre = view(self.picture, run_camera(run_dir), self.zoom), subject.head_translation[0]
-            camera = aside(camera, centre, math.radians(self.yaw), math.radians(self.pitch))
-            cameras = self._path(camera, centre, self._frames(timesteps))
+            cameras = self._path(self._camera(run_dir, subject), subject.head_translation[0], self._frames(timesteps))
         like = like_on(choose_device(self.device))
         move_avatar(avatar, like)
         face = face.to(like)
@@ -133,6 +148,45 @@ class Command:
         if covered is not None:
             neutral = avatar.face_model.head_vertices(subject)[0].detach().cpu().float()
             say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
+
+    def _camera(self, run_dir: Path, subject: "mien.face.FaceParams") -> "mien.camera.Camera":
+        """The run's first camera, moved by --yaw, --pitch and --zoom."""
+        from mien.commands.stages.pictures import view
+        from mien.render.camera_paths import aside
+        from mien.training import run_camera
+
+        camera, centre = view(self.picture, run_camera(run_dir), self.zoom), subject.head_translation[0]
+        return aside(camera, centre, math.radians(self.yaw), math.radians(self.pitch))
+
+    def _draw_sheet(
+        self,
+        run_dir: Path,
+        avatar: "mien.avatar.Avatar",
+        face: "mien.face.FaceParams",
+        output: "mien.export.output.Output",
+    ) -> None:
+        from mien.avatar import move_avatar
+        from mien.commands.stages.pictures import draw
+        from mien.commands.stages.sheets import draw_sheet, expression_tiles, filmed_tiles, turntable_tiles
+        from mien.export.pictures import write_pictures
+        from mien.progress import say
+        from mien.training import filmed_range
+
+        camera, model = self._camera(run_dir, avatar.subject), avatar.face_model
+        if self.sheet == "turntable":
+            tiles = turntable_tiles(face, camera, avatar.subject.head_translation[0], self.span)
+        elif self.sheet == "filmed":
+            tiles = filmed_tiles(model, face, camera, filmed_range(run_dir, avatar), self.strength)
+        else:
+            tiles = expression_tiles(model, face, camera, self.strength)
+        like = like_on(choose_device(self.device))
+        move_avatar(avatar, like)
+
+        def picture(face: "mien.face.FaceParams", camera: "mien.camera.Camera") -> "numpy.ndarray":
+            return draw(self.picture, avatar.pose(face.to(like)).gaussians.detach().timestep(0), camera)
+
+        write_pictures(output, [draw_sheet(tiles, picture)], self.fps)
+        say(f"{self.out}: {len(tiles)} pictures of {len(avatar.gaussian_store()):,} Gaussians")
 
     def _chosen_timestep(self, run_dir: Path, face_model: "mien.face.FaceModel") -> "mien.face.FaceParams | None":
         """The face at --timestep, or None without that option."""
@@ -162,6 +216,20 @@ class Command:
                 raise UserError(f"--{name} {angle:g}: moves a camera of mien's own; leave it out, or leave out {fixed}")
         if not abs(self.tilt) < 180:
             raise UserError(f"--tilt {self.tilt:g}: give degrees between -180 and 180")
+
+    def _check_sheet(self) -> None:
+        """Refuse what does not go with a sheet."""
+        if self.out.suffix.lower() != ".png" or not self._is_still():
+            raise UserError(f"{self.out}: a sheet is one picture; give --out NAME.png")
+        if not 0 <= self.strength <= _MAX_STRENGTH:
+            raise UserError(f"--strength {self.strength:g}: give a number from 0 to {_MAX_STRENGTH:g}")
+        if self.picture.background == "transparent":
+            raise UserError("--background transparent: a sheet has no transparency; choose a colour")
+        moving = {"--sequence": self.sequence is not None, "--own-motion": self.own_motion}
+        moving |= {"--cameras": self.cameras is not None, "--path captured": self.path == "captured"}
+        for name, given in moving.items():
+            if given:
+                raise UserError(f"--sheet {self.sheet}: shows one face from a camera of mien's own; leave out {name}")
 
     def _is_still(self) -> bool:
         return self.out.suffix.lower() == ".png" and "%" not in self.out.name

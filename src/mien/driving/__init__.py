@@ -7,6 +7,7 @@ from mien.lazy import lazy_names
 if TYPE_CHECKING:
     from mien.driving.blendshape_json import read_blendshape_json
     from mien.driving.drivers import Driver, read_recording, read_tracked_driver
+    from mien.driving.keeping import keep_to_filmed
     from mien.driving.live_link_face import read_live_link_face
     from mien.driving.motion import ARKIT_NAMES, Motion
     from mien.driving.transfer import drive, face_of_motion
@@ -16,6 +17,7 @@ else:
         {
             "blendshape_json": ["read_blendshape_json"],
             "drivers": ["Driver", "read_recording", "read_tracked_driver"],
+            "keeping": ["keep_to_filmed"],
             "live_link_face": ["read_live_link_face"],
             "motion": ["ARKIT_NAMES", "Motion"],
             "transfer": ["drive", "face_of_motion"],
@@ -28,6 +30,7 @@ __all__ = [
     "Motion",
     "drive",
     "face_of_motion",
+    "keep_to_filmed",
     "read_blendshape_json",
     "read_live_link_face",
     "read_recording",

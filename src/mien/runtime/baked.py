@@ -205,6 +205,25 @@ class About:
 
 
 @dataclass(frozen=True, eq=False)
+class Filmed:
+    """The part of all expressions and head poses that training saw. Driving stays softly inside (`runtime/filmed.py`).
+
+    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians.
+    """
+
+    lowest: Float32[np.ndarray, " i"]
+    """Smallest value of each input in the training frames."""
+    highest: Float32[np.ndarray, " i"]
+    directions: Float32[np.ndarray, "i i"]
+    """Factors with which differences from the person at rest have about unit spread in every direction."""
+    reach: Float32[np.ndarray, " 1"]
+    """Largest length of (inputs - rest) directions in the training frames."""
+    head_angles: Float32[np.ndarray, "2 2"]
+    """Yaw and pitch of the camera as the head sees it, each from the lowest to the highest, in radians. Yaw is positive
+    to the subject's left, pitch upwards."""
+
+
+@dataclass(frozen=True, eq=False)
 class PortableAvatar:
     """Everything that a program needs to pose and show an avatar."""
 
@@ -218,3 +237,5 @@ class PortableAvatar:
     camera: Camera
     """The camera that the avatar was trained with: a good first view."""
     about: About
+    filmed: Filmed | None = field(default=None, metadata={"since": 3})
+    """What training saw of the face. None if it is not known."""

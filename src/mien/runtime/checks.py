@@ -15,6 +15,7 @@ from mien.runtime.baked import (
     BakedAvatar,
     BlendSkinned,
     ExpressionChanges,
+    Filmed,
     LinearBases,
     MeshBound,
     PortableAvatar,
@@ -45,6 +46,19 @@ def baked_fault(baked: BakedAvatar) -> str | None:
     return next(_baked_faults(baked), None)
 
 
+def filmed_fault(filmed: Filmed, inputs: int) -> str | None:
+    """The reason why this cannot be what training saw of a face with so many inputs, or None if it can."""
+    shapes = {"lowest": (inputs,), "highest": (inputs,), "directions": (inputs, inputs), "reach": (1,)}
+    for name, shape in (shapes | {"head_angles": (2, 2)}).items():
+        if getattr(filmed, name).shape != shape:
+            return f"the shape of {name} of what was filmed does not fit"
+    if not all(is_moderate(getattr(filmed, f.name)) for f in fields(filmed)):
+        return f"what was filmed holds NaN, infinity or a number beyond {MAX_NUMBER:g}"
+    if (filmed.lowest > filmed.highest).any() or (filmed.head_angles[:, 0] > filmed.head_angles[:, 1]).any():
+        return "the lowest of what was filmed is above the highest"
+    return "the reach of what was filmed is negative" if filmed.reach[0] < 0 else None
+
+
 def _faults(avatar: PortableAvatar) -> Iterator[str]:
     baked, e = avatar.baked, len(avatar.expression_names)
     yield from _number_faults(avatar)
@@ -58,6 +72,10 @@ def _faults(avatar: PortableAvatar) -> Iterator[str]:
         yield f"it has {len(avatar.joint_names)} joint names, but {len(avatar.neutral.joints)} joints at rest"
     if (names, free) != (avatar.expression_names, avatar.joint_names):
         yield "its parts name different expressions or joints"
+    if avatar.filmed is not None:
+        fault = filmed_fault(avatar.filmed, e + 3 * len(avatar.joint_names))
+        if fault is not None:
+            yield fault
     camera = avatar.camera
     fault = camera_fault(camera.K, camera.viewmat, camera.width, camera.height)
     if fault is not None:

@@ -22,7 +22,7 @@ from mien.files import check_writable, expect_whole, read_safetensors, write_arr
 from mien.runtime.baked import PortableAvatar
 from mien.runtime.checks import check
 
-FORMAT, VERSIONS = "mien.baked", (1, 2)
+FORMAT, VERSIONS = "mien.baked", (1, 2, 3)
 ENDING = ".mien"
 _REMEDY = "write one with `mien export DIR --out me.mien`"
 
@@ -63,7 +63,7 @@ def read_portable(path: Path) -> PortableAvatar:
         if found[0] != FORMAT or found[1] not in VERSIONS:
             raise UserError(
                 f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {FORMAT!r} version "
-                f"{' or '.join(map(str, VERSIONS))}; "
+                f"{', '.join(map(str, VERSIONS[:-1]))} or {VERSIONS[-1]}; "
                 "export it again with `mien export`"
             )
         if header["sha256"] != _digest(header["content"], arrays):

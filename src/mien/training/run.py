@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 import mien
-from mien.avatar import Avatar, MethodConfig, method_of, write_avatar
+from mien.avatar import Avatar, MethodConfig, measure_filmed, method_of, write_avatar
 from mien.camera import Camera
 from mien.config import decode, encode
 from mien.errors import UserError
@@ -22,6 +22,7 @@ from mien.face.checks import check_face_params
 from mien.inside import check_tree, is_plain_name
 from mien.limits import camera_fault
 from mien.locks import WAIT, check_free
+from mien.runtime.baked import Filmed
 from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
 from mien.tracking import Tracking
 from mien.training.checkpoint import CURVES, TrainingState
@@ -156,6 +157,18 @@ def read_face_track(run_dir: Path, face_model: FaceModel) -> FaceParams:
         face = FaceParams(**tensors)
     check_face_params(face_model, face, str(path), "train it again")
     return face
+
+
+def filmed_range(run_dir: Path, avatar: Avatar) -> Filmed:
+    """What training saw of the face. For avatars that do not say, all timesteps of the run, seen by its first camera.
+
+    Raises:
+        UserError: a file of the run is missing or damaged, or does not belong to the face model.
+    """
+    if avatar.filmed is not None:
+        return avatar.filmed
+    face = read_face_track(run_dir, avatar.face_model)
+    return measure_filmed(face, avatar.subject, run_camera(run_dir).position.expand(len(face), 3))
 
 
 def write_imported_run(run_dir: Path, avatar: Avatar, face: FaceParams, camera: Camera, source: Path) -> None:

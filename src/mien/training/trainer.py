@@ -15,7 +15,16 @@ import torch
 from torch import Tensor
 
 from mien import _native
-from mien.avatar import Avatar, MethodConfig, Progress, load_avatar, method_named, method_of, move_avatar
+from mien.avatar import (
+    Avatar,
+    MethodConfig,
+    Progress,
+    load_avatar,
+    measure_filmed,
+    method_named,
+    method_of,
+    move_avatar,
+)
 from mien.camera import Camera
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
@@ -207,15 +216,18 @@ def start(
     like: Tensor | None = None,
 ) -> TrainingState:
     """The state before the first step, with the float dtype and device of `like` (default: float32 on the CPU)."""
-    face = concatenate([sequence.tracking.face for sequence in sequences])
+    faces = [sequence.tracking.face for sequence in sequences]
+    face, frames = concatenate(faces), training_frames(sequences, settings)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
-    frames, faces = training_frames(sequences, settings), [sequence.tracking.face for sequence in sequences]
+    starts = [sum(map(len, faces[:index])) for index in range(len(faces))]
+    seen = face[[starts[frame.sequence] + frame.timestep for frame in frames]]
+    eyes = torch.stack([sequences[frame.sequence].tracking.cameras[frame.camera].position for frame in frames])
+    avatar.filmed = measure_filmed(seen, avatar.subject, eyes)
     if avatar.wants_first_colors:
         avatar.paint(vertex_colors(face_model, sequences, faces, frames))
-    colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
-    unseen = unseen_of(avatar, sequences, faces, frames) if settings.unseen == "filled" else None
+from mien.camera import Camera
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)

@@ -14,7 +14,7 @@ from mien.commands.picture import PictureOptions
 from mien.commands.stages.capturing import run_capture_stage
 from mien.commands.stages.pictures import draw, view
 from mien.commands.stages.tracking import run_tracking_stage
-from mien.driving import Driver, drive, read_recording, read_tracked_driver
+from mien.driving import Driver, drive, keep_to_filmed, read_recording, read_tracked_driver
 from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
 from mien.face import FaceModel
@@ -23,7 +23,7 @@ from mien.pictures import side_by_side
 from mien.progress import say, track_progress
 from mien.storage import file_digest
 from mien.tracking import TrackingSettings
-from mien.training.run import run_camera
+from mien.training.run import filmed_range, run_camera
 from mien.workspace import Workspace, open_workspace
 
 
@@ -73,6 +73,8 @@ class DriveOptions:
     alone: bool = False
     fps: float | None = None
     """Frame rate of the timecode in a csv."""
+    unlimited: bool = False
+    """Whether the avatar follows also beyond what was filmed."""
 
 
 def run_driving_stage(
@@ -89,6 +91,11 @@ def run_driving_stage(
     if output.kind == "sequence":
         plan_output(out, len(driven), output.transparent)
     camera = view(picture, run_camera(run_dir))
+    if not options.unlimited:
+        filmed = filmed_range(run_dir, avatar)
+        driven, softened = keep_to_filmed(driven, filmed, avatar.subject, bounds, camera.position)
+        if softened:
+            say(f"{softened} of {len(driven)} frames go beyond what was filmed and are softened; --unlimited lets go")
     beside = None if options.alone or output.transparent else driver.pictures
 
     def frame(timestep: int) -> np.ndarray:

@@ -1,0 +1,117 @@
+"""Sheets: many pictures of an avatar in one, each above its name."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.driving import ARKIT_NAMES, Motion, face_of_motion
+from mien.driving.motion import gaze_of
+from mien.face import FaceModel, FaceParams
+from mien.pictures import WHITE, picture_grid
+from mien.render.camera_paths import orbit
+from mien.runtime.baked import Filmed
+
+SheetKind = Literal["expressions", "filmed", "turntable"]
+TURNTABLE_TILES = 9
+"""Number of angles on a sheet of a turntable."""
+MAX_TILES = 120
+"""Largest number of expressions on a sheet. Face models with more show the first ones."""
+_COLUMNS = 9
+_BAR, _BASELINE = 22, 15
+"""Height of the bar with a name, and of the foot of its letters above, in pixels."""
+_INK = (40, 40, 40)
+_FONT, _FONT_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """One picture of a sheet."""
+
+    name: str
+    face: FaceParams
+    camera: Camera
+
+
+def expression_tiles(model: FaceModel, face: FaceParams, camera: Camera, strength: float) -> list[Tile]:
+    """The face as given, then one tile for each named expression at `strength`, within the bounds of the face model.
+
+    A model with ARKit's expressions shows them in ARKit's order. Those of the gaze turn the eyes. Expressions that the
+    model cannot show are left out.
+    """
+    tiles, joints = [Tile("as it is", face, camera)], face.joints
+    named = [name for name in ARKIT_NAMES if name in model.expression_names]
+    for name in named or model.expression_names:
+        if name.startswith("eyeLook"):
+            turned = _gaze(model, name, strength)
+            if not torch.equal(turned, torch.zeros_like(turned)):
+                tiles.append(Tile(f"{name} {strength:.2f}", replace(face, joints=joints + turned.to(joints)), camera))
+            continue
+        lower, upper = model.expression_bounds[model.expression_names.index(name)].tolist()
+        value = min(max(strength, lower), upper)
+        if lower < upper:
+            tiles.append(Tile(f"{name} {value:.2f}", _with(face, model, name, value), camera))
+    return tiles[: MAX_TILES + 1]
+
+
+def filmed_tiles(model: FaceModel, face: FaceParams, camera: Camera, filmed: Filmed, strength: float) -> list[Tile]:
+    """The face as given, then each expression at `strength` times its largest filmed coefficient, strongest first.
+
+    Coefficients stay within the bounds of the face model. Expressions that it cannot show are left out.
+    """
+    tiles = [Tile("as it is", face, camera)]
+    highest = filmed.highest[: len(model.expression_names)]
+    for index in np.argsort(-highest, kind="stable").tolist()[:MAX_TILES]:
+        lower, upper = model.expression_bounds[index].tolist()
+        value = min(max(strength * float(highest[index]), lower), upper)
+        if lower < upper:
+            name = model.expression_names[index]
+            tiles.append(Tile(f"{name} {value:.2f}", _with(face, model, name, value), camera))
+    return tiles
+
+
+def turntable_tiles(face: FaceParams, camera: Camera, centre: Float[Tensor, " 3"], degrees: float) -> list[Tile]:
+    """The face from `TURNTABLE_TILES` sides, from the person's right to the left, `degrees` apart from end to end.
+
+    A full turn does not show its first side again.
+    """
+    gaps = TURNTABLE_TILES if abs(degrees) >= 360 else TURNTABLE_TILES - 1
+    angles = [degrees * (index / gaps - 0.5) for index in range(TURNTABLE_TILES)]
+    return [Tile(f"{angle:+.0f} degrees", face, orbit(camera, centre, math.radians(angle))) for angle in angles]
+
+
+def draw_sheet(
+    tiles: Sequence[Tile], picture: Callable[[FaceParams, Camera], UInt8[np.ndarray, "h w 3"]]
+) -> UInt8[np.ndarray, "_ _ 3"]:
+    """All tiles in rows, each above its name."""
+    return picture_grid([named_picture(picture(tile.face, tile.camera), tile.name) for tile in tiles], _COLUMNS)
+
+
+def named_picture(picture: UInt8[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "_ w 3"]:
+    """A picture with its name below. A name that is too wide is written smaller."""
+    bar = np.full((_BAR, picture.shape[1], 3), WHITE, np.uint8)
+    (wide, _), _ = cv2.getTextSize(name, _FONT, _FONT_SIZE, 1)
+    size = _FONT_SIZE * min(1.0, (picture.shape[1] - 8) / max(wide, 1))
+    cv2.putText(bar, name, (4, _BASELINE), _FONT, size, _INK, 1, cv2.LINE_AA)
+    return np.concatenate([picture, bar])
+
+
+def _with(face: FaceParams, model: FaceModel, name: str, value: float) -> FaceParams:
+    expression = face.expression.clone()
+    expression[:, model.expression_names.index(name)] = value
+    return replace(face, expression=expression)
+
+
+def _gaze(model: FaceModel, name: str, strength: float) -> Float[Tensor, "1 j 3"]:
+    """The turn of the eyes for one of ARKit's eyeLook expressions."""
+    coefficients, still = np.zeros((1, len(ARKIT_NAMES)), np.float32), np.zeros((1, 3), np.float32)
+    coefficients[0, ARKIT_NAMES.index(name)] = strength
+    face, _ = face_of_motion(Motion(30.0, coefficients, gaze_of(coefficients), still, still, 0), model)
+    return face.joints

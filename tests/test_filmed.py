@@ -1,0 +1,141 @@
+"""What training saw of a face is measured, stored with the avatar, and softly kept to in driving."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mien import runtime
+from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, load_avatar, make_portable, measure_filmed, write_avatar
+from mien.driving import keep_to_filmed
+from mien.errors import UserError
+from mien.face import FaceParams
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.runtime.filmed import ROOM, head_angles, soft_limits, within_filmed_inputs, within_filmed_poses
+from toy_scene import toy_camera, toy_face_model, toy_sequence
+
+EYE = np.array([0.0, 0.0, 1.0])
+
+
+def _face(yaws: list[float], expression: torch.Tensor | None = None) -> FaceParams:
+    """Heads at the origin that turn to their left by some angles in radians."""
+    count = len(yaws)
+    rotation = torch.tensor([[0.0, yaw, 0.0] for yaw in yaws])
+    still = torch.zeros(count, 2, 3)
+    values = torch.zeros(count, 3) if expression is None else expression
+    return FaceParams(torch.zeros(2), values, still, rotation, torch.zeros(count, 3))
+
+
+def _filmed(yaws: list[float], expression: torch.Tensor | None = None) -> runtime.Filmed:
+    face = _face(yaws, expression)
+    return measure_filmed(face, _face([0.0]), torch.tensor(EYE).float().expand(len(face), 3))
+
+
+def test_soft_limits_change_nothing_inside_and_stay_below_their_limit() -> None:
+    values = np.linspace(-5, 5, 1001)
+    limited = soft_limits(values, np.array(-1.0), np.array(2.0), np.array(0.0), 1e-6)
+    inside = (values >= -1) & (values <= 2)
+    assert np.array_equal(limited[inside], values[inside])
+    assert limited.max() < 2 * (1 + ROOM)
+    assert limited.min() > -(1 + ROOM)
+    slopes = np.diff(limited) / np.diff(values)
+    assert (slopes > 0).all(), "more motion of the driver is never less of the avatar"
+    assert slopes.max() < 1 + 1e-9
+    assert np.abs(np.diff(slopes)).max() < 0.08, "no kink"
+
+
+def test_a_rare_combination_becomes_weaker_and_keeps_its_kind() -> None:
+    """Either of two expressions was filmed at 1, never both together."""
+    single = torch.cat([torch.eye(3)[:2].repeat(20, 1), torch.zeros(20, 3)])
+    filmed = _filmed([0.0] * 60, single)
+    bounds, rest = np.array([[0.0, 1.5]] * 3), np.zeros(9, np.float32)
+    inputs = np.zeros((3, 9), np.float32)
+    inputs[0, 0], inputs[1, :2], inputs[2, 2] = 1.0, 1.0, 1.5
+    kept = within_filmed_inputs(filmed, inputs, rest, bounds)
+    assert np.array_equal(kept[0], inputs[0]), "what was filmed keeps its bits"
+    assert kept[1, 0] == pytest.approx(kept[1, 1], rel=1e-3)
+    assert 0.6 < kept[1, 0] < 0.99
+    assert 0 < kept[2, 2] < 0.3, "an expression that was never filmed is shown a little"
+
+
+def test_the_camera_sees_the_head_from_sides_that_were_filmed() -> None:
+    filmed = _filmed([-0.3, 0.1, 0.2])
+    np.testing.assert_allclose(filmed.head_angles[0], [-0.2, 0.3], atol=1e-6)
+    asked = _face([-0.25, 0.15, 1.2, -1.2])
+    rotation, translation = asked.head_rotation.numpy(), asked.head_translation.numpy()
+    kept = within_filmed_poses(filmed, rotation, translation, EYE)
+    assert np.array_equal(kept[:2], rotation[:2])
+    yaws = head_angles(kept, translation, EYE)[:, 0]
+    assert -0.2 - math.radians(8) - 1e-6 < yaws[2] < -0.2
+    assert 0.3 < yaws[3] < 0.3 + math.radians(8) + 1e-6
+    looking_up = np.array([[-1.0, 0.0, 0.0]], np.float32)
+    pitch = head_angles(within_filmed_poses(filmed, looking_up, translation[:1], EYE), translation[:1], EYE)[0, 1]
+    assert -math.radians(8) < pitch < 0
+
+
+def test_a_limited_head_keeps_its_roll() -> None:
+    filmed = _filmed([-0.1, 0.1])
+    roll, turn = torch.tensor([0.0, 0.0, 0.4]), torch.tensor([0.0, 1.0, 0.0])
+    matrix = matrix_from_axis_angle(turn) @ matrix_from_axis_angle(roll)
+    face = replace(_face([0.0]), head_rotation=axis_angle_from_matrix(matrix[None]))
+    kept = within_filmed_poses(filmed, face.head_rotation.numpy(), face.head_translation.numpy(), EYE)
+    up = matrix_from_axis_angle(torch.from_numpy(kept))[0, :, 1]
+    assert math.atan2(-float(up[0]), float(up[1])) == pytest.approx(0.4, abs=0.08)
+
+
+def test_driving_with_its_own_training_frames_changes_nothing() -> None:
+    model, sequence = toy_sequence()
+    face = sequence.tracking.face
+    avatar = _avatar(face)
+    eye = sequence.tracking.cameras[0].position
+    filmed = measure_filmed(face, avatar.subject, eye.expand(len(face), 3))
+    kept, softened = keep_to_filmed(face, filmed, avatar.subject, model.expression_bounds, eye)
+    assert softened == 0
+    for name, tensor in face.tensors().items():
+        assert torch.equal(getattr(kept, name), tensor), name
+    wild = replace(face, head_rotation=face.head_rotation + torch.tensor([0.0, 1.5, 0.0]))
+    kept, softened = keep_to_filmed(wild, filmed, avatar.subject, model.expression_bounds, eye)
+    assert softened == len(face)
+    assert (kept.head_rotation - wild.head_rotation).abs().amax(1).min() > 0.3
+
+
+def _avatar(face: FaceParams) -> Avatar:
+    method = METHODS[DEFAULT_METHOD]
+    return method.avatar(method.config(), toy_face_model(), face)
+
+
+def test_it_is_kept_in_a_run_and_in_a_mien_file(tmp_path: Path) -> None:
+    _, sequence = toy_sequence()
+    face, eye = sequence.tracking.face, sequence.tracking.cameras[0].position
+    avatar = _avatar(face)
+    write_avatar(tmp_path / "old", avatar)
+    assert load_avatar(tmp_path / "old").filmed is None
+    runtime.write_portable(tmp_path / "old.mien", make_portable(avatar, toy_camera(32), "toy"))
+    assert b'\\"version\\": 1}' in (tmp_path / "old.mien").read_bytes()
+    avatar.filmed = measure_filmed(face, avatar.subject, eye.expand(len(face), 3))
+    write_avatar(tmp_path / "new", avatar)
+    runtime.write_portable(tmp_path / "new.mien", make_portable(avatar, toy_camera(32), "toy"))
+    for found in (load_avatar(tmp_path / "new").filmed, runtime.read_portable(tmp_path / "new.mien").filmed):
+        assert found is not None
+        for name in ("lowest", "highest", "directions", "reach", "head_angles"):
+            assert np.array_equal(getattr(found, name), getattr(avatar.filmed, name)), name
+
+
+def test_a_range_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    face = toy_sequence()[1].tracking.face
+    avatar = _avatar(face)
+    good = measure_filmed(face, avatar.subject, torch.ones(len(face), 3))
+    for change in (
+        {"lowest": good.highest + 1},
+        {"reach": -np.ones(1, np.float32)},
+        {"head_angles": good.head_angles[:, ::-1].copy()},
+    ):
+        avatar.filmed = replace(good, **change)
+        write_avatar(tmp_path / "a", avatar)
+        with pytest.raises(UserError, match="filmed"):
+            load_avatar(tmp_path / "a")
+        with pytest.raises(UserError, match="filmed"):
+            runtime.write_portable(tmp_path / "a.mien", make_portable(avatar, toy_camera(32), "toy"))

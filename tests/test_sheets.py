@@ -1,0 +1,131 @@
+"""Sheets show every expression or side once, above its name, and drive and render tell what is beyond the film."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mien.cli import main
+from mien.commands.stages.sheets import (
+    TURNTABLE_TILES,
+    draw_sheet,
+    expression_tiles,
+    filmed_tiles,
+    named_picture,
+    turntable_tiles,
+)
+from mien.driving import ARKIT_NAMES
+from mien.face import load_face_model
+from mien.render.camera_paths import orbit
+from mien.runtime import Filmed
+from small_face_model import make_small_face_model
+from toy_scene import toy_camera
+from toy_workspace import write_toy_workspace
+
+CAMERA = toy_camera(32)
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("sheets") / "W"
+    write_toy_workspace(root)
+    return root
+
+
+def test_every_expression_that_the_face_model_shows_has_a_tile() -> None:
+    model = load_face_model("anny")
+    face = model.neutral()
+    tiles = expression_tiles(model, face, CAMERA, 1.0)
+    names = [tile.name.split()[0] for tile in tiles[1:]]
+    assert names == [name for name in ARKIT_NAMES if name not in ("mouthClose", "tongueOut")]
+    for name, tile in zip(names, tiles[1:], strict=True):
+        coefficients = tile.face.expression[0]
+        if name.startswith("eyeLook"):
+            assert not coefficients.any(), name
+            assert tile.face.joints.abs().max() > 0.3, name
+        else:
+            assert coefficients.nonzero().flatten().tolist() == [model.expression_names.index(name)], name
+            assert not tile.face.joints.any(), name
+    strong = {tile.name for tile in expression_tiles(model, face, CAMERA, 1.5)}
+    assert {"jawOpen 1.20", "browInnerUp 1.50"} <= strong, "coefficients stay within the bounds of the face model"
+
+
+def test_strengths_relative_to_what_was_filmed() -> None:
+    model = make_small_face_model()
+    count = len(model.expression_names)
+    bounds = torch.tensor([[0.0, 1.0]]).expand(count, 2).contiguous()
+    model, highest = replace(model, expression_bounds=bounds), np.linspace(0.2, 0.9, count + 3).astype(np.float32)
+    filmed = Filmed(
+        0 * highest, highest, np.eye(count + 3, dtype=np.float32), highest[:1], np.zeros((2, 2), np.float32)
+    )
+    tiles = filmed_tiles(model, model.neutral(), CAMERA, filmed, 1.5)
+    shown = [float(tile.face.expression.max()) for tile in tiles[1:]]
+    assert shown == pytest.approx([min(1.5 * value, 1.0) for value in highest[:count][::-1].tolist()])
+
+
+def test_a_turntable_ends_at_half_of_its_angle_on_either_side() -> None:
+    face, centre = make_small_face_model().neutral(), torch.zeros(3)
+    tiles = turntable_tiles(face, CAMERA, centre, 120.0)
+    assert [tile.name for tile in (tiles[0], tiles[4], tiles[-1])] == ["-60 degrees", "+0 degrees", "+60 degrees"]
+    assert len(tiles) == TURNTABLE_TILES
+    torch.testing.assert_close(tiles[-1].camera.viewmat, orbit(CAMERA, centre, torch.pi / 3).viewmat)
+    around = turntable_tiles(face, CAMERA, centre, 360.0)
+    assert not torch.allclose(around[0].camera.viewmat, around[-1].camera.viewmat, atol=0.1)
+
+
+def test_a_name_that_is_too_wide_is_written_smaller() -> None:
+    picture = np.zeros((20, 40, 3), np.uint8)
+    named = named_picture(picture, "a name that is far too wide for its tile")
+    assert np.array_equal(named[:20], picture)
+    assert (named[20:] < 255).any()
+    assert (named[20:, -2:] == 255).all(), "no letter is cut off"
+    tiles = turntable_tiles(make_small_face_model().neutral(), CAMERA, torch.zeros(3), 90.0)
+    assert draw_sheet(tiles, lambda face, camera: picture).shape[1] == TURNTABLE_TILES * 40 + (TURNTABLE_TILES - 1) * 4
+
+
+@pytest.mark.parametrize("options", [["expressions"], ["filmed", "--strength", "1.5"], ["turntable", "--span", "180"]])
+def test_the_command_draws_a_sheet(workspace: Path, tmp_path: Path, options: list[str]) -> None:
+    out = tmp_path / "sheet.png"
+    assert main(["render", str(workspace), "--out", str(out), "--size", "32", "--sheet", *options]) == 0
+    sheet = cv2.imread(str(out))
+    assert sheet is not None
+    assert sheet.shape[1] % 36 == 32 or sheet.shape[1] == 32
+    assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 20
+
+
+def test_what_is_beyond_the_film_is_told_and_softened(
+    workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    still = ["render", str(workspace), "--out", str(tmp_path / "a.png"), "--size", "32"]
+    assert main([*still, "--set", "drop=1"]) == 0
+    assert "beyond what was filmed, so it may look wrong: drop=1 (0.00 to" in capsys.readouterr().err
+    assert main([*still, "--set", "drop=0"]) == 0
+    assert "beyond what was filmed" not in capsys.readouterr().err
+
+
+def test_a_driver_who_goes_far_is_softened_unless_asked(
+    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mien.commands.stages import driving
+
+    looked_up, read = [], driving.read_tracked_driver
+
+    def far(folders: list[Path]) -> driving.Driver:
+        driver = read(folders)
+        turned = driver.face.head_rotation + torch.tensor([-1.0, 0.0, 0.0])
+        return replace(driver, face=replace(driver.face, head_rotation=turned))
+
+    draw = driving.draw
+    monkeypatch.setattr(driving, "read_tracked_driver", far)
+    monkeypatch.setattr(driving, "draw", lambda *given: looked_up.append(given[1].T_world_local) or draw(*given))
+    command = ["drive", str(workspace), "--by", str(workspace), "--out", str(tmp_path / "f.mp4"), "--size", "32"]
+    assert main(command) == 0
+    assert "5 of 5 frames go beyond what was filmed and are softened" in capsys.readouterr().err
+    kept, looked_up[:] = list(looked_up), []
+    assert main([*command[:-4], "--out", str(tmp_path / "g.mp4"), "--size", "32", "--unlimited"]) == 0
+    assert "softened" not in capsys.readouterr().err
+    for near, wild in zip(kept, looked_up, strict=True):
+        assert float(near[1, 2]) < float(wild[1, 2]) - 0.3, "the head looks up less"
