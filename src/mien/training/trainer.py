@@ -227,7 +227,8 @@ def start(
     avatar.filmed = measure_filmed(seen, avatar.subject, eyes)
     if avatar.wants_first_colors:
         avatar.paint(vertex_colors(face_model, sequences, faces, frames))
-from mien.camera import Camera
+    colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
+    unseen = unseen_of(avatar, sequences, faces, frames) if settings.unseen == "filled" else None
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
