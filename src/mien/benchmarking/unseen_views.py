@@ -146,12 +146,15 @@ def score_side_views(
             yield job
 
     rows = list(stream_in_threads(score, jobs(), settings.threads or None))
+    return _by_angle(rows), np.concatenate([np.concatenate(row, 0) for row in shown], 1)
+
+
+def _by_angle(rows: list[tuple[_View, dict[str, Scores]]]) -> Figures:
     figures: Figures = {}
     for label in dict.fromkeys(angle_names()):
         own = [scored for view, scored in rows if view.label == label]
         figures[label] = {name: mean_scores([row[name] for row in own]) for name in (AVATAR, MESH)}
-    sheet = np.concatenate([np.concatenate(row, 0) for row in shown], 1)
-    return figures, sheet
+    return figures
 
 
 def write_unseen_chart(path: Path, figures: Figures) -> None:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.avatar import Avatar, Posed
+from mien.avatar import Avatar, GradientDensity, Posed
 from mien.camera import Camera
 from mien.face import FaceParams
 from mien.render import rasterize
@@ -67,7 +67,8 @@ def trim_fills(avatar: Avatar, count: int, views: Iterable[tuple[FaceParams, Cam
         count: The number of fills.
         views: Training pictures with the face and the camera of each.
     """
-    name = avatar.density().opacity_logits
+    density = avatar.density()
+    name = density.opacity_logits if isinstance(density, GradientDensity) else None
     if count == 0 or name is None:
         return
     store = avatar.gaussian_store()
