@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from mien.benchmarking.quality import unseen_lines
-from mien.benchmarking.unseen_views import angle_names, camera_beside, write_unseen_chart
 from mien.camera import camera_from_fov, look_at
+from mien.evaluation.unseen_views import angle_names, camera_beside, write_unseen_chart
 from mien.rotation import matrix_from_axis_angle
 from mien.synthetic import REFERENCES
 from mien.synthetic.recipe import SIDES

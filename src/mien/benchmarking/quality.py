@@ -160,7 +160,7 @@ class QualityRow:
     seconds: dict[str, float]
     """Seconds of each stage when it last ran."""
     unseen_views: dict[str, Any] = field(default_factory=dict)
-    """Figures by angle (`mien.benchmarking.unseen_views`). Empty if the capture has no pictures from aside."""
+    """Figures by angle (`mien.evaluation.unseen_views`). Empty if the capture has no pictures from aside."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the row as a json object."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.adam import FactoredMoments, Moments
+from mien.adam import Moments
 from mien.avatar import ParameterGroup, Rate
 from mien.errors import UserError
 from mien.render.rendering import Rendering
@@ -48,7 +48,7 @@ class CameraColors:
         """The cameras, in the order of the maps."""
         self._changes = like.new_zeros(len(ids), 3, 4).requires_grad_()
         self._rate = Rate(settings.camera_color_rate, _LAST_RATE * settings.camera_color_rate)
-        self._moments: dict[str, Moments | FactoredMoments] = {"changes": Moments.zeros(self._changes.detach())}
+        self._moments = {"changes": Moments.zeros(self._changes.detach())}
         places = {camera_id: place for place, camera_id in enumerate(ids)}
         self._places = [[places.get(camera_id, 0) for camera_id in one.capture.camera_ids] for one in sequences]
 
@@ -66,7 +66,7 @@ class CameraColors:
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group of all maps."""
-        return [ParameterGroup("camera_colors", {"changes": self._changes}, self._rate, self._moments)]
+        return [ParameterGroup("camera_colors", {"changes": self._changes}, self._rate, {**self._moments})]
 
     def state(self) -> dict[str, Tensor]:
         """Tensors that a checkpoint has to save. They share memory with the maps."""

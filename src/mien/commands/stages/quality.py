@@ -13,7 +13,6 @@ import torch
 
 from mien.avatar import method_named
 from mien.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
-from mien.benchmarking.unseen_views import Figures, SidePictures, score_side_views, write_unseen_chart
 from mien.capture import CaptureSettings, read_capture, read_capture_hash
 from mien.commands.stages.capturing import run_capture_stage
 from mien.commands.stages.evaluating import run_evaluation_stage, run_sequences
@@ -26,6 +25,7 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
+from mien.evaluation.unseen_views import Figures, SidePictures, score_side_views, write_unseen_chart
 from mien.face import load_face_model
 from mien.inside import remove_tree
 from mien.locks import WAIT, hold
