@@ -135,7 +135,7 @@ def factored_update(update: FactoredUpdate) -> None:
         (rows, columns), moments = update.terms[0], update.moments
         arrays = (update.values.detach(), rows, columns.detach(), moments.second, moments.weights)
         if all(tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous() for tensor in arrays):
-            _native.factored_update(*unpacked(*arrays), update.rate)
+            _native.factored_update(*unpacked(*arrays), rate=update.rate)
             return
     factored_update_reference(update)
 
