@@ -22,7 +22,6 @@ MIEN_INLINE void store_some(float* to, int64_t valid, F value) {
 }
 
 void adam(const AdamTask& task, int64_t begin, int64_t end) {
-  [[maybe_unused]] const NoDenormals guard;  // moments of Gaussians that are not seen fade away
   const F beta1 = set1(kAdamBeta1), beta2 = set1(kAdamBeta2);
   for (int64_t i = begin; i < end; i += W) {
     const int64_t valid = end - i;

@@ -107,7 +107,8 @@ def test_threads_do_not_change_a_bit() -> None:
 def test_without_gradients_the_outputs_are_the_same() -> None:
     given = arguments(SIZES[0])
     with torch.no_grad():
-        alone = feature_network(*given[:4], Layers(*given[4:]), FactoredGradient())
+        bases, inputs, neutral, own, *layers = given
+        alone = feature_network(bases, inputs, neutral, own, Layers(*layers), FactoredGradient())
     assert all(torch.equal(a, b) for a, b in zip(alone, ours(given, gradients_of(SIZES[0])), strict=False))
 
 
