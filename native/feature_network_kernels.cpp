@@ -67,26 +67,35 @@ MIEN_INLINE void add_scaled(const float* from, float factor, int width, float* t
   for (; i < width; ++i) to[i] += factor * from[i];
 }
 
+MIEN_INLINE const float* row_of(const FeatureInput& input, int64_t index) {
+  return input.column + index * input.stride;
+}
+
 // As `add_scaled` for all inputs of one Gaussian, with the sums in registers.
 template <int V>
-MIEN_INLINE void blend_vectors(const FeatureInputs& inputs, int64_t offset, int place, float* to) {
+MIEN_INLINE void blend_vectors(const FeatureInputs& inputs, int64_t index, int place, float* to) {
   F sums[V];
   for (int v = 0; v < V; ++v) sums[v] = load(to + v * W);
   for (int64_t k = 0; k < inputs.count; ++k) {
-    const float* row = inputs.items[k].column + offset + place;
+    const float* row = row_of(inputs.items[k], index) + place;
     for (int v = 0; v < V; ++v) sums[v] = sums[v] + inputs.items[k].value * load(row + v * W);
   }
   for (int v = 0; v < V; ++v) store(to + v * W, sums[v]);
 }
 
 void blend_one(const FeatureInputs& inputs, int64_t index, int width, float* to) {
-  if (inputs.count == 0) return;
-  const int64_t offset = index * inputs.items[0].stride;
   int i = 0;
-  for (; i + 2 * W <= width; i += 2 * W) blend_vectors<2>(inputs, offset, i, to + i);
-  for (; i + W <= width; i += W) blend_vectors<1>(inputs, offset, i, to + i);
+  for (; i + 2 * W <= width; i += 2 * W) blend_vectors<2>(inputs, index, i, to + i);
+  for (; i + W <= width; i += W) blend_vectors<1>(inputs, index, i, to + i);
   for (; i < width; ++i)
-    for (int64_t k = 0; k < inputs.count; ++k) to[i] += inputs.items[k].value * inputs.items[k].column[offset + i];
+    for (int64_t k = 0; k < inputs.count; ++k) to[i] += inputs.items[k].value * row_of(inputs.items[k], index)[i];
+}
+
+// Whether every input's Gaussians lie together, row after row.
+bool all_by_input(const FeatureInputs& inputs, int64_t width) {
+  for (int64_t k = 0; k < inputs.count; ++k)
+    if (inputs.items[k].stride != width) return false;
+  return true;
 }
 
 // The blended features of a block go into the first columns of `rows`.
@@ -96,11 +105,10 @@ void blend(const PaddedNetwork& network, const FeatureInputs& inputs, int64_t fi
     copy(rows + i * network.in_stride, network.own->neutral + (first + i) * width, width);
   }
   // Memory is read in its order: a Gaussian's inputs may lie together, or an input's Gaussians.
-  if (inputs.count > 0 && inputs.items[0].stride == width) {
+  if (all_by_input(inputs, width)) {
     for (int64_t k = 0; k < inputs.count; ++k) {
       for (int64_t i = 0; i < count; ++i) {
-        add_scaled(inputs.items[k].column + (first + i) * width, inputs.items[k].value, width,
-                   rows + i * network.in_stride);
+        add_scaled(row_of(inputs.items[k], first + i), inputs.items[k].value, width, rows + i * network.in_stride);
       }
     }
   } else {
@@ -219,7 +227,7 @@ void backward_block(const PaddedNetwork& network, const FeatureInputs& inputs, c
     copy(gradients.features + block.index[i] * own.features, by_features, own.features);
     if (!gradients.inputs) continue;
     for (int64_t k = 0; k < inputs.count; ++k) {
-      const float* row = inputs.items[k].column + block.index[i] * inputs.items[k].stride;
+      const float* row = row_of(inputs.items[k], block.index[i]);
       store(sums.inputs + 16 * k, load(sums.inputs + 16 * k) + dot(row, by_features, own.features));
     }
   }

@@ -112,6 +112,22 @@ def test_without_gradients_the_outputs_are_the_same() -> None:
     assert all(torch.equal(a, b) for a, b in zip(alone, ours(given, gradients_of(SIZES[0])), strict=False))
 
 
+def test_bases_may_lie_in_memory_in_either_order(isa: str) -> None:
+    bases, inputs, neutral, own, *layers = arguments(SIZES[4])
+    network = _native.FeatureNetwork(neutral, own, *layers)
+
+    def outputs(*groups: _native.FeatureBases) -> tuple[Tensor, Tensor]:
+        others, last = torch.empty(len(neutral), len(layers[-1]) - 1), torch.empty(len(neutral))
+        _native.feature_network(network, groups, None, others, last)
+        return others, last
+
+    by_gaussian = _native.FeatureBases(bases[:, :2].contiguous(), inputs[:2], by_input=False)
+    by_input = _native.FeatureBases(bases[:, 2:].transpose(0, 1).contiguous(), inputs[2:], by_input=True)
+    together = _native.FeatureBases(bases, inputs, by_input=False)
+    for groups in ((by_gaussian, by_input), (by_input, by_gaussian)):
+        torch.testing.assert_close(outputs(*groups), outputs(together), rtol=1e-5, atol=1e-6)
+
+
 def update_of(dtype: torch.dtype = torch.float32, n: int = 2000, k: int = 5, f: int = 19) -> FactoredUpdate:
     rows, columns = random(n, f, seed=1), random(k, seed=2)
     rows[::3], columns[1] = 0, 0
