@@ -18,10 +18,8 @@ namespace {
 constexpr int64_t kGrain = 8192;  // values in one piece of the pool's work; a whole number of vectors
 constexpr float kMargin = 0.1f;   // the same number as in Python
 
-}  // namespace
-
-// No operation here may round in two ways, so this uses neither `exp` nor a kernel.
-void expression_activations(const ActivationArrays& arrays, float* out) {
+// Fills out [rank] with (inputs - rest) directions, and returns its length.
+float project(const ActivationArrays& arrays, float* out) {
   float squares = 0;
   for (int64_t k = 0; k < arrays.rank; ++k) {
     float sum = 0;
@@ -31,11 +29,42 @@ void expression_activations(const ActivationArrays& arrays, float* out) {
     out[k] = sum;
     squares += sum * sum;
   }
-  const float length = std::sqrt(std::max(squares, 1e-12f)), over = length - arrays.reach;
-  if (!(over > 0)) return;
+  return std::sqrt(std::max(squares, 1e-12f));
+}
+
+// The shorter length of activations that are `over` longer than the reach.
+float shortened(const ActivationArrays& arrays, float over) {
   const float margin = kMargin * arrays.reach;
-  const float shorter = (arrays.reach + margin * over / std::max(margin + over, 1e-6f)) / length;
-  for (int64_t k = 0; k < arrays.rank; ++k) out[k] *= shorter;
+  return arrays.reach + margin * over / std::max(margin + over, 1e-6f);
+}
+
+}  // namespace
+
+// No operation here may round in two ways, so these two use neither `exp` nor a kernel.
+void expression_activations(const ActivationArrays& arrays, float* out) {
+  const float length = project(arrays, out), over = length - arrays.reach;
+  if (!(over > 0)) return;
+  const float factor = shortened(arrays, over) / length;
+  for (int64_t k = 0; k < arrays.rank; ++k) out[k] *= factor;
+}
+
+void expression_activations_backward(const ActivationArrays& arrays, const float* gradient, float* grad_inputs) {
+  std::vector<float> values(arrays.rank), by_values(gradient, gradient + arrays.rank);
+  const float length = project(arrays, values.data()), over = length - arrays.reach;
+  if (over > 0) {
+    // Along the activations, only the slope of the shorter length is left; across them, its share of the length.
+    const float margin = kMargin * arrays.reach, sum = std::max(margin + over, 1e-6f);
+    const float factor = shortened(arrays, over) / length, slope = margin / sum * (margin / sum);
+    float along = 0;
+    for (int64_t k = 0; k < arrays.rank; ++k) along += gradient[k] * values[k];
+    const float share = (slope - factor) * along / (length * length);
+    for (int64_t k = 0; k < arrays.rank; ++k) by_values[k] = factor * gradient[k] + share * values[k];
+  }
+  for (int64_t i = 0; i < arrays.inputs_count; ++i) {
+    float sum = 0;
+    for (int64_t k = 0; k < arrays.rank; ++k) sum += arrays.directions[i * arrays.rank + k] * by_values[k];
+    grad_inputs[i] = sum;
+  }
 }
 
 void expression_change(const float* basis, const float* activations, int rank, int64_t count, float* out) {

@@ -19,6 +19,8 @@ struct ActivationArrays {
 };
 // Fills out [rank]. Sums run in the order of the inputs, so that training and the runtime get the same bits.
 void expression_activations(const ActivationArrays& arrays, float* out);
+// Fills the gradient of the inputs, given that of the activations [rank].
+void expression_activations_backward(const ActivationArrays& arrays, const float* gradient, float* grad_inputs);
 
 // out [count] = basis [count, rank] activations [rank], with a rank of 1 to 8. Runs on the pool.
 void expression_change(const float* basis, const float* activations, int rank, int64_t count, float* out);

@@ -19,7 +19,7 @@ from mien.progress import Advance
 from mien.render.rendering import Rendering
 from mien.training import Sequence, TrainSettings, read_curves, train
 from mien.training.frames import crop_random
-from mien.training.losses import drawn_crop, perceptual_loss
+from mien.training.losses import drawn_crop, perceptual_goal, perceptual_loss
 from mien.training.sequence import Target, Targets
 from toy_scene import toy_sequence
 
@@ -103,7 +103,8 @@ def test_weight_of_a_pixel_is_that_of_the_whole_picture() -> None:
         rendering = Rendering(image, torch.ones(64, width), torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
         target = replace(some_target((), 64, width), picture=torch.full((64, width, 3), 90, dtype=torch.uint8))
         settings = PerceptualLoss(weight=2.0, crop=32)
-        losses.append(float(perceptual_loss(rendering, target, settings, crop_random(TrainSettings(), 0))))
+        wanted = perceptual_goal(target, settings, crop_random(TrainSettings(), 0))
+        losses.append(float(perceptual_loss(rendering, wanted, settings)))
     crop, goal = torch.full((32, 32, 3), 0.5), torch.full((32, 32, 3), 90 / 255)
     assert losses[0] == pytest.approx(2.0 / 4 * float(load_training_features()(crop, goal)), rel=1e-5)
     assert losses[1] == pytest.approx(losses[0] / 2, rel=1e-5)

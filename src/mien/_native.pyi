@@ -372,6 +372,9 @@ def light_equations(surface: AlignSurface, sighting: SightingArrays, hessian: Te
 
 # native/bind_expression_change.cpp; basis: [.., r], its values: [..]
 def expression_activations(inputs: Tensor, rest: Tensor, directions: Tensor, reach: Tensor, out: Tensor) -> None: ...
+def expression_activations_backward(
+    inputs: Tensor, rest: Tensor, directions: Tensor, reach: Tensor, gradient: Tensor, grad_inputs: Tensor
+) -> None: ...
 def expression_change(basis: Tensor, activations: Tensor, out: Tensor) -> None: ...
 def expression_change_backward(
     basis: Tensor, activations: Tensor, gradient: Tensor, grad_basis: Tensor, grad_activations: Tensor

@@ -50,6 +50,11 @@ def expression_activations(native: Any, rng: Rng) -> Arguments:
     return [normal(rng, i), normal(rng, i), normal(rng, i, r), np.abs(normal(rng, 1)), empty(r)]
 
 
+def expression_activations_backward(native: Any, rng: Rng) -> Arguments:
+    i, r = few(rng), int(rng.integers(1, 9))
+    return [normal(rng, i), normal(rng, i), normal(rng, i, r), np.abs(normal(rng, 1)), normal(rng, r), empty(i)]
+
+
 def expression_change(native: Any, rng: Rng) -> Arguments:
     shape, r = (few(rng), *([3] if rng.random() < 0.5 else [])), int(rng.integers(1, 9))
     return [normal(rng, *shape, r), normal(rng, r), empty(*shape)]
@@ -297,7 +302,8 @@ def composite(native: Any, rng: Rng) -> Arguments:
 BASELINES: dict[str, Baseline] = {
     one.__name__: one
     for one in (
-        sigmoid, sigmoid_backward, expression_activations, expression_change, expression_change_backward,
+        sigmoid, sigmoid_backward, expression_activations, expression_activations_backward, expression_change,
+        expression_change_backward,
         feature_network, feature_network_backward, factored_update,
         make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
         compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,

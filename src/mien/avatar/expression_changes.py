@@ -80,10 +80,11 @@ class _Activations(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        inputs, *fixed = (tensor.detach() for tensor in ctx.saved_tensors)
-        with torch.enable_grad():
-            out = activations_reference(inputs.requires_grad_(), *fixed)
-        return *torch.autograd.grad(out, inputs, gradient), None, None, None
+        inputs, *fixed = ctx.saved_tensors
+        by_inputs = torch.empty_like(inputs)
+        for row, by_row, out in zip(inputs, gradient.contiguous(), by_inputs, strict=True):
+            _native.expression_activations_backward(*unpacked(row, *fixed, by_row, out))
+        return by_inputs, None, None, None
 
 
 def expression_inputs(face: FaceParams) -> Float[Tensor, "b i"]:

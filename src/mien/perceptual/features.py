@@ -1,5 +1,6 @@
 """Features for the perceptual loss: the first blocks of a VGG16 with anti-aliased pooling, trained with ST-LPIPS."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
@@ -55,6 +56,10 @@ class TrainingFeatures(nn.Module):
         """The distance between two images in 0..1, at least 0. There is no gradient in `target`."""
         with torch.no_grad():
             wanted = self.features(target)
+        return self.distance(image, wanted)
+
+    def distance(self, image: Float[Tensor, "h w 3"], wanted: Sequence[Float[Tensor, "1 _ _ _"]]) -> Float[Tensor, ""]:
+        """The distance of an image (0..1) from another one, given the other's `features`. It is at least 0."""
         total = image.new_zeros(())
         for number, (found, goal) in enumerate(zip(self.features(image), wanted, strict=True)):
             squared = (found - goal).square() * getattr(self, f"channel_weights{number}")

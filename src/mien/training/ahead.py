@@ -2,16 +2,21 @@
 
 import copy
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Items
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
+from typing import Any, TypeVar
 
 import cv2
+import torch
 
 from mien.training.frames import FrameOrder, background_at
 from mien.training.sequence import Target, Targets
 from mien.training.settings import TrainSettings
+
+Result = TypeVar("Result")
 
 _AHEAD = 4
 """Number of steps whose pictures are prepared in advance. It bounds the memory: each has 4 bytes a pixel."""
@@ -44,6 +49,10 @@ class TargetQueue:
         found = self._waiting.popleft()
         return found.result() if isinstance(found, Future) else found
 
+    def meanwhile(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
+        """Let the worker call a function after the pictures that it was asked for so far."""
+        return self._worker.submit(function, *arguments)
+
     def close(self) -> None:
         """Forget the targets that nobody will ask for."""
         for entry in self._waiting:
@@ -66,7 +75,9 @@ def targets_ahead(order: FrameOrder, targets: Items[Targets], settings: TrainSet
     """A queue whose worker ends with the block, also after an error."""
     cv2_threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # OpenCV's own threads and those of the step would wait for each other.
-    worker = ThreadPoolExecutor(1, thread_name_prefix="mien-targets")
+    # torch limits the threads of its operations for each thread apart.
+    limit = partial(torch.set_num_threads, torch.get_num_threads())
+    worker = ThreadPoolExecutor(1, thread_name_prefix="mien-targets", initializer=limit)
     try:
         yield TargetQueue(order, targets, settings, worker)
     finally:

@@ -1,6 +1,8 @@
 """Losses that compare a rendering with its target. They are pure functions, and means over the whole picture."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -8,7 +10,7 @@ from torch import Tensor
 
 from mien import _native
 from mien.avatar import PerceptualLoss, Photometric
-from mien.perceptual import load_training_features
+from mien.perceptual import TrainingFeatures, load_training_features
 from mien.pictures import Box
 from mien.render.rendering import Rendering
 from mien.training.photometric import photometric_loss
@@ -29,16 +31,34 @@ def picture_losses(rendering: Rendering, target: Target, weights: Photometric) -
     return losses
 
 
-def perceptual_loss(
-    rendering: Rendering, target: Target, settings: PerceptualLoss, random: torch.Generator
-) -> Float[Tensor, ""]:
-    """The weighted distance of trained features on one crop, drawn at random. Differentiable in the rendering."""
+@dataclass(frozen=True, eq=False)
+class PerceptualGoal:
+    """What the perceptual loss of one step compares the rendering with."""
+
+    crop: tuple[slice, slice]
+    """Rows and columns of the picture."""
+    features: Sequence[Float[Tensor, "1 _ _ _"]]
+    """Trained features of the target in the crop."""
+
+
+@torch.no_grad()
+def perceptual_goal(target: Target, settings: PerceptualLoss, random: torch.Generator) -> PerceptualGoal:
+    """The features of a crop of the target, drawn at random. They do not depend on the avatar."""
     left, top, width, height = drawn_crop(target, settings.crop, random)
-    inside = (slice(top, top + height), slice(left, left + width))
-    image = rendering.image[inside]
-    features = load_training_features(str(image.device), image.dtype, settings.blocks)
+    crop = (slice(top, top + height), slice(left, left + width))
+    picture = target.picture[crop].to(target.background) / 255
+    return PerceptualGoal(crop, _features(picture, settings).features(picture))
+
+
+def perceptual_loss(rendering: Rendering, goal: PerceptualGoal, settings: PerceptualLoss) -> Float[Tensor, ""]:
+    """The weighted distance of trained features on the goal's crop. Differentiable in the rendering."""
+    image = rendering.image[goal.crop]
     share = image.numel() / rendering.image.numel()
-    return settings.weight * share * features(image, target.picture[inside].to(image) / 255)
+    return settings.weight * share * _features(image, settings).distance(image, goal.features)
+
+
+def _features(image: Tensor, settings: PerceptualLoss) -> TrainingFeatures:
+    return load_training_features(str(image.device), image.dtype, settings.blocks)
 
 
 def drawn_crop(target: Target, side: int, random: torch.Generator) -> Box:

@@ -18,6 +18,7 @@ from mien import _native
 from mien.avatar import (
     Avatar,
     MethodConfig,
+    PerceptualLoss,
     Progress,
     load_avatar,
     measure_filmed,
@@ -52,7 +53,7 @@ from mien.training.frames import (
     expression_rarity,
     training_frames,
 )
-from mien.training.losses import perceptual_loss, picture_losses, train_psnr
+from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Target, Targets
 from mien.training.settings import TrainSettings
@@ -83,6 +84,15 @@ class TrainingData:
             return targets.moved(self.ahead.target(step))
         background = background_at(settings, step)
         return targets.target(frame.timestep, frame.camera, background, keep=settings.background == "white")
+
+    def goal(
+        self, target: Target, perceptual: PerceptualLoss, step: int, settings: TrainSettings
+    ) -> Callable[[], PerceptualGoal]:
+        """A function that returns the goal of a step's perceptual loss. With `ahead`, it is made meanwhile."""
+        make = partial(perceptual_goal, target, perceptual, crop_random(settings, step))
+        return (
+            make if self.ahead is None or target.background.device.type != "cpu" else self.ahead.meanwhile(make).result
+        )
 
 
 def train(
@@ -246,6 +256,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     progress = Progress(state.step, settings.steps, epoch, data.extent)
     target = data.target(state.step, settings)
     avatar, weights = state.avatar, state.avatar.config.photometric
+    perceptual = weights.perceptual
+    wanted = data.goal(target, perceptual, state.step, settings) if perceptual.due(state.step, settings.steps) else None
 
     index = state.track.index_of(frame.sequence, frame.timestep)
     face = state.track.face(index)
@@ -257,9 +269,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     )
     shown = rendering if state.colors is None else state.colors.seen_by(rendering, target.background, frame)
     losses = picture_losses(shown, target, weights) | avatar.regularizers(posed, rendering, progress)
-    perceptual = weights.perceptual
-    if perceptual.due(state.step, settings.steps):
-        losses["perceptual"] = perceptual_loss(shown, target, perceptual, crop_random(settings, state.step))
+    if wanted is not None:
+        losses["perceptual"] = perceptual_loss(shown, wanted(), perceptual)
     torch.autograd.backward(list(losses.values()))
 
     groups = [*avatar.parameter_groups(), *state.track.parameter_groups(index)]
