@@ -66,12 +66,15 @@ def drawn_head(count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head") -
 
     attributes = runtime.Attributes(some(1, 4), some(0.3, 3) - np.float32(1), some(2), some(0.7, sh, 3))
     inputs = len(portable.neutral.expression) + portable.neutral.joints.size
-    changes = None
+    changes, filmed = None, None
     if rank:
         directions = random.standard_normal((inputs, rank)).astype(np.float32)
         rest, reach = np.zeros(inputs, np.float32), np.ones(1, np.float32)
         parts = (some(0.3, 3, rank), some(0.3, rank), some(0.1, 3, rank))
         changes = runtime.ExpressionChanges(rest, directions, reach, *parts)
+        # With what was filmed, the file has the latest version of the format.
+        eye = np.eye(inputs, dtype=np.float32)
+        filmed = runtime.Filmed(rest, rest + 1, eye, reach, np.zeros((2, 2), np.float32))
     face_index = random.integers(0, len(baked.faces), count).astype(np.int32)
     baked = replace(
         baked, face_index=face_index, means=some(0.2, 3), attributes=attributes, sh_frame=sh_frame, changes=changes
@@ -82,7 +85,8 @@ def drawn_head(count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head") -
         head_rotation=np.array([0.05, -0.1, 0.02], np.float32),
         head_translation=np.array([0.01, 0.02, -0.9], np.float32),
     )
-    return replace(portable, baked=baked, neutral=neutral, camera=replace(portable.camera, K=K))
+    camera = replace(portable.camera, K=K)
+    return replace(portable, baked=baked, neutral=neutral, camera=camera, filmed=filmed)
 
 
 def faces_of(portable: runtime.PortableAvatar, count: int) -> list[runtime.Face]:

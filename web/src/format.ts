@@ -8,6 +8,7 @@ type Tree = null | boolean | number | string | Tree[] | { [key: string]: Tree };
 /** A file that cannot be read. Its message is for the user. */
 export class AvatarError extends Error {}
 
+const VERSIONS = [1, 2, 3];
 const BEYOND = "is damaged: an array lies beyond its end";
 
 /** The avatar in a .mien file. The checksum is not checked: that is the work of `mien`. */
@@ -15,7 +16,9 @@ export function readMien(file: ArrayBuffer): Avatar {
   const header = safetensorsHeader(file);
   const told = parse((header.__metadata__ as { mien?: string } | undefined)?.mien ?? "{}") as { [key: string]: Tree };
   if (told.format !== "mien.baked") throw new AvatarError("is not a .mien file");
-  if (told.version !== 1 && told.version !== 2) throw new AvatarError(`has version ${told.version} of the format; this page reads 1 and 2`);
+  if (!VERSIONS.includes(told.version as number)) {
+    throw new AvatarError(`has version ${told.version} of the format; this page reads ${VERSIONS.join(", ")}`);
+  }
   const start = 8 + Number(new DataView(file).getBigUint64(0, true));
   const tensor = (name: string): Numbers => {
     const entry = header[name] as { dtype: string; data_offsets: [number, number] } | undefined;
