@@ -37,7 +37,7 @@ class Command:
     """Also write every scored picture and its truth as png, so that other programs can be scored on them."""
     perceptual: bool = True
     """By default, ST-LPIPS is computed, which takes most of the time. --no-perceptual leaves it out."""
-    perceptual_frames: int = 32
+    perceptual_frames: int = 24
     """Largest number of frames, evenly spread, on which ST-LPIPS is computed. 0 means all frames."""
     compare: bool = False
     """Print one table over the runs of all given workspaces, and write compare.html into the first one."""

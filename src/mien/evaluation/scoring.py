@@ -39,7 +39,7 @@ class ScoreSettings:
 
     perceptual: bool = True
     """Whether to compute ST-LPIPS, which takes most of the time."""
-    perceptual_frames: int = 32
+    perceptual_frames: int = 24
     """Largest number of frames, evenly spread, on which ST-LPIPS is computed, 3 s each at 512x512. 0 means all
     frames."""
     threads: int = 0

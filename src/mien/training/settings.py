@@ -20,7 +20,7 @@ camera instead (`mien.training.named_split`)."""
 class TrainSettings:
     """Settings of a training run. Losses, rates and density control are settings of the method."""
 
-    steps: Annotated[int, Range(1, 1_000_000_000)] = 15_000
+    steps: Annotated[int, Range(1, 1_000_000_000)] = 12_000
     """Number of optimiser steps, one frame each. All schedules stretch with it."""
     split: Split = "blocks"
     """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none).
