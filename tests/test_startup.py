@@ -102,6 +102,15 @@ def test_wrong_values_and_paths_import_nothing_heavy(tmp_path: Path) -> None:
         face-models --add gone.npz
         bench scaling --plot a.txt
         bench quality --steps -1
+        bench compare
+        bench compare gone
+        bench compare w --minutes 2 --steps 3
+        bench compare w --methods nerf
+        study make gone --out a.html
+        study make w --out a.html
+        study make w --out a.mp4
+        study make w --out a.html --side 100
+        study tally gone.json gone.json
         demo --seconds 9999
         demo --out a.csv
     """

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mien.errors import UserError
-from mien.terminal import printable, show
+from mien.terminal import show
 from mien.workspace import Workspace, open_workspace
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ class Tally:
         if self.as_json:
             show(json.dumps({"format": FORMAT, "version": VERSION, **content}, indent=1))
         else:
-            show(printable(tally_text(content), lines=True))
+            show(tally_text(content))
 
 
 @dataclass(frozen=True)
