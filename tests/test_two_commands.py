@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,15 @@ def both(cache: Path) -> Iterator[Pair]:
         yield processes
 
 
+@contextmanager
+def twin_run(studio: Studio) -> Iterator[None]:
+    """Let the workspace have a second run, which a study needs."""
+    runs = studio.root / "runs"
+    shutil.copytree(runs / "alone", runs / "twin")
+    yield
+    shutil.rmtree(runs / "twin")
+
+
 def commands_that_write(studio: Studio, folder: Path) -> dict[str, tuple[Path, list[str]]]:
     """Return commands by name, each with the place that it writes."""
     root, video, runs = studio.root, str(studio.video), studio.root / "runs"
@@ -93,7 +103,7 @@ def test_every_command_that_writes_tells_who_is_at_it(
 ) -> None:
     commands = commands_that_write(studio, tmp_path)
     before = tree_bytes(studio.root)
-    with other.holding(*{place for place, _ in commands.values()}):
+    with twin_run(studio), other.holding(*{place for place, _ in commands.values()}):
         for name, (place, command) in commands.items():
             assert main(command) == 2, name
             (line,) = capsys.readouterr().err.splitlines()  # and no progress bar before it
