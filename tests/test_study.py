@@ -21,7 +21,6 @@ from mien.avatar import METHODS
 from mien.capture.video import read_video_frames
 from mien.cli import main
 from mien.training import read_sequence, train
-from needs import NO_CHROMIUM  # noqa: F401 (the reason that `chromium` gives)
 from toy_workspace import write_toy_workspace
 from web_case import browse, chromium, node
 
@@ -358,7 +357,8 @@ SAVE = """(async () => {
 def test_a_participant_answers_in_a_real_browser(
     page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    node(), chromium()
+    node()
+    chromium()
     key = read_key(page.with_name("study.key.json"))
     tiles = {run: [tile for clip in key.clips for tile, name in clip.tiles.items() if name == run] for run in RUNS}
     answer = ANSWER % json.dumps({"quality": tiles["toy"], "expression": tiles["begun"]})
@@ -394,7 +394,8 @@ def test_a_participant_answers_in_a_real_browser(
 
 @pytest.mark.slow
 def test_participants_see_different_orders(page: Path) -> None:
-    node(), chromium()
+    node()
+    chromium()
     read = '[...document.querySelectorAll("input[name=quality]")].map((input) => input.value)'
     seen = set()
     for _ in range(2):

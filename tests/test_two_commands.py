@@ -102,8 +102,8 @@ def test_every_command_that_writes_tells_who_is_at_it(
     other: Holder, studio: Studio, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     commands = commands_that_write(studio, tmp_path)
-    before = tree_bytes(studio.root)
     with twin_run(studio), other.holding(*{place for place, _ in commands.values()}):
+        before = tree_bytes(studio.root)
         for name, (place, command) in commands.items():
             assert main(command) == 2, name
             (line,) = capsys.readouterr().err.splitlines()  # and no progress bar before it

@@ -207,9 +207,7 @@ class Compare:
         names = [root.name for root in roots] + list(self.captures)
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
-            raise UserError(
-                f"{twice}: two captures have this name; give one of them, or rename its folder"
-            )
+            raise UserError(f"{twice}: two captures have this name; give one of them, or rename its folder")
         for folder in self.workspaces:
             open_workspace(folder)
         check_writable(self.out, folder=True)

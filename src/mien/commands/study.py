@@ -108,16 +108,18 @@ class Tally:
     """Print the result as json on standard output, for programs."""
 
     def check(self) -> None:
-        """Check that the result can be written."""
+        """Read the key and all answers, and check that the result can be written, without heavy libraries."""
+        from mien.analysis.study.files import read_all_answers, read_key
         from mien.files import check_writable
 
         if not self.answers:
             raise UserError("no answers to tally; give the files that participants saved, or a folder of them")
         if self.out is not None:
             check_writable(self.out)
+        read_all_answers(self.answers, read_key(self.key))
 
     def run(self) -> None:
-        """Read the key and all answers, and print the percentages."""
+        """Print the percentages."""
         from mien.analysis.study.files import read_all_answers, read_key
         from mien.analysis.study.tally import FORMAT, VERSION, tally_content, tally_text
         from mien.files import write_json
