@@ -65,8 +65,10 @@ def twin_run(studio: Studio) -> Iterator[None]:
     """Let the workspace have a second run, which a study needs."""
     runs = studio.root / "runs"
     shutil.copytree(runs / "alone", runs / "twin")
-    yield
-    shutil.rmtree(runs / "twin")
+    try:
+        yield
+    finally:
+        shutil.rmtree(runs / "twin")
 
 
 def commands_that_write(studio: Studio, folder: Path) -> dict[str, tuple[Path, list[str]]]:

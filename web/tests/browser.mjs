@@ -1,5 +1,5 @@
 // Opens a page in headless Chromium with software WebGL, runs scripts in it one after the other, and prints their
-// results and all requests as json. tests/test_web.py calls it:
+// results and all requests as json. tests/test_web.py and tests/test_study.py call it:
 //   node browser.mjs CHROMIUM PAGE < {"width", "height", "scripts": [..], "screenshots": [path or null, ..], "downloads": folder}
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
