@@ -38,6 +38,8 @@ COMMANDS = (
     "export W --out OUT/folder --format gaussian-avatars",
     "import OUT/avatar --out W",
     "analyze gaussian-avatars W --parts growth",
+    "study make W --out OUT/a.html",
+    "bench compare W --out OUT/compared --steps 1",
 )
 FOLDERS = (
     "sequences", "runs", "sequences/clip", "sequences/clip/capture", "sequences/clip/capture/cache",

@@ -29,6 +29,7 @@ COMMANDS = {
     "train": "captures + trackings -> an avatar, by the method of your choice",
     "evaluate": "avatar -> metrics.json and report.html on held-out frames",
     "analyze": "avatar -> the figures of its method's paper, measured: growth, speed, ablations",
+    "study": "runs -> a page on which people compare them blind; answers -> percentages",
     "render": "avatar -> a still or a video along a camera path, at any expression",
     "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
     "export": "avatar -> .mien (runs without torch), .ply at some expressions, or GaussianAvatars' folder",
