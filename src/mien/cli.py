@@ -31,6 +31,7 @@ COMMANDS = {
     "analyze": "avatar -> the figures of its method's paper, measured: growth, speed, ablations",
     "render": "avatar -> a still or a video along a camera path, at any expression",
     "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
+    "view": "avatar -> a viewer in the browser: turn it, move its face, play a motion",
     "export": "avatar -> .mien (runs without torch), .ply at some expressions, or GaussianAvatars' folder",
     "import": "GaussianAvatars' folder -> an avatar that can be rendered, driven and exported",
     "face-models": "list the face models and bake them ahead of time",
