@@ -18,6 +18,7 @@ from mien.viewer.session import Session, centre_of
 
 MAX_ANGLE = 0.5
 """Largest angle of a joint's slider, in radians."""
+_STEP = 0.01
 _AXES = ("nod", "turn", "tilt")
 _NOTHING = "none"
 _LEAST_HEIGHT, _MOST_HEIGHT = 128, 1080
@@ -74,7 +75,7 @@ class Panel:
         for name, angles in zip(avatar.joint_names, face.joints.tolist(), strict=True):
             values |= {f"{name}_{'xyz'[axis]}": angle for axis, angle in enumerate(angles)}
         for name, slider in self._sliders.items():
-            slider.value = min(max(values[name], slider.min), slider.max)
+            slider.value = _rounded(values[name], slider.min, slider.max)
         if self._time is not None:
             self._time.value = self._session.timestep
 
@@ -186,7 +187,7 @@ class Panel:
     def _add_slider(
         self, name: str, label: str, low: float, high: float, value: float, take: Callable[[float], None]
     ) -> None:
-        slider = self._server.gui.add_slider(label, low, high, 0.01, min(max(value, low), high))
+        slider = self._server.gui.add_slider(label, low, high, _STEP, _rounded(value, low, high))
         self._sliders[name] = slider
 
         # These run in the order of the events. Functions in viser's threads could overtake each other.
@@ -278,6 +279,11 @@ def filmed_from(session: Session) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     ahead, up = viewmat[2, :3], -viewmat[1, :3]
     distance = max(float((centre_of(session.avatar) - position) @ ahead), 0.05)
     return position, position + distance * ahead, up
+
+
+def _rounded(value: float, low: float, high: float) -> float:
+    """The value as a slider shows it."""
+    return min(max(round(value / _STEP) * _STEP, low), high)
 
 
 def _plain(text: str) -> str:
