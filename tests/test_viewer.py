@@ -161,15 +161,17 @@ def test_pictures_are_full_when_nothing_moves() -> None:
 
 
 def test_quick_pictures_are_always_full() -> None:
-    stage = Stage(seconds=0.001)
+    stage = Stage(seconds=0.004)
     stage.add(1)
-    stage.look(1, 11)
-    stage.loop.step()
-    stage.now += STILL_SECONDS
-    stage.loop.step()
-    stage.look(1, 12)
-    stage.loop.step()
-    assert [full for _, full in stage.drawn] == [False, True, True]
+    sizes = []
+    for seconds in (0.004, 0.016, 0.016, 0.03, 0.03, 0.03, 0.09, 0.0225, 0.0075, *[0.0035] * 6):
+        stage.seconds = seconds
+        stage.look(1, 11)
+        stage.loop.step()
+        sizes.append(stage.drawn[-1][1])
+    # It starts with half size; 30 ms do not change it, 90 ms do, and back only far below.
+    assert sizes[:9] == [False, *[True] * 6, False, False]
+    assert sizes[-1]
 
 
 def test_two_clients_take_turns() -> None:

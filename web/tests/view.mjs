@@ -19,7 +19,7 @@ try {
   tab.on("pageerror", (error) => errors.push(`${error}`));
   tab.setDefaultTimeout(60000);
   await tab.goto(address);
-  const did = async (step) => {
+  const act = async (step) => {
     if (step.wait) return tab.waitForTimeout(step.wait);
     if (step.see) return tab.getByText(step.see).first().waitFor();
     if (step.click) return tab.getByText(step.click, { exact: true }).first().click();
@@ -40,7 +40,7 @@ try {
     }
     throw new Error(`no such step: ${JSON.stringify(step)}`);
   };
-  for (const step of steps) await did(step);
+  for (const step of steps) await act(step);
   console.log(JSON.stringify({ requests, errors }));
 } finally {
   await browser.close();

@@ -13,8 +13,13 @@ from mien.viewer.drawing import View
 
 STILL_SECONDS = 0.25
 """Time without a change after which a full picture is drawn, in seconds."""
-QUICK_SECONDS = 0.03
-"""If a full picture took less than this, in seconds, pictures have full size while something moves, too."""
+QUICK_SECONDS, SLOW_SECONDS = 0.02, 0.04
+"""Times of a full picture in seconds: from below the first on, pictures have full size while something moves, too, and
+from above the second on, half size again. Two times keep the size from changing back and forth."""
+_OF_A_HALF = 4.0
+"""Time of a full picture, if it is not known, as a multiple of that of half size: it has four times the pixels."""
+_LAST = 0.5
+"""Weight of the last picture in the mean of these times."""
 _NEVER = float("-inf")
 
 
@@ -54,7 +59,8 @@ class DrawingLoop:
         self._changed = threading.Condition()
         self._stopping = False
         self._thread: threading.Thread | None = None
-        self._full_seconds = float("inf")
+        self._full_seconds: float | None = None
+        self._is_quick = False
         self.pictures = 0
         """Number of pictures so far."""
         self.error: BaseException | None = None
@@ -104,8 +110,7 @@ class DrawingLoop:
         picture = self._draw(view, full)
         ended = self._clock()
         with self._changed:
-            if full:
-                self._full_seconds = ended - began
+            self._time((ended - began) * (1.0 if full else _OF_A_HALF))
             client.drawn, client.is_full, client.served_at = wanted, full, ended
             self.pictures += 1
             there = self._clients.get(key) is client
@@ -119,7 +124,7 @@ class DrawingLoop:
         waiting = [(key, client) for key, client in seen if client.drawn < client.wanted]
         if waiting:
             key, client = min(waiting, key=lambda item: item[1].served_at)
-            return key, client, self._full_seconds < QUICK_SECONDS or now - client.changed_at >= STILL_SECONDS
+            return key, client, self._is_quick or now - client.changed_at >= STILL_SECONDS
         still = [
             (key, client) for key, client in seen if not client.is_full and now - client.changed_at >= STILL_SECONDS
         ]
@@ -127,6 +132,15 @@ class DrawingLoop:
             return None
         key, client = min(still, key=lambda item: item[1].served_at)
         return key, client, True
+
+    def _time(self, seconds: float) -> None:
+        """Take account of the time that a full picture took, or would have taken."""
+        before = seconds if self._full_seconds is None else self._full_seconds
+        self._full_seconds = _LAST * seconds + (1 - _LAST) * before
+        if self._full_seconds < QUICK_SECONDS:
+            self._is_quick = True
+        elif self._full_seconds > SLOW_SECONDS:
+            self._is_quick = False
 
     def _rest(self, now: float, wake: float | None) -> float | None:
         times = [client.changed_at + STILL_SECONDS for client in self._clients.values() if not client.is_full]

@@ -191,7 +191,8 @@ def _quiet() -> Iterator[None]:
 @contextlib.contextmanager
 def _guarded(door: Door) -> Iterator[None]:
     """Let servers that start inside ask the door about each request. viser has no place for that."""
-    module, start = websockets.asyncio.server, websockets.asyncio.server.serve
+    module: Any = websockets.asyncio.server
+    start = module.serve
 
     def guarded(*arguments: Any, process_request: Callable[[Any, Request], Any], **named: Any) -> Any:
         def process(connection: Any, request: Request) -> Any:
@@ -204,7 +205,7 @@ def _guarded(door: Door) -> Iterator[None]:
 
         return start(*arguments, process_request=process, **named)
 
-    module.serve = guarded  # type: ignore[assignment]
+    module.serve = guarded
     try:
         yield
     finally:
