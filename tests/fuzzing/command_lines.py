@@ -33,7 +33,8 @@ BASES = (
     "analyze gaussian-avatars W --parts growth", "analyze gaussian-avatars W --parts growth --out o --json",
     "import gaussian_avatars --out new", "import gaussian_avatars --out W --run other",
     "import flame_avatars --out new", "export W --out o --format gaussian-avatars", "track W --hold-out clip",
-    "view none.mien", "bench", "bench quality --captures nobody --out o", "create none.mp4 --out new", "demo --out head.ply",
+    "view none.mien", "bench", "bench quality --captures nobody --out o", "create none.mp4 --out new",
+    "demo --out head.ply",
 )  # fmt: skip
 HEAVY = (
     "capture videos/clip.mp4 --out new", "create videos/clip.mp4 --out new --steps 1", "capture pictures --out new",
