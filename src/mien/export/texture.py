@@ -1,0 +1,134 @@
+"""A texture of an avatar's mesh, taken from pictures of its Gaussians on all sides."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int
+from torch import Tensor
+
+from mien import runtime
+from mien.camera import Camera, camera_from_fov
+from mien.render.camera_paths import aside
+from mien.render.mesh import interpolate, rasterize_mesh, vertex_normals
+from mien.runtime.posing import SH_C0
+from mien.training.vertex_colors import sample_picture
+
+VIEWS = tuple((yaw, 0) for yaw in range(0, 360, 30)) + tuple(
+    (yaw, pitch) for pitch in (-40, 40) for yaw in range(0, 360, 60)
+)
+"""Sides that the head is drawn from: degrees to the person's left, and upwards."""
+_FIELD, _DISTANCE, _SIZE = 0.4, 1.0, 1024
+"""Field of view in radians, distance in metres and side in pixels of these pictures."""
+_DEPTH_TOLERANCE = 0.004
+"""Depth in metres behind the mesh's nearest surface up to which a texel counts as visible."""
+_LEAST_COSINE = 0.15
+_LEAST_ALPHA = 0.5
+"""Least cosine between the normal and the direction to the camera, and least alpha, with which a texel is taken."""
+_LITTLE = 1e-3
+"""Weight of the colour of the nearest Gaussians, which decides where no picture shows the surface."""
+_NEAREST, _CHUNK = 8, 512
+_ROUNDS = 8
+"""Texels by which the texture is continued over the borders of its pieces, so that they do not show."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A mesh with texture coordinates, in the head frame."""
+
+    vertices: Float[Tensor, "v 3"]
+    faces: Int[Tensor, "f 3"]
+    uv: Float[Tensor, "u 2"]
+    """Texture coordinates, 0..1, v upwards."""
+    uv_faces: Int[Tensor, "f 3"]
+    """Indices into `uv`."""
+
+
+@torch.no_grad()
+def bake_texture(surface: Surface, gaussians: runtime.Gaussians, size: int) -> Float32[np.ndarray, "s s 3"]:
+    """A texture [size, size], 0..1, with its first row at v = 1: the colours of the Gaussians as one sees them outside.
+
+    Each texel is the mean over the views that see it, weighted by how squarely they do. Surfaces that no view sees,
+    such as teeth behind closed lips, have the mean colour of the Gaussians nearest to their triangle.
+
+    Args:
+        surface: The mesh of the posed avatar.
+        gaussians: The Gaussians of the same pose, in the same frame.
+        size: Side of the texture in texels.
+    """
+    flat = torch.cat(
+        [surface.uv * torch.tensor([1.0, -1.0]) + torch.tensor([0.0, 1.0]), torch.ones(len(surface.uv), 1)], 1
+    )
+    K = torch.tensor([[float(size), 0, 0], [0, float(size), 0], [0, 0, 1]])
+    layout = rasterize_mesh(flat, surface.uv_faces, Camera(K, torch.eye(4), size, size))
+    covered = layout.face_index >= 0
+    points = interpolate(layout, surface.vertices, surface.faces)[covered]
+    normals = interpolate(layout, vertex_normals(surface.vertices, surface.faces), surface.faces)[covered]
+    colours = _LITTLE * _nearest_colours(surface, gaussians)[layout.face_index[covered].long()]
+    weights = torch.full((len(points), 1), _LITTLE)
+    for camera in _cameras(surface.vertices):
+        image, weight = _seen(points, normals, surface, gaussians, camera)
+        colours += weight * image
+        weights += weight
+    texture = torch.zeros(size, size, 3)
+    texture[covered] = (colours / weights).clamp(0, 1)
+    return _continued(texture, covered).numpy()
+
+
+def _cameras(vertices: Float[Tensor, "v 3"]) -> list[Camera]:
+    centre = (vertices.amin(0) + vertices.amax(0)) / 2
+    viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (centre + torch.tensor([0.0, 0.0, _DISTANCE]))
+    front = camera_from_fov(_FIELD, _SIZE, _SIZE, viewmat)
+    return [aside(front, centre, math.radians(yaw), math.radians(pitch)) for yaw, pitch in VIEWS]
+
+
+def _seen(
+    points: Float[Tensor, "p 3"],
+    normals: Float[Tensor, "p 3"],
+    surface: Surface,
+    gaussians: runtime.Gaussians,
+    camera: Camera,
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 1"]]:
+    """The colours of points in one picture, and their weights."""
+    plain = runtime.Camera(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height)
+    image, alpha = map(torch.from_numpy, runtime.render(gaussians, plain, (0.0, 0.0, 0.0)))
+    depth = rasterize_mesh(surface.vertices, surface.faces, camera).depth.nan_to_num(posinf=1e3)
+    pixels, ahead = camera.project(points)
+    grid = 2 * pixels / torch.tensor([float(camera.width), float(camera.height)]) - 1
+    picture = sample_picture(torch.cat([image, alpha[..., None]], -1), grid, "bilinear")
+    nearest = sample_picture(depth[..., None], grid, "nearest")[:, 0]
+    towards = torch.nn.functional.normalize(camera.position - points, dim=-1)
+    cosine = (torch.nn.functional.normalize(normals, dim=-1) * towards).sum(-1)
+    opacity = picture[:, 3]
+    usable = (ahead <= nearest + _DEPTH_TOLERANCE) & (cosine > _LEAST_COSINE) & (opacity > _LEAST_ALPHA)
+    usable &= (grid.abs() < 1).all(-1)
+    weight = torch.where(usable, cosine**4, torch.zeros_like(cosine))
+    return picture[:, :3] / opacity.clamp_min(_LEAST_ALPHA)[:, None], weight[:, None]
+
+
+def _nearest_colours(surface: Surface, gaussians: runtime.Gaussians) -> Float[Tensor, "f 3"]:
+    """For each triangle, the mean colour of the Gaussians nearest to its middle, weighted by their opacities."""
+    middles = surface.vertices[surface.faces].mean(1)
+    means, opacities = torch.from_numpy(gaussians.means), torch.from_numpy(gaussians.opacities)
+    colours = (0.5 + SH_C0 * torch.from_numpy(gaussians.sh[:, 0])).clamp(0, 1)
+    found = []
+    for part in middles.split(_CHUNK):
+        near = torch.cdist(part, means).topk(min(_NEAREST, len(means)), largest=False).indices
+        weight = opacities[near].clamp_min(1e-6)[..., None]
+        found.append((weight * colours[near]).sum(1) / weight.sum(1))
+    return torch.cat(found)
+
+
+def _continued(texture: Float[Tensor, "s s 3"], covered: Tensor) -> Float[Tensor, "s s 3"]:
+    """The texture with the colours at the borders of its pieces continued outwards."""
+    for _ in range(_ROUNDS):
+        weight = covered[None, None].float()
+        both = torch.cat([texture.permute(2, 0, 1)[None] * weight, weight], 1)
+        around = torch.nn.functional.avg_pool2d(both, 3, stride=1, padding=1)
+        filled = (around[:, :3] / around[:, 3:].clamp_min(1e-6))[0].permute(1, 2, 0)
+        fresh = ~covered & (around[0, 3] > 0)
+        texture = torch.where(fresh[..., None], filled, texture)
+        covered = covered | fresh
+    return texture
