@@ -19,7 +19,7 @@ from mien.errors import UserError
 from mien.export import Glb, MeshModel, read_glb, write_glb
 from mien.export.glb import joint_positions, morph_targets
 from mien.export.glb_file import GlbWriter
-from mien.export.texture import Surface, bake_texture
+from mien.export.texture import Shot, Surface, bake_texture
 from mien.face import load_face_model
 from mien.runtime.posing import SH_C0, rig_points
 from mien.runtime.rotation import matrix_from_axis_angle
@@ -230,8 +230,8 @@ def test_the_texture_has_the_colours_of_the_gaussians() -> None:
     )
     baked = replace(baked, attributes=attributes, means=np.zeros((n, 3), np.float32))
     gaussians = runtime.pose(baked, at_rest(plain))
-    surface = Surface(torch.from_numpy(vertices), model.faces, model.uv, model.uv_faces)
-    texture = bake_texture(surface, gaussians, 256)
+    surface = Surface(model.faces, model.uv, model.uv_faces)
+    texture = bake_texture(surface, [Shot(torch.from_numpy(vertices), gaussians)], 256)
     centres = model.uv[model.uv_faces].mean(1).numpy()
     texels = texture[((1 - centres[:, 1]) * 256).astype(int), (centres[:, 0] * 256).astype(int)]
     sides = vertices[baked.faces].mean(1)[:, 0]

@@ -17,7 +17,7 @@ from mien import runtime
 from mien.driving.motion import ARKIT_NAMES, gaze_of
 from mien.errors import UserError
 from mien.export.glb_file import INDICES, VERTICES, GlbWriter
-from mien.export.texture import Surface, bake_texture
+from mien.export.texture import FRONT_VIEWS, Shot, Surface, bake_texture
 from mien.files import check_writable
 from mien.picture_files import encode_picture
 from mien.runtime import Face, Gaussians, MeshBound, PortableAvatar, Rig
@@ -30,6 +30,8 @@ TEXTURE_SIZE = 1024
 _JPEG_QUALITY = 92
 _JOINTS = 4
 """Number of joints of a vertex, which is what every engine supports."""
+_JAW, _LOOK, _HIDDEN = 0.7, 0.4, 0.01
+"""Pose that shows what is hidden at rest: jawOpen, and eyes to each side in radians; and the weight of its pictures."""
 _MOVED = 1e-6
 """Distance in metres below which a morph target does not move a vertex."""
 _ANIMATES = (
@@ -82,9 +84,7 @@ def write_glb(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size
     skin = _skin(writer, model.rig, face, first_node=1)
     content["nodes"] = [{"name": avatar.about.name, "mesh": 0, "skin": 0}, *skin.pop("nodes")]
     content["skins"] = [skin]
-    tensors = (vertices, model.faces, model.uv, model.uv_faces)
-    surface = Surface(*(torch.from_numpy(np.asarray(array, _kind_of(array))) for array in tensors))
-    _add_texture(writer, content, bake_texture(surface, gaussians, texture_size))
+    _add_texture(writer, content, _texture(avatar, model, face, texture_size))
     _add_splats(writer, content, avatar, gaussians)
     names = tuple(targets)
     about = {**vars(avatar.about), "format": FORMAT, "version": VERSION, "animates": _ANIMATES}
@@ -146,6 +146,27 @@ def joint_positions(rig: Rig, face: Face) -> Float[np.ndarray, "k 3"]:
 def _at_rest(avatar: PortableAvatar) -> Face:
     zero = np.zeros(3, np.float32)
     return Face(avatar.neutral.expression, avatar.neutral.joints, zero, zero)
+
+
+def _texture(avatar: PortableAvatar, model: MeshModel, face: Face, size: int) -> Float32[np.ndarray, "s s 3"]:
+    """The texture, seen at rest, and with an open mouth and eyes to each side."""
+    tensors = (model.faces, model.uv, model.uv_faces)
+    surface = Surface(*(torch.from_numpy(np.asarray(array, _kind_of(array))) for array in tensors))
+
+    def shot(posed: Face, **how: Any) -> Shot:
+        return Shot(torch.from_numpy(rig_points(model.rig, posed)), runtime.pose(avatar.baked, posed), **how)
+
+    shots, names = [shot(face)], avatar.expression_names
+    if "jawOpen" in names:
+        for side in (-_LOOK, _LOOK):
+            expression, joints = face.expression.copy(), face.joints.copy()
+            expression[names.index("jawOpen")] += _JAW
+            for eye in ("left_eye", "right_eye"):
+                if eye in avatar.joint_names:
+                    joints[avatar.joint_names.index(eye), 1] += side
+            posed = replace(face, expression=expression, joints=joints)
+            shots.append(shot(posed, views=FRONT_VIEWS, weight=_HIDDEN))
+    return bake_texture(surface, shots, size)
 
 
 def _kind_of(array: np.ndarray) -> type:
