@@ -27,6 +27,7 @@ from toy_workspace import write_evaluated_workspace
 
 COMMANDS = (
     "render W --out OUT/a.png --size 32",
+    "view W",
     "export W --out OUT/a.ply",
     "drive W --by W --out OUT/b.mp4 --size 32",
     "evaluate W --no-perceptual",

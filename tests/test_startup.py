@@ -14,7 +14,7 @@ from mien.cli import COMMANDS
 from mien.commands.options import MethodName
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
-LAZY_ROOMS = ["analysis", "avatar", "capture", "driving", "export", "tracking", "training"]
+LAZY_ROOMS = ["analysis", "avatar", "capture", "driving", "export", "tracking", "training", "viewer"]
 SCRIPT = """
 import json, os, sys
 from mien.cli import main
@@ -67,6 +67,11 @@ drive gone --by a.csv --out b.mp4
 drive w --by gone --out b.mp4
 drive w --by a.csv --out b.gif
 drive w --by a.csv --out b.mp4 --fps 0
+view gone
+view gone.mien
+view a.csv
+view w --port 99999
+view w --play nobody
 export w --out a.obj
 export w --out gone.ply --series nobody
 face-models --name x

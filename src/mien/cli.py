@@ -32,6 +32,7 @@ COMMANDS = {
     "study": "runs -> a page on which people compare them blind; answers -> percentages",
     "render": "avatar -> a still or a video along a camera path, at any expression",
     "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
+    "view": "avatar -> a viewer in the browser: turn it, move its face, play a motion",
     "export": "avatar -> .mien (runs without torch), .ply at some expressions, or GaussianAvatars' folder",
     "import": "GaussianAvatars' folder -> an avatar that can be rendered, driven and exported",
     "face-models": "list the face models and bake them ahead of time",

@@ -35,14 +35,15 @@ BASES = (
     "import flame_avatars --out new", "export W --out o --format gaussian-avatars", "track W --hold-out clip",
     "evaluate W --no-perceptual --fit-faces --fit-steps 1",
     "study make W --out o.html", "study tally given/crops.json given/cameras.json", "bench compare W --methods nobody",
-    "bench", "bench quality --captures nobody --out o", "create none.mp4 --out new", "demo --out head.ply",
+    "view none.mien", "bench", "bench quality --captures nobody --out o", "create none.mp4 --out new",
+    "demo --out head.ply",
 )  # fmt: skip
 HEAVY = (
     "capture videos/clip.mp4 --out new", "create videos/clip.mp4 --out new --steps 1", "capture pictures --out new",
     "demo --out new --seconds 0.1 --steps 1",
     "face-models --add flame/tiny.npz --name tiny", "face-models --add flame/tiny.pkl",
     "bench compare W --steps 1 --out o", "bench render --seconds 0.001 --json", "bench scaling --seconds 0.001",
-    "drive W --by videos/clip.mp4 --out o.mp4", "track W --face-model flame/tiny.npz",
+    "drive W --by videos/clip.mp4 --out o.mp4", "view W", "view head.mien", "track W --face-model flame/tiny.npz",
     "analyze gaussian-avatars W --train --steps 1 --seconds 0.001",
     "import flame_avatars --out new --face-model flame/tiny.npz",
 )  # fmt: skip
