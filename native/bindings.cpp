@@ -10,6 +10,7 @@ void bind_memory(nanobind::module_& module);
 void bind_mesh(nanobind::module_& module);
 void bind_mesh_align(nanobind::module_& module);
 void bind_photometric(nanobind::module_& module);
+void bind_point_network(nanobind::module_& module);
 void bind_rig(nanobind::module_& module);
 void bind_ride(nanobind::module_& module);
 void bind_rasterize(nanobind::module_& module);
@@ -27,6 +28,7 @@ NB_MODULE(_native, module) {
   bind_mesh(module);
   bind_mesh_align(module);
   bind_photometric(module);
+  bind_point_network(module);
   bind_rig(module);
   bind_ride(module);  // after the face and the rig, whose classes it takes
   bind_rasterize(module);

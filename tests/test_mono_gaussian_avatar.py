@@ -269,6 +269,7 @@ def test_attribute_network_has_the_published_layers() -> None:
     torch.testing.assert_close(network(points), expected)
 
 
+@torch.no_grad()
 def test_attribute_network_starts_with_the_published_weights() -> None:
     torch.manual_seed(0)
     network = AttributeNet(256, 7)

@@ -96,6 +96,32 @@ def factored_update(native: Any, rng: Rng) -> Arguments:
     return [normal(rng, n, k, f), normal(rng, n, f), normal(rng, k), *moments, 0.01]
 
 
+def point_layers(native: Any, rng: Rng) -> tuple[list[Any], Any, int]:
+    n, widths, layers = few(rng), [int(rng.integers(1, 20))], []
+    for index in range(int(rng.integers(1, 5))):
+        extra = int(rng.integers(-1, index)) if index > 0 else -1
+        reads = widths[-1] + (widths[extra] if extra >= 0 else 0)
+        widths.append(int(rng.integers(1, 40)))
+        layers.append([normal(rng, widths[-1], reads), normal(rng, widths[-1]), int(rng.integers(0, 3)), extra])
+    layers[-1][2] = 0
+    kept = sum(-(-width // 16) * 16 for width in widths[1:-1])
+    return [native.PointLayer(*layer) for layer in layers], normal(rng, n, widths[0]), kept
+
+
+def point_network(native: Any, rng: Rng) -> Arguments:
+    layers, inputs, kept = point_layers(native, rng)
+    room = empty(len(inputs), kept) if rng.random() < 0.5 else None
+    return [layers, inputs, room, empty(len(inputs), len(layers[-1].bias))]
+
+
+def point_network_backward(native: Any, rng: Rng) -> Arguments:
+    layers, inputs, kept = point_layers(native, rng)
+    gradients = [native.PointLayerGradients(*(np.empty_like(array) for array in layer[:2])) for layer in layers]
+    by_inputs = np.empty_like(inputs) if rng.random() < 0.5 else None
+    by_outputs = normal(rng, len(inputs), len(layers[-1].bias))
+    return [layers, inputs, normal(rng, len(inputs), kept), by_outputs, gradients, by_inputs]
+
+
 # Faces
 
 Sizes = tuple[int, int, int]
@@ -298,7 +324,7 @@ BASELINES: dict[str, Baseline] = {
     one.__name__: one
     for one in (
         sigmoid, sigmoid_backward, expression_activations, expression_change, expression_change_backward,
-        feature_network, feature_network_backward, factored_update,
+        feature_network, feature_network_backward, factored_update, point_network, point_network_backward,
         make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
         compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,

@@ -96,7 +96,7 @@ def _paper() -> MonoGaussianAvatarConfig:
     perceptual = PerceptualLoss(weight=0.1, start=0.0, every=1, crop=224, blocks=3)
     return MonoGaussianAvatarConfig(
         photometric=Photometric(l1_weight=1.0, ssim_weight=0.25, perceptual=perceptual),
-        face_tuning=FaceTuning(expression=rate, joints=rate, head_rotation=rate, head_translation=Rate(0)),
+        face_tuning=FaceTuning(expression=rate, joints=rate, head_rotation=rate, head_translation=Rate(0.0)),
         max_points=100_000,
         epochs=_PAPER_EPOCHS,
         schedule="paper",

@@ -37,8 +37,8 @@ class AttributeNet(nn.Module):
     Args:
         width: Width of all layers.
         layers: Number of layers of the trunk.
-        sphere: Whether the trunk starts as about the signed distance to a sphere, as published. Otherwise its last layer
-            starts as the others.
+        sphere: Whether the trunk starts as about the signed distance to a sphere, as published. Otherwise its last
+            layer starts as the others do.
     """
 
     def __init__(self, width: int, layers: int, sphere: bool = True):
