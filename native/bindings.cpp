@@ -14,6 +14,7 @@ void bind_point_network(nanobind::module_& module);
 void bind_rig(nanobind::module_& module);
 void bind_ride(nanobind::module_& module);
 void bind_rasterize(nanobind::module_& module);
+void bind_skin_points(nanobind::module_& module);
 void bind_training(nanobind::module_& module);
 
 NB_MODULE(_native, module) {
@@ -32,5 +33,6 @@ NB_MODULE(_native, module) {
   bind_rig(module);
   bind_ride(module);  // after the face and the rig, whose classes it takes
   bind_rasterize(module);
+  bind_skin_points(module);
   bind_training(module);
 }

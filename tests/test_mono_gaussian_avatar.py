@@ -10,10 +10,8 @@ from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, Progress, 
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.mono_gaussian_avatar import (
     CANONICAL_JAW,
-    blend_transforms,
     canonical_face,
     nearest_vertices,
-    unskin,
 )
 from mien.avatar.mono_gaussian_avatar_settings import LENGTH_UNIT
 from mien.avatar.mono_networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
@@ -203,19 +201,6 @@ def test_expressions_that_never_move_stay_finite() -> None:
         avatar = MonoGaussianAvatar(SMALL, toy_face_model(), one)
         losses = avatar.regularizers(avatar.pose(one[0]), pictured(30), Progress(0, 10))
         assert all(loss.isfinite() for loss in losses.values())
-
-
-def test_unskin_undoes_blended_transforms() -> None:
-    torch.manual_seed(0)
-    face_model = toy_face_model()
-    face = replace(toy_face(5), joints=torch.randn(5, 1, 3))
-    weights = torch.rand(20, 3).softmax(-1)
-    transforms = blend_transforms(weights, face_model.joint_transforms(face))[2]
-    points = torch.randn(20, 3)
-    moved = torch.stack(
-        [transform[:, :3] @ x + transform[:, 3] for transform, x in zip(transforms, points, strict=True)]
-    )
-    torch.testing.assert_close(unskin(moved, transforms), points, atol=1e-5, rtol=1e-5)
 
 
 def test_attributes_are_those_at_rest_and_their_change() -> None:

@@ -454,3 +454,25 @@ def point_network_backward(
     by_inputs: Tensor | None,
 ) -> None:
     """Fills `gradients` and `by_inputs`. Points whose row of `by_outputs` is 0 have no gradient."""
+
+# native/bind_skin_points.cpp; n points, b poses, k bones
+class SkinPoints(NamedTuple):
+    points: Tensor
+    moved: Tensor
+    weights: Tensor
+    from_bones: Tensor
+    to_bones: Tensor
+
+class SkinPointsGradients(NamedTuple):
+    """The gradient of the posed points, and those that are filled."""
+
+    posed: Tensor
+    points: Tensor
+    moved: Tensor
+    weights: Tensor
+    to_bones: Tensor
+
+def skin_points(points: SkinPoints, posed: Tensor) -> None:
+    """Fills `posed` [b, n, 3]."""
+
+def skin_points_backward(points: SkinPoints, gradients: SkinPointsGradients) -> None: ...

@@ -122,6 +122,23 @@ def point_network_backward(native: Any, rng: Rng) -> Arguments:
     return [layers, inputs, normal(rng, len(inputs), kept), by_outputs, gradients, by_inputs]
 
 
+def skin_arrays(native: Any, rng: Rng) -> tuple[Any, tuple[int, int, int]]:
+    n, b, k = few(rng), int(rng.integers(0, 4)), int(rng.integers(1, 7))
+    points = normal(rng, n, 3), normal(rng, b, n, 3), normal(rng, n, k), normal(rng, k, 3, 4), normal(rng, b, k, 3, 4)
+    return native.SkinPoints(*points), (n, b, k)
+
+
+def skin_points(native: Any, rng: Rng) -> Arguments:
+    points, (n, b, _) = skin_arrays(native, rng)
+    return [points, empty(b, n, 3)]
+
+
+def skin_points_backward(native: Any, rng: Rng) -> Arguments:
+    points, (n, b, k) = skin_arrays(native, rng)
+    filled = empty(n, 3), empty(b, n, 3), empty(n, k), empty(b, k, 3, 4)
+    return [points, native.SkinPointsGradients(normal(rng, b, n, 3), *filled)]
+
+
 # Faces
 
 Sizes = tuple[int, int, int]
@@ -324,7 +341,8 @@ BASELINES: dict[str, Baseline] = {
     one.__name__: one
     for one in (
         sigmoid, sigmoid_backward, expression_activations, expression_change, expression_change_backward,
-        feature_network, feature_network_backward, factored_update, point_network, point_network_backward,
+        feature_network, feature_network_backward, factored_update, point_network, point_network_backward, skin_points,
+        skin_points_backward,
         make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
         compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,

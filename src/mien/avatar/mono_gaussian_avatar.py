@@ -34,6 +34,7 @@ from mien.avatar.mono_networks import (
 from mien.avatar.mono_schedule import Schedule
 from mien.avatar.schedules import TRAINED, Progress
 from mien.avatar.settings import RefillSettings
+from mien.avatar.skin_points import blend_transforms, skin_points, unskin
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians, sh_from_rgb
@@ -203,10 +204,10 @@ class MonoGaussianAvatar(Avatar):
     def _schedule(self) -> Schedule:
         return Schedule(self.config.schedule, self.config.epochs, self.config.points)
 
-    def _transforms(self, face: FaceParams) -> Float[Tensor, "b k 4 4"]:
+    def _transforms(self, face: FaceParams) -> Float[Tensor, "b k 3 4"]:
         """The joints' transforms in the head frame, then that of the bone which stands still in the world."""
         still = _inverse(face.T_world_head) @ self.canonical_face().T_world_head
-        return torch.cat([self.face_model.joint_transforms(face), still[:, None]], dim=1)
+        return torch.cat([self.face_model.joint_transforms(face), still[:, None]], dim=1)[:, :, :3]
 
     def _coefficients(self, face: FaceParams, absolute: bool = False) -> Float[Tensor, "b c"]:
         """Weights of the blend directions: less those of the canonical face, or as they are (`absolute`)."""
@@ -221,10 +222,9 @@ class MonoGaussianAvatar(Avatar):
         means = self.store["means"]
         offset, moved, weights = self.deformation(means / LENGTH_UNIT, self._coefficients(face))
         canonical = means + LENGTH_UNIT * offset
-        at_rest = unskin(canonical, blend_transforms(weights, self._transforms(self.canonical_face()))[0])
-        skinning = blend_transforms(weights, self._transforms(face))
-        shaped = at_rest + LENGTH_UNIT * moved
-        posed = (skinning[..., :3] @ shaped[..., None])[..., 0] + skinning[..., 3]
+        with torch.no_grad():
+            at_rest = self._transforms(self.canonical_face())[0]
+        posed = skin_points(canonical, LENGTH_UNIT * moved, weights, at_rest, self._transforms(face))
         return posed, posed - canonical
 
 
@@ -259,20 +259,6 @@ def _inverse(pose: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:
     return rigid_transform(turned, -(turned @ pose[:, :3, 3:])[..., 0])
 
 
-def blend_transforms(weights: Float[Tensor, "n k"], transforms: Float[Tensor, "b k 4 4"]) -> Float[Tensor, "b n 3 4"]:
-    """Each point's transform: the mean of the joints' transforms, weighted by its skinning weights."""
-    return (weights @ transforms[:, :, :3].flatten(2)).unflatten(-1, (3, 4))
-
-
-def unskin(points: Float[Tensor, "n 3"], transforms: Float[Tensor, "n 3 4"]) -> Float[Tensor, "n 3"]:
-    """Positions of the points before affine transforms moved them (inverse skinning)."""
-    a, b, c = transforms[..., :3].unbind(-2)
-    # Cramer's rule is several times as fast as a general inverse of many small matrices.
-    columns = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
-    determinant = (a * columns[..., 0]).sum(-1, keepdim=True)
-    return (columns @ (points - transforms[..., 3])[..., None])[..., 0] / determinant
-
-
 def split_attributes(raw: Float[Tensor, "*b 11"]) -> dict[str, Tensor]:
     """The columns of the attribute networks by name."""
     return dict(zip(ATTRIBUTES, raw.split(ATTRIBUTE_WIDTHS, dim=-1), strict=True))
@@ -281,7 +267,8 @@ def split_attributes(raw: Float[Tensor, "*b 11"]) -> dict[str, Tensor]:
 @torch.no_grad()
 def nearest_vertices(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "v 3"]) -> Int[Tensor, " n"]:
     """The index of the vertex nearest to each point."""
-    return torch.cdist(points, vertices).argmin(-1)
+    # |p - v|^2 less |p|^2, which is the same for all vertices, and half of that.
+    return torch.addmm(vertices.square().sum(-1) / 2, points, vertices.T, alpha=-1).argmin(-1)
 
 
 def _mean_square(values: Tensor) -> Float[Tensor, ""]:

@@ -68,7 +68,7 @@ class MonoGaussianAvatarConfig(MethodConfig):
     100)."""
     face_weight: Annotated[float, NOT_NEGATIVE] = 10.0
     """Weight of the losses that keep the networks near the face model. It halves at epochs 20, 30, 50 and 70."""
-    face_points: Annotated[int, GAUSSIAN_COUNT] = 512
+    face_points: Annotated[int, GAUSSIAN_COUNT] = 256
     """Number of points that these losses use in each step, in turn."""
 
     @classmethod
