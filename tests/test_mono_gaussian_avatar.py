@@ -241,7 +241,7 @@ def test_change_network_has_the_published_layers() -> None:
 
 def test_attribute_network_has_the_published_layers() -> None:
     torch.manual_seed(0)
-    network, points = AttributeNet(48, 7), torch.randn(9, 3)
+    network, points = AttributeNet(48, 7, 6), torch.randn(9, 3)
     encoding = values = positional_encoding(points, 6)
     for index, layer in enumerate(network.trunk):
         if index == 3:
@@ -257,7 +257,7 @@ def test_attribute_network_has_the_published_layers() -> None:
 @torch.no_grad()
 def test_attribute_network_starts_with_the_published_weights() -> None:
     torch.manual_seed(0)
-    network = AttributeNet(256, 7)
+    network = AttributeNet(256, 7, 6)
     first, last, skip = (network.trunk[index] for index in (0, -1, 3))
     # The waves have no effect at first, and the positions have no more than theirs.
     assert first.weight[:, 3:].abs().max() == skip.weight[:, -36:].abs().max() == 0
@@ -305,7 +305,7 @@ def test_deformation_starts_as_nothing_with_even_weights() -> None:
 @pytest.mark.parametrize("layers", [2, 3, 4, 7])
 def test_attribute_network_of_any_depth(layers: int) -> None:
     """The attribute network can have any depth."""
-    assert AttributeNet(48, layers)(torch.randn(5, 3)).shape == (5, 11)
+    assert AttributeNet(48, layers, 6)(torch.randn(5, 3)).shape == (5, 11)
 
 
 def radii(name: ScheduleName, epochs: int) -> dict[int, float]:

@@ -58,7 +58,8 @@ class MonoGaussianAvatar(Avatar):
         cube = 2 * torch.rand(config.points, 3).to(like) - 1
         self.store = GaussianStore({"means": config.sphere_radius * torch.nn.functional.normalize(cube, dim=-1)})
         e, k = face.expression.shape[1], len(face_model.joint_names)
-        self.attributes = AttributeNet(config.attribute_width, config.attribute_layers, config.sphere_start).to(like)
+        sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
+        self.attributes = AttributeNet(*sizes, config.sphere_start).to(like)
         self.deformation = DeformationNet(config.deformation_width, e, 9 * face.joints.shape[1], k + 1).to(like)
         self.change = AttributeChangeNet(config.change_width).to(like)
         expression, joints = canonical_face(face_model, face.expression.detach().mean(0))

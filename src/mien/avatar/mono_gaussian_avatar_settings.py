@@ -46,10 +46,13 @@ class MonoGaussianAvatarConfig(MethodConfig):
     schedule: Literal["paper", "code"] = "code"
     """Whose numbers of points and radii: those of the paper, whose children are on a sphere around their parents, or
     those of the published code, whose children are in a cube."""
-    attribute_width: Annotated[int, Range(40, 1024)] = 64
+    attribute_width: Annotated[int, _WIDTH] = 64
     """Width of the attribute network (paper: 256)."""
     attribute_layers: Annotated[int, Range(1, 32)] = 4
-    """Number of layers of the attribute network's trunk (paper: 7)."""
+    """Number of layers of the attribute network's trunk (paper: 7). The fourth reads the encoding of positions again,
+    if the network is wider than that."""
+    encoding_bands: Annotated[int, Range(0, 24)] = 6
+    """Number of octaves of the attribute network's encoding of positions. The shortest wave of 6 octaves is 49 mm."""
     sphere_start: bool = False
     """Whether the attribute network's trunk starts as about the signed distance to a sphere, as in the paper."""
     deformation_width: Annotated[int, _WIDTH] = 64

@@ -19,7 +19,6 @@ from mien.avatar.point_network import Activation, Layer, point_network
 
 SKINNING_SHARPNESS = 20.0
 """Factor on the logits of the skinning weights: their softmax has a temperature of 1/20."""
-_ENCODING_BANDS = 6
 _SKIP = 3  # the layer, counted from 0, that reads the encoding again
 _SPHERE_RADIUS = 0.6
 
@@ -37,18 +36,19 @@ class AttributeNet(nn.Module):
     Args:
         width: Width of all layers.
         layers: Number of layers of the trunk.
+        bands: Number of octaves of the encoding of positions.
         sphere: Whether the trunk starts as about the signed distance to a sphere, as published. Otherwise its last
             layer starts as the others do.
     """
 
-    def __init__(self, width: int, layers: int, sphere: bool = True):
+    def __init__(self, width: int, layers: int, bands: int, sphere: bool = True):
         super().__init__()
-        inputs = 3 + 6 * _ENCODING_BANDS
+        self.bands = bands
+        inputs = 3 + 6 * bands
         # The encoding enters a second time after the third layer, which has fewer outputs to make room for it.
-        self.skip = _SKIP if layers > _SKIP else None
+        self.skip = _SKIP if layers > _SKIP and width > inputs else None
         sizes = [inputs, *[width] * layers]
         outputs = [size - inputs if index + 1 == self.skip else size for index, size in enumerate(sizes[1:])]
-        assert min(outputs) > 0, f"attribute width {width} leaves no room for {inputs} columns of encoding"
         plain = [_linear(i, o) for i, o in zip(sizes[:-1], outputs, strict=True)]
         with torch.no_grad():
             # Start with smooth functions of the position. The waves of the encoding come in as training needs them.
@@ -82,7 +82,7 @@ class AttributeNet(nn.Module):
 
     def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 11"]:
         """Columns as in `ATTRIBUTES`."""
-        return point_network(positional_encoding(points, _ENCODING_BANDS), self.layers())
+        return point_network(positional_encoding(points, self.bands), self.layers())
 
 
 class Deformation(NamedTuple):

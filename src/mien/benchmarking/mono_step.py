@@ -29,12 +29,12 @@ _LATE_STEP = round(0.9 * SETTINGS.steps) + 1
 def mono_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
     """Measure whole steps with the sizes of the preset `standard`, and frames of the runtime, by threads."""
     face_model = load_face_model()
-    state, data = mono_case(face_model, COUNT)
+    state, data = mono_case(face_model, COUNT, SIZE)
     for threads in thread_counts():
         _native.set_thread_count(threads)
         timing = time_function(lambda: step(state, data, SETTINGS), seconds)
         yield benchmark_row("mono_step", COUNT, SIZE, timing)
-    late, others = mono_case(face_model, FRAME_COUNT)
+    late, others = mono_case(face_model, FRAME_COUNT, SIZE)
     camera, face, frames = others.targets[0].camera(0), late.track.params(), counting()
     portable = runtime.Avatar(make_portable(late.avatar, camera, "benchmark"))
     for threads in thread_counts():
@@ -43,9 +43,9 @@ def mono_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
         yield benchmark_row("mono_runtime_frame", FRAME_COUNT, SIZE, timing)
 
 
-def mono_case(face_model: FaceModel, count: int) -> tuple[TrainingState, TrainingData]:
-    """Return a state late in a run with `count` points near the mesh, and its pictures."""
-    sequence = benchmark_sequence(face_model, *SIZE)
+def mono_case(face_model: FaceModel, count: int, size: tuple[int, int]) -> tuple[TrainingState, TrainingData]:
+    """Return a state late in a run with `count` points near the mesh, and its pictures of (width, height) `size`."""
+    sequence = benchmark_sequence(face_model, *size)
     state = start([sequence], face_model, replace(PRESETS["standard"], points=len(face_model.template)), SETTINGS)
     assert isinstance(state.avatar, MonoGaussianAvatar)
     _fill(state.avatar, count)
