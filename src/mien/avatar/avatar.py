@@ -49,10 +49,13 @@ class ParameterGroup:
     """Whether the rate is multiplied by the extent of the cameras (`Progress.extent`)."""
     factored: Mapping[str, FactoredGradient] = field(default_factory=dict)
     """Gradients, by the names of `tensors`, that `Tensor.grad` does not hold."""
+    halvings: tuple[float, ...] = ()
+    """Times at which the rate is halved, as fractions of the run."""
 
     def rate_at(self, progress: Progress) -> float:
         """The learning rate at a step."""
-        return self.rate.at(progress) * (progress.extent if self.times_extent else 1.0)
+        halved = 0.5 ** sum(progress.fraction >= time for time in self.halvings)
+        return self.rate.at(progress) * (progress.extent if self.times_extent else 1.0) * halved
 
 
 def store_group(store: GaussianStore, name: str, rate: Rate, *, times_extent: bool = False) -> ParameterGroup:

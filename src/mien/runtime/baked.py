@@ -138,6 +138,11 @@ class BlendSkinned:
     """With `sigmoid`: the only SH coefficient is the logit of the colour."""
     bases: LinearBases | None = None
     network: AttributeNetwork | None = None
+    still_weights: Float32[np.ndarray, " n"] | None = field(default=None, metadata={"since": 4})
+    """Skinning weights of one more bone, which stands still in the world while the head moves. It comes with
+    `still_pose`."""
+    still_pose: Float32[np.ndarray, "4 4"] | None = field(default=None, metadata={"since": 4})
+    """Head pose (T_world_head) at which this bone moves no points."""
 
 
 @dataclass(frozen=True, eq=False)

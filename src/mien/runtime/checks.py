@@ -120,12 +120,22 @@ def _baked_faults(baked: BakedAvatar) -> Iterator[str]:
             yield f"its scales reach {baked.scale_gain:g} metres"
         if baked.colour_activation == "sigmoid" and attributes.sh.shape[1] != 1:
             yield "its colours are sigmoids, but have several SH coefficients"
+        yield from _still_faults(baked, n)
     if isinstance(baked, Static) and len(baked.means) != n:
         yield f"it has {len(baked.means)} points, but {n} Gaussians"
     if baked.bases is not None:
         yield from _bases_faults(baked.bases, attributes, len(names), mean_moves=isinstance(baked, Static))
     if baked.network is not None:
         yield from _network_faults(baked.network, attributes, len(names), len(free))
+
+
+def _still_faults(baked: BlendSkinned, n: int) -> Iterator[str]:
+    if (baked.still_weights is None) != (baked.still_pose is None):
+        yield "the bone that stands still has weights or a pose, but not both"
+    if baked.still_weights is not None and len(baked.still_weights) != n:
+        yield f"it has {len(baked.still_weights)} weights of the bone that stands still, but {n} Gaussians"
+    if baked.still_pose is not None and baked.still_pose.shape != (4, 4):
+        yield "the shape of the pose of the bone that stands still does not fit"
 
 
 def _number_faults(value: Any) -> Iterator[str]:

@@ -77,7 +77,11 @@ def pose(baked: BakedAvatar, face: Face) -> Gaussians:
 
 
 def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
-    centres = rig_points(baked.rig, face)
+    shaped, centres = shaped_and_posed(baked.rig, face)
+    if baked.still_weights is not None and baked.still_pose is not None:
+        still = np.linalg.inv(face.T_world_head.astype(np.float64)) @ baked.still_pose
+        moved = shaped @ still[:3, :3].T.astype(np.float32) + still[:3, 3].astype(np.float32)
+        centres = centres + baked.still_weights[:, None] * moved
     raw = _raw_values(baked.attributes, baked.bases, baked.network, centres - baked.rig.template, face)
     if baked.scale_activation == "sigmoid":
         scales = baked.scale_gain * sigmoid(raw["log_scales"]) + baked.scale_offset
@@ -89,6 +93,13 @@ def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
 
 def rig_points(rig: Rig, face: Face, in_world: bool = False) -> Float32[np.ndarray, "m 3"]:
     """The rig's points in the head frame or in world space, in metres, by the same operation as in training."""
+    return shaped_and_posed(rig, face, in_world)[1]
+
+
+def shaped_and_posed(
+    rig: Rig, face: Face, in_world: bool = False
+) -> tuple[Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"]]:
+    """The rig's points before skinning and after it."""
     compiled = _compiled.get(rig)
     if compiled is None:
         compiled = _compiled[rig] = _native.make_face_model(
@@ -104,7 +115,7 @@ def rig_points(rig: Rig, face: Face, in_world: bool = False) -> Float32[np.ndarr
     shaped, points = (np.empty((1, *rig.template.shape), np.float32) for _ in range(2))
     arrays = _native.FaceArrays(rig.template, rig.joint_template, _batch(face.expression), _batch(face.joints), *head)
     _native.pose_face(compiled, arrays, shaped=shaped, vertices=points)
-    return points[0]
+    return shaped[0], points[0]
 
 
 _compiled: "WeakKeyDictionary[Rig, _native.FaceModelData]" = WeakKeyDictionary()
