@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from mien.adam import FactoredGradient, FactoredMoments, Moments
@@ -138,6 +138,17 @@ class Avatar(nn.Module, ABC):
             colors: Colours of the fills, 0..1.
         """
         return 0
+
+    def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
+        """Close the surface of those of the chosen triangles that are less than half opaque, between two steps.
+
+        The number of Gaussians does not change. Nothing happens if `triangles` gives None.
+
+        Args:
+            chosen: Triangles that may be closed.
+            opacity: Opacity of closed triangles.
+            colors: Their colours, 0..1.
+        """
 
     @abstractmethod
     def bake(self) -> BakedAvatar:

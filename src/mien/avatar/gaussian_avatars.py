@@ -32,6 +32,8 @@ _Pair = tuple[float, float]
 """A value for centres, and one for scales."""
 _LEAST_OPACITY = 1 / 255
 """Gaussians below this opacity are never drawn."""
+_OPEN = 0.5
+"""Sum of the opacities of a triangle's Gaussians below which its surface is open."""
 _BASES = ("colour_basis", "opacity_basis", "offset_basis")
 """Names of the bases of changes with the expression."""
 
@@ -166,21 +168,37 @@ class GaussianAvatars(Avatar):
         store.assign("opacity_logits", torch.logit(drawn.clamp(1e-6, 1 - 1e-6)))
         filled = (opacity > _LEAST_OPACITY).nonzero()[:, 0].to(bound.device)
         count, kept = len(store), drawn > _LEAST_OPACITY
-        vertices = self.face_model.head_vertices(self.subject)[0]
-        quats, log_scales = triangle_ellipses(vertices, self.face_model.faces)
-        like = store["means"]
-        zeros = {name: like.new_zeros(len(filled), *store[name].shape[1:]) for name in store.trained}
-        own = {
-            **zeros,
-            "face_index": filled,
-            "quats": quats[filled],
-            "log_scales": log_scales[filled],
-            "opacity_logits": torch.logit(opacity.to(like)[filled].clamp(1e-6, 1 - 1e-6)),
-            "sh_constant": sh_from_rgb(colors.to(like)[filled])[:, None],
-        }
+        own = self._flat(filled, opacity, colors)
         store.append(torch.zeros(len(filled), dtype=torch.long, device=bound.device), own)
         store.select(torch.cat([kept, torch.ones(len(store) - count, dtype=torch.bool, device=bound.device)]))
         return len(filled)
+
+    @torch.no_grad()
+    def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
+        """Replace the first Gaussian of each chosen triangle that is open by a flat one of the triangle's shape."""
+        store, bound = self.store, self.store["face_index"].long()
+        opacities = store["opacity_logits"].sigmoid()
+        total = opacities.new_zeros(len(chosen)).index_add(0, bound, opacities)
+        order = torch.arange(len(store), device=bound.device)
+        first = torch.full_like(chosen, len(store), dtype=torch.long).scatter_reduce(0, bound, order, "amin")
+        opened = (chosen & (total < _OPEN) & (first < len(store))).nonzero()[:, 0]
+        for name, values in self._flat(opened, total.new_full((len(chosen),), opacity), colors).items():
+            store.assign_rows(name, first[opened], values)
+
+    def _flat(
+        self, triangles: Int[Tensor, " k"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]
+    ) -> dict[str, Tensor]:
+        """The tensors of flat Gaussians, one for each of the given triangles, which have the triangles' shapes."""
+        store, like = self.store, self.store["means"]
+        quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
+        return {
+            **{name: like.new_zeros(len(triangles), *store[name].shape[1:]) for name in store.trained},
+            "face_index": triangles,
+            "quats": quats[triangles],
+            "log_scales": log_scales[triangles],
+            "opacity_logits": torch.logit(opacity.to(like)[triangles].clamp(1e-6, 1 - 1e-6)),
+            "sh_constant": sh_from_rgb(colors.to(like)[triangles])[:, None],
+        }
 
     def bake(self) -> MeshBound:
         """The mesh of this subject and the raw values of all Gaussians."""

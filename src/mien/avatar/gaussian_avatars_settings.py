@@ -71,6 +71,8 @@ _STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000
 _SH_DEGREE, _DEGREE_STEPS = 3, 1_000
 _RANK = 4
 """Rank of the changes with the expression in the presets `draft` and `standard`, where only places change."""
+_ALPHA_WEIGHT = 0.2
+"""Weight of the loss of alpha in these presets, without which a pale face is a thin one before a white background."""
 _VISIT = 30
 """How much further the paper's optimiser moves a frame between two visits than its learning rate says.
 
@@ -110,15 +112,23 @@ def _paper() -> GaussianAvatarsConfig:
 
 
 def _draft() -> GaussianAvatarsConfig:
-    """The defaults, with places that change with the expression."""
+    """The defaults, with places that change with the expression, and a head that is opaque where the matte is."""
     return GaussianAvatarsConfig(
-        expression_rank=_RANK, expression_colour_rate=Rate(0.0), expression_opacity_rate=Rate(0.0)
+        photometric=Photometric(alpha_weight=_ALPHA_WEIGHT),
+        expression_rank=_RANK,
+        expression_colour_rate=Rate(0.0),
+        expression_opacity_rate=Rate(0.0),
     )
 
 
 def _standard() -> GaussianAvatarsConfig:
     """A draft with eyes and mouth weighed more and a perceptual loss, which take a third more time."""
-    return replace(_draft(), photometric=Photometric(part_weight=1.0, perceptual=PerceptualLoss(weight=8.0, every=16)))
+    return replace(
+        _draft(),
+        photometric=Photometric(
+            alpha_weight=_ALPHA_WEIGHT, part_weight=1.0, perceptual=PerceptualLoss(weight=8.0, every=16)
+        ),
+    )
 
 
 PRESETS = {"draft": _draft(), "standard": _standard(), "paper": _paper()}

@@ -41,6 +41,11 @@ class TrainSettings:
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
     broken from aside. Filled: they are not drawn in training, and get a closed surface in the nearest colours after it.
     Methods that bind no Gaussians to triangles train them in either case."""
+    inside: Literal["free", "covered"] = "free"
+    """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
+    them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in
+    each step, so that lids and lips become opaque; and what is hardly ever seen gets a surface in plausible colours.
+    Methods that bind no Gaussians to triangles have no such Gaussians."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
@@ -134,8 +139,8 @@ class Preset:
 PRESETS = {
     preset.name: preset
     for preset in (
-        Preset("draft", TrainSettings(steps=8_000)),
-        Preset("standard", TrainSettings()),
+        Preset("draft", TrainSettings(steps=8_000, inside="covered")),
+        Preset("standard", TrainSettings(inside="covered")),
         Preset("paper", TrainSettings()),
     )
 }

@@ -41,6 +41,7 @@ from mien.training.adam import Adam
 from mien.training.ahead import TargetQueue, targets_ahead
 from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
+from mien.training.coverage import coverage
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
 from mien.training.frames import (
@@ -50,9 +51,12 @@ from mien.training.frames import (
     camera_extent,
     crop_random,
     density_random,
+    disguise_random,
     expression_rarity,
     training_frames,
 )
+from mien.training.hidden import inside_triangles
+from mien.training.inside import disguise, inside_of
 from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Target, Targets
@@ -131,9 +135,12 @@ def train(
         if is_finished(run_dir):  # another process finished it before this one got the lock
             return load_avatar(run_dir)
         like = like_on(choose_device(settings.device))
-        parts_of = face_model if method_config.photometric.needs_parts else None
-        targets = [Targets(sequence, settings.resolution, len(sequences), like, parts_of) for sequence in sequences]
         state = start(sequences, face_model, method_config, settings, like)
+        inside = None if state.inside is None else inside_triangles(face_model)
+        parts_of = face_model if method_config.photometric.needs_parts or inside is not None else None
+        targets = [
+            Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside) for sequence in sequences
+        ]
         _train_to_the_end(state, TrainingData(order, tuple(targets), extent), settings, run_dir, progress)
     return state.avatar
 
@@ -239,14 +246,19 @@ def start(
         avatar.paint(vertex_colors(face_model, sequences, faces, frames))
     colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
     unseen = unseen_of(avatar, sequences, faces, frames) if settings.unseen == "filled" else None
+    inside = None
+    if settings.inside == "covered" and avatar.triangles() is not None:
+        covered = coverage(face_model, sequences, faces, frames) if unseen is None else unseen.coverage
+        inside = inside_of(avatar, covered)
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
         unseen = None if unseen is None else replace(unseen, share=unseen.share.to(like))
+        inside = None if inside is None else inside.to(like)
     density = density_strategy(avatar.density(), avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     track = FaceTrack(face, method_config.face_tuning, lengths, face_model.expression_bounds)
-    return TrainingState(avatar, Adam(), density, track, {}, colors, unseen=unseen)
+    return TrainingState(avatar, Adam(), density, track, {}, colors, unseen=unseen, inside=inside)
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
@@ -261,7 +273,9 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
 
     index = state.track.index_of(frame.sequence, frame.timestep)
     face = state.track.face(index)
-    posed = avatar.pose(face, progress)
+    if state.inside is not None:
+        state.inside.furnish(avatar, state.step, settings.steps)
+    posed = disguise(avatar.pose(face, progress), avatar, target.hidden, disguise_random(settings, state.step))
     if state.unseen is not None:
         posed = state.unseen.hide(posed, avatar)
     rendering = rasterize(
