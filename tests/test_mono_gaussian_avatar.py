@@ -189,7 +189,7 @@ def test_losses_near_the_face_model_are_those_of_the_paper() -> None:
     expression = unit.sqrt() * (found.expression - 4 * face_model.expression_basis[:, nearest].permute(1, 2, 0))
     expected = 10 * 10 * ((10 * expression).square() / (variance / unit * 2)).mean()
     torch.testing.assert_close(losses["expression_directions"], expected)
-    sum(losses.values()).backward()
+    torch.stack(list(losses.values())).sum().backward()
     # The points do not feel these losses.
     assert avatar.store["means"].grad is None
 
@@ -225,6 +225,11 @@ def test_attributes_do_not_pull_at_points() -> None:
     assert avatar.store["means"].grad is not None
 
 
+def linear(layer: torch.nn.Module) -> torch.nn.Linear:
+    assert isinstance(layer, torch.nn.Linear)
+    return layer
+
+
 def softplus(values: Tensor) -> Tensor:
     return torch.nn.functional.softplus(values, beta=100)
 
@@ -258,7 +263,7 @@ def test_attribute_network_has_the_published_layers() -> None:
 def test_attribute_network_starts_with_the_published_weights() -> None:
     torch.manual_seed(0)
     network = AttributeNet(256, 7, 6)
-    first, last, skip = (network.trunk[index] for index in (0, -1, 3))
+    first, last, skip = (linear(network.trunk[index]) for index in (0, -1, 3))
     # The waves have no effect at first, and the positions have no more than theirs.
     assert first.weight[:, 3:].abs().max() == skip.weight[:, -36:].abs().max() == 0
     assert float(first.weight[:, :3].std()) == pytest.approx((2 / 256) ** 0.5, rel=0.1)

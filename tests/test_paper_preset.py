@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate
-from mien.avatar.mono_schedule import Schedule
+from mien.avatar.mono_schedule import Schedule, ScheduleName
 from mien.camera import Camera
 from mien.errors import UserError
 from mien.training import PRESETS, TrainSettings, check_run, train
@@ -166,7 +166,8 @@ def test_docs_have_the_counts_and_radii_of_both_schedules() -> None:
     rows = re.findall(r"^\| (\d+) \| ([\d,]+) \| (\S+) \| ([\d,]+) \| (\S+) \|$", PAGE.read_text(), flags=re.MULTILINE)
     assert len(rows) == 9
     for epoch, *cells in rows:
-        for name, count, radius in (("paper", *cells[:2]), ("code", *cells[2:])):
+        names: tuple[ScheduleName, ...] = ("paper", "code")
+        for name, count, radius in zip(names, cells[::2], cells[1::2], strict=True):
             schedule = Schedule(name, 120, 400)
             assert schedule.points_at(int(epoch) / 120) == int(count.replace(",", "")), (epoch, name)
             assert 4 * schedule.rendering_radius(int(epoch) / 120) == pytest.approx(float(radius), rel=0.035), (

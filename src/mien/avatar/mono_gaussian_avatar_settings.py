@@ -48,11 +48,12 @@ class MonoGaussianAvatarConfig(MethodConfig):
     those of the published code, whose children are in a cube."""
     attribute_width: Annotated[int, _WIDTH] = 64
     """Width of the attribute network (paper: 256)."""
-    attribute_layers: Annotated[int, Range(1, 32)] = 4
+    attribute_layers: Annotated[int, Range(1, 32)] = 3
     """Number of layers of the attribute network's trunk (paper: 7). The fourth reads the encoding of positions again,
     if the network is wider than that."""
-    encoding_bands: Annotated[int, Range(0, 24)] = 6
-    """Number of octaves of the attribute network's encoding of positions. The shortest wave of 6 octaves is 49 mm."""
+    encoding_bands: Annotated[int, Range(0, 24)] = 9
+    """Number of octaves of the attribute network's encoding of positions (paper: 6). The shortest wave is 6 mm; with 6
+    octaves, it is 49 mm."""
     sphere_start: bool = False
     """Whether the attribute network's trunk starts as about the signed distance to a sphere, as in the paper."""
     deformation_width: Annotated[int, _WIDTH] = 64
@@ -105,6 +106,7 @@ def _paper() -> MonoGaussianAvatarConfig:
         schedule="paper",
         attribute_width=256,
         attribute_layers=7,
+        encoding_bands=6,
         sphere_start=True,
         deformation_width=128,
         change_width=64,

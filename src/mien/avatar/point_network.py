@@ -62,34 +62,36 @@ _ACTIVATIONS = {
 class _PointNetwork(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, structure: tuple[tuple[int, int], ...], inputs: Tensor, *parameters: Tensor) -> Tensor:
-        inputs, *parameters = (tensor.detach().contiguous() for tensor in (inputs, *parameters))
-        outputs, kept = recycled(len(inputs), len(parameters[-1])), None
+        points, *own = [tensor.detach().contiguous() for tensor in (inputs, *parameters)]
+        outputs, kept = recycled(len(points), len(own[-1])), None
         if any(ctx.needs_input_grad):
-            hidden = parameters[1:-1:2]
-            kept = recycled(len(inputs), sum(-(-len(bias) // _LANES) * _LANES for bias in hidden))
-        _native.point_network(_layers(structure, parameters), *unpacked(inputs, kept, outputs))
+            kept = recycled(len(points), sum(-(-len(bias) // _LANES) * _LANES for bias in own[1:-1:2]))
+        plain = unpacked(points, kept, outputs)
+        _native.point_network(_layers(structure, own), plain[0], plain[1], plain[2])
         ctx.structure = structure
-        ctx.save_for_backward(inputs, *parameters, *([] if kept is None else [kept]))
+        ctx.save_for_backward(points, *own, *([] if kept is None else [kept]))
         return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        inputs, *parameters, kept = ctx.saved_tensors
-        by_inputs = torch.empty_like(inputs) if ctx.needs_input_grad[1] else None
-        gradients = [torch.empty_like(tensor) for tensor in parameters]
+        points, *own, kept = ctx.saved_tensors
+        by_points = torch.empty_like(points) if ctx.needs_input_grad[1] else None
+        gradients = [torch.empty_like(tensor) for tensor in own]
+        plain = unpacked(points, kept, by_outputs.contiguous(), by_points)
+        into = [_native.PointLayerGradients(*unpacked(*pair)) for pair in _pairs(gradients)]
         _native.point_network_backward(
-            _layers(ctx.structure, parameters),
-            *unpacked(inputs, kept, by_outputs.contiguous()),
-            [_native.PointLayerGradients(*unpacked(*pair)) for pair in _pairs(gradients)],
-            *unpacked(by_inputs),
+            _layers(ctx.structure, own), plain[0], plain[1], plain[2], into, by_inputs=plain[3]
         )
-        return None, by_inputs, *gradients
+        return None, by_points, *gradients
 
 
 def _layers(structure: tuple[tuple[int, int], ...], parameters: Sequence[Tensor]) -> list[Any]:
-    layers = zip(_pairs(parameters), structure, strict=True)
-    return [_native.PointLayer(*unpacked(*pair), *codes) for pair, codes in layers]
+    layers = []
+    for (weight, bias), (activation, extra) in zip(_pairs(parameters), structure, strict=True):
+        plain = unpacked(weight, bias)
+        layers.append(_native.PointLayer(plain[0], plain[1], activation, extra))
+    return layers
 
 
 def _pairs(tensors: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:

@@ -18,6 +18,7 @@ from mien.runtime.baked import (
     Rig,
 )
 
+_MOST_LAYERS = 64
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * coefficient."""
 
@@ -188,12 +189,30 @@ def _raw_values(
             values += raw[name]
             raw[name] = values
     elif network is not None:
-        outputs, start = run_network(network, displacement, face), 0
+        runs = _run_layers(network, displacement) if _has_native_layers(network) else None
+        outputs, start = run_network(network, displacement, face) if runs is None else runs, 0
         for name in network.outputs:
             width = raw[name][0].size if len(raw[name]) else 0
             raw[name] = raw[name] + outputs[:, start : start + width].reshape(raw[name].shape)
             start += width
     return raw
+
+
+def _has_native_layers(network: AttributeNetwork) -> bool:
+    """Whether this is a network of `_native.point_network`, as mono_gaussian_avatar has it."""
+    return network.input == "displacement" and network.activation == "relu" and len(network.weights) <= _MOST_LAYERS
+
+
+def _run_layers(network: AttributeNetwork, displacement: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n _"]:
+    """The outputs of such a network, by the same operation as in training."""
+    layers = [
+        _native.PointLayer(_contiguous_row(weight), _contiguous_row(bias), int(index + 1 < len(network.weights)), -1)
+        for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True))
+    ]
+    inputs = np.concatenate([network.base, displacement], axis=1, dtype=np.float32)
+    outputs = np.empty((len(inputs), len(network.biases[-1])), np.float32)
+    _native.point_network(layers, inputs, None, outputs)
+    return outputs
 
 
 def _has_native(network: AttributeNetwork) -> bool:
