@@ -13,7 +13,7 @@ from mien.gaussians import rgb_from_sh, sh_from_rgb
 from mien.render import rasterize
 from mien.training import Sequence, TrainSettings, train
 from mien.training.hidden import hidden_triangles, inside_triangles
-from mien.training.inside import Inside, disguise
+from mien.training.inside import Inside, disguise, disguised_reference
 from mien.training.sequence import Targets
 from toy_scene import toy_face, toy_sequence
 
@@ -110,6 +110,24 @@ def test_hidden_gaussians_have_another_colour_and_do_not_fade(toy: tuple[FaceMod
         assert gradient is not None
         assert bool(gradient[hidden].any()) == trained, name
         assert gradient[~hidden].any(), name
+
+
+def test_the_fast_disguise_is_the_reference(toy: tuple[FaceModel, Sequence]) -> None:
+    config = GaussianAvatarsConfig(sh_degree=1)
+    avatar = METHODS["gaussian_avatars"].avatar(config, toy[0], toy[1].tracking.face)
+    posed = avatar.pose(toy[1].tracking.face[0])
+    sh, opacities = (getattr(posed.gaussians, name).detach().requires_grad_() for name in ("sh", "opacities"))
+    hidden = torch.arange(len(sh)) % 3 == 0
+    posed = replace(posed, gaussians=replace(posed.gaussians, sh=sh, opacities=opacities))
+    fast = disguise(posed, avatar, hidden, torch.Generator().manual_seed(5)).gaussians
+    color = sh_from_rgb(torch.rand(3, generator=torch.Generator().manual_seed(5)))
+    plain = disguised_reference(sh, opacities, hidden, color)
+    factors = torch.rand_like(sh), torch.rand_like(opacities)
+    found = torch.autograd.grad((fast.sh, fast.opacities), (sh, opacities), factors)
+    expected = torch.autograd.grad(plain, (sh, opacities), factors)
+    assert torch.equal(fast.sh, plain[0])
+    assert torch.equal(fast.opacities, plain[1])
+    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
 
 
 def test_other_methods_have_nothing_to_disguise(toy: tuple[FaceModel, Sequence]) -> None:
