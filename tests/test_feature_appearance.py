@@ -15,6 +15,7 @@ from mien import runtime
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate, make_portable
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.feature_network import Layers, feature_network_reference
+from mien.avatar.settings import GradientSettings
 from mien.errors import UserError
 from mien.export.gaussian_avatars_folder import write_gaussian_avatars_folder
 from mien.export.packed import pack
@@ -31,6 +32,7 @@ RANK = 3
 CONFIG = GaussianAvatarsConfig(
     expression_rank=RANK, expression_colour_rate=Rate(0.0), appearance="features", appearance_features=6
 )
+GROWING = GradientSettings(start=0.2, stop=0.8, rounds=4, grow_gradient=1e-4, max_gaussians=400)
 PARTS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -65,8 +67,8 @@ def test_colour_and_opacity_change_by_the_network() -> None:
     places = positional_encoding(vertices[avatar.face_model.faces.long()].mean(1) / 0.05, 4)[store["face_index"]]
     layers = avatar.appearance._layers()
     exact = Layers(*(tensor.double() for tensor in layers))
-    given = (store["feature_bases"], activations, store["neutral_features"], places)
-    colour, opacity = feature_network_reference(*(tensor.double() for tensor in given), exact)
+    bases, neutral = store["feature_bases"].double(), store["neutral_features"].double()
+    colour, opacity = feature_network_reference(bases, activations.double(), neutral, places.double(), exact)
     posed, still = avatar.pose(face).gaussians, replace(CONFIG, expression_rank=RANK, appearance="static")
     static = GaussianAvatars(still, toy_face_model(), toy_face(5))
     static.store.load_state_dict({name: store.state_dict()[name] for name in static.store.state_dict()})
@@ -126,7 +128,7 @@ def test_features_need_activations() -> None:
 def test_density_control_keeps_every_tensor_as_long_and_every_triangle() -> None:
     face_model, sequence = toy_sequence(5, 32)
     settings = train_toy.SETTINGS
-    density = replace(train_toy.CONFIG.density, prune_opacity=0.09)
+    density = replace(GROWING, prune_opacity=0.09)
     state = start([sequence], face_model, replace(CONFIG, density=density), settings)
     data = TrainingData(FrameOrder(training_frames([sequence], settings), 0), (Targets(sequence, 0),))
     counts = set()
@@ -145,7 +147,7 @@ def test_density_control_keeps_every_tensor_as_long_and_every_triangle() -> None
 
 def test_training_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     face_model, sequence = toy_sequence(timesteps=5, size=32)
-    config = replace(CONFIG, density=train_toy.CONFIG.density)
+    config = replace(CONFIG, density=GROWING)
     whole = train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "whole")
     assert float(whole.gaussian_store()["feature_bases"].detach().abs().max()) > 0
     for stop in (14, 22):

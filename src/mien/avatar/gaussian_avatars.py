@@ -231,7 +231,7 @@ class GaussianAvatars(Avatar):
         features = None if self.appearance is None else self.appearance.bake(self.store)
         fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "reach"))
         bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in _BASES)
-        return ExpressionChanges(*fixed, *bases, features)
+        return ExpressionChanges(*fixed, *bases, features=features)
 
     @property
     def _sh_frame(self) -> Literal["world", "head"]:
