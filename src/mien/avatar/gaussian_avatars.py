@@ -2,7 +2,7 @@
 
 Written from the paper and its supplement. Comments note where the published code differs from the paper in a way that
 matters. Lengths and scales in the store are in units of the triangle's own scale (`mien.avatar.triangle_frames`).
-Changes with the expression beside those of the mesh (`expression_rank`) are not part of the paper.
+Changes with the expression beside those of the mesh (`expression_rank`, `appearance`) are not part of the paper.
 """
 
 from typing import Any, Literal
@@ -19,6 +19,7 @@ from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.bound_gaussians import pose_bound_gaussians
 from mien.avatar.density import GradientDensity, highest_opacities_seen
 from mien.avatar.expression_changes import ExpressionActivations, expression_change
+from mien.avatar.feature_appearance import FeatureAppearance, feature_tensors
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
@@ -34,6 +35,8 @@ _LEAST_OPACITY = 1 / 255
 """Gaussians below this opacity are never drawn."""
 _OPEN = 0.5
 """Sum of the opacities of a triangle's Gaussians below which its surface is open."""
+_FEATURES = ("feature_colour", "feature_opacity")
+"""Names of the changes by features."""
 _BASES = ("colour_basis", "opacity_basis", "offset_basis")
 """Names of the bases of changes with the expression."""
 
@@ -57,32 +60,40 @@ class GaussianAvatars(Avatar):
         if config.sh_degree > 0:
             trained["sh_rest"] = like.new_zeros(n, (config.sh_degree + 1) ** 2 - 1, 3)
         trained |= {name: like.new_zeros(n, *shape) for name, shape in self._basis_shapes().items()}
-        if self._basis_shapes():
+        self.appearance = None
+        if config.appearance == "features":
+            trained |= feature_tensors(trained["means"], config.expression_rank, config.appearance_features)
+            vertices = face_model.head_vertices(self.subject)[0]
+            widths = (config.appearance_features, config.appearance_hidden)
+            self.appearance = FeatureAppearance(vertices, face_model.faces, *widths)
+        if self._changes:
             self.activations = ExpressionActivations(face, self.subject, config.expression_rank)
         self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in world space, or in the head frame (`_sh_frame`), with one batch entry per timestep."""
         sh, in_head = self._active_sh(progress), self._sh_frame == "head"
-        if self._basis_shapes() and len(face) > 0:
+        if self._changes and len(face) > 0:
             return self._pose_with_changes(face, sh, in_head)
         return Posed(pose_bound_gaussians(self.face_model, face, self.store, sh, in_head), {})
 
     def _pose_with_changes(self, face: FaceParams, sh: Float[Tensor, "n k 3"], in_head: bool) -> Posed:
-        """The same with the changes of the expression, which are also returned, by the names of their bases."""
+        """The same with the changes of the expression, which are also returned by name."""
         if len(face) > 1:
             each = [self._pose_with_changes(face[timestep], sh, in_head) for timestep in range(len(face))]
-            aux = {name: torch.stack([posed.aux[name] for posed in each]) for name in self._basis_shapes()}
+            aux = {name: torch.stack([posed.aux[name] for posed in each]) for name in each[0].aux}
             return Posed(stack_timesteps([posed.gaussians for posed in each]), aux)
         (activations,) = self.activations(face)
         changes = {name: expression_change(self.store[name], activations) for name in self._basis_shapes()}
         local = {name: self.store[name] for name in ("face_index", "means", "quats", "log_scales", "opacity_logits")}
+        if self.appearance is not None:
+            changes["feature_colour"], changes["feature_opacity"] = self.appearance(self.store, activations)
         if "offset_basis" in changes:
             local["means"] = local["means"] + changes["offset_basis"]
-        if "opacity_basis" in changes:
-            local["opacity_logits"] = local["opacity_logits"] + changes["opacity_basis"]
-        if "colour_basis" in changes:
-            sh = torch.cat([sh[:, :1] + changes["colour_basis"][:, None], sh[:, 1:]], dim=1)
+        for name in (name for name in ("opacity_basis", "feature_opacity") if name in changes):
+            local["opacity_logits"] = local["opacity_logits"] + changes[name]
+        for name in (name for name in ("colour_basis", "feature_colour") if name in changes):
+            sh = torch.cat([sh[:, :1] + changes[name][:, None], sh[:, 1:]], dim=1)
         return Posed(pose_bound_gaussians(self.face_model, face, local, sh, in_head), changes)
 
     def _basis_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -90,6 +101,15 @@ class GaussianAvatars(Avatar):
         rank, rates = self.config.expression_rank, self._basis_rates()
         wanted = [name for name in _BASES if rank > 0 and rates[name].start > 0]
         return {name: (rank,) if name == "opacity_basis" else (3, rank) for name in wanted}
+
+    @property
+    def _changes(self) -> bool:
+        """Whether Gaussians change with the expression beside the mesh."""
+        return bool(self._basis_shapes()) or self.config.appearance == "features"
+
+    @property
+    def _opacity_changes(self) -> bool:
+        return "opacity_basis" in self._basis_shapes() or self.config.appearance == "features"
 
     def _basis_rates(self) -> dict[str, Rate]:
         config = self.config
@@ -99,7 +119,7 @@ class GaussianAvatars(Avatar):
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units.
 
-        With `expression_rank`, also the mean squared changes with the expression, over all Gaussians.
+        With `expression_rank` or features, also the mean squared changes with the expression, over all Gaussians.
         """
         config = self.config
         position, scale = triangle_penalties(
@@ -110,9 +130,11 @@ class GaussianAvatars(Avatar):
             weights=(config.position_weight, config.scale_weight),
         )
         losses = {"position": position, "scale": scale}
-        if posed.aux:
-            squares = [change.square().mean() for change in posed.aux.values()]
-            losses["expression"] = config.expression_weight * torch.stack(squares).sum()
+        kinds = (("expression", _BASES, config.expression_weight), ("appearance", _FEATURES, config.appearance_weight))
+        for loss, names, weight in kinds:
+            squares = [posed.aux[name].square().mean() for name in names if name in posed.aux]
+            if squares:
+                losses[loss] = weight * torch.stack(squares).sum()
         return losses
 
     def parameter_groups(self) -> list[ParameterGroup]:
@@ -128,9 +150,13 @@ class GaussianAvatars(Avatar):
             rates["sh_rest"] = Rate(config.colour_rate.start / 20)
         rates |= {name: self._basis_rates()[name] for name in self._basis_shapes()}
         extent = {"means": config.means_times_extent}
-        return [
+        groups = [
             store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
         ]
+        if self.appearance is not None:
+            own = (config.appearance_rate, config.appearance_network_rate)
+            groups += self.appearance.parameter_groups(self.store, *own)
+        return groups
 
     def gaussian_store(self) -> GaussianStore:
         """Every per-Gaussian tensor."""
@@ -141,7 +167,7 @@ class GaussianAvatars(Avatar):
         return GradientDensity(
             self.config.density,
             opacity_logits="opacity_logits",
-            judged_opacities=highest_opacities_seen if "opacity_basis" in self._basis_shapes() else resting_opacities,
+            judged_opacities=highest_opacities_seen if self._opacity_changes else resting_opacities,
             may_prune=never_empty_a_triangle,
         )
 
@@ -167,7 +193,9 @@ class GaussianAvatars(Avatar):
         drawn = store["opacity_logits"].sigmoid() * share.to(bound.device)[bound]
         store.assign("opacity_logits", torch.logit(drawn.clamp(1e-6, 1 - 1e-6)))
         filled = (opacity > _LEAST_OPACITY).nonzero()[:, 0].to(bound.device)
-        count, kept = len(store), drawn > _LEAST_OPACITY
+        # Features may raise an opacity at other expressions than that of rest.
+        lowest = share.to(bound.device)[bound] if self.config.appearance == "features" else drawn
+        count, kept = len(store), lowest > _LEAST_OPACITY
         own = self._flat(filled, opacity, colors)
         store.append(torch.zeros(len(filled), dtype=torch.long, device=bound.device), own)
         store.select(torch.cat([kept, torch.ones(len(store) - count, dtype=torch.bool, device=bound.device)]))
@@ -216,11 +244,12 @@ class GaussianAvatars(Avatar):
 
     def _bake_changes(self) -> ExpressionChanges | None:
         """The changes with the expression, or None if the settings ask for none."""
-        if not self._basis_shapes():
+        if not self._changes:
             return None
+        features = None if self.appearance is None else self.appearance.bake(self.store)
         fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "reach"))
         bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in _BASES)
-        return ExpressionChanges(*fixed, *bases)
+        return ExpressionChanges(*fixed, *bases, features=features)
 
     @property
     def _sh_frame(self) -> Literal["world", "head"]:

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, PerceptualLoss, Photometric
+from mien.errors import UserError
 from mien.ranges import FRACTION, NOT_NEGATIVE, Range
 
 
@@ -54,6 +55,19 @@ class GaussianAvatarsConfig(MethodConfig):
     If its start is 0, places do not change."""
     expression_weight: Annotated[float, NOT_NEGATIVE] = 3.0
     """Weight of the mean squared changes with the expression, which keeps changes small that pictures do not need."""
+    appearance: Literal["static", "features"] = "static"
+    """Whether a Gaussian's colour and opacity stay as they are, as in the paper, or also change with features that the
+    activations of the face blend and one small network reads, as in HeadGaS. Features need `expression_rank`."""
+    appearance_features: Annotated[int, Range(1, 256)] = 32
+    """Number of features of each Gaussian, with `appearance` features."""
+    appearance_hidden: Annotated[int, Range(1, 1024)] = 64
+    """Width of the only hidden layer of the features' network."""
+    appearance_rate: Rate = Rate(2.5e-3)
+    """Learning rate of the features, per step."""
+    appearance_network_rate: Rate = Rate(2e-3, 2e-4)
+    """Learning rate of the features' network, per step."""
+    appearance_weight: Annotated[float, NOT_NEGATIVE] = 0.1
+    """Weight of the mean squared changes of colour and opacity by features."""
     position_threshold: Annotated[float, NOT_NEGATIVE] = 1.0
     """Distance from the triangle's centre up to which a Gaussian's centre has no penalty, in triangle units."""
     position_weight: Annotated[float, NOT_NEGATIVE] = 0.01
@@ -64,6 +78,19 @@ class GaussianAvatarsConfig(MethodConfig):
     """Weight of the scale penalty, which is the scale beyond the scale threshold."""
     density: GradientSettings = field(default_factory=GradientSettings)
     """Density control: when and where Gaussians are added and removed."""
+
+    def check(self) -> None:
+        """Check that the settings fit together.
+
+        Raises:
+            UserError: features have no activations to be blended by.
+        """
+        super().check()
+        if self.appearance == "features" and self.expression_rank == 0:
+            raise UserError(
+                "--method.appearance features: features are blended by the activations of the face, and "
+                "--method.expression-rank is 0; choose a rank from 1 to 8"
+            )
 
 
 _STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000

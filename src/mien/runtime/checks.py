@@ -15,6 +15,7 @@ from mien.runtime.baked import (
     BakedAvatar,
     BlendSkinned,
     ExpressionChanges,
+    FeatureChanges,
     Filmed,
     LinearBases,
     MeshBound,
@@ -168,6 +169,22 @@ def _changes_faults(changes: ExpressionChanges, n: int, inputs: int) -> Iterator
             return
     if changes.reach[0] < 0:
         yield "the reach of its changes with the expression is negative"
+    if changes.features is not None:
+        yield from _features_faults(changes.features, n, r)
+
+
+def _features_faults(features: FeatureChanges, n: int, r: int) -> Iterator[str]:
+    width, x = features.neutral.shape[1], features.own.shape[1]
+    shapes = [array.shape for array in (features.neutral, features.basis, features.own)]
+    if shapes != [(n, width), (n, r, width), (n, x)] or width == 0:
+        yield "the shapes of the features of its changes with the expression do not fit"
+    if len(features.weights) != 2 or len(features.biases) != 2:
+        yield "the network of its features has not two layers"
+        return
+    hidden = len(features.biases[0])
+    found = [array.shape for array in (*features.weights, *features.biases)]
+    if found != [(hidden, width + x), (4, hidden), (hidden,), (4,)] or hidden == 0:
+        yield "the shapes of the layers of its features do not fit"
 
 
 def _rig_faults(rig: Rig) -> Iterator[str]:

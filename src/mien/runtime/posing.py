@@ -13,6 +13,7 @@ from mien.runtime.baked import (
     BakedAvatar,
     BlendSkinned,
     ExpressionChanges,
+    FeatureChanges,
     LinearBases,
     MeshBound,
     Rig,
@@ -164,7 +165,24 @@ def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.n
         if basis is not None:
             added[name] = np.empty(basis.shape[:-1], np.float32)
             _native.expression_change(np.ascontiguousarray(basis), activations, added[name])
+    if changes.features is not None:
+        colour, opacity_logits = feature_changes(changes.features, activations)
+        added["colour"] = added.get("colour", np.float32(0)) + colour
+        added["opacity_logits"] = added.get("opacity_logits", np.float32(0)) + opacity_logits
     return added
+
+
+def feature_changes(
+    features: FeatureChanges, activations: Float32[np.ndarray, " r"]
+) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
+    """Changes of the first SH coefficient and of the raw opacity, by the same operation as in training."""
+    layers = zip(features.weights, features.biases, strict=True)
+    arrays = [features.neutral, features.own, *(array for layer in layers for array in layer)]
+    network = _native.FeatureNetwork(*(np.ascontiguousarray(array) for array in arrays))
+    colour, opacity_logits = (np.empty((len(features.neutral), *shape), np.float32) for shape in ((3,), ()))
+    bases = [_native.FeatureBases(np.ascontiguousarray(features.basis), activations, False)]
+    _native.feature_network(network, bases, None, colour, opacity_logits)
+    return colour, opacity_logits
 
 
 def _raw_values(
