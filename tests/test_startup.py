@@ -97,10 +97,7 @@ def test_wrong_values_and_paths_import_nothing_heavy(tmp_path: Path) -> None:
         drive w --by a.csv --out b.gif
         drive w --by a.csv --out b.mp4 --fps 0
         view gone
-        view gone.mien
-        view a.csv
         view w --port 99999
-        view w --play nobody
         export w --out a.obj
         export w --out gone.ply --series nobody
         face-models --name x
