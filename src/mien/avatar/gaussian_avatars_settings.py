@@ -9,6 +9,23 @@ from mien.ranges import FRACTION, NOT_NEGATIVE, Range
 
 
 @dataclass(frozen=True)
+class SurfaceLimits:
+    """Limits that keep Gaussians flat on the surface of the mesh, in metres of the neutral head."""
+
+    enabled: bool = False
+    """Whether the limits are kept."""
+    depth: Annotated[float, NOT_NEGATIVE] = 0.0015
+    hair_share: Annotated[float, NOT_NEGATIVE] = 1.3
+    thickness: Annotated[float, NOT_NEGATIVE] = 0.0005
+    hair_thickness: Annotated[float, NOT_NEGATIVE] = 0.3
+    width: Annotated[float, NOT_NEGATIVE] = 0.006
+    hair_width: Annotated[float, NOT_NEGATIVE] = 1.0
+    ratio: Annotated[float, NOT_NEGATIVE] = 5.0
+    tilt: Annotated[float, NOT_NEGATIVE] = 20.0
+    colour_pull: Annotated[float, NOT_NEGATIVE] = 0.05
+
+
+@dataclass(frozen=True)
 class GaussianAvatarsConfig(MethodConfig):
     """Settings of GaussianAvatars. The defaults suit one fixed camera and runs of some thousand steps.
 
@@ -62,6 +79,8 @@ class GaussianAvatarsConfig(MethodConfig):
     """Scale up to which a Gaussian has no penalty, in triangle units."""
     scale_weight: Annotated[float, NOT_NEGATIVE] = 1.0
     """Weight of the scale penalty, which is the scale beyond the scale threshold."""
+    surface: SurfaceLimits = field(default_factory=SurfaceLimits)
+    """Limits that keep Gaussians on the surface of the mesh."""
     density: GradientSettings = field(default_factory=GradientSettings)
     """Density control: when and where Gaussians are added and removed."""
 
