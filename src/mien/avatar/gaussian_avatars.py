@@ -31,8 +31,12 @@ from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
 _Pair = tuple[float, float]
 """A value for centres, and one for scales."""
+_PULL = 0.05
+"""Share of the difference to the completed colour that a step takes away where no picture shows a triangle."""
 _OPAQUE = 0.97
 """Opacity of a fill."""
+_FILL_HEIGHT = 0.5
+"""Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it."""
 _HEAD_RADIUS = 0.1
 """Radius of a head, in metres."""
 _BASES = ("colour_basis", "opacity_basis", "offset_basis")
@@ -175,7 +179,7 @@ class GaussianAvatars(Avatar):
         store, bound = self.store, self.store["face_index"]
         store.assign("sh_constant", sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None])
         quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
-        height = prior.hair[bound]
+        height = _FILL_HEIGHT * prior.hair[bound]
         store.assign("means", torch.stack([0 * height, height / self._sizes[bound], 0 * height], 1))
         filled = prior.made_up[bound]
         store.assign("quats", torch.where(filled[:, None], quats[bound], store["quats"]))
@@ -188,11 +192,11 @@ class GaussianAvatars(Avatar):
     @torch.no_grad()
     def keep_to(self, prior: SurfacePrior) -> None:
         """Apply `SurfaceLimits`, and pull the colours of what is rarely seen towards the completed ones."""
-        if self.config.surface.enabled:
+        if self.config.surface.enabled or prior.made_up is not None:
             keep_on_surface(self.store, self.config.surface, self._sizes, prior.hair)
-        if prior.colors is not None and prior.doubt is not None and self.config.surface.colour_pull > 0:
+        if prior.colors is not None and prior.doubt is not None:
             bound, own = self.store["face_index"], self.store["sh_constant"].detach()[:, 0]
-            pull = self.config.surface.colour_pull * prior.doubt[bound, None]
+            pull = _PULL * prior.doubt[bound, None]
             own += pull * (sh_from_rgb(prior.colors)[bound] - own)
 
     @property

@@ -35,9 +35,10 @@ def keep_on_surface(
         most = torch.minimum(widest, log_scales[:, other] + math.log(limits.ratio))
         log_scales[:, own] = torch.minimum(log_scales[:, own], most)
     quats /= torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(1e-12)
-    # The sine of half the angle between the thin axis and the normal is the length of these two.
-    tilted = torch.hypot(quats[:, 1], quats[:, 3])
+    # The sine of half the angle between the thin axis and the normal is the length of the second and the fourth number.
+    tilted, level = torch.hypot(quats[:, 1], quats[:, 3]), torch.hypot(quats[:, 0], quats[:, 2])
     most = math.sin(math.radians(limits.tilt) / 2)
-    factor = (most / tilted.clamp_min(1e-12)).clamp_max(1)
-    quats[:, 1] *= factor
-    quats[:, 3] *= factor
+    beyond = tilted > most
+    across = torch.where(beyond, most / tilted.clamp_min(1e-12), 1.0)
+    along = torch.where(beyond, math.sqrt(1 - most * most) / level.clamp_min(1e-6), 1.0)
+    quats *= torch.stack([along, across, along, across], dim=1)

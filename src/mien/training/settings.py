@@ -39,8 +39,9 @@ class TrainSettings:
     """Learning rate of these changes, per step. It ends at a tenth."""
     unseen: Literal["trained", "filled"] = "trained"
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
-    broken from aside. Filled: they are not drawn in training, and get a closed surface in the nearest colours after it.
-    Methods that bind no Gaussians to triangles train them in either case."""
+    broken from aside. Filled: they are a closed surface in completed colours from the first step on, what is seen is
+    kept flat on the mesh, and alpha is compared with the matte (weight 0.2 or more). Methods that bind no Gaussians to
+    triangles train all sides in either case."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0

@@ -214,14 +214,14 @@ def start(
         avatar.paint(vertex_colors(face_model, sequences, faces, frames))
     colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
     unseen, filled = None, settings.unseen == "filled"
-    if avatar.triangles() is not None and (filled or avatar.wants_surface):
+    if filled or avatar.wants_surface:
         unseen = unseen_of(avatar, sequences, faces, frames, filled=filled)
         avatar.close(unseen.prior)
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
         unseen = None if unseen is None else moved(unseen, like)
-    density = density_strategy(spare_fills(avatar.density(), unseen), avatar.gaussian_store())
+    density = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     track = FaceTrack(face, method_config.face_tuning, lengths, face_model.expression_bounds)
     return TrainingState(avatar, Adam(), density, track, {}, colors, unseen=unseen)
@@ -242,7 +242,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
         posed.gaussians.timestep(0), data.targets[frame.sequence].camera(frame.camera), target.background
     )
     shown = rendering if state.colors is None else state.colors.seen_by(rendering, target.background, frame)
-    losses = picture_losses(shown, target, weights) | avatar.regularizers(posed, rendering, progress)
+    compared = weights if state.unseen is None else state.unseen.weights(weights)
+    losses = picture_losses(shown, target, compared) | avatar.regularizers(posed, rendering, progress)
     perceptual = weights.perceptual
     if perceptual.due(state.step, settings.steps):
         losses["perceptual"] = perceptual_loss(shown, target, perceptual, crop_random(settings, state.step))

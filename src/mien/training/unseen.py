@@ -1,8 +1,8 @@
 """Sides of the head that no training picture shows: a closed surface in completed colours from the first step on.
 
 What no picture shows must not help to explain pictures. Gaussians on such triangles are made up: opaque and flat, at
-the height of hair, in completed colours. Training changes nothing of them but their opacity, and that only where
-pictures clearly contradict them, as where they stand out beyond the outline.
+the height of hair, in completed colours. Training changes only their height along the normal, where pictures clearly
+contradict it, as where they stand out beyond the outline.
 """
 
 from collections.abc import Sequence as Items
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar import Avatar, DensityControl, GaussianStore, GradientDensity, SurfacePrior
+from mien.avatar import Avatar, DensityControl, GaussianStore, GradientDensity, Photometric, SurfacePrior
 from mien.face import FaceParams
 from mien.render.rendering import Rendering
 from mien.training.completion import complete_colors
@@ -21,11 +21,15 @@ from mien.training.frames import Frame
 from mien.training.hair_height import hair_height
 from mien.training.sequence import Sequence
 
-_RARE = 0.1
-"""Share of confidence below which a triangle is made up."""
-_CONTRADICTION = 3e-5
-"""Gradient of an opacity (logit) from which pictures contradict a fill. A little light shines through every avatar, so
-small gradients reach what is hidden."""
+_RARE = 0.02
+"""Confidence below which a triangle is made up."""
+_CONTRADICTION = 1e-6
+"""Gradient of a centre, in triangle units, from which pictures contradict the height of a fill. A little light shines
+through every avatar, so smaller gradients reach what is hidden."""
+
+
+_ALPHA = 0.2
+"""Least weight of the loss of alpha. Without it, white Gaussians hide fills that stand out beyond the outline."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,38 +40,45 @@ class Unseen:
     """None if only limits to the surface were asked for."""
     prior: SurfacePrior
 
-    def made_up(self, store: GaussianStore) -> Bool[Tensor, " n"] | None:
+    def weights(self, weights: Photometric) -> Photometric:
+        """The weights of the losses, with a loss of alpha if anything is filled."""
+        if self.coverage is None:
+            return weights
+        return replace(weights, alpha_weight=max(weights.alpha_weight, _ALPHA))
+
+    def made_up(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
         """The Gaussians that are filled rather than trained."""
-        return None if self.prior.made_up is None else self.prior.made_up[store["face_index"]]
+        triangles = avatar.triangles()
+        return None if self.prior.made_up is None or triangles is None else self.prior.made_up[triangles]
 
     def guard(self, avatar: Avatar, rendering: Rendering) -> None:
-        """Take the gradients from what is made up, after the backward pass, but for strong ones of opacity."""
-        store = avatar.gaussian_store()
-        made_up = self.made_up(store)
+        """Take the gradients from what is made up, after the backward pass, but for strong ones of its height."""
+        made_up = self.made_up(avatar)
         if made_up is None:
             return
-        density = avatar.density()
-        opacity = density.opacity_logits if isinstance(density, GradientDensity) else None
+        store = avatar.gaussian_store()
         for name in store.trained:
             gradient = store[name].grad
             if gradient is None:
                 continue
-            if name == opacity:
-                strong = gradient.sign() * (gradient.abs() - _CONTRADICTION).clamp_min(0)
-                gradient.copy_(torch.where(made_up, strong, gradient))
-            else:
-                gradient.masked_fill_(made_up.view(-1, *[1] * (gradient.ndim - 1)), 0)
+            # The second axis of a triangle's frame is its normal.
+            height = gradient[:, 1].clone() if name == "means" else None
+            gradient.masked_fill_(made_up.view(-1, *[1] * (gradient.ndim - 1)), 0)
+            if height is not None:
+                strong = height.sign() * (height.abs() - _CONTRADICTION).clamp_min(0)
+                gradient[:, 1] = torch.where(made_up, strong, height)
         if rendering.means2d_offset.grad is not None:
             rendering.means2d_offset.grad.masked_fill_(made_up[:, None], 0)
 
 
-def spare_fills(density: DensityControl, unseen: Unseen | None) -> DensityControl:
-    """The density control of an avatar whose fills keep their opacity at resets."""
+def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
+    """The avatar's density control, with fills that keep their opacity at resets."""
+    density = avatar.density()
     if unseen is None or unseen.prior.made_up is None or not isinstance(density, GradientDensity):
         return density
 
     def may_reset(store: GaussianStore) -> Bool[Tensor, " n"]:
-        made_up = unseen.made_up(store)
+        made_up = unseen.made_up(avatar)
         assert made_up is not None
         return ~made_up
 
@@ -88,14 +99,16 @@ def unseen_of(
     colors = complete_colors(model, neutral, found.seen, found.colors)
     shown = drawn_share(model, found)
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
-    return Unseen(found, SurfacePrior(hair, colors, doubt, (shown < _RARE) & (found.above > 0.5)))
+    made_up = (shown < _RARE) & (found.above > 0.5) if avatar.triangles() is not None else None
+    return Unseen(found, SurfacePrior(hair, colors, doubt, made_up))
 
 
 def moved(unseen: Unseen, like: Tensor) -> Unseen:
     """The same on the device of `like`."""
     prior = unseen.prior
-    tensors = {name: getattr(prior, name) for name in ("hair", "colors", "doubt", "made_up")}
     put = {
-        name: None if t is None else t.to(like if t.is_floating_point() else like.device) for name, t in tensors.items()
+        "colors": None if prior.colors is None else prior.colors.to(like),
+        "doubt": None if prior.doubt is None else prior.doubt.to(like),
+        "made_up": None if prior.made_up is None else prior.made_up.to(like.device),
     }
-    return replace(unseen, prior=SurfacePrior(**put))
+    return replace(unseen, prior=SurfacePrior(prior.hair.to(like), **put))
