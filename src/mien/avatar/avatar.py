@@ -35,6 +35,20 @@ class Posed:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfacePrior:
+    """What is known of each of the f triangles of a head without training: from the mesh, the mattes and symmetry."""
+
+    hair: Float[Tensor, " f"]
+    """Height of hair along the triangle's normal, in metres; 0 on skin."""
+    colors: Float[Tensor, "f 3"] | None = None
+    """Colours, 0..1, completed where no picture shows any. None if nothing was completed."""
+    doubt: Float[Tensor, " f"] | None = None
+    """0 for triangles that pictures show well, 1 for those that none shows. None if nothing was completed."""
+    made_up: Bool[Tensor, " f"] | None = None
+    """Triangles that are filled rather than trained: no picture shows them, and they are above the neck line."""
+
+
+@dataclass(frozen=True, eq=False)
 class ParameterGroup:
     """Tensors that share a learning rate."""
 
@@ -127,17 +141,16 @@ class Avatar(nn.Module, ABC):
         """The triangle that each Gaussian is bound to. None for methods that bind none, which train on all pixels."""
         return None
 
-    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> int:
-        """Replace what training did not draw, after the last step, if `triangles` gives something.
+    @property
+    def wants_surface(self) -> bool:
+        """Whether `keep_to` is to be called after each step, also if nothing is filled."""
+        return False
 
-        Returns the number of fills, which are the last Gaussians of the store.
+    def close(self, prior: SurfacePrior) -> None:
+        """Start from what is known of the surface, before the first step: colours, and fills of what nothing shows."""
 
-        Args:
-            share: How much of each triangle's Gaussians training drew: their opacities were multiplied by it.
-            opacity: Opacity of the fill of each triangle; 0 for none.
-            colors: Colours of the fills, 0..1.
-        """
-        return 0
+    def keep_to(self, prior: SurfacePrior) -> None:
+        """Bring Gaussians back that have left what is known of the surface, after each step."""
 
     def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
         """Close the surface of those of the chosen triangles that are less than half opaque, between two steps.

@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.arrays import unpacked
-from mien.avatar.avatar import Avatar, ParameterGroup, Posed, store_group
+from mien.avatar.avatar import Avatar, ParameterGroup, Posed, SurfacePrior, store_group
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.bound_gaussians import pose_bound_gaussians
 from mien.avatar.density import GradientDensity, highest_opacities_seen
@@ -23,7 +23,8 @@ from mien.avatar.feature_appearance import FeatureAppearance, feature_tensors
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
-from mien.avatar.triangle_frames import triangle_ellipses
+from mien.avatar.surface_limits import keep_on_surface
+from mien.avatar.triangle_frames import triangle_ellipses, triangle_frames
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import sh_from_rgb, stack_timesteps
 from mien.render.rendering import Rendering
@@ -31,12 +32,18 @@ from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
 _Pair = tuple[float, float]
 """A value for centres, and one for scales."""
-_LEAST_OPACITY = 1 / 255
-"""Gaussians below this opacity are never drawn."""
 _OPEN = 0.5
 """Sum of the opacities of a triangle's Gaussians below which its surface is open."""
 _FEATURES = ("feature_colour", "feature_opacity")
 """Names of the changes by features."""
+_PULL = 0.05
+"""Share of the difference to the completed colour that a step takes away where no picture shows a triangle."""
+_OPAQUE = 0.97
+"""Opacity of a fill."""
+_FILL_HEIGHT = 0.5
+"""Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it."""
+_HEAD_RADIUS = 0.1
+"""Radius of a head, in metres."""
 _BASES = ("colour_basis", "opacity_basis", "offset_basis")
 """Names of the bases of changes with the expression."""
 
@@ -49,6 +56,7 @@ class GaussianAvatars(Avatar):
     def __init__(self, config: GaussianAvatarsConfig, face_model: FaceModel, face: FaceParams):
         super().__init__(config, face_model, face)
         like, n = face_model.template, face_model.faces.shape[0]
+        self._known_sizes: Tensor | None = None
         trained = {
             "means": like.new_zeros(n, 3),
             "quats": like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
@@ -186,20 +194,46 @@ class GaussianAvatars(Avatar):
         """The triangle that each Gaussian is bound to."""
         return self.store["face_index"]
 
+    @property
+    def wants_surface(self) -> bool:
+        """Whether the settings limit how far Gaussians may leave the surface."""
+        return self.config.surface.enabled
+
     @torch.no_grad()
-    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> int:
-        """Remove Gaussians that were not drawn, and add a flat one of the triangle's shape where there is a fill."""
+    def close(self, prior: SurfacePrior) -> None:
+        """Completed colours everywhere, and an opaque flat Gaussian at the height of hair on what no picture shows."""
+        if prior.colors is None or prior.made_up is None:
+            return
         store, bound = self.store, self.store["face_index"]
-        drawn = store["opacity_logits"].sigmoid() * share.to(bound.device)[bound]
-        store.assign("opacity_logits", torch.logit(drawn.clamp(1e-6, 1 - 1e-6)))
-        filled = (opacity > _LEAST_OPACITY).nonzero()[:, 0].to(bound.device)
-        # Features may raise an opacity at other expressions than that of rest.
-        lowest = share.to(bound.device)[bound] if self.config.appearance == "features" else drawn
-        count, kept = len(store), lowest > _LEAST_OPACITY
-        own = self._flat(filled, opacity, colors)
-        store.append(torch.zeros(len(filled), dtype=torch.long, device=bound.device), own)
-        store.select(torch.cat([kept, torch.ones(len(store) - count, dtype=torch.bool, device=bound.device)]))
-        return len(filled)
+        store.assign("sh_constant", sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None])
+        quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
+        height = _FILL_HEIGHT * prior.hair[bound]
+        store.assign("means", torch.stack([0 * height, height / self._sizes[bound], 0 * height], 1))
+        filled = prior.made_up[bound]
+        store.assign("quats", torch.where(filled[:, None], quats[bound], store["quats"]))
+        # Hair is a shell around the head, so its ellipses are larger than the triangles.
+        wider = (height / _HEAD_RADIUS).log1p()[:, None] * log_scales.new_tensor([1.0, 0.0, 1.0])
+        store.assign("log_scales", torch.where(filled[:, None], log_scales[bound] + wider, store["log_scales"]))
+        logits = store["opacity_logits"]
+        store.assign("opacity_logits", torch.where(filled, torch.logit(torch.full_like(logits, _OPAQUE)), logits))
+
+    @torch.no_grad()
+    def keep_to(self, prior: SurfacePrior) -> None:
+        """Apply `SurfaceLimits`, and pull the colours of what is rarely seen towards the completed ones."""
+        if self.config.surface.enabled or prior.made_up is not None:
+            keep_on_surface(self.store, self.config.surface, self._sizes, prior.hair)
+        if prior.colors is not None and prior.doubt is not None:
+            bound, own = self.store["face_index"], self.store["sh_constant"].detach()[:, 0]
+            pull = _PULL * prior.doubt[bound, None]
+            own += pull * (sh_from_rgb(prior.colors)[bound] - own)
+
+    @property
+    def _sizes(self) -> Float[Tensor, " f"]:
+        """Sizes of the triangles of the neutral head, in metres per triangle unit."""
+        if self._known_sizes is None:
+            vertices = self.face_model.head_vertices(self.subject)[0]
+            self._known_sizes = triangle_frames(vertices, self.face_model.faces).k.detach()
+        return self._known_sizes
 
     @torch.no_grad()
     def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:

@@ -10,6 +10,35 @@ from mien.ranges import FRACTION, NOT_NEGATIVE, Range
 
 
 @dataclass(frozen=True)
+class SurfaceLimits:
+    """Limits that keep Gaussians flat on the mesh, where one camera cannot see how deep they lie.
+
+    Lengths are those of the neutral head. Without limits, skin that was trained from the front falls to shards when it
+    is seen from aside.
+    """
+
+    enabled: bool = False
+    """Whether the limits are kept, by a correction after each step. They are always kept with `--training.unseen
+    filled`."""
+    depth: Annotated[float, Range(0, 0.1)] = 0.003
+    """Largest distance of a centre from the mesh along the triangle's normal, in metres."""
+    hair_share: Annotated[float, Range(0, 10)] = 1.3
+    """How far a centre may lie above the scalp, beside the depth, as a multiple of the height of hair."""
+    thickness: Annotated[float, Range(1e-5, 0.1)] = 0.0005
+    """Largest scale (standard deviation) along the normal, in metres."""
+    hair_thickness: Annotated[float, Range(0, 10)] = 0.3
+    """What is added to the thickness on the scalp, as a multiple of the height of hair."""
+    width: Annotated[float, Range(1e-5, 1)] = 0.006
+    """Largest scale along the surface, in metres."""
+    hair_width: Annotated[float, Range(0, 10)] = 1.0
+    """What is added to the width on the scalp, as a multiple of the height of hair."""
+    ratio: Annotated[float, Range(1, 1000)] = 5.0
+    """Largest ratio of the two scales along the surface. Larger ones are needles."""
+    tilt: Annotated[float, Range(0, 180)] = 20.0
+    """Largest angle between a Gaussian's thin axis and the normal, in degrees."""
+
+
+@dataclass(frozen=True)
 class GaussianAvatarsConfig(MethodConfig):
     """Settings of GaussianAvatars. The defaults suit one fixed camera and runs of some thousand steps.
 
@@ -76,6 +105,8 @@ class GaussianAvatarsConfig(MethodConfig):
     """Scale up to which a Gaussian has no penalty, in triangle units."""
     scale_weight: Annotated[float, NOT_NEGATIVE] = 1.0
     """Weight of the scale penalty, which is the scale beyond the scale threshold."""
+    surface: SurfaceLimits = field(default_factory=SurfaceLimits)
+    """Limits that keep Gaussians on the surface of the mesh."""
     density: GradientSettings = field(default_factory=GradientSettings)
     """Density control: when and where Gaussians are added and removed."""
 

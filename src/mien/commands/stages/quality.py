@@ -35,7 +35,7 @@ from mien.progress import say
 from mien.storage import read_json, replace_folder, write_atomically, write_json
 from mien.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
 from mien.terminal import show
-from mien.tracking import Tracking, TrackingSettings, read_tracking
+from mien.tracking import Tracking, TrackingSettings, make_scoring, read_tracking, write_scoring, write_tracking
 from mien.training import PRESETS, TrainSettings, read_training_summary
 from mien.workspace import Workspace
 
@@ -99,7 +99,15 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
     }
     with times.measured("views"):
         unseen = score_unseen_views(reference, drawn, workspace, run)
-    row = QualityRow(reference.name, key, method, steps, summary["gaussians"], protocols, errors, times.seconds, unseen)
+    by_truth: Figures = {}
+    if reference.views is not None:
+        with times.measured("views by true tracking"):
+            true = _workspace_of_truth(drawn, workspace, Workspace(out / f"{reference.name}-true"), list(trackings))
+            run_training_stage(true, list(trackings), run, PRESETS["standard"].config(method), settings)
+            by_truth = score_unseen_views(reference, drawn, true, run)
+    row = QualityRow(
+        reference.name, key, method, steps, summary["gaussians"], protocols, errors, times.seconds, unseen, by_truth
+    )
     return row, _strip(workspace, run)
 
 
@@ -127,6 +135,24 @@ def reference_settings(reference: ReferenceCapture, settings: TrainSettings) -> 
         held_out_sequences=reference.held_out_sequences,
         held_out_cameras=reference.held_out_cameras,
     )
+
+
+def _workspace_of_truth(drawn: Path, workspace: Workspace, true: Workspace, names: list[str]) -> Workspace:
+    """Make a workspace with the same captures and the true tracking, unless it exists, and return it."""
+    for name in names:
+        own, folder = workspace.sequence_dir(name) / "capture", true.sequence_dir(name)
+        pictures, truth = read_capture_hash(own), read_truth(drawn / name / "truth").tracking
+        if (folder / "capture").is_dir() and read_capture_hash(folder / "capture") == pictures:
+            continue
+        with hold(folder):
+            remove_tree(folder / "capture")
+            write_tracking(folder / "tracking", truth)
+            scoring = make_scoring(read_capture(own), truth, load_face_model(truth.face_model), scratch=folder)
+            write_scoring(folder / "scoring", scoring, pictures)
+            # The capture comes last: it says that the rest is there.
+            shutil.copytree(own, folder / ".capture.partial", dirs_exist_ok=True)
+            replace_folder(folder / "capture", folder / ".capture.partial")
+    return true
 
 
 def score_unseen_views(reference: ReferenceCapture, drawn: Path, workspace: Workspace, run: str) -> Figures:
