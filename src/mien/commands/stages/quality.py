@@ -85,7 +85,7 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
     say(f"== {reference.name}: {reference.description}")
     key, trackings = draw_and_track(reference, drawn, workspace, times)
     run = f"{method}-{steps}"
-    settings = reference_settings(reference, TrainSettings(steps=steps))
+    settings = reference_settings(reference, replace(PRESETS["standard"].settings_of(method), steps=steps))
     with times.measured("train"):
         run_training_stage(workspace, list(trackings), run, PRESETS["standard"].config(method), settings)
     with times.measured("evaluate"):
