@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from mien import runtime
-from mien.avatar import make_portable
 from mien.capture.video import count_frames
 from mien.cli import main
 from mien.errors import UserError
@@ -34,8 +33,6 @@ from mien.viewer.faces import (
 from mien.viewer.files import TURNTABLE_FRAMES, Stopped, around, screenshot, video
 from mien.viewer.loop import STILL_SECONDS, DrawingLoop
 from mien.viewer.session import Clip, Session, centre_of
-from test_runtime import new_avatar
-from toy_scene import toy_camera
 from toy_workspace import write_toy_workspace
 from web_case import drawn_head, faces_of
 
@@ -534,34 +531,6 @@ def test_mistakes_are_told_in_one_line(
     assert "a.mien: is damaged" in complaint(capsys, str(file))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert "run `pip install 'mien[viewer]'`" in complaint(capsys, workspace)
-
-
-def test_a_workspace_is_viewed_with_its_sequences(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from mien.commands.stages import viewing
-
-    write_toy_workspace(tmp_path / "W")
-    viewed = viewing._of_workspace(tmp_path / "W", None)
-    assert viewed.mesh is not None
-    assert viewed.portable.filmed is not None
-    assert list(viewed.sequences) == ["clip"]
-    avatar = runtime.Avatar(viewed.portable)
-    clip = viewing._clip_of(viewed, tmp_path / "W", "clip")()
-    assert len(clip.motion) == 5
-    assert clip.pictures is not None
-    assert clip.pictures(4).ndim == 3
-    session = Session(avatar, viewed.mesh, {"clip": lambda: clip})
-    session.choose("clip")
-    assert session.picture(front_view(avatar, 48, 48)).shape == (48, 48, 3)
-
-
-@pytest.mark.parametrize("method", ["headgas", "mono_gaussian_avatar"])
-def test_other_methods_can_be_viewed(method: str) -> None:
-    avatar = runtime.Avatar(make_portable(new_avatar(method), toy_camera(64), "toy"))
-    session = Session(avatar)
-    before = session.picture(front_view(avatar, 48, 48))
-    session.set_expression(avatar.expression_names[0], 1.0)
-    assert session.picture(front_view(avatar, 48, 48)).shape == before.shape
-    assert np.isfinite(centre_of(avatar)).all()
 
 
 def test_draw_without_a_mesh_draws_the_avatar(avatar: runtime.Avatar) -> None:
