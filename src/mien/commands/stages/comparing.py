@@ -100,7 +100,7 @@ def run_compare_stage(
         subjects = [_of_workspace(workspace, settings) for workspace in workspaces]
         rows: list[MethodRow] = []
         content: dict[str, Any] = {}
-        for subject in (*subjects, *(_of_reference(reference, out) for reference in references)):
+        for subject in (*subjects, *(_of_reference(reference, out, settings) for reference in references)):
             for method in settings.methods:
                 say(f"== {subject.name}: {method}")
                 rows.append(_row(subject, method, settings, out))
@@ -122,14 +122,14 @@ def _of_workspace(workspace: Workspace, settings: CompareSettings) -> _Subject:
     names = workspace.tracked_names()
     if not names:
         raise UserError(f"{workspace.root}: no tracked sequences; run `mien track {workspace.root}`")
-    held = TrainSettings(split=settings.split)
+    held = replace(PRESETS[settings.preset].settings, split=settings.split)
     return _Subject(workspace.root.resolve().name, workspace, names, held)
 
 
-def _of_reference(reference: ReferenceCapture, out: Path) -> _Subject:
+def _of_reference(reference: ReferenceCapture, out: Path, settings: CompareSettings) -> _Subject:
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
     _, trackings = draw_and_track(reference, drawn, workspace, StageTimes(workspace.root / "seconds.json"))
-    held = reference_settings(reference, TrainSettings())
+    held = reference_settings(reference, PRESETS[settings.preset].settings)
     return _Subject(reference.name, workspace, list(trackings), held, reference, drawn)
 
 
