@@ -178,7 +178,6 @@ def test_skin_is_painted_by_skin(toy: tuple[FaceModel, Sequence], tmp_path: Path
     for inside in ("free", "covered"):
         avatar = train([sequence], model, GaussianAvatarsConfig(), replace(SETTINGS, inside=inside), tmp_path / inside)
         shares[inside] = inner_share(avatar, model, sequence)
-    print(shares)
     assert shares["free"] > 0.1
     assert shares["covered"] < 0.5 * shares["free"]
 
