@@ -178,7 +178,6 @@ def test_skin_is_painted_by_skin(toy: tuple[FaceModel, Sequence], tmp_path: Path
     for inside in ("free", "covered"):
         avatar = train([sequence], model, GaussianAvatarsConfig(), replace(SETTINGS, inside=inside), tmp_path / inside)
         shares[inside] = inner_share(avatar, model, sequence)
-    print(shares)
     assert shares["free"] > 0.1
     assert shares["covered"] < 0.5 * shares["free"]
 
@@ -186,7 +185,10 @@ def test_skin_is_painted_by_skin(toy: tuple[FaceModel, Sequence], tmp_path: Path
 def test_a_run_resumes_exactly(toy: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
     """It stops after the step at which the surface is closed, and before it."""
     model, sequence = toy
-    settings, config = replace(SETTINGS, steps=6, checkpoint_every=2, record_every=1), GaussianAvatarsConfig()
+    settings, config = (
+        replace(SETTINGS, inside="furnished", steps=6, checkpoint_every=2, record_every=1),
+        GaussianAvatarsConfig(),
+    )
     whole = train([sequence], model, config, settings, tmp_path / "cut")
     means = whole.gaussian_store()["means"].clone()
     for lost in ("6", "[46]"):

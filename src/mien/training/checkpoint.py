@@ -42,7 +42,7 @@ class TrainingState:
     unseen: Unseen | None = None
     """What no training picture shows, if it is filled. It depends on the data alone, so checkpoints lack it."""
     inside: Inside | None = None
-    """What is inside the head, if it is covered. Checkpoints lack it for the same reason."""
+    """What is inside the mouth, if it is furnished. Checkpoints lack it for the same reason."""
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:

@@ -42,11 +42,12 @@ class TrainSettings:
     broken from aside. Filled: they are a closed surface in completed colours from the first step on, what is seen is
     kept flat on the mesh, and alpha is compared with the matte (weight 0.2 or more). Methods that bind no Gaussians to
     triangles train all sides in either case."""
-    inside: Literal["free", "covered"] = "free"
+    inside: Literal["free", "covered", "furnished"] = "free"
     """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
     them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in
-    each step, so that lids and lips become opaque; and what is hardly ever seen gets a surface in plausible colours.
-    Methods that bind no Gaussians to triangles have no such Gaussians."""
+    each step, so that lids and lips become opaque. Furnished: also, a mouth that is hardly ever seen gets a surface in
+    dark colours at half of the run, which can show as dark spots on cheeks from aside. Methods that bind no Gaussians
+    to triangles have no such Gaussians."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0

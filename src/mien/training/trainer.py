@@ -134,7 +134,8 @@ def train(
             return load_avatar(run_dir)
         like = like_on(choose_device(settings.device))
         state = start(sequences, face_model, method_config, settings, like)
-        inside = None if state.inside is None else inside_triangles(face_model)
+        covers = settings.inside != "free" and state.avatar.triangles() is not None
+        inside = inside_triangles(face_model) if covers else None
         parts_of = face_model if method_config.photometric.needs_parts or inside is not None else None
         targets = [
             Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside) for sequence in sequences
@@ -235,7 +236,7 @@ def start(
         unseen = unseen_of(avatar, sequences, faces, frames, filled=filled)
         avatar.close(unseen.prior)
     inside = None
-    if settings.inside == "covered" and avatar.triangles() is not None:
+    if settings.inside == "furnished" and avatar.triangles() is not None:
         known = None if unseen is None else unseen.coverage
         inside = inside_of(avatar, coverage(face_model, sequences, faces, frames) if known is None else known)
     if like is not None:
