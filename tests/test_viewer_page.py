@@ -239,14 +239,19 @@ def test_nothing_is_left_after_the_end(session: Session, capfd: pytest.CaptureFi
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_signals_end_the_command(number: signal.Signals, code: int, tmp_path: Path) -> None:
     runtime.write_portable(tmp_path / "a.mien", drawn_head(100))
-    command = [sys.executable, "-m", "mien.cli", "view", str(tmp_path / "a.mien")]
+    # A shell lets its background jobs, such as these tests, ignore Ctrl-C.
+    heard = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); from mien.cli import main"
+    command = [sys.executable, "-c", f"{heard}; sys.exit(main())", "view", str(tmp_path / "a.mien")]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        line = process.stderr.readline()
-        assert line.startswith("Open http://127.0.0.1:")
-        assert request(int(line.split(":")[2].partition("/")[0]))[0] == 200
-        os.kill(process.pid, number)
-        out, told = process.communicate(timeout=PATIENCE_SECONDS)
+        try:
+            assert process.stderr is not None
+            line = process.stderr.readline()
+            assert line.startswith("Open http://127.0.0.1:")
+            assert request(int(line.split(":")[2].partition("/")[0]))[0] == 200
+            os.kill(process.pid, number)
+            out, told = process.communicate(timeout=PATIENCE_SECONDS)
+        finally:
+            process.kill()
     assert process.returncode == code
     assert told == ("The viewer is closed\n" if code == 0 else "")
     assert out == ""
