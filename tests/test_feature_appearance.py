@@ -172,17 +172,6 @@ def stopping(at: int, title: str, total: int, completed: int) -> Iterator[Advanc
     yield advance
 
 
-def test_fills_and_gaussians_that_features_show_remain() -> None:
-    avatar, faces = new_avatar(), len(toy_face_model().faces)
-    avatar.store.assign("opacity_logits", torch.full((faces,), -9.0))
-    share, opacity = torch.ones(faces), torch.zeros(faces)
-    share[3], opacity[3] = 0, 0.8
-    assert avatar.fill(share, opacity, torch.full((faces, 3), 0.5)) == 1
-    assert len(avatar.store) == faces
-    assert (avatar.store["face_index"] == 3).nonzero().tolist() == [[faces - 1]]
-    assert not avatar.store["feature_bases"][-1].any()
-
-
 def test_formats_that_hold_no_features_say_so(tmp_path: Path) -> None:
     avatar = new_avatar()
     with pytest.raises(UserError, match="a page cannot hold features of Gaussians"):
