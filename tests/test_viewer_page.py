@@ -247,7 +247,11 @@ def test_signals_end_the_command(number: signal.Signals, code: int, tmp_path: Pa
             assert process.stderr is not None
             line = process.stderr.readline()
             assert line.startswith("Open http://127.0.0.1:")
-            assert request(int(line.split(":")[2].partition("/")[0]))[0] == 200
+            port = int(line.split(":")[2].partition("/")[0])
+            assert request(port)[0] == 200
+            with socket.create_connection(("127.0.0.1", port)) as vanished:
+                vanished.sendall(b"GET / HT")
+            time.sleep(0.5)
             os.kill(process.pid, number)
             out, told = process.communicate(timeout=PATIENCE_SECONDS)
         finally:

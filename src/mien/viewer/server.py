@@ -4,6 +4,7 @@ import contextlib
 import errno
 import http.client
 import io
+import logging
 import math
 import socket
 import warnings
@@ -58,6 +59,8 @@ class Serving:
     def __init__(self, session: Session, door: Door, port: int, title: str) -> None:
         """Start the server; the arguments are those of `serve`."""
         chosen = _free_port(door.host, port)
+        # A client that vanishes in the middle of a request is no error of the viewer.
+        logging.getLogger("websockets").setLevel(logging.CRITICAL)
         with _quiet(), _guarded(door):
             self._server = viser.ViserServer(host=door.host, port=chosen, label="mien", verbose=False)
         try:
@@ -85,6 +88,8 @@ class Serving:
 
     def stop(self) -> None:
         """Close all connections, and end all threads."""
+        # Connections that are still open are cut, which asyncio would report.
+        logging.getLogger("asyncio").setLevel(logging.CRITICAL)
         self._panel.stop()
         self.loop.stop()
         with _quiet():
