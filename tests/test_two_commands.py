@@ -13,7 +13,7 @@ from capture_helpers import tree_bytes
 from mien.cli import main
 from mien.locks import lock_file
 from other_process import Holder
-from two_commands import RANK, Outcome, Pair, Studio, pair, toy_studio
+from two_commands import RANK, Outcome, Pair, Studio, pair, toy_studio, waits_to_meet
 
 ROUNDS = 30
 TWO_RUNS = ["--runs", "alone", "twin"]
@@ -270,17 +270,24 @@ def test_two_analyses_of_one_run(studio: Studio, both: Pair, tmp_path: Path) -> 
 
 
 def test_create_beside_evaluate(studio: Studio, both: Pair) -> None:
-    """`create` beside `evaluate` works on a finished run without figures, and on a run that has to be trained first."""
+    """`create` beside `evaluate` works on a finished run without figures, and on a run that has to be trained first.
+
+    Each needs its own time until it writes, so the quicker one waits by what the rounds before measured.
+    """
     runs, told, figures = studio.root / "runs", 0, []
+    waits: dict[bool, tuple[float, float]] = {True: (0, 0), False: (0, 0)}
     for index in range(4 * ROUNDS):
         if index >= ROUNDS and told > MEETINGS:
             break
         name, run = f"e{index}", runs / f"e{index}"
         shutil.copytree(runs / "alone", run, ignore=shutil.ignore_patterns("metrics.json", "report.html", "videos"))
-        if index % 3 == 2:
+        trained = index % 3 != 2
+        if not trained:
             (run / "training.json").unlink()
         create = ["create", str(studio.video), "--out", str(studio.root), "--run", name, *studio.create_options]
-        outcomes = both.run(create, ["evaluate", str(studio.root), "--run", name])
+        outcomes = both.run(create, ["evaluate", str(studio.root), "--run", name], waits=waits[trained])
+        if all(outcome.code == 0 for outcome in outcomes):
+            waits[trained] = waits_to_meet(waits[trained], outcomes)
         if "missing; run `mien train` again" in outcomes[1].told:  # it came first, and there was nothing to evaluate
             assert outcomes[0].code == 0
         else:
