@@ -10,9 +10,11 @@ void bind_memory(nanobind::module_& module);
 void bind_mesh(nanobind::module_& module);
 void bind_mesh_align(nanobind::module_& module);
 void bind_photometric(nanobind::module_& module);
+void bind_point_network(nanobind::module_& module);
 void bind_rig(nanobind::module_& module);
 void bind_ride(nanobind::module_& module);
 void bind_rasterize(nanobind::module_& module);
+void bind_skin_points(nanobind::module_& module);
 void bind_training(nanobind::module_& module);
 
 NB_MODULE(_native, module) {
@@ -27,8 +29,10 @@ NB_MODULE(_native, module) {
   bind_mesh(module);
   bind_mesh_align(module);
   bind_photometric(module);
+  bind_point_network(module);
   bind_rig(module);
   bind_ride(module);  // after the face and the rig, whose classes it takes
   bind_rasterize(module);
+  bind_skin_points(module);
   bind_training(module);
 }

@@ -30,7 +30,7 @@ def make_experiment(timesteps: int = 50, split: Split = "blocks", seed: int = 0)
     avatar = METHODS[DEFAULT_METHOD].avatar(METHODS[DEFAULT_METHOD].config(), face_model, face)
     _paint(avatar)
     camera = camera_from_fov(0.6, SIZE, SIZE, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
-    sequence = _sequence(avatar, face, camera)
+    sequence = drawn_sequence(avatar, face, camera)
     test = held_out(timesteps, split).tolist()
     frames = [Frame(0, t, 0) for t in range(timesteps)]
     crops = np.tile(np.array([16, 8, 40, 56], np.int64), (timesteps, 1, 1))
@@ -69,7 +69,8 @@ def _paint(avatar: Avatar) -> None:
         store["sh_constant"].copy_(sh_from_rgb(rgb)[:, None])
 
 
-def _sequence(avatar: Avatar, face: FaceParams, camera: Camera) -> Sequence:
+def drawn_sequence(avatar: Avatar, face: FaceParams, camera: Camera) -> Sequence:
+    """Return the pictures of an avatar as a sequence with exact tracking."""
     images = np.zeros((len(face), 1, SIZE, SIZE, 3), np.uint8)
     alphas = np.zeros((len(face), 1, SIZE, SIZE), np.uint8)
     with torch.no_grad():

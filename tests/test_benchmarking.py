@@ -14,7 +14,7 @@ import torch
 from mien import _native
 from mien.avatar.headgas_settings import PRESETS as HEADGAS_PRESETS
 from mien.benchmarking import device as device_benchmark
-from mien.benchmarking import headgas_step, train_step
+from mien.benchmarking import headgas_step, mono_step, train_step
 from mien.benchmarking import render as render_benchmark
 from mien.benchmarking.charts import write_scaling_chart
 from mien.benchmarking.scenes import head_scene
@@ -118,6 +118,16 @@ def test_a_headgas_case_trains() -> None:
         step(state, data, train_step.SETTINGS)
     assert before.shape == (500, 20, 4)
     assert not torch.equal(before, state.avatar.gaussian_store()["bases"])
+
+
+def test_a_mono_gaussian_avatar_case_trains() -> None:
+    state, data = mono_step.mono_case(load_face_model(), 4000, (96, 80))
+    before = state.avatar.gaussian_store()["means"].detach().clone()
+    assert 0.2 < (data.targets[0].target(0, 0, np.full(3, 255, np.uint8), False).matte > 127).float().mean() < 0.8
+    for _ in range(3):
+        step(state, data, train_step.SETTINGS)
+    assert before.shape == (4000, 3)
+    assert not torch.equal(before, state.avatar.gaussian_store()["means"])
 
 
 def test_waiting_for_a_picture_is_measured_with_and_without_the_worker() -> None:

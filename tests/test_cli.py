@@ -52,7 +52,7 @@ def test_help_shows_no_line_breaks_of_the_source_and_no_empty_defaults(
     command = importlib.import_module(f"mien.commands.{name.replace('-', '_')}").Command
     hints = get_type_hints(readable(command), include_extras=True).values()
     texts = [mark.help for hint in hints for mark in get_args(hint)[1:] if getattr(mark, "help", None)]
-    assert texts or name == "bench"  # which has sub-commands alone
+    assert texts or name in ("bench", "study")  # which have sub-commands alone
     assert not [text for text in texts if "\n" in text]
     with pytest.raises(SystemExit):
         main([name, "--help-all"])
@@ -101,7 +101,7 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
         ("create a.mp4 --out here --steps many", ("--steps", "'many'")),
         ("create a.mp4 --out here --preset fast", ("'fast'", "draft")),
         ("export here --out", ("--out",)),
-        ("bench nothing", ("nothing", "render, train-step, scaling, quality")),
+        ("bench nothing", ("nothing", "render, train-step, scaling, quality, compare")),
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(

@@ -1,5 +1,6 @@
 """Train only what is seen: coverage of triangles, what training draws, the fill, and what views say about it."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,16 +8,21 @@ import numpy as np
 import pytest
 import torch
 
-from mien.avatar import METHODS, GaussianAvatarsConfig, load_avatar
+from mien.avatar import METHODS, Avatar, GaussianAvatarsConfig, GaussianStore, Progress, SurfacePrior, load_avatar
+from mien.avatar.gaussian_avatars_settings import SurfaceLimits
+from mien.avatar.surface_limits import keep_on_surface
 from mien.avatar.triangle_frames import triangle_ellipses
 from mien.errors import UserError
 from mien.face import FaceModel
+from mien.gaussians import rgb_from_sh
 from mien.render import rasterize
+from mien.rotation import matrix_from_quaternion
 from mien.training import Sequence, TrainSettings, filmed_words, read_coverage, train
 from mien.training.coverage import Coverage, coverage, drawn_share, smoothstep
+from mien.training.density_control import density_strategy
 from mien.training.filmed import FILE, filmed_yaws, view_of_head, write_coverage
 from mien.training.frames import Frame, training_frames
-from mien.training.unseen import Unseen, unseen_of
+from mien.training.unseen import Unseen, spare_fills, unseen_of
 from toy_scene import toy_face, toy_sequence
 
 SETTINGS = TrainSettings(steps=6, split="none", unseen="filled", checkpoint_every=3, record_every=1)
@@ -93,40 +99,77 @@ def test_a_triangle_behind_another_is_hidden(toy: tuple[FaceModel, Sequence]) ->
     assert not seen[half:].any()
 
 
-def test_only_what_is_seen_is_drawn_and_trained(toy: tuple[FaceModel, Sequence]) -> None:
+def known(toy: tuple[FaceModel, Sequence], avatar: Avatar) -> Unseen:
+    sequence = toy[1]
+    frames = training_frames([sequence], SETTINGS)
+    return unseen_of(avatar, [sequence], [sequence.tracking.face], frames, filled=True)
+
+
+def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
+    """Fills have no gradients but those that move them along their normal."""
     model, sequence = toy
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
-    unseen = unseen_of(avatar, [sequence], [sequence.tracking.face], training_frames([sequence], SETTINGS))
+    unseen = known(toy, avatar)
+    avatar.close(unseen.prior)
+    made_up = unseen.made_up(avatar)
+    assert made_up is not None
+    assert made_up.any()
+    assert not made_up.all()
+    behind = replace(sequence.tracking.face[0], head_rotation=torch.tensor([[0.0, 3.0, 0.0]]))
+    rendering = rasterize(avatar.pose(behind).gaussians.timestep(0), sequence.tracking.cameras[0], torch.ones(3))
+    rendering.image[:, :24].sum().backward()
+    store = avatar.gaussian_store()
+    before = {name: gradient.clone() for name in store.trained if (gradient := store[name].grad) is not None}
+    assert before["sh_constant"][made_up].any()
+    unseen.guard(avatar, rendering)
+    for name, gradient in before.items():
+        guarded = store[name].grad
+        assert guarded is not None
+        assert torch.equal(guarded[~made_up], gradient[~made_up])
+        if name != "means":
+            assert not guarded[made_up].any()
+    moved = store["means"].grad
+    assert moved is not None
+    assert moved[made_up][:, 1].any()
+    assert not moved[made_up][:, [0, 2]].any()
+
+
+def test_fills_keep_their_opacity_at_resets(toy: tuple[FaceModel, Sequence]) -> None:
+    model, sequence = toy
+    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    unseen = known(toy, avatar)
+    avatar.close(unseen.prior)
+    density = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store())
     posed = avatar.pose(sequence.tracking.face[0])
-    hidden = unseen.hide(posed, avatar)
-    torch.testing.assert_close(hidden.gaussians.opacities, posed.gaussians.opacities * unseen.share)
-    rasterize(hidden.gaussians.timestep(0), sequence.tracking.cameras[0], torch.ones(3)).image.sum().backward()
-    gradient = avatar.gaussian_store()["opacity_logits"].grad
-    assert gradient is not None
-    assert gradient[unseen.share > 0.5].any()
-    assert not gradient[unseen.share == 0].any()
+    density.adapt(avatar.gaussian_store(), posed, Progress(39, 100, 0, 1.0), lambda: torch.Generator())
+    opacities, made_up = avatar.gaussian_store()["opacity_logits"].sigmoid(), unseen.made_up(avatar)
+    assert made_up is not None
+    assert (opacities[made_up] > 0.9).all()
+    assert (opacities[~made_up] < 0.011).all()
 
 
 def test_other_methods_train_on_everything(toy: tuple[FaceModel, Sequence]) -> None:
     model, sequence = toy
     avatar = METHODS["headgas"].avatar(METHODS["headgas"].config(), model, sequence.tracking.face)
-    zero = torch.zeros(len(model.faces))
-    unseen = Unseen(Coverage(zero, torch.zeros(len(zero), 3), zero), zero)
-    posed = avatar.pose(sequence.tracking.face[0])
-    before = len(avatar.gaussian_store())
-    unseen.fill(avatar)
-    assert unseen.hide(posed, avatar) is posed
-    assert len(avatar.gaussian_store()) == before
+    unseen = known(toy, avatar)
+    assert unseen.coverage is not None
+    assert unseen.made_up(avatar) is None
+    density = avatar.density()
+    assert type(spare_fills(avatar, unseen)) is type(density)
+    before = avatar.gaussian_store()["means"].clone()
+    avatar.close(unseen.prior)
+    avatar.keep_to(unseen.prior)
+    assert torch.equal(avatar.gaussian_store()["means"], before)
 
 
-def test_the_fill_closes_the_head(toy: tuple[FaceModel, Sequence]) -> None:
+def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     """From behind, where nothing was seen, the head is opaque and has the colours of the fill."""
     model, sequence = toy
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
-    share = (facing(model) > 0).float()
-    colors = torch.tensor([0.2, 0.4, 0.6]).expand(len(share), 3)
-    avatar.fill(share, 0.97 * (1 - share), colors)
-    assert len(avatar.gaussian_store()) == len(share)
+    made_up = facing(model) <= 0
+    colors = torch.tensor([0.2, 0.4, 0.6]).expand(len(made_up), 3)
+    avatar.close(SurfacePrior(torch.zeros(len(made_up)), colors, made_up.float(), made_up))
+    assert len(avatar.gaussian_store()) == len(made_up)
     vertices = model.head_vertices(avatar.subject)[0]
     camera = view_of_head(vertices, 180)
     turned = replace(avatar.subject, head_rotation=torch.zeros(1, 3), head_translation=torch.zeros(1, 3))
@@ -135,17 +178,46 @@ def test_the_fill_closes_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     assert rendering.alpha[middle, middle].min() > 0.95
     color = rendering.image[middle, middle].reshape(-1, 3).mean(0)
     torch.testing.assert_close(color, colors[0], atol=0.03, rtol=0)
+    hair = SurfacePrior(torch.full((len(made_up),), 0.02), colors, made_up.float(), made_up)
+    avatar.close(hair)
+    assert (avatar.gaussian_store()["means"][:, 1] > 0).all()
 
 
-def test_a_fill_of_nothing_removes_what_was_not_drawn(toy: tuple[FaceModel, Sequence]) -> None:
+def test_colours_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Sequence]) -> None:
     model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(sh_degree=1), model, sequence.tracking.face)
-    share = torch.linspace(0, 1, len(model.faces))
-    avatar.fill(share, torch.zeros_like(share), torch.zeros(len(share), 3))
-    left = avatar.gaussian_store()["face_index"]
-    assert len(left) < len(share)
-    assert (share[left] > 0.03).all()
-    torch.testing.assert_close(avatar.gaussian_store()["opacity_logits"].sigmoid(), 0.1 * share[left])
+    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    doubt = (facing(model) <= 0).float()
+    before = avatar.gaussian_store()["sh_constant"].detach().clone()
+    prior = SurfacePrior(0 * doubt, torch.ones(len(doubt), 3), doubt, doubt > 0)
+    for _ in range(200):
+        avatar.keep_to(prior)
+    colors = avatar.gaussian_store()["sh_constant"].detach()
+    assert torch.equal(colors[doubt == 0], before[doubt == 0])
+    torch.testing.assert_close(rgb_from_sh(colors[doubt > 0][:, 0]), torch.ones(int(doubt.sum()), 3), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("hair", [0.0, 0.01])
+def test_limits_keep_gaussians_on_the_surface(hair: float) -> None:
+    torch.manual_seed(0)
+    count, limits = 200, SurfaceLimits(enabled=True)
+    values = {"means": torch.randn(count, 3), "quats": torch.randn(count, 4), "log_scales": torch.randn(count, 3)}
+    store = GaussianStore(values, {"face_index": torch.arange(count) % 5})
+    sizes = torch.tensor([0.001, 0.002, 0.004, 0.01, 0.1])
+    keep_on_surface(store, limits, sizes, torch.full((5,), hair))
+    size = sizes[store["face_index"]]
+    height, scales = store["means"][:, 1] * size, store["log_scales"].exp() * size[:, None]
+    assert (height <= limits.depth + limits.hair_share * hair + 1e-7).all()
+    assert (height >= -limits.depth - 1e-7).all()
+    assert (scales[:, 1] <= limits.thickness + limits.hair_thickness * hair + 1e-7).all()
+    flat = scales[:, [0, 2]]
+    assert (flat <= limits.width + limits.hair_width * hair + 1e-7).all()
+    assert (flat.amax(1) / flat.amin(1) <= limits.ratio * 1.0001).all()
+    normal = matrix_from_quaternion(torch.nn.functional.normalize(store["quats"], dim=1))[:, 1, 1]
+    assert (normal >= math.cos(math.radians(limits.tilt)) - 1e-5).all()
+    before = {name: store[name].clone() for name in store.names()}
+    keep_on_surface(store, limits, sizes, torch.full((5,), hair))
+    for name, value in before.items():
+        torch.testing.assert_close(store[name], value)
 
 
 def test_ellipses_have_the_moments_of_their_triangles() -> None:
@@ -159,7 +231,7 @@ def test_ellipses_have_the_moments_of_their_triangles() -> None:
     rotation = matrix_from_quaternion(world[0])
     found = rotation @ torch.diag_embed(scales[0] ** 2) @ rotation.mT
     corners = vertices[faces] - vertices[faces].mean(1, keepdim=True)
-    expected = 2.5**2 / 12 * torch.einsum("fci,fcj->fij", corners, corners)
+    expected = 2.0**2 / 12 * torch.einsum("fci,fcj->fij", corners, corners)
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = normal / normal.norm(dim=-1, keepdim=True)
     thin = torch.einsum("f,fi,fj->fij", scales[0].amin(-1) ** 2, normal, normal)

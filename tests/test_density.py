@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
+from mien.adam import Moments
 from mien.avatar import (
     FixedDensity,
     GaussianStore,
@@ -191,6 +194,41 @@ def test_refill_deletes_the_unseen_and_reaches_its_target() -> None:
     distance = (store["means"].detach() - 3 * store["face_index"][:, None] - torch.arange(3.0)).abs()
     assert distance[2:].max() <= 0.5
     assert distance[2:].min() > 0
+
+
+@given(
+    opacities=st.lists(st.floats(0, 1, width=32), min_size=1, max_size=40),
+    target=st.integers(1, 80),
+    seed=st.integers(0, 99),
+)
+def test_every_refill_keeps_the_store_whole(opacities: list[float], target: int, seed: int) -> None:
+    """Survivors keep their order, values and moments; children fill up to the target beside them, with new moments."""
+    n, seen = len(opacities), torch.tensor(opacities)
+    store = make_store([0.001] * n)
+    store.moments["means"] = Moments(torch.arange(1.0, n + 1)[:, None].repeat(1, 3), torch.ones(n, 3), torch.zeros(()))
+    described = RefillDensity(
+        RefillSettings((0.5,), (target,)),
+        refill=lambda store, parents, noise, fraction: {"means": store["means"].detach()[parents] + noise},
+    )
+    strategy = density_strategy(described, store)
+    posed = pose(store)
+    strategy.observe(Posed(replace(posed.gaussians, opacities=seen), {}), rendering([0.0] * n))
+    assert strategy.adapt(store, posed, Progress(49, 100), lambda: torch.Generator().manual_seed(seed))
+    kept = (seen >= 0.1).nonzero()[:, 0]
+    kept = kept if len(kept) > 0 else seen.argmax()[None]
+    assert len(store) == max(len(kept), target)
+    moments = store.moments["means"]
+    assert isinstance(moments, Moments)
+    assert {len(store[name]) for name in store.names()} == {len(moments.first), len(moments.second), len(store)}
+    assert store["face_index"][: len(kept)].tolist() == kept.tolist()
+    assert torch.equal(store["means"].detach()[: len(kept)], torch.arange(3.0 * n).reshape(n, 3)[kept])
+    assert torch.equal(moments.first[: len(kept), 0], kept + 1.0)
+    assert not moments.first[len(kept) :].any()
+    children = store["means"].detach()[len(kept) :] - 3 * store["face_index"][len(kept) :, None] - torch.arange(3.0)
+    assert set(store["face_index"].tolist()) <= set(kept.tolist())
+    assert children.abs().max() <= 0.5 + 1e-5 if len(children) else True
+    assert strategy.state()["opacity"].shape == (len(store),)
+    assert not strategy.state()["opacity"].any()
 
 
 def test_refill_survives_when_nothing_was_seen() -> None:

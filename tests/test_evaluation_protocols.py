@@ -160,8 +160,8 @@ def test_evaluation_goes_on_where_it_was(
     drawn: list[Frame] = []
     original = protocols._drawn
 
-    def stopping(experiment: Experiment, frames: list[Frame], baselines: object) -> Iterator:
-        for item in original(experiment, frames, baselines):  # type: ignore[arg-type]
+    def stopping(experiment: Experiment, frames: list[Frame], *more: object) -> Iterator:
+        for item in original(experiment, frames, *more):  # type: ignore[arg-type]
             drawn.append(item[0])
             yield item
             if len(drawn) == 12:

@@ -27,6 +27,7 @@ from toy_workspace import write_evaluated_workspace
 
 COMMANDS = (
     "render W --out OUT/a.png --size 32",
+    "view W",
     "export W --out OUT/a.ply",
     "drive W --by W --out OUT/b.mp4 --size 32",
     "evaluate W --no-perceptual",
@@ -38,6 +39,8 @@ COMMANDS = (
     "export W --out OUT/folder --format gaussian-avatars",
     "import OUT/avatar --out W",
     "analyze gaussian-avatars W --parts growth",
+    "study make W --out OUT/a.html",
+    "bench compare W --out OUT/compared --steps 1",
 )
 FOLDERS = (
     "sequences", "runs", "sequences/clip", "sequences/clip/capture", "sequences/clip/capture/cache",

@@ -6,17 +6,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, Progress
+from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, Progress, Rate
+from mien.avatar.encoding import positional_encoding
 from mien.avatar.mono_gaussian_avatar import (
-    blend_transforms,
-    face_decay,
+    CANONICAL_JAW,
+    canonical_face,
     nearest_vertices,
-    points_at,
-    rendering_radius,
-    unskin,
 )
-from mien.avatar.mono_networks import LENGTH_UNIT, AttributeChangeNet, AttributeNet, DeformationNet
-from mien.face import FaceModel, head_poses
+from mien.avatar.mono_gaussian_avatar_settings import LENGTH_UNIT
+from mien.avatar.mono_networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
+from mien.avatar.mono_schedule import Schedule, ScheduleName
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import rgb_from_sh
 from mien.render.rendering import Rendering
 from toy_scene import toy_face, toy_face_model
@@ -56,15 +57,66 @@ def test_starts_on_a_sphere_with_grey_translucent_points() -> None:
     assert ((gaussians.scales > 0.0211) & (gaussians.scales < 0.0211 + 0.00625)).all()
 
 
+def canonical_places(avatar: MonoGaussianAvatar) -> Tensor:
+    means = avatar.store["means"]
+    return means + LENGTH_UNIT * avatar.deformation.whole(means / LENGTH_UNIT).offset
+
+
 def test_canonical_face_leaves_points_at_their_canonical_places() -> None:
     avatar = new_avatar(face_model=with_pose_correctives())
     canonical = avatar.canonical_face()
-    torch.testing.assert_close(canonical.expression[0], toy_face(5).expression.mean(0))
     posed = avatar.pose(canonical)
-    torch.testing.assert_close(posed.gaussians.means[0], posed.aux["canonical"], atol=1e-6, rtol=0)
-    offset = avatar.deformation(avatar.store["means"] / LENGTH_UNIT)[0]
-    torch.testing.assert_close(posed.aux["canonical"], avatar.store["means"] + LENGTH_UNIT * offset)
+    torch.testing.assert_close(posed.gaussians.means[0], canonical_places(avatar), atol=1e-6, rtol=0)
     assert (avatar.pose(toy_face(5)[1]).gaussians.means - posed.gaussians.means).norm(dim=-1).max() > 1e-3
+
+
+def test_canonical_jaw_is_open() -> None:
+    """A jaw that follows the expression opens by its coefficient, a free one by its angle."""
+    follows = toy_face_model()
+    jaw = follows.joint_names.index("jaw")
+    mean = toy_face(5).expression.mean(0)
+    expression, joints = canonical_face(follows, mean)
+    opening = follows.joint_rotation_basis[:, jaw, 0]
+    assert float(expression @ opening) == pytest.approx(CANONICAL_JAW, abs=1e-6)
+    # Only the coefficient that opens the jaw most has changed.
+    assert (expression != mean).nonzero()[:, 0].tolist() == [int(opening.argmax())]
+    assert joints.abs().max() == 0
+    free = replace(
+        follows,
+        joint_free=tuple(
+            name == "jaw" or was for name, was in zip(follows.joint_names, follows.joint_free, strict=True)
+        ),
+        joint_rotation_basis=torch.zeros_like(follows.joint_rotation_basis),
+    )
+    expression, joints = canonical_face(free, mean)
+    assert torch.equal(expression, mean)
+    turned = joints[free.free_joint_names.index("jaw")]
+    torch.testing.assert_close(turned, torch.tensor([CANONICAL_JAW, 0, 0]))
+    assert joints.abs().sum() == turned.abs().sum()
+    headless = replace(follows, joint_names=tuple("chin" if name == "jaw" else name for name in follows.joint_names))
+    assert torch.equal(canonical_face(headless, mean)[0], mean)
+
+
+def test_a_point_on_the_still_bone_stays_in_the_world_while_the_head_moves() -> None:
+    avatar, face = new_avatar(), toy_face(5)
+    k = len(avatar.face_model.joint_names)
+    with torch.no_grad():
+        avatar.deformation.skinning.weight.zero_()
+        avatar.deformation.skinning.bias.copy_(10.0 * torch.eye(k + 1)[k])
+        avatar.deformation.directions.weight.zero_()
+        avatar.deformation.directions.bias.zero_()
+    face = replace(face, head_rotation=torch.randn(5, 3), head_translation=torch.randn(5, 3))
+    world = [points_in_world(avatar, face[index]) for index in range(5)]
+    for other in world[1:]:
+        torch.testing.assert_close(other, world[0], atol=1e-5, rtol=0)
+    with torch.no_grad():  # the head's bone
+        avatar.deformation.skinning.bias.copy_(10.0 * torch.eye(k + 1)[0])
+    assert (points_in_world(avatar, face[0]) - points_in_world(avatar, face[1])).abs().max() > 0.1
+
+
+def points_in_world(avatar: MonoGaussianAvatar, face: FaceParams) -> Tensor:
+    pose, means = head_poses(face)[0], avatar.pose(face).gaussians.means[0]
+    return means @ pose[:3, :3].T + pose[:3, 3]
 
 
 class Perfect(torch.nn.Module):
@@ -74,11 +126,17 @@ class Perfect(torch.nn.Module):
         super().__init__()
         self.model = face_model
 
-    def forward(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def whole(self, points: Tensor) -> Deformation:
         model, basis = self.model, self.model.pose_basis
         assert basis is not None
         expression = model.expression_basis.permute(1, 2, 0) / LENGTH_UNIT
-        return torch.zeros_like(points), expression, basis.permute(1, 2, 0) / LENGTH_UNIT, model.skinning_weights
+        weights = torch.nn.functional.pad(model.skinning_weights, (0, 1))
+        return Deformation(torch.zeros_like(points), expression, basis.permute(1, 2, 0) / LENGTH_UNIT, weights)
+
+    def forward(self, points: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        found = self.whole(points)
+        directions = torch.cat([found.expression, found.pose], dim=-1)
+        return found.offset, torch.einsum("nxc,bc->bnx", directions, coefficients), found.weights
 
 
 def perfect_avatar() -> MonoGaussianAvatar:
@@ -102,6 +160,7 @@ def test_vertices_with_their_own_directions_move_as_the_mesh_does() -> None:
 
 def test_vertices_with_their_own_directions_cost_nothing() -> None:
     avatar = perfect_avatar()
+    avatar.config = replace(SMALL, face_points=len(avatar.store))
     losses = avatar.regularizers(avatar.pose(toy_face(5)[1]), pictured(len(avatar.store)), Progress(0, 100))
     assert max(loss.item() for loss in losses.values()) < 1e-9
 
@@ -114,23 +173,25 @@ def test_losses_near_the_face_model_are_those_of_the_paper() -> None:
     losses = avatar.regularizers(posed, pictured(30), Progress(step, 100))
     # Points 48 .. 59, in turn, of 30.
     rows = torch.arange(18, 30)
+    found = avatar.deformation.whole(avatar.store["means"][rows] / LENGTH_UNIT)
     vertices = face_model.head_vertices(avatar.canonical_face())[0]
-    nearest = (posed.aux["canonical"][rows, None] - vertices).norm(dim=-1).argmin(1)
-    weights = posed.aux["weights"][rows] - face_model.skinning_weights[nearest]
+    nearest = (canonical_places(avatar)[rows, None] - vertices).norm(dim=-1).argmin(1)
+    weights = found.weights - torch.nn.functional.pad(face_model.skinning_weights[nearest], (0, 1))
     expected = 10 * 0.1 * weights.square().mean()
     torch.testing.assert_close(losses["skinning"], expected)
     assert face_model.pose_basis is not None
     # Lengths are four times life size.
-    pose = 4 * (posed.aux["pose"][rows] - face_model.pose_basis[:, nearest].permute(1, 2, 0))
+    pose = found.pose - 4 * face_model.pose_basis[:, nearest].permute(1, 2, 0)
     torch.testing.assert_close(losses["pose_correctives"], 10 * 10 * (10 * pose).square().mean())
     variance = toy_face(5).expression.var(0, correction=0)
     # Coefficients and directions in units where the mean variance of coefficients is 1.
     unit = variance.mean()
-    expression = (
-        4 * unit.sqrt() * (posed.aux["expression"][rows] - face_model.expression_basis[:, nearest].permute(1, 2, 0))
-    )
+    expression = unit.sqrt() * (found.expression - 4 * face_model.expression_basis[:, nearest].permute(1, 2, 0))
     expected = 10 * 10 * ((10 * expression).square() / (variance / unit * 2)).mean()
     torch.testing.assert_close(losses["expression_directions"], expected)
+    torch.stack(list(losses.values())).sum().backward()
+    # The points do not feel these losses.
+    assert avatar.store["means"].grad is None
 
 
 def test_expressions_that_never_move_stay_finite() -> None:
@@ -142,26 +203,13 @@ def test_expressions_that_never_move_stay_finite() -> None:
         assert all(loss.isfinite() for loss in losses.values())
 
 
-def test_unskin_undoes_blended_transforms() -> None:
-    torch.manual_seed(0)
-    face_model = toy_face_model()
-    face = replace(toy_face(5), joints=torch.randn(5, 1, 3))
-    weights = torch.rand(20, 3).softmax(-1)
-    transforms = blend_transforms(weights, face_model.joint_transforms(face))[2]
-    points = torch.randn(20, 3)
-    moved = torch.stack(
-        [transform[:, :3] @ x + transform[:, 3] for transform, x in zip(transforms, points, strict=True)]
-    )
-    torch.testing.assert_close(unskin(moved, transforms), points, atol=1e-5, rtol=1e-5)
-
-
 def test_attributes_are_those_at_rest_and_their_change() -> None:
     avatar, face = new_avatar(), toy_face(5)[3]
-    posed = avatar.pose(face, Progress(50, 100))
-    got = posed.gaussians
-    moved = (got.means[0] - posed.aux["canonical"]) / LENGTH_UNIT
+    got = avatar.pose(face, Progress(50, 100)).gaussians
+    moved = (got.means[0] - canonical_places(avatar)) / LENGTH_UNIT
     raw = avatar.attributes(avatar.store["means"] / LENGTH_UNIT) + avatar.change(moved)
-    torch.testing.assert_close(got.scales[0], 0.00625 * raw[:, :3].sigmoid() + rendering_radius(0.5))
+    radius = Schedule("code", 100, 30).rendering_radius(0.5)
+    torch.testing.assert_close(got.scales[0], 0.00625 * raw[:, :3].sigmoid() + radius)
     torch.testing.assert_close(got.quats[0], raw[:, 3:7] / raw[:, 3:7].norm(dim=-1, keepdim=True))
     torch.testing.assert_close(got.opacities[0], raw[:, 7].sigmoid())
     torch.testing.assert_close(rgb_from_sh(got.sh[0, :, 0]), raw[:, 8:].sigmoid())
@@ -177,52 +225,159 @@ def test_attributes_do_not_pull_at_points() -> None:
     assert avatar.store["means"].grad is not None
 
 
-def test_flattened_change_network_is_the_same_function() -> None:
+def linear(layer: torch.nn.Module) -> torch.nn.Linear:
+    assert isinstance(layer, torch.nn.Linear)
+    return layer
+
+
+def softplus(values: Tensor) -> Tensor:
+    return torch.nn.functional.softplus(values, beta=100)
+
+
+def test_change_network_has_the_published_layers() -> None:
     torch.manual_seed(0)
     network, values = AttributeChangeNet(16), torch.randn(9, 3)
-    expected = network(values)
-    weights, biases = network.flattened()
-    for index, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        values = values @ weight.T + bias
-        values = values.relu() if index < 3 else values
-    torch.testing.assert_close(values, expected)
+    first, second, third = network.trunk
+    trunk = third(second(first(values).relu()).relu())  # no activation after the third
+    heads = zip(network.heads, network.outputs, strict=True)
+    expected = torch.cat([output(head(trunk).relu()) for head, output in heads], dim=-1)
+    torch.testing.assert_close(network(values), expected)
+
+
+def test_attribute_network_has_the_published_layers() -> None:
+    torch.manual_seed(0)
+    network, points = AttributeNet(48, 7, 6), torch.randn(9, 3)
+    encoding = values = positional_encoding(points, 6)
+    for index, layer in enumerate(network.trunk):
+        if index == 3:
+            assert values.shape[1] == 48 - 39
+            values = torch.cat([values, encoding], dim=-1) / 2**0.5
+        values = softplus(layer(values))
+    hidden = [softplus(head(values)) for head in network.heads]
+    hidden[3] = network.colour(hidden[3])
+    expected = torch.cat([output(one) for output, one in zip(network.outputs, hidden, strict=True)], dim=-1)
+    torch.testing.assert_close(network(points), expected)
+
+
+@torch.no_grad()
+def test_attribute_network_starts_with_the_published_weights() -> None:
+    torch.manual_seed(0)
+    network = AttributeNet(256, 7, 6)
+    first, last, skip = (linear(network.trunk[index]) for index in (0, -1, 3))
+    # The waves have no effect at first, and the positions have no more than theirs.
+    assert first.weight[:, 3:].abs().max() == skip.weight[:, -36:].abs().max() == 0
+    assert float(first.weight[:, :3].std()) == pytest.approx((2 / 256) ** 0.5, rel=0.1)
+    assert float(last.weight.mean()) == pytest.approx((torch.pi / 256) ** 0.5, rel=1e-3)
+    assert float(last.weight.std()) == pytest.approx(1e-4, rel=0.1)
+    assert last.bias.unique().tolist() == pytest.approx([-0.6])
+    # About the distance to a sphere.
+    points = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
+    distances = []
+    for radius in (0.7, 1.4):
+        values = encoding = positional_encoding(radius * points, 6)
+        for index, layer in enumerate(network.trunk):
+            values = softplus(layer(torch.cat([values, encoding], -1) / 2**0.5 if index == 3 else values))
+        distances.append(float(values.mean()))
+    assert distances[1] > distances[0] + 0.2
+
+
+def test_summed_directions_are_exactly_the_sums_of_directions() -> None:
+    torch.manual_seed(0)
+    network = DeformationNet(16, 4, 9, 5).double()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    points, coefficients = torch.randn(7, 3).double(), torch.randn(2, 13).double()
+    offset, moved, weights = network(points, coefficients)
+    found = network.whole(points)
+    directions = torch.cat([found.expression, found.pose], dim=-1)
+    torch.testing.assert_close(moved, torch.einsum("nxc,bc->bnx", directions, coefficients))
+    torch.testing.assert_close(offset, found.offset)
+    torch.testing.assert_close(weights, found.weights)
+    values = points
+    for layer in network.trunk:
+        values = softplus(layer(values))
+    expected = network.directions(values).unflatten(-1, (3, 14))
+    torch.testing.assert_close(torch.cat([found.offset[..., None], directions], dim=-1), expected)
+    torch.testing.assert_close(weights, (20 * network.skinning(softplus(network.hidden(values)))).softmax(-1))
 
 
 def test_deformation_starts_as_nothing_with_even_weights() -> None:
-    offset, expression, pose, weights = DeformationNet(16, 4, 9, 5)(torch.randn(7, 3))
-    assert offset.abs().max() == expression.abs().max() == pose.abs().max() == 0
-    torch.testing.assert_close(weights, torch.full((7, 5), 0.2))
+    found = DeformationNet(16, 4, 9, 5).whole(torch.randn(7, 3))
+    assert found.offset.abs().max() == found.expression.abs().max() == found.pose.abs().max() == 0
+    torch.testing.assert_close(found.weights, torch.full((7, 5), 0.2))
 
 
 @pytest.mark.parametrize("layers", [2, 3, 4, 7])
 def test_attribute_network_of_any_depth(layers: int) -> None:
     """The attribute network can have any depth."""
-    assert AttributeNet(48, layers)(torch.randn(5, 3)).shape == (5, 11)
+    assert AttributeNet(48, layers, 6)(torch.randn(5, 3)).shape == (5, 11)
 
 
-def test_schedules_are_the_papers() -> None:
-    # Epochs over 100; the paper's radii are in lengths four times ours.
-    epochs = {0: 8.44e-2, 4.9: 8.44e-2, 5: 6.3e-2, 30: 1.5e-2, 60: 7.6e-3, 80: 2.4e-3}
-    for epoch, radius in epochs.items():
-        assert rendering_radius(epoch / 100) == pytest.approx(radius / 4, rel=0.02)
-    assert rendering_radius(1.0) == rendering_radius(0.99)
-    counts = {0: 400, 5: 800, 10: 1600, 25: 10_000, 29: 10_000, 45: 40_000, 60: 100_000, 100: 100_000}
-    assert {epoch: points_at(epoch / 100, 400) for epoch in counts} == counts
-    assert [face_decay(time) for time in (0.0, 0.2, 0.3, 0.5, 0.7, 1.0)] == [1, 0.5, 0.25, 0.125, 0.0625, 0.0625]
+def radii(name: ScheduleName, epochs: int) -> dict[int, float]:
+    """Radii by epoch, in the paper's lengths."""
+    schedule = Schedule(name, epochs, 400)
+    return {epoch: 4 * schedule.rendering_radius(epoch / epochs) for epoch in range(epochs)}
+
+
+def test_schedules_are_those_of_paper_and_code() -> None:
+    code, paper = radii("code", 130), radii("paper", 130)
+    expected = {0: 8.44e-2, 4: 8.44e-2, 5: 6.3e-2, 30: 1.5e-2, 60: 7.6e-3, 80: 2.4e-3, 100: 7.6e-4, 120: 2.4e-4}
+    for epoch, radius in expected.items():
+        assert code[epoch] == pytest.approx(radius, rel=0.02), epoch
+    # The paper's shrinks: every 5 epochs up to 40, every 10 up to 60, every 5 up to 100.
+    shrinks = [*range(5, 45, 5), 50, 60, *range(65, 105, 5)]
+    for epoch, radius in paper.items():
+        assert radius == pytest.approx(8.4375e-2 * 0.75 ** sum(epoch >= at for at in shrinks)), epoch
+    counts = {
+        "code": {0: 400, 5: 800, 10: 1600, 25: 10_000, 29: 10_000, 35: 20_000, 45: 40_000, 50: 80_000, 60: 100_000},
+        "paper": {0: 400, 5: 800, 10: 1600, 25: 10_000, 30: 20_000, 35: 40_000, 40: 80_000, 49: 80_000, 50: 100_000},
+    }
+    for name in ("code", "paper"):
+        schedule = Schedule(name, 130, 400)
+        assert {epoch: schedule.points_at(epoch / 130) for epoch in counts[name]} == counts[name]
+        assert 4 * schedule.sampling_length(101 / 130) == 0.004
+        assert schedule.sampling_length(100 / 130) == schedule.rendering_radius(100 / 130)
+    decays = [Schedule("code", 100, 400).face_decay(epoch / 100) for epoch in (0, 20, 30, 50, 70, 99)]
+    assert decays == [1, 0.5, 0.25, 0.125, 0.0625, 0.0625]
+
+
+def test_the_end_of_a_run_changes_nothing() -> None:
+    schedule = Schedule("code", 100, 400)
+    assert schedule.rendering_radius(1.0) == schedule.rendering_radius(0.999)
+    assert schedule.rendering_radius(0.949) > schedule.rendering_radius(0.95)
 
 
 def test_rounds_grow_to_the_limit_and_no_further() -> None:
-    settings = new_avatar(MonoGaussianAvatarConfig(rounds=100, max_points=5000)).density().settings
+    settings = new_avatar(MonoGaussianAvatarConfig(max_points=5000)).density().settings
     targets = dict(zip(settings.times, settings.targets, strict=True))
+    assert len(targets) == 99
     assert (targets[0.04], targets[0.05], targets[0.19], targets[0.2], targets[0.99]) == (400, 800, 3200, 5000, 5000)
     assert settings.prune_opacity == 0.1
 
 
-def test_children_are_in_a_cube_about_their_parents() -> None:
-    avatar = new_avatar()
+def test_children_are_around_their_parents() -> None:
     parents, noise = torch.tensor([3, 7]), torch.tensor([[0.5, -0.5, 0.0], [0.1, 0.2, 0.3]])
-    children = avatar.density().refill(avatar.store, parents, noise, 0.3)["means"]
-    torch.testing.assert_close(children, avatar.store["means"][parents] + noise * rendering_radius(0.3))
+    for name in ("code", "paper"):
+        avatar = new_avatar(replace(SMALL, schedule=name))
+        children = avatar.density().refill(avatar.store, parents, noise, 0.3)["means"]
+        away = (children - avatar.store["means"][parents]) / Schedule(name, 100, 30).rendering_radius(0.3)
+        if name == "code":
+            torch.testing.assert_close(away, noise, atol=1e-5, rtol=0)
+        else:
+            torch.testing.assert_close(away.norm(dim=-1), torch.ones(2), atol=1e-5, rtol=0)
+            assert (away * noise).sum(-1).min() > 0
+
+
+def test_rates_halve_at_their_times() -> None:
+    avatar = new_avatar(replace(SMALL, network_rate=Rate(1e-3), means_rate=Rate(1e-4), rate_halvings=(0.5, 0.75)))
+    for group in avatar.parameter_groups():
+        rates = [group.rate_at(Progress(step, 100)) / group.rate_at(Progress(0, 100)) for step in (0, 49, 50, 75, 99)]
+        assert rates == [1, 1, 0.5, 0.25, 0.25], group.name
+
+
+def test_an_avatar_of_an_older_version_is_refused_in_one_line() -> None:
+    with pytest.raises(UserError, match="older version of mono_gaussian_avatar"):
+        MonoGaussianAvatarConfig.upgraded({"points": 400, "rounds": 50})
 
 
 def test_nearest_vertices() -> None:

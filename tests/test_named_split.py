@@ -14,7 +14,7 @@ from mien.commands.stages import training as training_stage
 from mien.commands.stages.evaluating import _driver_folders
 from mien.errors import UserError
 from mien.tracking import write_tracking
-from mien.training import TrainSettings, doubly_held_out, split_by_name, with_named_split
+from mien.training import PRESETS, TrainSettings, doubly_held_out, split_by_name, with_named_split
 from mien.training.frames import training_frames
 from mien.training.named_split import SEQUENCES, driving_sequences
 from toy_scene import toy_sequence
@@ -148,7 +148,8 @@ def test_train_takes_the_split_by_name(tmp_path: Path, asked: list[Any], capsys:
     assert main(["train", str(root), "--split", "gaussian-avatars"]) == 0
     names, settings = asked.pop()
     assert names == [*FOLDERS[:10]]
-    assert settings == replace(NAMED, held_out_sequences=("EXP-2-eyes",), held_out_cameras=("08",))
+    held = {"held_out_sequences": ("EXP-2-eyes",), "held_out_cameras": ("08",)}
+    assert settings == replace(PRESETS["standard"].settings, split="gaussian-avatars", **held)
     shown = capsys.readouterr().err
     assert "held out are the sequence EXP-2-eyes and camera 08; not used: FREE, SEN-01" in shown
     assert "warning" not in shown

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 import torch
 
-from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress
+from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate
+from mien.avatar.mono_schedule import Schedule, ScheduleName
 from mien.camera import Camera
 from mien.errors import UserError
 from mien.training import PRESETS, TrainSettings, check_run, train
@@ -120,6 +121,59 @@ def test_docs_name_every_setting_that_differs_from_the_default_and_its_value() -
                 assert f"{group}.{field}" in table, field
     for name, words in (("density.max_gaussians", "200,000"), ("density.rounds", "295"), ("density.split_size", ".01")):
         assert words in table[name]
+
+
+# -- MonoGaussianAvatar ------------------------------------------------------------------------------------------------
+
+
+def mono_table() -> dict[str, str]:
+    page = PAGE.read_text()
+    own = page[page.index("## MonoGaussianAvatar") :]
+    rows = re.findall(r"^\| (`[a-z_., `]+) \|(.*)\|$", own, flags=re.MULTILINE)
+    return {name: words for names, words in rows for name in re.findall(r"`([a-z_.]+)`", names)}
+
+
+def test_mono_gaussian_avatar_has_the_papers_sizes_rates_and_schedules() -> None:
+    paper: Any = PRESETS["paper"].config("mono_gaussian_avatar")
+    assert PRESETS["paper"].settings_of("mono_gaussian_avatar").steps == 300_000
+    sizes = (paper.attribute_width, paper.attribute_layers, paper.deformation_width, paper.change_width)
+    assert sizes == (256, 7, 128, 64)
+    assert (paper.points, paper.max_points, paper.encoding_bands, paper.sphere_start) == (400, 100_000, 6, True)
+    # A head model of four times life size: radius .5, scales .025, rate 1e-4.
+    assert (4 * paper.sphere_radius, 4 * paper.scale_gain, 4 * paper.means_rate.start) == (0.5, 0.025, 1e-4)
+    assert (paper.network_rate, paper.face_weight) == (Rate(1e-4), 10)
+    assert [round(120 * time) for time in paper.rate_halvings] == [80, 100]
+    tuning = paper.face_tuning
+    for rate in (tuning.expression, tuning.joints, tuning.head_rotation):
+        assert (rate.start, round(rate.begin * 120), rate.end) == (5e-4, 10, None)
+    photometric = paper.photometric
+    weights = (photometric.l1_weight, photometric.ssim_weight, photometric.perceptual.weight)
+    assert weights == (1, 0.25, 0.1)
+
+
+def test_docs_name_every_setting_of_mono_gaussian_avatar_that_differs_from_the_default() -> None:
+    paper: Any = PRESETS["paper"].config("mono_gaussian_avatar")
+    default, table = type(paper)(), mono_table()
+    for field in type(paper).__dataclass_fields__:
+        if getattr(paper, field) != getattr(default, field):
+            names = [name for name in table if name.split(".")[0] == field]
+            assert names, field
+    for name, words in {"max_points": "100,000", "epochs": "120", "attribute_width": "256, 7"}.items():
+        assert words in table[name].split("|")[1], name
+
+
+def test_docs_have_the_counts_and_radii_of_both_schedules() -> None:
+    rows = re.findall(r"^\| (\d+) \| ([\d,]+) \| (\S+) \| ([\d,]+) \| (\S+) \|$", PAGE.read_text(), flags=re.MULTILINE)
+    assert len(rows) == 9
+    for epoch, *cells in rows:
+        names: tuple[ScheduleName, ...] = ("paper", "code")
+        for name, count, radius in zip(names, cells[::2], cells[1::2], strict=True):
+            schedule = Schedule(name, 120, 400)
+            assert schedule.points_at(int(epoch) / 120) == int(count.replace(",", "")), (epoch, name)
+            assert 4 * schedule.rendering_radius(int(epoch) / 120) == pytest.approx(float(radius), rel=0.035), (
+                epoch,
+                name,
+            )
 
 
 # -- the extent of the cameras ----------------------------------------------------------------------------------------

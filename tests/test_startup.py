@@ -14,7 +14,7 @@ from mien.cli import COMMANDS
 from mien.commands.options import MethodName
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
-LAZY_ROOMS = ["analysis", "avatar", "capture", "driving", "export", "tracking", "training"]
+LAZY_ROOMS = ["analysis", "avatar", "capture", "driving", "export", "tracking", "training", "viewer"]
 SCRIPT = """
 import json, os, sys
 from mien.cli import main
@@ -27,6 +27,70 @@ for line in json.loads(sys.argv[1]):
     found.append([code, sorted(sys.modules)])
 print(json.dumps(found), file=sys.__stdout__)
 """
+WRONG_VALUES = """
+capture gone.mp4 --out w
+capture a.mp4 --out w --capture.size 3
+capture a.mp4 --out a.csv
+capture a.mp4 --out w --capture.mattes gone
+create gone.mp4 --out w
+create a.mp4 a.mp4 --out w
+create a.mp4 --out w --steps -3
+create a.mp4 --out w --method nerf
+create a.mp4 --out w --method.sh-degree 9
+create a.mp4 --out w --method.no-such-setting 1
+create a.mp4 --out w --config gone.json
+create a.mp4 --out w --run a/b
+create a.mp4 --out a.csv
+track gone
+track .
+train gone
+train w --hold-out nobody
+train w --sequences nobody
+evaluate
+evaluate gone
+evaluate w --run nobody
+evaluate w w
+evaluate --images gone --truth gone
+evaluate w --perceptual-frames -1
+analyze gaussian-avatars gone
+analyze gaussian-avatars w --run nobody
+analyze gaussian-avatars w --parts hair
+analyze gaussian-avatars w --steps 0
+analyze nerf w
+render gone --out a.png
+render w --out a.gif
+render w --out b.png --size 9999
+render w --out b.png --background pinkish
+render w --out b.mp4 --frames 0
+render w --out b.mp4 --sequence nobody
+drive gone --by a.csv --out b.mp4
+drive w --by gone --out b.mp4
+drive w --by a.csv --out b.gif
+drive w --by a.csv --out b.mp4 --fps 0
+view gone
+view gone.mien
+view a.csv
+view w --port 99999
+view w --play nobody
+export w --out a.obj
+export w --out gone.ply --series nobody
+face-models --name x
+face-models --add gone.npz
+bench scaling --plot a.txt
+bench quality --steps -1
+bench compare
+bench compare gone
+bench compare w --minutes 2 --steps 3
+bench compare w --methods nerf
+study make gone --out a.html
+study make w --out a.html
+study make w --out a.mp4
+study make w --out a.html --side 100
+study tally gone.json gone.json
+demo --seconds 9999
+demo --out a.csv
+"""
+"""Command lines with a mistake in a value or a path, for a workspace `w` and files `a.*`."""
 
 
 def modules_after(lines: list[list[str]], folder: Path) -> list[tuple[int, set[str]]]:
@@ -56,56 +120,7 @@ def test_wrong_values_and_paths_import_nothing_heavy(tmp_path: Path) -> None:
         (tmp_path / name).write_text("{}")
     for name in ("a.mp4", "a.csv", "a.npz"):
         (tmp_path / name).touch()
-    text = """
-        capture gone.mp4 --out w
-        capture a.mp4 --out w --capture.size 3
-        capture a.mp4 --out a.csv
-        capture a.mp4 --out w --capture.mattes gone
-        create gone.mp4 --out w
-        create a.mp4 a.mp4 --out w
-        create a.mp4 --out w --steps -3
-        create a.mp4 --out w --method nerf
-        create a.mp4 --out w --method.sh-degree 9
-        create a.mp4 --out w --method.no-such-setting 1
-        create a.mp4 --out w --config gone.json
-        create a.mp4 --out w --run a/b
-        create a.mp4 --out a.csv
-        track gone
-        track .
-        train gone
-        train w --hold-out nobody
-        train w --sequences nobody
-        evaluate
-        evaluate gone
-        evaluate w --run nobody
-        evaluate w w
-        evaluate --images gone --truth gone
-        evaluate w --perceptual-frames -1
-        analyze gaussian-avatars gone
-        analyze gaussian-avatars w --run nobody
-        analyze gaussian-avatars w --parts hair
-        analyze gaussian-avatars w --steps 0
-        analyze nerf w
-        render gone --out a.png
-        render w --out a.gif
-        render w --out b.png --size 9999
-        render w --out b.png --background pinkish
-        render w --out b.mp4 --frames 0
-        render w --out b.mp4 --sequence nobody
-        drive gone --by a.csv --out b.mp4
-        drive w --by gone --out b.mp4
-        drive w --by a.csv --out b.gif
-        drive w --by a.csv --out b.mp4 --fps 0
-        export w --out a.obj
-        export w --out gone.ply --series nobody
-        face-models --name x
-        face-models --add gone.npz
-        bench scaling --plot a.txt
-        bench quality --steps -1
-        demo --seconds 9999
-        demo --out a.csv
-    """
-    lines: list[list[str]] = [[*line.split()] for line in text.strip().splitlines()]
+    lines: list[list[str]] = [[*line.split()] for line in WRONG_VALUES.strip().splitlines()]
     expect_light(lines, tmp_path, 2)
 
 

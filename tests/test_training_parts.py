@@ -184,6 +184,17 @@ def test_loss_inside_the_box_of_difference_is_that_of_the_whole_picture(
     assert loss["alpha"].item() == pytest.approx(expected)
 
 
+def test_gradient_of_the_loss_of_alpha_is_that_of_the_mean_difference() -> None:
+    random = torch.Generator().manual_seed(0)
+    alpha = torch.rand(7, 9, generator=random).requires_grad_()
+    matte = torch.randint(0, 256, (7, 9), generator=random, dtype=torch.uint8)
+    rendering = Rendering(torch.ones(7, 9, 3), alpha, torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
+    target = Target(torch.full((7, 9, 3), 255, dtype=torch.uint8), matte, (0, 0, 9, 7), torch.ones(3))
+    (found,) = torch.autograd.grad(2 * picture_losses(rendering, target, Photometric(alpha_weight=0.5))["alpha"], alpha)
+    (expected,) = torch.autograd.grad((alpha - matte / 255).abs().mean(), alpha)
+    torch.testing.assert_close(found, expected)
+
+
 def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:
     store = GaussianStore({"means": torch.linspace(-1, 1, 12).reshape(4, 3)})
     network = torch.nn.Linear(3, 2)

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,10 @@ from capture_helpers import tree_bytes
 from mien.cli import main
 from mien.locks import lock_file
 from other_process import Holder
-from two_commands import RANK, Outcome, Pair, Studio, pair, toy_studio
+from two_commands import RANK, Outcome, Pair, Studio, pair, toy_studio, waits_to_meet
 
 ROUNDS = 30
+TWO_RUNS = ["--runs", "alone", "twin"]
 MEETINGS = ROUNDS // 4  # a pair that meets less often goes on, up to four times as many rounds
 
 
@@ -58,6 +60,17 @@ def both(cache: Path) -> Iterator[Pair]:
         yield processes
 
 
+@contextmanager
+def twin_run(studio: Studio) -> Iterator[None]:
+    """Let the workspace have a second run, which a study needs."""
+    runs = studio.root / "runs"
+    shutil.copytree(runs / "alone", runs / "twin")
+    try:
+        yield
+    finally:
+        shutil.rmtree(runs / "twin")
+
+
 def commands_that_write(studio: Studio, folder: Path) -> dict[str, tuple[Path, list[str]]]:
     """Return commands by name, each with the place that it writes."""
     root, video, runs = studio.root, str(studio.video), studio.root / "runs"
@@ -78,6 +91,8 @@ def commands_that_write(studio: Studio, folder: Path) -> dict[str, tuple[Path, l
         "import": (runs / "new", ["import", str(studio.avatar_folder), "--out", str(root), "--run", "new"]),
         "demo": (folder / "demo" / "synthetic-0-1s.mp4", ["demo", "--out", str(folder / "demo"), "--seconds", "1"]),
         "bench quality": (folder / "q" / "quality", ["bench", "quality", "--out", str(folder / "q")]),
+        "bench compare": (folder / "q" / "compare", ["bench", "compare", str(root), "--out", str(folder / "q")]),
+        "study": (folder / "a.html", ["study", "make", str(root), "--out", str(folder / "a.html"), *TWO_RUNS]),
         "face-models": (
             Path(os.environ["MIEN_CACHE"]) / "face_models" / "added" / "pixels",
             ["face-models", "--add", f"{video}/0.png", "--name", "pixels"],
@@ -89,14 +104,14 @@ def test_every_command_that_writes_tells_who_is_at_it(
     other: Holder, studio: Studio, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     commands = commands_that_write(studio, tmp_path)
-    before = tree_bytes(studio.root)
-    with other.holding(*{place for place, _ in commands.values()}):
+    with twin_run(studio), other.holding(*{place for place, _ in commands.values()}):
+        before = tree_bytes(studio.root)
         for name, (place, command) in commands.items():
             assert main(command) == 2, name
             (line,) = capsys.readouterr().err.splitlines()  # and no progress bar before it
             assert line.startswith(f"mien: {place}: is being written by another command (process {other.pid} on "), name
             assert ("--run NAME" in line) == (name in ("train", "create", "import"))
-            assert ("--out DIR" in line) == (name == "bench quality")
+            assert ("--out DIR" in line) == name.startswith("bench")
         changed = {name for name, content in tree_bytes(studio.root).items() if before.get(name) != content}
         assert all(name.endswith(".lock") for name in changed)
 
@@ -255,17 +270,24 @@ def test_two_analyses_of_one_run(studio: Studio, both: Pair, tmp_path: Path) -> 
 
 
 def test_create_beside_evaluate(studio: Studio, both: Pair) -> None:
-    """`create` beside `evaluate` works on a finished run without figures, and on a run that has to be trained first."""
+    """`create` beside `evaluate` works on a finished run without figures, and on a run that has to be trained first.
+
+    Each needs its own time until it writes, so the quicker one waits by what the rounds before measured.
+    """
     runs, told, figures = studio.root / "runs", 0, []
+    waits: dict[bool, tuple[float, float]] = {True: (0, 0), False: (0, 0)}
     for index in range(4 * ROUNDS):
         if index >= ROUNDS and told > MEETINGS:
             break
         name, run = f"e{index}", runs / f"e{index}"
         shutil.copytree(runs / "alone", run, ignore=shutil.ignore_patterns("metrics.json", "report.html", "videos"))
-        if index % 3 == 2:
+        trained = index % 3 != 2
+        if not trained:
             (run / "training.json").unlink()
         create = ["create", str(studio.video), "--out", str(studio.root), "--run", name, *studio.create_options]
-        outcomes = both.run(create, ["evaluate", str(studio.root), "--run", name])
+        outcomes = both.run(create, ["evaluate", str(studio.root), "--run", name], waits=waits[trained])
+        if all(outcome.code == 0 for outcome in outcomes):
+            waits[trained] = waits_to_meet(waits[trained], outcomes)
         if "missing; run `mien train` again" in outcomes[1].told:  # it came first, and there was nothing to evaluate
             assert outcomes[0].code == 0
         else:

@@ -46,7 +46,6 @@ class Outcome:
     worked: list[tuple[str, float, float]]
     """Calls of `WORK` that were made, with start and end on the system's clock."""
 
-
 class Pair:
     """Two processes that have imported everything, and start each round together."""
 
@@ -61,10 +60,10 @@ class Pair:
             self._ends.append(ours)
             self._processes.append(process)
 
-    def run(self, *commands: list[str]) -> list[Outcome]:
-        """Run one command in each process, started together."""
-        for end, command in zip(self._ends, commands, strict=True):
-            end.send(command)
+    def run(self, *commands: list[str], waits: tuple[float, float] = (0, 0)) -> list[Outcome]:
+        """Run one command in each process, started together but for these seconds."""
+        for end, command, wait in zip(self._ends, commands, waits, strict=True):
+            end.send((command, wait))
         assert all(end.poll(_PATIENCE_SECONDS) for end in self._ends), "a command does not end"
         return [end.recv() for end in self._ends]
 
@@ -89,13 +88,27 @@ def _serve(pipe: Connection, barrier: Barrier, cache: Path, without_locks: bool)
         importlib.import_module(f"mien.commands.{kind}")
     for stage in ("capturing", "evaluating", "tracking", "training", "pictures"):
         importlib.import_module(f"mien.commands.stages.{stage}")
-    while (command := pipe.recv()) is not None:
+    while (received := pipe.recv()) is not None:
+        command, wait = received
         worked.clear()
         sys.argv = ["mien", *command]
         with contextlib.redirect_stderr(io.StringIO()) as told, contextlib.redirect_stdout(io.StringIO()):
             barrier.wait(_PATIENCE_SECONDS)
+            time.sleep(wait)
             code = main(command)
         pipe.send(Outcome(os.getpid(), code, told.getvalue(), list(worked)))
+
+
+def waits_to_meet(waits: tuple[float, float], outcomes: list[Outcome]) -> tuple[float, float]:
+    """Return the waits after which two commands that did not meet would have begun their work at one moment."""
+    one, other = (outcome.worked[0][1] if outcome.worked else None for outcome in outcomes)
+    if one is not None and other is not None:
+        lag = waits[1] - waits[0] + one - other
+    elif one is not None or other is not None:  # the late one had nothing left to do
+        lag = waits[1] - waits[0] + (0.05 if other is not None else -0.05)
+    else:
+        return waits
+    return (-lag, 0) if lag < 0 else (0, lag)
 
 
 def _watch(module: Any, name: str, kind: str, worked: list[tuple[str, float, float]]) -> None:

@@ -45,10 +45,28 @@ def build(folder: Path) -> Path:
     return folder
 
 
-def browse(page: Path, scripts: list[str], size: tuple[int, int] = (900, 600)) -> dict[str, Any]:
-    """Run scripts in a page, one after the other: their `results`, all `requests`, and `messages` of the console."""
-    told = json.dumps({"width": size[0], "height": size[1], "scripts": scripts})
-    command = [node(), str(WEB / "tests" / "browser.mjs"), chromium(), str(page)]
+def browse(
+    page: Path,
+    scripts: list[str],
+    size: tuple[int, int] = (900, 600),
+    screenshots: list[str | None] | None = None,
+    downloads: Path | None = None,
+    fragment: str = "",
+) -> dict[str, Any]:
+    """Run scripts in a page, one after the other: their `results`, all `requests`, and `messages` of the console.
+
+    Args:
+        page: The page.
+        scripts: JavaScript.
+        size: Width and height of the window.
+        screenshots: A file for the window after each script, or None.
+        downloads: Folder for the files that the page saves.
+        fragment: What follows the address after a #.
+    """
+    given = {"width": size[0], "height": size[1], "scripts": scripts, "screenshots": screenshots or []}
+    told = json.dumps(given | ({"downloads": str(downloads)} if downloads else {}))
+    address = f"{page}#{fragment}" if fragment else str(page)
+    command = [node(), str(WEB / "tests" / "browser.mjs"), chromium(), address]
     done = subprocess.run(command, input=told, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -430,3 +430,52 @@ def factored_update(
     values: Tensor, rows: Tensor, columns: Tensor, second: Tensor, weights: Tensor, rate: float
 ) -> None:
     """Updates `values` [n, k, f], `second` [n, f] and `weights` [n]. The gradient is rows [n, f] times columns [k]."""
+
+# native/bind_point_network.cpp; n points, l layers
+class PointLayer(NamedTuple):
+    weight: Tensor
+    """[o, i]; i counts the outputs of the previous layer, then those of `extra`."""
+    bias: Tensor
+    activation: int
+    """0 none (the last layer), 1 relu, 2 softplus with a sharpness of 100."""
+    extra: int
+    """0 for the inputs, 1 for the first layer, ..; -1 for none."""
+
+class PointLayerGradients(NamedTuple):
+    weight: Tensor
+    bias: Tensor
+
+def point_network(layers: Sequence[PointLayer], inputs: Tensor, kept: Tensor | None, outputs: Tensor) -> None:
+    """Fills `outputs` [n, o] and `kept`, which has the outputs of each layer but the last, rounded up to 16 numbers."""
+
+def point_network_backward(
+    layers: Sequence[PointLayer],
+    inputs: Tensor,
+    kept: Tensor,
+    by_outputs: Tensor,
+    gradients: Sequence[PointLayerGradients],
+    by_inputs: Tensor | None,
+) -> None:
+    """Fills `gradients` and `by_inputs`. Points whose row of `by_outputs` is 0 have no gradient."""
+
+# native/bind_skin_points.cpp; n points, b poses, k bones
+class SkinPoints(NamedTuple):
+    points: Tensor
+    moved: Tensor
+    weights: Tensor
+    from_bones: Tensor
+    to_bones: Tensor
+
+class SkinPointsGradients(NamedTuple):
+    """The gradient of the posed points, and those that are filled."""
+
+    posed: Tensor
+    points: Tensor
+    moved: Tensor
+    weights: Tensor
+    to_bones: Tensor
+
+def skin_points(points: SkinPoints, posed: Tensor) -> None:
+    """Fills `posed` [b, n, 3]."""
+
+def skin_points_backward(points: SkinPoints, gradients: SkinPointsGradients) -> None: ...

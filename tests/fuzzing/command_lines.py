@@ -33,14 +33,17 @@ BASES = (
     "analyze gaussian-avatars W --parts growth", "analyze gaussian-avatars W --parts growth --out o --json",
     "import gaussian_avatars --out new", "import gaussian_avatars --out W --run other",
     "import flame_avatars --out new", "export W --out o --format gaussian-avatars", "track W --hold-out clip",
-    "bench", "bench quality --captures nobody --out o", "create none.mp4 --out new", "demo --out head.ply",
+    "evaluate W --no-perceptual --fit-faces --fit-steps 1",
+    "study make W --out o.html", "study tally given/crops.json given/cameras.json", "bench compare W --methods nobody",
+    "view none.mien", "bench", "bench quality --captures nobody --out o", "create none.mp4 --out new",
+    "demo --out head.ply",
 )  # fmt: skip
 HEAVY = (
     "capture videos/clip.mp4 --out new", "create videos/clip.mp4 --out new --steps 1", "capture pictures --out new",
     "demo --out new --seconds 0.1 --steps 1",
     "face-models --add flame/tiny.npz --name tiny", "face-models --add flame/tiny.pkl",
-    "bench render --seconds 0.001 --json", "bench scaling --seconds 0.001",
-    "drive W --by videos/clip.mp4 --out o.mp4", "track W --face-model flame/tiny.npz",
+    "bench compare W --steps 1 --out o", "bench render --seconds 0.001 --json", "bench scaling --seconds 0.001",
+    "drive W --by videos/clip.mp4 --out o.mp4", "view W", "view head.mien", "track W --face-model flame/tiny.npz",
     "analyze gaussian-avatars W --train --steps 1 --seconds 0.001",
     "import flame_avatars --out new --face-model flame/tiny.npz",
 )  # fmt: skip

@@ -101,6 +101,49 @@ def factored_update(native: Any, rng: Rng) -> Arguments:
     return [normal(rng, n, k, f), normal(rng, n, f), normal(rng, k), *moments, 0.01]
 
 
+def point_layers(native: Any, rng: Rng) -> tuple[list[Any], Any, int]:
+    n, widths, layers = few(rng), [int(rng.integers(1, 20))], []
+    for index in range(int(rng.integers(1, 5))):
+        extra = int(rng.integers(-1, index)) if index > 0 else -1
+        reads = widths[-1] + (widths[extra] if extra >= 0 else 0)
+        widths.append(int(rng.integers(1, 40)))
+        layers.append([normal(rng, widths[-1], reads), normal(rng, widths[-1]), int(rng.integers(0, 3)), extra])
+    layers[-1][2] = 0
+    kept = sum(-(-width // 16) * 16 for width in widths[1:-1])
+    return [native.PointLayer(*layer) for layer in layers], normal(rng, n, widths[0]), kept
+
+
+def point_network(native: Any, rng: Rng) -> Arguments:
+    layers, inputs, kept = point_layers(native, rng)
+    room = empty(len(inputs), kept) if rng.random() < 0.5 else None
+    return [layers, inputs, room, empty(len(inputs), len(layers[-1].bias))]
+
+
+def point_network_backward(native: Any, rng: Rng) -> Arguments:
+    layers, inputs, kept = point_layers(native, rng)
+    gradients = [native.PointLayerGradients(*(np.empty_like(array) for array in layer[:2])) for layer in layers]
+    by_inputs = np.empty_like(inputs) if rng.random() < 0.5 else None
+    by_outputs = normal(rng, len(inputs), len(layers[-1].bias))
+    return [layers, inputs, normal(rng, len(inputs), kept), by_outputs, gradients, by_inputs]
+
+
+def skin_arrays(native: Any, rng: Rng) -> tuple[Any, tuple[int, int, int]]:
+    n, b, k = few(rng), int(rng.integers(0, 4)), int(rng.integers(1, 7))
+    points = normal(rng, n, 3), normal(rng, b, n, 3), normal(rng, n, k), normal(rng, k, 3, 4), normal(rng, b, k, 3, 4)
+    return native.SkinPoints(*points), (n, b, k)
+
+
+def skin_points(native: Any, rng: Rng) -> Arguments:
+    points, (n, b, _) = skin_arrays(native, rng)
+    return [points, empty(b, n, 3)]
+
+
+def skin_points_backward(native: Any, rng: Rng) -> Arguments:
+    points, (n, b, k) = skin_arrays(native, rng)
+    filled = empty(n, 3), empty(b, n, 3), empty(n, k), empty(b, k, 3, 4)
+    return [points, native.SkinPointsGradients(normal(rng, b, n, 3), *filled)]
+
+
 # Faces
 
 Sizes = tuple[int, int, int]
@@ -304,7 +347,8 @@ BASELINES: dict[str, Baseline] = {
     for one in (
         sigmoid, sigmoid_backward, expression_activations, expression_activations_backward, expression_change,
         expression_change_backward,
-        feature_network, feature_network_backward, factored_update,
+        feature_network, feature_network_backward, factored_update, point_network, point_network_backward, skin_points,
+        skin_points_backward,
         make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
         compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,

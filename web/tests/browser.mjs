@@ -1,27 +1,31 @@
 // Opens a page in headless Chromium with software WebGL, runs scripts in it one after the other, and prints their
-// results and all requests as json. tests/test_web.py calls it:
-//   node browser.mjs CHROMIUM PAGE < {"width", "height", "scripts": [..], "screenshots": [path or null, ..]}
+// results and all requests as json. tests/test_web.py and tests/test_study.py call it:
+//   node browser.mjs CHROMIUM PAGE < {"width", "height", "scripts": [..], "screenshots": [path or null, ..], "downloads": folder}
 import { readFileSync } from "node:fs";
+import { join } from "node:path";
 import { pathToFileURL } from "node:url";
 import { chromium } from "playwright-core";
 
 const [executablePath, page] = process.argv.slice(2);
-const { width, height, scripts, screenshots = [] } = JSON.parse(readFileSync(0, "utf8"));
+const { width, height, scripts, screenshots = [], downloads } = JSON.parse(readFileSync(0, "utf8"));
 const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
   "--disable-background-networking", "--disable-component-update", "--disable-sync"];
 const browser = await chromium.launch({ executablePath, args });
 try {
   const tab = await browser.newPage({ viewport: { width, height } });
-  const requests = [], messages = [], results = [];
+  const requests = [], messages = [], results = [], files = [];
+  if (downloads) tab.on("download", (file) => files.push(file.saveAs(join(downloads, file.suggestedFilename()))));
   tab.on("request", (request) => requests.push(request.url()));
   tab.on("console", (message) => messages.push(message.text()));
   tab.on("pageerror", (error) => messages.push(`${error}`));
-  const address = pathToFileURL(page).href;
-  await tab.goto(address);
+  const [place, hash] = page.split("#");
+  const address = pathToFileURL(place).href;
+  await tab.goto(hash ? `${address}#${hash}` : address);
   for (let i = 0; i < scripts.length; ++i) {
     results.push(await tab.evaluate(scripts[i]));
     if (screenshots[i]) await tab.screenshot({ path: screenshots[i] });
   }
+  await Promise.all(files);
   console.log(JSON.stringify({ requests: requests.filter((url) => url !== address), messages, results }));
 } finally {
   await browser.close();

@@ -6,7 +6,16 @@ from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mien.avatar.activation import sigmoid
-    from mien.avatar.avatar import Avatar, ParameterGroup, Posed, move_avatar, network_group, neutral_of, store_group
+    from mien.avatar.avatar import (
+        Avatar,
+        ParameterGroup,
+        Posed,
+        SurfacePrior,
+        move_avatar,
+        network_group,
+        neutral_of,
+        store_group,
+    )
     from mien.avatar.baking import as_array, bake_rig, make_portable
     from mien.avatar.density import DensityControl, FixedDensity, GradientDensity, RefillDensity
     from mien.avatar.files import load_avatar, write_avatar
@@ -38,6 +47,7 @@ else:
                 "Avatar",
                 "ParameterGroup",
                 "Posed",
+                "SurfacePrior",
                 "move_avatar",
                 "network_group",
                 "neutral_of",
@@ -93,6 +103,7 @@ __all__ = [
     "PerceptualLoss",
     "Photometric",
     "Posed",
+    "SurfacePrior",
     "Progress",
     "Rate",
     "RefillDensity",

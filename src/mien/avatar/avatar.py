@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from mien.adam import FactoredGradient, FactoredMoments, Moments
@@ -37,6 +37,20 @@ class Posed:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfacePrior:
+    """What is known of each of the f triangles of a head without training: from the mesh, the mattes and symmetry."""
+
+    hair: Float[Tensor, " f"]
+    """Height of hair along the triangle's normal, in metres; 0 on skin."""
+    colors: Float[Tensor, "f 3"] | None = None
+    """Colours, 0..1, completed where no picture shows any. None if nothing was completed."""
+    doubt: Float[Tensor, " f"] | None = None
+    """0 for triangles that pictures show well, 1 for those that none shows. None if nothing was completed."""
+    made_up: Bool[Tensor, " f"] | None = None
+    """Triangles that are filled rather than trained: no picture shows them, and they are above the neck line."""
+
+
+@dataclass(frozen=True, eq=False)
 class ParameterGroup:
     """Tensors that share a learning rate."""
 
@@ -51,10 +65,13 @@ class ParameterGroup:
     """Whether the rate is multiplied by the extent of the cameras (`Progress.extent`)."""
     factored: Mapping[str, FactoredGradient] = field(default_factory=dict)
     """Gradients, by the names of `tensors`, that `Tensor.grad` does not hold."""
+    halvings: tuple[float, ...] = ()
+    """Times at which the rate is halved, as fractions of the run."""
 
     def rate_at(self, progress: Progress) -> float:
         """The learning rate at a step."""
-        return self.rate.at(progress) * (progress.extent if self.times_extent else 1.0)
+        halved = 0.5 ** sum(progress.fraction >= time for time in self.halvings)
+        return self.rate.at(progress) * (progress.extent if self.times_extent else 1.0) * halved
 
 
 def store_group(store: GaussianStore, name: str, rate: Rate, *, times_extent: bool = False) -> ParameterGroup:
@@ -126,17 +143,27 @@ class Avatar(nn.Module, ABC):
         """The triangle that each Gaussian is bound to. None for methods that bind none, which train on all pixels."""
         return None
 
-    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> int:
-        """Replace what training did not draw, after the last step, if `triangles` gives something.
+    @property
+    def wants_surface(self) -> bool:
+        """Whether `keep_to` is to be called after each step, also if nothing is filled."""
+        return False
 
-        Returns the number of fills, which are the last Gaussians of the store.
+    def close(self, prior: SurfacePrior) -> None:
+        """Start from what is known of the surface, before the first step: colours, and fills of what nothing shows."""
+
+    def keep_to(self, prior: SurfacePrior) -> None:
+        """Bring Gaussians back that have left what is known of the surface, after each step."""
+
+    def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
+        """Close the surface of those of the chosen triangles that are less than half opaque, between two steps.
+
+        The number of Gaussians does not change. Nothing happens if `triangles` gives None.
 
         Args:
-            share: How much of each triangle's Gaussians training drew: their opacities were multiplied by it.
-            opacity: Opacity of the fill of each triangle; 0 for none.
-            colors: Colours of the fills, 0..1.
+            chosen: Triangles that may be closed.
+            opacity: Opacity of closed triangles.
+            colors: Their colours, 0..1.
         """
-        return 0
 
     @abstractmethod
     def bake(self) -> BakedAvatar:

@@ -44,19 +44,20 @@ def bake_rig(face_model: FaceModel, subject: FaceParams) -> Rig:
     )
 
 
-def make_portable(avatar: Avatar, camera: Camera, name: str) -> PortableAvatar:
+def make_portable(avatar: Avatar, camera: Camera, name: str, to_share: bool = True) -> PortableAvatar:
     """The content of a .mien file for an avatar (`mien.runtime.write_portable` writes it).
 
     Args:
         avatar: A trained avatar.
         camera: A good first view, such as the one that the avatar was trained with.
         name: The subject's name.
+        to_share: Whether the result leaves this machine, as a file does.
 
     Raises:
-        UserError: the licence of its face model does not allow passing it on.
+        UserError: it is to be shared, and the licence of its face model does not allow passing it on.
     """
     model, subject = avatar.face_model, avatar.subject
-    if not model.shareable:
+    if to_share and not model.shareable:
         raise UserError(
             f"{name}: a .mien file holds parts of the face model {model.name!r}, and its licence is not known to allow "
             "that; export a .ply instead, or train with another --face-model; if the licence does allow it, run "

@@ -55,6 +55,8 @@ class GradientDensity:
     """(store, parents, standard normal noise) -> tensors, by name, in which children differ from their parents."""
     may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = allow_all_prunes
     """(store, prunes requested) -> prunes allowed."""
+    may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]] | None = None
+    """(store) -> Gaussians whose opacity resets lower. None if they all are."""
 
 
 @dataclass(frozen=True)

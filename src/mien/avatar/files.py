@@ -94,7 +94,11 @@ def _load_avatar(folder: Path) -> Avatar:
     if file_digest(folder / "avatar.safetensors") != content.tensors_sha256:
         raise UserError(f"{folder / 'avatar.safetensors'}: was changed or damaged after it was written; {_REMEDY}")
     face_model = _face_model_of(folder, content)
-    config = decode(method.config, method.config.upgraded(content.config), where, _REMEDY)
+    try:
+        upgraded = method.config.upgraded(content.config)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
+    config = decode(method.config, upgraded, where, _REMEDY)
     with expect_whole(folder, _REMEDY):
         face = FaceParams(**_with_prefix(tensors, "subject."))
     check_face_params(face_model, face, str(folder), _REMEDY)

@@ -2,7 +2,7 @@
 
 Written from the paper and its supplement. Comments note where the published code differs from the paper in a way that
 matters. Lengths and scales in the store are in units of the triangle's own scale (`mien.avatar.triangle_frames`).
-Changes with the expression beside those of the mesh (`expression_rank`) are not part of the paper.
+Changes with the expression beside those of the mesh (`expression_rank`, `appearance`) are not part of the paper.
 """
 
 from typing import Any, Literal
@@ -14,15 +14,17 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.arrays import unpacked
-from mien.avatar.avatar import Avatar, ParameterGroup, Posed, store_group
+from mien.avatar.avatar import Avatar, ParameterGroup, Posed, SurfacePrior, store_group
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.bound_gaussians import pose_bound_gaussians
 from mien.avatar.density import GradientDensity, highest_opacities_seen
 from mien.avatar.expression_changes import ExpressionActivations, expression_change
+from mien.avatar.feature_appearance import FeatureAppearance, feature_tensors
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
-from mien.avatar.triangle_frames import triangle_ellipses
+from mien.avatar.surface_limits import keep_on_surface
+from mien.avatar.triangle_frames import triangle_ellipses, triangle_frames
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import sh_from_rgb, stack_timesteps
 from mien.render.rendering import Rendering
@@ -30,8 +32,18 @@ from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
 _Pair = tuple[float, float]
 """A value for centres, and one for scales."""
-_LEAST_OPACITY = 1 / 255
-"""Gaussians below this opacity are never drawn."""
+_OPEN = 0.5
+"""Sum of the opacities of a triangle's Gaussians below which its surface is open."""
+_FEATURES = ("feature_colour", "feature_opacity")
+"""Names of the changes by features."""
+_PULL = 0.05
+"""Share of the difference to the completed colour that a step takes away where no picture shows a triangle."""
+_OPAQUE = 0.97
+"""Opacity of a fill."""
+_FILL_HEIGHT = 0.5
+"""Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it."""
+_HEAD_RADIUS = 0.1
+"""Radius of a head, in metres."""
 _BASES = ("colour_basis", "opacity_basis", "offset_basis")
 """Names of the bases of changes with the expression."""
 
@@ -44,6 +56,7 @@ class GaussianAvatars(Avatar):
     def __init__(self, config: GaussianAvatarsConfig, face_model: FaceModel, face: FaceParams):
         super().__init__(config, face_model, face)
         like, n = face_model.template, face_model.faces.shape[0]
+        self._known_sizes: Tensor | None = None
         trained = {
             "means": like.new_zeros(n, 3),
             "quats": like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
@@ -55,32 +68,40 @@ class GaussianAvatars(Avatar):
         if config.sh_degree > 0:
             trained["sh_rest"] = like.new_zeros(n, (config.sh_degree + 1) ** 2 - 1, 3)
         trained |= {name: like.new_zeros(n, *shape) for name, shape in self._basis_shapes().items()}
-        if self._basis_shapes():
+        self.appearance = None
+        if config.appearance == "features":
+            trained |= feature_tensors(trained["means"], config.expression_rank, config.appearance_features)
+            vertices = face_model.head_vertices(self.subject)[0]
+            widths = (config.appearance_features, config.appearance_hidden)
+            self.appearance = FeatureAppearance(vertices, face_model.faces, *widths)
+        if self._changes:
             self.activations = ExpressionActivations(face, self.subject, config.expression_rank)
         self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in world space, or in the head frame (`_sh_frame`), with one batch entry per timestep."""
         sh, in_head = self._active_sh(progress), self._sh_frame == "head"
-        if self._basis_shapes() and len(face) > 0:
+        if self._changes and len(face) > 0:
             return self._pose_with_changes(face, sh, in_head)
         return Posed(pose_bound_gaussians(self.face_model, face, self.store, sh, in_head), {})
 
     def _pose_with_changes(self, face: FaceParams, sh: Float[Tensor, "n k 3"], in_head: bool) -> Posed:
-        """The same with the changes of the expression, which are also returned, by the names of their bases."""
+        """The same with the changes of the expression, which are also returned by name."""
         if len(face) > 1:
             each = [self._pose_with_changes(face[timestep], sh, in_head) for timestep in range(len(face))]
-            aux = {name: torch.stack([posed.aux[name] for posed in each]) for name in self._basis_shapes()}
+            aux = {name: torch.stack([posed.aux[name] for posed in each]) for name in each[0].aux}
             return Posed(stack_timesteps([posed.gaussians for posed in each]), aux)
         (activations,) = self.activations(face)
         changes = {name: expression_change(self.store[name], activations) for name in self._basis_shapes()}
         local = {name: self.store[name] for name in ("face_index", "means", "quats", "log_scales", "opacity_logits")}
+        if self.appearance is not None:
+            changes["feature_colour"], changes["feature_opacity"] = self.appearance(self.store, activations)
         if "offset_basis" in changes:
             local["means"] = local["means"] + changes["offset_basis"]
-        if "opacity_basis" in changes:
-            local["opacity_logits"] = local["opacity_logits"] + changes["opacity_basis"]
-        if "colour_basis" in changes:
-            sh = torch.cat([sh[:, :1] + changes["colour_basis"][:, None], sh[:, 1:]], dim=1)
+        for name in (name for name in ("opacity_basis", "feature_opacity") if name in changes):
+            local["opacity_logits"] = local["opacity_logits"] + changes[name]
+        for name in (name for name in ("colour_basis", "feature_colour") if name in changes):
+            sh = torch.cat([sh[:, :1] + changes[name][:, None], sh[:, 1:]], dim=1)
         return Posed(pose_bound_gaussians(self.face_model, face, local, sh, in_head), changes)
 
     def _basis_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -88,6 +109,15 @@ class GaussianAvatars(Avatar):
         rank, rates = self.config.expression_rank, self._basis_rates()
         wanted = [name for name in _BASES if rank > 0 and rates[name].start > 0]
         return {name: (rank,) if name == "opacity_basis" else (3, rank) for name in wanted}
+
+    @property
+    def _changes(self) -> bool:
+        """Whether Gaussians change with the expression beside the mesh."""
+        return bool(self._basis_shapes()) or self.config.appearance == "features"
+
+    @property
+    def _opacity_changes(self) -> bool:
+        return "opacity_basis" in self._basis_shapes() or self.config.appearance == "features"
 
     def _basis_rates(self) -> dict[str, Rate]:
         config = self.config
@@ -97,7 +127,7 @@ class GaussianAvatars(Avatar):
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units.
 
-        With `expression_rank`, also the mean squared changes with the expression, over all Gaussians.
+        With `expression_rank` or features, also the mean squared changes with the expression, over all Gaussians.
         """
         config = self.config
         position, scale = triangle_penalties(
@@ -108,9 +138,11 @@ class GaussianAvatars(Avatar):
             weights=(config.position_weight, config.scale_weight),
         )
         losses = {"position": position, "scale": scale}
-        if posed.aux:
-            squares = [change.square().mean() for change in posed.aux.values()]
-            losses["expression"] = config.expression_weight * torch.stack(squares).sum()
+        kinds = (("expression", _BASES, config.expression_weight), ("appearance", _FEATURES, config.appearance_weight))
+        for loss, names, weight in kinds:
+            squares = [posed.aux[name].square().mean() for name in names if name in posed.aux]
+            if squares:
+                losses[loss] = weight * torch.stack(squares).sum()
         return losses
 
     def parameter_groups(self) -> list[ParameterGroup]:
@@ -126,9 +158,13 @@ class GaussianAvatars(Avatar):
             rates["sh_rest"] = Rate(config.colour_rate.start / 20)
         rates |= {name: self._basis_rates()[name] for name in self._basis_shapes()}
         extent = {"means": config.means_times_extent}
-        return [
+        groups = [
             store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
         ]
+        if self.appearance is not None:
+            own = (config.appearance_rate, config.appearance_network_rate)
+            groups += self.appearance.parameter_groups(self.store, *own)
+        return groups
 
     def gaussian_store(self) -> GaussianStore:
         """Every per-Gaussian tensor."""
@@ -139,7 +175,7 @@ class GaussianAvatars(Avatar):
         return GradientDensity(
             self.config.density,
             opacity_logits="opacity_logits",
-            judged_opacities=highest_opacities_seen if "opacity_basis" in self._basis_shapes() else resting_opacities,
+            judged_opacities=highest_opacities_seen if self._opacity_changes else resting_opacities,
             may_prune=never_empty_a_triangle,
         )
 
@@ -158,29 +194,73 @@ class GaussianAvatars(Avatar):
         """The triangle that each Gaussian is bound to."""
         return self.store["face_index"]
 
+    @property
+    def wants_surface(self) -> bool:
+        """Whether the settings limit how far Gaussians may leave the surface."""
+        return self.config.surface.enabled
+
     @torch.no_grad()
-    def fill(self, share: Float[Tensor, " f"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> int:
-        """Remove Gaussians that were not drawn, and add a flat one of the triangle's shape where there is a fill."""
+    def close(self, prior: SurfacePrior) -> None:
+        """Completed colours everywhere, and an opaque flat Gaussian at the height of hair on what no picture shows."""
+        if prior.colors is None or prior.made_up is None:
+            return
         store, bound = self.store, self.store["face_index"]
-        drawn = store["opacity_logits"].sigmoid() * share.to(bound.device)[bound]
-        store.assign("opacity_logits", torch.logit(drawn.clamp(1e-6, 1 - 1e-6)))
-        filled = (opacity > _LEAST_OPACITY).nonzero()[:, 0].to(bound.device)
-        count, kept = len(store), drawn > _LEAST_OPACITY
-        vertices = self.face_model.head_vertices(self.subject)[0]
-        quats, log_scales = triangle_ellipses(vertices, self.face_model.faces)
-        like = store["means"]
-        zeros = {name: like.new_zeros(len(filled), *store[name].shape[1:]) for name in store.trained}
-        own = {
-            **zeros,
-            "face_index": filled,
-            "quats": quats[filled],
-            "log_scales": log_scales[filled],
-            "opacity_logits": torch.logit(opacity.to(like)[filled].clamp(1e-6, 1 - 1e-6)),
-            "sh_constant": sh_from_rgb(colors.to(like)[filled])[:, None],
+        store.assign("sh_constant", sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None])
+        quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
+        height = _FILL_HEIGHT * prior.hair[bound]
+        store.assign("means", torch.stack([0 * height, height / self._sizes[bound], 0 * height], 1))
+        filled = prior.made_up[bound]
+        store.assign("quats", torch.where(filled[:, None], quats[bound], store["quats"]))
+        # Hair is a shell around the head, so its ellipses are larger than the triangles.
+        wider = (height / _HEAD_RADIUS).log1p()[:, None] * log_scales.new_tensor([1.0, 0.0, 1.0])
+        store.assign("log_scales", torch.where(filled[:, None], log_scales[bound] + wider, store["log_scales"]))
+        logits = store["opacity_logits"]
+        store.assign("opacity_logits", torch.where(filled, torch.logit(torch.full_like(logits, _OPAQUE)), logits))
+
+    @torch.no_grad()
+    def keep_to(self, prior: SurfacePrior) -> None:
+        """Apply `SurfaceLimits`, and pull the colours of what is rarely seen towards the completed ones."""
+        if self.config.surface.enabled or prior.made_up is not None:
+            keep_on_surface(self.store, self.config.surface, self._sizes, prior.hair)
+        if prior.colors is not None and prior.doubt is not None:
+            bound, own = self.store["face_index"], self.store["sh_constant"].detach()[:, 0]
+            pull = _PULL * prior.doubt[bound, None]
+            own += pull * (sh_from_rgb(prior.colors)[bound] - own)
+
+    @property
+    def _sizes(self) -> Float[Tensor, " f"]:
+        """Sizes of the triangles of the neutral head, in metres per triangle unit."""
+        if self._known_sizes is None:
+            vertices = self.face_model.head_vertices(self.subject)[0]
+            self._known_sizes = triangle_frames(vertices, self.face_model.faces).k.detach()
+        return self._known_sizes
+
+    @torch.no_grad()
+    def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
+        """Replace the first Gaussian of each chosen triangle that is open by a flat one of the triangle's shape."""
+        store, bound = self.store, self.store["face_index"].long()
+        opacities = store["opacity_logits"].sigmoid()
+        total = opacities.new_zeros(len(chosen)).index_add(0, bound, opacities)
+        order = torch.arange(len(store), device=bound.device)
+        first = torch.full_like(chosen, len(store), dtype=torch.long).scatter_reduce(0, bound, order, "amin")
+        opened = (chosen & (total < _OPEN) & (first < len(store))).nonzero()[:, 0]
+        for name, values in self._flat(opened, total.new_full((len(chosen),), opacity), colors).items():
+            store.assign_rows(name, first[opened], values)
+
+    def _flat(
+        self, triangles: Int[Tensor, " k"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]
+    ) -> dict[str, Tensor]:
+        """The tensors of flat Gaussians, one for each of the given triangles, which have the triangles' shapes."""
+        store, like = self.store, self.store["means"]
+        quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
+        return {
+            **{name: like.new_zeros(len(triangles), *store[name].shape[1:]) for name in store.trained},
+            "face_index": triangles,
+            "quats": quats[triangles],
+            "log_scales": log_scales[triangles],
+            "opacity_logits": torch.logit(opacity.to(like)[triangles].clamp(1e-6, 1 - 1e-6)),
+            "sh_constant": sh_from_rgb(colors.to(like)[triangles])[:, None],
         }
-        store.append(torch.zeros(len(filled), dtype=torch.long, device=bound.device), own)
-        store.select(torch.cat([kept, torch.ones(len(store) - count, dtype=torch.bool, device=bound.device)]))
-        return len(filled)
 
     def bake(self) -> MeshBound:
         """The mesh of this subject and the raw values of all Gaussians."""
@@ -198,11 +278,12 @@ class GaussianAvatars(Avatar):
 
     def _bake_changes(self) -> ExpressionChanges | None:
         """The changes with the expression, or None if the settings ask for none."""
-        if not self._basis_shapes():
+        if not self._changes:
             return None
+        features = None if self.appearance is None else self.appearance.bake(self.store)
         fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "reach"))
         bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in _BASES)
-        return ExpressionChanges(*fixed, *bases)
+        return ExpressionChanges(*fixed, *bases, features=features)
 
     @property
     def _sh_frame(self) -> Literal["world", "head"]:

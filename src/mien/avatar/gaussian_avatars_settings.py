@@ -5,7 +5,37 @@ from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, PerceptualLoss, Photometric
+from mien.errors import UserError
 from mien.ranges import FRACTION, NOT_NEGATIVE, Range
+
+
+@dataclass(frozen=True)
+class SurfaceLimits:
+    """Limits that keep Gaussians flat on the mesh, where one camera cannot see how deep they lie.
+
+    Lengths are those of the neutral head. Without limits, skin that was trained from the front falls to shards when it
+    is seen from aside.
+    """
+
+    enabled: bool = False
+    """Whether the limits are kept, by a correction after each step. They are always kept with `--training.unseen
+    filled`."""
+    depth: Annotated[float, Range(0, 0.1)] = 0.003
+    """Largest distance of a centre from the mesh along the triangle's normal, in metres."""
+    hair_share: Annotated[float, Range(0, 10)] = 1.3
+    """How far a centre may lie above the scalp, beside the depth, as a multiple of the height of hair."""
+    thickness: Annotated[float, Range(1e-5, 0.1)] = 0.0005
+    """Largest scale (standard deviation) along the normal, in metres."""
+    hair_thickness: Annotated[float, Range(0, 10)] = 0.3
+    """What is added to the thickness on the scalp, as a multiple of the height of hair."""
+    width: Annotated[float, Range(1e-5, 1)] = 0.006
+    """Largest scale along the surface, in metres."""
+    hair_width: Annotated[float, Range(0, 10)] = 1.0
+    """What is added to the width on the scalp, as a multiple of the height of hair."""
+    ratio: Annotated[float, Range(1, 1000)] = 5.0
+    """Largest ratio of the two scales along the surface. Larger ones are needles."""
+    tilt: Annotated[float, Range(0, 180)] = 20.0
+    """Largest angle between a Gaussian's thin axis and the normal, in degrees."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +84,19 @@ class GaussianAvatarsConfig(MethodConfig):
     If its start is 0, places do not change."""
     expression_weight: Annotated[float, NOT_NEGATIVE] = 3.0
     """Weight of the mean squared changes with the expression, which keeps changes small that pictures do not need."""
+    appearance: Literal["static", "features"] = "static"
+    """Whether a Gaussian's colour and opacity stay as they are, as in the paper, or also change with features that the
+    activations of the face blend and one small network reads, as in HeadGaS. Features need `expression_rank`."""
+    appearance_features: Annotated[int, Range(1, 256)] = 32
+    """Number of features of each Gaussian, with `appearance` features."""
+    appearance_hidden: Annotated[int, Range(1, 1024)] = 64
+    """Width of the only hidden layer of the features' network."""
+    appearance_rate: Rate = Rate(2.5e-3)
+    """Learning rate of the features, per step."""
+    appearance_network_rate: Rate = Rate(2e-3, 2e-4)
+    """Learning rate of the features' network, per step."""
+    appearance_weight: Annotated[float, NOT_NEGATIVE] = 0.1
+    """Weight of the mean squared changes of colour and opacity by features."""
     position_threshold: Annotated[float, NOT_NEGATIVE] = 1.0
     """Distance from the triangle's centre up to which a Gaussian's centre has no penalty, in triangle units."""
     position_weight: Annotated[float, NOT_NEGATIVE] = 0.01
@@ -62,8 +105,23 @@ class GaussianAvatarsConfig(MethodConfig):
     """Scale up to which a Gaussian has no penalty, in triangle units."""
     scale_weight: Annotated[float, NOT_NEGATIVE] = 1.0
     """Weight of the scale penalty, which is the scale beyond the scale threshold."""
+    surface: SurfaceLimits = field(default_factory=SurfaceLimits)
+    """Limits that keep Gaussians on the surface of the mesh."""
     density: GradientSettings = field(default_factory=GradientSettings)
     """Density control: when and where Gaussians are added and removed."""
+
+    def check(self) -> None:
+        """Check that the settings fit together.
+
+        Raises:
+            UserError: features have no activations to be blended by.
+        """
+        super().check()
+        if self.appearance == "features" and self.expression_rank == 0:
+            raise UserError(
+                "--method.appearance features: features are blended by the activations of the face, and "
+                "--method.expression-rank is 0; choose a rank from 1 to 8"
+            )
 
 
 _STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000
@@ -71,6 +129,8 @@ _STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000
 _SH_DEGREE, _DEGREE_STEPS = 3, 1_000
 _RANK = 4
 """Rank of the changes with the expression in the presets `draft` and `standard`, where only places change."""
+_ALPHA_WEIGHT = 0.2
+"""Weight of the loss of alpha in these presets, without which a pale face is a thin one before a white background."""
 _VISIT = 30
 """How much further the paper's optimiser moves a frame between two visits than its learning rate says.
 
@@ -110,15 +170,23 @@ def _paper() -> GaussianAvatarsConfig:
 
 
 def _draft() -> GaussianAvatarsConfig:
-    """The defaults, with places that change with the expression."""
+    """The defaults, with places that change with the expression, and a head that is opaque where the matte is."""
     return GaussianAvatarsConfig(
-        expression_rank=_RANK, expression_colour_rate=Rate(0.0), expression_opacity_rate=Rate(0.0)
+        photometric=Photometric(alpha_weight=_ALPHA_WEIGHT),
+        expression_rank=_RANK,
+        expression_colour_rate=Rate(0.0),
+        expression_opacity_rate=Rate(0.0),
     )
 
 
 def _standard() -> GaussianAvatarsConfig:
     """A draft with eyes and mouth weighed more and a perceptual loss, which take a third more time."""
-    return replace(_draft(), photometric=Photometric(part_weight=1.0, perceptual=PerceptualLoss(weight=8.0, every=16)))
+    return replace(
+        _draft(),
+        photometric=Photometric(
+            alpha_weight=_ALPHA_WEIGHT, part_weight=1.0, perceptual=PerceptualLoss(weight=8.0, every=16)
+        ),
+    )
 
 
 PRESETS = {"draft": _draft(), "standard": _standard(), "paper": _paper()}

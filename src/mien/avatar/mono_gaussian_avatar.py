@@ -2,15 +2,16 @@
 
 Points deform by their own blend directions and skinning weights. Networks predict these from the points' positions, and
 losses keep them near those of the face model's nearest vertex. Written from the paper's supplement and from facts about
-its permissively licensed code. Differences from it: the face model is any `FaceModel` (its `head` joint, which is at
-rest in the head frame, is the paper's extra identity bone; a jaw may follow the expression); the canonical face has the
-mean expression of the training frames and free joints at rest; each head predicts its own attribute, while the
-published code mixes up columns of colours and rotations; schedules are fractions of the run, onto which the paper's
-epochs 0..100 are mapped; networks are small enough for a CPU. Not implemented yet: the perceptual loss, batches, a
-learned background.
+its permissively licensed code. The canonical face has the mean expression of the training frames and an open jaw, so
+that lips are apart where points are. Beside the face model's joints there is one more bone, which stands still in the
+world while the head moves: it can hold hair and shoulders.
+
+Differences from the paper and its code: the face model is any `FaceModel` (a jaw may follow the expression); each head
+predicts its own attribute, while the published code mixes up columns of scales and rotations; attributes change with
+the motion within the head frame, so that a turn of the head alone changes none of the head's; schedules are fractions
+of the run, which spans `epochs` epochs of the paper; the optimiser's moments survive rounds; each step uses one frame.
 """
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -22,35 +23,27 @@ from mien.avatar.activation import sigmoid
 from mien.avatar.avatar import Avatar, ParameterGroup, Posed, network_group, store_group
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.density import RefillDensity
-from mien.avatar.mono_gaussian_avatar_settings import MonoGaussianAvatarConfig
+from mien.avatar.mono_gaussian_avatar_settings import LENGTH_UNIT, MonoGaussianAvatarConfig
 from mien.avatar.mono_networks import (
     ATTRIBUTE_WIDTHS,
     ATTRIBUTES,
-    LENGTH_UNIT,
     AttributeChangeNet,
     AttributeNet,
     DeformationNet,
 )
+from mien.avatar.mono_schedule import Schedule
 from mien.avatar.schedules import TRAINED, Progress
 from mien.avatar.settings import RefillSettings
+from mien.avatar.skin_points import blend_transforms, skin_points, unskin
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.rendering import Rendering
-from mien.rotation import matrix_from_axis_angle
+from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.runtime.baked import AttributeNetwork, Attributes, BlendSkinned
 
-# The schedules below use the paper's epochs divided by 100.
-_GROWTH = (
-    (0.05, 800), (0.10, 1600), (0.15, 3200), (0.20, 6400), (0.25, 10_000),
-    (0.30, 20_000), (0.40, 40_000), (0.50, 80_000), (0.60, 100_000),
-)  # fmt: skip
-_SHRINKAGE = (
-    *((time / 100, 0.75) for time in (5, 10, 15, 20, 25, 30, 40, 50)),
-    (0.60, 0.9),
-    # The paper also shrinks at epoch 100. Here that would be the end of the run, with no training afterwards to adapt.
-    *((time / 100, 0.75) for time in (65, 70, 75, 80, 85, 90, 95)),
-)
+CANONICAL_JAW = 0.4
+"""Angle by which the jaw is open in the canonical face, in radians."""
 
 
 class MonoGaussianAvatar(Avatar):
@@ -65,164 +58,206 @@ class MonoGaussianAvatar(Avatar):
         cube = 2 * torch.rand(config.points, 3).to(like) - 1
         self.store = GaussianStore({"means": config.sphere_radius * torch.nn.functional.normalize(cube, dim=-1)})
         e, k = face.expression.shape[1], len(face_model.joint_names)
-        self.attributes = AttributeNet(config.attribute_width, config.attribute_layers).to(like)
-        self.deformation = DeformationNet(config.deformation_width, e, 9 * face.joints.shape[1], k).to(like)
+        sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
+        self.attributes = AttributeNet(*sizes, config.sphere_start).to(like)
+        self.deformation = DeformationNet(config.deformation_width, e, 9 * face.joints.shape[1], k + 1).to(like)
         self.change = AttributeChangeNet(config.change_width).to(like)
-        self.register_buffer("canonical_expression", face.expression.detach().mean(0))
+        expression, joints = canonical_face(face_model, face.expression.detach().mean(0))
+        self.register_buffer("canonical_expression", expression)
+        self.register_buffer("canonical_joints", joints)
         self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in the head frame, one batch entry per timestep."""
-        points = self._points()
-        means, displacement = self._deformed(points, face)
+        means, displacement = self._deformed(face)
         # Detached, as in the published code: attributes do not pull on the points.
         change = self.change(displacement.detach() / LENGTH_UNIT)
         raw = split_attributes(self.attributes(self.store["means"].detach() / LENGTH_UNIT) + change)
-        scales = self.config.scale_gain * sigmoid(raw["log_scales"]) + rendering_radius(progress.fraction)
+        radius = self._schedule().rendering_radius(progress.fraction)
+        scales = self.config.scale_gain * sigmoid(raw["log_scales"]) + radius
         quats = torch.nn.functional.normalize(raw["quats"], dim=-1)
         opacities = sigmoid(raw["opacity_logits"][..., 0])
         sh = sh_from_rgb(sigmoid(raw["sh"]))[..., None, :]
-        gaussians = Gaussians(means, quats, scales, opacities, sh, head_poses(face))
-        return Posed(gaussians, {name: points[name] for name in ("canonical", "expression", "pose", "weights")})
+        return Posed(Gaussians(means, quats, scales, opacities, sh, head_poses(face)), {})
 
     def canonical_face(self) -> FaceParams:
-        """The mean expression of the training frames with free joints at rest, at the origin of the head frame."""
-        expression = self.get_buffer("canonical_expression")[None]
-        still = torch.zeros_like(self.subject.head_rotation)
-        joints = torch.zeros_like(self.subject.joints)
-        return replace(self.subject, expression=expression, joints=joints, head_rotation=still, head_translation=still)
+        """The canonical expression and joints, at the subject's usual head pose."""
+        expression, joints = self.get_buffer("canonical_expression"), self.get_buffer("canonical_joints")
+        return replace(self.subject, expression=expression[None], joints=joints[None])
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Distance of skinning weights and blend directions from those of the nearest canonical vertex.
 
-        Each step uses the next `face_points` points; on average, that is the paper's mean over all points. The squared
-        difference of an expression direction is multiplied by the squared mean variance of all coefficients over the
-        training frames, and divided by the variance of its own coefficient. The term then does not depend on how a face
-        model scales its coefficients (the paper's weights are for FLAME).
+        Points are detached: these losses train the networks only. Each step uses the next `face_points` points; on
+        average, that is the paper's mean over all points. The squared difference of an expression direction is
+        multiplied by the squared mean variance of all coefficients over the training frames, and divided by the
+        variance of its own coefficient. The term then does not depend on how a face model scales its coefficients (the
+        paper's weights are for FLAME).
         """
         n = len(self.store)
         chosen = torch.arange(progress.step * self.config.face_points, (progress.step + 1) * self.config.face_points)
-        chosen = chosen[:n].to(posed.gaussians.means.device) % n
+        means = self.store["means"].detach()
+        means = means[chosen[:n].to(means.device) % n]
         model = self.face_model
-        nearest = nearest_vertices(posed.aux["canonical"][chosen], model.head_vertices(self.canonical_face())[0])
-        losses = {"skinning": 0.1 * _mean_square(posed.aux["weights"][chosen] - model.skinning_weights[nearest])}
-        targets = model.expression_basis[:, nearest].permute(1, 2, 0)
+        found = self.deformation.whole(means / LENGTH_UNIT)
+        canonical = means + LENGTH_UNIT * found.offset.detach()
+        nearest = nearest_vertices(canonical, model.head_vertices(self.canonical_face())[0])
+        # The bone that stands still belongs to no vertex.
+        weights = torch.nn.functional.pad(model.skinning_weights[nearest], (0, 1))
+        losses = {"skinning": 0.1 * _mean_square(found.weights - weights)}
+        difference = found.expression - model.expression_basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
         variance = self.get_buffer("expression_variance")
         unit = variance.mean().clamp_min(1e-8)
         # Coefficients that never moved would otherwise have an infinite weight.
         relative = (variance / unit).clamp_min(0.01)
-        difference = (posed.aux["expression"][chosen] - targets) / LENGTH_UNIT
         losses["expression_directions"] = 10 * _mean_square(
             10 * difference * (unit / (relative * len(relative))).sqrt()
         )
-        if posed.aux["pose"].shape[-1] > 0:
+        if found.pose.shape[-1] > 0:
             basis = model.pose_basis
-            correctives = 0 if basis is None else basis[:, nearest].permute(1, 2, 0)
-            losses["pose_correctives"] = 10 * _mean_square(10 * (posed.aux["pose"][chosen] - correctives) / LENGTH_UNIT)
-        weight = self.config.face_weight * face_decay(progress.fraction)
+            correctives = 0 if basis is None else basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
+            losses["pose_correctives"] = 10 * _mean_square(10 * (found.pose - correctives))
+        weight = self.config.face_weight * self._schedule().face_decay(progress.fraction)
         return {name: weight * loss for name, loss in losses.items()}
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group for the points, and one per network."""
-        rate = self.config.network_rate
+        rate, halvings = self.config.network_rate, self.config.rate_halvings
         networks = {"attributes": self.attributes, "deformation": self.deformation, "change": self.change}
-        groups = [network_group(name, network, rate) for name, network in networks.items()]
-        return [store_group(self.store, "means", self.config.means_rate), *groups]
+        groups = [store_group(self.store, "means", self.config.means_rate)]
+        groups += [network_group(name, network, rate) for name, network in networks.items()]
+        return [replace(group, halvings=halvings) for group in groups]
 
     def gaussian_store(self) -> GaussianStore:
         """The store of points. Everything else comes from networks."""
         return self.store
 
     def density(self) -> RefillDensity:
-        """Deletes points that no view of the last round has shown, then refills up to the scheduled number."""
-        config = self.config
-        times = tuple(index / config.rounds for index in range(1, config.rounds))
-        targets = tuple(min(config.max_points, points_at(time, config.points)) for time in times)
-        return RefillDensity(RefillSettings(times, targets, prune_opacity=0.1), refill=_near_parents)
+        """Deletes points that no view of the last epoch has shown, then refills up to the scheduled number."""
+        config, schedule = self.config, self._schedule()
+        times = tuple(epoch / config.epochs for epoch in range(1, config.epochs))
+        targets = tuple(min(config.max_points, schedule.points_at(time)) for time in times)
+
+        def near_parents(
+            store: GaussianStore, parents: Int[Tensor, " p"], noise: Float[Tensor, "p 3"], fraction: float
+        ) -> dict[str, Tensor]:
+            """Children on a sphere or in a cube around their parents."""
+            around = noise.to(store["means"])
+            if config.schedule == "paper":
+                around = torch.nn.functional.normalize(around, dim=-1)
+            return {"means": store["means"].detach()[parents] + around * schedule.sampling_length(fraction)}
+
+        return RefillDensity(RefillSettings(times, targets, prune_opacity=0.1), refill=near_parents)
 
     @torch.no_grad()
     def bake(self) -> BlendSkinned:
         """Points with blend directions and skinning weights, raw attributes, and the network that changes them."""
-        points = self._points()
-        raw = split_attributes(self.attributes(self.store["means"] / LENGTH_UNIT))
-        weights, biases = self.change.flattened()
+        means = self.store["means"]
+        found = self.deformation.whole(means / LENGTH_UNIT)
+        expression, pose = LENGTH_UNIT * found.expression, LENGTH_UNIT * found.pose
+        face = self.canonical_face()
+        canonical = means + LENGTH_UNIT * found.offset
+        skinning = blend_transforms(found.weights, self._transforms(face))[0]
+        coefficients = self._coefficients(face, absolute=True)
+        rest = unskin(canonical, skinning) - torch.cat([expression, pose], dim=-1) @ coefficients[0]
+        raw = split_attributes(self.attributes(means / LENGTH_UNIT))
+        layers = self.change.layers()
         rig = replace(
             bake_rig(self.face_model, self.subject),
-            template=as_array(points["rest"]),
-            expression_basis=as_array(points["expression"].permute(2, 0, 1)),
-            skinning_weights=as_array(points["weights"]),
-            pose_basis=as_array(points["pose"].permute(2, 0, 1)),
+            template=as_array(rest),
+            expression_basis=as_array(expression.permute(2, 0, 1)),
+            skinning_weights=as_array(found.weights[:, :-1]),
+            pose_basis=as_array(pose.permute(2, 0, 1)),
         )
         # The network takes the motion from the canonical position, but the runtime gives the motion from the rest
         # position. They differ by a constant for each point. Both enter linearly, so the constant uses the same columns
         # of weights again.
-        first = weights[0] / LENGTH_UNIT
+        first = layers[0].weight / LENGTH_UNIT
         network = AttributeNetwork(
             input="displacement",
-            base=as_array(points["rest"] - points["canonical"]),
+            base=as_array(rest - canonical),
             basis=np.zeros((0, len(self.store), 0), np.float32),
-            weights=tuple(as_array(weight) for weight in (torch.cat([first, first], dim=1), *weights[1:])),
-            biases=tuple(as_array(bias) for bias in biases),
+            weights=tuple(
+                as_array(part) for part in (torch.cat([first, first], dim=1), *(layer.weight for layer in layers[1:]))
+            ),
+            biases=tuple(as_array(layer.bias) for layer in layers),
             activation="relu",
             outputs=ATTRIBUTES,
         )
+        attributes = Attributes(
+            quats=as_array(raw["quats"]),
+            log_scales=as_array(raw["log_scales"]),
+            opacity_logits=as_array(raw["opacity_logits"][..., 0]),
+            sh=as_array(raw["sh"][:, None]),
+        )
         return BlendSkinned(
             rig=rig,
-            attributes=Attributes(
-                as_array(raw["quats"]),
-                as_array(raw["log_scales"]),
-                as_array(raw["opacity_logits"][..., 0]),
-                as_array(raw["sh"][:, None]),
-            ),
+            attributes=attributes,
             scale_activation="sigmoid",
             scale_gain=self.config.scale_gain,
-            scale_offset=rendering_radius(1.0),
+            scale_offset=self._schedule().rendering_radius(1.0),
             colour_activation="sigmoid",
             network=network,
+            still_weights=as_array(found.weights[:, -1]),
+            still_pose=as_array(face.T_world_head[0]),
         )
 
-    def _points(self) -> dict[str, Tensor]:
-        """Canonical and rest positions (metres), directions (metres per unit) and skinning weights of the points."""
-        means = self.store["means"]
-        offset, expression, pose, weights = self.deformation(means / LENGTH_UNIT)
-        expression, pose = LENGTH_UNIT * expression, LENGTH_UNIT * pose
-        canonical, face = means + LENGTH_UNIT * offset, self.canonical_face()
-        skinning = blend_transforms(weights, self.face_model.joint_transforms(face))[0]
-        shaped = unskin(canonical, skinning)
-        rest = shaped - blend_directions(expression, pose, face)[0]
-        return {"canonical": canonical, "rest": rest, "expression": expression, "pose": pose, "weights": weights}
+    def _schedule(self) -> Schedule:
+        return Schedule(self.config.schedule, self.config.epochs, self.config.points)
 
-    def _deformed(
-        self, points: dict[str, Tensor], face: FaceParams
-    ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
+    def _transforms(self, face: FaceParams) -> Float[Tensor, "b k 3 4"]:
+        """The joints' transforms in the head frame, then that of the bone which stands still in the world."""
+        still = _inverse(face.T_world_head) @ self.canonical_face().T_world_head
+        return torch.cat([self.face_model.joint_transforms(face), still[:, None]], dim=1)[:, :, :3]
+
+    def _coefficients(self, face: FaceParams, absolute: bool = False) -> Float[Tensor, "b c"]:
+        """Weights of the blend directions: less those of the canonical face, or as they are (`absolute`)."""
+        own = torch.cat([face.expression, _pose_features(face)], dim=1)
+        if absolute:
+            return own
+        canonical = self.canonical_face()
+        return own - torch.cat([canonical.expression, _pose_features(canonical)], dim=1)
+
+    def _deformed(self, face: FaceParams) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
         """Points in the head frame, and their motion from the canonical positions, both in metres."""
-        shaped = points["rest"] + blend_directions(points["expression"], points["pose"], face)
-        skinning = blend_transforms(points["weights"], self.face_model.joint_transforms(face))
-        means = (skinning[..., :3] @ shaped[..., None])[..., 0] + skinning[..., 3]
-        return means, means - points["canonical"]
+        means = self.store["means"]
+        offset, moved, weights = self.deformation(means / LENGTH_UNIT, self._coefficients(face))
+        canonical = means + LENGTH_UNIT * offset
+        with torch.no_grad():
+            at_rest = self._transforms(self.canonical_face())[0]
+        posed = skin_points(canonical, LENGTH_UNIT * moved, weights, at_rest, self._transforms(face))
+        return posed, posed - canonical
 
 
-def blend_directions(
-    expression: Float[Tensor, "n 3 e"], pose: Float[Tensor, "n 3 p"], face: FaceParams
-) -> Float[Tensor, "b n 3"]:
-    """E psi + P (R - I): the displacements from expression and free joints, before skinning."""
-    turned = matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)
-    added = expression.flatten(0, 1) @ face.expression.T + pose.flatten(0, 1) @ turned.flatten(1).T
-    return added.T.unflatten(-1, (-1, 3))
+def canonical_face(
+    model: FaceModel, expression: Float[Tensor, " e"]
+) -> tuple[Float[Tensor, " e"], Float[Tensor, "j 3"]]:
+    """An expression and joints at which the jaw is open by `CANONICAL_JAW`.
+
+    A free jaw turns by this angle. A jaw that follows the expression gets it from the coefficient that opens it most.
+    Other joints are at rest. A model without a joint `jaw` keeps its jaw.
+    """
+    joints = expression.new_zeros(len(model.free_joint_names), 3)
+    if "jaw" in model.free_joint_names:
+        joints[model.free_joint_names.index("jaw"), 0] = CANONICAL_JAW
+    elif "jaw" in model.joint_names:
+        opening = model.joint_rotation_basis[:, model.joint_names.index("jaw"), 0].to(expression)
+        best = opening.argmax()
+        if opening[best] > 0:
+            expression = expression.clone()
+            expression[best] += (CANONICAL_JAW - expression @ opening) / opening[best]
+    return expression, joints
 
 
-def blend_transforms(weights: Float[Tensor, "n k"], transforms: Float[Tensor, "b k 4 4"]) -> Float[Tensor, "b n 3 4"]:
-    """Each point's transform: the mean of the joints' transforms, weighted by its skinning weights."""
-    return (weights @ transforms[:, :, :3].flatten(2)).unflatten(-1, (3, 4))
+def _pose_features(face: FaceParams) -> Float[Tensor, "b p"]:
+    """R - I of the free joints, row by row."""
+    return (matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)).flatten(1)
 
 
-def unskin(points: Float[Tensor, "n 3"], transforms: Float[Tensor, "n 3 4"]) -> Float[Tensor, "n 3"]:
-    """Positions of the points before affine transforms moved them (inverse skinning)."""
-    a, b, c = transforms[..., :3].unbind(-2)
-    # Cramer's rule is several times as fast as a general inverse of many small matrices.
-    columns = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
-    determinant = (a * columns[..., 0]).sum(-1, keepdim=True)
-    return (columns @ (points - transforms[..., 3])[..., None])[..., 0] / determinant
+def _inverse(pose: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:
+    """The inverses of rigid transforms."""
+    turned = pose[:, :3, :3].transpose(1, 2)
+    return rigid_transform(turned, -(turned @ pose[:, :3, 3:])[..., 0])
 
 
 def split_attributes(raw: Float[Tensor, "*b 11"]) -> dict[str, Tensor]:
@@ -233,30 +268,8 @@ def split_attributes(raw: Float[Tensor, "*b 11"]) -> dict[str, Tensor]:
 @torch.no_grad()
 def nearest_vertices(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "v 3"]) -> Int[Tensor, " n"]:
     """The index of the vertex nearest to each point."""
-    return torch.cdist(points, vertices).argmin(-1)
-
-
-def rendering_radius(fraction: float) -> float:
-    """Length added to all scales at a fraction of the run, in metres. It is also the spread of new points."""
-    radius = 0.15 * 0.75 ** math.log2(400 / 100) * LENGTH_UNIT
-    return radius * math.prod(factor for time, factor in _SHRINKAGE if fraction >= time)
-
-
-def points_at(fraction: float, first: int) -> int:
-    """The paper's number of points at a fraction of the run."""
-    return max([first, *(count for time, count in _GROWTH if fraction >= time)])
-
-
-def face_decay(fraction: float) -> float:
-    """Factor on the weight of the face model's terms at a fraction of the run."""
-    return 0.5 ** sum(fraction >= time for time in (0.2, 0.3, 0.5, 0.7))
-
-
-def _near_parents(
-    store: GaussianStore, parents: Int[Tensor, " p"], noise: Float[Tensor, "p 3"], fraction: float
-) -> dict[str, Tensor]:
-    """Children in a cube around their parents. The side of the cube is the rendering radius."""
-    return {"means": store["means"].detach()[parents] + noise.to(store["means"]) * rendering_radius(fraction)}
+    # |p - v|^2 less |p|^2, which is the same for all vertices, and half of that.
+    return torch.addmm(vertices.square().sum(-1) / 2, points, vertices.T, alpha=-1).argmin(-1)
 
 
 def _mean_square(values: Tensor) -> Float[Tensor, ""]:

@@ -1,17 +1,27 @@
 """The settings of MonoGaussianAvatar."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import GAUSSIAN_COUNT, MethodConfig, Photometric
+from mien.avatar.settings import GAUSSIAN_COUNT, FaceTuning, MethodConfig, PerceptualLoss, Photometric
+from mien.errors import UserError
 from mien.ranges import NOT_NEGATIVE, Range, ToLoad
 
+LENGTH_UNIT = 0.25
+"""Unit of length, in metres. The paper's head model is four times life size, and its radii and weights fit that."""
 _WIDTH = Range(1, 1024)
+_EPOCHS = 100
 
 
 def _photometric() -> Photometric:
     return Photometric(l1_weight=1.0, ssim_weight=0.25)
+
+
+def _face_tuning() -> FaceTuning:
+    rate = Rate(1e-3, begin=10 / _EPOCHS)
+    return FaceTuning(expression=rate, joints=rate, head_rotation=rate, head_translation=Rate(3e-4, begin=10 / _EPOCHS))
 
 
 @dataclass(frozen=True)
@@ -21,19 +31,31 @@ class MonoGaussianAvatarConfig(MethodConfig):
     photometric: Photometric = field(default_factory=_photometric)
     """Weights of the losses that compare a rendering with its target. The weights of L1 and 1 - SSIM are the
     paper's."""
+    face_tuning: FaceTuning = field(default_factory=_face_tuning)
+    """Whether and how fast training changes the tracked face parameters of each frame. As in the paper, this begins
+    with epoch 10."""
     points: Annotated[int, Range(1, 1_000_000), ToLoad(1)] = 400
     """Number of Gaussians at the start, on a sphere."""
     sphere_radius: Annotated[float, Range(1e-3, 10)] = 0.125
     """Radius of the initial sphere around the origin of the head frame, in metres."""
-    max_points: Annotated[int, GAUSSIAN_COUNT] = 6_000
+    max_points: Annotated[int, GAUSSIAN_COUNT] = 10_000
     """Largest number of Gaussians. Growth stops there (paper: 100,000)."""
-    rounds: Annotated[int, Range(1, 100_000)] = 50
-    """Number of equal parts of the run. Points are pruned and refilled after each part except the last (paper: 100
-    parts of one epoch)."""
-    attribute_width: Annotated[int, Range(40, 1024)] = 64
+    epochs: Annotated[int, Range(1, 100_000)] = _EPOCHS
+    """Number of the paper's epochs that the run spans. After each, points are pruned and refilled; number of points,
+    radii and the weight of the face model's terms follow the epochs."""
+    schedule: Literal["paper", "code"] = "code"
+    """Whose numbers of points and radii: those of the paper, whose children are on a sphere around their parents, or
+    those of the published code, whose children are in a cube."""
+    attribute_width: Annotated[int, _WIDTH] = 64
     """Width of the attribute network (paper: 256)."""
-    attribute_layers: Annotated[int, Range(1, 32)] = 4
-    """Number of layers of the attribute network (paper: 7)."""
+    attribute_layers: Annotated[int, Range(1, 32)] = 3
+    """Number of layers of the attribute network's trunk (paper: 7). The fourth reads the encoding of positions again,
+    if the network is wider than that."""
+    encoding_bands: Annotated[int, Range(0, 24)] = 9
+    """Number of octaves of the attribute network's encoding of positions (paper: 6). The shortest wave is 6 mm; with 6
+    octaves, it is 49 mm."""
+    sphere_start: bool = False
+    """Whether the attribute network's trunk starts as about the signed distance to a sphere, as in the paper."""
     deformation_width: Annotated[int, _WIDTH] = 64
     """Width of the deformation network (paper: 128)."""
     change_width: Annotated[int, _WIDTH] = 32
@@ -42,14 +64,60 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Largest scale that the networks add to the radius that all points share, in metres (paper: 0.0025 for pictures of
     1024x1024)."""
     means_rate: Rate = Rate(1e-4, 1e-5)
-    """Learning rate of the points, in metres per step."""
+    """Learning rate of the points, in metres per step (paper: 2.5e-5)."""
     network_rate: Rate = Rate(1e-3, 1e-4)
     """Learning rate of the networks, per step (paper: 1e-4, over some hundred thousand steps)."""
+    rate_halvings: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = ()
+    """Times at which the rates of points and networks are halved, as fractions of the run (paper: epochs 80 and
+    100)."""
     face_weight: Annotated[float, NOT_NEGATIVE] = 10.0
-    """Weight of the losses that keep points near the face model. It halves at 0.2, 0.3, 0.5 and 0.7 of the run."""
-    face_points: Annotated[int, GAUSSIAN_COUNT] = 512
+    """Weight of the losses that keep the networks near the face model. It halves at epochs 20, 30, 50 and 70."""
+    face_points: Annotated[int, GAUSSIAN_COUNT] = 256
     """Number of points that these losses use in each step, in turn."""
 
+    @classmethod
+    def upgraded(cls, stored: Mapping[str, Any]) -> dict[str, Any]:
+        """Refuse avatars of versions whose bone stood still in the head frame: their networks have other shapes.
 
-PRESETS = {"draft": MonoGaussianAvatarConfig(), "standard": MonoGaussianAvatarConfig()}
-"""Settings of this method for each preset. They are equal: a draft is only a shorter run."""
+        Raises:
+            UserError: it is such an avatar.
+        """
+        if "epochs" not in stored:
+            raise UserError(
+                "was made by an older version of mono_gaussian_avatar, whose networks this version cannot read; "
+                "train it again under another name (`mien train --method mono_gaussian_avatar --run NAME`)"
+            )
+        return dict(stored)
+
+
+_PAPER_EPOCHS, _PAPER_FRAMES = 120, 2_500
+"""The preset `paper` spans the epochs up to which results are published, over a video of 100 seconds."""
+
+
+def _paper() -> MonoGaussianAvatarConfig:
+    """The paper's settings (docs/paper_preset.md)."""
+    rate = Rate(5e-4, begin=10 / _PAPER_EPOCHS)
+    perceptual = PerceptualLoss(weight=0.1, start=0.0, every=1, crop=224, blocks=3)
+    return MonoGaussianAvatarConfig(
+        photometric=Photometric(l1_weight=1.0, ssim_weight=0.25, perceptual=perceptual),
+        face_tuning=FaceTuning(expression=rate, joints=rate, head_rotation=rate, head_translation=Rate(0.0)),
+        max_points=100_000,
+        epochs=_PAPER_EPOCHS,
+        schedule="paper",
+        attribute_width=256,
+        attribute_layers=7,
+        encoding_bands=6,
+        sphere_start=True,
+        deformation_width=128,
+        change_width=64,
+        means_rate=Rate(1e-4 * LENGTH_UNIT),
+        network_rate=Rate(1e-4),
+        rate_halvings=(80 / _PAPER_EPOCHS, 100 / _PAPER_EPOCHS),
+        face_points=100_000,
+    )
+
+
+PRESETS = {"draft": MonoGaussianAvatarConfig(), "standard": MonoGaussianAvatarConfig(), "paper": _paper()}
+"""Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
+PRESET_STEPS = {"paper": _PAPER_EPOCHS * _PAPER_FRAMES}
+"""Number of steps of the presets for which the method has its own."""

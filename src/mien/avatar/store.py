@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Int
 from torch import Tensor, nn
 
 from mien.adam import FactoredMoments, Moments
@@ -72,6 +73,15 @@ class GaussianStore(nn.Module):
             state = self.moments[name]
             for field in state.PER_ROW:
                 setattr(state, field, torch.zeros_like(getattr(state, field)))
+
+    def assign_rows(self, name: str, rows: Int[Tensor, " k"], values: Tensor) -> None:
+        """Overwrite some rows of a tensor outside the optimiser. Only their moments restart from zero."""
+        with torch.no_grad():
+            self[name].index_copy_(0, rows, values.to(self[name]))
+        if name in self.moments:
+            state = self.moments[name]
+            for field in state.PER_ROW:
+                getattr(state, field).index_fill_(0, rows, 0.0)
 
     def resize(self, length: int) -> None:
         """Make room for `length` Gaussians whose values will be loaded next. Moments are dropped."""

@@ -16,7 +16,7 @@ DEGENERATE_LENGTH = 1e-7
 """Shortest first edge or height of a triangle that has a frame of its own, in metres."""
 
 
-_WIDENING, _FLATNESS = 2.5, 0.05
+_WIDENING, _FLATNESS = 2.0, 0.05
 """Scales of Gaussians that cover a triangle: those in its plane, in its standard deviations, and the other one."""
 
 

@@ -21,9 +21,9 @@ from mien.benchmarking.train_step import (
     empty_statistics,
     paint_targets,
     pose_and_render,
+    runtime_frame,
 )
-from mien.face import FaceModel, FaceParams, load_face_model
-from mien.runtime import Face
+from mien.face import FaceModel, load_face_model
 from mien.training.checkpoint import TrainingState
 from mien.training.frames import FrameOrder, training_frames
 from mien.training.sequence import Targets
@@ -58,7 +58,7 @@ def headgas_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
             lambda: pose_and_render(state.avatar, face[next(frames) % TIMESTEPS], camera), seconds / 3
         )
         yield benchmark_row("headgas_frame", COUNT, SIZE, timing)
-        timing = time_function(lambda: _runtime_frame(portable, face[next(frames) % TIMESTEPS]), seconds / 3)
+        timing = time_function(lambda: runtime_frame(portable, face[next(frames) % TIMESTEPS]), seconds / 3)
         yield benchmark_row("headgas_runtime_frame", COUNT, SIZE, timing)
 
 
@@ -91,8 +91,3 @@ def _fill(avatar: HeadGas, count: int) -> None:
     last = avatar.network[-1]
     assert isinstance(last, torch.nn.Linear)
     last.bias[-1] = 2.0
-
-
-def _runtime_frame(avatar: runtime.Avatar, face: FaceParams) -> None:
-    parts = (face.expression, face.joints, face.head_rotation, face.head_translation)
-    avatar.render(runtime.pose(avatar.portable.baked, Face(*(part[0].numpy() for part in parts))))

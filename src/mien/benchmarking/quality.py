@@ -161,6 +161,8 @@ class QualityRow:
     """Seconds of each stage when it last ran."""
     unseen_views: dict[str, Any] = field(default_factory=dict)
     """Figures by angle (`mien.evaluation.unseen_views`). Empty if the capture has no pictures from aside."""
+    unseen_views_by_truth: dict[str, Any] = field(default_factory=dict)
+    """The same for a run that was trained and posed by the true tracking, which leaves what the avatar itself costs."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the row as a json object."""
@@ -190,6 +192,8 @@ def markdown_table(rows: list[QualityRow]) -> str:
         lines += [f"| {row.capture} | {name} | {tracking_cells(errors)} |" for name, errors in row.tracking.items()]
     for row in rows:
         lines += ["", *unseen_lines(row.capture, row.unseen_views)] if row.unseen_views else []
+        truth = unseen_lines(f"{row.capture}, true tracking", row.unseen_views_by_truth)
+        lines += ["", *truth] if row.unseen_views_by_truth else []
     lines += ["", "| capture | steps | Gaussians | seconds by stage |", "|---|---|---|---|"]
     for row in rows:
         seconds = ", ".join(f"{name} {value:.0f}" for name, value in row.seconds.items())
@@ -200,7 +204,7 @@ def markdown_table(rows: list[QualityRow]) -> str:
 def unseen_lines(name: str, views: dict[str, Any]) -> list[str]:
     """Return a table of the head crop by angle in markdown, line by line."""
     lines = [
-        f"| {name}: degrees aside | avatar: PSNR / SSIM / ST-LPIPS of the head crop | mesh with its colours |",
+        f"| {name}: degrees aside | avatar: PSNR / SSIM / ST-LPIPS of the head crop | mesh in completed colours |",
         "|---|---|---|",
     ]
     for angle, row in views.items():

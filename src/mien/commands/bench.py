@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from mien.avatar import DEFAULT_METHOD
-from mien.commands.options import MethodName
+from mien.avatar import DEFAULT_METHOD, METHODS
+from mien.commands.options import MethodName, PresetName
 from mien.devices import DeviceName, check_device, choose_device, like_on
 from mien.errors import UserError
 from mien.terminal import show
+from mien.workspace import open_workspace
 
 if TYPE_CHECKING:
     import torch
@@ -26,6 +27,7 @@ CaptureName = Literal[
     "mono-sides-long-hair",
 ]  # fmt: skip
 """The keys of `mien.synthetic.REFERENCES`, written out because options are read before torch. A test compares them."""
+_MOST_MINUTES = 100_000
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,9 @@ class Scaling:
 class TrainStep:
     """Measure a training step (no footage is needed), and posing together with drawing."""
 
-    method: Literal["gaussian_avatars", "headgas"] = "gaussian_avatars"
-    """Method to measure. headgas is measured on the CPU, with the paper's features and colours, at 512x512."""
+    method: Literal["gaussian_avatars", "headgas", "mono_gaussian_avatar"] = "gaussian_avatars"
+    """Method to measure. The other two are measured on the CPU at 512x512: headgas with the paper's features and
+    colours, mono_gaussian_avatar with the sizes of the preset standard."""
 
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the machine and all rows as json, for programs."""
@@ -104,16 +107,18 @@ class TrainStep:
         """Check that CUDA has gsplat and that there is time to measure."""
         check_device(self.device)
         _check_seconds(self.seconds)
-        if self.method == "headgas" and self.device == "cuda":
-            raise UserError("--device cuda: headgas is measured on the CPU only; leave out --device")
+        if self.method != "gaussian_avatars" and self.device == "cuda":
+            raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
 
     def run(self) -> None:
         """Measure and print the rows."""
         from mien.benchmarking.headgas_step import headgas_suite
+        from mien.benchmarking.mono_step import mono_suite
         from mien.benchmarking.train_step import train_step_suite
 
-        if self.method == "headgas":
-            show_rows(headgas_suite(self.seconds), self.as_json)
+        suites = {"headgas": headgas_suite, "mono_gaussian_avatar": mono_suite}
+        if self.method in suites:
+            show_rows(suites[self.method](self.seconds), self.as_json)
             return
         like = _gpu(self.device)
         if like is None:
@@ -155,14 +160,81 @@ class Quality:
 
 
 @dataclass(frozen=True)
+class Compare:
+    """Compare methods: train and score each one on the same frames with the same budget, and print one table.
+
+    The table has quality (head, eyes, mouth, whole frame, unseen views where there are any), Gaussians, training time,
+    time a frame, and size on disk. A stopped command continues where it was. The runs are in the workspaces, named
+    compare-METHOD-BUDGET, for `mien evaluate --compare` and `mien study make`.
+    """
+
+    workspaces: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[DIR [DIR ...]]")] = ()
+    """Tracked workspaces."""
+    captures: tuple[CaptureName, ...] = ()
+    """Reference captures as well. They are drawn, captured and tracked in --out first."""
+    methods: tuple[MethodName, ...] = tuple(METHODS)
+    """Methods to compare."""
+    minutes: float = 0.0
+    """Minutes of training for each method on each capture. Trials on this machine, which take a tenth more, turn them
+    into steps. 0 means --steps."""
+    steps: int = 0
+    """Number of optimiser steps of each method. 0 means the preset's own number for each method."""
+    preset: PresetName = "standard"
+    """How thorough the training is."""
+    split: Literal["blocks", "tail"] = "blocks"
+    """Held-out frames of workspaces: every fifth block of 10 frames (blocks), or the last 20 % (tail). Reference
+    captures have their own."""
+    out: Path = Path("out/bench-compare")
+    """Folder for the tables, trials and reference captures."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the result as json, for programs."""
+
+    def check(self) -> None:
+        """Check without heavy libraries that there is something to compare, and that it can be written."""
+        from mien.files import check_writable
+        from mien.training import PRESETS
+
+        if not self.workspaces and not self.captures:
+            raise UserError("nothing to compare on; give workspace folders, or --captures NAME")
+        if not 0 <= self.minutes <= _MOST_MINUTES:
+            raise UserError(f"--minutes {self.minutes:g}: give a number from 0 to {_MOST_MINUTES}")
+        if self.steps < 0:
+            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's number")
+        if self.minutes and self.steps:
+            raise UserError(f"--minutes {self.minutes:g} --steps {self.steps}: give one of them")
+        if not self.methods:
+            raise UserError("--methods: give at least one method")
+        for method in self.methods:
+            PRESETS[self.preset].config(method)
+        roots = [folder.resolve() for folder in self.workspaces]
+        names = [root.name for root in roots] + list(self.captures)
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise UserError(f"{twice}: two captures have this name; give one of them, or rename its folder")
+        for folder in self.workspaces:
+            open_workspace(folder)
+        check_writable(self.out, folder=True)
+
+    def run(self) -> None:
+        """Train and score every method on every capture, then print the table."""
+        from mien.commands.stages.comparing import Budget, CompareSettings, run_compare_stage
+
+        methods = tuple(dict.fromkeys(self.methods))
+        settings = CompareSettings(methods, self.preset, Budget(self.minutes, self.steps), self.split)
+        opened = [open_workspace(folder) for folder in self.workspaces]
+        run_compare_stage(self.out, opened, self.captures, settings, as_json=self.as_json)
+
+
+@dataclass(frozen=True)
 class Command:
-    """Measure this machine and this version of mien: `mien bench render`, `train-step`, `scaling`, `quality`."""
+    """Measure this machine and this version of mien: `mien bench render | train-step | scaling | quality | compare`."""
 
     what: Annotated[
         Annotated[Render, tyro.conf.subcommand("render", prefix_name=False)]
         | Annotated[TrainStep, tyro.conf.subcommand("train-step", prefix_name=False)]
         | Annotated[Scaling, tyro.conf.subcommand("scaling", prefix_name=False)]
-        | Annotated[Quality, tyro.conf.subcommand("quality", prefix_name=False)],
+        | Annotated[Quality, tyro.conf.subcommand("quality", prefix_name=False)]
+        | Annotated[Compare, tyro.conf.subcommand("compare", prefix_name=False)],
         tyro.conf.arg(name=""),
     ]
 

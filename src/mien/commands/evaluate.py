@@ -39,6 +39,11 @@ class Command:
     """By default, ST-LPIPS is computed, which takes most of the time. --no-perceptual leaves it out."""
     perceptual_frames: int = 24
     """Largest number of frames, evenly spread, on which ST-LPIPS is computed. 0 means all frames."""
+    fit_faces: bool = False
+    """Also score the avatar with expression and pose fitted to each held-out frame by its colours: a third figure
+    beside those as tracked and corrected, never the headline. It takes longer."""
+    fit_steps: int = 20
+    """Number of optimiser steps of --fit-faces, for each held-out timestep: 1 to 10,000."""
     compare: bool = False
     """Print one table over the runs of all given workspaces, and write compare.html into the first one."""
     images: Path | None = None
@@ -60,6 +65,10 @@ class Command:
         """Check without heavy libraries which of the three tasks is asked for, and that its input exists."""
         if self.perceptual_frames < 0:
             raise UserError(f"--perceptual-frames {self.perceptual_frames}: give a positive number, or 0 for all")
+        if not 1 <= self.fit_steps <= 10_000:
+            raise UserError(f"--fit-steps {self.fit_steps}: give a number from 1 to 10000")
+        if self.fit_faces and (self.compare or self.images is not None):
+            raise UserError("--fit-faces: is for one run, without --compare and --images; leave it out")
         if self.images is not None or self.truth is not None:
             self._check_images()
         elif not self.workspaces:
@@ -85,7 +94,11 @@ class Command:
         from mien.evaluation import EvaluationSettings
 
         settings = EvaluationSettings(
-            perceptual=self.perceptual, perceptual_frames=self.perceptual_frames, pictures=self.pictures
+            perceptual=self.perceptual,
+            perceptual_frames=self.perceptual_frames,
+            pictures=self.pictures,
+            fit_faces=self.fit_faces,
+            fit_steps=self.fit_steps,
         )
         workspace = open_workspace(self.workspaces[0])
         metrics = run_evaluation_stage(workspace, workspace.pick_run(self.run_name), settings, self.drivers)

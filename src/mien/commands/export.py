@@ -13,15 +13,15 @@ from mien.workspace import Workspace, open_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Write an avatar as .mien (all of it), .html (a page to send), .ply (one pose) or GaussianAvatars' folder."""
+    """Write an avatar as .mien (all of it), .html (a page), .glb (a mesh for engines), .ply (a pose) or a folder."""
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder."""
     out: Path
-    """The .mien, .html or .ply file to write. With --series, the .ply files get numbers: NAME_000000.ply. With --format
-    gaussian-avatars, a folder."""
-    format: Literal["mien", "html", "ply", "gaussian-avatars"] | None = None
-    """Format of the output: mien, html, ply (default: by the ending of --out), or gaussian-avatars: a folder with
+    """The .mien, .html, .glb or .ply file to write. With --series, the .ply files get numbers: NAME_000000.ply. With
+    --format gaussian-avatars, a folder."""
+    format: Literal["mien", "html", "glb", "ply", "gaussian-avatars"] | None = None
+    """Format of the output: mien, html, glb, ply (default: by the ending of --out), or gaussian-avatars: a folder with
     point_cloud.ply, whose Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's
     training."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
@@ -45,13 +45,17 @@ class Command:
         if self.format == "gaussian-avatars":
             self._check_folder()
             return
-        if kind not in (".ply", ".mien", ".html"):
-            told = f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply, .mien or .html"
+        if kind not in (".ply", ".mien", ".html", ".glb"):
+            told = f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply, .mien, .html or .glb"
             raise UserError(f"{told}, or --format gaussian-avatars for a folder")
         if self.format is not None and kind != f".{self.format}":
             raise UserError(f"{self.out}: does not end in .{self.format}, as --format {self.format} asks; rename it")
         if kind == ".mien" and (self.set or self.series):
             raise UserError(f"{self.out}: a .mien file holds every expression; leave --set and --series out")
+        if kind == ".glb" and (self.set or self.series):
+            raise UserError(
+                f"{self.out}: a .glb file has a morph target for every expression; leave --set and --series out"
+            )
         if kind == ".html" and self.set:
             raise UserError(f"{self.out}: a page has a slider for every expression; leave --set out")
         if self.every < 1 or (self.every > 1 and self.series is None):
@@ -73,6 +77,8 @@ class Command:
             self._write_mien(avatar, run_dir)
         elif self.out.suffix.lower() == ".html":
             self._write_page(avatar, run_dir, workspace)
+        elif self.out.suffix.lower() == ".glb":
+            self._write_glb(avatar, run_dir)
         elif self.series is None:
             self._write_one(avatar)
         else:
@@ -81,7 +87,7 @@ class Command:
     def _check_folder(self) -> None:
         from mien.files import check_writable
 
-        if self.out.suffix.lower() in (".ply", ".mien", ".html"):
+        if self.out.suffix.lower() in (".ply", ".mien", ".html", ".glb"):
             raise UserError(f"{self.out}: --format gaussian-avatars writes a folder; give a name without an ending")
         if self.set or self.series or self.every != 1:
             raise UserError(
@@ -131,6 +137,20 @@ class Command:
         say(
             f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians{moves}, {page.size / 1e6:.1f} MB; compression "
             f"changes the picture little ({page.psnr:.0f} dB)"
+        )
+
+    def _write_glb(self, avatar, run_dir: Path) -> None:
+        from mien.avatar import as_array, bake_rig, make_portable
+        from mien.export import MeshModel, write_glb
+        from mien.progress import say
+        from mien.training import run_camera
+
+        portable, model = make_portable(avatar, run_camera(run_dir), self.workspace.resolve().name), avatar.face_model
+        mesh = MeshModel(bake_rig(model, avatar.subject), *map(as_array, (model.faces, model.uv, model.uv_faces)))
+        written = write_glb(self.out, portable, mesh)
+        say(
+            f"{self.out}: a mesh with {len(written.targets)} morph targets and {len(model.joint_names)} joints, "
+            f"{len(avatar.gaussian_store()):,} Gaussians at rest, {written.size / 1e6:.1f} MB"
         )
 
     def _write_one(self, avatar) -> None:

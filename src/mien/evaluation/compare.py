@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mien.errors import UserError
-from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FACE_SOURCE_NAMES, figure, read_figures
+from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FACE_SOURCE_NAMES, FITTED_NAME, figure, read_figures
 from mien.training import read_run_config
 
 
@@ -30,7 +30,7 @@ class Row:
     entry: Mapping[str, Any]
     """Figures: `psnr`, ..., `head`: {...}."""
     run: ScoredRun | None
-    """The run, or None for baselines and for a run without its corrections."""
+    """The run, or None for baselines and for a run with other face parameters than the headline's."""
     faces: str
     """Source of the face parameters of held-out frames. For a baseline that depends on them: the runs."""
     baseline: bool = False
@@ -166,6 +166,10 @@ def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
         entry = run.metrics["protocols"][protocol]
         if entry["face_params"] != "as_tracked":
             rows.append(Row(run.label, entry["as_tracked"], None, FACE_SOURCE_NAMES["as_tracked"]))
+    for run in runs:
+        entry = run.metrics["protocols"][protocol]
+        if "fitted" in entry:
+            rows.append(Row(run.label, entry["fitted"], None, FITTED_NAME))
     first = runs[0].metrics["protocols"][protocol]
     for key, name in BASELINE_NAMES.items():
         rows += _baseline_rows(key, name, runs, protocol)

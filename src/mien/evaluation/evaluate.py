@@ -19,6 +19,7 @@ from mien.evaluation.report_sections import cross_section
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.inside import check_tree
 from mien.locks import hold
+from mien.ranges import check_ranges
 from mien.storage import file_digest, write_json
 from mien.training import read_coverage, read_curves, read_run_config, read_training_summary
 
@@ -48,6 +49,7 @@ def evaluate(
             process is writing the run.
     """
     check_tree(run_dir)
+    check_ranges(settings or EvaluationSettings(), lambda name: f"--{name.replace('_', '-')}")
     with hold(run_dir):
         return _evaluate(run_dir, sequence_dirs, settings or EvaluationSettings(), driver_dirs)
 
@@ -127,4 +129,6 @@ def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings:
         file_digest(run_dir / "face_track.safetensors"), experiment.digests, experiment.held_out_frames,
         settings.baselines, settings.perceptual, settings.perceptual_frames, settings.backbone,
     ]  # fmt: skip
+    if settings.fit_faces:
+        content.append(settings.fit_steps)
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

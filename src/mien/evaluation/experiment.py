@@ -95,13 +95,18 @@ def scored_on(experiment: Experiment, frames: Items[Frame]) -> dict[str, dict[st
 
 
 @torch.no_grad()
-def avatar_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
+def avatar_image(experiment: Experiment, frame: Frame, face: FaceParams | None = None) -> Float[Tensor, "h w 3"]:
     """The avatar posed and seen as in a frame, over white, clamped to 0..1.
+
+    Args:
+        experiment: The experiment.
+        frame: The frame.
+        face: Face parameters that pose the avatar instead of the experiment's.
 
     Raises:
         UserError: the avatar or the face parameters give Gaussians that are not finite.
     """
-    gaussians = experiment.avatar.pose(experiment.face(frame)).gaussians.timestep(0)
+    gaussians = experiment.avatar.pose(experiment.face(frame) if face is None else face).gaussians.timestep(0)
     white = torch.ones(3).to(gaussians.means)
     with drawable(f"{experiment.sequences[frame.sequence].name}, timestep {frame.timestep}", "train again"):
         return rasterize(gaussians, experiment.camera(frame), white).image.clamp(0, 1).cpu()

@@ -23,6 +23,8 @@ BASELINE_NAMES = {"mean_frame": "mean training picture", "mesh": "coloured mesh"
 """Names of the baselines, by their keys in metrics.json."""
 FACE_SOURCE_NAMES = {"corrected": "corrected", "as_tracked": "as tracked"}
 """Names for the source of held-out face parameters: tracking with corrections from training, or tracking alone."""
+FITTED_NAME = "fitted to the scored pictures"
+"""Name for face parameters that were fitted to the held-out frames themselves. They are never the headline."""
 _DRIVEN = ("expression_error", "expression_error_still", "head_rotation_error_degrees",
            "head_rotation_error_still_degrees", "faces_found")  # fmt: skip
 _MAX_FIGURE = 1e12
@@ -74,6 +76,8 @@ def _check_protocol(entry: Mapping[str, Any]) -> None:
     _number(entry, "seconds_per_frame")
     if entry["face_params"] != "as_tracked":
         _check_row(entry["as_tracked"])
+    if "fitted" in entry:
+        _check_row(entry["fitted"])
     for name, row in entry["baselines"].items():
         _require(name in BASELINE_NAMES, "a baseline's name")
         _check_row(row)

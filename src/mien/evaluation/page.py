@@ -52,6 +52,13 @@ GLOSSARY = {
     ),
 }
 """Explanation of each term, for readers who see it for the first time."""
+FITTED_GLOSSARY = {
+    "Faces fitted to the scored pictures": (
+        "Expression and pose of each held-out frame, tuned by the difference of colours to the very picture that is "
+        "scored. The figures show what the avatar can draw, not what it predicts, so compare them only with each other."
+    ),
+}
+"""Explanation for pages that show such figures."""
 _MAX_EMBEDDED_BYTES = 6 << 20
 
 

@@ -4,12 +4,13 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import Any
+from typing import Annotated, Any
 
 from torch import Tensor
 
 from mien.evaluation.baselines import Baselines, make_baselines
 from mien.evaluation.experiment import Experiment, avatar_image, scored_on, target_image
+from mien.evaluation.fitting import LOSS, FittedFaces
 from mien.evaluation.metrics import psnr
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.scoring import (
@@ -26,9 +27,10 @@ from mien.evaluation.scoring import (
 )
 from mien.parallel import stream_in_threads
 from mien.progress import progress_bar
+from mien.ranges import Range
 from mien.training.frames import Frame, spread_frames
 
-AVATAR, AS_TRACKED, MEAN_FRAME, MESH = "avatar", "as_tracked", "mean_frame", "mesh"
+AVATAR, AS_TRACKED, FITTED, MEAN_FRAME, MESH = "avatar", "as_tracked", "fitted", "mean_frame", "mesh"
 _MAX_TRAINING_FRAMES = 200
 _ALWAYS = {f"{part}{metric}" for part in ("", "head_") for metric in ("psnr", "ssim", "l1")}
 """Figures that every frame has."""
@@ -47,6 +49,10 @@ class EvaluationSettings(ScoreSettings):
     """Largest number of frames in each side-by-side video. 0 makes no videos."""
     pictures: bool = False
     """Whether to write every scored picture and its truth as png as well."""
+    fit_faces: bool = False
+    """Whether to score the avatar a third time, with expression and pose fitted to each held-out frame's picture."""
+    fit_steps: Annotated[int, Range(1, 10_000)] = 20
+    """Number of optimiser steps of that fit, for each timestep."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +61,8 @@ class Evaluation:
 
     frames: tuple[Frame, ...]
     scores: dict[str, tuple[Scores, ...]]
-    """Figures by subject, with one entry per frame: `avatar`; `as_tracked`, if the avatar's faces are corrected; and,
-    with baselines, `mean_frame` and `mesh`."""
+    """Figures by subject, with one entry per frame: `avatar`; `as_tracked`, if the avatar's faces are corrected;
+    `fitted`, if asked for; and, with baselines, `mean_frame` and `mesh`."""
     seconds_per_frame: float
     """Median time to pose and render the avatar."""
     baselines: Baselines | None
@@ -83,6 +89,7 @@ def evaluate_frames(
     assert experiment.held_out_frames, "nothing is held out"
     frames = experiment.held_out_frames
     subjects = {AVATAR} | ({AS_TRACKED} if experiment.face_source != "as_tracked" else set())
+    subjects |= {FITTED} if settings.fit_faces else set()
     subjects |= {MEAN_FRAME, MESH} if settings.baselines else set()
     kept = partial.read() if partial is not None else {}
     done = {frame: scored for frame, scored in kept.items() if _is_complete(scored[0], subjects)}
@@ -90,6 +97,7 @@ def evaluate_frames(
     judged = set(spread_frames(frames, settings.perceptual_frames))
     threads = worker_threads(settings.threads)
     baselines = make_baselines(experiment, threads) if settings.baselines else None
+    fitted = FittedFaces(experiment, settings.fit_steps) if settings.fit_faces else None
 
     def score(job: tuple[Frame, dict[str, Tensor], float]) -> tuple[Frame, dict[str, Scores], float]:
         frame, drawn, seconds = job
@@ -99,7 +107,7 @@ def evaluate_frames(
         return frame, score_pictures(pictures, truth, crop, judge, experiment.parts(frame)), seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:
-        jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines)
+        jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines, fitted)
         for frame, row, seconds in stream_in_threads(score, jobs, threads):
             done[frame] = row, seconds
             if partial is not None:
@@ -117,7 +125,7 @@ def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
 
 
 def _drawn(
-    experiment: Experiment, frames: list[Frame], baselines: Baselines | None
+    experiment: Experiment, frames: list[Frame], baselines: Baselines | None, fitted: FittedFaces | None
 ) -> Iterator[tuple[Frame, dict[str, Tensor], float]]:
     """Yield each frame with its pictures to score, by name, and the seconds to pose and render the avatar."""
     as_tracked = None if experiment.face_source == "as_tracked" else _as_tracked(experiment)
@@ -127,6 +135,8 @@ def _drawn(
         seconds = time.perf_counter() - start
         if as_tracked is not None:
             drawn[AS_TRACKED] = avatar_image(as_tracked, frame)
+        if fitted is not None:
+            drawn[FITTED] = avatar_image(experiment, frame, fitted.face(frame))
         if baselines is not None:
             drawn[MEAN_FRAME] = baselines.mean_frame_image(experiment, frame)
             drawn[MESH] = baselines.mesh_image(experiment, frame)
@@ -178,6 +188,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "training_frames": _training_means(evaluation),
         "baselines": {name: mean_scores(scores[name]) for name in (MEAN_FRAME, MESH) if name in scores},
         "as_tracked": mean_scores(scores.get(AS_TRACKED, own_rows)),
+        **_fitted_content(scores, settings),
         "per_frame": {
             "sequence": [experiment.sequences[frame.sequence].name for frame in evaluation.frames],
             "timestep": [frame.timestep for frame in evaluation.frames],
@@ -185,6 +196,13 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
             **{name: [_rounded(row.get(name)) for row in own_rows] for name in _figure_names(own_rows)},
         },
     }
+
+
+def _fitted_content(scores: Mapping[str, Sequence[Scores]], settings: EvaluationSettings) -> dict[str, Any]:
+    """The figures with fitted faces and how they were fitted, or nothing if they were not asked for."""
+    if FITTED not in scores:
+        return {}
+    return {FITTED: {**mean_scores(scores[FITTED]), "fit": {"steps": settings.fit_steps, "loss": LOSS}}}
 
 
 def _figure_names(rows: Sequence[Scores]) -> list[str]:

@@ -13,8 +13,16 @@ import numpy as np
 
 from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
-from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, PART_NAMES, figure
-from mien.evaluation.page import GLOSSARY, ReportVideo, glossary_html, metric_groups, metric_headings, page_html
+from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FITTED_NAME, PART_NAMES, figure
+from mien.evaluation.page import (
+    FITTED_GLOSSARY,
+    GLOSSARY,
+    ReportVideo,
+    glossary_html,
+    metric_groups,
+    metric_headings,
+    page_html,
+)
 from mien.evaluation.protocols import Evaluation
 from mien.storage import write_atomically
 from mien.training.coverage import Coverage
@@ -28,6 +36,7 @@ _TITLES = {
 _ROWS = {
     "avatar": "Avatar",
     "as_tracked": "Avatar, faces as tracked",
+    "fitted": f"Avatar, faces {FITTED_NAME}",
     **{key: BASELINE_NAMES[key].capitalize() for key in ("mesh", "mean_frame")},
 }
 
@@ -134,7 +143,8 @@ def _table(protocols: Mapping[str, Any]) -> str:
     parts = []
     for name, entry in protocols.items():
         corrected = {} if entry["face_params"] == "as_tracked" else {"as_tracked": entry["as_tracked"]}
-        subjects = {"avatar": entry, **corrected, **entry["baselines"]}
+        fitted = {"fitted": entry["fitted"]} if "fitted" in entry else {}
+        subjects = {"avatar": entry, **corrected, **fitted, **entry["baselines"]}
         rows = "".join(
             f'<tr class="{"own" if key == "avatar" else ""}"><td>{label}</td>{_cells(key, subjects)}</tr>'
             for key, label in _ROWS.items()
@@ -203,7 +213,12 @@ def _cells(key: str, subjects: Mapping[str, Any]) -> str:
 
 def _how_to_read(protocols: Mapping[str, Any]) -> str:
     backbones = {entry["perceptual_backbone"] for entry in protocols.values()} - {None}
-    texts = {**GLOSSARY, "ST-LPIPS": f"{GLOSSARY['ST-LPIPS']} Here: {', '.join(sorted(backbones)) or 'not computed'}."}
+    fitted = FITTED_GLOSSARY if any("fitted" in entry for entry in protocols.values()) else {}
+    texts = {
+        **GLOSSARY,
+        **fitted,
+        "ST-LPIPS": f"{GLOSSARY['ST-LPIPS']} Here: {', '.join(sorted(backbones)) or 'not computed'}.",
+    }
     return glossary_html(texts)
 
 

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture import Capture
-from mien.evaluation.baselines import make_baselines
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.scoring import Scores, ScoreSettings, as_8_bit, mean_scores, perceptual_metric, score_pictures
@@ -27,6 +26,8 @@ from mien.rotation import align_centred
 from mien.synthetic import Truth
 from mien.synthetic.recipe import SIDES
 from mien.tracking import make_scoring
+from mien.training.completion import complete_colors, vertex_means
+from mien.training.coverage import coverage
 from mien.training.sequence import composite
 
 AVATAR, MESH = "avatar", "mesh"
@@ -94,7 +95,7 @@ def camera_beside(camera: Camera, tracked: Float[np.ndarray, "n 3"], true: Float
 def score_side_views(
     experiment: Experiment, sequence: str, pictures: SidePictures, settings: ScoreSettings
 ) -> tuple[Figures, Float[np.ndarray, "h w 3"]]:
-    """Figures by angle for the avatar and for the coloured mesh, and a sheet: truth, avatar and mesh by angle.
+    """Figures by angle for the avatar and the mesh in completed colours, and a sheet: truth, avatar, mesh by angle.
 
     The pictures are cut and cropped as in every other protocol: over white, above the neck line of the true head. An
     avatar is posed as in `experiment`, and seen by the true camera at the place that it has relative to the tracked
@@ -109,7 +110,7 @@ def score_side_views(
     index = [one.name for one in experiment.sequences].index(sequence)
     model, truth = experiment.avatar.face_model, pictures.truth
     scoring = make_scoring(pictures.capture, truth.tracking, model)
-    colors = make_baselines(experiment, settings.threads or None).vertex_colors
+    colors = _completed_colors(experiment, settings.threads or None)
     metric, judged = perceptual_metric(settings), _judged(len(pictures.timesteps), settings.perceptual_frames)
     tracked, used = experiment.sequences[index].tracking.face, experiment.faces[index]
     true_points = truth.vertices_world
@@ -147,6 +148,14 @@ def score_side_views(
 
     rows = list(stream_in_threads(score, jobs(), settings.threads or None))
     return _by_angle(rows), np.concatenate([np.concatenate(row, 0) for row in shown], 1)
+
+
+def _completed_colors(experiment: Experiment, threads: int | None) -> Float[Tensor, "v 3"]:
+    """Colours of the mesh from the training pictures, completed where they show none."""
+    model = experiment.avatar.face_model
+    found = coverage(model, experiment.sequences, experiment.faces, experiment.training_frames, threads)
+    neutral = model.head_vertices(experiment.avatar.subject)[0]
+    return vertex_means(model, complete_colors(model, neutral, found.seen, found.colors))
 
 
 def _by_angle(rows: list[tuple[_View, dict[str, Scores]]]) -> Figures:

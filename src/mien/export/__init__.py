@@ -10,6 +10,8 @@ if TYPE_CHECKING:
         read_gaussian_avatars_folder,
         write_gaussian_avatars_folder,
     )
+    from mien.export.glb import MeshModel, WrittenGlb, write_glb
+    from mien.export.glb_file import Glb, read_glb
     from mien.export.packed import Motion, pack, unpacked
     from mien.export.ply import read_ply, write_ply
     from mien.export.web_page import WrittenPage, write_page
@@ -22,6 +24,8 @@ else:
                 "GaussianAvatarsFolder", "read_gaussian_avatars_folder", "write_gaussian_avatars_folder",
             ],
             "world_space": ["in_world"],
+            "glb": ["MeshModel", "WrittenGlb", "write_glb"],
+            "glb_file": ["Glb", "read_glb"],
             "packed": ["Motion", "pack", "unpacked"],
             "ply": ["read_ply", "write_ply"],
             "web_page": ["WrittenPage", "write_page"],
@@ -30,14 +34,19 @@ else:
 
 __all__ = [
     "GaussianAvatarsFolder",
+    "Glb",
+    "MeshModel",
     "Motion",
+    "WrittenGlb",
     "WrittenPage",
     "in_world",
     "pack",
     "read_gaussian_avatars_folder",
+    "read_glb",
     "read_ply",
     "unpacked",
     "write_gaussian_avatars_folder",
+    "write_glb",
     "write_page",
     "write_ply",
 ]

@@ -83,7 +83,7 @@ def pack(avatar: PortableAvatar, motion: Motion | None = None) -> bytes:
     """The packed form of a bound avatar, with a motion or without. The same input gives the same bytes.
 
     Raises:
-        UserError: the avatar is not `MeshBound`.
+        UserError: the avatar is not `MeshBound`, or has features.
     """
     tensors: dict[str, dict[str, Any]] = {}
     pieces: list[bytes] = []
@@ -106,6 +106,11 @@ def _prepared(avatar: PortableAvatar) -> PortableAvatar:
         raise UserError(
             f"{avatar.about.name}: a page draws avatars of gaussian_avatars, not of {avatar.about.method}; train one "
             "with --method gaussian_avatars, or export a .mien"
+        )
+    if baked.changes is not None and baked.changes.features is not None:
+        raise UserError(
+            f"{avatar.about.name}: a page cannot hold features of Gaussians (--method.appearance); export a .mien, or "
+            "train a run with --method.appearance static"
         )
     order = np.argsort(baked.face_index, kind="stable")
     raw = baked.attributes

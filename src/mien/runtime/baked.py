@@ -86,6 +86,25 @@ class AttributeNetwork:
 
 
 @dataclass(frozen=True, eq=False)
+class FeatureChanges:
+    """Changes of the first SH coefficient and of the raw opacity, from blended features through two layers.
+
+    The features are `neutral`, plus `basis` weighted by the activations. They and `own` are the input of the network,
+    whose hidden layer has leaky ReLU with the slope 0.01. Its outputs are three changes of colour, then one of opacity.
+    """
+
+    neutral: Float32[np.ndarray, "n _"]
+    """[n, w]: features of each Gaussian."""
+    basis: Float32[np.ndarray, "n _ _"]
+    """[n, r, w]: change of the features per unit of each activation."""
+    own: Float32[np.ndarray, "n _"]
+    """Numbers of each Gaussian that go into the network after its features."""
+    weights: tuple[Float32[np.ndarray, "_ _"], ...]
+    """Weights of both layers, [out, in]."""
+    biases: tuple[Float32[np.ndarray, " _"], ...]
+
+
+@dataclass(frozen=True, eq=False)
 class ExpressionChanges:
     """Changes of the raw values with the expression, of low rank. A part that is None does not change.
 
@@ -103,6 +122,8 @@ class ExpressionChanges:
     opacity_logits: Float32[np.ndarray, "n r"] | None = None
     means: Float32[np.ndarray, "n 3 r"] | None = None
     """Changes of the centres, in the triangle's frame and units."""
+    features: FeatureChanges | None = field(default=None, metadata={"since": 5})
+    """Further changes of colours and opacities."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +159,11 @@ class BlendSkinned:
     """With `sigmoid`: the only SH coefficient is the logit of the colour."""
     bases: LinearBases | None = None
     network: AttributeNetwork | None = None
+    still_weights: Float32[np.ndarray, " n"] | None = field(default=None, metadata={"since": 4})
+    """Skinning weights of one more bone, which stands still in the world while the head moves. It comes with
+    `still_pose`."""
+    still_pose: Float32[np.ndarray, "4 4"] | None = field(default=None, metadata={"since": 4})
+    """Head pose (T_world_head) at which this bone moves no points."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from mien.runtime.baked import (
     BakedAvatar,
     BlendSkinned,
     ExpressionChanges,
+    FeatureChanges,
     Filmed,
     LinearBases,
     MeshBound,
@@ -120,12 +121,22 @@ def _baked_faults(baked: BakedAvatar) -> Iterator[str]:
             yield f"its scales reach {baked.scale_gain:g} metres"
         if baked.colour_activation == "sigmoid" and attributes.sh.shape[1] != 1:
             yield "its colours are sigmoids, but have several SH coefficients"
+        yield from _still_faults(baked, n)
     if isinstance(baked, Static) and len(baked.means) != n:
         yield f"it has {len(baked.means)} points, but {n} Gaussians"
     if baked.bases is not None:
         yield from _bases_faults(baked.bases, attributes, len(names), mean_moves=isinstance(baked, Static))
     if baked.network is not None:
         yield from _network_faults(baked.network, attributes, len(names), len(free))
+
+
+def _still_faults(baked: BlendSkinned, n: int) -> Iterator[str]:
+    if (baked.still_weights is None) != (baked.still_pose is None):
+        yield "the bone that stands still has weights or a pose, but not both"
+    if baked.still_weights is not None and len(baked.still_weights) != n:
+        yield f"it has {len(baked.still_weights)} weights of the bone that stands still, but {n} Gaussians"
+    if baked.still_pose is not None and baked.still_pose.shape != (4, 4):
+        yield "the shape of the pose of the bone that stands still does not fit"
 
 
 def _number_faults(value: Any) -> Iterator[str]:
@@ -158,6 +169,22 @@ def _changes_faults(changes: ExpressionChanges, n: int, inputs: int) -> Iterator
             return
     if changes.reach[0] < 0:
         yield "the reach of its changes with the expression is negative"
+    if changes.features is not None:
+        yield from _features_faults(changes.features, n, r)
+
+
+def _features_faults(features: FeatureChanges, n: int, r: int) -> Iterator[str]:
+    width, x = features.neutral.shape[1], features.own.shape[1]
+    shapes = [array.shape for array in (features.neutral, features.basis, features.own)]
+    if shapes != [(n, width), (n, r, width), (n, x)] or width == 0:
+        yield "the shapes of the features of its changes with the expression do not fit"
+    if len(features.weights) != 2 or len(features.biases) != 2:
+        yield "the network of its features has not two layers"
+        return
+    hidden = len(features.biases[0])
+    found = [array.shape for array in (*features.weights, *features.biases)]
+    if found != [(hidden, width + x), (4, hidden), (hidden,), (4,)] or hidden == 0:
+        yield "the shapes of the layers of its features do not fit"
 
 
 def _rig_faults(rig: Rig) -> Iterator[str]:

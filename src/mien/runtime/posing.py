@@ -13,11 +13,13 @@ from mien.runtime.baked import (
     BakedAvatar,
     BlendSkinned,
     ExpressionChanges,
+    FeatureChanges,
     LinearBases,
     MeshBound,
     Rig,
 )
 
+_MOST_LAYERS = 64
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * coefficient."""
 
@@ -77,7 +79,11 @@ def pose(baked: BakedAvatar, face: Face) -> Gaussians:
 
 
 def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
-    centres = rig_points(baked.rig, face)
+    shaped, centres = shaped_and_posed(baked.rig, face)
+    if baked.still_weights is not None and baked.still_pose is not None:
+        still = np.linalg.inv(face.T_world_head.astype(np.float64)) @ baked.still_pose
+        moved = shaped @ still[:3, :3].T.astype(np.float32) + still[:3, 3].astype(np.float32)
+        centres = centres + baked.still_weights[:, None] * moved
     raw = _raw_values(baked.attributes, baked.bases, baked.network, centres - baked.rig.template, face)
     if baked.scale_activation == "sigmoid":
         scales = baked.scale_gain * sigmoid(raw["log_scales"]) + baked.scale_offset
@@ -89,6 +95,13 @@ def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
 
 def rig_points(rig: Rig, face: Face, in_world: bool = False) -> Float32[np.ndarray, "m 3"]:
     """The rig's points in the head frame or in world space, in metres, by the same operation as in training."""
+    return shaped_and_posed(rig, face, in_world)[1]
+
+
+def shaped_and_posed(
+    rig: Rig, face: Face, in_world: bool = False
+) -> tuple[Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"]]:
+    """The rig's points before skinning and after it."""
     compiled = _compiled.get(rig)
     if compiled is None:
         compiled = _compiled[rig] = _native.make_face_model(
@@ -104,7 +117,7 @@ def rig_points(rig: Rig, face: Face, in_world: bool = False) -> Float32[np.ndarr
     shaped, points = (np.empty((1, *rig.template.shape), np.float32) for _ in range(2))
     arrays = _native.FaceArrays(rig.template, rig.joint_template, _batch(face.expression), _batch(face.joints), *head)
     _native.pose_face(compiled, arrays, shaped=shaped, vertices=points)
-    return points[0]
+    return shaped[0], points[0]
 
 
 _compiled: "WeakKeyDictionary[Rig, _native.FaceModelData]" = WeakKeyDictionary()
@@ -152,7 +165,24 @@ def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.n
         if basis is not None:
             added[name] = np.empty(basis.shape[:-1], np.float32)
             _native.expression_change(np.ascontiguousarray(basis), activations, added[name])
+    if changes.features is not None:
+        colour, opacity_logits = feature_changes(changes.features, activations)
+        added["colour"] = added.get("colour", np.float32(0)) + colour
+        added["opacity_logits"] = added.get("opacity_logits", np.float32(0)) + opacity_logits
     return added
+
+
+def feature_changes(
+    features: FeatureChanges, activations: Float32[np.ndarray, " r"]
+) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
+    """Changes of the first SH coefficient and of the raw opacity, by the same operation as in training."""
+    layers = zip(features.weights, features.biases, strict=True)
+    arrays = [features.neutral, features.own, *(array for layer in layers for array in layer)]
+    network = _native.FeatureNetwork(*(np.ascontiguousarray(array) for array in arrays))
+    colour, opacity_logits = (np.empty((len(features.neutral), *shape), np.float32) for shape in ((3,), ()))
+    bases = [_native.FeatureBases(np.ascontiguousarray(features.basis), activations, False)]
+    _native.feature_network(network, bases, None, colour, opacity_logits)
+    return colour, opacity_logits
 
 
 def _raw_values(
@@ -177,12 +207,30 @@ def _raw_values(
             values += raw[name]
             raw[name] = values
     elif network is not None:
-        outputs, start = run_network(network, displacement, face), 0
+        runs = _run_layers(network, displacement) if _has_native_layers(network) else None
+        outputs, start = run_network(network, displacement, face) if runs is None else runs, 0
         for name in network.outputs:
             width = raw[name][0].size if len(raw[name]) else 0
             raw[name] = raw[name] + outputs[:, start : start + width].reshape(raw[name].shape)
             start += width
     return raw
+
+
+def _has_native_layers(network: AttributeNetwork) -> bool:
+    """Whether this is a network of `_native.point_network`, as mono_gaussian_avatar has it."""
+    return network.input == "displacement" and network.activation == "relu" and len(network.weights) <= _MOST_LAYERS
+
+
+def _run_layers(network: AttributeNetwork, displacement: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n _"]:
+    """The outputs of such a network, by the same operation as in training."""
+    layers = [
+        _native.PointLayer(_contiguous_row(weight), _contiguous_row(bias), int(index + 1 < len(network.weights)), -1)
+        for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True))
+    ]
+    inputs = np.concatenate([network.base, displacement], axis=1, dtype=np.float32)
+    outputs = np.empty((len(inputs), len(network.biases[-1])), np.float32)
+    _native.point_network(layers, inputs, None, outputs)
+    return outputs
 
 
 def _has_native(network: AttributeNetwork) -> bool:

@@ -17,7 +17,7 @@ from mien.training.sequence import Sequence
 from mien.training.settings import Split, TrainSettings, check_held_out
 
 Item = TypeVar("Item")
-_ORDER, _BACKGROUND, _DENSITY, _CROP = range(4)
+_ORDER, _BACKGROUND, _DENSITY, _CROP, _DISGUISE = range(5)
 """Purposes of random numbers."""
 _BLOCK, _EVERY = 10, 5
 _TAIL_SHARE = 0.2
@@ -185,6 +185,11 @@ def density_random(settings: TrainSettings, step: int) -> torch.Generator:
 def crop_random(settings: TrainSettings, step: int) -> torch.Generator:
     """The random numbers for a step's crop of the perceptual loss."""
     return random_at(settings.seed, _CROP, step)
+
+
+def disguise_random(settings: TrainSettings, step: int) -> torch.Generator:
+    """The random numbers for the colour of a step's hidden Gaussians."""
+    return random_at(settings.seed, _DISGUISE, step)
 
 
 def random_at(seed: int, purpose: int, step: int) -> torch.Generator:

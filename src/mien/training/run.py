@@ -212,7 +212,7 @@ def write_results(run_dir: Path, state: TrainingState) -> None:
     """Write everything that is kept after training. training.json is last and marks the run as finished."""
     write_avatar(run_dir / "avatar", state.avatar)
     write_tensors(run_dir / _TRACK, state.track.params().tensors())
-    if state.unseen is not None:
+    if state.unseen is not None and state.unseen.coverage is not None:
         write_coverage(run_dir, state.unseen.coverage)
     curves = {name: torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     write_tensors(run_dir / "curves.safetensors", curves)

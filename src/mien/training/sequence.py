@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from mien import _native
@@ -17,6 +17,7 @@ from mien.face import FaceModel, part_boxes
 from mien.locks import read_beside_writers
 from mien.pictures import Box
 from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, read_tracking
+from mien.training.hidden import hidden_triangles
 
 _CACHE_BYTES = 1 << 30
 _ON_CPU = torch.zeros(())
@@ -98,6 +99,8 @@ class Target:
     """Colour of the background, 0..1."""
     parts: tuple[Box, ...] = ()
     """Boxes around eyes and mouth, as far as they are seen. Empty if no loss needs them."""
+    hidden: Bool[Tensor, " f"] | None = None
+    """Which triangles inside the head the mesh hides (`mien.training.hidden`). None if nothing needs them."""
 
     def pinned(self) -> "Target":
         """This target in pinned memory, which a GPU can read asynchronously."""
@@ -106,6 +109,7 @@ class Target:
             picture=self.picture.pin_memory(),
             matte=self.matte.pin_memory(),
             background=self.background.pin_memory(),
+            hidden=None if self.hidden is None else self.hidden.pin_memory(),
         )
 
     def to(self, like: Tensor) -> "Target":
@@ -115,6 +119,7 @@ class Target:
             picture=self.picture.to(like.device, non_blocking=True),
             matte=self.matte.to(like.device, non_blocking=True),
             background=self.background.to(like, non_blocking=True),
+            hidden=None if self.hidden is None else self.hidden.to(like.device, non_blocking=True),
         )
 
 
@@ -127,6 +132,7 @@ class Targets:
         share: Number of sequences that share the memory for cached pictures.
         like: Cameras and targets have its float dtype and its device.
         face_model: The face model, on the CPU, if targets shall have the boxes around eyes and mouth.
+        inside: The triangles inside the head, if targets shall say which of them are hidden. Needs `face_model`.
     """
 
     def __init__(
@@ -136,6 +142,7 @@ class Targets:
         share: int = 1,
         like: Tensor = _ON_CPU,
         face_model: FaceModel | None = None,
+        inside: Bool[Tensor, " f"] | None = None,
     ):
         self._sequence = sequence
         longest = max(sequence.capture.width, sequence.capture.height)
@@ -147,9 +154,9 @@ class Targets:
         self._like = like
         self._on_cpu = like.device.type == "cpu" and like.dtype == torch.float32
         self._cache: dict[tuple[int, int, bytes], Target] = {}
-        self._face_model = face_model
-        self._boxes: dict[tuple[int, int], tuple[Box, tuple[Box, ...]]] = {}
-        """Boxes of the mattes and of the parts, by timestep and camera."""
+        self._face_model, self._inside = face_model, inside
+        self._boxes: dict[tuple[int, int], tuple[Box, tuple[Box, ...], Tensor | None]] = {}
+        """Boxes of the mattes and of the parts, and hidden triangles, by timestep and camera."""
         self._max_cached = _CACHE_BYTES // (share * self.width * self.height * 4)
 
     def camera(self, camera: int) -> Camera:
@@ -183,20 +190,22 @@ class Targets:
         boxes = self._boxes.get((timestep, camera))
         if boxes is None:
             left, top, width, height = cv2.boundingRect(matte)
-            boxes = self._boxes[timestep, camera] = (left, top, width, height), self._parts(timestep, camera)
+            boxes = self._boxes[timestep, camera] = (left, top, width, height), *self._tracked(timestep, camera)
         picture, colour = composite(image, matte, background, boxes[0]), torch.from_numpy(background) / 255
-        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), boxes[0], colour, boxes[1])
+        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), boxes[0], colour, *boxes[1:])
         return target.pinned() if self._like.is_cuda else target
 
     @torch.no_grad()
-    def _parts(self, timestep: int, camera: int) -> tuple[Box, ...]:
-        """The boxes around eyes and mouth, by the tracking. What training corrects of it does not move them."""
+    def _tracked(self, timestep: int, camera: int) -> tuple[tuple[Box, ...], Tensor | None]:
+        """The boxes around eyes and mouth, and hidden triangles, by the tracking. Its corrections change neither."""
         if self._face_model is None:
-            return ()
+            return (), None
         tracking = self._sequence.tracking
         vertices = self._face_model(tracking.face[timestep])[0]
         view = tracking.cameras[camera].resized(self.width, self.height)
-        return tuple(part_boxes(self._face_model, vertices, view).values())
+        boxes = tuple(part_boxes(self._face_model, vertices, view).values())
+        inside = self._inside
+        return boxes, None if inside is None else hidden_triangles(vertices, self._face_model, inside, view)
 
     def _resize(self, picture: np.ndarray) -> np.ndarray:
         if picture.shape[:2] == (self.height, self.width):

@@ -39,8 +39,15 @@ class TrainSettings:
     """Learning rate of these changes, per step. It ends at a tenth."""
     unseen: Literal["trained", "filled"] = "trained"
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
-    broken from aside. Filled: they are not drawn in training, and get a closed surface in the nearest colours after it.
-    Methods that bind no Gaussians to triangles train them in either case."""
+    broken from aside. Filled: they are a closed surface in completed colours from the first step on, what is seen is
+    kept flat on the mesh, and alpha is compared with the matte (weight 0.2 or more). Methods that bind no Gaussians to
+    triangles train all sides in either case."""
+    inside: Literal["free", "covered", "furnished"] = "free"
+    """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
+    them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in
+    each step, so that lids and lips become opaque. Furnished: also, a mouth that is hardly ever seen gets a surface in
+    dark colours at half of the run, which can show as dark spots on cheeks from aside. Methods that bind no Gaussians
+    to triangles have no such Gaussians."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
@@ -134,8 +141,8 @@ class Preset:
 PRESETS = {
     preset.name: preset
     for preset in (
-        Preset("draft", TrainSettings(steps=8_000)),
-        Preset("standard", TrainSettings()),
+        Preset("draft", TrainSettings(steps=8_000, inside="covered")),
+        Preset("standard", TrainSettings(inside="covered")),
         Preset("paper", TrainSettings()),
     )
 }

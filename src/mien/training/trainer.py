@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,10 +25,9 @@ from mien.avatar import (
     method_of,
     move_avatar,
 )
-from mien.camera import Camera
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, concatenate
+from mien.face import FaceModel, concatenate
 from mien.face.checks import check_face_params
 from mien.locks import hold
 from mien.perceptual import load_training_features
@@ -41,6 +39,7 @@ from mien.training.adam import Adam
 from mien.training.ahead import TargetQueue, targets_ahead
 from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
+from mien.training.coverage import coverage
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
 from mien.training.frames import (
@@ -50,14 +49,17 @@ from mien.training.frames import (
     camera_extent,
     crop_random,
     density_random,
+    disguise_random,
     expression_rarity,
     training_frames,
 )
+from mien.training.hidden import inside_triangles
+from mien.training.inside import disguise, inside_of
 from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses, train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Target, Targets
 from mien.training.settings import TrainSettings
-from mien.training.unseen import TRIM_STEPS, trim_fills, unseen_of
+from mien.training.unseen import moved, spare_fills, unseen_of
 from mien.training.vertex_colors import vertex_colors
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
@@ -131,9 +133,13 @@ def train(
         if is_finished(run_dir):  # another process finished it before this one got the lock
             return load_avatar(run_dir)
         like = like_on(choose_device(settings.device))
-        parts_of = face_model if method_config.photometric.needs_parts else None
-        targets = [Targets(sequence, settings.resolution, len(sequences), like, parts_of) for sequence in sequences]
         state = start(sequences, face_model, method_config, settings, like)
+        covers = settings.inside != "free" and state.avatar.triangles() is not None
+        inside = inside_triangles(face_model) if covers else None
+        parts_of = face_model if method_config.photometric.needs_parts or inside is not None else None
+        targets = [
+            Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside) for sequence in sequences
+        ]
         _train_to_the_end(state, TrainingData(order, tuple(targets), extent), settings, run_dir, progress)
     return state.avatar
 
@@ -162,21 +168,8 @@ def _train_to_the_end(
                     write_checkpoint(run_dir / "checkpoints", state)
                 if interrupted():
                     raise KeyboardInterrupt
-        if state.unseen is not None:
-            trim_fills(state.avatar, state.unseen.fill(state.avatar), _trim_views(state, data))
         _check_finite(run_dir, state)
         write_results(run_dir, state)
-
-
-def _trim_views(state: TrainingState, data: TrainingData) -> Iterator[tuple[FaceParams, Camera, Target]]:
-    """Training pictures for `trim_fills`, in the order in which training would go on, over white."""
-    white = np.full(3, 255, np.uint8)
-    face = state.track.params()
-    for step in range(TRIM_STEPS):
-        frame, _ = data.order.at(step)
-        targets = data.targets[frame.sequence]
-        target = targets.moved(targets.composed(frame.timestep, frame.camera, white, keep=False))
-        yield face[state.track.index_of(frame.sequence, frame.timestep)], targets.camera(frame.camera), target
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:
@@ -238,15 +231,23 @@ def start(
     if avatar.wants_first_colors:
         avatar.paint(vertex_colors(face_model, sequences, faces, frames))
     colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
-    unseen = unseen_of(avatar, sequences, faces, frames) if settings.unseen == "filled" else None
+    unseen, filled = None, settings.unseen == "filled"
+    if filled or avatar.wants_surface:
+        unseen = unseen_of(avatar, sequences, faces, frames, filled=filled)
+        avatar.close(unseen.prior)
+    inside = None
+    if settings.inside == "furnished" and avatar.triangles() is not None:
+        known = None if unseen is None else unseen.coverage
+        inside = inside_of(avatar, coverage(face_model, sequences, faces, frames) if known is None else known)
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
-        unseen = None if unseen is None else replace(unseen, share=unseen.share.to(like))
-    density = density_strategy(avatar.density(), avatar.gaussian_store())
+        unseen = None if unseen is None else moved(unseen, like)
+        inside = None if inside is None else inside.to(like)
+    density = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     track = FaceTrack(face, method_config.face_tuning, lengths, face_model.expression_bounds)
-    return TrainingState(avatar, Adam(), density, track, {}, colors, unseen=unseen)
+    return TrainingState(avatar, Adam(), density, track, {}, colors, unseen=unseen, inside=inside)
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
@@ -261,17 +262,20 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
 
     index = state.track.index_of(frame.sequence, frame.timestep)
     face = state.track.face(index)
-    posed = avatar.pose(face, progress)
-    if state.unseen is not None:
-        posed = state.unseen.hide(posed, avatar)
+    if state.inside is not None:
+        state.inside.furnish(avatar, state.step, settings.steps)
+    posed = disguise(avatar.pose(face, progress), avatar, target.hidden, disguise_random(settings, state.step))
     rendering = rasterize(
         posed.gaussians.timestep(0), data.targets[frame.sequence].camera(frame.camera), target.background
     )
     shown = rendering if state.colors is None else state.colors.seen_by(rendering, target.background, frame)
-    losses = picture_losses(shown, target, weights) | avatar.regularizers(posed, rendering, progress)
+    compared = weights if state.unseen is None else state.unseen.weights(weights)
+    losses = picture_losses(shown, target, compared) | avatar.regularizers(posed, rendering, progress)
     if wanted is not None:
         losses["perceptual"] = perceptual_loss(shown, wanted(), perceptual)
     torch.autograd.backward(list(losses.values()))
+    if state.unseen is not None:
+        state.unseen.guard(avatar, rendering)
 
     groups = [*avatar.parameter_groups(), *state.track.parameter_groups(index)]
     groups += [] if state.colors is None else state.colors.parameter_groups()
@@ -280,6 +284,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     state.track.confine(index)
     random = partial(density_random, settings, state.step)
     state.density.adapt(avatar.gaussian_store(), posed, progress, random)
+    if state.unseen is not None:
+        avatar.keep_to(state.unseen.prior)
 
     state.step += 1
     elapsed = time.perf_counter() - began

@@ -1,95 +1,114 @@
-"""Train only what is seen: what no training picture shows is not drawn in training, and filled after it."""
+"""Sides of the head that no training picture shows: a closed surface in completed colours from the first step on.
 
-from collections.abc import Iterable
+What no picture shows must not help to explain pictures. Gaussians on such triangles are made up: opaque and flat, at
+the height of hair, in completed colours. Training changes only their height along the normal, where pictures clearly
+contradict it, as where they stand out beyond the outline.
+"""
+
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar import Avatar, GradientDensity, Posed
-from mien.camera import Camera
+from mien.avatar import Avatar, DensityControl, GaussianStore, GradientDensity, Photometric, SurfacePrior
 from mien.face import FaceParams
-from mien.render import rasterize
+from mien.render.rendering import Rendering
 from mien.training.completion import complete_colors
-from mien.training.coverage import Coverage, coverage, drawn_share, smoothstep
+from mien.training.coverage import Coverage, coverage, drawn_share
 from mien.training.frames import Frame
-from mien.training.losses import picture_losses
-from mien.training.sequence import Sequence, Target
+from mien.training.hair_height import hair_height
+from mien.training.sequence import Sequence
 
-_OPAQUE = 0.97
-"""Opacity of a fill."""
-_FADE = 4.0
-"""Inverse of the share from which a triangle has no fill: what training draws covers it."""
+_RARE = 0.02
+"""Confidence below which a triangle is made up."""
+_CONTRADICTION = 1e-6
+"""Gradient of a centre, in triangle units, from which pictures contradict the height of a fill. A little light shines
+through every avatar, so smaller gradients reach what is hidden."""
 
-TRIM_STEPS = 600
-"""Number of steps that fit the fills' opacities to training pictures."""
-_TRIM_RATE, _TRIM_EPSILON = 0.1, 3e-5
-"""Learning rate of the fills' opacities (logits), and the epsilon of Adam, below which gradients have no say: a fill
-that shines through what hides it must not fade."""
+
+_ALPHA = 0.2
+"""Least weight of the loss of alpha. Without it, white Gaussians hide fills that stand out beyond the outline."""
 
 
 @dataclass(frozen=True, eq=False)
 class Unseen:
-    """What the training pictures show of a head, and how much of it training draws."""
+    """What the training pictures show of a head, and what is known of the rest."""
 
-    coverage: Coverage
-    share: Float[Tensor, " f"]
-    """Factor of the opacity of the Gaussians on each triangle in training, 0..1."""
+    coverage: Coverage | None
+    """None if only limits to the surface were asked for."""
+    prior: SurfacePrior
 
-    def hide(self, posed: Posed, avatar: Avatar) -> Posed:
-        """Posed Gaussians as training draws them. All of them, if the method binds none to triangles."""
+    def weights(self, weights: Photometric) -> Photometric:
+        """The weights of the losses, with a loss of alpha if anything is filled."""
+        if self.coverage is None:
+            return weights
+        return replace(weights, alpha_weight=max(weights.alpha_weight, _ALPHA))
+
+    def made_up(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
+        """The Gaussians that are filled rather than trained."""
         triangles = avatar.triangles()
-        if triangles is None:
-            return posed
-        share = self.share.to(posed.gaussians.opacities)[triangles]
-        return replace(posed, gaussians=replace(posed.gaussians, opacities=posed.gaussians.opacities * share))
+        return None if self.prior.made_up is None or triangles is None else self.prior.made_up[triangles]
 
-    def fill(self, avatar: Avatar) -> int:
-        """Close what training did not draw, down to the neck line. Returns the number of fills, the last Gaussians."""
-        if avatar.triangles() is None:
-            return 0
-        found = self.coverage
-        neutral = avatar.face_model.head_vertices(avatar.subject)[0].detach().cpu().float()
-        colors = complete_colors(avatar.face_model.to(neutral), neutral, found.seen, found.colors)
-        rare = 1 - smoothstep(self.share.cpu().float() * _FADE)
-        return avatar.fill(self.share, _OPAQUE * rare * found.above, colors)
+    def guard(self, avatar: Avatar, rendering: Rendering) -> None:
+        """Take the gradients from what is made up, after the backward pass, but for strong ones of its height."""
+        made_up = self.made_up(avatar)
+        if made_up is None:
+            return
+        store = avatar.gaussian_store()
+        for name in store.trained:
+            gradient = store[name].grad
+            if gradient is None:
+                continue
+            # The second axis of a triangle's frame is its normal.
+            height = gradient[:, 1].clone() if name == "means" else None
+            gradient.masked_fill_(made_up.view(-1, *[1] * (gradient.ndim - 1)), 0)
+            if height is not None:
+                strong = height.sign() * (height.abs() - _CONTRADICTION).clamp_min(0)
+                gradient[:, 1] = torch.where(made_up, strong, height)
+        if rendering.means2d_offset.grad is not None:
+            rendering.means2d_offset.grad.masked_fill_(made_up[:, None], 0)
 
 
-def trim_fills(avatar: Avatar, count: int, views: Iterable[tuple[FaceParams, Camera, Target]]) -> None:
-    """Make fills faint that the training pictures contradict, such as those that stand out beyond the outline.
-
-    Only the opacities of the fills are fitted. Fills that no picture shows have no gradient and stay as they are.
-
-    Args:
-        avatar: The avatar, whose last Gaussians are the fills.
-        count: The number of fills.
-        views: Training pictures with the face and the camera of each.
-    """
+def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
+    """The avatar's density control, with fills that keep their opacity at resets."""
     density = avatar.density()
-    name = density.opacity_logits if isinstance(density, GradientDensity) else None
-    if count == 0 or name is None:
-        return
-    store = avatar.gaussian_store()
-    logits = store[name].detach()
-    fills = logits[-count:].clone().requires_grad_()
-    adam = torch.optim.Adam([fills], lr=_TRIM_RATE, eps=_TRIM_EPSILON)
-    for face, camera, target in views:
-        with torch.no_grad():
-            gaussians = avatar.pose(face).gaussians.timestep(0)
-        opacities = torch.cat([gaussians.opacities[:-count], fills.sigmoid()])
-        rendering = rasterize(replace(gaussians, opacities=opacities), camera, target.background)
-        adam.zero_grad()
-        picture_losses(rendering, target, avatar.config.photometric)["photometric"].backward()
-        adam.step()
-    # A fill is never more opaque than it was made.
-    kept = torch.minimum(fills.detach(), logits[-count:])
-    store.assign(name, torch.cat([logits[:-count], kept]))
+    if unseen is None or unseen.prior.made_up is None or not isinstance(density, GradientDensity):
+        return density
+
+    def may_reset(store: GaussianStore) -> Bool[Tensor, " n"]:
+        made_up = unseen.made_up(avatar)
+        assert made_up is not None
+        return ~made_up
+
+    return replace(density, may_reset=may_reset)
 
 
 @torch.no_grad()
-def unseen_of(avatar: Avatar, sequences: Items[Sequence], faces: Items[FaceParams], frames: Items[Frame]) -> Unseen:
+def unseen_of(
+    avatar: Avatar, sequences: Items[Sequence], faces: Items[FaceParams], frames: Items[Frame], *, filled: bool
+) -> Unseen:
     """What some frames show of an avatar's head. The avatar is on the CPU, in float32."""
-    found = coverage(avatar.face_model, sequences, faces, frames)
-    return Unseen(found, drawn_share(avatar.face_model, found))
+    model = avatar.face_model
+    hair = hair_height(model, sequences, faces, frames)
+    if not filled:
+        return Unseen(None, SurfacePrior(hair))
+    found = coverage(model, sequences, faces, frames)
+    neutral = model.head_vertices(avatar.subject)[0].detach()
+    colors = complete_colors(model, neutral, found.seen, found.colors)
+    shown = drawn_share(model, found)
+    doubt: Float[Tensor, " f"] = (1 - shown) * found.above
+    made_up = (shown < _RARE) & (found.above > 0.5) if avatar.triangles() is not None else None
+    return Unseen(found, SurfacePrior(hair, colors, doubt, made_up))
+
+
+def moved(unseen: Unseen, like: Tensor) -> Unseen:
+    """The same on the device of `like`."""
+    prior = unseen.prior
+    put = {
+        "colors": None if prior.colors is None else prior.colors.to(like),
+        "doubt": None if prior.doubt is None else prior.doubt.to(like),
+        "made_up": None if prior.made_up is None else prior.made_up.to(like.device),
+    }
+    return replace(unseen, prior=SurfacePrior(prior.hair.to(like), **put))

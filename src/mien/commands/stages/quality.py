@@ -5,6 +5,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -34,7 +35,7 @@ from mien.progress import say
 from mien.storage import read_json, replace_folder, write_atomically, write_json
 from mien.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
 from mien.terminal import show
-from mien.tracking import TrackingSettings, read_tracking
+from mien.tracking import Tracking, TrackingSettings, make_scoring, read_tracking, write_scoring, write_tracking
 from mien.training import PRESETS, TrainSettings, read_training_summary
 from mien.workspace import Workspace
 
@@ -80,22 +81,11 @@ def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int
 def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
     """Run all stages on one reference capture and skip those with current results; return its row and its pictures."""
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
-    times = _Times(workspace.root / _TIMES)
+    times = StageTimes(workspace.root / _TIMES)
     say(f"== {reference.name}: {reference.description}")
-    with times.measured("draw"):
-        key = reference.write(drawn)
-    with times.measured("capture"):
-        for recipe in reference.sequences:
-            _capture(workspace, drawn / recipe.name, recipe.name)
-    with times.measured("track"):
-        trackings = run_tracking_stage(workspace, _FACE_MODEL, TrackingSettings(), overlay="none")
+    key, trackings = draw_and_track(reference, drawn, workspace, times)
     run = f"{method}-{steps}"
-    settings = TrainSettings(
-        steps=steps,
-        split="none" if reference.held_out_sequences else "blocks",
-        held_out_sequences=reference.held_out_sequences,
-        held_out_cameras=reference.held_out_cameras,
-    )
+    settings = reference_settings(reference, replace(PRESETS["standard"].settings_of(method), steps=steps))
     with times.measured("train"):
         run_training_stage(workspace, list(trackings), run, PRESETS["standard"].config(method), settings)
     with times.measured("evaluate"):
@@ -108,12 +98,64 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
         for name, entry in metrics["protocols"].items()
     }
     with times.measured("views"):
-        unseen = _unseen_views(reference, drawn, workspace, run)
-    row = QualityRow(reference.name, key, method, steps, summary["gaussians"], protocols, errors, times.seconds, unseen)
+        unseen = score_unseen_views(reference, drawn, workspace, run)
+    by_truth: Figures = {}
+    if reference.views is not None:
+        with times.measured("views by true tracking"):
+            true = _workspace_of_truth(drawn, workspace, Workspace(out / f"{reference.name}-true"), list(trackings))
+            run_training_stage(true, list(trackings), run, PRESETS["standard"].config(method), settings)
+            by_truth = score_unseen_views(reference, drawn, true, run)
+    row = QualityRow(
+        reference.name, key, method, steps, summary["gaussians"], protocols, errors, times.seconds, unseen, by_truth
+    )
     return row, _strip(workspace, run)
 
 
-def _unseen_views(reference: ReferenceCapture, drawn: Path, workspace: Workspace, run: str) -> Figures:
+def draw_and_track(
+    reference: ReferenceCapture, drawn: Path, workspace: Workspace, times: "StageTimes"
+) -> tuple[str, dict[str, Tracking]]:
+    """Draw, capture and track a reference capture, and skip stages with current results.
+
+    Returns its key, and the tracking of each sequence by name.
+    """
+    with times.measured("draw"):
+        key = reference.write(drawn)
+    with times.measured("capture"):
+        for recipe in reference.sequences:
+            _capture(workspace, drawn / recipe.name, recipe.name)
+    with times.measured("track"):
+        return key, run_tracking_stage(workspace, _FACE_MODEL, TrackingSettings(), overlay="none")
+
+
+def reference_settings(reference: ReferenceCapture, settings: TrainSettings) -> TrainSettings:
+    """The settings with what a reference capture holds out."""
+    return replace(
+        settings,
+        split="none" if reference.held_out_sequences else "blocks",
+        held_out_sequences=reference.held_out_sequences,
+        held_out_cameras=reference.held_out_cameras,
+    )
+
+
+def _workspace_of_truth(drawn: Path, workspace: Workspace, true: Workspace, names: list[str]) -> Workspace:
+    """Make a workspace with the same captures and the true tracking, unless it exists, and return it."""
+    for name in names:
+        own, folder = workspace.sequence_dir(name) / "capture", true.sequence_dir(name)
+        pictures, truth = read_capture_hash(own), read_truth(drawn / name / "truth").tracking
+        if (folder / "capture").is_dir() and read_capture_hash(folder / "capture") == pictures:
+            continue
+        with hold(folder):
+            remove_tree(folder / "capture")
+            write_tracking(folder / "tracking", truth)
+            scoring = make_scoring(read_capture(own), truth, load_face_model(truth.face_model), scratch=folder)
+            write_scoring(folder / "scoring", scoring, pictures)
+            # The capture comes last: it says that the rest is there.
+            shutil.copytree(own, folder / ".capture.partial", dirs_exist_ok=True)
+            replace_folder(folder / "capture", folder / ".capture.partial")
+    return true
+
+
+def score_unseen_views(reference: ReferenceCapture, drawn: Path, workspace: Workspace, run: str) -> Figures:
     """Score a run on true pictures from all sides, if there are any. Writes a sheet and a chart beside its report."""
     views = reference.views
     if views is None:
@@ -150,7 +192,7 @@ def _errors(workspace: Workspace, drawn: Path, name: str) -> TrackingErrors:
     return tracking_errors(tracking, read_capture(folder / "capture"), truth, load_face_model(tracking.face_model))
 
 
-class _Times:
+class StageTimes:
     """Seconds of each stage, kept between calls. A stage with nothing to do does not overwrite its earlier time."""
 
     def __init__(self, path: Path) -> None:

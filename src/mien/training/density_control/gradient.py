@@ -71,7 +71,11 @@ class GradientStrategy(DensityStrategy):
         resets = settings.opacity_resets if settings.rules.reset_opacities else ()
         if name is not None and done in {max(1, round(time * progress.steps)) for time in resets}:
             ceiling = torch.logit(torch.tensor(settings.reset_opacity))
-            store.assign(name, store[name].detach().clamp_max(float(ceiling)))
+            logits = store[name].detach()
+            lowered = logits.clamp_max(float(ceiling))
+            if self._density.may_reset is not None:
+                lowered = torch.where(self._density.may_reset(store), lowered, logits)
+            store.assign(name, lowered)
         return changed
 
     def state(self) -> dict[str, Tensor]:

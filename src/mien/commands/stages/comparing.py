@@ -1,0 +1,193 @@
+"""From workspaces and methods to one table, as the command line runs it."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from mien.avatar import MethodConfig
+from mien.benchmarking.comparing import MethodRow, comparison_table
+from mien.benchmarking.timing import measure_machine
+from mien.commands.stages.evaluating import run_evaluation_stage
+from mien.commands.stages.quality import (
+    StageTimes,
+    draw_and_track,
+    reference_settings,
+    score_unseen_views,
+)
+from mien.commands.stages.training import run_training_stage
+from mien.errors import UserError
+from mien.evaluation.protocols import EvaluationSettings
+from mien.face import load_face_model
+from mien.locks import WAIT, hold
+from mien.progress import say
+from mien.storage import file_digest, read_json, write_atomically, write_json
+from mien.synthetic import ReferenceCapture, reference_named
+from mien.terminal import show
+from mien.training import PRESETS, TrainSettings, read_sequence, read_training_summary, train
+from mien.workspace import Workspace
+
+_FORMAT, _VERSION = "mien.bench_compare", 1
+_SCORED = EvaluationSettings(perceptual_frames=16, video_frames=0)
+_FIRST_TRIAL_STEPS = 100
+_TRIAL_SHARE = 0.1
+"""Share of the budget that the trial may take beside it. A shorter trial grows fewer Gaussians than the run will."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long each method trains on each capture. If both are 0, as long as its preset says."""
+
+    minutes: float = 0.0
+    """Minutes of training. The number of steps is chosen by a trial on this machine."""
+    steps: int = 0
+
+    @property
+    def name(self) -> str:
+        """A part of a run's name."""
+        return f"{self.minutes:g}min" if self.minutes else f"{self.steps}" if self.steps else "full"
+
+
+@dataclass(frozen=True)
+class CompareSettings:
+    """What `mien bench compare` compares."""
+
+    methods: tuple[str, ...]
+    preset: str
+    budget: Budget
+    split: Literal["blocks", "tail"]
+    """Held-out frames of workspaces. Reference captures have their own."""
+
+    def run_name(self, method: str) -> str:
+        """The name of a method's run."""
+        parts = ["compare", method, self.budget.name]
+        parts += [] if self.preset == "standard" else [self.preset]
+        return "-".join(parts + ([] if self.split == "blocks" else [self.split]))
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """A capture on which all methods are trained."""
+
+    name: str
+    workspace: Workspace
+    sequences: list[str]
+    settings: TrainSettings
+    """What is held out."""
+    reference: ReferenceCapture | None = None
+    drawn: Path | None = None
+    """The folder of a reference capture's true pictures."""
+
+
+def run_compare_stage(
+    out: Path, workspaces: Sequence[Workspace], captures: Sequence[str], settings: CompareSettings, *, as_json: bool
+) -> None:
+    """Train and score every method on every capture, and print the table. Writes OUT/compare.json and compare.md.
+
+    Args:
+        out: Folder for the tables, for trials, and for reference captures with their workspaces.
+        workspaces: Tracked workspaces. Their runs are called `settings.run_name(method)`.
+        captures: Names of reference captures, which are drawn, captured and tracked first.
+        settings: Methods and budget.
+        as_json: Whether the result is printed as json.
+
+    Raises:
+        UserError: a capture cannot be read or trained on, or another process is comparing in the same folder.
+    """
+    references = [reference_named(name) for name in captures]
+    with hold(out / "compare", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
+        subjects = [_of_workspace(workspace, settings) for workspace in workspaces]
+        rows: list[MethodRow] = []
+        content: dict[str, Any] = {}
+        for subject in (*subjects, *(_of_reference(reference, out, settings) for reference in references)):
+            for method in settings.methods:
+                say(f"== {subject.name}: {method}")
+                rows.append(_row(subject, method, settings, out))
+                content = _write(out, rows, settings)
+    show(json.dumps(content) if as_json else comparison_table(rows))
+    say(f"The table is in {out / 'compare.md'}")
+
+
+def _write(out: Path, rows: Sequence[MethodRow], settings: CompareSettings) -> dict[str, Any]:
+    chosen = {**asdict(settings), "methods": list(settings.methods)}
+    content = {"settings": chosen, "machine": asdict(measure_machine()), "rows": [row.as_json() for row in rows]}
+    content = json.loads(json.dumps(content))
+    write_json(out / "compare.json", _FORMAT, _VERSION, content)
+    write_atomically(out / "compare.md", lambda path: path.write_text(comparison_table(rows), encoding="utf-8"))
+    return {"format": _FORMAT, "version": _VERSION, **content}
+
+
+def _of_workspace(workspace: Workspace, settings: CompareSettings) -> _Subject:
+    names = workspace.tracked_names()
+    if not names:
+        raise UserError(f"{workspace.root}: no tracked sequences; run `mien track {workspace.root}`")
+    held = replace(PRESETS[settings.preset].settings, split=settings.split)
+    return _Subject(workspace.root.resolve().name, workspace, names, held)
+
+
+def _of_reference(reference: ReferenceCapture, out: Path, settings: CompareSettings) -> _Subject:
+    drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
+    _, trackings = draw_and_track(reference, drawn, workspace, StageTimes(workspace.root / "seconds.json"))
+    held = reference_settings(reference, PRESETS[settings.preset].settings)
+    return _Subject(reference.name, workspace, list(trackings), held, reference, drawn)
+
+
+def _row(subject: _Subject, method: str, settings: CompareSettings, out: Path) -> MethodRow:
+    """Train and score a method on a capture, unless that is done."""
+    workspace, run, preset = subject.workspace, settings.run_name(method), PRESETS[settings.preset]
+    run_dir, config = workspace.run_dir(run), preset.config(method)
+    own = replace(subject.settings, steps=preset.settings_of(method).steps)
+    own = replace(own, steps=_steps(subject, config, own, settings.budget, out / "trials" / subject.name / run))
+    run_training_stage(workspace, subject.sequences, run, config, own)
+    metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)
+    summary = read_training_summary(run_dir)
+    protocols = {
+        name: {key: value for key, value in entry.items() if key != "per_frame"}
+        for name, entry in metrics["protocols"].items()
+    }
+    size = sum(path.stat().st_size for path in (run_dir / "avatar").rglob("*") if path.is_file())
+    return MethodRow(
+        subject.name, method, run, summary["steps"], summary["seconds"], summary["gaussians"], size, protocols,
+        _unseen(subject, run),
+    )  # fmt: skip
+
+
+def _unseen(subject: _Subject, run: str) -> dict[str, Any]:
+    if subject.reference is None or subject.drawn is None or subject.reference.views is None:
+        return {}
+    known = subject.workspace.run_dir(run) / "unseen_view.json"
+    if known.is_file():
+        return read_json(known, "mien.unseen_view", 1, remedy="delete this file and run the same command again")[
+            "angles"
+        ]
+    return score_unseen_views(subject.reference, subject.drawn, subject.workspace, run)
+
+
+def _steps(subject: _Subject, config: MethodConfig, settings: TrainSettings, budget: Budget, folder: Path) -> int:
+    """The number of steps of a run. A budget of minutes is turned into steps by two trials, which are kept."""
+    if not budget.minutes:
+        return budget.steps or settings.steps
+    finished = subject.workspace.run_dir(folder.name) / "training.json"
+    if finished.is_file():
+        return read_training_summary(finished.parent)["steps"]
+    steps = _FIRST_TRIAL_STEPS
+    rate = _trial(subject, config, replace(settings, steps=steps), folder / "first")
+    longer = round(_TRIAL_SHARE * 60 * budget.minutes / rate)
+    if longer > steps:
+        rate = _trial(subject, config, replace(settings, steps=longer), folder / "second")
+    steps = max(1, round(60 * budget.minutes / rate))
+    say(f"{folder.name}: {1e3 * rate:.1f} ms a step in the trial, so {steps:,} steps in {budget.minutes:g} minutes")
+    return steps
+
+
+def _trial(subject: _Subject, config: MethodConfig, settings: TrainSettings, folder: Path) -> float:
+    """Seconds of a step of a short run, whose schedules are as short. A trial that was done is only read."""
+    folders = [subject.workspace.sequence_dir(name) for name in subject.sequences]
+    tracked = "".join(file_digest(one / "tracking/tracking.safetensors")[:8] for one in folders)[:32]
+    run_dir = folder.with_name(f"{folder.name}-{settings.steps}-{tracked}")
+    if not (run_dir / "training.json").is_file():
+        sequences = [read_sequence(one) for one in folders]
+        train(sequences, load_face_model(sequences[0].tracking.face_model), config, settings, run_dir)
+    summary = read_training_summary(run_dir)
+    return max(summary["seconds"], 0.05) / summary["steps"]

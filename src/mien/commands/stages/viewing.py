@@ -1,0 +1,112 @@
+"""From a workspace or a .mien file to a viewer, as the command line runs it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mien import runtime
+from mien.avatar import as_array, bake_rig, load_avatar, make_portable
+from mien.commands.stages.driving import open_driver
+from mien.driving import drive, keep_to_filmed
+from mien.errors import UserError
+from mien.export import Motion
+from mien.face import FaceModel, FaceParams, load_face_model
+from mien.progress import say
+from mien.runtime import MeshBound, PortableAvatar, read_portable
+from mien.training import read_coverage, run_camera
+from mien.training.run import filmed_range
+from mien.viewer import Clip, Door, Mesh, Session, serve
+from mien.workspace import open_workspace
+
+
+@dataclass(frozen=True, eq=False)
+class Viewed:
+    """An avatar to view."""
+
+    portable: PortableAvatar
+    mesh: Mesh | None
+    sequences: dict[str, Path]
+    """Names of the workspace's tracked sequences, and the workspace."""
+    person: Callable[[], tuple[FaceModel, FaceParams]]
+    """Returns the face model and the person at rest, which motions need."""
+
+
+def run_viewing_stage(avatar: Path, run: str | None, play: str | None, host: str, port: int) -> None:
+    """Show an avatar in browsers until Ctrl-C."""
+    viewed = _of_file(avatar) if avatar.is_file() else _of_workspace(avatar, run)
+    clips = {name: _clip_of(viewed, folder, name) for name, folder in viewed.sequences.items()}
+    if play is not None:
+        clips[Path(play).name] = _clip_of(viewed, Path(play), None)
+    session = Session(runtime.Avatar(viewed.portable), viewed.mesh, clips)
+    door = Door.of(host)
+
+    def ready(address: str) -> None:
+        say(f"Open {address} in a browser; Ctrl-C ends the viewer")
+
+    try:
+        serve(session, door, port, viewed.portable.about.name, ready)
+    except KeyboardInterrupt:
+        say("The viewer is closed")
+
+
+def _of_file(path: Path) -> Viewed:
+    portable = read_portable(path)
+
+    def person() -> tuple[FaceModel, FaceParams]:
+        about, rest = portable.about, portable.neutral
+        model = load_face_model(about.face_model)
+        if model.content_hash != about.face_model_hash:
+            raise UserError(
+                f"{path}: was made with another version of the face model {about.face_model!r}, so no motion can be "
+                "played; export it again from its workspace"
+            )
+        fields = ("expression", "joints", "head_rotation", "head_translation")
+        given = {name: torch.from_numpy(getattr(rest, name).copy())[None] for name in fields}
+        return model, replace(model.neutral(), **given)
+
+    return Viewed(portable, _mesh_of(portable), {}, person)
+
+
+def _of_workspace(root: Path, run: str | None) -> Viewed:
+    workspace = open_workspace(root)
+    run_dir = workspace.run_dir(workspace.pick_run(run))
+    avatar = load_avatar(run_dir)
+    model = avatar.face_model
+    portable = make_portable(avatar, run_camera(run_dir), root.resolve().name, to_share=False)
+    portable = replace(portable, filmed=filmed_range(run_dir, avatar))
+    mesh = _mesh_of(portable) or Mesh(bake_rig(model, avatar.subject), as_array(model.faces))
+    coverage = read_coverage(run_dir, model)
+    if coverage is not None and len(coverage.seen) == len(mesh.faces):
+        mesh = replace(mesh, seen=as_array(coverage.seen))
+    sequences = dict.fromkeys(workspace.tracked_names(), root)
+    return Viewed(portable, mesh, sequences, lambda: (model, avatar.subject))
+
+
+def _mesh_of(portable: PortableAvatar) -> Mesh | None:
+    baked = portable.baked
+    return Mesh(baked.rig, baked.faces) if isinstance(baked, MeshBound) else None
+
+
+def _clip_of(viewed: Viewed, by: Path, sequence: str | None) -> Callable[[], Clip]:
+    """Return a function that loads a motion, made for the avatar and softly within what was filmed."""
+
+    def load() -> Clip:
+        model, subject = viewed.person()
+        driver = open_driver(by, sequence, model)
+        face = drive(driver.face, driver.at_rest, subject, model.expression_bounds, True, str(by))
+        portable = viewed.portable
+        if portable.filmed is not None:
+            eye = _position(portable.camera)
+            face, _ = keep_to_filmed(face, portable.filmed, subject, model.expression_bounds, eye)
+        fields = (face.expression, face.joints, face.head_rotation, face.head_translation)
+        return Clip(Motion(*map(as_array, fields), fps=driver.fps), driver.pictures)
+
+    return load
+
+
+def _position(camera: runtime.Camera) -> torch.Tensor:
+    """The camera's centre in world space, in metres."""
+    return torch.from_numpy((-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]).astype(np.float32))

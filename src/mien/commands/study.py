@@ -1,0 +1,162 @@
+"""`mien study`: people judge methods blind, beside the truth."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from mien.errors import UserError
+from mien.terminal import show
+from mien.workspace import Workspace, open_workspace
+
+if TYPE_CHECKING:
+    from mien.analysis.study import StudyRuns, StudySettings
+
+
+@dataclass(frozen=True)
+class Make:
+    """Write the page of a study: clips of held-out frames, runs beside the truth in random order and without names.
+
+    The page is one file that makes no request. Send it to participants; each saves a small json file with the answers
+    and sends it back. The key, which says which run is which, is beside the page: keep it.
+    """
+
+    workspaces: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR [DIR ...]")]
+    """Workspace folders. All need runs of the same names."""
+    out: Path
+    """File for the page, .html. The key is beside it: NAME.key.json."""
+    runs: tuple[str, ...] = ()
+    """Names of the runs to compare, 2 to 8 (default: those that all workspaces have)."""
+    clips: int = 10
+    """Largest number of clips, spread evenly over the workspaces."""
+    seconds: float = 4.0
+    """Longest clip. A clip never crosses the end of a held-out part, so runs with --split tail or --hold-out have
+    longer clips than those with --split blocks."""
+    side: int = 384
+    """Side of each picture in pixels, a multiple of 16. It shows the square around the head."""
+    megabytes: float = 30.0
+    """Largest size of the page. Videos are compressed until they fit."""
+    seed: int = 0
+    """Seed of the choice of clips and of opaque names. The order of the methods differs for each participant and clip;
+    the page draws it from the participant's number."""
+
+    def check(self) -> None:
+        """Check options and paths without heavy libraries."""
+        from mien.files import check_writable
+        from mien.inside import check_subtrees
+
+        self._settings().check()
+        if self.out.suffix.lower() != ".html":
+            raise UserError(f"--out {self.out}: give a file that ends in .html")
+        check_writable(self.out)
+        roots = [folder.resolve() for folder in self.workspaces]
+        twice = next((root for root in roots if roots.count(root) > 1), None)
+        if twice is not None:
+            raise UserError(f"{twice}: is given twice; give each workspace once")
+        for workspace in (opened := [open_workspace(folder) for folder in self.workspaces]):
+            check_subtrees(workspace.root, "runs", "sequences")
+        self._labels(opened)
+
+    def run(self) -> None:
+        """Write the page and the key."""
+        from mien.analysis.study import write_study
+        from mien.progress import say
+
+        opened = [open_workspace(folder) for folder in self.workspaces]
+        labels = self._labels(opened)
+        write_study(self.out, [_study_runs(one, labels) for one in opened], self._settings())
+        key = self.out.with_name(f"{self.out.stem}.key.json")
+        say(f"Look at {self.out} and send it; keep {key}, then: mien study tally {key} ANSWERS.json ...")
+
+    def _settings(self) -> "StudySettings":
+        from mien.analysis.study import StudySettings
+
+        return StudySettings(self.clips, self.seconds, self.side, self.megabytes, self.seed)
+
+    def _labels(self, workspaces: list[Workspace]) -> list[str]:
+        """The names of the runs: those asked for, or those that all workspaces have."""
+        from mien.analysis.study.files import MOST_RUNS
+
+        if self.runs:
+            for workspace in workspaces:
+                for name in self.runs:
+                    workspace.pick_run(name)
+        trained = [
+            [name for name in one.run_names() if (one.run_dir(name) / "training.json").is_file()] for one in workspaces
+        ]
+        every = [name for name in trained[0] if all(name in names for names in trained)]
+        labels = list(dict.fromkeys(self.runs)) or every
+        if not 2 <= len(labels) <= MOST_RUNS:
+            listed = ", ".join(labels) or "none"
+            raise UserError(f"--runs: a study compares 2 to {MOST_RUNS} runs, here {listed}; name them with --runs")
+        return labels
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Count answers: for each run the percentage of judgements that prefer it, with 95 % confidence intervals."""
+
+    key: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEY.json")]
+    """The key that `mien study make` wrote beside the page."""
+    answers: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="ANSWERS [ANSWERS ...]")]
+    """Files that participants saved, or folders of them."""
+    out: Path | None = None
+    """File for the result as json (default: only printed)."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the result as json on standard output, for programs."""
+
+    def check(self) -> None:
+        """Read the key and all answers, and check that the result can be written, without heavy libraries."""
+        from mien.analysis.study.files import read_all_answers, read_key
+        from mien.files import check_writable
+
+        if not self.answers:
+            raise UserError("no answers to tally; give the files that participants saved, or a folder of them")
+        if self.out is not None:
+            check_writable(self.out)
+        read_all_answers(self.answers, read_key(self.key))
+
+    def run(self) -> None:
+        """Print the percentages."""
+        from mien.analysis.study.files import read_all_answers, read_key
+        from mien.analysis.study.tally import FORMAT, VERSION, tally_content, tally_text
+        from mien.files import write_json
+
+        key = read_key(self.key)
+        content = tally_content(key, read_all_answers(self.answers, key))
+        if self.out is not None:
+            write_json(self.out, FORMAT, VERSION, content)
+        if self.as_json:
+            show(json.dumps({"format": FORMAT, "version": VERSION, **content}, indent=1))
+        else:
+            show(tally_text(content))
+
+
+@dataclass(frozen=True)
+class Command:
+    """Let people compare runs blind: `mien study make` writes the page, `mien study tally` counts the answers."""
+
+    what: Annotated[
+        Annotated[Make, tyro.conf.subcommand("make", prefix_name=False)]
+        | Annotated[Tally, tyro.conf.subcommand("tally", prefix_name=False)],
+        tyro.conf.arg(name=""),
+    ]
+
+    def check(self) -> None:
+        """Check the options of the chosen task."""
+        self.what.check()
+
+    def run(self) -> None:
+        """Run the chosen task."""
+        self.what.run()
+
+
+def _study_runs(workspace: Workspace, labels: list[str]) -> "StudyRuns":
+    from mien.analysis.study import StudyRuns
+    from mien.commands.stages.evaluating import run_sequences
+
+    folders = {label: workspace.run_dir(label) for label in labels}
+    runs = {label: (folder, tuple(run_sequences(workspace, folder))) for label, folder in folders.items()}
+    return StudyRuns(workspace.root.resolve().name, runs)

@@ -1,0 +1,28 @@
+"""The viewer: an avatar in a browser, drawn by mien's own renderer on the processor.
+
+Session, pictures and the loop that draws know nothing of the browser. Only `server.py` and `panel.py` call viser.
+"""
+
+from typing import TYPE_CHECKING
+
+from mien.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from mien.viewer.access import Door, is_loopback
+    from mien.viewer.drawing import Look, Mesh, View
+    from mien.viewer.loop import DrawingLoop
+    from mien.viewer.server import serve
+    from mien.viewer.session import Clip, Session
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "access": ["Door", "is_loopback"],
+            "drawing": ["Look", "Mesh", "View"],
+            "loop": ["DrawingLoop"],
+            "server": ["serve"],
+            "session": ["Clip", "Session"],
+        },
+    )
+
+__all__ = ["Clip", "Door", "DrawingLoop", "Look", "Mesh", "Session", "View", "is_loopback", "serve"]

@@ -1,0 +1,71 @@
+"""Screenshots and videos of a session, as the content of files."""
+
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mien.export.output import Output
+from mien.export.pictures import write_pictures
+from mien.picture_files import encode_picture
+from mien.runtime.rotation import matrix_from_axis_angle
+from mien.viewer.drawing import MAX_SIDE, View
+from mien.viewer.session import Session
+
+TURNTABLE_FRAMES, TURNTABLE_FPS = 100, 25.0
+"""Number of frames and frames a second of a turntable, which is the video of a session without a motion."""
+
+
+class Stopped(Exception):  # noqa: N818
+    """The recording was stopped."""
+
+
+def screenshot(session: Session, view: View) -> bytes:
+    """A view as the content of a .png, with as many pixels as the browser's canvas has."""
+    return encode_picture(session.picture(view, height=MAX_SIDE))
+
+
+def video(
+    session: Session, view: View, centre: Float[np.ndarray, " 3"], go_on: Callable[[], bool] = lambda: True
+) -> bytes:
+    """The content of an .mp4: the whole motion of the session, or a turntable of its face, from a view.
+
+    Args:
+        session: The session.
+        view: The view.
+        centre: Point that a turntable goes around, in world space, in metres.
+        go_on: Is asked before each frame.
+
+    Raises:
+        Stopped: `go_on` returned False.
+    """
+    clip = session.clip
+
+    def pictures() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        for index in range(TURNTABLE_FRAMES if clip is None else len(clip.motion)):
+            if not go_on():
+                raise Stopped
+            if clip is None:
+                turned = around(view, centre, 2 * math.pi * index / TURNTABLE_FRAMES)
+                yield session.picture(turned)
+            else:
+                yield session.picture(view, timestep=index)
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "video.mp4"
+        write_pictures(Output(path, "mp4", False), pictures(), TURNTABLE_FPS if clip is None else clip.motion.fps)
+        return path.read_bytes()
+
+
+def around(view: View, centre: Float[np.ndarray, " 3"], angle: float) -> View:
+    """The view from a camera that went around a point, about its own vertical axis, by an angle in radians."""
+    up = view.viewmat[1, :3].astype(np.float64)
+    turn = matrix_from_axis_angle((angle * up)[None])[0]
+    moved = view.viewmat.astype(np.float64).copy()
+    moved[:3, 3] += moved[:3, :3] @ (centre - turn @ centre)
+    moved[:3, :3] = moved[:3, :3] @ turn
+    return replace(view, viewmat=moved)

@@ -1,0 +1,291 @@
+"""The controls beside the picture, in viser's words. All browsers share them."""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import viser
+
+from mien.errors import UserError
+from mien.terminal import printable
+from mien.viewer.drawing import BACKGROUNDS, Surface, View
+from mien.viewer.faces import grouped, matches, presets_for, readable
+from mien.viewer.files import Stopped, screenshot, video
+from mien.viewer.session import Session, centre_of
+
+MAX_ANGLE = 0.5
+"""Largest angle of a joint's slider, in radians."""
+_STEP = 0.01
+_AXES = ("nod", "turn", "tilt")
+_NOTHING = "none"
+_LEAST_HEIGHT, _MOST_HEIGHT = 128, 1080
+_FOLLOW_SECONDS = 0.25
+"""Time between two moves of the sliders while a motion plays, in seconds."""
+
+
+class Panel:
+    """The controls of one session."""
+
+    def __init__(self, server: viser.ViserServer, session: Session, title: str, view_of: Callable[..., View]) -> None:
+        """Add the controls to a server.
+
+        Args:
+            server: The server.
+            session: What the controls change.
+            title: Name of the avatar, for people and for the files that are saved.
+            view_of: Returns the view of a client.
+        """
+        self._server, self._session, self._view_of = server, session, view_of
+        self._title = printable(Path(title).name) or "avatar"
+        self._sliders: dict[str, viser.GuiSliderHandle[float]] = {}
+        self._time: viser.GuiSliderHandle[int] | None = None
+        self._followed_at, self._stopping = 0.0, False
+        self._recording = threading.Lock()
+        about = session.avatar.portable.about
+        count = len(session.avatar.portable.baked.attributes.opacity_logits)
+        server.gui.add_markdown(f"**{_plain(self._title)}**: {count:,} Gaussians, {_plain(about.method)}")
+        if session.clip_names:
+            self._add_motion()
+        self._add_faces()
+        self._add_expressions()
+        self._add_joints()
+        self._add_picture()
+        self._add_files()
+
+    def stop(self) -> None:
+        """Stop a video that is being written."""
+        self._stopping = True
+
+    def follow(self) -> None:
+        """Move the sliders to the face that is shown, now and then while a motion plays."""
+        now = time.monotonic()
+        if self._session.playing and now - self._followed_at < _FOLLOW_SECONDS:
+            return
+        self._followed_at = now
+        if self._time is not None:
+            self._time.value = self._session.timestep
+
+    def move_sliders(self) -> None:
+        """Move all sliders to the face that is shown."""
+        avatar, face = self._session.avatar, self._session.face
+        values = dict(zip(avatar.expression_names, face.expression.tolist(), strict=True))
+        for name, angles in zip(avatar.joint_names, face.joints.tolist(), strict=True):
+            values |= {f"{name}_{'xyz'[axis]}": angle for axis, angle in enumerate(angles)}
+        for name, slider in self._sliders.items():
+            slider.value = _rounded(values[name], slider.min, slider.max)
+        if self._time is not None:
+            self._time.value = self._session.timestep
+
+    def _add_motion(self) -> None:
+        gui, session = self._server.gui, self._session
+        with gui.add_folder("Motion"):
+            chosen = gui.add_dropdown("Motion", (_NOTHING, *session.clip_names), initial_value=_NOTHING)
+            play = gui.add_button("Play")
+            timeline = self._time = gui.add_slider("Frame", 0, 1, 1, 0)
+            filmed = gui.add_checkbox("Filmed frame beside it", False)
+        before = [_NOTHING]
+
+        @chosen.on_update
+        def _(event: Any) -> None:
+            if chosen.value == before[0]:
+                return
+            try:
+                session.choose(None if chosen.value == _NOTHING else chosen.value)
+            except UserError as error:
+                self._complain(event.client, str(error))
+                chosen.value = before[0]
+                return
+            before[0] = chosen.value
+            timeline.max = max(1, len(session.clip.motion) - 1) if session.clip else 1
+            self.move_sliders()
+
+        @play.on_click
+        async def _(event: Any) -> None:
+            session.play(not session.playing, time.monotonic())
+            self.move_sliders()
+
+        @timeline.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                session.seek(timeline.value)
+
+        @filmed.on_update
+        async def _(event: Any) -> None:
+            session.show(side_by_side=filmed.value)
+
+    def _add_faces(self) -> None:
+        gui, session = self._server.gui, self._session
+        random = np.random.default_rng()
+        with gui.add_folder("Face"):
+            rest = gui.add_button("At rest")
+            anyone = gui.add_button("Random face")
+            names = presets_for(session.avatar.expression_names)
+            preset = gui.add_dropdown("Preset", (_NOTHING, *names), initial_value=_NOTHING) if names else None
+
+        @rest.on_click
+        async def _(event: Any) -> None:
+            session.rest()
+            self.move_sliders()
+
+        @anyone.on_click
+        async def _(event: Any) -> None:
+            session.take_random(random)
+            self.move_sliders()
+
+        if preset is not None:
+
+            @preset.on_update
+            async def _(event: Any) -> None:
+                if preset.value == _NOTHING:
+                    session.rest()
+                else:
+                    session.take_preset(preset.value)
+                self.move_sliders()
+
+    def _add_expressions(self) -> None:
+        gui, portable = self._server.gui, self._session.avatar.portable
+        bounds = {name: pair for name, pair in zip(portable.expression_names, portable.expression_bounds, strict=True)}
+        rest = dict(zip(portable.expression_names, portable.neutral.expression.tolist(), strict=True))
+        groups, folders = grouped(portable.expression_names, portable.expression_bounds), {}
+        with gui.add_folder("Expressions"):
+            search = gui.add_text("Search", "", hint="Part of a name, such as: smile left")
+            for title, names in groups.items():
+                folders[title] = gui.add_folder(title, expand_by_default=not folders)
+                with folders[title]:
+                    for name in names:
+                        low, high = (float(bound) for bound in bounds[name])
+                        self._add_slider(name, readable(name), low, high, rest[name], self._expression_setter(name))
+
+        @search.on_update
+        async def _(event: Any) -> None:
+            for title, names in groups.items():
+                found = [matches(search.value, name) for name in names]
+                for name, visible in zip(names, found, strict=True):
+                    self._sliders[name].visible = visible
+                folders[title].visible = any(found)
+
+    def _expression_setter(self, name: str) -> Callable[[float], None]:
+        return lambda value: self._session.set_expression(name, value)
+
+    def _add_joints(self) -> None:
+        gui, avatar = self._server.gui, self._session.avatar
+        if not avatar.joint_names:
+            return
+        with gui.add_folder("Joints", expand_by_default=False):
+            for name, angles in zip(avatar.joint_names, avatar.portable.neutral.joints.tolist(), strict=True):
+                for axis, angle in enumerate(angles):
+                    label = f"{readable(name)} {_AXES[axis]}"
+                    setter = self._joint_setter(name, axis)
+                    self._add_slider(f"{name}_{'xyz'[axis]}", label, -MAX_ANGLE, MAX_ANGLE, angle, setter)
+
+    def _joint_setter(self, name: str, axis: int) -> Callable[[float], None]:
+        return lambda value: self._session.set_joint(name, axis, value)
+
+    def _add_slider(
+        self, name: str, label: str, low: float, high: float, value: float, take: Callable[[float], None]
+    ) -> None:
+        slider = self._server.gui.add_slider(label, low, high, _STEP, _rounded(value, low, high))
+        self._sliders[name] = slider
+
+        # These run in the order of the events. Functions in viser's threads could overtake each other.
+        @slider.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                take(slider.value)
+
+    def _add_picture(self) -> None:
+        gui, session = self._server.gui, self._session
+        surfaces = list(get_args(Surface)) if session.mesh is not None else ["avatar"]
+        if session.mesh is None or session.mesh.seen is None:
+            surfaces = [name for name in surfaces if name != "confidence"]
+        with gui.add_folder("Picture"):
+            surface = gui.add_dropdown("Show", tuple(surfaces)) if len(surfaces) > 1 else None
+            wireframe = gui.add_checkbox("Wireframe", False) if session.mesh is not None else None
+            background = gui.add_dropdown("Background", tuple(BACKGROUNDS))
+            height = gui.add_slider("Height in pixels", _LEAST_HEIGHT, _MOST_HEIGHT, 8, session.height)
+            filmed = gui.add_button("Camera as filmed")
+        for handle, name in ((surface, "surface"), (wireframe, "wireframe"), (background, "background")):
+            if handle is not None:
+                self._show_on_update(handle, name)
+        self._show_on_update(height, "height")
+
+        @filmed.on_click
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                position, target, up = filmed_from(session)
+                with event.client.atomic():
+                    event.client.camera.up_direction = up
+                    event.client.camera.position = position
+                    event.client.camera.look_at = target
+
+    def _show_on_update(self, handle: Any, name: str) -> None:
+        @handle.on_update
+        async def _(event: Any) -> None:
+            self._session.show(**{name: handle.value})
+
+    def _add_files(self) -> None:
+        gui, session = self._server.gui, self._session
+        with gui.add_folder("Save", expand_by_default=False):
+            still = gui.add_button("Screenshot")
+            moving = gui.add_button("Video", hint="The whole motion from here; without a motion, once around the head")
+
+        @still.on_click
+        def _(event: Any) -> None:
+            if event.client is not None:
+                content = screenshot(session, self._view_of(event.client.camera))
+                event.client.send_file_download(f"{self._title}.png", content, save_immediately=True)
+
+        @moving.on_click
+        def _(event: Any) -> None:
+            if event.client is not None:
+                self._record(event.client)
+
+    def _record(self, client: viser.ClientHandle) -> None:
+        """Write a video in this thread, and send it. A second one has to wait."""
+        if not self._recording.acquire(blocking=False):
+            self._complain(client, "A video is being written; wait for it.")
+            return
+
+        def go_on() -> bool:
+            return not self._stopping and client.client_id in self._server.get_clients()
+
+        try:
+            note = client.add_notification("Video", "It is being written ...", loading=True, with_close_button=False)
+            content = video(self._session, self._view_of(client.camera), centre_of(self._session.avatar), go_on)
+            note.remove()
+            client.send_file_download(f"{self._title}.mp4", content, save_immediately=True)
+        except Stopped:
+            pass
+        except UserError as error:
+            self._complain(client, str(error))
+        finally:
+            self._recording.release()
+
+    def _complain(self, client: viser.ClientHandle | None, message: str) -> None:
+        if client is not None:
+            client.add_notification("mien", printable(message), color="red")
+
+
+def filmed_from(session: Session) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position of the camera that the avatar was trained with, the point that it looks at, and its upward direction.
+
+    The point is the one on the camera's axis that is nearest to the middle of the head. All are in world space.
+    """
+    viewmat = session.avatar.camera.viewmat.astype(np.float64)
+    position = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    ahead, up = viewmat[2, :3], -viewmat[1, :3]
+    distance = max(float((centre_of(session.avatar) - position) @ ahead), 0.05)
+    return position, position + distance * ahead, up
+
+
+def _rounded(value: float, low: float, high: float) -> float:
+    """The value as a slider shows it."""
+    return min(max(round(value / _STEP) * _STEP, low), high)
+
+
+def _plain(text: str) -> str:
+    """A text without characters that Markdown or HTML would read."""
+    return "".join(character if character.isalnum() or character in " -._" else " " for character in printable(text))

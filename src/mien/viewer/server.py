@@ -1,0 +1,229 @@
+"""The viewer's server: viser shows our pictures behind its controls, and `mien.viewer.access` guards every request."""
+
+import contextlib
+import errno
+import http.client
+import io
+import logging
+import math
+import socket
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import viser
+import viser.transforms
+import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from mien.errors import UserError
+from mien.viewer.access import Door
+from mien.viewer.drawing import View
+from mien.viewer.loop import DrawingLoop
+from mien.viewer.panel import Panel, filmed_from
+from mien.viewer.session import Session, centre_of
+
+_MOVING_QUALITY, _STILL_QUALITY = 75, 92
+"""JPEG qualities of pictures of half size and of full size, 1 to 100."""
+_MOST_FIELD = math.pi - 0.01
+"""Largest field of view of a browser, in radians."""
+_WATCH_SECONDS = 0.5
+
+
+def serve(session: Session, door: Door, port: int, title: str, ready: Callable[[str], None]) -> None:
+    """Show a session to browsers until Ctrl-C or SIGTERM.
+
+    Args:
+        session: The session.
+        door: Who may use it, and the host to listen on.
+        port: The port, or 0 for a free one.
+        title: Name of the avatar.
+        ready: Is called with the address, as soon as browsers can open it.
+
+    Raises:
+        UserError: the host or the port cannot be used.
+    """
+    serving = Serving(session, door, port, title)
+    try:
+        ready(serving.address)
+        serving.wait()
+    finally:
+        serving.stop()
+
+
+class Serving:
+    """A server that runs."""
+
+    def __init__(self, session: Session, door: Door, port: int, title: str) -> None:
+        """Start the server; the arguments are those of `serve`."""
+        chosen = _free_port(door.host, port)
+        # A client that vanishes in the middle of a request is no error of the viewer.
+        logging.getLogger("websockets").setLevel(logging.CRITICAL)
+        with _quiet(), _guarded(door):
+            self._server = viser.ViserServer(host=door.host, port=chosen, label="mien", verbose=False)
+        try:
+            self.port = self._server.get_port()
+            if port and self.port != port:
+                raise _taken(port)
+            _check_guard(door.host, self.port)
+            # viser could pass this server on through a machine of its makers.
+            self._server.request_share_url = lambda verbose=True: None
+            self._session = session
+            self._show(title)
+        except BaseException:
+            with _quiet():
+                self._server.stop()
+            raise
+        shown = socket.gethostname() if door.host in ("0.0.0.0", "::") else door.host
+        self.address = door.address(shown, self.port)
+
+    def wait(self) -> None:
+        """Wait until the loop fails, which is a bug. Ctrl-C and SIGTERM end the wait, too."""
+        while self.loop.running:
+            self.loop.wait(_WATCH_SECONDS)
+        if self.loop.error is not None:
+            raise self.loop.error
+
+    def stop(self) -> None:
+        """Close all connections, and end all threads."""
+        # Connections that are still open are cut, which asyncio would report.
+        logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+        self._panel.stop()
+        self.loop.stop()
+        with _quiet():
+            self._server.stop()
+
+    def _show(self, title: str) -> None:
+        server, session = self._server, self._session
+        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        server.gui.main_panel.dock_right()
+        position, target, up = filmed_from(session)
+        camera = session.avatar.camera
+        server.scene.set_up_direction(up)
+        server.initial_camera.position = position
+        server.initial_camera.look_at = centre_of(session.avatar)
+        server.initial_camera.up = up
+        server.initial_camera.fov = 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
+        self.loop = DrawingLoop(session.picture, session.advance)
+        session.changed = self.loop.change
+        self._panel = Panel(server, session, title, view_of)
+        self.loop.start()
+        # A browser may leave while its picture is drawn; viser would warn about that.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+        server.on_client_connect(self._welcome)
+        server.on_client_disconnect(self._forget)
+
+    async def _welcome(self, client: viser.ClientHandle) -> None:
+        words = client.gui.add_markdown("", order=0.5)
+
+        def show(picture: Any, full: bool) -> None:
+            quality = _STILL_QUALITY if full else _MOVING_QUALITY
+            client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+            self._panel.follow()
+            if not self._session.playing:
+                view = view_of(client.camera)
+                words.content = self._session.words(view)
+
+        async def look(camera: viser.CameraHandle) -> None:
+            view = view_of(camera)
+            if is_possible(view):
+                self.loop.look(client.client_id, view)
+
+        self.loop.add(client.client_id, show)
+        client.camera.on_update(look)
+        await look(client.camera)
+
+    async def _forget(self, client: viser.ClientHandle) -> None:
+        self.loop.remove(client.client_id)
+
+
+def view_of(camera: viser.CameraHandle) -> View:
+    """The view of a browser's camera. viser's cameras have OpenCV axes, too."""
+    rotation = viser.transforms.SO3(camera.wxyz).as_matrix()
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ camera.position
+    return View(viewmat, float(camera.fov), int(camera.image_width), int(camera.image_height))
+
+
+def is_possible(view: View) -> bool:
+    """Whether a picture of a view can be drawn. A hidden browser window has no size."""
+    return bool(
+        np.isfinite(view.viewmat).all()
+        and np.abs(view.viewmat).max() < 1e6
+        and 0 < view.field < _MOST_FIELD
+        and view.width > 0
+        and view.height > 0
+    )
+
+
+def _free_port(host: str, port: int) -> int:
+    """The port, or a free one if it is 0. viser would silently take the next one, or wait for ever.
+
+    Raises:
+        UserError: the port is taken or not allowed, or the host is none of this machine.
+    """
+    try:
+        family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(place)
+            return int(probe.getsockname()[1])
+    except (OSError, UnicodeError) as error:
+        number = getattr(error, "errno", None)
+        if number == errno.EADDRINUSE:
+            raise _taken(port) from None
+        if number == errno.EACCES:
+            raise UserError(f"--port {port}: is not allowed for this user; give one above 1023") from None
+        raise UserError(
+            f"--host {host}: is no address of this machine; give one of its addresses, or 0.0.0.0 for all"
+        ) from None
+
+
+def _taken(port: int) -> UserError:
+    return UserError(f"--port {port}: another program uses it; give another port, or leave --port out for a free one")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Drop what viser prints on standard output."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+@contextlib.contextmanager
+def _guarded(door: Door) -> Iterator[None]:
+    """Let servers that start inside ask the door about each request. viser has no place for that."""
+    module: Any = websockets.asyncio.server
+    start = module.serve
+
+    def guarded(*arguments: Any, process_request: Callable[[Any, Request], Any], **named: Any) -> Any:
+        def process(connection: Any, request: Request) -> Any:
+            answer = door.answer(request.path, dict(request.headers.raw_items()))
+            if answer is None:
+                return process_request(connection, request)
+            body = answer.body.encode()
+            headers = Headers({**answer.headers, "Content-Length": str(len(body))})
+            return Response(answer.status.value, answer.status.phrase, headers, body)
+
+        return start(*arguments, process_request=process, **named)
+
+    module.serve = guarded
+    try:
+        yield
+    finally:
+        module.serve = start
+
+
+def _check_guard(host: str, port: int) -> None:
+    """Check that a request which the door refuses is refused, so that no version of viser can go around it."""
+    reached = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    connection = http.client.HTTPConnection(reached, port, timeout=10)
+    try:
+        connection.request("GET", "/", headers={"Host": "stranger.invalid"})
+        status = connection.getresponse().status
+    finally:
+        connection.close()
+    assert status == http.HTTPStatus.FORBIDDEN, f"the viewer's door is open: {status}"

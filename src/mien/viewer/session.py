@@ -1,0 +1,240 @@
+"""What all browsers of a viewer share: the face, the motion that plays, and what is drawn.
+
+Methods may be called from any thread. A `version` counts the changes.
+"""
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from mien import runtime
+from mien.export import Motion
+from mien.runtime import Face
+from mien.runtime.filmed import within_filmed_inputs
+from mien.viewer.drawing import Look, Mesh, View, beside, draw, words_about_view
+from mien.viewer.faces import preset_expression, random_expression
+
+DEFAULT_HEIGHT = 512
+"""Largest height of a picture in pixels, at first."""
+_IN_BOX = (0.02, 0.98)
+"""Shares of the Gaussians between which the box of the head is, along each axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """A motion that the avatar can play."""
+
+    motion: Motion
+    pictures: Callable[[int], UInt8[np.ndarray, "_ _ 3"]] | None = None
+    """Returns the filmed frame at a timestep. None if there are none."""
+
+
+class Session:
+    """An avatar with its face, its motion, and what is drawn of it."""
+
+    def __init__(
+        self, avatar: runtime.Avatar, mesh: Mesh | None = None, clips: Mapping[str, Callable[[], Clip]] | None = None
+    ) -> None:
+        """Show an avatar at rest.
+
+        Args:
+            avatar: The avatar.
+            mesh: The mesh of its face model, if it is known.
+            clips: Motions by name. Each is loaded at its first use.
+        """
+        self.avatar, self.mesh = avatar, mesh
+        self._makers, self._clips = dict(clips or {}), dict[str, Clip]()
+        self._lock, self._drawing = threading.RLock(), threading.Lock()
+        self._face = avatar.face()
+        self._posed: tuple[Face, runtime.Gaussians] | None = None
+        self._version = 0
+        self._clip: Clip | None = None
+        self._timestep = 0
+        self._playing_since: float | None = None
+        """Time at which timestep 0 was due, or None if nothing plays."""
+        self.look, self.height, self.side_by_side = Look(), DEFAULT_HEIGHT, False
+        self.changed: Callable[[], None] = lambda: None
+        """Is called after each change."""
+
+    @property
+    def clip_names(self) -> list[str]:
+        """Names of the motions that can be chosen."""
+        return list(self._makers)
+
+    @property
+    def clip(self) -> Clip | None:
+        """The chosen motion."""
+        return self._clip
+
+    @property
+    def timestep(self) -> int:
+        """The timestep of the motion that is shown."""
+        return self._timestep
+
+    @property
+    def playing(self) -> bool:
+        """Whether the motion plays."""
+        return self._playing_since is not None
+
+    @property
+    def face(self) -> Face:
+        """The face that is shown."""
+        return self._face
+
+    @property
+    def version(self) -> int:
+        """Number of changes so far."""
+        return self._version
+
+    def set_expression(self, name: str, value: float) -> None:
+        """Set one expression, within the bounds of the face model. What plays is paused."""
+        index = self.avatar.expression_names.index(name)
+        low, high = self.avatar.portable.expression_bounds[index]
+        with self._lock:
+            expression = self._face.expression.copy()
+            expression[index] = np.clip(value, low, high)
+            self._take(replace(self._face, expression=expression))
+
+    def set_joint(self, name: str, axis: int, angle: float) -> None:
+        """Set one component of a joint's axis-angle vector, in radians. What plays is paused."""
+        with self._lock:
+            joints = self._face.joints.copy()
+            joints[self.avatar.joint_names.index(name), axis] = angle
+            self._take(replace(self._face, joints=joints))
+
+    def rest(self) -> None:
+        """Show the person at rest."""
+        self._take(self.avatar.face())
+
+    def take_preset(self, preset: str) -> None:
+        """Show a preset of `mien.viewer.faces`, of which the avatar has all expressions."""
+        portable = self.avatar.portable
+        rest, bounds = portable.neutral.expression, portable.expression_bounds
+        expression = preset_expression(preset, portable.expression_names, rest, bounds)
+        self._take(self.avatar.face(expression))
+
+    def take_random(self, random: np.random.Generator) -> None:
+        """Show a random face, softly within what was filmed if that is known."""
+        portable = self.avatar.portable
+        rest, bounds = portable.neutral.expression, portable.expression_bounds
+        expression = random_expression(portable.expression_names, rest, bounds, random)
+        if portable.filmed is not None:
+            joints = portable.neutral.joints.reshape(-1)
+            inputs, start = np.concatenate([expression, joints])[None], np.concatenate([rest, joints])
+            expression = within_filmed_inputs(portable.filmed, inputs, start, bounds)[0, : len(rest)]
+        self._take(self.avatar.face(expression))
+
+    def choose(self, name: str | None) -> None:
+        """Choose a motion and show its first timestep, or no motion and the person at rest.
+
+        Raises:
+            UserError: the motion cannot be loaded. The one before stays.
+        """
+        clip = None
+        if name is not None:
+            # Loading takes seconds, so nothing waits for it.
+            clip = self._clips[name] if name in self._clips else self._makers[name]()
+            self._clips[name] = clip
+        with self._lock:
+            self._clip, self._playing_since = clip, None
+            self._timestep = 0
+            self._take(self.avatar.face() if clip is None else clip.motion.face(0))
+
+    def seek(self, timestep: int) -> None:
+        """Show a timestep of the motion, and pause."""
+        with self._lock:
+            if self._clip is not None:
+                self._timestep = min(max(timestep, 0), len(self._clip.motion) - 1)
+                self._take(self._clip.motion.face(self._timestep))
+
+    def play(self, playing: bool, now: float) -> None:
+        """Play the motion from the timestep that is shown, again and again, or pause it."""
+        with self._lock:
+            if self._clip is None or not playing:
+                self._playing_since = None
+            else:
+                self._playing_since = now - self._timestep / self._clip.motion.fps
+            self._change()
+
+    def advance(self, now: float) -> float | None:
+        """Go on to the timestep of this moment. Return the time at which the next one is due, or None if none plays."""
+        with self._lock:
+            if self._clip is None or self._playing_since is None:
+                return None
+            motion = self._clip.motion
+            # Half a microsecond keeps a moment that is due from being rounded to the one before it.
+            steps = int((now - self._playing_since) * motion.fps + 5e-7 * motion.fps)
+            timestep = steps % len(motion)
+            if timestep != self._timestep:
+                self._timestep, self._face = timestep, motion.face(timestep)
+                self._change()
+            return self._playing_since + (steps + 1) / motion.fps
+
+    def show(self, **changes: Any) -> None:
+        """Change `look` (fields of `Look`), `height` or `side_by_side`."""
+        with self._lock:
+            self.height = int(changes.pop("height", self.height))
+            self.side_by_side = bool(changes.pop("side_by_side", self.side_by_side))
+            self.look = replace(self.look, **changes)
+            self._change()
+
+    def picture(
+        self, view: View, full: bool = True, height: int | None = None, timestep: int | None = None
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture of a view.
+
+        Args:
+            view: The view.
+            full: Whether the picture has its full size, or half of it.
+            height: Largest height of a full picture in pixels (default: that of the session).
+            timestep: Timestep of the motion to draw (default: the face that is shown).
+        """
+        with self._lock:
+            face, look, clip = self._face, self.look, self._clip
+            most, side_by_side = height or self.height, self.side_by_side
+            if timestep is None:
+                timestep = self._timestep
+            else:
+                assert clip is not None, "there is no motion"
+                face = clip.motion.face(timestep)
+        wide, high = view.sized(most)
+        if not full:
+            wide, high = max(1, wide // 2), max(1, high // 2)
+        filmed = clip.pictures if clip is not None and side_by_side else None
+        with self._drawing:
+            camera = view.camera(wide if filmed is None else max(1, wide // 2), high)
+            shown = draw(self._gaussians(face), face, self.mesh, look, camera)
+            return shown if filmed is None else beside(filmed(timestep), shown, look.background)
+
+    def words(self, view: View) -> str:
+        """One line about whether a view shows a side that was filmed."""
+        return words_about_view(self.avatar.portable.filmed, self._face, view)
+
+    def _gaussians(self, face: Face) -> runtime.Gaussians:
+        """The Gaussians of a face. The last ones are kept, because several views show the same face."""
+        if self._posed is None or self._posed[0] is not face:
+            self._posed = (face, runtime.pose(self.avatar.portable.baked, face))
+        return self._posed[1]
+
+    def _take(self, face: Face) -> None:
+        with self._lock:
+            self._playing_since, self._face = None, face
+            self._change()
+
+    def _change(self) -> None:
+        self._version += 1
+        self.changed()
+
+
+def centre_of(avatar: runtime.Avatar) -> Float32[np.ndarray, " 3"]:
+    """The middle of the avatar at rest in world space, in metres: of the box that holds nearly all of its Gaussians."""
+    posed = avatar.pose()
+    box = np.quantile(posed.means, _IN_BOX, axis=0)
+    middle = box.mean(0)
+    if posed.T_world_local is not None:
+        middle = posed.T_world_local[:3, :3] @ middle + posed.T_world_local[:3, 3]
+    return middle.astype(np.float32)

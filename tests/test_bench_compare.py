@@ -1,0 +1,175 @@
+"""`mien bench compare` trains methods on the same frames with the same budget, continues, and writes one table."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mien.avatar import METHODS
+from mien.benchmarking.comparing import MethodRow, comparison_table, unseen_mean
+from mien.cli import main
+from mien.commands.stages import comparing
+from mien.commands.stages.comparing import Budget, CompareSettings
+from mien.face import add_face_model
+from mien.training import read_run_config, read_training_summary
+from toy_scene import toy_face_model
+from toy_workspace import write_toy_workspace
+
+METRICS = {"psnr": 30.0, "ssim": 0.9, "l1": 0.01, "perceptual": 0.2}
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Return a tracked workspace whose face model is in the cache, as that of a user."""
+    folder = tmp_path_factory.mktemp("compared")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("MIEN_CACHE", str(folder / "cache"))
+        add_face_model(toy_face_model(), folder / "toy.npz", "none")
+        write_toy_workspace(folder / "anna")
+        yield folder / "anna"
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Return the folders of the runs that are really trained, in order."""
+    from mien.training import trainer
+
+    seen: list[Path] = []
+    original = trainer._train_to_the_end
+
+    def watched(state: Any, data: Any, settings: Any, run_dir: Path, progress: Any) -> None:
+        seen.append(run_dir)
+        original(state, data, settings, run_dir, progress)
+
+    monkeypatch.setattr(trainer, "_train_to_the_end", watched)
+    return seen
+
+
+def test_every_method_gets_the_same_frames_and_steps(
+    workspace: Path, tmp_path: Path, trained: list[Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["bench", "compare", str(workspace), "--steps", "6", "--split", "tail", "--out", str(tmp_path)]
+    assert main([*command, "--methods", "gaussian_avatars"]) == 0
+    assert main([*command, "--json"]) == 0
+    assert [folder.name for folder in trained] == [f"compare-{method}-6-tail" for method in METHODS]
+    content = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert content["format"] == "mien.bench_compare"
+    rows = content["rows"]
+    assert [(row["capture"], row["method"], row["steps"]) for row in rows] == [("anna", m, 6) for m in METHODS]
+    stored = json.loads((tmp_path / "compare.json").read_text())
+    assert stored["rows"] == rows
+    scored_on = []
+    for row in rows:
+        entry = row["protocols"]["self_reenactment_tail"]
+        assert row["gaussians"] > 0
+        assert row["seconds"] >= 0
+        assert entry["head"]["psnr"] > 0
+        assert "per_frame" not in entry
+        run_dir = workspace / "runs" / row["run"]
+        assert row["bytes_on_disk"] == sum(path.stat().st_size for path in (run_dir / "avatar").iterdir())
+        frames = json.loads((run_dir / "metrics.json").read_text())["protocols"]["self_reenactment_tail"]["per_frame"]
+        scored_on.append((entry["scored_on"], frames["timestep"], read_run_config(run_dir)["settings"]["steps"]))
+    assert all(each == scored_on[0] for each in scored_on)
+    table = (tmp_path / "compare.md").read_text()
+    assert table.startswith("| capture | protocol | method | head: PSNR, dB |")
+    assert "unseen" not in table
+    assert all(f"| {method} |" in table for method in METHODS)
+    before = len(trained)
+    assert main(command) == 0
+    assert len(trained) == before
+    assert table.strip() in capsys.readouterr().out
+
+
+def test_minutes_become_steps_by_trials_that_are_kept(
+    workspace: Path, tmp_path: Path, trained: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ["bench", "compare", str(workspace), "--minutes", "0.02", "--methods", "gaussian_avatars"]
+    command += ["--out", str(tmp_path), "--split", "tail"]
+    monkeypatch.setattr(comparing, "_FIRST_TRIAL_STEPS", 5)
+    assert main(command) == 0
+    summary = read_training_summary(workspace / "runs" / "compare-gaussian_avatars-0.02min-tail")
+    assert summary["steps"] > 5
+    assert 0.2 < summary["seconds"] < 6  # 1.2 s on an idle machine
+    first = trained[0]
+    assert first.name.startswith("first-5-")
+    assert first.parent == tmp_path / "trials" / "anna" / "compare-gaussian_avatars-0.02min-tail"
+    assert trained[-1].name == "compare-gaussian_avatars-0.02min-tail"
+    before = len(trained)
+    assert main(command) == 0
+    assert len(trained) == before
+
+
+def test_the_longer_trial_decides(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step costs more once there are more Gaussians, so the rate of a trial with the whole schedule counts."""
+    rates, asked = {100: 0.01, 600: 0.02}, []
+
+    def trial(subject: Any, config: Any, settings: Any, folder: Path) -> float:
+        asked.append(settings.steps)
+        return rates[settings.steps]
+
+    monkeypatch.setattr(comparing, "_trial", trial)
+    from mien.commands.stages.comparing import _of_workspace, _steps
+    from mien.training import PRESETS
+    from mien.workspace import Workspace
+
+    chosen = CompareSettings(("gaussian_avatars",), "standard", Budget(minutes=1.0), "tail")
+    subject = _of_workspace(Workspace(workspace), chosen)
+    config = PRESETS["standard"].config("gaussian_avatars")
+    assert _steps(subject, config, subject.settings, chosen.budget, tmp_path / "new") == 3000
+    assert asked == [100, 600]
+    assert _steps(subject, config, subject.settings, Budget(steps=7), tmp_path / "new") == 7
+    assert _steps(subject, config, subject.settings, Budget(), tmp_path / "new") == subject.settings.steps
+
+
+def row(capture: str, method: str, psnr: float, unseen: dict[str, Any] | None = None, **parts: Any) -> MethodRow:
+    entry = {**METRICS, "psnr": psnr + 3, "head": {**METRICS, "psnr": psnr}, "seconds_per_frame": 0.0123, **parts}
+    return MethodRow(capture, method, "run", 2000, 90.0, 12345, 3_456_789, {"self_reenactment": entry}, unseen or {})
+
+
+def test_the_table_marks_the_best_and_means_over_shared_captures() -> None:
+    eyes = {"eyes": {**METRICS, "psnr": 25.0}}
+    views = {angle: {"avatar": {"head": {**METRICS, "psnr": psnr}}} for angle, psnr in (("front", 40.0), ("30", 22.0))}
+    rows = [row("one", "a", 20.0, **eyes), row("one", "b", 21.0), row("two", "a", 30.0, views), row("two", "b", 26.0)]
+    table = comparison_table(rows).splitlines()
+    heads = [cell.strip() for cell in table[0].strip("|").split("|")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in table[2:]]
+    head, eyes_at, unseen = (heads.index(name) for name in ("head: PSNR, dB", "eyes: PSNR", "unseen views: PSNR"))
+    assert [line[head] for line in cells] == ["20.00", "**21.00**", "**30.00**", "26.00", "**25.00**", "23.50"]
+    assert [line[eyes_at] for line in cells] == ["25.00", "-", "-", "-", "-", "-"]
+    assert [line[unseen] for line in cells] == ["-", "-", "22.00", "-", "-", "-"]
+    assert "mouth: PSNR" not in heads
+    assert cells[4][:3] == ["mean of 2", "all", "a"]
+    assert cells[0][heads.index("Gaussians")] == "12,345"
+    assert cells[0][heads.index("training, min")] == "1.5"
+    assert cells[0][heads.index("ms a frame")] == "12.3"
+    assert cells[0][heads.index("MB on disk")] == "3.5"
+    assert unseen_mean(views, "psnr") == 22
+    assert unseen_mean({}, "psnr") is None
+
+
+def test_captures_that_a_method_lacks_do_not_count_in_the_means() -> None:
+    rows = [row("one", "a", 20.0), row("one", "b", 21.0), row("two", "a", 30.0)]
+    assert "mean of" not in comparison_table(rows)
+
+
+def test_bad_options_are_told_in_one_line(workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for more, told in (
+        ([], "nothing to compare on"),
+        ([str(workspace), "--minutes", "-1"], "--minutes -1: give a number from 0"),
+        ([str(workspace), "--minutes", "nan"], "--minutes nan: give a number from 0"),
+        ([str(workspace), "--steps", "-1"], "--steps -1"),
+        ([str(workspace), "--steps", "5", "--minutes", "1"], "give one of them"),
+        ([str(workspace), str(workspace)], "two captures have this name"),
+        ([str(workspace), "--methods", "nerf"], "instead of 'nerf'"),
+        ([str(workspace), "--preset", "paper", "--methods", "mono_gaussian_avatar"], "has no such preset"),
+        (["--captures", "mono"], "mono-short"),
+        ([str(tmp_path / "gone")], "no such folder"),
+    ):
+        if "paper" in more and "paper" in METHODS["mono_gaussian_avatar"].presets:
+            continue
+        assert main(["bench", "compare", *more, "--out", str(tmp_path / "out")]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert told in line, line
+    assert not (tmp_path / "out").exists()

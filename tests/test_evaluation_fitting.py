@@ -1,0 +1,147 @@
+"""Faces fitted to held-out pictures: they come nearer to the truth, leave the avatar alone, and are a third figure."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from evaluation_case import drawn_sequence, make_experiment
+from mien.avatar import METHODS
+from mien.cli import main
+from mien.errors import UserError
+from mien.evaluation import EvaluationSettings, evaluate
+from mien.evaluation.experiment import Experiment, avatar_image, target_image
+from mien.evaluation.fitting import FittedFaces, fit_face
+from mien.evaluation.metrics import l1
+from mien.evaluation.partial import PartialScores
+from mien.evaluation.protocols import AS_TRACKED, AVATAR, FITTED, evaluate_frames, protocol_content
+from mien.evaluation.text import protocol_line
+from mien.tracking import Scoring
+from toy_workspace import write_toy_workspace
+
+QUICK = EvaluationSettings(perceptual=False, video_frames=0, baselines=False, threads=1)
+FIT = replace(QUICK, fit_faces=True)
+
+
+def astray(experiment: Experiment) -> Experiment:
+    """Return the experiment with face parameters that are a little wrong."""
+    faces = tuple(
+        replace(
+            face,
+            expression=(face.expression + 0.1).clamp(0, 1),
+            head_rotation=face.head_rotation + 0.02,
+            head_translation=face.head_translation + torch.tensor([0.004, -0.004, 0.0]),
+        )
+        for face in experiment.faces
+    )
+    return replace(experiment, faces=faces, face_source="corrected")
+
+
+def drawn_by(method: str) -> Experiment:
+    """Return an experiment whose pictures a new avatar of that method drew."""
+    base, chosen = make_experiment(5), METHODS[method]
+    torch.manual_seed(0)
+    avatar = chosen.avatar(chosen.config(), base.avatar.face_model, base.faces[0])
+    sequence = drawn_sequence(avatar, base.faces[0], base.sequences[0].tracking.cameras[0])
+    scorings = (Scoring(sequence.scoring, base.scorings[0].crops),)
+    return replace(base, avatar=avatar, sequences=(sequence,), scorings=scorings)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_fitted_faces_draw_the_picture_better_and_change_nothing_else(method: str) -> None:
+    experiment = astray(drawn_by(method))
+    avatar, frame = experiment.avatar, experiment.held_out_frames[0]
+    before = {name: tensor.clone() for name, tensor in avatar.state_dict().items()}
+    wanted = [tensor.requires_grad for tensor in avatar.parameters()]
+    start = experiment.face(frame)
+    truth = target_image(experiment, frame)
+    with torch.no_grad():
+        fitted = fit_face(experiment, [frame], 20)
+    assert l1(avatar_image(experiment, frame, fitted), truth) < 0.9 * l1(avatar_image(experiment, frame), truth)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in avatar.state_dict().items())
+    assert [tensor.requires_grad for tensor in avatar.parameters()] == wanted
+    assert all(tensor.grad is None for tensor in avatar.parameters())
+    assert not any(term for group in avatar.parameter_groups() for one in group.factored.values() for term in one.terms)
+    assert fitted.identity.equal(start.identity)
+    low, high = avatar.face_model.expression_bounds.unbind(-1)
+    low, high = start.expression.minimum(low), start.expression.maximum(high)
+    assert bool(((fitted.expression >= low) & (fitted.expression <= high)).all())
+    assert experiment.face(frame).expression.equal(start.expression)
+
+
+def test_fits_do_not_depend_on_the_order_of_questions() -> None:
+    experiment = astray(make_experiment(10))
+    frames = experiment.held_out_frames
+    there, back = FittedFaces(experiment, 3), FittedFaces(experiment, 3)
+    forward = [there.face(frame) for frame in frames]
+    backward = [back.face(frame) for frame in reversed(frames)][::-1]
+    assert all(a.expression.equal(b.expression) for a, b in zip(forward, backward, strict=True))
+    assert there.face(frames[0]) is forward[0]
+
+
+def test_the_third_figure_stands_beside_the_others_and_is_never_the_headline(tmp_path: Path) -> None:
+    experiment = astray(make_experiment(10))
+    plain = evaluate_frames(experiment, QUICK)
+    partial = PartialScores(tmp_path / "partial", "one")
+    scored = evaluate_frames(experiment, FIT, partial)
+    assert set(scored.scores) == {AVATAR, AS_TRACKED, FITTED}
+    assert scored.scores[AVATAR] == plain.scores[AVATAR]
+    without, entry = (protocol_content(experiment, each, FIT) for each in (plain, scored))
+    assert "fitted" not in without
+    assert entry["psnr"] == without["psnr"]
+    assert entry["fitted"]["psnr"] > entry["psnr"] + 1
+    assert entry["fitted"]["head"]["psnr"] > entry["head"]["psnr"]
+    assert entry["fitted"]["fit"]["steps"] == 20
+    line = protocol_line("self_reenactment", entry)
+    assert line.index(f"{entry['psnr']:.2f} dB") < line.index("faces fitted to the scored pictures")
+    assert "fitted" not in protocol_line("self_reenactment", without)
+    resumed = evaluate_frames(experiment, FIT, partial)
+    assert resumed.scores == scored.scores
+
+
+def test_the_command_adds_the_figure_only_if_it_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_toy_workspace(tmp_path / "W")
+    run_dir, command = tmp_path / "W/runs/toy", ["evaluate", str(tmp_path / "W"), "--no-perceptual"]
+    assert main(command) == 0
+    before = [(run_dir / name).read_text() for name in ("metrics.json", "report.html")]
+    assert not any("fitted" in text for text in before)
+    assert main([*command, "--fit-faces", "--fit-steps", "5", "--json"]) == 0
+    shown = capsys.readouterr()
+    entry = next(iter(json.loads(shown.out)["protocols"].values()))
+    assert entry["fitted"]["fit"]["steps"] == 5
+    assert "faces fitted to the scored pictures" in shown.err
+    assert "Avatar, faces fitted to the scored pictures" in (run_dir / "report.html").read_text()
+    assert main(["evaluate", str(tmp_path / "W"), "--compare"]) == 0
+    table = capsys.readouterr().out
+    assert [line for line in table.splitlines() if line.startswith("toy") and "fitted to the scored pictures" in line]
+    assert main(command) == 0
+    assert "fitted" not in (run_dir / "metrics.json").read_text()
+
+
+def test_wrong_numbers_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_toy_workspace(tmp_path / "W")
+    for more, told in (
+        (["--fit-faces", "--fit-steps", "0"], "--fit-steps 0: give a number from 1 to 10000"),
+        (["--fit-faces", "--compare"], "--fit-faces: is for one run"),
+    ):
+        assert main(["evaluate", str(tmp_path / "W"), *more]) == 2
+        assert told in capsys.readouterr().err
+    with pytest.raises(UserError, match="--fit-steps 0: give a number from 1 to 10000"):
+        evaluate(tmp_path / "W/runs/toy", [tmp_path / "W/sequences/clip"], replace(FIT, fit_steps=0))
+
+
+def test_a_damaged_third_figure_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_toy_workspace(tmp_path / "W")
+    path = tmp_path / "W/runs/toy/metrics.json"
+    assert main(["evaluate", str(tmp_path / "W"), "--no-perceptual", "--fit-faces", "--fit-steps", "1"]) == 0
+    content = json.loads(path.read_text())
+    del content["checksum"]
+    next(iter(content["protocols"].values()))["fitted"]["psnr"] = "good"
+    path.write_text(json.dumps(content))
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path / "W"), "--compare"]) == 2
+    assert "metrics.json: incomplete or damaged" in capsys.readouterr().err

@@ -1,0 +1,198 @@
+"""Features on Gaussians that follow a mesh: their formulas, and their way through training, files and refusals."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import train_toy
+from mien import runtime
+from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate, make_portable
+from mien.avatar.encoding import positional_encoding
+from mien.avatar.feature_network import Layers, feature_network_reference
+from mien.avatar.settings import GradientSettings
+from mien.errors import UserError
+from mien.export.gaussian_avatars_folder import write_gaussian_avatars_folder
+from mien.export.packed import pack
+from mien.progress import Advance
+from mien.render.rendering import Rendering
+from mien.runtime.checks import baked_fault
+from mien.training import train
+from mien.training.frames import FrameOrder, training_frames
+from mien.training.sequence import Targets
+from mien.training.trainer import TrainingData, start, step
+from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_sequence
+
+RANK = 3
+CONFIG = GaussianAvatarsConfig(
+    expression_rank=RANK, expression_colour_rate=Rate(0.0), appearance="features", appearance_features=6
+)
+GROWING = GradientSettings(start=0.2, stop=0.8, rounds=4, grow_gradient=1e-4, max_gaussians=400)
+PARTS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def new_avatar(config: GaussianAvatarsConfig = CONFIG, *, filled: bool = True) -> GaussianAvatars:
+    """Return an avatar whose features and network are random, as after training, or as before it."""
+    torch.manual_seed(0)
+    avatar = GaussianAvatars(config, toy_face_model(), toy_face(5))
+    if filled:
+        torch.manual_seed(1)
+        for name in set(avatar.store.names()) & {"feature_bases", "neutral_features", "offset_basis", "opacity_basis"}:
+            avatar.store.assign(name, 0.3 * torch.randn(avatar.store[name].shape))
+        with torch.no_grad():
+            assert avatar.appearance is not None
+            avatar.appearance.last.weight.normal_(0, 0.3)
+    return avatar
+
+
+def test_starts_as_without_features() -> None:
+    plain = GaussianAvatarsConfig(expression_rank=RANK, expression_colour_rate=Rate(0.0))
+    torch.manual_seed(0)
+    static = GaussianAvatars(plain, toy_face_model(), toy_face(5))
+    ours, theirs = (avatar.pose(toy_face(5)).gaussians for avatar in (new_avatar(filled=False), static))
+    assert all(torch.equal(getattr(ours, part), getattr(theirs, part)) for part in PARTS)
+
+
+def test_colour_and_opacity_change_by_the_network() -> None:
+    """By the plain formula from the activations, the features and the triangles' places, in float64."""
+    avatar, face = new_avatar(), toy_face(5)[2]
+    assert avatar.appearance is not None
+    store, (activations,) = avatar.store, avatar.activations(face)
+    vertices = avatar.face_model.head_vertices(avatar.subject)[0]
+    places = positional_encoding(vertices[avatar.face_model.faces.long()].mean(1) / 0.05, 4)[store["face_index"]]
+    layers = avatar.appearance._layers()
+    exact = Layers(*(tensor.double() for tensor in layers))
+    bases, neutral = store["feature_bases"].double(), store["neutral_features"].double()
+    colour, opacity = feature_network_reference(bases, activations.double(), neutral, places.double(), exact)
+    posed, still = avatar.pose(face).gaussians, replace(CONFIG, expression_rank=RANK, appearance="static")
+    static = GaussianAvatars(still, toy_face_model(), toy_face(5))
+    static.store.load_state_dict({name: store.state_dict()[name] for name in static.store.state_dict()})
+    plain = static.pose(face).gaussians
+    logits = store["opacity_logits"] + opacity + store["opacity_basis"] @ activations
+    torch.testing.assert_close(posed.sh.view(-1, 3).double(), store["sh_constant"][:, 0] + colour, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(posed.opacities.view(-1).double(), logits.sigmoid(), atol=1e-6, rtol=1e-5)
+    assert colour.abs().max() > 0.1
+    for part in ("means", "quats", "scales"):
+        assert torch.equal(getattr(posed, part), getattr(plain, part))
+
+
+@pytest.mark.parametrize("settings", [{}, {"expression_offset_rate": Rate(0.0), "expression_opacity_rate": Rate(0.0)}])
+@pytest.mark.parametrize("far", [1.0, 30.0])
+def test_baked_avatars_pose_alike(settings: dict[str, Rate], far: float, tmp_path: Path) -> None:
+    avatar, face = new_avatar(replace(CONFIG, **settings)), toy_face(5)
+    face = replace(face, expression=far * face.expression)
+    runtime.write_portable(tmp_path / "a.mien", make_portable(avatar, toy_camera(64), "toy"))
+    baked, expected = runtime.load(tmp_path / "a.mien").portable.baked, avatar.pose(face).gaussians
+    for index in range(len(face)):
+        found = runtime.pose(baked, runtime_face(face[index]))
+        truth = expected.timestep(index)
+        for part in PARTS:
+            np.testing.assert_allclose(
+                getattr(found, part), getattr(truth, part).detach().numpy(), atol=1e-5, rtol=1e-4, err_msg=part
+            )
+
+
+def test_gradients_reach_features_network_and_face() -> None:
+    avatar, face = new_avatar(), toy_face(5)[1]
+    assert avatar.appearance is not None
+    face = replace(face, expression=face.expression.clone().requires_grad_())
+    posed = avatar.pose(face).gaussians
+    (posed.sh.square().sum() + posed.opacities.sum()).backward()
+    ((rows, columns),) = avatar.appearance._gradient.take()
+    assert rows.abs().sum() > 0
+    torch.testing.assert_close(columns, avatar.activations(face)[0])
+    parameters = [avatar.store["neutral_features"], *avatar.appearance.parameters(), face.expression]
+    assert all(tensor.grad is not None and tensor.grad.abs().sum() > 0 for tensor in parameters)
+
+
+def test_changes_have_a_penalty_of_their_own() -> None:
+    avatar = new_avatar(replace(CONFIG, appearance_weight=0.5))
+    posed, count = avatar.pose(toy_face(5)[1]), len(avatar.store)
+    radii = torch.zeros(count, dtype=torch.int32)
+    rendering = Rendering(torch.zeros(4, 4, 3), torch.zeros(4, 4), radii, torch.zeros(count, 2))
+    losses = avatar.regularizers(posed, rendering, Progress(0, 1))
+    squares = sum(posed.aux[name].square().mean() for name in ("feature_colour", "feature_opacity"))
+    torch.testing.assert_close(losses["appearance"], 0.5 * squares)
+
+
+def test_features_need_activations() -> None:
+    with pytest.raises(UserError, match=r"--method\.expression-rank is 0; choose a rank from 1 to 8"):
+        GaussianAvatarsConfig(appearance="features").check()
+
+
+def test_density_control_keeps_every_tensor_as_long_and_every_triangle() -> None:
+    face_model, sequence = toy_sequence(5, 32)
+    settings = train_toy.SETTINGS
+    density = replace(GROWING, prune_opacity=0.09)
+    state = start([sequence], face_model, replace(CONFIG, density=density), settings)
+    data = TrainingData(FrameOrder(training_frames([sequence], settings), 0), (Targets(sequence, 0),))
+    counts = set()
+    while state.step < settings.steps:
+        step(state, data, settings)
+        store = state.avatar.gaussian_store()
+        lengths = {len(store[name]) for name in store.names()}
+        lengths |= {len(getattr(m, field)) for m in store.moments.values() for field in m.PER_ROW}
+        assert lengths == {len(store)}
+        assert len(store["face_index"].unique()) == len(face_model.faces)
+        counts.add(len(store))
+    assert len(counts) > 1
+    assert state.avatar.gaussian_store()["feature_bases"].abs().max() > 0
+    assert baked_fault(state.avatar.bake()) is None
+
+
+def test_training_resumes_to_the_same_bytes(tmp_path: Path) -> None:
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    config = replace(CONFIG, density=GROWING)
+    whole = train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "whole")
+    assert float(whole.gaussian_store()["feature_bases"].detach().abs().max()) > 0
+    for stop in (14, 22):
+        with pytest.raises(KeyboardInterrupt):
+            train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "parts", partial(stopping, stop))
+    train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "parts")
+    for name in ("avatar/avatar.safetensors", "avatar/avatar.json", "face_track.safetensors"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
+
+
+@contextmanager
+def stopping(at: int, title: str, total: int, completed: int) -> Iterator[Advance]:
+    """Progress that ends like Ctrl-C at a step."""
+    done = completed
+
+    def advance(amount: int = 1, status: str = "") -> None:
+        nonlocal done
+        done += amount
+        if done == at:
+            raise KeyboardInterrupt
+
+    yield advance
+
+
+def test_formats_that_hold_no_features_say_so(tmp_path: Path) -> None:
+    avatar = new_avatar()
+    with pytest.raises(UserError, match="a page cannot hold features of Gaussians"):
+        pack(make_portable(avatar, toy_camera(64), "toy"))
+    with pytest.raises(UserError, match="cannot hold Gaussians that change with the expression"):
+        write_gaussian_avatars_folder(tmp_path / "folder", avatar, toy_face(2))
+
+
+@pytest.mark.parametrize("what", ["gaussians", "activations", "layers"])
+def test_features_that_do_not_fit_are_refused(what: str) -> None:
+    baked = new_avatar().bake()
+    assert baked.changes is not None
+    features = baked.changes.features
+    assert features is not None
+    if what == "gaussians":
+        rows = {name: getattr(features, name)[:-1] for name in ("neutral", "basis", "own")}
+        wrong, part = replace(features, **rows), "features"
+    elif what == "activations":
+        wrong, part = replace(features, basis=features.basis[:, :-1]), "features"
+    else:
+        wrong, part = replace(features, biases=(features.biases[0], features.biases[1][:3])), "layers of its features"
+    fault = baked_fault(replace(baked, changes=replace(baked.changes, features=wrong)))
+    assert fault is not None
+    assert part in fault

@@ -1,0 +1,198 @@
+"""What is inside a head explains only what the mesh shows of it, and is closed where nothing shows it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from mien.avatar import METHODS, Avatar, GaussianAvatarsConfig
+from mien.face import FaceModel
+from mien.gaussians import rgb_from_sh, sh_from_rgb
+from mien.render import rasterize
+from mien.training import Sequence, TrainSettings, train
+from mien.training.hidden import hidden_triangles, inside_triangles
+from mien.training.inside import Inside, disguise, disguised_reference
+from mien.training.sequence import Targets
+from toy_scene import toy_face, toy_sequence
+
+SETTINGS = TrainSettings(steps=120, split="none", inside="covered", checkpoint_every=60, record_every=60)
+
+
+@pytest.fixture(scope="module")
+def toy() -> tuple[FaceModel, Sequence]:
+    """A head with another one inside of it, which is its mouth."""
+    model, sequence = toy_sequence(timesteps=5, size=48)
+    count = len(model.template)
+    faces = torch.cat([model.faces, model.faces + count])
+    nested = replace(
+        model,
+        template=torch.cat([model.template, 0.9 * model.template]),
+        faces=faces,
+        uv=torch.zeros(2 * count, 2),
+        uv_faces=faces,
+        region_names=("skin", "mouth"),
+        face_regions=torch.arange(2).repeat_interleave(len(model.faces)),
+        identity_basis=torch.zeros(2, 2 * count, 3),
+        expression_basis=torch.zeros(2, 2 * count, 3),
+        skinning_weights=torch.tensor([[1.0, 0, 0]]).repeat(2 * count, 1),
+    )
+    tracking = replace(sequence.tracking, face_model_hash=nested.content_hash)
+    return nested, replace(sequence, tracking=tracking)
+
+
+def facing(model: FaceModel) -> torch.Tensor:
+    """The z of each triangle's normal in the head frame: 1 faces the camera."""
+    a, b, c = (model.template[model.faces[:, corner]] for corner in range(3))
+    return normalize(torch.linalg.cross(b - a, c - a), dim=-1)[:, 2]
+
+
+def made(toy: tuple[FaceModel, Sequence], method: str = "gaussian_avatars") -> Avatar:
+    return METHODS[method].avatar(METHODS[method].config(), toy[0], toy[1].tracking.face)
+
+
+def test_what_a_closed_mouth_hides_is_hidden(toy: tuple[FaceModel, Sequence]) -> None:
+    model, sequence = toy
+    inside, camera = inside_triangles(model), sequence.tracking.cameras[0]
+    assert torch.equal(inside, model.face_regions == 1)
+    vertices = model(toy_face(1))[0]
+    assert torch.equal(hidden_triangles(vertices, model, inside, camera), inside)
+
+
+def test_what_an_open_mouth_shows_is_not_hidden(toy: tuple[FaceModel, Sequence]) -> None:
+    model, sequence = toy
+    camera, front = sequence.tracking.cameras[0], facing(model)
+    kept = (model.face_regions == 1) | (front < 0.9)
+    opened = replace(model, faces=model.faces[kept], uv_faces=model.faces[kept], face_regions=model.face_regions[kept])
+    inside = inside_triangles(opened)
+    hidden = hidden_triangles(opened(toy_face(1))[0], opened, inside, camera)
+    assert not hidden[inside & (facing(opened) > 0.95)].any()
+    assert hidden[inside & (opened.template[opened.faces].mean(1)[:, 1].abs() > 0.06)].all()
+    assert not hidden[~inside].any()
+
+
+def test_a_picture_does_not_show_what_is_beside_it(toy: tuple[FaceModel, Sequence]) -> None:
+    model, sequence = toy
+    inside = torch.ones(len(model.faces), dtype=torch.bool)
+    face = replace(toy_face(1), head_translation=torch.tensor([[0.6, 0.0, -0.5]]))
+    assert hidden_triangles(model(face)[0], model, inside, sequence.tracking.cameras[0]).all()
+
+
+def test_targets_say_what_is_hidden_if_they_are_asked(toy: tuple[FaceModel, Sequence]) -> None:
+    model, sequence = toy
+    inside = inside_triangles(model)
+    white = torch.full((3,), 255, dtype=torch.uint8).numpy()
+    asked = Targets(sequence, 0, face_model=model, inside=inside).target(1, 0, white, keep=False)
+    assert asked.hidden is not None
+    assert torch.equal(asked.hidden, inside)
+    assert asked.to(torch.zeros((), dtype=torch.float64)).hidden is not None
+    assert Targets(sequence, 0, face_model=model).target(1, 0, white, keep=False).hidden is None
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_hidden_gaussians_have_another_colour_and_do_not_fade(toy: tuple[FaceModel, Sequence], degree: int) -> None:
+    model, sequence = toy
+    config = GaussianAvatarsConfig(sh_degree=degree)
+    avatar = METHODS["gaussian_avatars"].avatar(config, model, sequence.tracking.face)
+    hidden = model.face_regions == 1
+    posed = avatar.pose(sequence.tracking.face[0])
+    changed = disguise(posed, avatar, hidden, torch.Generator().manual_seed(3))
+    colors = rgb_from_sh(changed.gaussians.sh[hidden, 0])
+    torch.testing.assert_close(colors, torch.rand(3, generator=torch.Generator().manual_seed(3)).expand_as(colors))
+    assert not changed.gaussians.sh[hidden, 1:].any()
+    assert torch.equal(changed.gaussians.sh[~hidden], posed.gaussians.sh[~hidden])
+    assert torch.equal(changed.gaussians.opacities, posed.gaussians.opacities)
+    rasterize(changed.gaussians.timestep(0), sequence.tracking.cameras[0], torch.ones(3)).image.sum().backward()
+    store = avatar.gaussian_store()
+    for name, trained in (("opacity_logits", False), ("sh_constant", False), ("means", True)):
+        gradient = store[name].grad
+        assert gradient is not None
+        assert bool(gradient[hidden].any()) == trained, name
+        assert gradient[~hidden].any(), name
+
+
+def test_the_fast_disguise_is_the_reference(toy: tuple[FaceModel, Sequence]) -> None:
+    config = GaussianAvatarsConfig(sh_degree=1)
+    avatar = METHODS["gaussian_avatars"].avatar(config, toy[0], toy[1].tracking.face)
+    posed = avatar.pose(toy[1].tracking.face[0])
+    sh, opacities = (getattr(posed.gaussians, name).detach().requires_grad_() for name in ("sh", "opacities"))
+    hidden = torch.arange(len(sh)) % 3 == 0
+    posed = replace(posed, gaussians=replace(posed.gaussians, sh=sh, opacities=opacities))
+    fast = disguise(posed, avatar, hidden, torch.Generator().manual_seed(5)).gaussians
+    color = sh_from_rgb(torch.rand(3, generator=torch.Generator().manual_seed(5)))
+    plain = disguised_reference(sh, opacities, hidden, color)
+    factors = torch.rand_like(sh), torch.rand_like(opacities)
+    found = torch.autograd.grad((fast.sh, fast.opacities), (sh, opacities), factors)
+    expected = torch.autograd.grad(plain, (sh, opacities), factors)
+    assert torch.equal(fast.sh, plain[0])
+    assert torch.equal(fast.opacities, plain[1])
+    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+
+
+def test_other_methods_have_nothing_to_disguise(toy: tuple[FaceModel, Sequence]) -> None:
+    avatar = made(toy, "headgas")
+    posed = avatar.pose(toy[1].tracking.face[0])
+    before = {name: avatar.gaussian_store()[name].clone() for name in avatar.gaussian_store().names()}
+    assert disguise(posed, avatar, toy[0].face_regions == 1, torch.Generator()) is posed
+    assert disguise(posed, made(toy), None, torch.Generator()) is posed
+    avatar.furnish(toy[0].face_regions == 1, 0.97, torch.zeros(len(toy[0].faces), 3))
+    assert all(torch.equal(avatar.gaussian_store()[name], tensor) for name, tensor in before.items())
+
+
+def test_open_surface_is_closed_and_the_rest_stays(toy: tuple[FaceModel, Sequence]) -> None:
+    avatar, inside = made(toy), toy[0].face_regions == 1
+    store, half = avatar.gaussian_store(), inside.nonzero()[: int(inside.sum()) // 2, 0]
+    opaque = store["opacity_logits"].detach().clone()
+    opaque[half] = 2.0
+    store.assign("opacity_logits", opaque)
+    before = {name: store[name].detach().clone() for name in store.names()}
+    colors = torch.tensor([0.2, 0.1, 0.1]).expand(len(inside), 3)
+    furniture = Inside(inside, colors)
+    furniture.furnish(avatar, 59, 120)
+    assert all(torch.equal(store[name], tensor) for name, tensor in before.items()), "it is not due"
+    furniture.furnish(avatar, 60, 120)
+    opened = inside.clone()
+    opened[half] = False
+    for name, tensor in before.items():
+        assert torch.equal(store[name][~opened], tensor[~opened]), name
+    torch.testing.assert_close(store["opacity_logits"][opened].sigmoid(), torch.full((int(opened.sum()),), 0.97))
+    torch.testing.assert_close(store["sh_constant"][opened, 0], sh_from_rgb(colors[opened]))
+
+
+@torch.no_grad()
+def inner_share(avatar: Avatar, model: FaceModel, sequence: Sequence) -> float:
+    """How much of the head in a picture is painted by what is inside, 0..1."""
+    gaussians = avatar.pose(sequence.tracking.face[0]).gaussians.detach().timestep(0)
+    triangles = avatar.triangles()
+    assert triangles is not None
+    own = (model.face_regions[triangles] == 1).float()[:, None, None].expand(-1, 1, 3)
+    shown = rasterize(replace(gaussians, sh=sh_from_rgb(own)), sequence.tracking.cameras[0], torch.zeros(3))
+    return float(shown.image[..., 0].sum() / shown.alpha.sum())
+
+
+def test_skin_is_painted_by_skin(toy: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
+    """A mouth that no picture shows paints a good part of the skin, unless it is covered."""
+    model, sequence = toy
+    shares = {}
+    for inside in ("free", "covered"):
+        avatar = train([sequence], model, GaussianAvatarsConfig(), replace(SETTINGS, inside=inside), tmp_path / inside)
+        shares[inside] = inner_share(avatar, model, sequence)
+    assert shares["free"] > 0.1
+    assert shares["covered"] < 0.5 * shares["free"]
+
+
+def test_a_run_resumes_exactly(toy: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
+    """It stops after the step at which the surface is closed, and before it."""
+    model, sequence = toy
+    settings, config = (
+        replace(SETTINGS, inside="furnished", steps=6, checkpoint_every=2, record_every=1),
+        GaussianAvatarsConfig(),
+    )
+    whole = train([sequence], model, config, settings, tmp_path / "cut")
+    means = whole.gaussian_store()["means"].clone()
+    for lost in ("6", "[46]"):
+        for path in (tmp_path / "cut/training.json", *(tmp_path / "cut/checkpoints").glob(f"*{lost}.safetensors")):
+            path.unlink()
+        again = train([sequence], model, config, settings, tmp_path / "cut")
+        assert torch.equal(again.gaussian_store()["means"], means)

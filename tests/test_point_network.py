@@ -1,0 +1,140 @@
+"""The network of points: native against PyTorch, finite differences, and independence of the number of threads."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from instruction_sets import ISAS, each_isa
+from mien import _native
+from mien.avatar.point_network import Activation, Layer, point_network, point_network_reference
+
+Sizes = tuple[int, int, tuple[tuple[int, Activation, int | None], ...]]
+"""Points, inputs, and outputs, activation and extra values of each layer."""
+NETWORKS: list[Sizes] = [
+    (100, 3, ((64, "softplus", None), (25, "softplus", None), (64, "softplus", 0), (11, "none", None))),
+    (1, 1, ((1, "none", None),)),
+    (0, 3, ((4, "relu", None), (5, "none", None))),
+    (2000, 39, ((64, "softplus", None), (70, "relu", None), (17, "softplus", 1), (33, "none", 2))),
+    (97, 3, ((16, "relu", None), (16, "softplus", 0), (5, "none", 0))),
+]
+
+
+@pytest.fixture(params=ISAS)
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    yield from each_isa(request)
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    """Standard normal numbers."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def arguments(sizes: Sizes, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+    """Inputs, then weight and bias of each layer. The values reach both ends of every activation."""
+    n, inputs, layers = sizes
+    widths, made = [inputs], [random(n, inputs)]
+    for index, (outputs, _, extra) in enumerate(layers):
+        reads = widths[-1] + (0 if extra is None else widths[extra])
+        made += [random(outputs, reads, seed=2 * index + 1) / reads**0.5, 0.1 * random(outputs, seed=2 * index + 2)]
+        widths.append(outputs)
+    return [tensor.to(dtype) for tensor in made]
+
+
+def layers_of(sizes: Sizes, parameters: list[Tensor]) -> list[Layer]:
+    return [
+        Layer(weight, bias, activation, extra)
+        for weight, bias, (_, activation, extra) in zip(parameters[::2], parameters[1::2], sizes[2], strict=True)
+    ]
+
+
+def gradient_of(sizes: Sizes) -> Tensor:
+    """A gradient of the outputs. Every third point has none."""
+    gradient = random(sizes[0], sizes[2][-1][0], seed=99)
+    gradient[::3] = 0
+    return gradient
+
+
+def results(sizes: Sizes, given: list[Tensor], native: bool) -> list[Tensor]:
+    """Outputs, and gradients of inputs, weights and biases."""
+    inputs, *parameters = [tensor.clone().requires_grad_() for tensor in given]
+    outputs = (point_network if native else point_network_reference)(inputs, layers_of(sizes, parameters))
+    found = torch.autograd.grad(outputs, [inputs, *parameters], gradient_of(sizes).to(outputs))
+    return [tensor.detach() for tensor in (outputs, *found)]
+
+
+@pytest.mark.parametrize("sizes", NETWORKS, ids=lambda sizes: f"{sizes[0]} points")
+def test_native_outputs_and_gradients_equal_their_reference(isa: str, sizes: Sizes) -> None:
+    given = arguments(sizes)
+    expected = results(sizes, [tensor.double() for tensor in given], native=False)
+    for index, (own, truth) in enumerate(zip(results(sizes, given, native=True), expected, strict=True)):
+        assert own.shape == truth.shape
+        error = (own.double() - truth).norm() / truth.norm().clamp_min(1e-6)
+        assert float(error) < 1e-5, index
+
+
+def test_softplus_over_its_whole_range(isa: str) -> None:
+    values = torch.cat([torch.linspace(-2, 2, 4001), torch.tensor([0.0, -1e30, 1e30, 1e-20])])[:, None]
+    one = torch.ones(1, 1)
+    inputs = values.clone().requires_grad_()
+    given = [Layer(one, torch.zeros(1), "softplus"), Layer(one, torch.zeros(1))]
+    outputs = point_network(inputs, given)
+    (slope,) = torch.autograd.grad(outputs.sum(), inputs)
+    expected = torch.nn.functional.softplus(values.double(), beta=100)
+    torch.testing.assert_close(outputs.detach().double(), expected, atol=2e-8, rtol=1e-6)
+    torch.testing.assert_close(slope.double(), (100 * values.double()).sigmoid(), atol=2e-5, rtol=0)
+
+
+def test_reference_has_the_gradients_of_finite_differences() -> None:
+    for sizes in (NETWORKS[0], NETWORKS[4]):
+        small: Sizes = (3, 2, tuple((1 + outputs % 5, activation, extra) for outputs, activation, extra in sizes[2]))
+        given = [tensor.requires_grad_() for tensor in arguments(small, torch.float64)]
+        assert torch.autograd.gradcheck(
+            lambda inputs, *parameters, small=small: point_network(inputs, layers_of(small, list(parameters))), given
+        )
+
+
+def test_native_gradients_are_those_of_finite_differences() -> None:
+    """A step along each gradient changes the result by the gradient's square."""
+    sizes = NETWORKS[0]
+    given, by = arguments(sizes), gradient_of(sizes)
+
+    def result(tensors: list[Tensor]) -> float:
+        return float((point_network(tensors[0], layers_of(sizes, tensors[1:])).double() * by).sum())
+
+    _, *gradients = results(sizes, given, native=True)
+    for index, gradient in enumerate(gradients):
+        step = 1e-3 * gradient / gradient.norm()
+        moved = [[tensor + sign * step if i == index else tensor for i, tensor in enumerate(given)] for sign in (1, -1)]
+        slope = (result(moved[0]) - result(moved[1])) / 2e-3
+        assert slope == pytest.approx(float(gradient.norm()), rel=0.02), index
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    before, found = _native.thread_count(), []
+    for threads in (1, 3):
+        _native.set_thread_count(threads)
+        found.append(results(NETWORKS[3], arguments(NETWORKS[3]), native=True))
+    _native.set_thread_count(before)
+    assert all(torch.equal(one, two) for one, two in zip(*found, strict=True))
+
+
+def test_without_gradients_the_outputs_are_the_same() -> None:
+    sizes = NETWORKS[0]
+    inputs, *parameters = arguments(sizes)
+    with torch.no_grad():
+        alone = point_network(inputs, layers_of(sizes, parameters))
+    assert torch.equal(alone, results(sizes, arguments(sizes), native=True)[0])
+
+
+def test_inputs_that_need_no_gradient_get_none() -> None:
+    sizes = NETWORKS[0]
+    inputs, *parameters = arguments(sizes)
+    parameters = [tensor.requires_grad_() for tensor in parameters]
+    point_network(inputs, layers_of(sizes, parameters)).backward(gradient_of(sizes))
+    expected = results(sizes, arguments(sizes), native=True)[2:]
+    assert inputs.grad is None
+    for own, truth in zip(parameters, expected, strict=True):
+        assert own.grad is not None
+        assert torch.equal(own.grad, truth)

@@ -1,0 +1,404 @@
+"""`mien study`: a page shows runs blind and in random order, saves answers, and the tally counts them."""
+
+import base64
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import train_toy
+from mien.analysis.study import StudySettings, read_key, tally_content
+from mien.analysis.study.clips import spans
+from mien.analysis.study.files import QUESTIONS, Answer, Answers, KeyClip, StudyKey, read_all_answers
+from mien.analysis.study.shuffling import shuffled
+from mien.analysis.study.tally import interval, student_quantile, tally_text, wilson
+from mien.avatar import METHODS
+from mien.capture.video import read_video_frames
+from mien.cli import main
+from mien.training import read_sequence, train
+from toy_workspace import write_toy_workspace
+from web_case import browse, chromium, node
+
+RUNS = ("headgas", "begun", "toy")
+SIDE = 64
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a workspace with three runs that look different, and 6 held-out timesteps at the end."""
+    root = tmp_path_factory.mktemp("studied") / "somebody"
+    write_toy_workspace(root, 30)
+    sequence = read_sequence(root / "sequences" / "clip")
+    from toy_scene import toy_face_model
+
+    short = replace(train_toy.SETTINGS, split="tail", steps=2)
+    train([sequence], toy_face_model(), train_toy.CONFIG, short, root / "runs" / "begun")
+    train([sequence], toy_face_model(), METHODS["headgas"].config(), short, root / "runs" / "headgas")
+    return root
+
+
+def make(workspace: Path, page: Path, *more: str) -> int:
+    options = ["--side", str(SIDE), "--seconds", "0.12", "--clips", "2", "--megabytes", "1", *more]
+    return main(["study", "make", str(workspace), "--out", str(page), "--runs", *RUNS, *options])
+
+
+@pytest.fixture(scope="module")
+def page(workspace: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    page = tmp_path_factory.mktemp("page") / "study.html"
+    assert make(workspace, page) == 0
+    return page
+
+
+def content_of(page: Path) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="study">(.*?)</script>', page.read_text())
+    assert found is not None
+    return json.loads(found[1])
+
+
+def answered(page: Path, participant: str, choose: dict[str, str]) -> dict[str, Any]:
+    """Return the answer file of a participant who chooses one run for each question, as the page writes it."""
+    study, key = content_of(page), read_key(page.with_name("study.key.json"))
+    answers = []
+    for clip in key.clips:
+        names = {run: tile for tile, run in clip.tiles.items()}
+        shown = shuffled(list(clip.tiles), key.study, participant, clip.name)
+        picks = {question: names[run] for question, run in choose.items()}
+        answers.append({"clip": clip.name, "shown": shown, "seconds": 1.5, **picks})
+    named = {"format": study["format"], "version": study["version"], "study": study["study"]}
+    return {**named, "participant": participant, "answers": answers}
+
+
+def test_the_page_says_nothing_about_the_runs(page: Path, workspace: Path) -> None:
+    text, key = page.read_text(), read_key(page.with_name("study.key.json"))
+    assert key.runs == RUNS
+    for word in (*RUNS, *METHODS, "somebody", str(workspace), '"seed"'):
+        assert word not in re.sub(r'"video":"[^"]*"', "", text), word
+    for entry in content_of(page)["clips"]:
+        video = base64.b64decode(entry["video"])
+        assert not [word for word in (*RUNS, "somebody", "mien") if word.encode() in video]
+        assert entry["tiles"] == sorted(entry["tiles"])
+    assert "http://" not in text
+    assert "https://" not in text
+    assert (
+        "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; media-src blob:"
+        in text
+    )
+
+
+def test_the_same_seed_gives_the_same_page_and_another_one_other_names(
+    page: Path, workspace: Path, tmp_path: Path
+) -> None:
+    assert make(workspace, tmp_path / "study.html") == 0
+    for name in ("study.html", "study.key.json"):
+        assert (tmp_path / name).read_bytes() == page.with_name(name).read_bytes()
+    assert make(workspace, tmp_path / "other.html", "--seed", "1") == 0
+    first, other = read_key(tmp_path / "study.key.json"), read_key(tmp_path / "other.key.json")
+    assert first.study != other.study
+    assert not {tile for clip in first.clips for tile in clip.tiles} & {t for clip in other.clips for t in clip.tiles}
+
+
+def test_the_key_says_which_tile_shows_which_run(page: Path, workspace: Path, tmp_path: Path) -> None:
+    """Each tile of the videos is nearest to the picture of its run that `mien evaluate --pictures` writes."""
+    truth: dict[str, np.ndarray] = {}
+    for run in RUNS:
+        command = ["evaluate", str(workspace), "--run", run, "--pictures", "--no-perceptual"]
+        assert main(command) == 0
+    pictures = workspace / "runs"
+    key = read_key(page.with_name("study.key.json"))
+    videos = {entry["clip"]: base64.b64decode(entry["video"]) for entry in content_of(page)["clips"]}
+    for clip in key.clips:
+        (tmp_path / "clip.mp4").write_bytes(videos[clip.name])
+        frames = [picture for _, picture in read_video_frames(tmp_path / "clip.mp4")]
+        assert len(frames) == clip.timesteps
+        tiles = np.split(frames[0].astype(np.float64), 1 + len(RUNS), axis=1)
+        name = f"clip_front_{clip.first:06d}.png"
+        drawn = {run: pictures / run / "pictures/self_reenactment_tail/rendering" / name for run in RUNS}
+        drawn["truth"] = pictures / "toy" / "pictures/self_reenactment_tail/truth" / name
+        truth = {run: head_square(path) for run, path in drawn.items()}
+        for tile, run in zip(tiles, ["truth", *clip.tiles.values()], strict=True):
+            errors = {other: float(np.abs(tile - picture).mean()) for other, picture in truth.items()}
+            assert min(errors, key=errors.__getitem__) == run, errors
+
+
+def head_square(path: Path) -> np.ndarray:
+    """Return the square around the toy's head box, with its margin of 1 pixel, as the study scales it."""
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    cut = picture[3:25, 3:25, ::-1]
+    return cv2.resize(np.ascontiguousarray(cut), (SIDE, SIDE), interpolation=cv2.INTER_CUBIC).astype(np.float64)
+
+
+def test_the_budget_is_kept(workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "study.html"
+    assert make(workspace, page, "--side", "1024") == 0
+    assert page.stat().st_size <= 1_000_000
+    assert "of 1 MB" in capsys.readouterr().err
+    from mien.analysis.study.drawing import encode
+    from mien.errors import UserError
+
+    noise = np.random.default_rng(0).integers(0, 255, (4, 64, 256, 3), dtype=np.uint8)
+    best, small = encode(noise, 25.0, 1 << 20, "it"), encode(noise, 25.0, 30_000, "it")
+    assert best.crf < small.crf
+    assert len(small.data) <= 30_000
+    with pytest.raises(UserError, match="it: does not fit into the page even at the lowest quality"):
+        encode(noise, 25.0, 1_000, "it")
+
+
+def test_spans_are_cut_into_equal_parts() -> None:
+    assert spans([3, 4, 5, 9, 20, 21, 22, 23, 24], 3) == [(3, 3), (20, 3), (23, 2)]
+    assert spans(list(range(10)), 4) == [(0, 4), (4, 3), (7, 3)]
+
+
+def test_every_order_is_equally_likely() -> None:
+    counts: dict[tuple[str, ...], int] = {}
+    for participant in range(6000):
+        order = tuple(shuffled(["a", "b", "c"], "0123456789ab", f"{participant:08x}", "fedcba987654"))
+        counts[order] = counts.get(order, 0) + 1
+    assert len(counts) == 6
+    expected = 1000
+    assert sum((count - expected) ** 2 / expected for count in counts.values()) < 20.5  # chi squared, 5 degrees, 0.1 %
+    assert shuffled(["c", "a", "b"], "s", "0", "x") == shuffled(["a", "b", "c"], "s", "0", "x")
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    """Participants differ in their taste, so that their judgements are not independent."""
+    random, held, naive, rounds = np.random.default_rng(0), 0, 0, 800
+    for _ in range(rounds):
+        taste = random.beta(0.6 * 4, 0.4 * 4, 15)
+        shares = random.binomial(10, taste) / 10
+        low, high = interval(shares, 10)
+        held += low <= 0.6 <= high
+        low, high = wilson(float(shares.mean()), 150.0, 1.96)
+        naive += low <= 0.6 <= high
+    assert 0.93 <= held / rounds <= 0.98
+    assert naive / rounds < 0.85
+
+
+def test_intervals_at_the_edges() -> None:
+    low, high = interval(np.zeros(15), 10)
+    assert low == 0
+    assert 0.15 < high < 0.25  # 15 people, not 150
+    low, high = interval(np.ones(15), 10)
+    assert high == pytest.approx(1)
+    alone = interval(np.array([0.5]), 10)
+    assert alone[0] < 0.1
+    assert alone[1] > 0.9
+    same = interval(np.full(20, 0.5), 10)
+    assert 0.4 < same[0] < 0.5 < same[1] < 0.6
+    assert student_quantile(1) == pytest.approx(12.706, rel=1e-3)
+    assert student_quantile(2) == pytest.approx(4.303, rel=0.012)
+    assert student_quantile(14) == pytest.approx(2.145, rel=1e-3)
+
+
+def table_3() -> tuple[StudyKey, list[Answers]]:
+    """Return answers with the counts of the paper's table: 15 participants, 10 clips, 4 methods."""
+    runs = ("nerface", "imavatar", "pointavatar", "ours")
+    counts = {"quality": (19, 0, 13, 118), "expression": (35, 0, 12, 103)}
+    tiles = {f"{index:012x}": run for index, run in enumerate(runs)}
+    clips = tuple(KeyClip(f"c{index:07x}", "w", "s", "0", 0, 9, tiles) for index in range(10))
+    picks = {question: np.repeat(runs, each).reshape(15, 10) for question, each in counts.items()}
+    answers = [
+        Answers(f"{i:08x}", tuple(Answer(clips[j], runs, {q: str(picks[q][i, j]) for q in picks}) for j in range(10)))
+        for i in range(15)
+    ]
+    return StudyKey("0123456789ab", 0, runs, clips), answers
+
+
+def test_the_tally_gives_the_paper_s_percentages() -> None:
+    content = tally_content(*table_3())
+    percents = {run: [entry[question]["percent"] for question in QUESTIONS] for run, entry in content["runs"].items()}
+    assert percents == {
+        "nerface": [12.67, 23.33], "imavatar": [0.0, 0.0], "pointavatar": [8.67, 8.0], "ours": [78.67, 68.67]
+    }  # fmt: skip
+    assert content["judgements"] == 150
+    for entry in content["runs"].values():
+        for figures in entry.values():
+            assert 0 <= figures["low"] <= figures["percent"] <= figures["high"] <= 100
+    text = tally_text(content)
+    assert "| ours | 78.7 % (" in text
+    assert "Chance is 25.0 %" in text
+
+
+def test_answers_become_percentages(page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    key = str(page.with_name("study.key.json"))
+    for number in range(4):
+        picks = {"quality": "toy" if number else "begun", "expression": "headgas"}
+        content = answered(page, f"{number:08x}", picks)
+        (tmp_path / f"{number}.json").write_text(json.dumps(content))
+    out = tmp_path / "sums" / "tally.json"
+    assert main(["study", "tally", key, str(tmp_path), "--out", str(out), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown == {name: value for name, value in json.loads(out.read_text()).items() if name != "checksum"}
+    assert shown["participants"] == 4
+    assert shown["runs"]["toy"]["quality"]["percent"] == 75
+    assert shown["runs"]["begun"]["quality"]["percent"] == 25
+    assert shown["runs"]["headgas"]["expression"]["percent"] == 100
+    assert [one["quality"] for one in shown["per_clip"]] == [{"headgas": 0, "begun": 1, "toy": 3}] * 2
+    assert sum(shown["positions"]["quality"].values()) == pytest.approx(100, abs=0.1)
+    assert main(["study", "tally", key, *(str(tmp_path / f"{number}.json") for number in range(4))]) == 0
+    assert "| toy | 75.0 % (" in capsys.readouterr().out
+
+
+def damages(good: dict[str, Any]) -> dict[str, tuple[str, str]]:
+    """Return texts of bad answer files by name, each with what the message says."""
+    first, rest = good["answers"][0], good["answers"][1:]
+
+    def with_first(**changed: Any) -> str:
+        return json.dumps({**good, "answers": [{**first, **changed}, *rest]})
+
+    missing = {name: value for name, value in first.items() if name != "quality"}
+    return {
+        "cut": (json.dumps(good)[:-20], "cannot be read as json"),
+        "empty": ("", "cannot be read as json"),
+        "list": ("[]", "has format None"),
+        "foreign": (json.dumps({**good, "format": "mien.metrics"}), "has format 'mien.metrics'"),
+        "newer": (json.dumps({**good, "version": 2}), "version 2"),
+        "study": (json.dumps({**good, "study": "0" * 12}), "answers study 000000000000, but the key is of study"),
+        "one": (json.dumps({**good, "answers": rest}), "1 of 2 clips have no answer"),
+        "twice": (json.dumps({**good, "answers": [first, first, *rest]}), "answers a clip twice"),
+        "unknown": (with_first(clip="0" * 12), "no clip of the study"),
+        "choice": (with_first(quality="0" * 12), "incomplete or damaged"),
+        "unanswered": (json.dumps({**good, "answers": [missing, *rest]}), "incomplete or damaged"),
+        "order": (with_first(shown=first["shown"][::-1]), "is not that of its participant"),
+        "participant": (json.dumps({**good, "participant": "00000009"}), "is not that of its participant"),
+        "type": (with_first(shown=7), "incomplete or damaged"),
+        "name": (json.dumps({**good, "participant": "<b>"}), "is not a name of a page"),
+    }
+
+
+def test_bad_answers_are_told_in_one_line(page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    key = str(page.with_name("study.key.json"))
+    good = answered(page, "00000001", {"quality": "toy", "expression": "toy"})
+    (tmp_path / "good.json").write_text(json.dumps(good))
+    for name, (text, told) in damages(good).items():
+        bad = tmp_path / f"{name}.json"
+        bad.write_text(text)
+        capsys.readouterr()
+        assert main(["study", "tally", key, str(tmp_path / "good.json"), str(bad)]) == 2, name
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{name}.json: " in line, line
+        assert told in line, line
+        bad.unlink()
+    (tmp_path / "again.json").write_text(json.dumps(good))
+    for arguments, told in (
+        ([key, str(tmp_path)], "is of participant 00000001"),
+        ([key, str(tmp_path / "gone.json")], "gone.json: no such file"),
+        ([str(tmp_path / "gone.json"), str(tmp_path)], "gone.json: missing"),
+        ([str(tmp_path / "good.json"), str(tmp_path)], "expected 'mien.study_key'"),
+        ([key, str(page.parent)], "has no answer file"),
+    ):
+        assert main(["study", "tally", *arguments]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert told in line
+
+
+def test_bad_options_are_told_in_one_line(workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page, root = str(tmp_path / "a.html"), str(workspace)
+    for arguments, told in (
+        ([root, "--out", str(tmp_path / "a.mp4")], "give a file that ends in .html"),
+        ([root, "--out", page, "--runs", "toy"], "a study compares 2 to 8 runs, here toy"),
+        ([root, "--out", page, "--runs", "toy", "nobody"], "no run 'nobody'"),
+        ([root, "--out", page, "--side", "100"], "--side 100: give a multiple of 16, for example 96"),
+        ([root, "--out", page, "--clips", "0"], "--clips 0: give a number from 1 to 200"),
+        ([root, "--out", page, "--megabytes", "nan"], "--megabytes nan"),
+        ([root, "--out", page, "--seconds", "0"], "--seconds 0: give a number from 0.1 to 60"),
+        ([root, root, "--out", page], "is given twice"),
+        ([str(tmp_path / "gone"), "--out", page], "no such folder"),
+    ):
+        assert main(["study", "make", *arguments]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert told in line, line
+    assert not (tmp_path / "a.html").exists()
+
+
+def test_defaults_are_the_paper_s() -> None:
+    settings = StudySettings()
+    settings.check()
+    assert settings.clips == 10
+
+
+START = 'document.getElementById("start").click()'
+LOOK = """(async () => {
+  const began = performance.now(), blank = document.createElement("canvas");
+  const canvases = [...document.querySelectorAll("canvas")];
+  blank.width = blank.height = canvases[0].width;
+  const drawn = (canvas) => canvas.toDataURL() !== blank.toDataURL();
+  while (!canvases.every(drawn) && performance.now() - began < 20000) await new Promise((done) => setTimeout(done, 30));
+  document.getElementById("pause").click();
+  document.getElementById("again").click();
+  document.getElementById("pause").click();
+  await new Promise((done) => setTimeout(done, 300));
+  const radios = [...document.querySelectorAll("input[name=quality]")].map((input) => input.value);
+  return [radios, canvases.map((canvas) => canvas.toDataURL()), document.getElementById("next").disabled];
+})()"""
+ANSWER = """(() => {
+  const wanted = %s;
+  for (const [question, tiles] of Object.entries(wanted)) {
+    const input = [...document.querySelectorAll(`input[name=${question}]`)].find((one) => tiles.includes(one.value));
+    input.click();
+  }
+  const next = document.getElementById("next"), ready = !next.disabled;
+  next.click();
+  return ready;
+})()"""
+SAVE = """(async () => {
+  document.getElementById("save").click();
+  await new Promise((done) => setTimeout(done, 500));
+  return document.getElementById("participant").textContent;
+})()"""
+
+
+@pytest.mark.slow
+def test_a_participant_answers_in_a_real_browser(
+    page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    node()
+    chromium()
+    key = read_key(page.with_name("study.key.json"))
+    tiles = {run: [tile for clip in key.clips for tile, name in clip.tiles.items() if name == run] for run in RUNS}
+    answer = ANSWER % json.dumps({"quality": tiles["toy"], "expression": tiles["begun"]})
+    scripts = [START, LOOK, answer, LOOK, answer, SAVE]
+    told = browse(page, scripts, (1200, 800), downloads=tmp_path, fragment="participant=0000002a")
+    assert told["messages"] == []
+    assert not [url for url in told["requests"] if not url.startswith("blob:")]
+    _, first, ready, second, also, participant = told["results"]
+    assert (ready, also, participant) == (True, True, "0000002a")
+    clips = {clip.name: clip for clip in key.clips}
+    order = shuffled(list(clips), key.study, participant, "clips")
+    videos = {entry["clip"]: base64.b64decode(entry["video"]) for entry in content_of(page)["clips"]}
+    for name, (radios, pictures, disabled) in zip(order, (first, second), strict=True):
+        assert disabled
+        assert radios == shuffled(list(clips[name].tiles), key.study, participant, name)
+        (tmp_path / "clip.mp4").write_bytes(videos[name])
+        frames = np.stack([picture for _, picture in read_video_frames(tmp_path / "clip.mp4")]).astype(np.float64)
+        own = dict(zip(["truth", *clips[name].tiles], np.split(frames, 1 + len(RUNS), axis=2), strict=True))
+        for tile, address in zip(["truth", *radios], pictures, strict=True):
+            shown = cv2.imdecode(np.frombuffer(base64.b64decode(address.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
+            assert shown is not None
+            errors = {other: np.abs(f - shown[..., ::-1]).mean((1, 2, 3)).min() for other, f in own.items()}
+            assert min(errors, key=errors.__getitem__) == tile, errors
+            assert errors[tile] < 4
+    (saved,) = tmp_path.glob("answers-*.json")
+    assert saved.name == f"answers-{key.study}-0000002a.json"
+    assert read_all_answers([saved], key)[0].participant == "0000002a"
+    assert main(["study", "tally", str(page.with_name("study.key.json")), str(saved), "--json"]) == 0
+    runs = json.loads(capsys.readouterr().out)["runs"]
+    assert runs["toy"]["quality"]["percent"] == 100
+    assert runs["begun"]["expression"]["percent"] == 100
+
+
+@pytest.mark.slow
+def test_participants_see_different_orders(page: Path) -> None:
+    node()
+    chromium()
+    read = '[...document.querySelectorAll("input[name=quality]")].map((input) => input.value)'
+    seen = set()
+    for _ in range(2):
+        told = browse(page, [START, read, 'document.getElementById("participant").textContent'])
+        seen.add(told["results"][2])
+    assert len(seen) == 2

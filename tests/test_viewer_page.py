@@ -1,0 +1,320 @@
+"""The viewer's server: real connections, two clients, clients that vanish, the door, and a real browser."""
+
+import asyncio
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("viser")
+
+import msgspec
+import viser
+import websockets
+import zstandard
+from viser._messages import ViewerCameraMessage
+from viser.transforms import SO3
+
+from mien import runtime
+from mien.errors import UserError
+from mien.viewer.access import Door
+from mien.viewer.panel import filmed_from
+from mien.viewer.server import Serving
+from mien.viewer.session import Session
+from test_viewer import clip_of
+from web_case import WEB, chromium, drawn_head, node
+
+PROTOCOL = f"viser-v{viser.__version__}"
+PATIENCE_SECONDS = 60.0
+
+
+@pytest.fixture(scope="module")
+def avatar() -> runtime.Avatar:
+    return runtime.Avatar(drawn_head(3000))
+
+
+@pytest.fixture
+def session(avatar: runtime.Avatar) -> Session:
+    return Session(avatar, None, {"clip": lambda: clip_of(avatar)})
+
+
+@pytest.fixture
+def serving(session: Session) -> Iterator[Serving]:
+    running = Serving(session, Door.of("127.0.0.1"), 0, "drawn")
+    yield running
+    running.stop()
+
+
+class Client:
+    """A browser that only sends its camera and takes pictures."""
+
+    def __init__(self, connection: Any) -> None:
+        self.connection = connection
+        self.pictures: list[np.ndarray] = []
+
+    async def look(self, session: Session, width: int, height: int, aside: float = 0.0) -> None:
+        position, target, up = filmed_from(session)
+        viewmat = session.avatar.camera.viewmat
+        message = ViewerCameraMessage(
+            tuple(SO3.from_matrix(viewmat[:3, :3].T.astype(float)).wxyz), tuple(position + aside), 0.4, 0.01, 100.0,
+            height, width, tuple(target), tuple(up),
+        )  # fmt: skip
+        await self.connection.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+
+    async def picture(self, height: int) -> np.ndarray:
+        """Return the first picture of that height from now on."""
+        while True:
+            content = await asyncio.wait_for(self.connection.recv(), PATIENCE_SECONDS)
+            packed = content[16 : 16 + int.from_bytes(content[8:16], "little")]
+            for message in msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed))["messages"]:
+                if message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None:
+                    picture = cv2.imdecode(np.frombuffer(message["rgb_data"], np.uint8), cv2.IMREAD_COLOR)
+                    assert picture is not None
+                    if len(picture) == height:
+                        return picture
+
+
+def connect(serving: Serving, **headers: str) -> Any:
+    return websockets.connect(
+        f"ws://127.0.0.1:{serving.port}", subprotocols=[websockets.Subprotocol(PROTOCOL)], max_size=None,
+        additional_headers=headers,
+    )  # fmt: skip
+
+
+def request(port: int, path: str = "/", **headers: str) -> tuple[int, dict[str, str], bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    content = answer.read()
+    connection.close()
+    return answer.status, dict(answer.getheaders()), content
+
+
+def until(done: Callable[[], bool]) -> None:
+    """Wait until something is so."""
+    ends = time.monotonic() + PATIENCE_SECONDS
+    while not done():
+        assert time.monotonic() < ends, "it never came"
+        time.sleep(0.01)
+
+
+def test_two_clients_see_their_own_views_and_one_may_vanish(serving: Serving, session: Session) -> None:
+    async def talk() -> None:
+        async with connect(serving) as first:
+            near = Client(first)
+            await near.look(session, 96, 64)
+            shown = await near.picture(64)
+            assert shown.shape == (64, 96, 3)
+            assert shown.std() > 10, "there is a head"
+            async with connect(serving) as second:
+                far = Client(second)
+                await far.look(session, 50, 100)
+                assert (await far.picture(100)).shape == (100, 50, 3)
+                session.set_expression("jawOpen", 0.8)
+                opened = [await near.picture(64), await far.picture(100)]
+                assert np.abs(opened[0].astype(int) - shown).max() > 30
+                second.transport.abort()  # the cable is pulled
+            session.rest()
+            await near.look(session, 96, 64)
+            again = await near.picture(64)
+            assert np.abs(again.astype(int) - shown).mean() < 2
+            await near.look(session, 0, 0)  # a window that is hidden
+            await near.look(session, 96, 64, float("nan"))
+            await near.look(session, 48, 32)
+            await near.picture(32)
+        async with connect(serving) as third:  # the page is loaded again
+            await Client(third).look(session, 96, 64)
+            await Client(third).picture(64)
+
+    asyncio.run(talk())
+    assert serving.loop.error is None
+    until(lambda: not serving._server.get_clients())
+
+
+def test_moving_pictures_are_smaller_and_still_ones_full(session: Session) -> None:
+    sizes: list[tuple[int, bool]] = []
+    original = session.picture
+
+    def slow(view: Any, full: bool) -> np.ndarray:
+        time.sleep(0.05)
+        picture = original(view, full)
+        sizes.append((len(picture), full))
+        return picture
+
+    session.picture = slow  # type: ignore[method-assign]
+    running = Serving(session, Door.of("127.0.0.1"), 0, "drawn")
+    try:
+
+        async def talk() -> None:
+            async with connect(running) as connection:
+                client = Client(connection)
+                await client.look(session, 96, 64)
+                await client.picture(32)
+                await client.picture(64)
+
+        asyncio.run(talk())
+    finally:
+        running.stop()
+    assert sizes[0] == (32, False)
+    assert sizes[-1] == (64, True)
+
+
+def test_strangers_get_nothing(serving: Serving) -> None:
+    assert request(serving.port)[0] == 200
+    status, headers, content = request(serving.port, Host="rebound.example")
+    assert status == 403
+    assert b"private" in content
+    for origin in ("http://evil.example", "null"):
+        with pytest.raises(websockets.InvalidStatus, match="403"):
+            asyncio.run(open_and_close(serving, Origin=origin))
+    asyncio.run(open_and_close(serving, Origin=f"http://127.0.0.1:{serving.port}"))
+
+
+async def open_and_close(serving: Serving, **headers: str) -> None:
+    async with connect(serving, **headers):
+        pass
+
+
+def test_beyond_loopback_nothing_goes_without_the_token(session: Session) -> None:
+    door = Door.of("0.0.0.0")
+    running = Serving(session, door, 0, "drawn")
+    try:
+        assert f"?token={door.token}" in running.address
+        assert request(running.port)[0] == 403
+        assert request(running.port, "/index.html?token=guess")[0] == 403
+        with pytest.raises(websockets.InvalidStatus, match="403"):
+            asyncio.run(open_and_close(running))
+        status, headers, _ = request(running.port, f"/?token={door.token}")
+        assert status == 303
+        cookie = headers["Set-Cookie"].partition(";")[0]
+        assert request(running.port, Cookie=cookie)[0] == 200
+        asyncio.run(open_and_close(running, Cookie=cookie))
+    finally:
+        running.stop()
+
+
+def test_the_viewer_is_never_passed_on(serving: Serving) -> None:
+    """viser has a button and a message that make a server public through a machine of its makers."""
+    assert serving._server.request_share_url() is None
+    assert serving._server._share_tunnel is None
+
+
+def test_a_port_that_is_taken_is_told(session: Session) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(UserError, match=f"--port {port}: another program uses it"):
+            Serving(session, Door.of("127.0.0.1"), port, "drawn")
+    running = Serving(session, Door.of("127.0.0.1"), port, "drawn")
+    assert running.port == port
+    running.stop()
+
+
+def test_nothing_is_left_after_the_end(session: Session, capfd: pytest.CaptureFixture[str]) -> None:
+    before = {thread for thread in threading.enumerate() if not thread.name.startswith("ThreadPool")}
+    running = Serving(session, Door.of("127.0.0.1"), 0, "drawn")
+    asyncio.run(open_and_close(running))
+    running.stop()
+    after = {thread for thread in threading.enumerate() if not thread.name.startswith("ThreadPool")}
+    assert after <= before
+    with pytest.raises(OSError):  # noqa: PT011
+        request(running.port)
+    assert capfd.readouterr().out == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_signals_end_the_command(number: signal.Signals, code: int, tmp_path: Path) -> None:
+    runtime.write_portable(tmp_path / "a.mien", drawn_head(100))
+    # A shell lets its background jobs, such as these tests, ignore Ctrl-C.
+    heard = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); from mien.cli import main"
+    command = [sys.executable, "-c", f"{heard}; sys.exit(main())", "view", str(tmp_path / "a.mien")]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            line = process.stderr.readline()
+            assert line.startswith("Open http://127.0.0.1:")
+            port = int(line.split(":")[2].partition("/")[0])
+            assert request(port)[0] == 200
+            with socket.create_connection(("127.0.0.1", port)) as vanished:
+                vanished.sendall(b"GET / HT")
+            time.sleep(0.5)
+            os.kill(process.pid, number)
+            out, told = process.communicate(timeout=PATIENCE_SECONDS)
+        finally:
+            process.kill()
+    assert process.returncode == code
+    assert told == ("The viewer is closed\n" if code == 0 else "")
+    assert out == ""
+
+
+def browse(address: str, steps: list[dict[str, Any]], size: tuple[int, int] = (1100, 700)) -> dict[str, Any]:
+    """Open an address in Chromium and do the steps of web/tests/view.mjs."""
+    told = json.dumps({"width": size[0], "height": size[1], "steps": steps})
+    command = [node(), str(WEB / "tests" / "view.mjs"), chromium(), address]
+    done = subprocess.run(command, input=told, capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.slow
+def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path: Path) -> None:
+    chromium()
+    node()
+    shots = [tmp_path / f"{index}.png" for index in range(4)]
+    steps: list[dict[str, Any]] = [
+        {"see": "Expressions"},
+        {"wait": 3000},
+        {"screenshot": str(shots[0])},
+        {"click": "Random face"},
+        {"wait": 3000},
+        {"screenshot": str(shots[1])},
+        {"drag": [120, 0]},
+        {"wait": 3000},
+        {"screenshot": str(shots[2])},
+        {"click": "Save"},
+        {"save": ["Screenshot", str(tmp_path / "saved.png")]},
+        {"fill": ["Search", "smile left"]},
+        {"wait": 3000},
+        {"reload": True},
+        {"see": "Expressions"},
+        {"wait": 3000},
+        {"screenshot": str(shots[3])},
+    ]
+    told = browse(serving.address, steps)
+    here = (f"http://127.0.0.1:{serving.port}/", f"blob:http://127.0.0.1:{serving.port}/", "data:")
+    assert told["errors"] == []
+    assert [address for address in told["requests"] if not address.startswith(here)] == []
+    rest, random, turned, again = (read(path)[:, :700] for path in shots)
+    view = (rest[350:] < 250).any(-1)
+    assert 0.1 < view.mean() < 0.9, "a head over white"
+    assert np.abs(random.astype(int) - rest).max() > 30
+    assert np.abs(turned.astype(int) - random).mean() > 3
+    assert np.abs(session.face.expression - session.avatar.portable.neutral.expression).max() > 0
+    assert np.abs(again.astype(int) - random).mean() < 3, "a new page has the same face, seen from the front"
+    saved = read(tmp_path / "saved.png")
+    assert len(saved) == 700
+    visible = {
+        name for name, slider in serving._panel._sliders.items() if slider.visible and name[0] != name[0].upper()
+    }
+    assert {name for name in visible if name in session.avatar.expression_names} == {"mouthSmileLeft"}
+    assert serving.loop.error is None
+
+
+def read(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    return picture
