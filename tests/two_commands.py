@@ -46,6 +46,7 @@ class Outcome:
     worked: list[tuple[str, float, float]]
     """Calls of `WORK` that were made, with start and end on the system's clock."""
 
+
 class Pair:
     """Two processes that have imported everything, and start each round together."""
 
