@@ -177,7 +177,7 @@ def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_a_terminated_command_removes_what_is_unfinished(tmp_path: Path) -> None:
-    """A terminated command removes unfinished files, as after Ctrl-C.
+    """A terminated command removes unfinished files, as after Ctrl-C, even if a second signal comes meanwhile.
 
     By default a signal would end the process at once.
     """
@@ -195,14 +195,19 @@ class Command:
     def run(self):
         def write(path):
             path.write_text("half")
-            os.kill(os.getpid(), signal.SIGTERM)
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+            finally:
+                os.kill(os.getpid(), signal.SIGTERM)
+                print("cleaned up")
 
         write_atomically(Path({str(tmp_path / "film.mp4")!r}), write)
 
 sys.modules["mien.commands.demo"] = types.SimpleNamespace(Command=Command)
 sys.exit(main(["demo"]))
 """
-    assert subprocess.run([sys.executable, "-c", program], check=False, capture_output=True).returncode == 143
+    ended = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (143, "cleaned up\n", "")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -204,7 +204,11 @@ def _run(name: str, rest: list[str]) -> int:
 
 
 def _terminated(number: int, frame: object) -> None:
-    """Stop as Ctrl-C does, so that unfinished files are removed. The exit code is that of a terminated process."""
+    """Stop as Ctrl-C does, so that unfinished files are removed. The exit code is that of a terminated process.
+
+    Further signals are ignored, since they would interrupt the removal and the wait for threads in native code.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise SystemExit(EXIT_TERMINATED)
 
 
