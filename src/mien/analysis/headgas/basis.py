@@ -78,7 +78,8 @@ def basis(context: Context) -> PartResult:
             "Each expression is drawn at 1, or at the bound of the face model if that is smaller. The other "
             + ("coefficients are those of the person at rest." if added else "coefficients are 0."),
             f"Features of this run change along {avatar.directions.shape[1]} directions of "
-            f"{avatar.directions.shape[0]} inputs (--method.directions). What expressions have in common along them looks alike.",
+            f"{avatar.directions.shape[0]} inputs (--method.directions). "
+            "What expressions have in common along them looks alike.",
         ),
     )
 
