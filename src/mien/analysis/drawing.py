@@ -9,16 +9,25 @@ import torch
 from mien import _native
 from mien.avatar import Avatar
 from mien.camera import Camera
+from mien.face import FaceParams
 from mien.render import rasterize
 from mien.threads import one_torch_thread
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-def measure_drawing(avatar: Avatar, camera: Camera, seconds: float) -> dict[str, float | int]:
-    """Draw the avatar at rest over white, at all threads, for about `seconds`, and return the figures of one row.
+def measure_drawing(
+    avatar: Avatar, camera: Camera, seconds: float, face: FaceParams | None = None
+) -> dict[str, float | int]:
+    """Draw the avatar over white, at all threads, for about `seconds`, and return the figures of one row.
 
     The first picture warms up and does not count, unless it alone takes longer than `seconds`.
+
+    Args:
+        avatar: The avatar.
+        camera: The camera, with the size of the picture.
+        seconds: Time to spend.
+        face: The timestep to pose, or None for the person at rest.
 
     Returns:
         width, height: Size of the picture in pixels.
@@ -36,7 +45,7 @@ def measure_drawing(avatar: Avatar, camera: Camera, seconds: float) -> dict[str,
         began = time.perf_counter()
         while True:
             start = time.perf_counter()
-            gaussians = avatar.pose(avatar.subject).gaussians.timestep(0)
+            gaussians = avatar.pose(avatar.subject if face is None else face).gaussians.timestep(0)
             middle = time.perf_counter()
             rasterize(gaussians, camera, white)
             end = time.perf_counter()

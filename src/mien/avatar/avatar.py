@@ -21,6 +21,8 @@ from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.runtime.baked import BakedAvatar, Filmed
 
+UNBAKED_REMEDY = "export a .ply instead, or draw it with `mien render`"
+"""What to do with avatars that have no record of `mien.runtime`."""
 _CALM_SHARE = 0.1
 """Share of the timesteps that are used to estimate the expression at rest."""
 
@@ -165,7 +167,16 @@ class Avatar(nn.Module, ABC):
 
     @abstractmethod
     def bake(self) -> BakedAvatar:
-        """The avatar as a record of `mien.runtime`, which works without torch and this class: for files and engines."""
+        """The avatar as a record of `mien.runtime`, which works without torch and this class: for files and engines.
+
+        Raises:
+            UserError: there is no such record (`unbaked`).
+        """
+
+    @property
+    def unbaked(self) -> str | None:
+        """Why `bake` refuses this avatar, with its name. None for all that have a record, which is nearly all."""
+        return None
 
 
 def move_avatar(avatar: Avatar, like: Tensor) -> None:

@@ -53,9 +53,19 @@ def feature_network(
         gradient: Takes the gradient of the bases, if they require one.
     """
     if bases.dtype != torch.float32 or bases.device.type != "cpu":
-        features = _Blend.apply(gradient, bases, inputs, neutral)
+        features = blended_features(bases, inputs, neutral, gradient)
         return _network(features, own, layers)
     return _Network.apply(gradient, bases, inputs, neutral, own, *layers)
+
+
+def blended_features(
+    bases: Float[Tensor, "n k f"],
+    inputs: Float[Tensor, " k"],
+    neutral: Float[Tensor, "n f"],
+    gradient: FactoredGradient,
+) -> Float[Tensor, "n f"]:
+    """The features without a network. The gradient of the bases goes to `gradient`, as in `feature_network`."""
+    return _Blend.apply(gradient, bases, inputs, neutral)
 
 
 def feature_network_reference(

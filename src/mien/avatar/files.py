@@ -141,7 +141,8 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{source}: does not fit its settings ({reason}); train it again") from None
-    fault = baked_fault(avatar.bake())
+    # A few avatars have no record, and only drawing them can tell.
+    fault = baked_fault(avatar.bake()) if avatar.unbaked is None else None
     if fault is not None:
         raise UserError(f"{source}: cannot be posed ({fault}); train it again")
 

@@ -2,11 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
-from mien.ranges import FRACTION, Range, ToLoad
+from mien.ranges import FRACTION, NOT_NEGATIVE, Range, ToLoad
+
+Variant = Literal["full", "no_mlp", "delta", "change_all", "no_blending"]
+"""The method and its ablations (supplement, section 2), as `mien.avatar.headgas_variants` makes them."""
 
 
 def _density() -> GradientSettings:
@@ -27,6 +30,13 @@ _BEFORE = {
 class HeadGasConfig(MethodConfig):
     """Settings of HeadGaS. The defaults suit a CPU and runs of some thousand steps."""
 
+    variant: Variant = "full"
+    """The method itself (`full`), or one of the paper's ablations. `no_mlp` averages explicit colours and opacities,
+    without a network. `delta` moves and turns Gaussians instead of painting them. `change_all` does both.
+    `no_blending` has no features: a network of five layers takes the expression and the place."""
+    shift_weight: Annotated[float, NOT_NEGATIVE] = 1.0
+    """Weight of the mean absolute shift of the centres, in metres, which only `delta` and `change_all` have. The paper
+    has this term, but not its weight."""
     face_tuning: FaceTuning = field(default_factory=_face_tuning)
     """Whether and how fast training changes the tracked face parameters of each frame."""
     points: Annotated[int, Range(4, 1_000_000), ToLoad(4)] = 2500

@@ -8,7 +8,7 @@ import tyro
 
 from mien.workspace import Workspace, open_workspace
 
-AnalysisName = Literal["gaussian-avatars"]
+AnalysisName = Literal["gaussian-avatars", "headgas"]
 """The keys of `mien.analysis.ANALYSES`, written out for options. A test compares them."""
 
 
@@ -22,6 +22,10 @@ class Command:
     Parts of gaussian-avatars: growth (Gaussians and step time over training), speed (drawing at five sizes, and
     memory), teeth (with and without the Gaussians on teeth), teeth-trained and scale (two short trainings each: without
     the triangles of teeth, and without the threshold of the scale loss).
+
+    Parts of headgas: basis (one expression at a time, beside the mesh), layers (Gaussians removed from near to far),
+    beyond (an expression to 1.4 times its training maximum, and views beyond those of training), sizes (time of a frame
+    against the size of the picture), ablations (a short training for each variant of the paper).
     """
 
     method: Annotated[AnalysisName, tyro.conf.Positional]

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from mien.analysis.context import Context, Variant, mean_psnr
 from mien.analysis.result import PartResult, Picture, Table
+from mien.analysis.views import draw_avatar, mouth_box, mouth_camera
 from mien.avatar import Avatar
-from mien.camera import Camera
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import crop_to, psnr
@@ -27,8 +27,6 @@ _FRAMES, _SHOWN = 12, 3
 """Number of frames that are compared, and of those that are shown."""
 _SIDE = 360
 """Width and height of a picture, in pixels."""
-_MOUTH = ("lips", "teeth")
-"""Regions that say where the mouth is. The first one that the face model has counts."""
 _NO_TEETH = "The face model of this run has no triangles of teeth, so there is nothing to compare."
 
 
@@ -40,12 +38,12 @@ def teeth(context: Context) -> PartResult:
     if not bool(avatar.face_model.region_mask("teeth").any()):
         return PartResult({"teeth_triangles": 0}, (_NO_TEETH,))
     face = open_jaw(avatar.subject, avatar.face_model)
-    camera = mouth_camera(avatar.face_model, face, context.camera)
+    camera = mouth_camera(avatar.face_model, face, context.camera, _SIDE)
     kept = ~bound
     drawn = [
-        _drawn(avatar, face, context.camera.fitted(_SIDE, _SIDE)),
-        _drawn(avatar, face, camera),
-        _drawn(avatar, face, camera, kept),
+        draw_avatar(avatar, face, context.camera.fitted(_SIDE, _SIDE)),
+        draw_avatar(avatar, face, camera),
+        draw_avatar(avatar, face, camera, kept),
     ]
     pictures = [
         Picture(
@@ -104,8 +102,8 @@ def teeth_trained(context: Context) -> PartResult:
         head = mean_psnr(experiment, frames) if experiment is not None else None
         rows.append((name, variant.summary["gaussians"], _rounded(mouth), _rounded(head)))
     face = open_jaw(context.avatar.subject, model)
-    camera = mouth_camera(model, face, context.camera)
-    drawn = [_drawn(variant.avatar, face, camera) for variant in variants.values()]
+    camera = mouth_camera(model, face, context.camera, _SIDE)
+    drawn = [draw_avatar(variant.avatar, face, camera) for variant in variants.values()]
     names = ("name", "gaussians", "mouth_psnr", "head_psnr")
     values = {"steps": context.options.steps, "rows": [dict(zip(names, row, strict=True)) for row in rows]}
     findings = []
@@ -164,43 +162,14 @@ def jaw_opening(face: FaceParams, model: FaceModel) -> Float[Tensor, " b"]:
     return face.expression[:, _jaw_expression(model)]
 
 
-def mouth_camera(model: FaceModel, face: FaceParams, camera: Camera) -> Camera:
-    """The camera, enlarged to the mouth, with a square picture."""
-    left, top, width, height = _mouth_box(model, face, camera)
-    scale = _SIDE / max(width, height)
-    K = camera.K.clone()
-    K[0, 2] -= left + width / 2
-    K[1, 2] -= top + height / 2
-    K[:2] *= scale
-    K[:2, 2] += _SIDE / 2
-    return replace(camera, K=K, width=_SIDE, height=_SIDE)
-
-
 def _jaw_expression(model: FaceModel) -> int:
     jaw = model.joint_names.index("jaw")
     return int(model.joint_rotation_basis[:, jaw].norm(dim=-1).argmax())
 
 
-def _mouth_box(model: FaceModel, face: FaceParams, camera: Camera) -> Box:
-    """A square box around the mouth in the picture, at least 8 pixels wide."""
-    mask = next(mask for mask in map(model.region_mask, _MOUTH) if bool(mask.any()))
-    vertices = model.faces[mask].unique()
-    pixels, _ = camera.project(model(face)[0, vertices])
-    low, high = pixels.amin(0), pixels.amax(0)
-    side = max(8.0, 1.3 * float((high - low).max()))
-    x, y = ((low + high) / 2).tolist()
-    return round(x - side / 2), round(y - side / 2), round(side), round(side)
-
-
 def _on_teeth(avatar: Avatar) -> Tensor:
     """Mark the Gaussians that are bound to triangles of teeth, bool [n]."""
     return avatar.face_model.region_mask("teeth")[avatar.gaussian_store()["face_index"].long()]
-
-
-@torch.no_grad()
-def _drawn(avatar: Avatar, face: FaceParams, camera: Camera, kept: Tensor | None = None) -> Any:
-    gaussians = avatar.pose(face).gaussians.timestep(0)
-    return to_uint8(rasterize(gaussians if kept is None else gaussians.select(kept), camera, torch.ones(3)).image)
 
 
 def _most_open(experiment: Experiment) -> list[Any]:
@@ -221,7 +190,7 @@ def _image(experiment: Experiment, frame: Any, kept: Tensor | None) -> Tensor:
 
 
 def _box_of(experiment: Experiment, frame: Any, model: FaceModel) -> Box:
-    return _mouth_box(model, experiment.face(frame), experiment.camera(frame))
+    return mouth_box(model, experiment.face(frame), experiment.camera(frame))
 
 
 def _mouth_psnr(experiment: Experiment, frames: Sequence[Any], model: FaceModel, kept: Tensor | None = None) -> float:

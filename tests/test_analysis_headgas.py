@@ -1,0 +1,208 @@
+"""`mien analyze headgas`: every part runs and writes its files; what parts choose and draw is as they say."""
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import train_toy
+from capture_helpers import tree_bytes
+from mien.analysis import ANALYSES, AnalysisOptions
+from mien.analysis.context import Context
+from mien.analysis.headgas import ablations, beyond, layers, sizes
+from mien.analysis.headgas.basis import start_of_bases
+from mien.analysis.headgas.trained import Trained, busy_face, trained_range, with_expression
+from mien.analysis.views import head_camera, labelled, mouth_camera
+from mien.avatar import GradientSettings, HeadGasConfig, PerceptualLoss, Photometric
+from mien.capture.video import count_frames
+from mien.cli import main
+from mien.gaussians import Gaussians
+from mien.runtime.filmed import head_angles
+from toy_scene import toy_camera, toy_face, toy_face_model
+from toy_workspace import write_toy_workspace
+
+CONFIG = HeadGasConfig(
+    points=80,
+    features=4,
+    hidden=8,
+    density=GradientSettings(start=0.2, stop=0.8, rounds=3, grow_gradient=1e-4, opacity_resets=(), max_gaussians=150),
+)
+FILMS = {"basis.mp4": 32, "layers.mp4": 75, "beyond-expression.mp4": 60, "beyond-view.mp4": 60}
+"""Frames of each film: 16 for each of the two expressions in the first one."""
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("analysis-headgas") / "W"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(train_toy, "CONFIG", CONFIG)
+        write_toy_workspace(root)
+    return root
+
+
+@pytest.fixture(autouse=True)
+def _small_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sizes, "PAPER", {16: 4.0, 32: 8.0})
+    monkeypatch.setattr(ablations, "_SIZE", 16)
+
+
+@pytest.fixture
+def workspace(toy: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(toy, tmp_path / "W"))
+
+
+@pytest.fixture
+def context(toy: Path, tmp_path: Path) -> Context:
+    return Context(toy / "runs/toy", (toy / "sequences/clip",), tmp_path, AnalysisOptions())
+
+
+def analyze(root: Path, *more: str) -> dict[str, Any]:
+    assert main(["analyze", "headgas", str(root), *more]) == 0
+    return json.loads((root / "analysis/toy/analysis.json").read_text())["parts"]
+
+
+def test_parts_without_training_write_pictures_and_films(workspace: Path) -> None:
+    before = tree_bytes(workspace)
+    parts = analyze(workspace, "--seconds", "0.01")
+    assert list(parts) == ["basis", "layers", "beyond", "sizes"]
+    folder = workspace / "analysis/toy"
+    films = {entry["file"] for part in parts.values() for entry in part["films"]}
+    assert films == set(FILMS)
+    assert {name: count_frames(folder / name) for name in FILMS} == FILMS
+    pictures = {entry["file"] for part in parts.values() for entry in (*part["pictures"], *part["charts"])}
+    assert {"basis.png", "layers-head.png", "layers-mouth.png", "beyond-view.png", "sizes.png"} <= pictures
+    assert all((folder / name).read_bytes().startswith(b"\x89PNG") for name in pictures)
+    names = [row["name"] for row in parts["basis"]["values"]["rows"]]
+    assert names == ["drop", "swell"]
+    assert not parts["basis"]["values"]["neutral_added"]
+    assert parts["beyond"]["values"]["factors"][-1] == 1.4
+    rows = parts["sizes"]["values"]["rows"]
+    assert [(row["width"], row["height"], row["paper_ms"]) for row in rows] == [(16, 16, 4.0), (32, 32, 8.0)]
+    assert all(row["frame_ms"] > 0 for row in rows)
+    after = tree_bytes(workspace)
+    assert {name: after[name] for name in before} == before
+
+
+def test_the_ablations_are_trained_alike(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ("--parts", "ablations", "--steps", "6", "--seconds", "0.01")
+    part = analyze(workspace, *asked)["ablations"]
+    assert "ablations: 5 trainings of 6 steps each" in capsys.readouterr().err
+    rows = part["values"]["rows"]
+    assert [row["name"] for row in rows] == ["no_blending", "change_all", "delta", "no_mlp", "full"]
+    assert all(row["gaussians"] > 0 and row["frame_ms"] > 0 and row["head_psnr"] > 0 for row in rows)
+    assert len({row["head_psnr"] for row in rows}) == 5
+    runs = sorted(path.name.rsplit("-", 2)[0] for path in (workspace / "analysis/toy/runs").iterdir() if path.is_dir())
+    assert runs == [f"ablation-{name}" for name in ("change-all", "delta", "full", "no-blending", "no-mlp")]
+    assert part["tables"][0]["rows"][-1][-3:] == [28_000, 4.0, 32.5]
+    assert (workspace / "analysis/toy/ablations.png").is_file()
+    assert analyze(workspace, *asked)["ablations"] == part
+
+
+def test_rows_differ_only_in_what_they_say() -> None:
+    plain = ablations.ablation_configs(CONFIG)
+    assert "no_perceptual" not in plain
+    assert plain["full"] == CONFIG
+    assert plain["delta"] == replace(CONFIG, variant="delta")
+    config = replace(CONFIG, variant="no_mlp", photometric=Photometric(perceptual=PerceptualLoss(weight=0.1)))
+    rows = ablations.ablation_configs(config)
+    assert list(rows) == list(ablations.PAPER)
+    without = rows["no_perceptual"]
+    assert (without.variant, without.photometric.perceptual.weight) == ("full", 0.0)
+    assert rows["full"] == replace(config, variant="full")
+
+
+def gaussians_at(points: list[tuple[float, float, float]], opacities: list[float]) -> Gaussians:
+    n = len(points)
+    return Gaussians(
+        torch.tensor(points), torch.ones(n, 4), torch.ones(n, 3), torch.tensor(opacities), torch.zeros(n, 1, 3)
+    )
+
+
+def test_gaussians_are_removed_from_near_to_far() -> None:
+    # The camera looks along -z. The third is faint, the fourth beside the picture, the fifth behind the camera.
+    points = [(0.0, 0.0, -2.0), (0.0, 0.1, -1.0), (0.0, 0.0, -0.5), (9.0, 0.0, -1.0), (0.0, 0.0, 1.0), (0.1, 0.0, -3.0)]
+    gaussians = gaussians_at(points, [1.0, 0.5, 0.001, 1.0, 1.0, 0.1])
+    order = layers.near_to_far(gaussians, toy_camera(64))
+    assert order.tolist() == [1, 0, 5]
+    assert layers.without_nearest(6, order, 0.0).all()
+    assert layers.without_nearest(6, order, 0.67).tolist() == [False, False, True, True, True, True]
+
+
+def test_bases_with_negative_coefficients_start_at_the_person_at_rest() -> None:
+    model, face = toy_face_model(), toy_face(5)[1]
+    start, added = start_of_bases(face, model)
+    assert added == 0
+    assert not bool(start.expression.any())
+    assert torch.equal(start.joints, face.joints)
+    signed = replace(model, expression_bounds=torch.tensor([[-1.0, 1.0], [0.0, 1.0]]))
+    start, added = start_of_bases(face, signed)
+    assert added == 1
+    assert start is face
+
+
+def test_the_training_range_is_that_of_the_avatar_or_of_its_sequences(context: Context) -> None:
+    filmed = trained_range(context)
+    assert context.avatar.filmed is not None
+    assert torch.equal(filmed.highest, torch.from_numpy(context.avatar.filmed.highest[:2]))
+    context.avatar.filmed = None
+    tracked = trained_range(context)
+    face = context.sequences[0].tracking.face
+    assert torch.equal(tracked.highest, face.expression.amax(0))
+    angles = head_angles(face.head_rotation.numpy(), face.head_translation.numpy(), context.camera.position.numpy())
+    assert tracked.yaws == pytest.approx((angles[:, 0].min(), angles[:, 0].max()))
+    assert tracked.yaw_at_rest == filmed.yaw_at_rest
+
+
+def test_the_camera_goes_where_the_head_sees_it_at_an_angle(context: Context) -> None:
+    trained, subject = trained_range(context), context.avatar.subject
+    for yaw in (trained.yaws[0] - 0.5, 0.0, 0.6):
+        eye = beyond.view_from(context, trained, yaw).position.numpy()
+        seen = head_angles(subject.head_rotation.numpy(), subject.head_translation.numpy(), eye)
+        assert seen[0, 0] == pytest.approx(yaw, abs=0.02)
+    shown = [math.degrees(yaw) for yaw in beyond.shown_yaws(Trained(trained.highest, (-0.5, 0.25), 0.0))]
+    low, high = math.degrees(-0.5), math.degrees(0.25)
+    assert shown == pytest.approx([low - 30, low - 15, low, (low + high) / 2, high, high + 15, high + 30])
+
+
+def test_the_strongest_expression_moves_the_mesh_most(context: Context) -> None:
+    trained = trained_range(context)
+    norms = context.avatar.face_model.expression_basis.flatten(1).norm(dim=-1)
+    assert beyond.strongest_expression(context, trained) == int((trained.highest * norms).argmax())
+    never = replace(trained, highest=torch.tensor([-1.0, 0.001]))
+    assert beyond.strongest_expression(context, never) == 1
+
+
+def test_faces_change_only_in_their_expression(context: Context) -> None:
+    face = context.avatar.subject
+    changed = with_expression(face, 1, 1.4)
+    assert changed.expression[0].tolist() == [float(face.expression[0, 0]), pytest.approx(1.4)]
+    assert float(face.expression[0, 1]) < 1.4
+    assert bool((busy_face(context).expression != face.expression).all())
+
+
+def test_views_hold_the_head() -> None:
+    model, face = toy_face_model(), toy_face(5)[0]
+    camera = head_camera(model, face, toy_camera(64), 100)
+    pixels, _ = camera.project(model(face)[0])
+    assert (camera.width, camera.height) == (100, 100)
+    assert float(pixels.min()) > 0
+    assert float(pixels.max()) < 100
+    assert float((pixels.amax(0) - pixels.amin(0)).max()) > 70
+    # A face model without regions of a mouth gives the whole head.
+    assert mouth_camera(model, face, toy_camera(64), 50).K[0, 0] < 0.6 * camera.K[0, 0]
+    grey = np.full((10, 40, 3), 128, np.uint8)
+    picture = labelled(grey, "text")
+    assert picture.shape == (30, 40, 3)
+    assert (picture[20:] == grey).all()
+    assert picture[:20].min() < 200
+
+
+def test_the_papers_figures() -> None:
+    assert [part.name for part in ANALYSES["headgas"].parts if part.trainings] == ["ablations"]
+    assert ablations.PAPER["full"][1:] == (28_000, 4.0, 32.50)
