@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from mien.camera import look_at
 from mien.tracking import Tracking, draw_overlay, make_scoring, write_overlay
+from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.neck_line import bottom_vertices, fit_neck_lines
-from mien.tracking.scoring import above_neck_line, cut_matte, head_crop
+from mien.tracking.scoring import cut_matte, head_crop
 from small_face_model import make_small_face_model
 from tracking_case import SIZE, capture_of, still_camera
 
@@ -71,15 +73,70 @@ def test_neck_line_turns_with_the_head():
         torch.testing.assert_close(line[:2], expected, atol=2e-2, rtol=0)
 
 
+def _ring(height: float, radii: tuple[float, float] = (0.06, 0.05)) -> torch.Tensor:
+    """Points of an elliptic neck around the y axis at a height, in metres."""
+    angles = torch.arange(48) * (2 * torch.pi / 48)
+    return torch.stack([radii[0] * angles.cos(), torch.full((48,), height), radii[1] * angles.sin()], dim=-1)
+
+
+def _camera_at(position: torch.Tensor):
+    viewmat = look_at(position, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    return replace(still_camera().to(torch.zeros(())), viewmat=viewmat)
+
+
+def _neck_cut(turn: torch.Tensor | None = None):
+    turn = torch.eye(3) if turn is None else turn
+    vertices = torch.cat([_ring(-0.1), _ring(0.0)]) @ turn.mT
+    return fit_neck_cut(NeckParts(torch.arange(48), torch.arange(48, 96)), vertices, turn[:, 1])
+
+
+def test_neck_cut_is_a_plane_across_the_neck():
+    turn = torch.linalg.qr(torch.tensor([[1.0, 0.2, 0.1], [0.0, 1.0, 0.4], [0.3, 0.0, 1.0]])).Q
+    turn = turn * torch.linalg.det(turn).sign()
+    cut = _neck_cut(turn)
+    assert cut.axes[2] == pytest.approx(turn[:, 1].numpy(), abs=1e-5)
+    assert cut.origin == pytest.approx((turn @ torch.tensor([0.0, -0.06, 0.0])).numpy(), abs=1e-5)
+    assert cut.radii == pytest.approx((0.06, 0.05), abs=1e-5)
+    points = torch.tensor([[0.3, -0.06, 0.1], [0.0, 0.04, 0.0], [0.1, -0.16, 0.2]])
+    torch.testing.assert_close(cut.heights(points @ turn.mT), torch.tensor([0.0, 0.1, -0.1]))
+    assert abs(cut.axes[0] @ turn[:, 0].numpy()) == pytest.approx(1, abs=1e-5)
+    assert cut.axes @ cut.axes.T == pytest.approx(np.eye(3), abs=1e-6)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.9, np.pi])
+@pytest.mark.parametrize("pitch", [-0.45, 0.0, 0.45])
+def test_all_cameras_cut_a_neck_at_the_same_place(yaw: float, pitch: float):
+    """Points of the neck's skin are kept above the cut and cut off below it, wherever the camera is."""
+    away = torch.tensor([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)]).float()
+    camera = replace(
+        still_camera().to(torch.zeros(())), viewmat=look_at(away, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    )
+    keep = above_neck_cut(_neck_cut(), camera)
+    for height, expected in ((-0.055, 1), (-0.065, 0)):
+        points = _ring(height)
+        normals = points / torch.tensor([0.06, torch.inf, 0.05]) ** 2
+        faces_camera = ((camera.position - points) * normals).sum(-1) > 0.3 * normals.norm(dim=-1)
+        assert 8 < int(faces_camera.sum()) < 28
+        columns, rows = camera.project(points[faces_camera])[0].long().unbind(-1)
+        assert (keep[rows, columns] == expected).all(), (height, keep[rows, columns])
+
+
 def test_far_beside_the_neck_goes():
-    camera = still_camera()
-    neck = np.array([[200.0, 400.0], [300.0, 400.0]], np.float32)
-    keep = above_neck_line(np.array([0.0, -1.0, 400.0], np.float32), neck, camera)
-    assert keep[380, 250] == 1
-    assert keep[420, 250] == 0
-    assert keep[395, 120] == 0, "a shoulder that rises above the line"
-    assert keep[200, 120] == 1, "hair beside the cheek"
-    assert 0.4 < keep[399, 250] < 1.0 or keep[399, 250] == 1.0
+    camera = replace(
+        still_camera().to(torch.zeros(())),
+        viewmat=look_at(*torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])),
+    )
+    keep = above_neck_cut(_neck_cut(), camera)
+
+    def at(x: float, y: float) -> float:
+        column, row = camera.project(torch.tensor([[x, y, 0.0]]))[0][0].long().tolist()
+        return float(keep[row, column])
+
+    assert at(0.0, 0.0) == 1
+    assert at(0.0, -0.08) == 0
+    assert at(0.1, -0.05) == 0, "a shoulder that rises above the cut"
+    assert at(0.1, 0.05) == 1, "hair beside the cheek"
+    assert ((keep > 0) & (keep < 1)).any(), "borders are soft"
 
 
 def test_bowed_chin_stays_and_slivers_go():
@@ -119,7 +176,9 @@ def test_make_scoring():
     capture = capture_of(torch.full((2, 478, 2), 100.0))
     scoring = make_scoring(capture, tracking, model)
     assert scoring.masks.shape == (2, 1, SIZE, SIZE)
-    row = int(tracking.neck_lines[0, 0, 2])
+    vertices = model(face[0])[0]
+    cut = fit_neck_cut(NeckParts.of(model), vertices, torch.tensor([0.0, 1.0, 0.0]))
+    row = int(tracking.cameras[0].project(torch.from_numpy(cut.origin).float()[None])[0][0, 1])
     assert scoring.masks[0, 0, row - 10, SIZE // 2] == 255
     assert scoring.masks[0, 0, row + 20, SIZE // 2] == 0
     left, top, width, height = scoring.crops[0, 0]

@@ -47,7 +47,7 @@ class SurfacePrior:
     doubt: Float[Tensor, " f"] | None = None
     """0 for triangles that pictures show well, 1 for those that none shows. None if nothing was completed."""
     made_up: Bool[Tensor, " f"] | None = None
-    """Triangles that are filled rather than trained: no picture shows them, and they are above the neck line."""
+    """Triangles that are filled rather than trained: no picture shows them, and they are above the cut at the neck."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ GLOSSARY = {
         "as tracked. cameras: held-out cameras, at timesteps that training saw through other cameras."
     ),
     "Target": (
-        "The picture inside a frozen mask (the matte, cut below the neck line), over white. The mask does not change "
+        "The picture inside a frozen mask (the matte, cut at the neck), over white. The mask does not change "
         "when the sequence is tracked again, so that runs can be compared."
     ),
     "Whole frame, head crop": (

@@ -34,7 +34,7 @@ AVATAR, AS_TRACKED, FITTED, MEAN_FRAME, MESH = "avatar", "as_tracked", "fitted",
 _MAX_TRAINING_FRAMES = 200
 _ALWAYS = {f"{part}{metric}" for part in ("", "head_") for metric in ("psnr", "ssim", "l1")}
 """Figures that every frame has."""
-_MASK = "frozen scoring mask: matte cut below the neck line, over white"
+_MASK = "frozen scoring mask: matte cut at the neck, over white"
 _CROP = "frozen head box of each frame"
 _PART_CROPS = f"boxes of the tracked mesh; enlarged to {PART_SIDE} pixels for ST-LPIPS if a side is shorter"
 

@@ -30,7 +30,7 @@ _SIDES = {-90: "right side", -45: "45 degrees to the right", 0: "front", 45: "45
           90: "left side", 180: "back"}  # fmt: skip
 _CONFIDENCE_NOTE = (
     "Blue surfaces were seen squarely by the camera in some training pictures. Orange ones were never seen; their "
-    "colours are spread or mirrored from seen ones. Grey ones are below the neck line and are not shown."
+    "colours are spread or mirrored from seen ones. Grey ones are below the cut at the neck and are not shown."
 )
 _CROSS_COLUMNS = (
     ("expression_error", "Expression ↓", 4), ("expression_error_still", "if still", 4),

@@ -1,4 +1,4 @@
-"""Fit of the face model to a capture: the tracking, its files, the neck line and the fixed scoring mask."""
+"""Fit of the face model to a capture: the tracking, its files, the cut at the neck, and the fixed scoring mask."""
 
 from typing import TYPE_CHECKING
 
@@ -7,6 +7,7 @@ from mien.lazy import lazy_names
 if TYPE_CHECKING:
     from mien.tracking.files import check_tracking_of, read_tracking, write_tracking
     from mien.tracking.fitting import has_enough_faces
+    from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
     from mien.tracking.pipeline import track, track_subject
     from mien.tracking.report import (
         draw_overlay,
@@ -27,6 +28,7 @@ else:
         {
             "fitting": ["has_enough_faces"],
             "files": ["check_tracking_of", "read_tracking", "write_tracking"],
+            "neck_cut": ["NeckCut", "NeckParts", "fit_neck_cut"],
             "pipeline": ["track", "track_subject"],
             "report": [
                 "draw_overlay",
@@ -46,6 +48,8 @@ else:
 
 __all__ = [
     "Appearance",
+    "NeckCut",
+    "NeckParts",
     "PaperSettings",
     "PhotometricSettings",
     "Scoring",
@@ -55,6 +59,7 @@ __all__ = [
     "check_tracking_of",
     "draw_overlay",
     "draw_overlay_grid",
+    "fit_neck_cut",
     "frontal_camera",
     "has_enough_faces",
     "make_scoring",

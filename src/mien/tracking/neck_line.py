@@ -1,4 +1,4 @@
-"""The neck line: the line in a picture at which a tracked head ends, to cut off shoulders and clothes."""
+"""The neck line: a line through the base of a tracked neck in a picture, as in GaussianAvatars; and the neck's vertices."""
 
 from collections import defaultdict
 

@@ -7,21 +7,16 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.face import FaceModel
 from mien.picture_files import PictureStack
 from mien.progress import track_progress
 from mien.render.mesh import rasterize_mesh
-from mien.tracking.neck_line import neck_vertices
+from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.tracking import Tracking
 
 _SILHOUETTE_MARGIN = 0.015
 """Margin around the projected head, in its own widths, because tracking is not exact to the pixel."""
-_NECK_MARGIN = 1.15
-"""Half of the width that is kept at the neck line, in half widths of the neck."""
-_SLOPE = 1.0
-"""Growth of that half width with every pixel above the neck line. Hair is kept; collars and shoulders are cut off."""
 _FAINT = 32
 """Least opacity (of 255) of a pixel that counts for connection and for the crop."""
 
@@ -31,7 +26,7 @@ class Scoring:
     """The parts of the pictures of t timesteps and c cameras that are trained on and scored."""
 
     masks: UInt8[np.ndarray, "t c h w"]
-    """Opacity of the head (255 is head): the matte, cut below the neck line. It is a memory map if there are many."""
+    """Opacity of the head (255 is head): the matte, cut at the neck. It is a memory map if there are many."""
     crops: Int[np.ndarray, "t c 4"]
     """Left, top, width and height of the head crop in pixels: the box of the mask."""
 
@@ -39,43 +34,23 @@ class Scoring:
 def make_scoring(capture: Capture, tracking: Tracking, face_model: FaceModel, scratch: Path | None = None) -> Scoring:
     """Make masks and head crops of every frame. Masks too large for the memory are in an unnamed file in `scratch`.
 
-    A pixel keeps its matte if it is above the neck line and not far beside the neck, or inside the projected head,
-    because a lowered chin is below the line. Parts that are then not connected to the head are removed.
+    A pixel keeps its matte if it is above the neck cut and not far beside the neck, or inside the projected head,
+    because a lowered chin is below the cut. Parts that are then not connected to the head are removed.
     """
     masks = PictureStack(capture.mattes.shape, scratch)
     crops = np.zeros((*capture.mattes.shape[:2], 4), np.int64)
     head_faces = face_model.faces[~face_model.region_mask("neck")]
-    ring = neck_vertices(face_model)
+    neck = NeckParts.of(face_model)
     for timestep in track_progress(range(capture.timesteps), "Scoring masks", capture.timesteps):
-        vertices = face_model(tracking.face[timestep])[0]
+        face = tracking.face[timestep]
+        vertices = face_model(face)[0]
+        cut = fit_neck_cut(neck, vertices, face.T_world_head[0, :3, 1])
         for index, camera in enumerate(tracking.cameras):
             head = rasterize_mesh(vertices, head_faces, camera).face_index.numpy() >= 0
-            neck = camera.project(vertices[ring])[0].numpy()
-            keep = above_neck_line(tracking.neck_lines[timestep, index].numpy(), neck, camera)
-            mask = cut_matte(np.asarray(capture.mattes[timestep, index]), head, keep)
+            mask = cut_matte(np.asarray(capture.mattes[timestep, index]), head, above_neck_cut(cut, camera))
             masks.write(timestep, index, mask)
             crops[timestep, index] = head_crop(mask)
     return Scoring(masks.array(), crops)
-
-
-def above_neck_line(
-    line: Float[np.ndarray, " 3"], neck: Float[np.ndarray, "n 2"], camera: Camera
-) -> Float[np.ndarray, "h w"]:
-    """1 above the neck line and near the neck, 0 elsewhere, with soft borders one pixel wide.
-
-    Args:
-        line: The neck line (`Tracking.neck_lines`).
-        neck: Projected vertices of the middle of the neck in pixels, which give its place and width.
-        camera: The camera that took the picture.
-    """
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    a, b, d = (float(value) for value in line)
-    above = a * x + b * y + d
-    along = b * x - a * y
-    neck_along = neck @ np.array([b, -a])
-    middle, half_width = (neck_along.max() + neck_along.min()) / 2, np.ptp(neck_along) / 2
-    beside = half_width * _NECK_MARGIN + _SLOPE * above - np.abs(along - middle)
-    return (np.clip(above + 0.5, 0, 1) * np.clip(beside + 0.5, 0, 1)).astype(np.float32)
 
 
 def cut_matte(

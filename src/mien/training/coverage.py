@@ -17,6 +17,7 @@ from mien.face import FaceModel, FaceParams
 from mien.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
+from mien.tracking import NeckCut, NeckParts, fit_neck_cut
 from mien.training.frames import Frame, spread_frames
 from mien.training.sequence import Sequence
 from mien.training.vertex_colors import sample_picture
@@ -29,6 +30,8 @@ _FACING = (0.1, 0.3)
 """Cosines between a triangle's normal and the direction to the camera, between which its view begins to count."""
 _ENOUGH = 1.0
 """Sum of squared cosines over the frames from which a triangle is certain. Rare sights, such as teeth, count fully."""
+_SOFT = 0.001
+"""Distance in metres below the cut at the neck to which a vertex counts as above. It fades over the same distance."""
 _INTERIOR = ("mouth", "teeth", "tongue")
 """Regions inside the mouth. Lips hide them in most frames, so the mesh cannot say which of them pictures show."""
 
@@ -42,7 +45,7 @@ class Coverage:
     colors: Float[Tensor, "f 3"]
     """Mean colours in the pictures, 0..1; 0.5 where `seen` is 0."""
     above: Float[Tensor, " f"]
-    """1 for triangles above the neck line, 0 for those below it, which nothing shows or scores; it fades."""
+    """1 for triangles above the cut at the neck, 0 for those below it, which nothing shows or scores; it fades."""
 
 
 @torch.no_grad()
@@ -70,9 +73,13 @@ def coverage(
     colors, weights, above = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
     chosen = telling_frames(faces, sequences, frames)
 
+    neck = NeckParts.of(face_model)
+
     def seen_in(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
-        return _seen_colors(sequences[frame.sequence], frame, vertices, face_model.faces)
+        face = faces[frame.sequence][frame.timestep]
+        vertices = face_model(face)[0]
+        cut = fit_neck_cut(neck, vertices, face.T_world_head[0, :3, 1])
+        return _seen_colors(sequences[frame.sequence], frame, vertices, face_model.faces, cut)
 
     for own, weight, line in stream_in_threads(seen_in, chosen, threads):
         colors += weight[:, None] * own
@@ -125,9 +132,9 @@ def triangle_views(
 
 
 def _seen_colors(
-    sequence: Sequence, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
+    sequence: Sequence, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], cut: NeckCut
 ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, " f"], Float[Tensor, " f"]]:
-    """Each triangle's colour in one picture, its weight, and whether it is above the neck line (0..1).
+    """Each triangle's colour in one picture, its weight, and whether it is above the cut at the neck (0..1).
 
     The weight is 0 if the triangle is hidden, faces away, or is not part of the head that is scored.
     """
@@ -147,6 +154,7 @@ def _seen_colors(
     weight = cosine.clamp_min(0) ** 2 * facing * visible * smoothstep(2 * head[:, 0] - 1)
     line = sequence.tracking.neck_lines[frame.timestep, frame.camera]
     corners, _ = camera.project(vertices)
-    # All of the triangle has to be above: what hangs over the line is scored as background.
-    above = (corners @ line[:2] + line[2]).clamp(0, 1)[faces.long()].amin(1)
-    return colors, torch.where(inside, weight, 0.0), above
+    # Masks of workspaces from before 2026-11-23 end at the neck line, later ones at the cut.
+    above = torch.minimum((corners @ line[:2] + line[2]).clamp(0, 1), (cut.heights(vertices) / _SOFT + 2).clamp(0, 1))
+    # All of the triangle has to be above: what hangs over the cut is scored as background.
+    return colors, torch.where(inside, weight, 0.0), above[faces.long()].amin(1)

@@ -56,7 +56,7 @@ def read_coverage(run_dir: Path, face_model: FaceModel) -> Coverage | None:
 
 
 def filmed_share(vertices: Float[Tensor, "v 3"], face_model: FaceModel, coverage: Coverage, camera: Camera) -> float:
-    """Mean confidence, 0..1, of the surface above the neck line that a camera sees; 0 if it sees none."""
+    """Mean confidence, 0..1, of the surface above the cut at the neck that a camera sees; 0 if it sees none."""
     index = rasterize_mesh(vertices, face_model.faces, camera).face_index
     shown = index[index >= 0].long()
     above = coverage.above[shown]

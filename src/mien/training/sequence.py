@@ -31,7 +31,7 @@ class Sequence:
     capture: Capture
     tracking: Tracking
     scoring: UInt8[np.ndarray, "t c h w"]
-    """Opacity of the pixels that count (the matte above the neck line). 255 is opaque."""
+    """Opacity of the pixels that count (the matte above the cut at the neck). 255 is opaque."""
     folder: Path | None = None
     """Folder that it was read from, for messages."""
 

@@ -62,7 +62,7 @@ def _seen_colors(
 ) -> tuple[Float[Tensor, "v 3"], Float[Tensor, " v"]]:
     """The colour of each vertex in one frame's target, and its weight: 0 if it is hidden or outside the person.
 
-    The part of the person that the scoring mask cuts off, below the neck line, is white in the target and on the mesh.
+    The part of the person that the scoring mask cuts off, below the neck, is white in the target and on the mesh.
     """
     camera = sequence.tracking.cameras[frame.camera]
     pixels, depth = camera.project(vertices)

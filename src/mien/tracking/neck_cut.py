@@ -1,0 +1,103 @@
+"""The neck cut: where the body is cut off below the head, as one surface in space that all cameras see alike."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.face import FaceModel
+from mien.tracking.neck_line import bottom_vertices, neck_vertices
+
+_RAISED = 0.4
+"""Height of the cut above the base of the neck, as a share of the way to the middle of the neck: above most collars."""
+_BESIDE = 1.15
+"""Radius that is kept at the neck cut, in radii of the neck."""
+_SLOPE = 1.0
+"""Growth of that radius with the height above the cut. Hair is kept; collars and shoulders are cut off."""
+
+
+@dataclass(frozen=True, eq=False)
+class NeckCut:
+    """A plane across the lower neck, and the neck as an elliptic cylinder on it, of one timestep."""
+
+    origin: Float[np.ndarray, " 3"]
+    """Middle of the cylinder on the plane, in world coordinates."""
+    axes: Float[np.ndarray, "3 3"]
+    """Rows: the cylinder's two principal directions, and its axis, which points to the head. Orthonormal."""
+    radii: Float[np.ndarray, " 2"]
+    """Half lengths of the ellipse along the first two axes, in metres."""
+
+    def heights(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Signed distances of points from the plane in metres, positive on the head's side."""
+        origin, up = (torch.from_numpy(vector).to(points) for vector in (self.origin, self.axes[2]))
+        return (points - origin) @ up
+
+
+@dataclass(frozen=True, eq=False)
+class NeckParts:
+    """The vertices of a face model that place the cut."""
+
+    base: Int[Tensor, " n"]
+    """The lowest boundary of the mesh (`bottom_vertices`)."""
+    middle: Int[Tensor, " m"]
+    """The vertices around the middle of the neck (`neck_vertices`)."""
+
+    @classmethod
+    def of(cls, face_model: FaceModel) -> "NeckParts":
+        """The parts of a face model."""
+        return cls(bottom_vertices(face_model), neck_vertices(face_model))
+
+
+def fit_neck_cut(parts: NeckParts, vertices: Float[Tensor, "v 3"], up: Float[Tensor, " 3"]) -> NeckCut:
+    """Fit the cut to a posed mesh.
+
+    The plane is parallel to the one that fits the base of the neck best (total least squares).
+
+    Args:
+        parts: The neck's vertices.
+        vertices: The mesh, in world coordinates in metres.
+        up: A direction on the head's side of the plane.
+    """
+    points, ring = (vertices[indices].double().numpy() for indices in (parts.base, parts.middle))
+    centre = points.mean(0)
+    normal = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, 0]
+    normal = normal if normal @ up.double().numpy() > 0 else -normal
+    offsets = ring - ring.mean(0)
+    flat = offsets - np.outer(offsets @ normal, normal)
+    first = np.linalg.eigh(flat.T @ flat)[1][:, 2]
+    axes = np.stack([first, np.cross(normal, first), normal])
+    radii = np.maximum(np.abs(offsets @ axes[:2].T).max(0), 1e-3)
+    middle = ring.mean(0)
+    return NeckCut(middle - (1 - _RAISED) * normal * ((middle - centre) @ normal), axes, radii)
+
+
+def above_neck_cut(cut: NeckCut, camera: Camera) -> Float[np.ndarray, "h w"]:
+    """1 above the cut and near the neck, 0 elsewhere, with soft borders about one pixel wide.
+
+    The ray of a pixel is judged where it meets the cylinder, or where it passes nearest to its axis. So all cameras
+    cut the skin of a neck at the same place, which a straight line in each picture does not.
+    """
+    to_world = camera.viewmat[:3, :3].double().numpy().T
+    eye = camera.position.double().numpy()
+    inverse = to_world @ np.linalg.inv(camera.K.double().numpy())
+    start = ((eye - cut.origin) @ cut.axes.T).astype(np.float32)
+    turned = cut.axes @ inverse
+    x = np.arange(camera.width, dtype=np.float32)[None] + 0.5
+    y = np.arange(camera.height, dtype=np.float32)[:, None] + 0.5
+    # Rays in the cylinder's frame, of depth 1 along the camera's axis, scaled so that the ellipse is a unit circle.
+    dx, dy, dz = ((row[0] * x + row[1] * y + row[2]).astype(np.float32) for row in turned)
+    px, py = start[:2] / cut.radii
+    dx, dy = dx / np.float32(cut.radii[0]), dy / np.float32(cut.radii[1])
+    a = np.maximum(dx * dx + dy * dy, np.float32(1e-12))
+    half = px * dx + py * dy
+    nearest = -half / a
+    miss = np.maximum(px * px + py * py - half * half / a, 0)
+    depth = nearest - np.sqrt(np.maximum(1 - miss, 0) / a)
+    height = start[2] + depth * dz
+    radius = float(np.sqrt(cut.radii[0] * cut.radii[1]))
+    pixel = np.maximum(depth, np.float32(1e-6)) / np.float32(camera.K[1, 1])
+    beside = radius * (_BESIDE - np.sqrt(miss)) + _SLOPE * height
+    return (np.clip(height / pixel + 0.5, 0, 1) * np.clip(beside / pixel + 0.5, 0, 1)).astype(np.float32)
