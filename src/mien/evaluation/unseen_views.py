@@ -97,8 +97,8 @@ def score_side_views(
 ) -> tuple[Figures, Float[np.ndarray, "h w 3"]]:
     """Figures by angle for the avatar and the mesh in completed colours, and a sheet: truth, avatar, mesh by angle.
 
-    The pictures are cut and cropped as in every other protocol: over white, above the cut at the neck of the true head. An
-    avatar is posed as in `experiment`, and seen by the true camera at the place that it has relative to the tracked
+    The pictures are cut and cropped as in every other protocol: over white, above the cut at the neck of the true head.
+    An avatar is posed as in `experiment`, and seen by the true camera at the place that it has relative to the tracked
     face.
 
     Args:

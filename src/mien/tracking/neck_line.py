@@ -1,4 +1,4 @@
-"""The neck line: a line through the base of a tracked neck in a picture, as in GaussianAvatars; and the neck's vertices."""
+"""The neck line: a line through the base of a tracked neck in a picture. Also the vertices of the neck."""
 
 from collections import defaultdict
 

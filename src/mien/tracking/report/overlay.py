@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.capture.video import write_video
 from mien.face import FaceModel, most_frontal_camera
 from mien.parallel import stream_in_threads
 from mien.progress import track_progress
 from mien.render.mesh import Headlight, render_mesh
+from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.pixels import model_pictures, window_of
 from mien.tracking.report.heat import dimmed, draw_legend, heat_map, write_text
 from mien.tracking.report.rig import seen_from_front, visible_landmarks
@@ -65,6 +65,7 @@ class OverlayPainter:
     def __init__(self, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
         self._capture, self._tracking, self._face_model = capture, tracking, face_model
         self._colors = region_colors(face_model)
+        self._neck = NeckParts.of(face_model)
         self._models = model_pictures(capture, tracking, face_model)
         self._from_front = seen_from_front(tracking)
 
@@ -83,7 +84,7 @@ class OverlayPainter:
     def panels(self, timestep: int, camera_index: int = 0) -> list[UInt8[np.ndarray, "h w 3"]]:
         """The two or four panels of a picture, each of the capture's size.
 
-        The first shows detected (green) and mesh (red) landmarks and the neck line, the second the mesh. With several
+        The first shows detected (green) and mesh (red) landmarks and the neck cut, the second the mesh. With several
         cameras, the first shows the landmarks of the side of the head that faces the camera. If the tracking was fitted
         to pixels, the third shows the model's own picture and the fourth the difference of its colours from the
         capture's.
@@ -120,7 +121,8 @@ class OverlayPainter:
         if np.isfinite(detected).all():
             _draw_points(picture, detected, _GREEN)
         _draw_points(picture, marks, _RED)
-        _draw_line(picture, tracking.neck_lines[timestep, camera_index].numpy(), camera)
+        cut = fit_neck_cut(self._neck, vertices, tracking.face.T_world_head[timestep, :3, 1])
+        _draw_edge(picture, above_neck_cut(cut, camera))
         return picture
 
     def _caption(self, timestep: int, camera_index: int) -> str:
@@ -210,13 +212,10 @@ def _draw_points(image: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "l
         cv2.circle(image, (int(x), int(y)), 1 << _SUBPIXEL_BITS, color, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def _draw_line(image: UInt8[np.ndarray, "h w 3"], line: Float[np.ndarray, " 3"], camera: Camera) -> None:
-    a, b, d = (float(value) for value in line)
-    middle = np.array([camera.width / 2, camera.height / 2])
-    foot = middle - (np.array([a, b]) @ middle + d) * np.array([a, b])
-    reach = (camera.width + camera.height) * np.array([b, -a])
-    (x1, y1), (x2, y2) = _fixed_point(np.stack([foot - reach, foot + reach]))
-    cv2.line(image, (int(x1), int(y1)), (int(x2), int(y2)), _BLUE, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+def _draw_edge(image: UInt8[np.ndarray, "h w 3"], keep: Float[np.ndarray, "h w"]) -> None:
+    """Draw the line between what is kept (1) and what is not (0)."""
+    edge = cv2.morphologyEx((keep > 0.5).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8))
+    image[edge > 0] = _BLUE
 
 
 def _fixed_point(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
