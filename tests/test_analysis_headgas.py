@@ -206,3 +206,12 @@ def test_views_hold_the_head() -> None:
 def test_the_papers_figures() -> None:
     assert [part.name for part in ANALYSES["headgas"].parts if part.trainings] == ["ablations"]
     assert ablations.PAPER["full"][1:] == (28_000, 4.0, 32.50)
+
+
+def test_a_limit_that_all_variants_reach_is_no_finding_about_their_counts() -> None:
+    config = HeadGasConfig(density=GradientSettings(max_gaussians=100))
+    rows = [{"name": name, "gaussians": 100, "head_psnr": None} for name in ("delta", "full")]
+    same, limit = ablations.findings(config, 10, rows)
+    assert "All variants have 100" in same and "--method.density.max-gaussians" in limit
+    few = ablations.findings(config, 10, [rows[0] | {"gaussians": 40}, rows[1] | {"gaussians": 50}])
+    assert len(few) == 1 and "with delta(mu, R) has the fewest Gaussians (40)" in few[0]

@@ -61,7 +61,7 @@ def ablations(context: Context) -> PartResult:
     )  # fmt: skip
     return PartResult(
         {"steps": context.options.steps, "rows": rows},
-        _findings(context, rows),
+        findings(config, context.options.steps, rows),
         (Table(heading, cells, "Scores are those of the head crop, means over held-out frames."),),
         pictures=_picture(context, trained),
         notes=(
@@ -129,12 +129,22 @@ def _cells(row: dict[str, Any]) -> tuple[str | float | int | None, ...]:
     return (label, row["gaussians"], round(row["frame_ms"], 1), *scores, gaussians, milliseconds, psnr)
 
 
-def _findings(context: Context, rows: list[dict[str, Any]]) -> tuple[str, ...]:
-    few = min(rows, key=lambda row: row["gaussians"])
-    found = [
-        f"After {context.options.steps:,} steps, {PAPER[few['name']][0]} has the fewest Gaussians "
-        f"({few['gaussians']:,}); in the paper it is the full method."
-    ]
+def findings(config: HeadGasConfig, steps: int, rows: list[dict[str, Any]]) -> tuple[str, ...]:
+    """What the rows say about the paper's claims: the full method has the fewest Gaussians and the best PSNR."""
+    counts = [row["gaussians"] for row in rows]
+    if len(set(counts)) == 1:
+        found = [f"All variants have {counts[0]:,} Gaussians; in the paper, the full method has the fewest."]
+    else:
+        few = min(rows, key=lambda row: row["gaussians"])
+        found = [
+            f"After {steps:,} steps, {PAPER[few['name']][0]} has the fewest Gaussians "
+            f"({few['gaussians']:,}); in the paper it is the full method."
+        ]
+    if max(counts) >= config.density.max_gaussians:
+        found.append(
+            f"The limit of {config.density.max_gaussians:,} Gaussians was reached, so counts say little; "
+            "analyze a run with a larger --method.density.max-gaussians to compare them."
+        )
     scored = [row for row in rows if row["head_psnr"] is not None]
     if scored:
         best = max(scored, key=lambda row: row["head_psnr"])
