@@ -212,6 +212,8 @@ def test_a_limit_that_all_variants_reach_is_no_finding_about_their_counts() -> N
     config = HeadGasConfig(density=GradientSettings(max_gaussians=100))
     rows = [{"name": name, "gaussians": 100, "head_psnr": None} for name in ("delta", "full")]
     same, limit = ablations.findings(config, 10, rows)
-    assert "All variants have 100" in same and "--method.density.max-gaussians" in limit
+    assert "All variants have 100" in same
+    assert "--method.density.max-gaussians" in limit
     few = ablations.findings(config, 10, [rows[0] | {"gaussians": 40}, rows[1] | {"gaussians": 50}])
-    assert len(few) == 1 and "with delta(mu, R) has the fewest Gaussians (40)" in few[0]
+    assert len(few) == 1
+    assert "with delta(mu, R) has the fewest Gaussians (40)" in few[0]
