@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from mien import runtime
-from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, make_portable
+from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, HeadGas, HeadGasConfig, make_portable
 from mien.face import load_face_model
 from needs import NO_CHROMIUM, NO_NODE, NO_NODE_PACKAGES
 from toy_scene import toy_camera
@@ -97,14 +98,31 @@ def drawn_head(count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head") -
     baked = replace(
         baked, face_index=face_index, means=some(0.2, 3), attributes=attributes, sh_frame=sh_frame, changes=changes
     )
+    return _filling(replace(portable, baked=baked, filmed=filmed))
+
+
+def painted_head(count: int, **config: Any) -> runtime.PortableAvatar:
+    """Return `count` Gaussians of headgas with random features on the mean head of anny, as `drawn_head` stands."""
+    model, generator = load_face_model("anny"), torch.Generator().manual_seed(0)
+    rest = model.neutral(6)
+    face = replace(rest, expression=0.4 * torch.rand(rest.expression.shape, generator=generator))
+    avatar = HeadGas(HeadGasConfig(points=count, **config), model, face)
+    with torch.no_grad():
+        for parameter in avatar.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator) * parameter.std().nan_to_num(0))
+        avatar.store["bases"].copy_(2 * torch.randn(avatar.store["bases"].shape, generator=generator))
+    return _filling(make_portable(avatar, toy_camera(512), "painted"))
+
+
+def _filling(portable: runtime.PortableAvatar) -> runtime.PortableAvatar:
+    """Return the avatar with a head that fills the picture, a little turned."""
     K = np.array([[1300, 0, 256], [0, 1300, 256], [0, 0, 1]], np.float32)
     neutral = replace(
         portable.neutral,
         head_rotation=np.array([0.05, -0.1, 0.02], np.float32),
         head_translation=np.array([0.01, 0.02, -0.9], np.float32),
     )
-    camera = replace(portable.camera, K=K)
-    return replace(portable, baked=baked, neutral=neutral, camera=camera, filmed=filmed)
+    return replace(portable, neutral=neutral, camera=replace(portable.camera, K=K))
 
 
 def faces_of(portable: runtime.PortableAvatar, count: int) -> list[runtime.Face]:

@@ -1,4 +1,5 @@
-// What a .mien file holds, as src/mien/runtime/baked.py documents it. Only bound Gaussians (`MeshBound`) are known here.
+// What a .mien file holds, as src/mien/runtime/baked.py documents it. Only bound Gaussians (`MeshBound`) are known here:
+// `mien export` writes those of headgas bound to a single triangle that never moves.
 
 /** m points of one person that move with expressions and joints. Arrays are row by row. */
 export interface Rig {
@@ -23,6 +24,15 @@ export interface Attributes {
   sh: Float32Array; // [n, s, 3]
 }
 
+/** Features of w numbers that the activations blend, and a network of two layers that makes changes of them. */
+export interface FeatureChanges {
+  neutral: Float32Array; // [n, w]
+  basis: Float32Array; // [n, r, w]
+  own: Float32Array; // [n, _], further inputs of the network
+  weights: Float32Array[]; // of both layers, [out, in]
+  biases: Float32Array[];
+}
+
 /** Changes of the raw values with the expression, of low rank r. */
 export interface ExpressionChanges {
   rest: Float32Array; // [i]
@@ -31,6 +41,7 @@ export interface ExpressionChanges {
   colour: Float32Array | null; // [n, 3, r]
   opacity_logits: Float32Array | null; // [n, r]
   means: Float32Array | null; // [n, 3, r]
+  features?: FeatureChanges | null;
 }
 
 export interface MeshBound {

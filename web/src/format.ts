@@ -8,7 +8,7 @@ type Tree = null | boolean | number | string | Tree[] | { [key: string]: Tree };
 /** A file that cannot be read. Its message is for the user. */
 export class AvatarError extends Error {}
 
-const VERSIONS = [1, 2, 3];
+const VERSIONS = [1, 2, 3, 4, 5];
 const BEYOND = "is damaged: an array lies beyond its end";
 
 /** The avatar in a .mien file. The checksum is not checked: that is the work of `mien`. */
@@ -116,6 +116,15 @@ function checked(avatar: Avatar): Avatar {
     inside(baked.faces, points) && inside(baked.face_index, triangles) && baked.means.length === 3 * count &&
     quats.length === 4 * count && log_scales.length === 3 * count && opacity_logits.length === count &&
     [1, 4, 9, 16].includes(sh.length / 3 / Math.max(count, 1));
+  const features = baked.changes?.features;
+  if (features) {
+    const { neutral, basis, own, weights, biases } = features, rank = baked.changes!.directions.length / baked.changes!.rest.length;
+    const hidden = biases[0].length, inputs = (neutral.length + own.length) / Math.max(count, 1);
+    const whole =
+      weights.length === 2 && biases.length === 2 && basis.length === rank * neutral.length && biases[1].length === 4 &&
+      weights[0].length === hidden * inputs && weights[1].length === 4 * hidden;
+    if (!whole) throw new AvatarError("is damaged: its features do not fit together");
+  }
   if (!fits) throw new AvatarError("is damaged: its arrays do not fit together");
   return avatar;
 }

@@ -1,7 +1,9 @@
 // Draws posed Gaussians with WebGL2: one quad each, from far to near, blended into a picture of half floats.
 
 import type { Avatar } from "./avatar";
+import { FeaturePass } from "./feature_pass";
 import { AvatarError } from "./format";
+import { Program } from "./program";
 import type { Poser } from "./rig";
 import { SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, TEXTURE_WIDTH } from "./shaders";
 
@@ -62,6 +64,7 @@ export class Renderer {
   private readonly order: WebGLBuffer;
   private readonly attributes: WebGLVertexArrayObject;
   private readonly picture: Picture;
+  private readonly features: FeaturePass | null;
 
   constructor(canvas: HTMLCanvasElement, avatar: Avatar, private readonly poser: Poser) {
     const gl = canvas.getContext("webgl2", { antialias: false, depth: false, premultipliedAlpha: true, powerPreference: "high-performance" });
@@ -88,6 +91,9 @@ export class Renderer {
     quats.upload();
     scales.upload();
     sh.upload();
+    const { features } = baked.changes ?? {};
+    this.features = features ? FeaturePass.on(gl, features, this.count) : null;
+    poser.runsNetwork = !this.features;
     this.uploadChanged();
     this.order = gl.createBuffer()!;
     this.attributes = gl.createVertexArray()!;
@@ -106,7 +112,7 @@ export class Renderer {
   upload(): void {
     this.arrays.frames.values.set(this.poser.frames);
     this.arrays.frames.upload();
-    if (this.poser.hasChanges) this.uploadChanged();
+    if (this.poser.changed) this.uploadChanged();
   }
 
   /** Draws the Gaussians in the given order over a background. */
@@ -115,7 +121,10 @@ export class Renderer {
     this.picture.begin(view.width, view.height);
     splats.use();
     ARRAYS.forEach((name, unit) => {
-      this.arrays[name].bind(unit);
+      if (name === "colours" && this.features) {
+        gl.activeTexture(gl.TEXTURE0 + unit);
+        gl.bindTexture(gl.TEXTURE_2D, this.features.output);
+      } else this.arrays[name].bind(unit);
       gl.uniform1i(splats.uniform(`u_${name}`), unit);
     });
     gl.uniform4fv(splats.uniform("u_view"), Float32Array.from(view.head));
@@ -144,9 +153,11 @@ export class Renderer {
     const { means, colours } = this.arrays, { poser } = this;
     spread(poser.means, means.values);
     spread(poser.colours, colours.values);
-    poser.opacityLogits.forEach((logit, i) => (colours.values[4 * i + 3] = 1 / (1 + Math.exp(-logit))));
+    const { features } = this;
+    poser.opacityLogits.forEach((logit, i) => (colours.values[4 * i + 3] = features ? logit : 1 / (1 + Math.exp(-logit))));
     means.upload();
     colours.upload();
+    features?.run((unit) => colours.bind(unit), poser.activations);
   }
 }
 
@@ -196,34 +207,5 @@ class Picture {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
-  }
-}
-
-class Program {
-  readonly program: WebGLProgram;
-  private readonly uniforms = new Map<string, WebGLUniformLocation | null>();
-
-  constructor(private readonly gl: WebGL2RenderingContext, vertex: string, fragment: string) {
-    this.program = gl.createProgram()!;
-    for (const [type, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]] as const) {
-      const shader = gl.createShader(type)!;
-      gl.shaderSource(shader, source);
-      gl.compileShader(shader);
-      gl.attachShader(this.program, shader);
-    }
-    gl.linkProgram(this.program);
-    if (!gl.getProgramParameter(this.program, gl.LINK_STATUS) && !gl.isContextLost()) {
-      const logs = gl.getAttachedShaders(this.program)!.map((shader) => gl.getShaderInfoLog(shader));
-      throw new Error(`shaders: ${[...logs, gl.getProgramInfoLog(this.program)].filter(Boolean).join("; ")}`);
-    }
-  }
-
-  use(): void {
-    this.gl.useProgram(this.program);
-  }
-
-  uniform(name: string): WebGLUniformLocation | null {
-    if (!this.uniforms.has(name)) this.uniforms.set(name, this.gl.getUniformLocation(this.program, name));
-    return this.uniforms.get(name)!;
   }
 }

@@ -2,6 +2,7 @@
 // src/mien/runtime/posing.py, FaceModel.head_vertices_reference and triangle_frames.
 
 import type { ExpressionChanges, Face, MeshBound, Rig } from "./avatar";
+import { FeatureNetwork } from "./features";
 import { chained, rigid, rotationMatrix } from "./rigid";
 
 /** Rows of a basis [rows, m, 3] without its zeros: most expressions move a small part of the face. */
@@ -181,7 +182,15 @@ export class Poser {
   /** The rig's points in the head frame. */
   points: Float32Array = new Float32Array();
   private readonly rig: RigPoser;
+  /** The activations of the changes at the last face. */
+  activations: Float64Array;
+  /** Whether the last face has changed means, colours or opacities. */
+  changed = false;
+  /** Whether posing runs the network of features. Not where the renderer runs it on the GPU. */
+  runsNetwork = true;
   private readonly restColours: Float32Array;
+  private readonly network: FeatureNetwork | null;
+  private posed = false;
 
   constructor(private readonly baked: MeshBound) {
     const { attributes, faces, means } = baked, count = baked.face_index.length;
@@ -193,11 +202,9 @@ export class Poser {
     this.restColours = new Float32Array(3 * count);
     for (let i = 0; i < count; ++i) this.restColours.set(attributes.sh.subarray(i * width, i * width + 3), 3 * i);
     this.colours = this.restColours.slice();
-  }
-
-  /** Whether means, opacities and colours change with the face. */
-  get hasChanges(): boolean {
-    return this.baked.changes != null;
+    const { changes } = baked, features = changes?.features;
+    this.activations = new Float64Array(changes ? changes.directions.length / changes.rest.length : 0);
+    this.network = features ? new FeatureNetwork(features, count) : null;
   }
 
   pose(face: Face): void {
@@ -205,10 +212,19 @@ export class Poser {
     triangleFrames(this.points, this.baked.faces, this.frames);
     const { changes, attributes } = this.baked;
     if (!changes) return;
-    const weights = activations(changes, face);
+    const weights = activations(changes, face), before = this.activations;
+    this.activations = weights;
+    // Turns of the head alone change none of this.
+    this.changed = !this.posed || weights.some((weight, k) => weight !== before[k]);
+    if (!this.changed) return;
+    this.posed = true;
     changed(this.baked.means, changes.means, weights, this.means);
     changed(attributes.opacity_logits, changes.opacity_logits, weights, this.opacityLogits);
     changed(this.restColours, changes.colour, weights, this.colours);
+    if (!this.network || !this.runsNetwork) return;
+    if (!changes.opacity_logits) this.opacityLogits.set(attributes.opacity_logits);
+    if (!changes.colour) this.colours.set(this.restColours);
+    this.network.add(weights, this.colours, this.opacityLogits);
   }
 
   /** Depths of the centres along a row of a view of the head frame: x view[0] + y view[1] + z view[2] + view[3]. */

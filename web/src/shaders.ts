@@ -1,6 +1,8 @@
 // The kernel of the native renderer (native/rasterize_geometry.h, rasterize_project.h, rasterize_blend.h): the same
 // projection, dilation, cutoff and largest alpha.
 
+import { SLOPE } from "./features";
+
 /** Width of the textures that hold arrays. Every WebGL2 device has at least 2048. */
 export const TEXTURE_WIDTH = 1024;
 
@@ -112,3 +114,41 @@ void main() {
   c += (1. - c.a) * u_background;
   o_colour = vec4(clamp(c.rgb, 0., c.a), c.a);
 }`;
+
+/** Width of the textures that hold the arrays of features. Every WebGL2 device has at least 2048. */
+export const FEATURE_WIDTH = 2048;
+
+/** The network of features.ts at one pixel for each Gaussian: with `texels` of features, `rank` directions, `hidden` units. */
+export function featureFragment(texels: number, rank: number, hidden: number): string {
+  return `#version 300 es
+precision highp float; precision highp int; precision highp sampler2D;
+uniform sampler2D u_rest, u_neutral, u_basis, u_own, u_weights;
+uniform float u_activations[${rank}];
+uniform vec4 u_bias;
+uniform int u_count;
+out vec4 o_colour;
+vec4 at(sampler2D array, int i) { return texelFetch(array, ivec2(i & ${FEATURE_WIDTH - 1}, i >> ${Math.log2(FEATURE_WIDTH)}), 0); }
+void main() {
+  ivec2 place = ivec2(gl_FragCoord.xy);
+  int i = place.y * ${TEXTURE_WIDTH} + place.x;
+  if (i >= u_count) discard;
+  vec4 f[${texels}];
+  for (int t = 0; t < ${texels}; ++t) f[t] = at(u_neutral, i * ${texels} + t);
+  for (int k = 0; k < ${rank}; ++k) {
+    float a = u_activations[k];
+    if (a != 0.) for (int t = 0; t < ${texels}; ++t) f[t] += a * at(u_basis, (i * ${rank} + k) * ${texels} + t);
+  }
+  vec4 sum = u_bias;
+  for (int q = 0; q < ${hidden / 4}; ++q) {
+    vec4 own = at(u_own, i * ${hidden / 4} + q);
+    for (int c = 0; c < 4; ++c) {
+      int w = (4 * q + c) * ${texels + 1};
+      float x = own[c];
+      for (int t = 0; t < ${texels}; ++t) x += dot(at(u_weights, w + t), f[t]);
+      sum += at(u_weights, w + ${texels}) * (x < 0. ? ${SLOPE} * x : x);
+    }
+  }
+  sum += texelFetch(u_rest, place, 0);
+  o_colour = vec4(sum.rgb, 1. / (1. + exp(-sum.a)));
+}`;
+}

@@ -43,7 +43,9 @@ export class Viewer {
     const count = avatar.baked.face_index.length;
     this.sorter = new DepthSorter(count);
     this.depths = new Float32Array(count);
-    this.middle = middleOf(avatar.baked.rig.template);
+    // A rig of one triangle holds Gaussians that follow no mesh.
+    const { rig, means } = avatar.baked;
+    this.middle = middleOf(rig.template.length > 9 ? rig.template : means);
     this.renderer = new Renderer(canvas, avatar, this.poser);
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => {

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from mien.errors import UserError
-from mien.runtime import Face, MeshBound, PortableAvatar
+from mien.export.bound_features import bound_features
+from mien.runtime import Face, MeshBound, PortableAvatar, Static
 
 FORMAT, VERSION = "mien.packed", 1
 
@@ -52,6 +53,8 @@ class _Code:
     axis: Literal["first", "columns"]
     signed: bool = False
     """Whether the middle is zero, so that zeros stay zeros."""
+    levels: int | None = None
+    """Largest integer, if it is smaller than that of the bits: fewer levels compress better."""
 
 
 _CODES = {
@@ -63,6 +66,9 @@ _CODES = {
     "avatar.baked.changes.colour": _Code(8, "columns", signed=True),
     "avatar.baked.changes.opacity_logits": _Code(8, "columns", signed=True),
     "avatar.baked.changes.means": _Code(8, "columns", signed=True),
+    "avatar.baked.changes.features.neutral": _Code(8, "columns"),
+    "avatar.baked.changes.features.basis": _Code(8, "columns", signed=True, levels=31),
+    "avatar.baked.changes.features.own": _Code(8, "columns"),
     "avatar.baked.rig.template": _Code(16, "columns"),
     "avatar.baked.rig.expression_basis": _Code(16, "first", signed=True),
     "avatar.baked.rig.pose_basis": _Code(8, "first", signed=True),
@@ -80,10 +86,10 @@ _OPACITY_LOGITS = (-6.5, 7.5)
 
 
 def pack(avatar: PortableAvatar, motion: Motion | None = None) -> bytes:
-    """The packed form of a bound avatar, with a motion or without. The same input gives the same bytes.
+    """The packed form of an avatar, with a motion or without. The same input gives the same bytes.
 
     Raises:
-        UserError: the avatar is not `MeshBound`, or has features.
+        UserError: the avatar is neither `MeshBound` nor one of headgas that pages can draw.
     """
     tensors: dict[str, dict[str, Any]] = {}
     pieces: list[bytes] = []
@@ -102,15 +108,12 @@ def unpacked(avatar: PortableAvatar) -> PortableAvatar:
 def _prepared(avatar: PortableAvatar) -> PortableAvatar:
     """The same avatar in the order of its triangles, with unit rotations, and without invisible differences."""
     baked = avatar.baked
+    if isinstance(baked, Static):
+        baked = bound_features(avatar)
     if not isinstance(baked, MeshBound):
         raise UserError(
-            f"{avatar.about.name}: a page draws avatars of gaussian_avatars, not of {avatar.about.method}; train one "
-            "with --method gaussian_avatars, or export a .mien"
-        )
-    if baked.changes is not None and baked.changes.features is not None:
-        raise UserError(
-            f"{avatar.about.name}: a page cannot hold features of Gaussians (--method.appearance); export a .mien, or "
-            "train a run with --method.appearance static"
+            f"{avatar.about.name}: a page draws avatars of gaussian_avatars and headgas, not of {avatar.about.method}; "
+            "train one of these, or export a .mien"
         )
     order = np.argsort(baked.face_index, kind="stable")
     raw = baked.attributes
@@ -130,6 +133,9 @@ def _prepared(avatar: PortableAvatar) -> PortableAvatar:
     if changes is not None:
         parts = {name: getattr(changes, name) for name in ("colour", "opacity_logits", "means")}
         changes = replace(changes, **{name: part[order] for name, part in parts.items() if part is not None})
+        if (features := changes.features) is not None:
+            rows = {name: getattr(features, name)[order] for name in ("neutral", "basis", "own")}
+            changes = replace(changes, features=replace(features, **rows))
     baked = replace(
         baked, face_index=baked.face_index[order], means=baked.means[order], attributes=attributes, changes=changes
     )
@@ -144,7 +150,7 @@ def _grouped(array: np.ndarray, code: _Code) -> np.ndarray:
 
 def _quantise(array: np.ndarray, code: _Code) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Integers by group, and each group's middle and step."""
-    rows, most = _grouped(array, code), 2 ** (code.bits - 1) - 1
+    rows, most = _grouped(array, code), code.levels or 2 ** (code.bits - 1) - 1
     low, high = rows.min(1, initial=np.inf), rows.max(1, initial=-np.inf)
     low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, 0.0)
     middle = np.zeros(len(rows)) if code.signed else (low + high) / 2
@@ -166,7 +172,9 @@ def _tree(value: Any, path: str, tensors: dict[str, dict[str, Any]], pieces: lis
         return {"kind": type(value).__name__} | _tree(inside, path, tensors, pieces)
     if isinstance(value, dict):
         return {name: _tree(item, f"{path}.{name}".lstrip("."), tensors, pieces) for name, item in value.items()}
-    return list(value) if isinstance(value, tuple) else value
+    if isinstance(value, tuple):
+        return [_tree(item, f"{path}.{index}", tensors, pieces) for index, item in enumerate(value)]
+    return value
 
 
 def _stored(array: np.ndarray, code: _Code | None) -> tuple[dict[str, Any], bytes]:

@@ -1,0 +1,95 @@
+"""Gaussians of headgas in the form of bound ones, which web pages draw: features on one triangle that never moves.
+
+A .mien file has a basis of features for each input of the face. Here they are written along few directions of the face.
+Avatars are trained along 20 directions, so this loses nothing.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from mien.errors import UserError
+from mien.runtime import MeshBound, PortableAvatar, Rig, Static
+from mien.runtime.baked import AttributeNetwork, ExpressionChanges, FeatureChanges
+
+_UNIT_FRAME = np.array([[-1 / 3, 0, 1 / 3], [2 / 3, 0, 1 / 3], [-1 / 3, 0, -2 / 3]], np.float32)
+"""A triangle whose frame is the head's: the first edge is +x, the normal +y, the centre the origin, the size 1."""
+_LEAST_SHARE = 1e-9
+"""Share of the largest direction's energy, of those that are kept."""
+_REACH = np.float32(1e6)
+"""Length of activations that no face has, so that none is shortened."""
+
+
+def bound_features(avatar: PortableAvatar) -> MeshBound:
+    """The Gaussians of an avatar of headgas as features on one triangle. They look the same.
+
+    Raises:
+        UserError: the network is not that of headgas, or colours depend on the view.
+    """
+    baked = avatar.baked
+    assert isinstance(baked, Static)
+    network, name = baked.network, avatar.about.name
+    if network is None or len(network.weights) != 2 or network.outputs != ("sh", "opacity_logits"):
+        raise UserError(
+            f"{name}: a page draws avatars of headgas with --method.variant full; train one, or export a .mien"
+        )
+    if baked.attributes.sh.shape[1] != 1:
+        raise UserError(
+            f"{name}: colours depend on the view ({baked.attributes.sh.shape[1]} coefficients), and a page draws "
+            "avatars of headgas with one colour; train with --method.sh-degree 0, or export a .mien"
+        )
+    directions, basis = _factored(network)
+    width = basis.shape[2]
+    changes = ExpressionChanges(
+        rest=np.zeros(len(directions), np.float32),
+        directions=directions,
+        reach=np.array([_REACH]),
+        features=FeatureChanges(
+            neutral=np.ascontiguousarray(network.base[:, :width]),
+            basis=basis,
+            own=np.ascontiguousarray(network.base[:, width:]),
+            weights=network.weights,
+            biases=network.biases,
+        ),
+    )
+    return MeshBound(
+        rig=_still_rig(avatar),
+        faces=np.array([[0, 1, 2]], np.int32),
+        face_index=np.zeros(len(baked.means), np.int32),
+        means=baked.means,
+        attributes=baked.attributes,
+        sh_frame="head",
+        changes=changes,
+    )
+
+
+def _factored(network: AttributeNetwork) -> tuple[Float[np.ndarray, "i r"], Float[np.ndarray, "n r w"]]:
+    """Directions of the face and the features' change along each, whose product is the basis of every input."""
+    parts = [network.basis, *([] if network.joint_basis is None else [network.joint_basis])]
+    inputs = np.concatenate(parts)
+    _, n, width = inputs.shape
+    flat = inputs.reshape(len(inputs), -1).astype(np.float64)
+    energies, vectors = np.linalg.eigh(flat @ flat.T)
+    keep = np.flatnonzero(energies > _LEAST_SHARE * max(energies[-1], np.finfo(np.float64).tiny))[::-1]
+    directions = vectors[:, keep]
+    basis = (directions.T @ flat).reshape(len(keep), n, width).transpose(1, 0, 2)
+    return np.ascontiguousarray(directions, np.float32), np.ascontiguousarray(basis, np.float32)
+
+
+def _still_rig(avatar: PortableAvatar) -> Rig:
+    """One triangle on a root joint. The face's joints are there, and move nothing."""
+    e, names = len(avatar.expression_names), ("root", *avatar.joint_names)
+    k = len(names)
+    weights = np.zeros((3, k), np.float32)
+    weights[:, 0] = 1
+    return Rig(
+        template=_UNIT_FRAME,
+        expression_names=avatar.expression_names,
+        expression_basis=np.zeros((e, 3, 3), np.float32),
+        joint_names=names,
+        joint_parents=(-1, *(0 for _ in avatar.joint_names)),
+        joint_free=(False, *(True for _ in avatar.joint_names)),
+        joint_template=np.zeros((k, 3), np.float32),
+        joint_rotation_basis=np.zeros((e, k, 3), np.float32),
+        joint_translation_basis=np.zeros((e, k, 3), np.float32),
+        skinning_weights=weights,
+    )
