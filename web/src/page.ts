@@ -1,7 +1,9 @@
 // The page that `mien export --out NAME.html` writes: the avatar on a canvas, sliders by group, the packed motion.
 
+import { enliven, type Life } from "./alive";
 import { motionLength } from "./avatar";
 import { AvatarError, readPacked } from "./format";
+import { readSeries } from "./series";
 import { Viewer } from "./viewer";
 
 const GROUPS: [string, RegExp][] = [
@@ -108,14 +110,15 @@ function addTurning(viewer: Viewer): void {
   });
 }
 
-/** Play, pause, and a time line, if there is a motion. */
+/** Play, pause, and a time line, while there is a motion. Files that are chosen or dropped become the motion. */
 function addMotion(viewer: Viewer, moveSliders: () => void): void {
-  const { motion } = viewer;
-  if (!motion) return;
-  const button = find<HTMLButtonElement>("play"), time = find<HTMLInputElement>("time");
-  find("motion").hidden = false;
-  time.max = `${motionLength(motion) - 1}`;
+  const button = find<HTMLButtonElement>("play"), time = find<HTMLInputElement>("time"), file = find<HTMLInputElement>("file");
   const show = () => (button.textContent = viewer.playing ? "Pause" : "Play");
+  const take = () => {
+    find("motion").hidden = !viewer.motion;
+    if (viewer.motion) time.max = `${motionLength(viewer.motion) - 1}`;
+  };
+  take();
   viewer.onMotion = () => {
     time.value = `${viewer.timestep}`;
     moveSliders();
@@ -136,6 +139,54 @@ function addMotion(viewer: Viewer, moveSliders: () => void): void {
     viewer.seek(Number(time.value));
   });
   find("panel").addEventListener("input", show);
+  const open = async (given: File | undefined) => {
+    if (!given) return;
+    const message = find("message");
+    message.textContent = "";
+    try {
+      viewer.setMotion(readSeries(await given.text(), viewer.avatar));
+      take();
+      toggle();
+    } catch (error) {
+      message.textContent = `${given.name} ${error instanceof AvatarError ? error.message : "cannot be read"}. Give a csv of Live Link Face, or blend shapes as json.`;
+    }
+  };
+  file.addEventListener("change", () => open(file.files?.[0]));
+  addEventListener("dragover", (event) => event.preventDefault());
+  addEventListener("drop", (event) => {
+    event.preventDefault();
+    open(event.dataTransfer?.files[0]);
+  });
+}
+
+/** Blinks and small movements, and eyes that follow the pointer, while no motion plays. */
+function addLife(viewer: Viewer): void {
+  const idle = find<HTMLInputElement>("idle"), gaze = find<HTMLInputElement>("gaze"), { canvas, avatar, face } = viewer;
+  const life: Life = { idle: false, pointer: null };
+  let waiting = false;
+  const live = (now: number) => {
+    waiting = life.idle || life.pointer !== null;
+    if (!viewer.playing) {
+      enliven(face, avatar, life, now / 1000);
+      viewer.change();
+    }
+    if (waiting) requestAnimationFrame(live);
+  };
+  const wake = () => {
+    life.idle = idle.checked;
+    life.pointer = gaze.checked ? (life.pointer ?? [0, 0]) : null;
+    if (!waiting) requestAnimationFrame(live);
+  };
+  idle.addEventListener("change", wake);
+  gaze.addEventListener("change", wake);
+  addEventListener("pointermove", (event) => {
+    if (!life.pointer) return;
+    const box = canvas.getBoundingClientRect();
+    const share = (at: number, middle: number, size: number) => Math.min(Math.max((2 * (at - middle)) / Math.max(size, 1), -1), 1);
+    life.pointer = [
+      share(event.clientX, box.left + box.width / 2, box.width), -share(event.clientY, box.top + box.height / 2, box.height),
+    ];
+  });
 }
 
 function addRest(viewer: Viewer, moveSliders: () => void): void {
@@ -180,6 +231,7 @@ async function open(): Promise<Viewer> {
   moveSliders();
   addTurning(viewer);
   addMotion(viewer, moveSliders);
+  addLife(viewer);
   addRest(viewer, moveSliders);
   new ResizeObserver(() => fit(viewer)).observe(viewer.canvas);
   fit(viewer);

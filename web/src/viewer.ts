@@ -37,7 +37,7 @@ export class Viewer {
   private before = 0;
   private since = 0;
 
-  constructor(readonly canvas: HTMLCanvasElement, readonly avatar: Avatar, readonly motion: Motion | null = null) {
+  constructor(readonly canvas: HTMLCanvasElement, readonly avatar: Avatar, public motion: Motion | null = null) {
     this.face = copyFace(avatar.neutral);
     this.poser = new Poser(avatar.baked);
     const count = avatar.baked.face_index.length;
@@ -83,6 +83,13 @@ export class Viewer {
     this.timestep = timestep;
     this.take(motionFace(this.motion, timestep));
     this.onMotion();
+  }
+
+  /** Takes another motion, and shows its first timestep. */
+  setMotion(motion: Motion | null): void {
+    this.motion = motion;
+    this.play(false);
+    this.seek(0);
   }
 
   play(playing = true): void {

