@@ -55,8 +55,8 @@ def recordings(folder: Path) -> list[Path]:
         folder / "take.csv",
         *(
             row(
-                f"0:00:00:{2 * index:02d}.0", JawOpen=index / 8, EyeBlinkLeft=0.5, EyeLookOutLeft=0.4, EyeLookInRight=0.4,
-                EyeLookUpLeft=0.2, HeadYaw=yaw, HeadPitch=pitch, HeadRoll=roll,
+                f"0:00:00:{2 * index:02d}.0", JawOpen=index / 8, EyeBlinkLeft=0.5, EyeLookOutLeft=0.4,
+                EyeLookInRight=0.4, EyeLookUpLeft=0.2, HeadYaw=yaw, HeadPitch=pitch, HeadRoll=roll,
             )
             for index, (yaw, pitch, roll) in enumerate(turns)
         ),
