@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from mien.capture import CaptureSettings
-from mien.commands.options import TrainOptions
+from mien.commands.options import TrainOptions, check_viewer
 from mien.errors import UserError
 from mien.tracking import TrackingSettings
 from mien.training import NAMED_SPLIT
@@ -43,6 +43,8 @@ class Command:
     overlay: Literal["auto", "all", "none"] = "auto"
     """Frames in overlay.mp4: every frame (all), every n-th frame of long clips, at most 3,000 (auto), or no overlay
     (none)."""
+    view: bool = False
+    """Show the avatar in a browser while it trains (docs/viewer.md)."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
@@ -52,6 +54,8 @@ class Command:
         from mien.commands.stages.names import rig_name, run_name, sequence_names
 
         self.options.check()
+        if self.view:
+            check_viewer()
         if self.options.settings().split == NAMED_SPLIT:
             raise UserError(
                 f"--split {NAMED_SPLIT}: needs ten sequences of calibrated cameras, and this command makes one; use "
@@ -111,7 +115,8 @@ class Command:
             preview=self.preview,
             hold_out=settings.held_out_sequences if self.track_apart else (),
         )
-        run_training_stage(workspace, [name for name in captured if name in trackings], run, method, settings)
+        together = [name for name in captured if name in trackings]
+        run_training_stage(workspace, together, run, method, settings, self.view)
         if settings.holds_out:
             run_evaluation_stage(workspace, run, again=False)
         which = ["--run", run] if len(workspace.run_names()) > 1 else []

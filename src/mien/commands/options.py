@@ -1,6 +1,7 @@
 """Options that several sub-commands share: the method, the preset, and the settings in detail."""
 
 import argparse
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -200,6 +201,16 @@ def _chosen(arguments: Sequence[str]) -> argparse.Namespace:
     for name in ("method", "preset", "config"):
         parser.add_argument(f"--{name}", nargs="?")
     return parser.parse_known_args(list(arguments))[0]
+
+
+def check_viewer() -> None:
+    """Check that the package of the viewer's page is installed.
+
+    Raises:
+        UserError: it is missing.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")
 
 
 def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> None:

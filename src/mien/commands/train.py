@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.options import TrainOptions
+from mien.commands.options import TrainOptions, check_viewer
 from mien.errors import UserError
 from mien.training import NAMED_SPLIT, NamedSplit, check_held_out, split_by_name, with_named_split
 from mien.workspace import Workspace, open_workspace
@@ -22,6 +22,8 @@ class Command:
     """Names of the sequences (default: all tracked ones). Those of --hold-out belong to the run as well."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the method's name)."""
+    view: bool = False
+    """Show the avatar in a browser while it trains (docs/viewer.md)."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
 
     def check(self) -> None:
@@ -29,6 +31,8 @@ class Command:
         from mien.commands.stages.names import run_name
 
         self.options.check()
+        if self.view:
+            check_viewer()
         workspace, settings = open_workspace(self.workspace), self.options.settings()
         run_name(self.run_name or self.options.method)
         names = self._names(workspace)
@@ -52,7 +56,7 @@ class Command:
             names, settings = list(split.sequences), fill_in_named_split(workspace, settings, split)
         check_run(workspace.run_dir(run), method, settings, names)
         self.options.say_what_is_ignored()
-        run_training_stage(workspace, names, run, method, settings)
+        run_training_stage(workspace, names, run, method, settings, self.view)
 
     def _named_split(self, names: list[str]) -> NamedSplit:
         return split_by_name(names, self.workspace.resolve().name, self.options.subject)

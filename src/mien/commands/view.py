@@ -1,13 +1,12 @@
 """`mien view`: an avatar in a browser."""
 
-import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from mien.commands.options import check_driver
+from mien.commands.options import check_driver, check_viewer
 from mien.errors import UserError
 from mien.workspace import open_workspace
 
@@ -27,6 +26,8 @@ class Command:
     """A motion to choose from, beside the workspace's own sequences: anything that `mien drive --by` takes."""
     port: int = 0
     """Port of the server, from 1 to 65535. 0 means a free one."""
+    follow: bool = False
+    """Show the .mien file anew each time it changes."""
     host: str = _LOOPBACK
     """Address to listen on. Beyond loopback, for example 0.0.0.0, browsers need the token in the printed address."""
 
@@ -41,15 +42,16 @@ class Command:
             raise UserError(f"{self.avatar}: no such file; write one with `mien export DIR --out me.mien`")
         else:
             open_workspace(self.avatar).pick_run(self.run_name)
+        if self.follow and not self.avatar.is_file():
+            raise UserError(f"--follow: needs a .mien file, and {self.avatar} is a workspace; leave --follow out")
         if not 0 <= self.port <= _MAX_PORT:
             raise UserError(f"--port {self.port}: give a number from 1 to {_MAX_PORT}, or 0 for a free one")
         if self.play is not None:
             check_driver(Path(self.play), None)
-        if importlib.util.find_spec("viser") is None:
-            raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")
+        check_viewer()
 
     def run(self) -> None:
         """Load the avatar, and show it until Ctrl-C."""
-        from mien.commands.stages.viewing import run_viewing_stage
+        from mien.commands.stages.viewing import Place, run_viewing_stage
 
-        run_viewing_stage(self.avatar, self.run_name, self.play, self.host, self.port)
+        run_viewing_stage(self.avatar, self.run_name, self.play, Place(self.host, self.port), self.follow)

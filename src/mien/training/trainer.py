@@ -64,6 +64,8 @@ from mien.training.vertex_colors import vertex_colors
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
 """(title, total, completed) -> a context manager whose value moves the bar on."""
+Watch = Callable[[Avatar], None]
+"""Is called with the avatar after each step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +106,11 @@ def train(
     settings: TrainSettings,
     run_dir: Path,
     progress: ProgressBar = progress_bar,
+    watch: Watch | None = None,
 ) -> Avatar:
     """Train an avatar on some sequences of one subject. The result is also in `run_dir`.
+
+    `watch` is called after each step. It must not change the avatar.
 
     If `run_dir` holds a stopped run with the same settings, training continues where it stopped, and the result has the
     same bytes as without the stop. If that run is finished, its avatar is loaded.
@@ -140,12 +145,18 @@ def train(
         targets = [
             Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside) for sequence in sequences
         ]
-        _train_to_the_end(state, TrainingData(order, tuple(targets), extent), settings, run_dir, progress)
+        data = TrainingData(order, tuple(targets), extent)
+        _train_to_the_end(state, data, settings, run_dir, progress, watch)
     return state.avatar
 
 
 def _train_to_the_end(
-    state: TrainingState, data: TrainingData, settings: TrainSettings, run_dir: Path, progress: ProgressBar
+    state: TrainingState,
+    data: TrainingData,
+    settings: TrainSettings,
+    run_dir: Path,
+    progress: ProgressBar,
+    watch: Watch | None,
 ) -> None:
     """Continue from the newest checkpoint, if there is one, and write the results."""
     resume(run_dir / "checkpoints", state)
@@ -163,6 +174,8 @@ def _train_to_the_end(
                 except CannotDrawError as error:
                     raise _diverged(run_dir, state, str(error)) from None
                 advance(1, status)
+                if watch is not None:
+                    watch(state.avatar)
                 if state.step % settings.checkpoint_every == 0 or interrupted():
                     _check_finite(run_dir, state)
                     write_checkpoint(run_dir / "checkpoints", state)

@@ -90,6 +90,12 @@ class Session:
         """Number of changes so far."""
         return self._version
 
+    def replace_avatar(self, avatar: runtime.Avatar) -> None:
+        """Show another state of the same person's avatar. The face stays."""
+        with self._lock:
+            self.avatar, self._posed = avatar, None
+            self._change()
+
     def set_expression(self, name: str, value: float) -> None:
         """Set one expression, within the bounds of the face model. What plays is paused."""
         index = self.avatar.expression_names.index(name)

@@ -1,7 +1,10 @@
 """From sequences to a run, as the command line runs it."""
 
+from contextlib import ExitStack
+
 from mien.avatar import MethodConfig
 from mien.capture import read_capture
+from mien.commands.stages.live_view import LiveView
 from mien.face import FaceModel, load_face_model
 from mien.locks import read_beside_writers
 from mien.progress import say
@@ -37,9 +40,17 @@ def fill_in_named_split(workspace: Workspace, settings: TrainSettings, split: Na
 
 
 def run_training_stage(
-    workspace: Workspace, sequences: list[str], run: str, method: MethodConfig, settings: TrainSettings
+    workspace: Workspace,
+    sequences: list[str],
+    run: str,
+    method: MethodConfig,
+    settings: TrainSettings,
+    view: bool = False,
 ) -> None:
-    """Train a run on some sequences of the workspace. An interrupted run continues; a finished run stays as it is."""
+    """Train a run on some sequences of the workspace. An interrupted run continues; a finished run stays as it is.
+
+    With `view`, browsers can watch it.
+    """
     run_dir = workspace.run_dir(run)
     check_untouched(run_dir)
     folders = [workspace.sequence_dir(name) for name in sequences]
@@ -51,6 +62,10 @@ def run_training_stage(
         return read, face_model
 
     loaded, face_model = read_beside_writers(read_together, [folder / "tracking" for folder in folders], folders)
-    train(loaded, face_model, method, settings, run_dir)
+    with ExitStack() as closing:
+        live = LiveView(run, loaded[0].tracking.cameras[0]) if view else None
+        if live is not None:
+            closing.callback(live.close)
+        train(loaded, face_model, method, settings, run_dir, watch=live)
     summary = read_training_summary(run_dir)
     say(f"{run}: {summary['gaussians']:,} Gaussians after {summary['steps']:,} steps in {summary['seconds']:.0f} s")

@@ -1,5 +1,10 @@
 """From a workspace or a .mien file to a viewer, as the command line runs it."""
 
+import contextlib
+import os
+import signal
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +15,7 @@ import torch
 from mien import runtime
 from mien.avatar import as_array, bake_rig, load_avatar, make_portable
 from mien.commands.stages.driving import open_driver
+from mien.commands.stages.live_view import PARENT
 from mien.driving import drive, keep_to_filmed
 from mien.errors import UserError
 from mien.export import Motion
@@ -20,6 +26,8 @@ from mien.training import read_coverage, run_camera
 from mien.training.run import filmed_range
 from mien.viewer import Clip, Door, Mesh, Session, serve
 from mien.workspace import open_workspace
+
+_FOLLOW_SECONDS = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,22 +42,57 @@ class Viewed:
     """Returns the face model and the person at rest, which motions need."""
 
 
-def run_viewing_stage(avatar: Path, run: str | None, play: str | None, host: str, port: int) -> None:
-    """Show an avatar in browsers until Ctrl-C."""
+@dataclass(frozen=True)
+class Place:
+    """Where a viewer listens."""
+
+    host: str
+    port: int
+    """0 means a free one."""
+
+
+def run_viewing_stage(avatar: Path, run: str | None, play: str | None, place: Place, follow: bool = False) -> None:
+    """Show an avatar in browsers until Ctrl-C. With `follow`, show its file anew each time it changes."""
     viewed = _of_file(avatar) if avatar.is_file() else _of_workspace(avatar, run)
     clips = {name: _clip_of(viewed, folder, name) for name, folder in viewed.sequences.items()}
     if play is not None:
         clips[Path(play).name] = _clip_of(viewed, Path(play), None)
     session = Session(runtime.Avatar(viewed.portable), viewed.mesh, clips)
-    door = Door.of(host)
+    door = Door.of(place.host)
 
     def ready(address: str) -> None:
         say(f"Open {address} in a browser; Ctrl-C ends the viewer")
 
+    if follow:
+        threading.Thread(target=_follow, args=(session, avatar), daemon=True).start()
     try:
-        serve(session, door, port, viewed.portable.about.name, ready)
+        serve(session, door, place.port, viewed.portable.about.name, ready)
     except KeyboardInterrupt:
         say("The viewer is closed")
+
+
+def _follow(session: Session, path: Path) -> None:
+    """Show the file whenever it changes. If a training started this viewer and is gone, end it."""
+    parent, seen = os.environ.get(PARENT), _changed_at(path)
+    while True:
+        time.sleep(_FOLLOW_SECONDS)
+        if parent is not None and str(os.getppid()) != parent:
+            os.kill(os.getpid(), signal.SIGTERM)
+            return
+        now = _changed_at(path)
+        if now in (None, seen):
+            continue
+        seen = now
+        with contextlib.suppress(UserError):  # The next state comes soon.
+            session.replace_avatar(runtime.Avatar(read_portable(path)))
+
+
+def _changed_at(path: Path) -> int | None:
+    """Time of the last change, or None if there is no such file."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return None
 
 
 def _of_file(path: Path) -> Viewed:
