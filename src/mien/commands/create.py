@@ -41,10 +41,9 @@ class Command:
     preview: bool = False
     """Show the fit of the face while it runs, in DIR/tracking_preview.html (for a browser)."""
     overlay: Literal["auto", "all", "none"] = "auto"
-    """Frames in overlay.mp4: every frame (all), every n-th frame of long clips, at most 3,000 (auto), or no overlay
-    (none)."""
+    """Frames in overlay.mp4: all, every n-th if a clip has over 3,000 (auto), or none."""
     view: bool = False
-    """Show the avatar in a browser while it trains (docs/viewer.md)."""
+    """Show the avatar in a browser while it trains."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)

@@ -23,7 +23,7 @@ class Command:
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the method's name)."""
     view: bool = False
-    """Show the avatar in a browser while it trains (docs/viewer.md)."""
+    """Show the avatar in a browser while it trains."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
 
     def check(self) -> None:
