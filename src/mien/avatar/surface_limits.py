@@ -31,14 +31,15 @@ def keep_on_surface(
     thickest = ((limits.thickness + limits.hair_thickness * height) / size).log()
     widest = ((limits.width + limits.hair_width * height) / size).log()
     log_scales[:, 1] = torch.minimum(log_scales[:, 1], thickest)
-    for own, other in ((0, 2), (2, 0)):
-        most = torch.minimum(widest, log_scales[:, other] + math.log(limits.ratio))
-        log_scales[:, own] = torch.minimum(log_scales[:, own], most)
+    across, along = (torch.minimum(log_scales[:, axis], widest) for axis in (0, 2))
+    # The shorter one grows. No picture holds it once it is thinner than a pixel, and it would draw the other with it.
+    log_scales[:, 0] = torch.maximum(across, along - math.log(limits.ratio))
+    log_scales[:, 2] = torch.maximum(along, across - math.log(limits.ratio))
     quats /= torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(1e-12)
     # The sine of half the angle between the thin axis and the normal is the length of the second and the fourth number.
     tilted, level = torch.hypot(quats[:, 1], quats[:, 3]), torch.hypot(quats[:, 0], quats[:, 2])
     most = math.sin(math.radians(limits.tilt) / 2)
     beyond = tilted > most
-    across = torch.where(beyond, most / tilted.clamp_min(1e-12), 1.0)
-    along = torch.where(beyond, math.sqrt(1 - most * most) / level.clamp_min(1e-6), 1.0)
-    quats *= torch.stack([along, across, along, across], dim=1)
+    aside = torch.where(beyond, most / tilted.clamp_min(1e-12), 1.0)
+    upright = torch.where(beyond, math.sqrt(1 - most * most) / level.clamp_min(1e-6), 1.0)
+    quats *= torch.stack([upright, aside, upright, aside], dim=1)
