@@ -14,6 +14,7 @@ from mien.avatar import (
     Avatar,
     GaussianAvatarsConfig,
     GaussianStore,
+    Photometric,
     Progress,
     SurfacePrior,
     load_avatar,
@@ -126,6 +127,7 @@ def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
     assert made_up is not None
     assert made_up.any()
     assert not made_up.all()
+    assert unseen.weights(Photometric(alpha_weight=0.0)).alpha_weight > 0
     behind = replace(sequence.tracking.face[0], head_rotation=torch.tensor([[0.0, 3.0, 0.0]]))
     rendering = rasterize(avatar.pose(behind).gaussians.timestep(0), sequence.tracking.cameras[0], torch.ones(3))
     rendering.image[:, :24].sum().backward()
@@ -165,6 +167,8 @@ def test_other_methods_train_on_everything(toy: tuple[FaceModel, Sequence]) -> N
     unseen = known(toy, avatar)
     assert unseen.coverage is not None
     assert unseen.made_up(avatar) is None
+    weights = Photometric(alpha_weight=0.0)
+    assert unseen.weights(weights) == weights
     density = avatar.density()
     assert type(spare_fills(avatar, unseen)) is type(density)
     before = avatar.gaussian_store()["means"].clone()
