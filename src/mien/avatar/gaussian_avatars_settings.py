@@ -24,7 +24,7 @@ class SurfaceLimits:
     """Largest distance of a centre from the mesh along the triangle's normal, in metres."""
     hair_share: Annotated[float, Range(0, 10)] = 1.3
     """How far a centre may lie above the scalp, beside the depth, as a multiple of the height of hair."""
-    thickness: Annotated[float, Range(1e-5, 0.1)] = 0.001
+    thickness: Annotated[float, Range(1e-5, 0.1)] = 0.0005
     """Largest scale (standard deviation) along the normal, in metres."""
     hair_thickness: Annotated[float, Range(0, 10)] = 0.3
     """What is added to the thickness on the scalp, as a multiple of the height of hair."""
@@ -34,7 +34,7 @@ class SurfaceLimits:
     """What is added to the width on the scalp, as a multiple of the height of hair."""
     ratio: Annotated[float, Range(1, 1000)] = 5.0
     """Largest ratio of the two scales along the surface. Larger ones are needles."""
-    tilt: Annotated[float, Range(0, 180)] = 45.0
+    tilt: Annotated[float, Range(0, 180)] = 20.0
     """Largest angle between a Gaussian's thin axis and the normal, in degrees."""
 
 
