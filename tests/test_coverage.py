@@ -8,11 +8,23 @@ import numpy as np
 import pytest
 import torch
 
-from mien.avatar import METHODS, Avatar, GaussianAvatarsConfig, GaussianStore, Progress, SurfacePrior, load_avatar
+from mien import runtime
+from mien.avatar import (
+    METHODS,
+    Avatar,
+    GaussianAvatarsConfig,
+    GaussianStore,
+    Photometric,
+    Progress,
+    SurfacePrior,
+    load_avatar,
+    make_portable,
+)
 from mien.avatar.gaussian_avatars_settings import SurfaceLimits
 from mien.avatar.surface_limits import keep_on_surface
 from mien.avatar.triangle_frames import triangle_ellipses
 from mien.errors import UserError
+from mien.export import MeshModel, read_glb, read_ply, write_glb, write_page, write_ply
 from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh
 from mien.render import rasterize
@@ -115,6 +127,7 @@ def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
     assert made_up is not None
     assert made_up.any()
     assert not made_up.all()
+    assert unseen.weights(Photometric(alpha_weight=0.0)).alpha_weight > 0
     behind = replace(sequence.tracking.face[0], head_rotation=torch.tensor([[0.0, 3.0, 0.0]]))
     rendering = rasterize(avatar.pose(behind).gaussians.timestep(0), sequence.tracking.cameras[0], torch.ones(3))
     rendering.image[:, :24].sum().backward()
@@ -154,6 +167,8 @@ def test_other_methods_train_on_everything(toy: tuple[FaceModel, Sequence]) -> N
     unseen = known(toy, avatar)
     assert unseen.coverage is not None
     assert unseen.made_up(avatar) is None
+    weights = Photometric(alpha_weight=0.0)
+    assert unseen.weights(weights) == weights
     density = avatar.density()
     assert type(spare_fills(avatar, unseen)) is type(density)
     before = avatar.gaussian_store()["means"].clone()
@@ -220,6 +235,17 @@ def test_limits_keep_gaussians_on_the_surface(hair: float) -> None:
         torch.testing.assert_close(store[name], value)
 
 
+def test_needles_grow_wider_and_not_shorter() -> None:
+    """Training cannot hold a side that is thinner than a pixel. It must not take the longer side with it."""
+    limits, sizes = SurfaceLimits(enabled=True), torch.ones(1)
+    scales = torch.tensor([[0.004, 0.0001, 1e-7], [1e-7, 0.0001, 0.004], [0.9, 0.0001, 1e-7], [0.002, 0.0001, 0.001]])
+    values = {"means": torch.zeros(4, 3), "quats": torch.eye(4)[:1].repeat(4, 1), "log_scales": scales.log()}
+    store = GaussianStore(values, {"face_index": torch.zeros(4, dtype=torch.long)})
+    keep_on_surface(store, limits, sizes, torch.zeros(1))
+    expected = [[0.004, 0.0001, 0.0008], [0.0008, 0.0001, 0.004], [0.006, 0.0001, 0.0012], [0.002, 0.0001, 0.001]]
+    torch.testing.assert_close(store["log_scales"].exp(), torch.tensor(expected))
+
+
 def test_ellipses_have_the_moments_of_their_triangles() -> None:
     torch.manual_seed(0)
     vertices, faces = torch.randn(9, 3), torch.arange(9).view(3, 3)
@@ -255,6 +281,38 @@ def test_a_run_keeps_its_coverage_and_resumes_exactly(toy: tuple[FaceModel, Sequ
     plain = train([sequence], model, config, replace(SETTINGS, unseen="trained"), tmp_path / "plain")
     assert read_coverage(tmp_path / "plain", model) is None
     assert len(plain.gaussian_store()["face_index"].unique()) == len(model.faces)
+
+
+def test_a_filled_avatar_is_exported_as_it_is_posed(toy: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
+    """Fills are Gaussians like all others in each format: .mien, .ply, .glb and .html."""
+    model, sequence = toy
+    avatar = train([sequence], model, GaussianAvatarsConfig(), SETTINGS, tmp_path / "run")
+    made_up = known(toy, avatar).made_up(avatar)
+    assert made_up is not None
+    assert made_up.any()
+    portable = make_portable(avatar, sequence.tracking.cameras[0], "filled")
+    runtime.write_portable(tmp_path / "a.mien", portable)
+    carried = runtime.load(tmp_path / "a.mien")
+    face = replace(avatar.subject, expression=torch.full_like(avatar.subject.expression, 0.3))
+    posed = avatar.pose(face).gaussians.detach().timestep(0)
+    ours = carried.pose(face.expression[0].numpy())
+    write_ply(tmp_path / "a.ply", posed)
+    ply = read_ply(tmp_path / "a.ply")
+    for name in ("means", "scales", "opacities", "sh"):
+        expected = getattr(posed, name)
+        torch.testing.assert_close(torch.from_numpy(getattr(ours, name)), expected, atol=1e-6, rtol=1e-4)
+        torch.testing.assert_close(getattr(ply, name), expected, atol=1e-6, rtol=1e-4)
+    assert (posed.opacities[made_up] > 0.9).all()
+    baked = portable.baked
+    assert isinstance(baked, runtime.MeshBound)
+    unwrapped = MeshModel(baked.rig, baked.faces, model.uv.numpy(), model.uv_faces.numpy())
+    write_glb(tmp_path / "a.glb", portable, unwrapped, 64)
+    glb = read_glb(tmp_path / "a.glb")
+    attributes = glb.content["meshes"][1]["primitives"][0]["attributes"]
+    np.testing.assert_array_equal(glb.array(attributes["_TRIANGLE"]), avatar.triangles().numpy())
+    opacities = glb.array(attributes["KHR_gaussian_splatting:OPACITY"])
+    np.testing.assert_allclose(opacities, posed.opacities.numpy(), atol=1e-6)
+    assert write_page(tmp_path / "a.html", portable).psnr > 40
 
 
 def test_damaged_coverage_is_named(toy: tuple[FaceModel, Sequence], tmp_path: Path) -> None:

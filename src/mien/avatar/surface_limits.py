@@ -23,22 +23,23 @@ def keep_on_surface(
         hair: Height of hair above each triangle, in metres; 0 on skin.
     """
     bound = store["face_index"]
-    size, height = sizes[bound], hair[bound]
     means, quats, log_scales = (store[name].detach() for name in ("means", "quats", "log_scales"))
     # The second axis of a triangle's frame is its normal.
-    lowest, highest = -limits.depth / size, (limits.depth + limits.hair_share * height) / size
-    means[:, 1] = torch.minimum(torch.maximum(means[:, 1], lowest), highest)
-    thickest = ((limits.thickness + limits.hair_thickness * height) / size).log()
-    widest = ((limits.width + limits.hair_width * height) / size).log()
-    log_scales[:, 1] = torch.minimum(log_scales[:, 1], thickest)
-    for own, other in ((0, 2), (2, 0)):
-        most = torch.minimum(widest, log_scales[:, other] + math.log(limits.ratio))
-        log_scales[:, own] = torch.minimum(log_scales[:, own], most)
+    lowest, highest = -limits.depth / sizes, (limits.depth + limits.hair_share * hair) / sizes
+    thickest = ((limits.thickness + limits.hair_thickness * hair) / sizes).log()
+    widest = ((limits.width + limits.hair_width * hair) / sizes).log()
+    low, high, thick, wide = torch.stack([lowest, highest, thickest, widest], dim=1)[bound].unbind(1)
+    means[:, 1].clamp_(low, high)
+    log_scales[:, 1].clamp_(max=thick)
+    across, along = (torch.minimum(log_scales[:, axis], wide) for axis in (0, 2))
+    # The shorter one grows. No picture holds it once it is thinner than a pixel, and it would draw the other with it.
+    log_scales[:, 0] = torch.maximum(across, along - math.log(limits.ratio))
+    log_scales[:, 2] = torch.maximum(along, across - math.log(limits.ratio))
     quats /= torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(1e-12)
     # The sine of half the angle between the thin axis and the normal is the length of the second and the fourth number.
-    tilted, level = torch.hypot(quats[:, 1], quats[:, 3]), torch.hypot(quats[:, 0], quats[:, 2])
     most = math.sin(math.radians(limits.tilt) / 2)
-    beyond = tilted > most
-    across = torch.where(beyond, most / tilted.clamp_min(1e-12), 1.0)
-    along = torch.where(beyond, math.sqrt(1 - most * most) / level.clamp_min(1e-6), 1.0)
-    quats *= torch.stack([along, across, along, across], dim=1)
+    beyond = (quats[:, 1].square() + quats[:, 3].square() > most * most).nonzero()[:, 0]
+    leaning = quats[beyond]
+    tilted, level = torch.hypot(leaning[:, 1], leaning[:, 3]), torch.hypot(leaning[:, 0], leaning[:, 2])
+    aside, upright = most / tilted.clamp_min(1e-12), math.sqrt(1 - most * most) / level.clamp_min(1e-6)
+    quats[beyond] = leaning * torch.stack([upright, aside, upright, aside], dim=1)

@@ -42,7 +42,7 @@ class Unseen:
 
     def weights(self, weights: Photometric) -> Photometric:
         """The weights of the losses, with a loss of alpha if anything is filled."""
-        if self.coverage is None:
+        if self.prior.made_up is None:
             return weights
         return replace(weights, alpha_weight=max(weights.alpha_weight, _ALPHA))
 
