@@ -31,7 +31,7 @@ class Command:
     name: tuple[str, ...] = ()
     """Names of the sequences, one per video (default: the videos' names)."""
     calibration: Path | None = None
-    """Calibrated cameras as json (docs/using.md). All videos are then one sequence, filmed at the same time."""
+    """Calibrated cameras as json (docs/using.md). The videos then form one sequence, filmed at once."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the method's name)."""
     face_model: str = "anny"
