@@ -309,7 +309,7 @@ def test_a_filled_avatar_is_exported_as_it_is_posed(toy: tuple[FaceModel, Sequen
     write_glb(tmp_path / "a.glb", portable, unwrapped, 64)
     glb = read_glb(tmp_path / "a.glb")
     attributes = glb.content["meshes"][1]["primitives"][0]["attributes"]
-    np.testing.assert_array_equal(glb.array(attributes["_TRIANGLE"]), avatar.triangles().numpy())
+    np.testing.assert_array_equal(glb.array(attributes["_TRIANGLE"]), avatar.gaussian_store()["face_index"].numpy())
     opacities = glb.array(attributes["KHR_gaussian_splatting:OPACITY"])
     np.testing.assert_allclose(opacities, posed.opacities.numpy(), atol=1e-6)
     assert write_page(tmp_path / "a.html", portable).psnr > 40
