@@ -21,6 +21,7 @@ from torch import Tensor
 
 from mien.avatar.activation import sigmoid
 from mien.avatar.avatar import Avatar, ParameterGroup, Posed, network_group, store_group
+from mien.avatar.baked_pose import KeptBake, can_pose_baked, pose_baked
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.density import RefillDensity
 from mien.avatar.mono_gaussian_avatar_settings import LENGTH_UNIT, MonoGaussianAvatarConfig
@@ -66,9 +67,15 @@ class MonoGaussianAvatar(Avatar):
         self.register_buffer("canonical_expression", expression)
         self.register_buffer("canonical_joints", joints)
         self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
+        self._kept = KeptBake()
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
-        """The Gaussians in the head frame, one batch entry per timestep."""
+        """The Gaussians in the head frame, one batch entry per timestep.
+
+        An avatar that is not in training mode (`eval()`) poses its baked form, unless `face` is to have gradients.
+        """
+        if not self.training and progress is TRAINED and can_pose_baked(self.store["means"], face):
+            return Posed(pose_baked(self._kept.of(self), face), {})
         means, displacement = self._deformed(face)
         # Detached, as in the published code: attributes do not pull on the points.
         change = self.change(displacement.detach() / LENGTH_UNIT)
