@@ -1,32 +1,36 @@
 """Pose the baked form of an avatar from `FaceParams`, for methods whose networks are slower than what they bake."""
 
+from collections.abc import Callable, Iterable
+from typing import Generic, TypeVar
+
 import torch
 from torch import Tensor
 
 from mien import runtime
-from mien.avatar.avatar import Avatar
 from mien.face import FaceParams, head_poses
 from mien.gaussians import Gaussians
 from mien.runtime.baked import BakedAvatar
 
+T = TypeVar("T")
 
-class KeptBake:
-    """The result of `Avatar.bake`, kept until a tensor of the avatar changes."""
+
+class Kept(Generic[T]):
+    """A result that is kept until one of the tensors that it was made from changes."""
 
     def __init__(self) -> None:
         self._of: list[tuple[Tensor, int]] = []
-        self._baked: BakedAvatar | None = None
+        self._result: T | None = None
 
-    def of(self, avatar: Avatar) -> BakedAvatar:
-        """The baked form of an avatar, whose tensors are changed by torch only."""
+    def of(self, tensors: Iterable[Tensor], make: Callable[[], T]) -> T:
+        """The result of `make`, called again only if there are other tensors, or torch has changed one in place."""
         # Held here, so that no other tensor can take the place of one that is gone.
-        now = [(tensor, tensor._version) for tensor in (*avatar.parameters(), *avatar.buffers())]
+        now = [(tensor, tensor._version) for tensor in tensors]
         same = len(now) == len(self._of) and all(
             a is b and version == before for (a, version), (b, before) in zip(now, self._of, strict=True)
         )
-        if self._baked is None or not same:
-            self._of, self._baked = now, avatar.bake()
-        return self._baked
+        if self._result is None or not same:
+            self._of, self._result = now, make()
+        return self._result
 
 
 def can_pose_baked(like: Tensor, face: FaceParams) -> bool:
