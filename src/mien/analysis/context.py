@@ -8,6 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Bool
+from torch import Tensor
+
 import mien
 from mien import _native
 from mien.analysis.spec import AnalysisOptions
@@ -133,8 +136,15 @@ class Context:
         write_json(path, _KEPT, _VERSION, {"key": digest, "result": result})
         return result
 
-    def train(self, name: str, config: MethodConfig, face_model: FaceModel | None = None) -> Variant:
-        """Train the run's sequences again for `options.steps` steps, with a changed config or face model.
+    def train(
+        self,
+        name: str,
+        config: MethodConfig,
+        face_model: FaceModel | None = None,
+        resolution: int | None = None,
+        timesteps: Sequence[Bool[Tensor, " t"]] | None = None,
+    ) -> Variant:
+        """Train the run's sequences again for `options.steps` steps, with something changed.
 
         A stopped training continues, and a finished one is only read.
 
@@ -142,15 +152,25 @@ class Context:
             name: Name of the variant, which begins the name of its folder.
             config: The method's settings.
             face_model: A face model with the vertices of the run's; None for that one.
+            resolution: Longer side of the training pictures, in pixels; None for that of the run.
+            timesteps: Which timesteps of each sequence may be trained on; None for all.
         """
         model = face_model or self.avatar.face_model
         settings = replace(self.settings, steps=self.options.steps, checkpoint_every=_CHECKPOINT_STEPS)
+        if resolution is not None:
+            settings = replace(settings, resolution=resolution)
         key = [encode(config), encode(settings), self.config["data"], model.content_hash]
+        key += [] if timesteps is None else [[one.nonzero()[:, 0].tolist() for one in timesteps]]
         run_dir = self.folder / "runs" / f"{name}-{self.options.steps}-{digest_of(key)[:8]}"
         sequences = [
             replace(one, tracking=replace(one.tracking, face_model=model.name, face_model_hash=model.content_hash))
             for one in self.sequences
         ]
+        if timesteps is not None:
+            sequences = [
+                replace(one, tracking=replace(one.tracking, valid=one.tracking.valid & some))
+                for one, some in zip(sequences, timesteps, strict=True)
+            ]
         avatar = train(sequences, model, config, settings, run_dir)
         return Variant(run_dir, avatar, read_curves(run_dir), read_training_summary(run_dir))
 

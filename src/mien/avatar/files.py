@@ -109,7 +109,7 @@ def _load_avatar(folder: Path) -> Avatar:
     avatar.config = config
     overwrite(avatar, _with_prefix(tensors, "avatar."), content.gaussians, folder)
     avatar.filmed = _filmed(_with_prefix(tensors, "filmed."), avatar, folder)
-    return avatar
+    return avatar.eval()
 
 
 def _filmed(tensors: dict[str, Tensor], avatar: Avatar, folder: Path) -> Filmed | None:

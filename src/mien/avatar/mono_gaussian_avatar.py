@@ -13,6 +13,7 @@ of the run, which spans `epochs` epochs of the paper; the optimiser's moments su
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from mien.avatar.activation import sigmoid
 from mien.avatar.avatar import Avatar, ParameterGroup, Posed, network_group, store_group
+from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.density import RefillDensity
 from mien.avatar.mono_gaussian_avatar_settings import LENGTH_UNIT, MonoGaussianAvatarConfig
@@ -66,9 +68,16 @@ class MonoGaussianAvatar(Avatar):
         self.register_buffer("canonical_expression", expression)
         self.register_buffer("canonical_joints", joints)
         self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
+        self._baked, self._rest = Kept[BlendSkinned](), Kept[_AtRest]()
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
-        """The Gaussians in the head frame, one batch entry per timestep."""
+        """The Gaussians in the head frame, one batch entry per timestep.
+
+        An avatar that is not in training mode (`eval()`) poses its baked form, unless `face` is to have gradients.
+        """
+        if not self.training and progress is TRAINED and can_pose_baked(self.store["means"], face):
+            baked = self._baked.of((*self.parameters(), *self.buffers()), self.bake)
+            return Posed(pose_baked(baked, face), {})
         means, displacement = self._deformed(face)
         # Detached, as in the published code: attributes do not pull on the points.
         change = self.change(displacement.detach() / LENGTH_UNIT)
@@ -101,7 +110,7 @@ class MonoGaussianAvatar(Avatar):
         model = self.face_model
         found = self.deformation.whole(means / LENGTH_UNIT)
         canonical = means + LENGTH_UNIT * found.offset.detach()
-        nearest = nearest_vertices(canonical, model.head_vertices(self.canonical_face())[0])
+        nearest = nearest_vertices(canonical, self._at_rest().vertices)
         # The bone that stands still belongs to no vertex.
         weights = torch.nn.functional.pad(model.skinning_weights[nearest], (0, 1))
         losses = {"skinning": 0.1 * _mean_square(found.weights - weights)}
@@ -210,23 +219,41 @@ class MonoGaussianAvatar(Avatar):
         still = _inverse(face.T_world_head) @ self.canonical_face().T_world_head
         return torch.cat([self.face_model.joint_transforms(face), still[:, None]], dim=1)[:, :, :3]
 
+    def _at_rest(self) -> "_AtRest":
+        """What depends on the canonical face alone."""
+
+        @torch.no_grad()
+        def make() -> _AtRest:
+            face = self.canonical_face()
+            vertices, transforms = self.face_model.head_vertices(face)[0], self._transforms(face)[0]
+            return _AtRest(vertices, transforms, self._coefficients(face, absolute=True))
+
+        own = (self.get_buffer("canonical_expression"), self.get_buffer("canonical_joints"))
+        return self._rest.of((*own, *self.subject.tensors().values()), make)
+
     def _coefficients(self, face: FaceParams, absolute: bool = False) -> Float[Tensor, "b c"]:
         """Weights of the blend directions: less those of the canonical face, or as they are (`absolute`)."""
         own = torch.cat([face.expression, _pose_features(face)], dim=1)
         if absolute:
             return own
-        canonical = self.canonical_face()
-        return own - torch.cat([canonical.expression, _pose_features(canonical)], dim=1)
+        return own - self._at_rest().coefficients
 
     def _deformed(self, face: FaceParams) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
         """Points in the head frame, and their motion from the canonical positions, both in metres."""
         means = self.store["means"]
         offset, moved, weights = self.deformation(means / LENGTH_UNIT, self._coefficients(face))
         canonical = means + LENGTH_UNIT * offset
-        with torch.no_grad():
-            at_rest = self._transforms(self.canonical_face())[0]
+        at_rest = self._at_rest().transforms
         posed = skin_points(canonical, LENGTH_UNIT * moved, weights, at_rest, self._transforms(face))
         return posed, posed - canonical
+
+
+class _AtRest(NamedTuple):
+    """The canonical face."""
+
+    vertices: Float[Tensor, "v 3"]
+    transforms: Float[Tensor, "k 3 4"]
+    coefficients: Float[Tensor, "1 c"]
 
 
 def canonical_face(

@@ -8,7 +8,7 @@ import tyro
 
 from mien.workspace import Workspace, open_workspace
 
-AnalysisName = Literal["gaussian-avatars", "headgas"]
+AnalysisName = Literal["gaussian-avatars", "headgas", "mono-gaussian-avatar"]
 """The keys of `mien.analysis.ANALYSES`, written out for options. A test compares them."""
 
 
@@ -26,6 +26,10 @@ class Command:
     Parts of headgas: basis (one expression at a time, beside the mesh), layers (Gaussians removed from near to far),
     beyond (an expression to 1.4 times its training maximum, and views beyond those of training), sizes (time of a frame
     against the size of the picture), ablations (a short training for each variant of the paper).
+
+    Parts of mono-gaussian-avatar: times (of the training, and of a frame with networks and baked), convergence
+    (held-out pictures during a short training), resolutions (short trainings at full and at half resolution), diversity
+    (short trainings on all frames, on a frontal quarter and on a mixed half).
     """
 
     method: Annotated[AnalysisName, tyro.conf.Positional]

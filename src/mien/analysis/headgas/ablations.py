@@ -1,7 +1,6 @@
 """The ablations, trained alike: Table 1 of the supplement."""
 
 from dataclasses import replace
-from statistics import fmean
 from typing import Any, get_args
 
 import numpy as np
@@ -12,17 +11,16 @@ from mien.analysis.context import Context, Variant
 from mien.analysis.drawing import measure_drawing
 from mien.analysis.headgas.trained import busy_face
 from mien.analysis.result import PartResult, Picture, Table
+from mien.analysis.scoring import METRICS, held_out_scores, perceptual_metric
 from mien.analysis.views import labelled
 from mien.avatar import HeadGasConfig
 from mien.avatar.headgas_settings import Variant as VariantName
-from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.scoring import score_pictures
-from mien.perceptual import PerceptualDistance, load_perceptual
+from mien.perceptual import PerceptualDistance
 from mien.pictures import side_by_side, to_uint8
 from mien.storage import file_digest
-from mien.training.frames import Frame, spread_frames
+from mien.training.frames import Frame
 
 PAPER: dict[str, tuple[str, int | None, float | None, float]] = {
     "no_blending": ("without blending", 135_000, 8.0, 29.38),
@@ -33,11 +31,8 @@ PAPER: dict[str, tuple[str, int | None, float | None, float]] = {
     "full": ("full", 28_000, 4.0, 32.50),
 }
 """Variant -> its name, and Gaussians, milliseconds of a frame and PSNR in the paper, in the order of its Table 1."""
-_FRAMES = 16
-"""Largest number of held-out frames that are scored."""
 _SIZE = 512
 """Side of the pictures that are timed."""
-_METRICS = ("head_psnr", "head_ssim", "head_perceptual")
 
 
 def ablations(context: Context) -> PartResult:
@@ -47,7 +42,7 @@ def ablations(context: Context) -> PartResult:
     configs = ablation_configs(config)
     context.say_how_long("ablations", len(configs))
     trained = {name: context.train(f"ablation-{name.replace('_', '-')}", one) for name, one in configs.items()}
-    metric, notes = _metric()
+    metric, notes = perceptual_metric()
     rows = [_row(context, name, one, metric) for name, one in trained.items()]
     if "no_perceptual" not in configs:
         notes.append(
@@ -98,34 +93,12 @@ def _row(context: Context, name: str, variant: Variant, metric: PerceptualDistan
         "gaussians": variant.summary["gaussians"],
         "frame_ms": round(drawn["draw_ms"] + drawn["pose_ms"], 2),
     }
-    return row | _scores(context.experiment(variant.run_dir), metric)
-
-
-def _metric() -> tuple[PerceptualDistance | None, list[str]]:
-    try:
-        return load_perceptual(), []
-    except UserError as error:
-        return None, [f"ST-LPIPS was not computed: {error}."]
-
-
-@torch.no_grad()
-def _scores(experiment: Experiment | None, metric: PerceptualDistance | None) -> dict[str, float | None]:
-    """Means over held-out frames. None where nothing was held out, or pictures are too small."""
-    rows = []
-    for frame in [] if experiment is None else spread_frames(experiment.held_out_frames, _FRAMES):
-        assert experiment is not None
-        pictures = {"avatar": avatar_image(experiment, frame)}
-        rows.append(score_pictures(pictures, target_image(experiment, frame), experiment.crop(frame), metric)["avatar"])
-    means: dict[str, float | None] = {}
-    for name in _METRICS:
-        values = [row[name] for row in rows if name in row]
-        means[name] = round(fmean(values), 4) if values else None
-    return means
+    return row | held_out_scores(context.experiment(variant.run_dir), metric)
 
 
 def _cells(row: dict[str, Any]) -> tuple[str | float | int | None, ...]:
     label, gaussians, milliseconds, psnr = PAPER[row["name"]]
-    scores = (row[name] if row[name] is None else round(row[name], 2 + (name != "head_psnr")) for name in _METRICS)
+    scores = (row[name] if row[name] is None else round(row[name], 2 + (name != "head_psnr")) for name in METRICS)
     return (label, row["gaussians"], round(row["frame_ms"], 1), *scores, gaussians, milliseconds, psnr)
 
 

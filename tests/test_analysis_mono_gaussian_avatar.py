@@ -1,0 +1,116 @@
+"""`mien analyze mono-gaussian-avatar`: every part runs and writes its files; subsets are what they say."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import train_toy
+from mien.analysis import ANALYSES
+from mien.analysis.mono_gaussian_avatar import times
+from mien.analysis.mono_gaussian_avatar.subsets import Measured, frontal_quarter, masks, measure, mixed_half, ranges
+from mien.avatar import MonoGaussianAvatarConfig
+from mien.cli import main
+from mien.training import TrainSettings
+from mien.training.frames import training_frames
+from toy_scene import toy_sequence
+from toy_workspace import write_toy_workspace
+
+CONFIG = MonoGaussianAvatarConfig(points=60, max_points=120, epochs=10)
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("analysis-mono") / "W"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(train_toy, "CONFIG", CONFIG)
+        write_toy_workspace(root)
+    return root
+
+
+@pytest.fixture
+def workspace(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(times, "_SIDE", 16)
+    return Path(shutil.copytree(toy, tmp_path / "W"))
+
+
+def analyze(root: Path, *more: str) -> dict[str, Any]:
+    assert main(["analyze", "mono-gaussian-avatar", str(root), *more]) == 0
+    return json.loads((root / "analysis/toy/analysis.json").read_text())["parts"]
+
+
+def test_times_stand_beside_the_papers(workspace: Path) -> None:
+    part = analyze(workspace, "--seconds", "0.01")
+    assert list(part) == ["times"]
+    values, rows = part["times"]["values"], part["times"]["tables"][0]["rows"]
+    assert set(values["frame_ms"]) == {"networks", "baked"}
+    assert all(value > 0 for value in values["frame_ms"].values())
+    assert rows[-1][:3] == ["paper: MonoGaussianAvatar", 9.0, 30.0]
+    assert rows[-4][:3] == ["paper: NeRFace", 48.0, 2000.0]
+
+
+@pytest.mark.slow
+def test_short_trainings_write_their_pictures(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ("--parts", "convergence", "resolutions", "diversity", "--steps", "10")
+    parts = analyze(workspace, *asked)
+    said = capsys.readouterr().err
+    assert "resolutions: 2 trainings of 10 steps each" in said
+    assert "diversity: 3 trainings of 10 steps each" in said
+    folder = workspace / "analysis/toy"
+    for name in ("convergence", "convergence-psnr", "convergence-points", "resolutions", "diversity"):
+        assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    shown = parts["convergence"]["values"]["rows"]
+    assert [row["step"] for row in shown] == [1, 2, 5, 10]
+    assert len({row["head_psnr"] for row in shown}) == 4
+    sides = parts["resolutions"]["values"]["rows"]
+    assert [row["side"] for row in sides] == [32, 16]
+    assert sides[0]["head_psnr"] != sides[1]["head_psnr"]
+    subsets = parts["diversity"]["values"]["rows"]
+    assert [(row["name"], row["timesteps"]) for row in subsets] == [
+        ("all frames", 4), ("frontal quarter", 1), ("mixed half", 2)
+    ]  # fmt: skip
+    assert len({row["head_psnr"] for row in subsets}) == 3
+    # All frames at full size is the same training in both parts.
+    assert subsets[0]["head_psnr"] == sides[0]["head_psnr"]
+    assert analyze(workspace, *asked) == parts
+
+
+def measured(angles: np.ndarray, expressions: np.ndarray) -> Measured:
+    return Measured(tuple((0, index) for index in range(len(angles))), angles, expressions)
+
+
+def test_the_frontal_quarter_has_the_views_nearest_to_the_median() -> None:
+    yaws = np.array([-0.9, 0.05, 0.8, 0.0, -0.05, 0.7, -0.8, 0.02])
+    chosen = frontal_quarter(measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1))))
+    assert chosen == [3, 7]
+
+
+def test_the_mixed_half_keeps_what_is_rare() -> None:
+    # Twenty equal timesteps, then one turned far, and one with a strong expression.
+    angles, expressions = np.zeros((22, 2)), np.zeros((22, 3))
+    angles[20, 0], expressions[21, 1] = 1.0, 4.0
+    chosen = mixed_half(measured(angles, expressions))
+    assert len(chosen) == len(set(chosen)) == 11
+    assert {20, 21} <= set(chosen)
+    whole = measured(angles, expressions)
+    assert ranges(whole, chosen)["yaw_range"] > ranges(whole, list(range(20)))["yaw_range"] == 0
+
+
+def test_subsets_are_chosen_among_the_frames_of_the_training() -> None:
+    _, sequence = toy_sequence(10, 32)
+    frames = training_frames([sequence], TrainSettings(split="tail"))
+    found = measure([sequence], frames)
+    assert found.timesteps == tuple((0, index) for index in range(8))
+    assert found.expressions.std(0)[sequence.tracking.face.expression[:8].std(0).numpy() > 0] == pytest.approx(1)
+    (mask,) = masks([sequence], found, [0, 3])
+    assert mask.nonzero()[:, 0].tolist() == [0, 3]
+    full = ranges(found, list(range(8)))
+    assert full["expression_spread"] == pytest.approx(1)
+
+
+def test_parts_with_trainings_run_only_if_asked_for() -> None:
+    trainings = {part.name: part.trainings for part in ANALYSES["mono-gaussian-avatar"].parts}
+    assert trainings == {"times": 0, "convergence": 1, "resolutions": 2, "diversity": 3}
