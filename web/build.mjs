@@ -9,12 +9,12 @@ import { gzipSync } from "node:zlib";
 const here = dirname(fileURLToPath(import.meta.url));
 const folder = process.argv[2];
 const options = { bundle: true, minify: true, target: "es2022", charset: "ascii", legalComments: "none", write: false, absWorkingDir: here };
-/** Shaders without comments and indentation. */
+/** Shaders without comments and blanks. */
 const shaders = {
   name: "shaders",
   setup: (on) =>
     on.onLoad({ filter: /shaders\.ts$/ }, async ({ path }) => ({
-      contents: (await readFile(path, "utf8")).replace(/(?<!:)\/\/ .*$/gm, "").replace(/^ +/gm, ""),
+      contents: (await readFile(path, "utf8")).replace(/(?<!:)\/\/ .*$/gm, "").replace(/^ +/gm, "").replace(/ *([=+*/<>?:,;{}()&|-]) */g, "$1"),
       loader: "ts",
     })),
 };

@@ -3,6 +3,7 @@
 import type { Avatar } from "./avatar";
 import { AvatarError } from "./format";
 import type { Poser } from "./rig";
+import type { SkinnedPoser } from "./skinned";
 import { SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, TEXTURE_WIDTH } from "./shaders";
 
 /** A view of the head frame. */
@@ -140,6 +141,14 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  private uploadShapes(posed: SkinnedPoser): void {
+    const { quats, scales } = this.arrays;
+    quats.values.set(posed.quats);
+    spread(posed.scales, scales.values);
+    quats.upload();
+    scales.upload();
+  }
+
   private uploadChanged(): void {
     const { means, colours } = this.arrays, { poser } = this;
     spread(poser.means, means.values);
@@ -147,6 +156,7 @@ export class Renderer {
     poser.opacityLogits.forEach((logit, i) => (colours.values[4 * i + 3] = 1 / (1 + Math.exp(-logit))));
     means.upload();
     colours.upload();
+    if (poser.skinned) this.uploadShapes(poser.skinned);
   }
 }
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mien.errors import UserError
-from mien.runtime import Face, MeshBound, PortableAvatar
+from mien.runtime import BlendSkinned, Face, MeshBound, PortableAvatar
 
 FORMAT, VERSION = "mien.packed", 1
 
@@ -63,6 +63,8 @@ _CODES = {
     "avatar.baked.changes.colour": _Code(8, "columns", signed=True),
     "avatar.baked.changes.opacity_logits": _Code(8, "columns", signed=True),
     "avatar.baked.changes.means": _Code(8, "columns", signed=True),
+    "avatar.baked.network.base": _Code(16, "columns"),
+    "avatar.baked.still_weights": _Code(16, "columns", signed=True),
     "avatar.baked.rig.template": _Code(16, "columns"),
     "avatar.baked.rig.expression_basis": _Code(16, "first", signed=True),
     "avatar.baked.rig.pose_basis": _Code(8, "first", signed=True),
@@ -102,6 +104,9 @@ def unpacked(avatar: PortableAvatar) -> PortableAvatar:
 def _prepared(avatar: PortableAvatar) -> PortableAvatar:
     """The same avatar in the order of its triangles, with unit rotations, and without invisible differences."""
     baked = avatar.baked
+    if isinstance(baked, BlendSkinned):
+        _check_network(baked, avatar.about.name)
+        return avatar
     if not isinstance(baked, MeshBound):
         raise UserError(
             f"{avatar.about.name}: a page draws avatars of gaussian_avatars, not of {avatar.about.method}; train one "
@@ -136,6 +141,13 @@ def _prepared(avatar: PortableAvatar) -> PortableAvatar:
     return replace(avatar, baked=baked)
 
 
+def _check_network(baked: BlendSkinned, name: str) -> None:
+    """Refuse what the runtime of pages does not pose: it knows the network of mono_gaussian_avatar."""
+    network = baked.network
+    if baked.bases is not None or network is None or (network.input, network.activation) != ("displacement", "relu"):
+        raise UserError(f"{name}: a page cannot draw Gaussians with another network or with bases; export a .mien")
+
+
 def _grouped(array: np.ndarray, code: _Code) -> np.ndarray:
     """The array as float64, one row for each index of the first axis, or for each index of all others together."""
     rows = array.astype(np.float64).reshape(len(array), -1)
@@ -166,7 +178,9 @@ def _tree(value: Any, path: str, tensors: dict[str, dict[str, Any]], pieces: lis
         return {"kind": type(value).__name__} | _tree(inside, path, tensors, pieces)
     if isinstance(value, dict):
         return {name: _tree(item, f"{path}.{name}".lstrip("."), tensors, pieces) for name, item in value.items()}
-    return list(value) if isinstance(value, tuple) else value
+    if isinstance(value, tuple):
+        return [_tree(item, f"{path}.{index}", tensors, pieces) for index, item in enumerate(value)]
+    return value
 
 
 def _stored(array: np.ndarray, code: _Code | None) -> tuple[dict[str, Any], bytes]:
