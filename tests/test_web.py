@@ -40,7 +40,7 @@ def test_the_committed_page_is_that_of_a_fresh_build(built: Path) -> None:
 
 
 def test_the_package_is_small(built: Path) -> None:
-    assert len(gzip.compress((built / "mien.js").read_bytes())) <= 11_000
+    assert len(gzip.compress((built / "mien.js").read_bytes())) <= 12_000
 
 
 def posed_by_node(built: Path, path: Path, portable: runtime.PortableAvatar, faces: list[runtime.Face]) -> list[Any]:
@@ -311,11 +311,6 @@ def test_a_page_opens_other_pages_never(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("method", "config", "message"),
     [
-        (
-            "mono_gaussian_avatar",
-            {},
-            "a page draws avatars of gaussian_avatars and headgas, not of mono_gaussian_avatar",
-        ),
         ("headgas", {"sh_degree": 1}, "--method.sh-degree 0"),
         ("headgas", {"variant": "no_blending"}, "--method.variant full"),
     ],

@@ -44,6 +44,31 @@ export interface ExpressionChanges {
   features?: FeatureChanges | null;
 }
 
+/** A small network, the same for all Gaussians: rows of `base`, then the centre's motion in metres, are its inputs. */
+export interface PointNetwork {
+  input: string;
+  base: Float32Array; // [n, _]
+  weights: Float32Array[]; // of each layer: [out, in]
+  biases: Float32Array[];
+  activation: string;
+  outputs: string[];
+}
+
+/** Gaussians that have their own blend directions and skinning weights. */
+export interface BlendSkinned {
+  kind: "BlendSkinned";
+  rig: Rig; // of the centres
+  attributes: Attributes;
+  scale_activation: "exp" | "sigmoid";
+  scale_gain: number;
+  scale_offset: number; // metres
+  colour_activation: "sh" | "sigmoid";
+  bases: unknown;
+  network: PointNetwork;
+  still_weights?: Float32Array | null; // [n]
+  still_pose?: Float32Array | null; // [4, 4]
+}
+
 export interface MeshBound {
   kind: "MeshBound";
   rig: Rig;
@@ -53,6 +78,8 @@ export interface MeshBound {
   attributes: Attributes;
   sh_frame: "world" | "head";
   changes?: ExpressionChanges;
+  /** What moves the Gaussians, if they are bound to no mesh (`onTriangle`). */
+  skinned?: BlendSkinned;
 }
 
 /** A pinhole camera, OpenCV convention: +x right, +y down, +z forward. */

@@ -1,6 +1,7 @@
 // Reads .mien files (docs/avatar_file.md) and their packed form, which `mien export --out NAME.html` puts into pages.
 
-import type { Avatar, Motion } from "./avatar";
+import type { Avatar, BlendSkinned, Motion } from "./avatar";
+import { onTriangle, skinnedFault } from "./skinned";
 
 type Numbers = Float32Array | Int32Array;
 type Tree = null | boolean | number | string | Tree[] | { [key: string]: Tree };
@@ -106,8 +107,11 @@ function restored(node: Tree, tensor: (name: string) => Numbers): unknown {
 }
 
 /** Refuses what this runtime cannot draw, and indices that lead nowhere. */
-function checked(avatar: Avatar): Avatar {
-  const baked = avatar.baked;
+function checked(given: Avatar): Avatar {
+  const isSkinned = (given.baked.kind as string) === "BlendSkinned";
+  const fault = isSkinned ? skinnedFault(given.baked as unknown as BlendSkinned) : "";
+  if (fault) throw new AvatarError(fault);
+  const avatar = isSkinned ? onTriangle(given) : given, baked = avatar.baked;
   if (baked.kind !== "MeshBound") throw new AvatarError(`holds a ${baked.kind} avatar; this page draws MeshBound ones (gaussian_avatars)`);
   const points = baked.rig.template.length / 3, triangles = baked.faces.length / 3, count = baked.face_index.length;
   const inside = (indices: Int32Array, size: number) => indices.every((index) => index >= 0 && index < size);

@@ -5,6 +5,7 @@ import { FeaturePass } from "./feature_pass";
 import { AvatarError } from "./format";
 import { Program } from "./program";
 import type { Poser } from "./rig";
+import type { SkinnedPoser } from "./skinned";
 import { SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, TEXTURE_WIDTH } from "./shaders";
 
 /** A view of the head frame. */
@@ -149,6 +150,14 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  private uploadShapes(posed: SkinnedPoser): void {
+    const { quats, scales } = this.arrays;
+    quats.values.set(posed.quats);
+    spread(posed.scales, scales.values);
+    quats.upload();
+    scales.upload();
+  }
+
   private uploadChanged(): void {
     const { means, colours } = this.arrays, { poser } = this;
     spread(poser.means, means.values);
@@ -158,6 +167,7 @@ export class Renderer {
     means.upload();
     colours.upload();
     features?.run((unit) => colours.bind(unit), poser.activations);
+    if (poser.skinned) this.uploadShapes(poser.skinned);
   }
 }
 

@@ -4,6 +4,7 @@
 import type { ExpressionChanges, Face, MeshBound, Rig } from "./avatar";
 import { FeatureNetwork } from "./features";
 import { chained, rigid, rotationMatrix } from "./rigid";
+import { SkinnedPoser } from "./skinned";
 
 /** Rows of a basis [rows, m, 3] without its zeros: most expressions move a small part of the face. */
 class SparseBasis {
@@ -37,7 +38,8 @@ class SparseBasis {
 export class RigPoser {
   private readonly expressions: SparseBasis;
   private readonly correctives: SparseBasis | null;
-  private readonly shaped: Float64Array;
+  /** Points before skinning. */
+  readonly shaped: Float64Array;
   private readonly points: Float32Array;
   private readonly follows: { joint: Int32Array; weight: Float32Array; start: Int32Array };
 
@@ -181,6 +183,8 @@ export class Poser {
   readonly colours: Float32Array;
   /** The rig's points in the head frame. */
   points: Float32Array = new Float32Array();
+  /** What moves Gaussians that are bound to no mesh. */
+  readonly skinned: SkinnedPoser | null;
   private readonly rig: RigPoser;
   /** The activations of the changes at the last face. */
   activations: Float64Array;
@@ -194,7 +198,8 @@ export class Poser {
 
   constructor(private readonly baked: MeshBound) {
     const { attributes, faces, means } = baked, count = baked.face_index.length;
-    this.rig = new RigPoser(baked.rig);
+    this.skinned = baked.skinned ? new SkinnedPoser(baked.skinned) : null;
+    this.rig = this.skinned?.rig ?? new RigPoser(baked.rig);
     this.frames = new Float32Array(4 * faces.length);
     this.means = means.slice();
     this.opacityLogits = attributes.opacity_logits.slice();
@@ -208,6 +213,12 @@ export class Poser {
   }
 
   pose(face: Face): void {
+    if (this.skinned) {
+      this.frames.set([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]);
+      this.skinned.pose(face, this);
+      this.changed = true;
+      return;
+    }
     this.points = this.rig.pose(face);
     triangleFrames(this.points, this.baked.faces, this.frames);
     const { changes, attributes } = this.baked;

@@ -1,6 +1,6 @@
 // Poses an avatar as a page does, for tests/test_web.py:
 //   node pose.mjs MIEN.JS AVATAR (.mien or packed) FACES.JSON OUT   writes float32 arrays, face by face:
-//     points of the rig, centres, raw opacities, first colours
+//     points of the rig, centres, raw opacities, first colours; then, of Gaussians on no mesh, rotations and scales
 //   node pose.mjs MIEN.JS AVATAR FACES.JSON   prints milliseconds: least of posing and sorting, over all faces
 import { readFileSync, writeFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
@@ -16,7 +16,8 @@ const poser = new Poser(avatar.baked);
 if (out) {
   const written = faces.flatMap((face) => {
     poser.pose(face);
-    return [poser.points, poser.centres(), poser.opacityLogits, poser.colours].map((array) => Buffer.from(array.slice().buffer));
+    const shapes = poser.skinned ? [poser.skinned.quats, poser.skinned.scales] : [];
+    return [poser.points, poser.centres(), poser.opacityLogits, poser.colours, ...shapes].map((array) => Buffer.from(array.slice().buffer));
   });
   writeFileSync(out, Buffer.concat(written));
 } else {

@@ -16,7 +16,7 @@ from jaxtyping import Float32
 
 from mien.errors import UserError
 from mien.export.bound_features import bound_features
-from mien.runtime import Face, MeshBound, PortableAvatar, Static
+from mien.runtime import BlendSkinned, Face, PortableAvatar, Static
 
 FORMAT, VERSION = "mien.packed", 1
 
@@ -69,6 +69,8 @@ _CODES = {
     "avatar.baked.changes.features.neutral": _Code(8, "columns"),
     "avatar.baked.changes.features.basis": _Code(8, "columns", signed=True, levels=31),
     "avatar.baked.changes.features.own": _Code(8, "columns"),
+    "avatar.baked.network.base": _Code(16, "columns"),
+    "avatar.baked.still_weights": _Code(16, "columns", signed=True),
     "avatar.baked.rig.template": _Code(16, "columns"),
     "avatar.baked.rig.expression_basis": _Code(16, "first", signed=True),
     "avatar.baked.rig.pose_basis": _Code(8, "first", signed=True),
@@ -89,7 +91,7 @@ def pack(avatar: PortableAvatar, motion: Motion | None = None) -> bytes:
     """The packed form of an avatar, with a motion or without. The same input gives the same bytes.
 
     Raises:
-        UserError: the avatar is neither `MeshBound` nor one of headgas that pages can draw.
+        UserError: pages cannot draw the network of the avatar.
     """
     tensors: dict[str, dict[str, Any]] = {}
     pieces: list[bytes] = []
@@ -108,13 +110,11 @@ def unpacked(avatar: PortableAvatar) -> PortableAvatar:
 def _prepared(avatar: PortableAvatar) -> PortableAvatar:
     """The same avatar in the order of its triangles, with unit rotations, and without invisible differences."""
     baked = avatar.baked
+    if isinstance(baked, BlendSkinned):
+        _check_network(baked, avatar.about.name)
+        return avatar
     if isinstance(baked, Static):
         baked = bound_features(avatar)
-    if not isinstance(baked, MeshBound):
-        raise UserError(
-            f"{avatar.about.name}: a page draws avatars of gaussian_avatars and headgas, not of {avatar.about.method}; "
-            "train one of these, or export a .mien"
-        )
     order = np.argsort(baked.face_index, kind="stable")
     raw = baked.attributes
     lengths = np.maximum(np.linalg.norm(raw.quats, axis=1, keepdims=True), 1e-12)
@@ -140,6 +140,13 @@ def _prepared(avatar: PortableAvatar) -> PortableAvatar:
         baked, face_index=baked.face_index[order], means=baked.means[order], attributes=attributes, changes=changes
     )
     return replace(avatar, baked=baked)
+
+
+def _check_network(baked: BlendSkinned, name: str) -> None:
+    """Refuse what the runtime of pages does not pose: it knows the network of mono_gaussian_avatar."""
+    network = baked.network
+    if baked.bases is not None or network is None or (network.input, network.activation) != ("displacement", "relu"):
+        raise UserError(f"{name}: a page cannot draw Gaussians with another network or with bases; export a .mien")
 
 
 def _grouped(array: np.ndarray, code: _Code) -> np.ndarray:

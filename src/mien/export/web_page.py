@@ -39,7 +39,7 @@ def write_page(path: Path, avatar: PortableAvatar, motion: Motion | None = None)
     """Write a page with an avatar, and a motion that it can play, as one file.
 
     Raises:
-        UserError: the avatar is not `MeshBound`, or the path cannot be written.
+        UserError: pages cannot draw the avatar's network, or the path cannot be written.
     """
     check_writable(path)
     packed = base64.b64encode(pack(avatar, motion)).decode()
