@@ -39,9 +39,9 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     seen: list[Path] = []
     original = trainer._train_to_the_end
 
-    def watched(state: Any, data: Any, settings: Any, run_dir: Path, progress: Any) -> None:
+    def watched(state: Any, data: Any, settings: Any, run_dir: Path, progress: Any, watch: Any) -> None:
         seen.append(run_dir)
-        original(state, data, settings, run_dir, progress)
+        original(state, data, settings, run_dir, progress, watch)
 
     monkeypatch.setattr(trainer, "_train_to_the_end", watched)
     return seen

@@ -136,7 +136,9 @@ def write_subject(root: Path, names: tuple[str, ...] = FOLDERS, camera: str = "0
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], TrainSettings]]:
     found: list[tuple[list[str], TrainSettings]] = []
 
-    def remember(workspace: object, names: list[str], run: object, method: object, settings: TrainSettings) -> None:
+    def remember(
+        workspace: object, names: list[str], run: object, method: object, settings: TrainSettings, view: bool
+    ) -> None:
         found.append((names, settings))
 
     monkeypatch.setattr(training_stage, "run_training_stage", remember)

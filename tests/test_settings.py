@@ -49,7 +49,9 @@ def choices(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Return a function that gives the settings that `mien train` uses with some options."""
     asked: list[Choices] = []
 
-    def remember(workspace: object, names: object, run: object, method: MethodConfig, settings: TrainSettings) -> None:
+    def remember(
+        workspace: object, names: object, run: object, method: MethodConfig, settings: TrainSettings, view: bool
+    ) -> None:
         asked.append((method, settings))
 
     monkeypatch.setattr(training, "run_training_stage", remember)
