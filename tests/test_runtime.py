@@ -17,6 +17,8 @@ from mien.errors import UserError
 from mien.face import FaceParams
 from mien.render import rasterize
 from mien.runtime.checks import baked_fault
+from mien.runtime.posing import run_network
+from older_files import with_a_basis_for_each_input
 from toy_scene import runtime_face, toy_camera, toy_sequence
 
 SIZE = 64
@@ -166,6 +168,47 @@ def test_linear_bases_add_to_the_raw_values(kind: str) -> None:
         assert bases.means is not None
         moved = record.means + np.tensordot(face.expression, bases.means, 1)
         np.testing.assert_allclose(found.means, moved, rtol=1e-5, atol=1e-6)
+
+
+@torch.no_grad()
+def test_features_along_directions_equal_a_basis_for_each_input(tmp_path: Path) -> None:
+    """Files of version 6 pose as older ones, in which every input has its own basis, and take less room."""
+    whole = export(new_avatar("headgas", directions=2), tmp_path / "new.mien").portable
+    assert isinstance(whole.baked, runtime.Static)
+    older = replace(whole, baked=with_a_basis_for_each_input(whole.baked))
+    runtime.write_portable(tmp_path / "old.mien", older)
+    sizes = [(tmp_path / name).stat().st_size for name in ("new.mien", "old.mien")]
+    assert sizes[0] < 0.8 * sizes[1]
+    for timestep in range(3):
+        face = runtime_face(toy_sequence(5, SIZE)[1].tracking.face[timestep])
+        new, old = (runtime.pose(one.baked, face) for one in (whole, runtime.load(tmp_path / "old.mien").portable))
+        np.testing.assert_allclose(new.sh, old.sh, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(new.opacities, old.opacities, rtol=0, atol=5e-7)
+        network = whole.baked.network
+        assert network is not None
+        by_hand = run_network(network, np.zeros_like(whole.baked.means), face)
+        np.testing.assert_allclose(by_hand[:, :-1].reshape(new.sh.shape), new.sh, rtol=0, atol=2e-6)
+
+
+def test_directions_that_do_not_fit_are_told(tmp_path: Path) -> None:
+    whole = export(new_avatar("headgas", directions=2), tmp_path / "a.mien").portable
+    assert isinstance(whole.baked, runtime.Static)
+    network = whole.baked.network
+    assert network is not None
+    along = network.along
+    assert along is not None
+    for wrong, part in (
+        (
+            replace(network, along=replace(along, rest=along.rest[1:], directions=along.directions[1:])),
+            "the shape of rest of its directions",
+        ),
+        (replace(network, along=replace(along, basis=along.basis[:, :, 1:])), "the shape of basis of its directions"),
+        (replace(network, along=replace(along, basis=along.basis[1:])), "the shape of basis of its directions"),
+        (replace(network, joint_basis=np.zeros((3, *network.basis.shape[1:]), np.float32)), "beside another input"),
+        (replace(network, along=None), "the shape of its network's basis"),
+    ):
+        with pytest.raises(UserError, match=part):
+            runtime.write_portable(tmp_path / "a.mien", replace(whole, baked=replace(whole.baked, network=wrong)))
 
 
 @pytest.mark.parametrize("seed", range(30))

@@ -50,7 +50,7 @@ from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.rotation import multiply_quaternions
-from mien.runtime.baked import AttributeNetwork, Attributes, Static
+from mien.runtime.baked import AttributeNetwork, Attributes, FeatureDirections, Static
 
 _CHUNK = 512
 _OLD_BASES = "feature_bases"
@@ -182,8 +182,8 @@ class HeadGas(Avatar):
         if self.unbaked is not None:
             raise UserError(f"{self.unbaked}; {UNBAKED_REMEDY}")
         store = {name: as_array(self.store[name]) for name in self.store.names()}
-        n, e = len(self.store), self.subject.expression.shape[1]
-        bases, neutral = self._baked_inputs()
+        n = len(self.store)
+        neutral, along = self._baked_features()
         layers = [layer for layer in self.network if isinstance(layer, nn.Linear)]
         shares = self._output_shares().to(layers[-1].weight)
         weights = [*(layer.weight for layer in layers[:-1]), layers[-1].weight * shares[:, None]]
@@ -191,26 +191,27 @@ class HeadGas(Avatar):
         network = AttributeNetwork(
             input="features",
             base=np.concatenate([as_array(neutral), as_array(self._encoding())], axis=1),
-            basis=as_array(bases[:e]),
-            joint_basis=as_array(bases[e:]),
+            basis=np.empty((0, *neutral.shape), np.float32),
             weights=tuple(map(as_array, weights)),
             biases=tuple(map(as_array, biases)),
             activation="leaky_relu",
             outputs=("sh", "opacity_logits"),
+            along=along,
         )
         none, no_sh = np.zeros(n, np.float32), np.zeros((n, self._coefficients, 3), np.float32)
         attributes = Attributes(store["quats"], store["log_scales"], none, no_sh)
         names, free = self.face_model.expression_names, self.face_model.free_joint_names
         return Static(store["means"], attributes, names, free, network=network)
 
-    def _baked_inputs(self) -> tuple[Float[Tensor, "i n w"], Float[Tensor, "n w"]]:
-        """What each input of the face adds to a network's first columns, and what these are where all inputs are 0."""
-        if not self._parts.blends:
-            n = len(self.store)
-            return self.directions[:, None].expand(-1, n, -1), -(self.rest @ self.directions).expand(n, -1)
-        # The directions expand exactly: each input of the face has its own basis.
-        bases = torch.einsum("ik,nkf->inf", self.directions, self.store["bases"])
-        return bases, self.store["neutral_features"] - torch.einsum("i,inf->nf", self.rest, bases)
+    def _baked_features(self) -> tuple[Float[Tensor, "n w"], FeatureDirections]:
+        """A network's first columns for the person at rest, and what the face adds to them."""
+        rest, directions = as_array(self.rest), as_array(self.directions)
+        if self._parts.blends:
+            return self.store["neutral_features"], FeatureDirections(rest, directions, as_array(self.store["bases"]))
+        # Without features, the columns are the inputs along the directions, the same for all Gaussians.
+        n, k = len(self.store), directions.shape[1]
+        same = np.broadcast_to(np.eye(k, dtype=np.float32), (n, k, k))
+        return self.rest.new_zeros(n, k), FeatureDirections(rest, directions, same.copy())
 
     @property
     def _parts(self) -> Parts:

@@ -38,8 +38,8 @@ def headgas_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
     """Measure whole steps and frames at 512x512 by directions and threads.
 
     `headgas_step` has the directions of the preset `standard`, `headgas_step_all` those of all inputs of the face.
-    Frames are posed by the avatar itself (`headgas_frame`) and by the runtime (`headgas_runtime_frame`), where every
-    input has its own basis; each frame has another expression.
+    Frames are posed by the avatar itself (`headgas_frame`) and by the runtime (`headgas_runtime_frame`); each frame has
+    another expression.
     """
     config = replace(PRESETS["standard"], features=32, sh_degree=3)
     face_model = load_face_model()

@@ -1,15 +1,14 @@
 """Gaussians of headgas in the form of bound ones, which web pages draw: features on one triangle that never moves.
 
-A .mien file has a basis of features for each input of the face. Here they are written along few directions of the face.
-Avatars are trained along 20 directions, so this loses nothing.
+Older .mien files have a basis of features for each input of the face. Here they are written along few directions of the
+face. Avatars are trained along 20 directions, so this loses nothing.
 """
 
 import numpy as np
-from jaxtyping import Float
 
 from mien.errors import UserError
 from mien.runtime import MeshBound, PortableAvatar, Rig, Static
-from mien.runtime.baked import AttributeNetwork, ExpressionChanges, FeatureChanges
+from mien.runtime.baked import AttributeNetwork, ExpressionChanges, FeatureChanges, FeatureDirections
 
 _UNIT_FRAME = np.array([[-1 / 3, 0, 1 / 3], [2 / 3, 0, 1 / 3], [-1 / 3, 0, -2 / 3]], np.float32)
 """A triangle whose frame is the head's: the first edge is +x, the normal +y, the centre the origin, the size 1."""
@@ -37,15 +36,15 @@ def bound_features(avatar: PortableAvatar) -> MeshBound:
             f"{name}: colours depend on the view ({baked.attributes.sh.shape[1]} coefficients), and a page draws "
             "avatars of headgas with one colour; train with --method.sh-degree 0, or export a .mien"
         )
-    directions, basis = _factored(network)
-    width = basis.shape[2]
+    along = network.along or _factored(network)
+    width = along.basis.shape[2]
     changes = ExpressionChanges(
-        rest=np.zeros(len(directions), np.float32),
-        directions=directions,
+        rest=along.rest,
+        directions=along.directions,
         reach=np.array([_REACH]),
         features=FeatureChanges(
             neutral=np.ascontiguousarray(network.base[:, :width]),
-            basis=basis,
+            basis=along.basis,
             own=np.ascontiguousarray(network.base[:, width:]),
             weights=network.weights,
             biases=network.biases,
@@ -62,8 +61,8 @@ def bound_features(avatar: PortableAvatar) -> MeshBound:
     )
 
 
-def _factored(network: AttributeNetwork) -> tuple[Float[np.ndarray, "i r"], Float[np.ndarray, "n r w"]]:
-    """Directions of the face and the features' change along each, whose product is the basis of every input."""
+def _factored(network: AttributeNetwork) -> FeatureDirections:
+    """Directions of the face whose products with the features' changes along them are the basis of every input."""
     parts = [network.basis, *([] if network.joint_basis is None else [network.joint_basis])]
     inputs = np.concatenate(parts)
     _, n, width = inputs.shape
@@ -72,7 +71,8 @@ def _factored(network: AttributeNetwork) -> tuple[Float[np.ndarray, "i r"], Floa
     keep = np.flatnonzero(energies > _LEAST_SHARE * max(energies[-1], np.finfo(np.float64).tiny))[::-1]
     directions = vectors[:, keep]
     basis = (directions.T @ flat).reshape(len(keep), n, width).transpose(1, 0, 2)
-    return np.ascontiguousarray(directions, np.float32), np.ascontiguousarray(basis, np.float32)
+    arrays = (np.zeros(len(directions)), directions, basis)
+    return FeatureDirections(*(np.ascontiguousarray(array, np.float32) for array in arrays))
 
 
 def _still_rig(avatar: PortableAvatar) -> Rig:

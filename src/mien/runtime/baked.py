@@ -62,18 +62,33 @@ class LinearBases:
 
 
 @dataclass(frozen=True, eq=False)
+class FeatureDirections:
+    """Few directions of the face, along which features change. The face's inputs are many more.
+
+    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. Each
+    row of `basis` is weighted by one entry of (inputs - rest) directions.
+    """
+
+    rest: Float32[np.ndarray, " i"]
+    """Inputs at which features do not change: the person at rest."""
+    directions: Float32[np.ndarray, "i k"]
+    basis: Float32[np.ndarray, "n k w"]
+    """Change of the features of each Gaussian per unit along each direction."""
+
+
+@dataclass(frozen=True, eq=False)
 class AttributeNetwork:
     """A small network, the same for all Gaussians. Its outputs are added to the raw values.
 
-    Its input is a row of `base` with an addition. With `features`, two sums are added to the first w columns: `basis`
-    weighted by the expression, and `joint_basis` weighted by the free joints. With `displacement`, the centre's motion
-    from the rig's template is appended, in metres.
+    Its input is a row of `base` with an addition. With `features`, sums are added to the first w columns: those of
+    `along`, or, in older files, `basis` weighted by the expression and `joint_basis` weighted by the free joints. With
+    `displacement`, the centre's motion from the rig's template is appended, in metres.
     """
 
     input: Literal["features", "displacement"]
     base: Float32[np.ndarray, "n _"]
     basis: Float32[np.ndarray, "_ n _"]
-    """[e, n, w]. With `displacement` it has no entries."""
+    """[e, n, w]. With `displacement` it has no entries, and with `along` it is [0, n, w]."""
     weights: tuple[Float32[np.ndarray, "_ _"], ...]
     """Weights of each layer, [out, in]."""
     biases: tuple[Float32[np.ndarray, " _"], ...]
@@ -83,6 +98,8 @@ class AttributeNetwork:
     """Names out of quats, log_scales, opacity_logits and sh, in the order of the last layer's columns."""
     joint_basis: Float32[np.ndarray, "_ n _"] | None = None
     """[3 j, n, w]: for each free joint, the change per radian of each component of its axis-angle vector."""
+    along: FeatureDirections | None = field(default=None, metadata={"since": 6})
+    """Features that change along directions of the face, instead of `basis` and `joint_basis`."""
 
 
 @dataclass(frozen=True, eq=False)

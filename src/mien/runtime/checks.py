@@ -16,6 +16,7 @@ from mien.runtime.baked import (
     BlendSkinned,
     ExpressionChanges,
     FeatureChanges,
+    FeatureDirections,
     Filmed,
     LinearBases,
     MeshBound,
@@ -27,7 +28,7 @@ from mien.runtime.baked import (
 MAX_SHAPES = 256
 """Largest number of expressions, plus nine for each free joint, that native/face.h accepts."""
 MAX_ACTIVATIONS = 8
-"""Largest number of activations that native/expression_change.h accepts."""
+"""Largest number of activations that native/expression_change.h accepts, for parts other than features."""
 _MAX_LOG_SCALE = 30
 """Largest logarithm of a scale. Its exponential, and the square of that, still fit into float32."""
 
@@ -158,7 +159,9 @@ def _bases_faults(bases: LinearBases, attributes: Attributes, e: int, mean_moves
 
 def _changes_faults(changes: ExpressionChanges, n: int, inputs: int) -> Iterator[str]:
     r = changes.directions.shape[1]
-    if not 1 <= r <= MAX_ACTIVATIONS:
+    # Features are blended by another operation, which takes any number of activations.
+    limited = any(part is not None for part in (changes.colour, changes.opacity_logits, changes.means))
+    if r < 1 or (limited and r > MAX_ACTIVATIONS):
         yield f"it has {r} activations of its changes with the expression, not 1 to {MAX_ACTIVATIONS}"
     shapes = {"rest": (inputs,), "directions": (inputs, r), "reach": (1,)}
     shapes |= {"colour": (n, 3, r), "opacity_logits": (n, r), "means": (n, 3, r)}
@@ -230,10 +233,22 @@ def _network_faults(network: AttributeNetwork, attributes: Attributes, e: int, j
         joints, n = network.joint_basis, len(network.base)
         if network.basis.shape[1] != n or (joints is not None and joints.shape[1] != n):
             yield "its network's bases have another number of Gaussians"
-        if network.basis.shape[0] != e or features > network.base.shape[1]:
+        if network.basis.shape[0] != (e if network.along is None else 0) or features > network.base.shape[1]:
             yield "the shape of its network's basis does not fit"
         if joints is not None and (joints.shape[0] != 3 * j or joints.shape[2] != features):
             yield "the shape of its network's joint basis does not fit"
+    if network.along is not None:
+        yield from _along_faults(network, network.along, e + 3 * j)
+
+
+def _along_faults(network: AttributeNetwork, along: FeatureDirections, inputs: int) -> Iterator[str]:
+    if network.input != "features" or network.joint_basis is not None:
+        yield "its network has directions of features beside another input"
+    k = along.directions.shape[1]
+    shapes = {"rest": (inputs,), "directions": (inputs, k), "basis": (len(network.base), k, network.basis.shape[2])}
+    for name, shape in shapes.items():
+        if getattr(along, name).shape != shape:
+            yield f"the shape of {name} of its directions of features does not fit"
 
 
 def _free_names(rig: Rig) -> tuple[str, ...]:

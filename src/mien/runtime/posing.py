@@ -20,6 +20,8 @@ from mien.runtime.baked import (
 )
 
 _MOST_LAYERS = 64
+_UNBOUNDED = np.array([np.finfo(np.float32).max])
+"""A reach that no face goes beyond."""
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * coefficient."""
 
@@ -156,9 +158,7 @@ def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
 
 def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.ndarray]:
     """Return the changes of the raw values, by the names of the parts: [n, 3], [n] and [n, 3]. None changes nothing."""
-    inputs = np.concatenate([face.expression, face.joints.reshape(-1)]).astype(np.float32, copy=False)
-    activations = np.empty(changes.directions.shape[1], np.float32)
-    _native.expression_activations(inputs, changes.rest, changes.directions, changes.reach, activations)
+    activations = _along(face, changes.rest, changes.directions, changes.reach)
     added = {}
     for name in ("colour", "opacity_logits", "means"):
         basis = getattr(changes, name)
@@ -170,6 +170,19 @@ def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.n
         added["colour"] = added.get("colour", np.float32(0)) + colour
         added["opacity_logits"] = added.get("opacity_logits", np.float32(0)) + opacity_logits
     return added
+
+
+def _along(
+    face: Face,
+    rest: Float32[np.ndarray, " i"],
+    directions: Float32[np.ndarray, "i r"],
+    reach: Float32[np.ndarray, " 1"],
+) -> Float32[np.ndarray, " r"]:
+    """(inputs - rest) directions, shortened to the reach, by the same operation as in training."""
+    inputs = np.concatenate([face.expression, face.joints.reshape(-1)]).astype(np.float32, copy=False)
+    activations = np.empty(directions.shape[1], np.float32)
+    _native.expression_activations(inputs, rest, directions, reach, activations)
+    return activations
 
 
 def feature_changes(
@@ -252,14 +265,25 @@ def _run_native(network: AttributeNetwork, face: Face) -> tuple[np.ndarray, np.n
         layers = zip(network.weights, network.biases, strict=True)
         arrays = [np.ascontiguousarray(array, np.float32) for layer in layers for array in layer]
         prepared = _networks[network] = _native.FeatureNetwork(*rows, *arrays)
-    bases = [_native.FeatureBases(np.ascontiguousarray(network.basis), _contiguous_row(face.expression), True)]
-    if network.joint_basis is not None:
-        joints = np.ascontiguousarray(network.joint_basis)
-        bases.append(_native.FeatureBases(joints, _contiguous_row(face.joints.reshape(-1)), True))
+    bases = _native_bases(network, face)
     n, outputs = len(network.base), len(network.biases[-1])
     sh, opacity_logits = np.empty((n, outputs - 1), np.float32), np.empty(n, np.float32)
     _native.feature_network(prepared, bases, None, sh, opacity_logits)
     return sh, opacity_logits
+
+
+def _native_bases(network: AttributeNetwork, face: Face) -> list[_native.FeatureBases]:
+    along = network.along
+    if along is not None:
+        activations = _along(face, along.rest, along.directions, _UNBOUNDED)
+        return [_native.FeatureBases(np.ascontiguousarray(along.basis), activations, by_input=False)]
+    inputs = [(network.basis, face.expression)]
+    if network.joint_basis is not None:
+        inputs.append((network.joint_basis, face.joints.reshape(-1)))
+    return [
+        _native.FeatureBases(np.ascontiguousarray(basis), _contiguous_row(values), by_input=True)
+        for basis, values in inputs
+    ]
 
 
 _networks: "WeakKeyDictionary[AttributeNetwork, _native.FeatureNetwork]" = WeakKeyDictionary()
@@ -274,9 +298,7 @@ def run_network(
 ) -> Float32[np.ndarray, "n _"]:
     """The outputs of an attribute network, in numpy. This is the reference of `_native.feature_network`."""
     if network.input == "features":
-        blended = _combined(network.basis, face.expression)
-        if network.joint_basis is not None:
-            blended = blended + _combined(network.joint_basis, face.joints.reshape(-1))
+        blended = _blended(network, face)
         values = network.base.copy()
         values[:, : blended.shape[1]] += blended
     else:
@@ -286,6 +308,17 @@ def run_network(
         if index + 1 < len(network.weights):
             values = _ACTIVATIONS[network.activation](values)
     return values
+
+
+def _blended(network: AttributeNetwork, face: Face) -> Float32[np.ndarray, "n w"]:
+    """What the face adds to the features."""
+    along = network.along
+    if along is not None:
+        return _combined(along.basis.swapaxes(0, 1), _along(face, along.rest, along.directions, _UNBOUNDED))
+    blended = _combined(network.basis, face.expression)
+    if network.joint_basis is None:
+        return blended
+    return blended + _combined(network.joint_basis, face.joints.reshape(-1))
 
 
 def _combined(basis: Float32[np.ndarray, "b n w"], coefficients: Float32[np.ndarray, " b"]) -> np.ndarray:
