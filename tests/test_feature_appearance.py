@@ -28,9 +28,13 @@ from mien.training.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_sequence
 
-RANK = 3
+RANK, DIRECTIONS = 3, 5
 CONFIG = GaussianAvatarsConfig(
-    expression_rank=RANK, expression_colour_rate=Rate(0.0), appearance="features", appearance_features=6
+    expression_rank=RANK,
+    expression_colour_rate=Rate(0.0),
+    appearance="features",
+    appearance_directions=DIRECTIONS,
+    appearance_features=6,
 )
 GROWING = GradientSettings(start=0.2, stop=0.8, rounds=4, grow_gradient=1e-4, max_gaussians=400)
 PARTS = ("means", "quats", "scales", "opacities", "sh")
@@ -73,7 +77,7 @@ def test_colour_and_opacity_change_by_the_network() -> None:
     static = GaussianAvatars(still, toy_face_model(), toy_face(5))
     static.store.load_state_dict({name: store.state_dict()[name] for name in static.store.state_dict()})
     plain = static.pose(face).gaussians
-    logits = store["opacity_logits"] + opacity + store["opacity_basis"] @ activations
+    logits = store["opacity_logits"] + opacity + store["opacity_basis"] @ activations[:RANK]
     torch.testing.assert_close(posed.sh.view(-1, 3).double(), store["sh_constant"][:, 0] + colour, atol=1e-6, rtol=1e-5)
     torch.testing.assert_close(posed.opacities.view(-1).double(), logits.sigmoid(), atol=1e-6, rtol=1e-5)
     assert colour.abs().max() > 0.1
@@ -120,9 +124,23 @@ def test_changes_have_a_penalty_of_their_own() -> None:
     torch.testing.assert_close(losses["appearance"], 0.5 * squares)
 
 
-def test_features_need_activations() -> None:
-    with pytest.raises(UserError, match=r"--method\.expression-rank is 0; choose a rank from 1 to 8"):
-        GaussianAvatarsConfig(appearance="features").check()
+def test_features_have_their_own_number_of_activations() -> None:
+    """Bases take the first activations. Avatars from before had as many for features as for bases."""
+    avatar = new_avatar()
+    assert avatar.store["feature_bases"].shape[1] == DIRECTIONS
+    assert avatar.store["offset_basis"].shape[-1] == RANK
+    changes = avatar.bake().changes
+    assert changes is not None
+    assert changes.basis_columns == RANK
+    for columns in (0, RANK + 1, 99):
+        fault = baked_fault(replace(avatar.bake(), changes=replace(changes, basis_columns=columns)))
+        assert fault is not None
+    alone = replace(CONFIG, expression_rank=0)
+    alone.check()
+    assert baked_fault(new_avatar(alone).bake()) is None
+    stored = {"expression_rank": 4, "appearance": "features"}
+    assert GaussianAvatarsConfig.upgraded(stored)["appearance_directions"] == 4
+    assert "appearance_directions" not in GaussianAvatarsConfig.upgraded({"appearance": "static"})
 
 
 def test_density_control_keeps_every_tensor_as_long_and_every_triangle() -> None:

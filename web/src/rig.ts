@@ -160,10 +160,10 @@ export function activations(changes: ExpressionChanges, face: Face): Float64Arra
   return out.map((x) => x * shorter);
 }
 
-/** raw + basis times activations, into `out`. */
+/** raw + basis times the first activations, into `out`. */
 function changed(raw: Float32Array, basis: Float32Array | null, weights: Float64Array, out: Float32Array): void {
   if (!basis) return;
-  const rank = weights.length;
+  const rank = basis.length / Math.max(out.length, 1);
   for (let i = 0, b = 0; i < out.length; ++i) {
     let sum = raw[i];
     for (let k = 0; k < rank; ++k) sum += basis[b++] * weights[k];

@@ -70,12 +70,12 @@ class GaussianAvatars(Avatar):
         trained |= {name: like.new_zeros(n, *shape) for name, shape in self._basis_shapes().items()}
         self.appearance = None
         if config.appearance == "features":
-            trained |= feature_tensors(trained["means"], config.expression_rank, config.appearance_features)
+            trained |= feature_tensors(trained["means"], self._activation_count, config.appearance_features)
             vertices = face_model.head_vertices(self.subject)[0]
             widths = (config.appearance_features, config.appearance_hidden)
             self.appearance = FeatureAppearance(vertices, face_model.faces, *widths)
         if self._changes:
-            self.activations = ExpressionActivations(face, self.subject, config.expression_rank)
+            self.activations = ExpressionActivations(face, self.subject, self._activation_count)
         self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
@@ -92,7 +92,9 @@ class GaussianAvatars(Avatar):
             aux = {name: torch.stack([posed.aux[name] for posed in each]) for name in each[0].aux}
             return Posed(stack_timesteps([posed.gaussians for posed in each]), aux)
         (activations,) = self.activations(face)
-        changes = {name: expression_change(self.store[name], activations) for name in self._basis_shapes()}
+        # Bases take the first activations, which are those of the largest spread.
+        first = activations[: self.config.expression_rank]
+        changes = {name: expression_change(self.store[name], first) for name in self._basis_shapes()}
         local = {name: self.store[name] for name in ("face_index", "means", "quats", "log_scales", "opacity_logits")}
         if self.appearance is not None:
             changes["feature_colour"], changes["feature_opacity"] = self.appearance(self.store, activations)
@@ -114,6 +116,11 @@ class GaussianAvatars(Avatar):
     def _changes(self) -> bool:
         """Whether Gaussians change with the expression beside the mesh."""
         return bool(self._basis_shapes()) or self.config.appearance == "features"
+
+    @property
+    def _activation_count(self) -> int:
+        config = self.config
+        return max(config.expression_rank, config.appearance_directions if config.appearance == "features" else 0)
 
     @property
     def _opacity_changes(self) -> bool:
@@ -283,7 +290,9 @@ class GaussianAvatars(Avatar):
         features = None if self.appearance is None else self.appearance.bake(self.store)
         fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "reach"))
         bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in _BASES)
-        return ExpressionChanges(*fixed, *bases, features=features)
+        rank = self.config.expression_rank
+        basis_columns = rank if self._basis_shapes() and rank < self._activation_count else None
+        return ExpressionChanges(*fixed, *bases, features=features, basis_columns=basis_columns)
 
     @property
     def _sh_frame(self) -> Literal["world", "head"]:

@@ -1,11 +1,11 @@
 """The settings of GaussianAvatars."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, PerceptualLoss, Photometric
-from mien.errors import UserError
 from mien.ranges import FRACTION, NOT_NEGATIVE, Range
 
 
@@ -86,7 +86,10 @@ class GaussianAvatarsConfig(MethodConfig):
     """Weight of the mean squared changes with the expression, which keeps changes small that pictures do not need."""
     appearance: Literal["static", "features"] = "static"
     """Whether a Gaussian's colour and opacity stay as they are, as in the paper, or also change with features that the
-    activations of the face blend and one small network reads, as in HeadGaS. Features need `expression_rank`."""
+    activations of the face blend and one small network reads, as in HeadGaS."""
+    appearance_directions: Annotated[int, Range(1, 64)] = 20
+    """Number of activations of the face that blend the features, with `appearance` features. It is at least
+    `expression_rank`."""
     appearance_features: Annotated[int, Range(1, 256)] = 32
     """Number of features of each Gaussian, with `appearance` features."""
     appearance_hidden: Annotated[int, Range(1, 1024)] = 64
@@ -110,18 +113,13 @@ class GaussianAvatarsConfig(MethodConfig):
     density: GradientSettings = field(default_factory=GradientSettings)
     """Density control: when and where Gaussians are added and removed."""
 
-    def check(self) -> None:
-        """Check that the settings fit together.
-
-        Raises:
-            UserError: features have no activations to be blended by.
-        """
-        super().check()
-        if self.appearance == "features" and self.expression_rank == 0:
-            raise UserError(
-                "--method.appearance features: features are blended by the activations of the face, and "
-                "--method.expression-rank is 0; choose a rank from 1 to 8"
-            )
+    @classmethod
+    def upgraded(cls, stored: Mapping[str, Any]) -> dict[str, Any]:
+        """Features had the activations of `expression_rank` before they had their own number."""
+        settings = super().upgraded(stored)
+        if settings.get("appearance") == "features":
+            settings.setdefault("appearance_directions", settings.get("expression_rank", 1))
+        return settings
 
 
 _STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000

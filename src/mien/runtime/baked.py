@@ -134,13 +134,16 @@ class ExpressionChanges:
     directions: Float32[np.ndarray, "i r"]
     reach: Float32[np.ndarray, " 1"]
     """Length of the activations up to which training saw expressions."""
-    colour: Float32[np.ndarray, "n 3 r"] | None = None
-    """Changes of the first SH coefficient per unit of each activation."""
-    opacity_logits: Float32[np.ndarray, "n r"] | None = None
-    means: Float32[np.ndarray, "n 3 r"] | None = None
+    colour: Float32[np.ndarray, "n 3 _"] | None = None
+    """[n, 3, r], or [n, 3, c]: changes of the first SH coefficient per unit of each activation."""
+    opacity_logits: Float32[np.ndarray, "n _"] | None = None
+    means: Float32[np.ndarray, "n 3 _"] | None = None
     """Changes of the centres, in the triangle's frame and units."""
     features: FeatureChanges | None = field(default=None, metadata={"since": 5})
     """Further changes of colours and opacities."""
+    basis_columns: int | None = field(default=None, metadata={"since": 6})
+    """Number of columns c of colour, opacity_logits and means, which the first c activations weight. None if they have
+    all r."""
 
 
 @dataclass(frozen=True, eq=False)

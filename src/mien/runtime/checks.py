@@ -160,11 +160,13 @@ def _bases_faults(bases: LinearBases, attributes: Attributes, e: int, mean_moves
 def _changes_faults(changes: ExpressionChanges, n: int, inputs: int) -> Iterator[str]:
     r = changes.directions.shape[1]
     # Features are blended by another operation, which takes any number of activations.
+    c = r if changes.basis_columns is None else changes.basis_columns
     limited = any(part is not None for part in (changes.colour, changes.opacity_logits, changes.means))
-    if r < 1 or (limited and r > MAX_ACTIVATIONS):
-        yield f"it has {r} activations of its changes with the expression, not 1 to {MAX_ACTIVATIONS}"
+    if r < 1 or not 1 <= c <= r or (limited and c > MAX_ACTIVATIONS):
+        yield f"its changes with the expression have {c} of {r} activations, not 1 to {MAX_ACTIVATIONS}"
+        return
     shapes = {"rest": (inputs,), "directions": (inputs, r), "reach": (1,)}
-    shapes |= {"colour": (n, 3, r), "opacity_logits": (n, r), "means": (n, 3, r)}
+    shapes |= {"colour": (n, 3, c), "opacity_logits": (n, c), "means": (n, 3, c)}
     for name, shape in shapes.items():
         part = getattr(changes, name)
         if part is not None and part.shape != shape:

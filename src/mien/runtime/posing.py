@@ -164,7 +164,7 @@ def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.n
         basis = getattr(changes, name)
         if basis is not None:
             added[name] = np.empty(basis.shape[:-1], np.float32)
-            _native.expression_change(np.ascontiguousarray(basis), activations, added[name])
+            _native.expression_change(np.ascontiguousarray(basis), activations[: changes.basis_columns], added[name])
     if changes.features is not None:
         colour, opacity_logits = feature_changes(changes.features, activations)
         added["colour"] = added.get("colour", np.float32(0)) + colour
