@@ -25,6 +25,7 @@ from mien.avatar.avatar import (
     network_group,
     store_group,
 )
+from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
 from mien.avatar.baking import as_array
 from mien.avatar.density import GradientDensity
 from mien.avatar.encoding import positional_encoding
@@ -90,16 +91,20 @@ class HeadGas(Avatar):
         # Not in files: only training needs it, and makes it anew.
         self.judged = nn.Buffer(spread.detach().clone(), persistent=False)
         self.store = GaussianStore(trained)
-        self._bases_gradient = FactoredGradient()
+        self._bases_gradient, self._baked = FactoredGradient(), Kept[Static]()
         inputs = (width if parts.blends else directions.shape[1]) + 3 + 6 * config.encoding_bands
         self.network = new_network(parts, inputs, config.hidden, 3 * self._coefficients).to(means)
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in the head frame, one batch entry per timestep. Colours and opacities differ between them.
 
-        Two variants also move Gaussians (supplement, eq. 1 to 3).
+        Two variants also move Gaussians (supplement, eq. 1 to 3). An avatar that is not in training mode (`eval()`)
+        poses its baked form, if there is one, unless `face` is to have gradients.
         """
         store = self.store
+        if not self.training and progress is TRAINED and self.unbaked is None and can_pose_baked(store["means"], face):
+            baked = self._baked.of((*self.parameters(), *self.buffers()), self.bake)
+            return Posed(pose_baked(baked, face), {})
         inputs = (expression_inputs(face) - self.rest) @ self.directions
         changes = list(self._changes(inputs, progress))
         sh = _stacked([one.colours for one in changes]).unflatten(-1, (self._coefficients, 3))
