@@ -334,4 +334,4 @@ def test_export_writes_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main(["export", str(tmp_path / "W"), "--out", page, "--series", "clip", "--every", "2"]) == 0
     assert "a motion of 3 frames" in capsys.readouterr().err
     assert main(["export", str(tmp_path / "W"), "--out", page, "--set", "drop=1"]) == 2
-    assert "a page has a slider for every expression" in capsys.readouterr().err
+    assert "a page sets every expression itself" in capsys.readouterr().err

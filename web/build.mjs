@@ -1,4 +1,4 @@
-// Builds dist/mien.js and dist/motion.js (the package) and src/mien/export/page.html (the page that `mien export` fills; it is committed,
+// Builds dist/mien.js, dist/motion.js and dist/element.js (the package) and src/mien/export/page.html (the page that `mien export` fills; it is committed,
 // so that the Python package needs no node). `node build.mjs FOLDER` writes both into FOLDER instead.
 import { build } from "esbuild";
 import { mkdir, readFile, writeFile } from "node:fs/promises";
@@ -31,6 +31,6 @@ const write = async (path, text) => {
 const script = await bundle("src/page.ts", "iife");
 if (script.includes("</script")) throw new Error("the script would end its own element");
 const template = await readFile(join(here, "src/page.html"), "utf8");
-for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"]])
+for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"]])
   await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm")) + "\n");
 await write(folder ? join(folder, "page.html") : join(here, "../src/mien/export/page.html"), template.replace("{{script}}", () => script));

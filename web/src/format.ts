@@ -64,6 +64,12 @@ export async function readPacked(packed: Uint8Array): Promise<{ avatar: Avatar; 
   return { avatar: checked(content.avatar), motion: content.motion };
 }
 
+/** An avatar in either form, told apart by its first bytes. */
+export async function readAny(file: Uint8Array): Promise<{ avatar: Avatar; motion: Motion | null }> {
+  if (file[0] === 0x1f && file[1] === 0x8b) return readPacked(file);
+  return { avatar: readMien(file.slice().buffer as ArrayBuffer), motion: null };
+}
+
 /** value = middle + integer * step, with one middle and step for each index of the first axis or for each column. */
 function unpack(file: ArrayBuffer, start: number, tensor: PackedTensor): Numbers {
   const count = tensor.shape.reduce((product, size) => product * size, 1);

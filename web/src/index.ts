@@ -7,3 +7,4 @@ export { DepthSorter } from "./sort";
 export { Renderer } from "./renderer";
 export type { Colour, View } from "./renderer";
 export { Viewer } from "./viewer";
+export type { Matrices } from "./viewer";

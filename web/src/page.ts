@@ -2,6 +2,7 @@
 
 import { enliven, type Life } from "./alive";
 import { motionLength } from "./avatar";
+import { addTurning, fit } from "./controls";
 import { AvatarError, readPacked } from "./format";
 import { readSeries } from "./series";
 import { Viewer } from "./viewer";
@@ -15,8 +16,6 @@ const GROUPS: [string, RegExp][] = [
   ["Other", /./],
 ];
 const AXES = ["nod", "turn", "tilt"];
-/** Most pixels of a picture: more would make telephones stutter. */
-const MOST_PIXELS = 1_600_000;
 /** Largest angle of a slider of a joint, in radians. */
 const MOST_ANGLE = 0.5;
 
@@ -66,48 +65,6 @@ function addSliders(viewer: Viewer, place: HTMLElement): () => void {
   if (joints.length) place.append(element("details", {}, element("summary", {}, "Joints"), ...joints));
   place.querySelector("details")?.setAttribute("open", "");
   return () => updates.forEach((update) => update());
-}
-
-/** One finger or the mouse turns, two fingers or the wheel zoom, arrow keys turn. */
-function addTurning(viewer: Viewer): void {
-  const { canvas } = viewer, pointers = new Map<number, { x: number; y: number }>();
-  const span = () => {
-    const [a, b] = [...pointers.values()];
-    return Math.hypot(a.x - b.x, a.y - b.y);
-  };
-  canvas.addEventListener("pointerdown", (event) => {
-    canvas.setPointerCapture(event.pointerId);
-    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-  });
-  for (const name of ["pointerup", "pointercancel"] as const) canvas.addEventListener(name, (event) => pointers.delete(event.pointerId));
-  canvas.addEventListener("pointermove", (event) => {
-    const last = pointers.get(event.pointerId);
-    if (!last) return;
-    const apart = pointers.size === 2 ? span() : 0;
-    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-    if (apart) viewer.zoom *= span() / apart;
-    else {
-      viewer.yaw -= (event.clientX - last.x) * 0.008;
-      viewer.pitch += (event.clientY - last.y) * 0.008;
-    }
-    viewer.look();
-  });
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    viewer.zoom *= Math.exp(-0.0015 * event.deltaY);
-    viewer.look();
-  }, { passive: false });
-  canvas.addEventListener("keydown", (event) => {
-    const turns: Record<string, () => void> = {
-      ArrowLeft: () => (viewer.yaw += 0.1), ArrowRight: () => (viewer.yaw -= 0.1),
-      ArrowUp: () => (viewer.pitch -= 0.1), ArrowDown: () => (viewer.pitch += 0.1),
-      "+": () => (viewer.zoom *= 1.1), "-": () => (viewer.zoom /= 1.1),
-    };
-    if (!turns[event.key]) return;
-    event.preventDefault();
-    turns[event.key]();
-    viewer.look();
-  });
 }
 
 /** Play, pause, and a time line, while there is a motion. Files that are chosen or dropped become the motion. */
@@ -210,17 +167,6 @@ function addRest(viewer: Viewer, moveSliders: () => void): void {
   }
   show();
   find("full").addEventListener("click", () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()));
-}
-
-function fit(viewer: Viewer): void {
-  const { canvas } = viewer, { width, height } = canvas.getBoundingClientRect();
-  const ratio = Math.min(devicePixelRatio, 2, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1)));
-  const [w, h] = [width, height].map((size) => Math.max(1, Math.round(size * ratio)));
-  if (canvas.width !== w || canvas.height !== h) {
-    canvas.width = w;
-    canvas.height = h;
-    viewer.look();
-  }
 }
 
 async function open(): Promise<Viewer> {

@@ -150,6 +150,11 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  /** Gives the context back. Browsers have few of them. */
+  dispose(): void {
+    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+  }
+
   private uploadShapes(posed: SkinnedPoser): void {
     const { quats, scales } = this.arrays;
     quats.values.set(posed.quats);

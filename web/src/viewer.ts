@@ -9,6 +9,14 @@ import { DepthSorter } from "./sort";
 /** Turns beyond this would show the head upside down, in radians. */
 const MOST_PITCH = 1.4;
 
+/** A camera of another 3D program: column-major matrices as OpenGL has them. */
+export interface Matrices {
+  /** From the camera to the screen. */
+  projection: ArrayLike<number>;
+  /** From the head frame (+x to the person's left, +y up, +z out of the face, metres) to the camera. */
+  headToCamera: ArrayLike<number>;
+}
+
 export class Viewer {
   /** The face that is drawn. After changing it, call `change`. */
   readonly face: Face;
@@ -16,6 +24,8 @@ export class Viewer {
   yaw = 0;
   pitch = 0;
   zoom = 1;
+  /** The camera of another 3D program, in place of the viewer's own. */
+  matrices: Matrices | null = null;
   /** Colour behind the head; alpha 0 is transparent. */
   background: Colour = [0, 0, 0, 0];
   /** Timestep of the motion, and whether it runs. */
@@ -127,9 +137,11 @@ export class Viewer {
     turn[11] = pivot[2] - to[2];
     const worldDirections = this.avatar.baked.sh_frame === "world";
     const p = pose;
+    const directions = worldDirections ? [p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]] : [1, 0, 0, 0, 1, 0, 0, 0, 1];
+    if (this.matrices) return { directions, width, height, ...fromOpenGL(this.matrices, width, height) };
     return {
       head: chained(turn, chained(viewmat, pose)),
-      directions: worldDirections ? [p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]] : [1, 0, 0, 0, 1, 0, 0, 0, 1],
+      directions,
       focal: [K[0] * scale * this.zoom, K[4] * scale * this.zoom],
       centre: [width / 2 + (K[2] - w / 2) * scale * this.zoom, height / 2 + (K[5] - h / 2) * scale * this.zoom],
       width,
@@ -152,6 +164,13 @@ export class Viewer {
     this.milliseconds = performance.now() - began;
   }
 
+  /** Frees what the avatar holds on the GPU. Nothing is drawn after it. */
+  dispose(): void {
+    this.playing = this.stale = false;
+    cancelAnimationFrame(this.waiting);
+    this.renderer.dispose();
+  }
+
   private wait(): void {
     if (!this.waiting) this.waiting = requestAnimationFrame((now) => this.tick(now));
   }
@@ -169,6 +188,16 @@ export class Viewer {
     }
     if (this.stale) this.draw();
   }
+}
+
+/** The same camera with axes that go right, down and forward, as rows of [R | t], and its focal lengths in pixels. */
+function fromOpenGL({ projection: p, headToCamera: m }: Matrices, width: number, height: number): Pick<View, "head" | "focal" | "centre"> {
+  const row = (sign: number, k: number) => [m[k], m[4 + k], m[8 + k], m[12 + k]].map((x) => sign * x);
+  return {
+    head: [...row(1, 0), ...row(-1, 1), ...row(-1, 2)],
+    focal: [(p[0] * width) / 2, (p[5] * height) / 2],
+    centre: [((1 - p[8]) * width) / 2, ((1 + p[9]) * height) / 2],
+  };
 }
 
 /** The middle of the box around points. */

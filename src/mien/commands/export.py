@@ -10,19 +10,22 @@ from mien.commands.options import check_driver
 from mien.errors import UserError
 from mien.workspace import Workspace, open_workspace
 
+_ENDINGS = (".ply", ".mien", ".html", ".packed", ".glb")
+_PAGES = (".html", ".packed")
+
 
 @dataclass(frozen=True)
 class Command:
-    """Write an avatar as .mien (all of it), .html (a page), .glb (a mesh for engines), .ply (a pose) or a folder."""
+    """Write an avatar: .mien (all of it), .html (a page), .packed (for pages), .glb (a mesh), .ply (a pose) or a folder."""
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder."""
     out: Path
-    """The .mien, .html, .glb or .ply file to write. With --series, the .ply files get numbers: NAME_000000.ply. With
-    --format gaussian-avatars, a folder."""
-    format: Literal["mien", "html", "glb", "ply", "gaussian-avatars"] | None = None
-    """Format of the output: mien, html, glb, ply (default: by the ending of --out), or gaussian-avatars: a folder with
-    point_cloud.ply, whose Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's
+    """The .mien, .html, .packed, .glb or .ply file to write. With --series, the .ply files get numbers:
+    NAME_000000.ply. With --format gaussian-avatars, a folder."""
+    format: Literal["mien", "html", "packed", "glb", "ply", "gaussian-avatars"] | None = None
+    """Format of the output: mien, html, packed, glb, ply (default: by the ending of --out), or gaussian-avatars: a folder
+    with point_cloud.ply, whose Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's
     training."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
@@ -45,9 +48,9 @@ class Command:
         if self.format == "gaussian-avatars":
             self._check_folder()
             return
-        if kind not in (".ply", ".mien", ".html", ".glb"):
-            told = f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply, .mien, .html or .glb"
-            raise UserError(f"{told}, or --format gaussian-avatars for a folder")
+        if kind not in _ENDINGS:
+            told = f"{self.out}: cannot write {kind or 'a file without ending'}"
+            raise UserError(f"{told}; use .ply, .mien, .html, .packed or .glb, or --format gaussian-avatars for a folder")
         if self.format is not None and kind != f".{self.format}":
             raise UserError(f"{self.out}: does not end in .{self.format}, as --format {self.format} asks; rename it")
         if kind == ".mien" and (self.set or self.series):
@@ -56,8 +59,8 @@ class Command:
             raise UserError(
                 f"{self.out}: a .glb file has a morph target for every expression; leave --set and --series out"
             )
-        if kind == ".html" and self.set:
-            raise UserError(f"{self.out}: a page has a slider for every expression; leave --set out")
+        if kind in _PAGES and self.set:
+            raise UserError(f"{self.out}: a page sets every expression itself; leave --set out")
         if self.every < 1 or (self.every > 1 and self.series is None):
             raise UserError(f"--every {self.every}: give 1 or more, together with --series")
         if self.series is not None and self.series not in workspace.sequence_names():
@@ -75,7 +78,7 @@ class Command:
             self._write_folder(avatar, run_dir)
         elif self.out.suffix.lower() == ".mien":
             self._write_mien(avatar, run_dir)
-        elif self.out.suffix.lower() == ".html":
+        elif self.out.suffix.lower() in _PAGES:
             self._write_page(avatar, run_dir, workspace)
         elif self.out.suffix.lower() == ".glb":
             self._write_glb(avatar, run_dir)
@@ -87,7 +90,7 @@ class Command:
     def _check_folder(self) -> None:
         from mien.files import check_writable
 
-        if self.out.suffix.lower() in (".ply", ".mien", ".html", ".glb"):
+        if self.out.suffix.lower() in _ENDINGS:
             raise UserError(f"{self.out}: --format gaussian-avatars writes a folder; give a name without an ending")
         if self.set or self.series or self.every != 1:
             raise UserError(
@@ -122,7 +125,7 @@ class Command:
 
     def _write_page(self, avatar, run_dir: Path, workspace: Workspace) -> None:
         from mien.avatar import make_portable
-        from mien.export import Motion, write_page
+        from mien.export import Motion, write_packed, write_page
         from mien.progress import say
         from mien.training import run_camera
 
@@ -132,7 +135,7 @@ class Command:
             driven, fps = self._driven(avatar, workspace, self.series, with_head_pose=True)
             fields = (driven.expression, driven.joints, driven.head_rotation, driven.head_translation)
             motion = Motion(*(tensor.detach().float().numpy() for tensor in fields), fps=fps / self.every)
-        page = write_page(self.out, portable, motion)
+        page = (write_page if self.out.suffix.lower() == ".html" else write_packed)(self.out, portable, motion)
         moves = "" if motion is None else f", a motion of {len(motion):,} frames"
         say(
             f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians{moves}, {page.size / 1e6:.1f} MB; compression "

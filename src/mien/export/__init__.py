@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mien.export.glb_file import Glb, read_glb
     from mien.export.packed import Motion, pack, unpacked
     from mien.export.ply import read_ply, write_ply
-    from mien.export.web_page import WrittenPage, write_page
+    from mien.export.web_page import WrittenPage, write_packed, write_page
     from mien.export.world_space import in_world
 else:
     __getattr__, __dir__ = lazy_names(
@@ -28,7 +28,7 @@ else:
             "glb_file": ["Glb", "read_glb"],
             "packed": ["Motion", "pack", "unpacked"],
             "ply": ["read_ply", "write_ply"],
-            "web_page": ["WrittenPage", "write_page"],
+            "web_page": ["WrittenPage", "write_packed", "write_page"],
         },
     )  # fmt: skip
 
@@ -47,6 +47,7 @@ __all__ = [
     "unpacked",
     "write_gaussian_avatars_folder",
     "write_glb",
+    "write_packed",
     "write_page",
     "write_ply",
 ]

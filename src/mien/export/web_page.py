@@ -26,7 +26,7 @@ _MOST_PSNR = 120.0
 
 @dataclass(frozen=True)
 class WrittenPage:
-    """A page on disk."""
+    """A page, or a packed avatar, on disk."""
 
     size: int
     """Size in bytes."""
@@ -45,6 +45,18 @@ def write_page(path: Path, avatar: PortableAvatar, motion: Motion | None = None)
     packed = base64.b64encode(pack(avatar, motion)).decode()
     page = TEMPLATE.read_text(encoding="utf-8").replace("{{title}}", html.escape(avatar.about.name))
     content = page.replace("{{avatar}}", packed).encode()
+    write_atomically(path, lambda temporary: temporary.write_bytes(content))
+    return WrittenPage(len(content), _psnr(avatar))
+
+
+def write_packed(path: Path, avatar: PortableAvatar, motion: Motion | None = None) -> WrittenPage:
+    """Write the packed form alone, for pages of one's own (`<mien-avatar src=...>`, docs/publishing.md).
+
+    Raises:
+        UserError: pages cannot draw the avatar's network, or the path cannot be written.
+    """
+    check_writable(path)
+    content = pack(avatar, motion)
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
     return WrittenPage(len(content), _psnr(avatar))
 

@@ -1,0 +1,154 @@
+// <mien-avatar src="me.packed" expression="jawOpen:0.5 eyeBlinkLeft:1" controls idle></mien-avatar>
+
+import { enliven } from "./alive";
+import type { Motion } from "./avatar";
+import { addTurning, fit } from "./controls";
+import { AvatarError, readAny } from "./format";
+import { Viewer } from "./viewer";
+
+const RADIANS = Math.PI / 180;
+const STYLE = ":host{display:inline-block;width:320px;height:320px}canvas{display:block;width:100%;height:100%;outline-offset:-2px}:host([controls]) canvas{touch-action:none;cursor:grab}";
+
+/**
+ * An avatar as an element. Attributes:
+ * `src`: address of a .packed or .mien file.
+ * `expression`: names and strengths, `jawOpen:0.5 eyeBlinkLeft:1`; all others are those of the person at rest.
+ * `yaw`, `pitch`, `zoom`: the camera, in degrees to the person's left and upwards.
+ * `controls`: may be turned by hand. `idle`: blinks and moves a little.
+ *
+ * Events: `load` when it can be seen, `error` (a CustomEvent whose detail is the message) when it cannot.
+ */
+export class MienAvatar extends HTMLElement {
+  static readonly observedAttributes = ["src", "expression", "yaw", "pitch", "zoom", "idle"];
+  /** What draws the avatar, or null before `load`. */
+  viewer: Viewer | null = null;
+  private readonly observer = new ResizeObserver(() => this.viewer && fit(this.viewer));
+  private loading: AbortController | null = null;
+  private beating = 0;
+
+  connectedCallback(): void {
+    if (!this.hasAttribute("role")) this.setAttribute("role", "img");
+    this.open();
+  }
+
+  disconnectedCallback(): void {
+    this.close();
+  }
+
+  attributeChangedCallback(name: string, before: string | null, now: string | null): void {
+    if (!this.isConnected || before === now) return;
+    if (name === "src") this.open();
+    else if (name === "idle") this.live();
+    else if (name === "expression") this.pose();
+    else this.look();
+  }
+
+  get src(): string {
+    return this.getAttribute("src") ?? "";
+  }
+
+  set src(address: string) {
+    this.setAttribute("src", address);
+  }
+
+  get expression(): string {
+    return this.getAttribute("expression") ?? "";
+  }
+
+  set expression(text: string) {
+    this.setAttribute("expression", text);
+  }
+
+  /** Sets one expression, and leaves the others. False if the avatar has none of that name, or is not there yet. */
+  setExpression(name: string, value: number): boolean {
+    return this.viewer?.setExpression(name, value) ?? false;
+  }
+
+  /** Plays the motion that came with the file, or another one. */
+  play(motion?: Motion): void {
+    if (motion) this.viewer?.setMotion(motion);
+    this.viewer?.play();
+  }
+
+  pause(): void {
+    this.viewer?.play(false);
+  }
+
+  private close(): void {
+    this.loading?.abort();
+    this.observer.disconnect();
+    this.viewer?.dispose();
+    this.viewer = this.loading = null;
+  }
+
+  private async open(): Promise<void> {
+    this.close();
+    if (!this.src) return;
+    const loading = (this.loading = new AbortController());
+    try {
+      const answer = await fetch(this.src, { signal: loading.signal });
+      if (!answer.ok) throw new AvatarError(`cannot be fetched: the server answers ${answer.status}`);
+      const { avatar, motion } = await readAny(new Uint8Array(await answer.arrayBuffer()));
+      if (loading.signal.aborted) return;
+      const root = this.shadowRoot ?? this.attachShadow({ mode: "open" }), canvas = document.createElement("canvas");
+      const style = document.createElement("style");
+      style.textContent = STYLE;
+      root.replaceChildren(style, canvas);
+      if (!this.hasAttribute("aria-label")) this.setAttribute("aria-label", `Avatar of ${avatar.about.name}`);
+      const viewer = (this.viewer = new Viewer(canvas, avatar, motion));
+      if (this.hasAttribute("controls")) {
+        canvas.tabIndex = 0;
+        addTurning(viewer);
+      }
+      this.pose();
+      this.look();
+      this.observer.observe(canvas);
+      fit(viewer);
+      this.live();
+      this.dispatchEvent(new Event("load"));
+    } catch (error) {
+      if (loading.signal.aborted) return;
+      const { message } = error as Error;
+      const detail = error instanceof AvatarError ? `${this.src} ${message}` : `${this.src} cannot be shown: ${message}`;
+      this.dispatchEvent(new CustomEvent("error", { detail }));
+    }
+  }
+
+  private pose(): void {
+    const { viewer } = this;
+    if (!viewer) return;
+    viewer.face.expression.set(viewer.avatar.neutral.expression);
+    for (const one of this.expression.split(/[\s,]+/).filter(Boolean)) {
+      const [name, value] = one.split(":");
+      if (!viewer.setExpression(name, Number(value) || 0)) console.warn(`<mien-avatar>: no expression ${name}`);
+    }
+    viewer.change();
+  }
+
+  private look(): void {
+    const { viewer } = this, number = (name: string, otherwise: number) => Number(this.getAttribute(name) ?? otherwise) || otherwise;
+    if (!viewer) return;
+    [viewer.yaw, viewer.pitch, viewer.zoom] = [number("yaw", 0) * RADIANS, number("pitch", 0) * RADIANS, number("zoom", 1)];
+    viewer.look();
+  }
+
+  private live(): void {
+    if (this.beating || !this.viewer) return;
+    const beat = (now: number) => {
+      const { viewer } = this, idle = this.hasAttribute("idle") && viewer !== null;
+      this.beating = idle ? requestAnimationFrame(beat) : 0;
+      if (!viewer || viewer.playing) return;
+      enliven(viewer.face, viewer.avatar, { idle, pointer: null }, now / 1000);
+      viewer.change();
+    };
+    if (this.hasAttribute("idle")) this.beating = requestAnimationFrame(beat);
+  }
+}
+
+if (!customElements.get("mien-avatar")) customElements.define("mien-avatar", MienAvatar);
+
+declare global {
+  interface HTMLElementTagNameMap {
+    "mien-avatar": MienAvatar;
+  }
+}
