@@ -47,7 +47,7 @@ def build(folder: Path) -> Path:
 
 
 def browse(
-    page: Path,
+    page: Path | str,
     scripts: list[str],
     size: tuple[int, int] = (900, 600),
     screenshots: list[str | None] | None = None,
@@ -57,7 +57,7 @@ def browse(
     """Run scripts in a page, one after the other: their `results`, all `requests`, and `messages` of the console.
 
     Args:
-        page: The page.
+        page: The page's file, or its address on this machine.
         scripts: JavaScript.
         size: Width and height of the window.
         screenshots: A file for the window after each script, or None.

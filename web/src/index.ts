@@ -1,7 +1,7 @@
 // What the package offers.
 export { copyFace, motionFace, motionLength } from "./avatar";
 export type { Avatar, Camera, Face, MeshBound, Motion, Rig } from "./avatar";
-export { AvatarError, readMien, readPacked } from "./format";
+export { AvatarError, readAny, readMien, readPacked } from "./format";
 export { Poser } from "./rig";
 export { DepthSorter } from "./sort";
 export { Renderer } from "./renderer";

@@ -1,6 +1,6 @@
 // Opens a page in headless Chromium with software WebGL, runs scripts in it one after the other, and prints their
 // results and all requests as json. tests/test_web.py and tests/test_study.py call it:
-//   node browser.mjs CHROMIUM PAGE < {"width", "height", "scripts": [..], "screenshots": [path or null, ..], "downloads": folder}
+//   node browser.mjs CHROMIUM PAGE (a file, or an address on this machine) < {"width", "height", "scripts": [..], "screenshots": [path or null, ..], "downloads": folder}
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { pathToFileURL } from "node:url";
@@ -19,7 +19,7 @@ try {
   tab.on("console", (message) => messages.push(message.text()));
   tab.on("pageerror", (error) => messages.push(`${error}`));
   const [place, hash] = page.split("#");
-  const address = pathToFileURL(place).href;
+  const address = place.startsWith("http://") ? place : pathToFileURL(place).href;
   await tab.goto(hash ? `${address}#${hash}` : address);
   for (let i = 0; i < scripts.length; ++i) {
     results.push(await tab.evaluate(scripts[i]));

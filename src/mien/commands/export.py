@@ -16,7 +16,7 @@ _PAGES = (".html", ".packed")
 
 @dataclass(frozen=True)
 class Command:
-    """Write an avatar: .mien (all of it), .html (a page), .packed (for pages), .glb (a mesh), .ply (a pose) or a folder."""
+    """Write an avatar: .mien (all of it), .html (a page), .packed (for pages), .glb (mesh), .ply (a pose), a folder."""
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder."""
@@ -24,9 +24,9 @@ class Command:
     """The .mien, .html, .packed, .glb or .ply file to write. With --series, the .ply files get numbers:
     NAME_000000.ply. With --format gaussian-avatars, a folder."""
     format: Literal["mien", "html", "packed", "glb", "ply", "gaussian-avatars"] | None = None
-    """Format of the output: mien, html, packed, glb, ply (default: by the ending of --out), or gaussian-avatars: a folder
-    with point_cloud.ply, whose Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's
-    training."""
+    """Format of the output: mien, html, packed, glb, ply (default: by the ending of --out), or gaussian-avatars: a
+    folder with point_cloud.ply, whose Gaussians are bound to triangles, and flame_param.npz with all timesteps of the
+    run's training."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()
@@ -49,8 +49,8 @@ class Command:
             self._check_folder()
             return
         if kind not in _ENDINGS:
-            told = f"{self.out}: cannot write {kind or 'a file without ending'}"
-            raise UserError(f"{told}; use .ply, .mien, .html, .packed or .glb, or --format gaussian-avatars for a folder")
+            told = f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply, .mien, .html, .packed or"
+            raise UserError(f"{told} .glb, or --format gaussian-avatars for a folder")
         if self.format is not None and kind != f".{self.format}":
             raise UserError(f"{self.out}: does not end in .{self.format}, as --format {self.format} asks; rename it")
         if kind == ".mien" and (self.set or self.series):

@@ -7,7 +7,7 @@ export class AvatarObject extends THREE.Mesh {
   constructor(avatar, motion = null) {
     const canvas = document.createElement("canvas");
     const picture = new THREE.CanvasTexture(canvas);
-    picture.colorSpace = THREE.NoColorSpace;
+    picture.premultiplyAlpha = true;
     const geometry = new THREE.PlaneGeometry(2, 2);
     // The picture fills the screen, at the depth of the head's middle: what is nearer hides it, what is farther is hidden.
     const material = new THREE.ShaderMaterial({

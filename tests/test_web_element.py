@@ -1,0 +1,207 @@
+"""The element <mien-avatar>, the package, and the example in three.js, in a real browser."""
+
+import json
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mien import runtime
+from mien.export import write_packed
+from test_web import picture, psnr
+from web_case import WEB, browse, build, chromium, drawn_head, node
+
+SIDE = 320
+EXAMPLES = WEB / "examples"
+LOADED = """
+window.avatar = document.querySelector("mien-avatar");
+if (!avatar.viewer) await new Promise((done, fail) => {
+  avatar.addEventListener("load", done);
+  avatar.addEventListener("error", (event) => fail(new Error(event.detail)));
+});
+"""
+SHOT = """
+const { viewer } = avatar;
+[viewer.canvas.width, viewer.canvas.height] = [320, 320];
+viewer.background = [1, 1, 1, 1];
+viewer.draw();
+return viewer.canvas.toDataURL();
+"""
+
+
+PAGE = '<link rel="icon" href="data:,"><canvas id="scene" style="width: 400px; height: 400px"></canvas>'
+ONE_BY_ONE = "for (const [name, value] of [['jawOpen', 0.7], ['eyeBlinkLeft', 1]]) avatar.setExpression(name, value);"
+STILL = """
+avatar.removeAttribute("idle");
+for (let i = 0; i < 3; ++i) await new Promise(requestAnimationFrame);
+avatar.expression = "jawOpen:0";
+"""
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        """Say nothing."""
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder from loopback, as a web server of one's own does."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+
+
+def script(*parts: str) -> str:
+    return "(async () => {" + "".join(parts) + "})()"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the package, an avatar, and the example of the element."""
+    chromium()
+    folder = build(tmp_path_factory.mktemp("site"))
+    write_packed(folder / "me.packed", drawn_head(6000, rank=2))
+    (folder / "index.html").write_text((EXAMPLES / "element.html").read_text())
+    return folder
+
+
+@pytest.mark.slow
+def test_the_element_shows_an_avatar(site: Path) -> None:
+    steps = [
+        script(LOADED, STILL, SHOT),
+        script("avatar.expression = 'jawOpen:0.7, eyeBlinkLeft:1';", SHOT),
+        script("avatar.expression = '';", ONE_BY_ONE, SHOT),
+        script("avatar.setAttribute('yaw', '20');", SHOT),
+        "[avatar.getAttribute('role'), avatar.getAttribute('aria-label'), avatar.setExpression('smirk', 1),"
+        " avatar.viewer.canvas.tabIndex]",
+        script("avatar.remove(); const gone = avatar.viewer; document.body.append(avatar);", LOADED, "return gone;"),
+        script(
+            "const told = new Promise((done) => avatar.addEventListener('error', (event) => done(event.detail)));",
+            "avatar.src = 'nobody.packed'; return told;",
+        ),
+    ]  # fmt: skip
+    with served(site) as address:
+        told = browse(f"{address}/index.html", steps, size=(500, 600))
+    rest, open_, same, turned, facts, gone, error = told["results"]
+    exact = runtime.Avatar(drawn_head(6000, rank=2))
+    camera = exact.camera.resized(SIDE, SIDE)
+    shut = exact.render(exact.pose({"jawOpen": 0.0}), camera)[0]
+    assert psnr(picture(rest)[..., :3], shut) >= 45
+    np.testing.assert_array_equal(picture(open_), picture(same))
+    wide = exact.render(exact.pose({"jawOpen": 0.7, "eyeBlinkLeft": 1.0}), camera)[0]
+    assert psnr(picture(open_)[..., :3], wide) >= 45
+    assert psnr(shut, wide) < 40
+    assert psnr(picture(turned)[..., :3], wide) < 30
+    assert facts == ["img", "Avatar of drawn", False, 0]
+    assert gone is None
+    assert error == "nobody.packed cannot be fetched: the server answers 404"
+    assert all(request.startswith(address) for request in told["requests"])
+
+
+@pytest.mark.slow
+def test_yaw_goes_to_the_left_of_the_person(site: Path) -> None:
+    """As for `mien render --yaw`. The camera's place in the head frame is -R^T t of the view."""
+    place = """
+      const { head } = avatar.viewer.view(100, 100);
+      return -(head[0] * head[3] + head[4] * head[7] + head[8] * head[11]);
+    """
+    with served(site) as address:
+        told = browse(
+            f"{address}/index.html",
+            [script(LOADED, place), *(script(f"avatar.setAttribute('yaw', '{yaw}');", place) for yaw in (30, -30))],
+        )
+    ahead, left, right = told["results"]
+    assert left > ahead + 0.2
+    assert right < ahead - 0.2
+
+
+@pytest.mark.slow
+def test_an_avatar_stands_in_a_scene_of_three(site: Path) -> None:
+    """It is seen by the scene's camera, hides what is behind it, and is hidden by what is before it."""
+    bundle = [
+        "--bundle",
+        "--format=esm",
+        f"--alias:mien-web={site / 'mien.js'}",
+        f"--outfile={site / 'main.bundle.js'}",
+    ]
+    esbuild = WEB / "node_modules" / ".bin" / "esbuild"
+    subprocess.run([str(esbuild), str(EXAMPLES / "three" / "main.js"), *bundle], check=True, capture_output=True)
+    (site / "three.html").write_text(PAGE)
+    begin = """
+      const { start } = await import("./main.bundle.js");
+      const file = new Uint8Array(await (await fetch("me.packed")).arrayBuffer());
+      window.made = await start(document.getElementById("scene"), file);
+    """
+    shot = "made.look(%g); return document.getElementById('scene').toDataURL();"
+    hidden = "for (const box of Object.values(made.boxes)) box.visible = false;"
+    places = """
+      const { camera, boxes } = made;
+      return Object.values(boxes).map((box) => { const p = box.position.clone().project(camera); return [p.x, p.y]; });
+    """
+    steps = [script(begin, shot % 0), script(places), script(hidden, shot % 0), script(shot % 20)]
+    with served(site) as address:
+        told = browse(f"{address}/three.html", steps, size=(600, 600))
+    assert told["messages"] == []
+    scene, (front, behind), alone, turned = told["results"]
+    scene, alone, turned = (picture(address)[..., :3] for address in (scene, alone, turned))
+
+    def at(image: np.ndarray, place: list[float]) -> np.ndarray:
+        height, width = image.shape[:2]
+        return image[round((1 - place[1]) / 2 * height), round((1 + place[0]) / 2 * width)]
+
+    red, head = at(scene, front), at(alone, front)
+    assert red[0] > 2 * red[2]
+    assert np.abs(red - head).max() > 0.1
+    blue = (scene[..., 2] > scene[..., 0] + 0.3).mean()
+    # The whole box would take 0.16 of the picture.
+    assert 0.03 < blue < 0.11
+    # Where the head is opaque, the box behind it changes nothing.
+    exact = runtime.Avatar(drawn_head(6000, rank=2))
+    gaussians = exact.pose()
+    moved = runtime.Gaussians(**{**vars(gaussians), "T_world_local": np.eye(4, dtype=np.float32)})
+    for degrees, found in ((0.0, alone), (20.0, turned)):
+        camera = scene_camera(np.radians(degrees), 400)
+        expected, alpha = exact.render(moved, camera, background=(0xDD / 255, 0xE4 / 255, 0xEA / 255))
+        assert psnr(found, expected) >= 40
+        if degrees == 0:
+            solid = alpha > 0.99
+            assert np.abs(scene - alone).max(-1)[solid & ~(scene[..., 0] > 2 * scene[..., 2])].max() < 0.03
+
+
+def scene_camera(turn: float, side: int) -> runtime.Camera:
+    """The camera of the example, which looks at the origin from 0.8 m, with OpenCV's axes."""
+    eye = np.array([0.8 * np.sin(turn), 0.05, 0.8 * np.cos(turn)])
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0, 1, 0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    focal = side / (2 * np.tan(np.radians(25) / 2))
+    K = np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1]])
+    return runtime.Camera(K.astype(np.float32), viewmat.astype(np.float32), side, side)
+
+
+def test_the_package_has_what_it_promises() -> None:
+    """Every file that package.json names is built, with types, and nothing else goes to a registry."""
+    node()
+    package = json.loads((WEB / "package.json").read_text())
+    assert "dependencies" not in package
+    assert (WEB / "LICENSE").read_text() == (WEB.parent / "LICENSE").read_text()
+    subprocess.run(["npm", "run", "build", "--prefix", str(WEB)], check=True, capture_output=True)
+    done = subprocess.run(
+        ["npm", "pack", "--dry-run", "--json", "--ignore-scripts"], cwd=WEB, check=True, capture_output=True
+    )
+    (packed,) = json.loads(done.stdout)
+    files = {entry["path"] for entry in packed["files"]}
+    wanted = {path.removeprefix("./") for export in package["exports"].values() for path in export.values()}
+    assert wanted <= files
+    assert {"README.md", "LICENSE", "package.json"} <= files
+    assert all(path.startswith("dist/") for path in files - {"README.md", "LICENSE", "package.json"})
