@@ -33,6 +33,7 @@ _BESIDE_CODE = {
     "CHANGELOG.md": "changelog.md",
     "examples/README.md": "examples.md",
     "native/README.md": "native.md",
+    "web/README.md": "web_package.md",
 }
 """Pages outside docs/, and what they are called in the site."""
 _LINK = re.compile(r"(?P<before>\]\()(?P<target>[^)\s#:]+)(?P<after>(#[^)\s]*)?\))")
