@@ -28,7 +28,7 @@ _RARE = 0.02
 """Confidence below which a triangle is made up."""
 _SIGHTS, _RARELY = 240, 0.02
 """Number of frames in which the inside of the mouth is looked for, and the share of them that have to show it."""
-_MOVING, _LOOSE = ("lips", "eyelids", "eyes", "irises"), 2.5
+_MOVING, _LOOSE = ("lips", "eyelids", "eyes", "irises"), 3.0
 """Regions that move most, and the factor on the limits there and inside the mouth. The tracked mesh is millimetres off
 there, and its folds are not those of the skin."""
 _NEAR = (0.008, 0.024)
