@@ -211,26 +211,29 @@ def test_colours_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Seque
     torch.testing.assert_close(rgb_from_sh(colors[doubt > 0][:, 0]), torch.ones(int(doubt.sum()), 3), atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("hair", [0.0, 0.01])
-def test_limits_keep_gaussians_on_the_surface(hair: float) -> None:
+@pytest.mark.parametrize(("hair", "loose"), [(0.0, 1.0), (0.01, 1.0), (0.0, 2.0)])
+def test_limits_keep_gaussians_on_the_surface(hair: float, loose: float) -> None:
     torch.manual_seed(0)
     count, limits = 200, SurfaceLimits(enabled=True)
     values = {"means": torch.randn(count, 3), "quats": torch.randn(count, 4), "log_scales": torch.randn(count, 3)}
     store = GaussianStore(values, {"face_index": torch.arange(count) % 5})
     sizes = torch.tensor([0.001, 0.002, 0.004, 0.01, 0.1])
-    keep_on_surface(store, limits, sizes, torch.full((5,), hair))
+    looseness = torch.full((5,), loose)
+    keep_on_surface(store, limits, sizes, torch.full((5,), hair), looseness)
     size = sizes[store["face_index"]]
     height, scales = store["means"][:, 1] * size, store["log_scales"].exp() * size[:, None]
-    assert (height <= limits.depth + limits.hair_share * hair + 1e-7).all()
-    assert (height >= -limits.depth - 1e-7).all()
-    assert (scales[:, 1] <= limits.thickness + limits.hair_thickness * hair + 1e-7).all()
+    depth, thickness = loose * limits.depth, loose * limits.thickness
+    assert (height <= depth + limits.hair_share * hair + 1e-7).all()
+    assert (height >= -depth - 1e-7).all()
+    assert (height.abs() > 0.9 * depth).any()
+    assert (scales[:, 1] <= thickness + limits.hair_thickness * hair + 1e-7).all()
     flat = scales[:, [0, 2]]
     assert (flat <= limits.width + limits.hair_width * hair + 1e-7).all()
     assert (flat.amax(1) / flat.amin(1) <= limits.ratio * 1.0001).all()
     normal = matrix_from_quaternion(torch.nn.functional.normalize(store["quats"], dim=1))[:, 1, 1]
-    assert (normal >= math.cos(math.radians(limits.tilt)) - 1e-5).all()
+    assert (normal >= math.cos(math.radians(loose * limits.tilt)) - 1e-5).all()
     before = {name: store[name].clone() for name in store.names()}
-    keep_on_surface(store, limits, sizes, torch.full((5,), hair))
+    keep_on_surface(store, limits, sizes, torch.full((5,), hair), looseness)
     for name, value in before.items():
         torch.testing.assert_close(store[name], value)
 

@@ -14,7 +14,7 @@ import torch
 from mien import runtime
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, make_portable
 from mien.cli import main
-from mien.driving.motion import ARKIT_NAMES, LOOK_ANGLE
+from mien.driving.motion import ARKIT_NAMES, LOOK_ANGLE, within_lids
 from mien.errors import UserError
 from mien.export import Glb, MeshModel, read_glb, write_glb
 from mien.export.glb import joint_positions, morph_targets
@@ -130,7 +130,7 @@ def test_morph_targets_do_what_expressions_do(glb: Glb, portable: runtime.Portab
         np.testing.assert_allclose(found, corners_of(portable, expected), atol=2e-6)
         assert np.abs(found).max() > 1e-3
     joints = rest.joints.copy()
-    joints[portable.joint_names.index("left_eye"), 0] += LOOK_ANGLE
+    joints[portable.joint_names.index("left_eye"), 0] += within_lids(np.array([LOOK_ANGLE, 0, 0], np.float32))[0]
     expected = rig_points(rig, replace(rest, joints=joints)) - rig_points(rig, rest)
     np.testing.assert_allclose(morph_targets(portable, rig, rest)["eyeLookDownLeft"], expected, atol=2e-6)
 

@@ -7,14 +7,17 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from mien.avatar import METHODS, Avatar, GaussianAvatarsConfig
+from mien.avatar import METHODS, Avatar, GaussianAvatarsConfig, Progress
 from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh, sh_from_rgb
 from mien.render import rasterize
 from mien.training import Sequence, TrainSettings, train
+from mien.training.density_control import density_strategy
+from mien.training.frames import training_frames
 from mien.training.hidden import hidden_triangles, inside_triangles
 from mien.training.inside import Inside, disguise, disguised_reference
 from mien.training.sequence import Targets
+from mien.training.unseen import spare_fills, unseen_of
 from toy_scene import toy_face, toy_sequence
 
 SETTINGS = TrainSettings(steps=120, split="none", inside="covered", checkpoint_every=60, record_every=60)
@@ -62,12 +65,12 @@ def test_what_a_closed_mouth_hides_is_hidden(toy: tuple[FaceModel, Sequence]) ->
 
 def test_what_an_open_mouth_shows_is_not_hidden(toy: tuple[FaceModel, Sequence]) -> None:
     model, sequence = toy
-    camera, front = sequence.tracking.cameras[0], facing(model)
-    kept = (model.face_regions == 1) | (front < 0.9)
-    opened = replace(model, faces=model.faces[kept], uv_faces=model.faces[kept], face_regions=model.face_regions[kept])
+    camera, opened = sequence.tracking.cameras[0], open_mouth(model)
     inside = inside_triangles(opened)
     hidden = hidden_triangles(opened(toy_face(1))[0], opened, inside, camera)
-    assert not hidden[inside & (facing(opened) > 0.95)].any()
+    front = inside & (facing(opened) > 0.94)
+    assert front.any()
+    assert not hidden[front].any()
     assert hidden[inside & (opened.template[opened.faces].mean(1)[:, 1].abs() > 0.06)].all()
     assert not hidden[~inside].any()
 
@@ -88,6 +91,39 @@ def test_targets_say_what_is_hidden_if_they_are_asked(toy: tuple[FaceModel, Sequ
     assert torch.equal(asked.hidden, inside)
     assert asked.to(torch.zeros((), dtype=torch.float64)).hidden is not None
     assert Targets(sequence, 0, face_model=model).target(1, 0, white, keep=False).hidden is None
+
+
+def open_mouth(model: FaceModel) -> FaceModel:
+    """The nested heads with a hole in front."""
+    kept = (model.face_regions == 1) | (facing(model) < 0.9)
+    return replace(model, faces=model.faces[kept], uv_faces=model.faces[kept], face_regions=model.face_regions[kept])
+
+
+@pytest.mark.parametrize("opened", [False, True])
+def test_a_mouth_that_no_picture_shows_is_a_dark_closed_surface(toy: tuple[FaceModel, Sequence], opened: bool) -> None:
+    """What pictures show of it is closed as well before the first step, but it is trained."""
+    model, sequence = open_mouth(toy[0]) if opened else toy[0], toy[1]
+    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    frames = training_frames([sequence], SETTINGS)
+    unseen = unseen_of(avatar, [sequence], [sequence.tracking.face], frames, filled=True)
+    prior, inside = unseen.prior, inside_triangles(model)
+    assert prior.made_up is not None
+    assert prior.closed is not None
+    assert prior.looseness is not None
+    assert bool(prior.made_up[inside].all()) != opened
+    assert prior.made_up[inside].any()
+    front = inside & (facing(model) > 0.94)
+    assert front.any()
+    assert bool(prior.made_up[front].any()) != opened
+    assert prior.closed[inside].all()
+    assert (prior.looseness[inside] > 1).all()
+    assert (prior.looseness[~inside] == 1).all()
+    avatar.close(prior)
+    density, store = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store()), avatar.gaussian_store()
+    density.adapt(store, avatar.pose(sequence.tracking.face[0]), Progress(39, 100, 0, 1.0), torch.Generator)
+    own = inside[store["face_index"]]
+    assert (store["opacity_logits"].sigmoid()[own] > 0.9).all()
+    assert (rgb_from_sh(store["sh_constant"][own][:, 0]) < 0.4).all()
 
 
 @pytest.mark.parametrize("degree", [0, 2])

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from mien.camera import camera_from_fov, look_at
 from mien.driving import ARKIT_NAMES, drive, face_of_motion, read_blendshape_json, read_live_link_face
 from mien.driving.live_link_face import EYES, HEAD
-from mien.driving.motion import LOOK_ANGLE
+from mien.driving.motion import LOOK_ANGLE, Motion, gaze_of
 from mien.errors import UserError
+from mien.face import load_face_model
+from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model
@@ -198,7 +201,7 @@ def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
     driven = drive(face, at_rest, rest, model.expression_bounds)
     torch.testing.assert_close(driven.expression[:, 0], torch.tensor([0.05, 0.15, 0.25]))
     assert (driven.expression[:, 1] == 0.05).all()
-    up = torch.tensor([-math.radians(30), 0, 0])
+    up = torch.tensor([-math.radians(14) * math.tanh(30 / 14), 0, 0])
     for joint in ("left_eye", "right_eye"):
         torch.testing.assert_close(driven.joints[0, model.free_joint_names.index(joint)], up, atol=1e-5, rtol=0)
     # The head's rest pose is where it mostly is: the middle of the turn, which goes to the right.
@@ -206,3 +209,24 @@ def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
     torch.testing.assert_close(driven.head_translation, rest.head_translation.expand(3, -1))
     with pytest.raises(UserError, match="none of ARKit's"):
         face_of_motion(motion, toy_face_model())
+
+
+def test_eyes_that_look_up_and_down_stay_open() -> None:
+    """The lids follow the gaze. At ARKit's largest coefficients they must leave the iris in sight."""
+    model = load_face_model("anny")
+    irises = model.region_mask("irises")
+
+    def visible(name: str, strength: float) -> int:
+        coefficients, still = np.zeros((1, len(ARKIT_NAMES)), np.float32), np.zeros((1, 3), np.float32)
+        coefficients[0, [ARKIT_NAMES.index(f"{name}{side}") for side in ("Left", "Right")]] = strength
+        face, _ = face_of_motion(Motion(30.0, coefficients, gaze_of(coefficients), still, still, 0), model)
+        vertices = model.head_vertices(face)[0]
+        middle = vertices[model.faces[irises].long().flatten()].mean(0)
+        eye = look_at(middle + torch.tensor([0.0, 0, 0.5]), middle, torch.tensor([0.0, 1, 0]))
+        shown = rasterize_mesh(vertices, model.faces, camera_from_fov(0.3, 256, 128, eye)).face_index
+        return int(irises[shown[shown >= 0].long()].sum())
+
+    ahead = visible("eyeLookUp", 0.0)
+    assert ahead > 100
+    for name in ("eyeLookUp", "eyeLookDown"):
+        assert visible(name, 1.0) > 0.3 * ahead, name

@@ -15,6 +15,8 @@ interface Row {
 
 /** Angle of the eyes at a coefficient eyeLook of 1, in radians. */
 const LOOK_ANGLE = Math.PI / 6;
+/** Pitch that eyes come near but do not exceed, up and down, in radians: beyond it, the lids would cover the iris. */
+const MOST_UP = (14 * Math.PI) / 180, MOST_DOWN = (18 * Math.PI) / 180;
 const STILL = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 
 /** The motion in a recording, for an avatar. Its errors complete the sentence "NAME ...". */
@@ -123,7 +125,8 @@ function transferred(rows: Row[], fps: number, avatar: Avatar): Motion {
       const j = joints.indexOf(joint);
       if (j < 0) continue;
       const look = (way: string) => LOOK_ANGLE * score(`eyelook${way}${side}`);
-      const gaze = rotationMatrix([look("down") - look("up"), look(left) - look(right), 0], 0);
+      const pitch = look("down") - look("up"), most = pitch < 0 ? MOST_UP : MOST_DOWN;
+      const gaze = rotationMatrix([most * Math.tanh(pitch / most), look(left) - look(right), 0], 0);
       motion.joints.set(axisAngle(multiplied(rotationMatrix(neutral.joints, 3 * j), gaze)), t * neutral.joints.length + 3 * j);
     }
     motion.head_rotation.set(axisAngle(multiplied(rest, multiplied(back, head))), 3 * t);

@@ -48,6 +48,11 @@ class SurfacePrior:
     """0 for triangles that pictures show well, 1 for those that none shows. None if nothing was completed."""
     made_up: Bool[Tensor, " f"] | None = None
     """Triangles that are filled rather than trained: no picture shows them, and they are above the cut at the neck."""
+    closed: Bool[Tensor, " f"] | None = None
+    """Triangles that are an opaque surface before the first step: the made-up ones, and the inside of the mouth, which
+    is trained where pictures show it. None if these are the made-up ones."""
+    looseness: Float[Tensor, " f"] | None = None
+    """Factors on the limits to the surface (`Avatar.keep_to`), for parts that the mesh fits less well. None means 1."""
 
 
 @dataclass(frozen=True, eq=False)

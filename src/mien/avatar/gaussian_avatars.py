@@ -209,14 +209,15 @@ class GaussianAvatars(Avatar):
     @torch.no_grad()
     def close(self, prior: SurfacePrior) -> None:
         """Completed colours everywhere, and an opaque flat Gaussian at the height of hair on what no picture shows."""
-        if prior.colors is None or prior.made_up is None:
+        closed = prior.made_up if prior.closed is None else prior.closed
+        if prior.colors is None or closed is None:
             return
         store, bound = self.store, self.store["face_index"]
         store.assign("sh_constant", sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None])
         quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
         height = _FILL_HEIGHT * prior.hair[bound]
         store.assign("means", torch.stack([0 * height, height / self._sizes[bound], 0 * height], 1))
-        filled = prior.made_up[bound]
+        filled = closed[bound]
         store.assign("quats", torch.where(filled[:, None], quats[bound], store["quats"]))
         # Hair is a shell around the head, so its ellipses are larger than the triangles.
         wider = (height / _HEAD_RADIUS).log1p()[:, None] * log_scales.new_tensor([1.0, 0.0, 1.0])
@@ -228,7 +229,7 @@ class GaussianAvatars(Avatar):
     def keep_to(self, prior: SurfacePrior) -> None:
         """Apply `SurfaceLimits`, and pull the colours of what is rarely seen towards the completed ones."""
         if self.config.surface.enabled or prior.made_up is not None:
-            keep_on_surface(self.store, self.config.surface, self._sizes, prior.hair)
+            keep_on_surface(self.store, self.config.surface, self._sizes, prior.hair, prior.looseness)
         if prior.colors is not None and prior.doubt is not None:
             bound, own = self.store["face_index"], self.store["sh_constant"].detach()[:, 0]
             pull = _PULL * prior.doubt[bound, None]

@@ -29,6 +29,8 @@ ARKIT_NAMES = (
 LOOK_ANGLE = math.radians(30)
 """Rotation of an eye for an eyeLook coefficient of 1, in radians. Apple gives no angle; this is about the most that
 eyes turn."""
+_MOST_UP, _MOST_DOWN = math.radians(14), math.radians(18)
+"""Pitch that a driven eye comes near but does not exceed, in radians."""
 MAX_GAP_SECONDS = 60.0
 """Longest gap between two moments, in seconds, that is interpolated. A longer gap means another recording."""
 MAX_MOMENTS = 500_000
@@ -72,6 +74,17 @@ def gaze_of(coefficients: Float32[np.ndarray, "t 52"]) -> Float32[np.ndarray, "t
         eyes[:, index, 0] = LOOK_ANGLE * (look[f"eyeLookDown{side}"] - look[f"eyeLookUp{side}"])
         eyes[:, index, 1] = LOOK_ANGLE * (look[f"eyeLook{left}{side}"] - look[f"eyeLook{right}{side}"])
     return eyes
+
+
+def within_lids(eyes: Float32[np.ndarray, "*t 3"]) -> Float32[np.ndarray, "*t 3"]:
+    """Rotations of eyes with a softly limited pitch: small ones hardly change, and large ones keep the eye open.
+
+    The face model's lids follow the gaze in proportion, as they do at 10 degrees. At 25 degrees up or down, the lids
+    would cover the iris, which a person's lids do not.
+    """
+    limited, most = eyes.copy(), np.where(eyes[..., 0] < 0, _MOST_UP, _MOST_DOWN)
+    limited[..., 0] = most * np.tanh(eyes[..., 0] / most)
+    return limited
 
 
 def resample_evenly(

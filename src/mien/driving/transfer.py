@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.driving.motion import ARKIT_NAMES, Motion
+from mien.driving.motion import ARKIT_NAMES, Motion, within_lids
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
@@ -83,7 +83,8 @@ def _relative_rotation(
 def face_of_motion(motion: Motion, model: FaceModel) -> tuple[FaceParams, FaceParams]:
     """The face parameters, for a face model, of a motion that another program recorded, and the driver at rest.
 
-    Coefficients go to the expressions of the same names, gaze goes to the eye joints. At rest, which is one timestep,
+    Coefficients go to the expressions of the same names, gaze goes to the eye joints, within what the lids
+    can follow (`within_lids`). At rest, which is one timestep,
     all coefficients are zero, as in ARKit and MediaPipe, and the head has its median pose.
 
     Raises:
@@ -100,7 +101,7 @@ def face_of_motion(motion: Motion, model: FaceModel) -> tuple[FaceParams, FacePa
         expression[:, ours] = coefficients[:, theirs]
     for side, name in enumerate(("left_eye", "right_eye")):
         if name in model.free_joint_names:
-            joints[:, model.free_joint_names.index(name)] = torch.from_numpy(motion.eyes[:, side])
+            joints[:, model.free_joint_names.index(name)] = torch.from_numpy(within_lids(motion.eyes[:, side]))
     rotation, translation = torch.from_numpy(motion.head_rotation), torch.from_numpy(motion.head_translation)
     rest = replace(
         model.neutral(),

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Float32, Int
 
 from mien import runtime
-from mien.driving.motion import ARKIT_NAMES, gaze_of
+from mien.driving.motion import ARKIT_NAMES, gaze_of, within_lids
 from mien.errors import UserError
 from mien.export.glb_file import INDICES, VERTICES, GlbWriter
 from mien.export.texture import FRONT_VIEWS, Shot, Surface, bake_texture
@@ -117,7 +117,7 @@ def morph_targets(avatar: PortableAvatar, rig: Rig, face: Face) -> dict[str, Flo
                 coefficients = np.zeros((1, len(ARKIT_NAMES)), np.float32)
                 coefficients[0, index] = 1
                 joints = face.joints.copy()
-                joints[eyes] += gaze_of(coefficients)[0]
+                joints[eyes] += within_lids(gaze_of(coefficients)[0])
                 found[name] = rig_points(rig, replace(face, joints=joints)) - rest
     known = [name for name in ARKIT_NAMES if name in found]
     ordered = [*known, *(name for name in found if name not in known)]

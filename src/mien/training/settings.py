@@ -39,9 +39,10 @@ class TrainSettings:
     """Learning rate of these changes, per step. It ends at a tenth."""
     unseen: Literal["trained", "filled"] = "trained"
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
-    broken from aside. Filled: they are a closed surface in completed colours from the first step on, what is seen is
-    kept flat on the mesh, and alpha is compared with the matte (weight 0.2 or more). Methods that bind no Gaussians to
-    triangles train all sides in either case."""
+    broken from aside. Filled: they are a closed surface in completed colours from the first step on, and so is what no
+    picture shows of the inside of the mouth; what is seen is kept flat on the mesh, less so around mouth and eyes; and
+    alpha is compared with the matte (weight 0.2 or more). Methods that bind no Gaussians to triangles train all sides
+    in either case."""
     inside: Literal["free", "covered", "furnished"] = "free"
     """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
     them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in

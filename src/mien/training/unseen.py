@@ -13,16 +13,26 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.avatar import Avatar, DensityControl, GaussianStore, GradientDensity, Photometric, SurfacePrior
-from mien.face import FaceParams
+from mien.face import FaceModel, FaceParams
+from mien.parallel import stream_in_threads
 from mien.render.rendering import Rendering
 from mien.training.completion import complete_colors
-from mien.training.coverage import Coverage, coverage, drawn_share
-from mien.training.frames import Frame
+from mien.training.coverage import Coverage, coverage, drawn_share, smoothstep
+from mien.training.frames import Frame, spread_frames
 from mien.training.hair_height import hair_height
+from mien.training.head_parts import head_parts
+from mien.training.hidden import hidden_triangles
 from mien.training.sequence import Sequence
 
 _RARE = 0.02
 """Confidence below which a triangle is made up."""
+_SIGHTS, _RARELY = 240, 0.02
+"""Number of frames in which the inside of the mouth is looked for, and the share of them that have to show it."""
+_MOVING, _LOOSE = ("lips", "eyelids", "eyes", "irises"), 3.0
+"""Regions that move most, and the factor on the limits there and inside the mouth. The tracked mesh is millimetres off
+there, and its folds are not those of the skin."""
+_NEAR = (0.008, 0.024)
+"""Distances in metres from these regions between which the factor falls to 1."""
 _CONTRADICTION = 1e-6
 """Gradient of a centre, in triangle units, from which pictures contradict the height of a fill. A little light shines
 through every avatar, so smaller gradients reach what is hidden."""
@@ -72,15 +82,16 @@ class Unseen:
 
 
 def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
-    """The avatar's density control, with fills that keep their opacity at resets."""
+    """The avatar's density control, with closed surfaces that keep their opacity at resets."""
     density = avatar.density()
-    if unseen is None or unseen.prior.made_up is None or not isinstance(density, GradientDensity):
+    if unseen is None or unseen.prior.closed is None or not isinstance(density, GradientDensity):
         return density
 
     def may_reset(store: GaussianStore) -> Bool[Tensor, " n"]:
-        made_up = unseen.made_up(avatar)
-        assert made_up is not None
-        return ~made_up
+        closed, triangles = unseen.prior.closed, avatar.triangles()
+        assert closed is not None
+        assert triangles is not None
+        return ~closed[triangles]
 
     return replace(density, may_reset=may_reset)
 
@@ -96,11 +107,57 @@ def unseen_of(
         return Unseen(None, SurfacePrior(hair))
     found = coverage(model, sequences, faces, frames)
     neutral = model.head_vertices(avatar.subject)[0].detach()
-    colors = complete_colors(model, neutral, found.seen, found.colors)
+    parts = head_parts(model)
+    # The mesh cannot say exactly which part of a mouth a picture shows, so no colour from there is believed.
+    seen = torch.where(parts.interior, 0.0, found.seen)
+    colors = complete_colors(model, neutral, seen, found.colors)
     shown = drawn_share(model, found)
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
-    made_up = (shown < _RARE) & (found.above > 0.5) if avatar.triangles() is not None else None
-    return Unseen(found, SurfacePrior(hair, colors, doubt, made_up))
+    if avatar.triangles() is None:
+        return Unseen(found, SurfacePrior(hair, colors, doubt))
+    made_up = (shown < _RARE) & (found.above > 0.5)
+    made_up |= hidden_inside(model, parts.interior, sequences, faces, frames)
+    looseness = looser_where_faces_move(model, neutral, parts.interior)
+    return Unseen(found, SurfacePrior(hair, colors, doubt, made_up, made_up | parts.interior, looseness))
+
+
+def looser_where_faces_move(
+    face_model: FaceModel, vertices: Float[Tensor, "v 3"], interior: Bool[Tensor, " f"]
+) -> Float[Tensor, " f"]:
+    """Factors on the limits to the surface: above 1 at and around lips and lids, and inside the mouth.
+
+    Args:
+        face_model: The face model.
+        vertices: The person's neutral head in the head frame, in metres.
+        interior: Triangles inside the mouth.
+    """
+    middles, moving = vertices[face_model.faces.long()].mean(1), face_model.region_mask(*_MOVING)
+    if not bool(moving.any()):
+        return torch.where(interior, _LOOSE, 1.0)
+    distances = torch.cdist(middles, middles[moving], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+    near = smoothstep((_NEAR[1] - distances) / (_NEAR[1] - _NEAR[0]))
+    return 1 + (_LOOSE - 1) * torch.where(interior, 1.0, near)
+
+
+def hidden_inside(
+    face_model: FaceModel,
+    interior: Bool[Tensor, " f"],
+    sequences: Items[Sequence],
+    faces: Items[FaceParams],
+    frames: Items[Frame],
+) -> Bool[Tensor, " f"]:
+    """Which triangles inside a mouth hardly any picture shows, because lips, cheeks or tongue are in front of them."""
+
+    def shown_in(frame: Frame) -> Bool[Tensor, " f"]:
+        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
+        camera = sequences[frame.sequence].tracking.cameras[frame.camera]
+        return interior & ~hidden_triangles(vertices, face_model, interior, camera)
+
+    looked = spread_frames(frames, _SIGHTS)
+    sights = torch.zeros(len(interior))
+    for shown in stream_in_threads(shown_in, looked):
+        sights += shown
+    return interior & (sights < _RARELY * len(looked))
 
 
 def moved(unseen: Unseen, like: Tensor) -> Unseen:
@@ -110,5 +167,7 @@ def moved(unseen: Unseen, like: Tensor) -> Unseen:
         "colors": None if prior.colors is None else prior.colors.to(like),
         "doubt": None if prior.doubt is None else prior.doubt.to(like),
         "made_up": None if prior.made_up is None else prior.made_up.to(like.device),
+        "closed": None if prior.closed is None else prior.closed.to(like.device),
+        "looseness": None if prior.looseness is None else prior.looseness.to(like),
     }
     return replace(unseen, prior=SurfacePrior(prior.hair.to(like), **put))
