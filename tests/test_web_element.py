@@ -103,6 +103,8 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
     assert gone is None
     assert error == "nobody.packed cannot be fetched: the server answers 404"
     assert all(request.startswith(address) for request in told["requests"])
+    # Once for the page, and once when it came back.
+    assert sum(request.endswith("me.packed") for request in told["requests"]) == 2
 
 
 @pytest.mark.slow

@@ -25,18 +25,22 @@ export class MienAvatar extends HTMLElement {
   private readonly observer = new ResizeObserver(() => this.viewer && fit(this.viewer));
   private loading: AbortController | null = null;
   private beating = 0;
+  private attached = false;
 
   connectedCallback(): void {
     if (!this.hasAttribute("role")) this.setAttribute("role", "img");
+    this.attached = true;
     this.open();
   }
 
   disconnectedCallback(): void {
+    this.attached = false;
     this.close();
   }
 
   attributeChangedCallback(name: string, before: string | null, now: string | null): void {
-    if (!this.isConnected || before === now) return;
+    // Before it is attached, as when the page had it before this script, one fetch is enough.
+    if (!this.attached || before === now) return;
     if (name === "src") this.open();
     else if (name === "idle") this.live();
     else if (name === "expression") this.pose();
