@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from mien import _native
+from mien.adam import Moments
 from mien.avatar import Avatar, MonoGaussianAvatarConfig, PerceptualLoss, Photometric, Progress
 from mien.cli import main
 from mien.errors import UserError
@@ -49,7 +50,13 @@ def pull_at(state: TrainingState, data: TrainingData, frame: int, settings: Trai
     """Return the gradient of the points in the first step, which begins at a frame: ten times the first moments."""
     state.step = frame
     step(state, data, settings)
-    return 10 * state.avatar.gaussian_store().moments["means"].first
+    return 10 * means_moments(state).first
+
+
+def means_moments(state: TrainingState) -> Moments:
+    moments = state.avatar.gaussian_store().moments["means"]
+    assert isinstance(moments, Moments)
+    return moments
 
 
 def test_a_step_follows_the_mean_of_its_frames() -> None:
@@ -77,7 +84,7 @@ def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step() -> None:
         step(state, data, SETTINGS)
     assert seen == [data.order.at(number)[0] for number in range(SETTINGS.steps)]
     # Seven steps of four frames, and one of the two that are left.
-    assert state.avatar.gaussian_store().moments["means"].step == 8
+    assert means_moments(state).step == 8
     # Six numbers of steps at which the curves have an entry, of which the steps reach three alone.
     assert state.curves["step"] == [8, 12, 16, 20, 28, 30]
     # No round of density control is left out.
