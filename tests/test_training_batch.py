@@ -74,8 +74,10 @@ def test_every_loss_of_a_picture_is_a_mean() -> None:
     assert half == Photometric(0.35, 0.15, 0.1, 0.5, PerceptualLoss(0.2))
 
 
-def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step() -> None:
+def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     state, data = new_state()
+    rounds, adapt = [], state.density.adapt
+    monkeypatch.setattr(state.density, "adapt", lambda *given: rounds.append(adapt(*given)))
     seen = []
     while state.step < SETTINGS.steps:
         batch = next_batch(state, data, SETTINGS)
@@ -87,7 +89,8 @@ def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step() -> None:
     assert means_moments(state).step == 8
     # Six numbers of steps at which the curves have an entry, of which the steps reach three alone.
     assert state.curves["step"] == [8, 12, 16, 20, 28, 30]
-    # No round of density control is left out.
+    # No round of density control is left out: those after 5, 10, .., 25 frames.
+    assert rounds == [False, True, True, True, True, False, True, False]
     assert len(state.avatar.gaussian_store()) == 120
 
 

@@ -139,6 +139,5 @@ def _summed(losses: Iterable[dict[str, Float[Tensor, ""]]]) -> dict[str, Float[T
 
 
 def face_groups(state: TrainingState, batch: Items[BatchFrame]) -> list[ParameterGroup]:
-    """The parameters of the frames' faces. A timestep that is used twice is there once."""
-    indices = dict.fromkeys(one.index for one in batch)
-    return [group for index in indices for group in state.track.parameter_groups(index)]
+    """The parameters of the frames' faces. A timestep that comes twice is updated once, which clears its gradient."""
+    return [group for one in batch for group in state.track.parameter_groups(one.index)]
