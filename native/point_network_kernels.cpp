@@ -91,7 +91,7 @@ void forward(const PaddedPoints& network, float* kept, float* outputs, float* sc
   }
 }
 
-constexpr int kTileVectors = 3;             // vectors of points in a tile; a block has a whole number of tiles
+constexpr int kTileVectors = 3;                // vectors of points in a tile; a block has a whole number of tiles
 constexpr int kTileOutputs = W == 16 ? 8 : 4;  // so that a tile fits into the registers
 static_assert(kPointBlock % (kTileVectors * W) == 0);
 
@@ -164,7 +164,8 @@ void outputs_of(const PaddedPoints& network, float* outputs, float* scratch, int
   float* values[kMostPointLayers + 1];
   // At a whole vector of the widest kind: half of the scratch is not used.
   values[0] = (float*)(((uintptr_t)scratch + 63) & ~(uintptr_t)63);
-  for (int l = 0; l < layers; ++l) values[l + 1] = values[l] + kPointBlock * (l ? network.layers[l - 1].outputs : inputs);
+  for (int l = 0; l < layers; ++l)
+    values[l + 1] = values[l] + kPointBlock * (l ? network.layers[l - 1].outputs : inputs);
   const int last = network.layers[layers - 1].outputs;
   for (int64_t begin = first; begin < end; begin += kPointBlock) {
     const int64_t count = end - begin < kPointBlock ? end - begin : kPointBlock;
