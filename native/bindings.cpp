@@ -2,6 +2,7 @@
 #include <nanobind/nanobind.h>
 
 void bind_activation(nanobind::module_& module);
+void bind_baked_points(nanobind::module_& module);
 void bind_composite(nanobind::module_& module);
 void bind_expression_change(nanobind::module_& module);
 void bind_face(nanobind::module_& module);
@@ -21,6 +22,7 @@ NB_MODULE(_native, module) {
   nanobind::set_leak_warnings(false);  // a picture that lives until the interpreter ends is no leak
   module.doc() = "mien's native core. Private: only the autograd functions in mien.render and mien.avatar call it.";
   bind_activation(module);
+  bind_baked_points(module);
   bind_composite(module);
   bind_expression_change(module);
   bind_face(module);

@@ -29,12 +29,14 @@ int64_t piece_of(int64_t count) {
   return std::max<int64_t>(8, (blocks + 15) / 16) * kPointBlock;
 }
 
+enum class Pass { forward, backward, outputs };
+
 // All padded weights of a network. Sizes are known before anything is written, so that no address changes.
 class Packed {
  public:
   PaddedPoints network{};
 
-  Packed(const PointNetwork& own, bool backward) {
+  Packed(const PointNetwork& own, Pass pass) {
     network.own = &own, network.in_stride = padded(own.inputs);
     int64_t size = 0, hidden = 0;
     for (int l = 0; l < own.layers; ++l) {
@@ -48,20 +50,49 @@ class Packed {
       out.sums = sums_, sums_ += layer.outputs * padded(reads);
       out.extra_sums = sums_, sums_ += layer.outputs * padded(extra);
       out.bias_sums = sums_, sums_ += out.out_stride;
-      size += backward ? layer.outputs * (padded(reads) + padded(extra)) : (reads + extra + 1) * out.out_stride;
+      if (pass == Pass::forward) size += (reads + extra + 1) * out.out_stride;
+      if (pass == Pass::backward) size += layer.outputs * (padded(reads) + padded(extra));
     }
     // Two rows for each value: the value itself and its gradient; and zeros.
     network.scratch = kPointBlock * 2 * (network.in_stride + hidden) + widest();
     thread_local std::vector<float> buffer;
     buffer.assign(size, 0.0f);
     next_ = buffer.data();
-    for (int l = 0; l < own.layers; ++l) backward ? pack_rows(l) : pack_columns(l);
+    if (pass == Pass::outputs) find_spans();
+    for (int l = 0; l < own.layers && pass == Pass::forward; ++l) pack_columns(l);
+    for (int l = 0; l < own.layers && pass == Pass::backward; ++l) pack_rows(l);
   }
   int64_t sums() const { return sums_; }
 
  private:
   float* next_ = nullptr;
   int64_t sums_ = 0;
+
+  void find_spans() {
+    thread_local std::vector<WeightSpan> spans;
+    spans.clear();
+    for (int l = 0; l < network.own->layers; ++l) {
+      const PointLayer& layer = network.own->items[l];
+      const int reads = width_of(*network.own, l), extra = layer.extra < 0 ? 0 : width_of(*network.own, layer.extra);
+      for (int o = 0; o < layer.outputs; ++o) {
+        const float* row = layer.weight + static_cast<int64_t>(o) * (reads + extra);
+        WeightSpan span;
+        not_zero(row, reads, span.begin, span.end);
+        not_zero(row + reads, extra, span.extra_begin, span.extra_end);
+        spans.push_back(span);
+      }
+    }
+    const WeightSpan* next = spans.data();
+    for (int l = 0; l < network.own->layers; ++l) {
+      network.layers[l].spans = next;
+      next += network.layers[l].outputs;
+    }
+  }
+  static void not_zero(const float* values, int count, int& begin, int& end) {
+    begin = 0, end = count;
+    while (begin < end && values[begin] == 0) ++begin;
+    while (end > begin && values[end - 1] == 0) --end;
+  }
 
   int64_t widest() const {
     int64_t most = network.in_stride;
@@ -131,17 +162,22 @@ int64_t point_kept_floats(const PointNetwork& network) {
 }
 
 void point_network(const PointNetwork& network, float* kept, float* outputs) {
-  const Packed packed(network, false);
+  const Packed packed(network, kept ? Pass::forward : Pass::outputs);
   const PointKernels& kernels = point_kernels();
   const int64_t piece = piece_of(network.count);
   parallel_for((network.count + piece - 1) / piece, [&](int64_t index) {
-    kernels.forward(packed.network, kept, outputs, scratch_of(packed.network), index * piece,
-                    std::min((index + 1) * piece, network.count));
+    float* const scratch = scratch_of(packed.network);
+    const int64_t end = std::min((index + 1) * piece, network.count);
+    if (kept) {
+      kernels.forward(packed.network, kept, outputs, scratch, index * piece, end);
+    } else {
+      kernels.outputs(packed.network, outputs, scratch, index * piece, end);
+    }
   });
 }
 
 void point_network_backward(const PointNetwork& network, float* kept, const PointGradients& gradients) {
-  const Packed packed(network, true);
+  const Packed packed(network, Pass::backward);
   const PointKernels& kernels = point_kernels();
   const int64_t piece = piece_of(network.count), pieces = (network.count + piece - 1) / piece, size = packed.sums();
   thread_local std::vector<float> buffer;

@@ -28,7 +28,8 @@ struct PointNetwork {
 
 // Floats that the forward pass keeps of each point for the backward pass.
 int64_t point_kept_floats(const PointNetwork& network);
-// Fills outputs [count, outputs of the last layer]; `kept` may be null. Runs on the pool.
+// Fills outputs [count, outputs of the last layer], to the same bits with and without `kept`, which may be null. Runs
+// on the pool.
 void point_network(const PointNetwork& network, float* kept, float* outputs);
 
 struct PointLayerGradients {

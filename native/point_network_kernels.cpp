@@ -74,7 +74,7 @@ void forward(const PaddedPoints& network, float* kept, float* outputs, float* sc
     for (int64_t i = 0; i < count; ++i) fill_inputs(network, begin + i, rows[0].values + i * rows[0].stride);
     for (int l = 0; l < layers; ++l) {
       const PaddedLayer& layer = network.layers[l];
-      if (kept && l + 1 < layers) rows[l + 1].values = kept + layer.kept + begin * layer.out_stride;
+      if (l + 1 < layers) rows[l + 1].values = kept + layer.kept + begin * layer.out_stride;
       const Rows &from = rows[l], &to = rows[l + 1];
       multiply({from.values, from.stride, 1}, count, layer.first, to.stride, from.width, layer.bias, 0, to.values);
       if (layer.extra >= 0) {
@@ -87,6 +87,104 @@ void forward(const PaddedPoints& network, float* kept, float* outputs, float* sc
     const Rows& last = rows[layers];
     for (int64_t i = 0; i < count; ++i) {
       copy(outputs + (begin + i) * last.width, last.values + i * last.stride, last.width);
+    }
+  }
+}
+
+constexpr int kTileVectors = 3;                // vectors of points in a tile; a block has a whole number of tiles
+constexpr int kTileOutputs = W == 16 ? 8 : 4;  // so that a tile fits into the registers
+static_assert(kPointBlock % (kTileVectors * W) == 0);
+
+// T rows of `out`, for a tile's points: biases, or if there are none the rows themselves, plus `values` [end,
+// kPointBlock] weighted by rows of weights.
+template <int T>
+MIEN_INLINE void column_tile(const float* weights, int64_t row, int64_t begin, int64_t end, const float* biases,
+                             const float* values, float* out) {
+  F sums[T][kTileVectors];
+  for (int t = 0; t < T; ++t)
+    for (int v = 0; v < kTileVectors; ++v) sums[t][v] = biases ? set1(biases[t]) : load(out + t * kPointBlock + v * W);
+  for (int64_t k = begin; k < end; ++k) {
+    F own[kTileVectors];
+    for (int v = 0; v < kTileVectors; ++v) own[v] = load(values + k * kPointBlock + v * W);
+    for (int t = 0; t < T; ++t) {
+      const F weight = set1(weights[t * row + k]);
+      for (int v = 0; v < kTileVectors; ++v) sums[t][v] = sums[t][v] + own[v] * weight;
+    }
+  }
+  for (int t = 0; t < T; ++t)
+    for (int v = 0; v < kTileVectors; ++v) store(out + t * kPointBlock + v * W, sums[t][v]);
+}
+
+template <int T>
+void add_weighted(const float* weights, int64_t row, int begin, int end, const float* biases, const float* values,
+                  float* out) {
+  for (int p = 0; p < kPointBlock; p += kTileVectors * W) {
+    column_tile<T>(weights, row, begin, end, biases, values + p, out + p);
+  }
+}
+
+MIEN_INLINE bool same(const WeightSpan& a, const WeightSpan& b) {
+  return a.begin == b.begin && a.end == b.end && a.extra_begin == b.extra_begin && a.extra_end == b.extra_end;
+}
+
+template <int T>
+void add_outputs(const PointLayer& layer, const WeightSpan& span, int reads, int64_t row, int output,
+                 const float* values, const float* extra, float* out) {
+  const float* weights = layer.weight + output * row;
+  float* const to = out + output * kPointBlock;
+  add_weighted<T>(weights, row, span.begin, span.end, layer.bias + output, values, to);
+  if (extra) add_weighted<T>(weights + reads, row, span.extra_begin, span.extra_end, nullptr, extra, to);
+}
+
+// One layer of a block, whose points are side by side: out [outputs, kPointBlock].
+void layer_of_columns(const PointLayer& layer, const WeightSpan* spans, int reads, int extra_reads, const float* values,
+                      const float* extra, float* out) {
+  const int64_t row = reads + extra_reads;
+  for (int o = 0; o < layer.outputs;) {
+    int alike = 1;
+    while (alike < kTileOutputs && o + alike < layer.outputs && same(spans[o], spans[o + alike])) ++alike;
+    if (alike >= kTileOutputs) {
+      add_outputs<kTileOutputs>(layer, spans[o], reads, row, o, values, extra, out), o += kTileOutputs;
+    } else if (alike >= 4) {
+      add_outputs<4>(layer, spans[o], reads, row, o, values, extra, out), o += 4;
+    } else if (alike >= 2) {
+      add_outputs<2>(layer, spans[o], reads, row, o, values, extra, out), o += 2;
+    } else {
+      add_outputs<1>(layer, spans[o], reads, row, o, values, extra, out), o += 1;
+    }
+  }
+  activate(layer.activation, out, static_cast<int64_t>(layer.outputs) * kPointBlock);
+}
+
+// As `forward`, with the points of a block side by side in vectors: outputs fill no vector up with zeros, and zeros at
+// the ends of a row of weights cost nothing. All sums have the order of `forward`, and so the same bits.
+void outputs_of(const PaddedPoints& network, float* outputs, float* scratch, int64_t first, int64_t end) {
+  [[maybe_unused]] const NoDenormals guard;
+  const int layers = network.own->layers, inputs = network.own->inputs;
+  float* values[kMostPointLayers + 1];
+  // At a whole vector of the widest kind: half of the scratch is not used.
+  values[0] = (float*)(((uintptr_t)scratch + 63) & ~(uintptr_t)63);
+  for (int l = 0; l < layers; ++l)
+    values[l + 1] = values[l] + kPointBlock * (l ? network.layers[l - 1].outputs : inputs);
+  const int last = network.layers[layers - 1].outputs;
+  for (int64_t begin = first; begin < end; begin += kPointBlock) {
+    const int64_t count = end - begin < kPointBlock ? end - begin : kPointBlock;
+    for (int c = 0; c < inputs; ++c) {
+      float* const column = values[0] + c * kPointBlock;
+      for (int64_t i = 0; i < kPointBlock; ++i) {
+        column[i] = i < count ? network.own->values[(begin + i) * inputs + c] : 0.0f;
+      }
+    }
+    for (int l = 0; l < layers; ++l) {
+      const PointLayer& layer = network.own->items[l];
+      const bool more = layer.extra >= 0;
+      const int reads = l ? network.layers[l - 1].outputs : inputs;
+      const int extra = !more ? 0 : layer.extra ? network.layers[layer.extra - 1].outputs : inputs;
+      layer_of_columns(layer, network.layers[l].spans, reads, extra, values[l], more ? values[layer.extra] : nullptr,
+                       values[l + 1]);
+    }
+    for (int64_t i = 0; i < count; ++i) {
+      for (int o = 0; o < last; ++o) outputs[(begin + i) * last + o] = values[layers][o * kPointBlock + i];
     }
   }
 }
@@ -172,6 +270,6 @@ void backward(const PaddedPoints& network, const float* kept, const float* by_ou
 }  // namespace
 
 extern const PointKernels point_kernels;
-const PointKernels point_kernels = {forward, backward};
+const PointKernels point_kernels = {forward, outputs_of, backward};
 
 }  // namespace mien::MIEN_ISA

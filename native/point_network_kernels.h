@@ -9,6 +9,11 @@ namespace mien {
 
 constexpr int kPointBlock = 48;  // points that go through the network together
 
+// Where the weights of one output are not zero: among the values of the previous layer, and among the extra ones.
+struct WeightSpan {
+  int begin, end, extra_begin, extra_end;
+};
+
 // A layer with its weights in the order in which kernels read them. Rows are padded with zeros to whole vectors, and
 // strides are in floats. `extra` parts are null if there is none.
 struct PaddedLayer {
@@ -20,6 +25,7 @@ struct PaddedLayer {
   const float* bias;                    // [out_stride]
   const float *back, *extra_back;       // backward: [outputs, stride of the values it reads]
   int64_t sums, extra_sums, bias_sums;  // where its sums begin: as `back`, `extra_back` and `bias`
+  const WeightSpan* spans;              // outputs: [outputs]
 };
 struct PaddedPoints {
   const PointNetwork* own;
@@ -28,8 +34,10 @@ struct PaddedPoints {
 };
 
 struct PointKernels {
-  // `kept` may be null. `scratch` holds `network.scratch` floats.
+  // `scratch` holds `network.scratch` floats.
   void (*forward)(const PaddedPoints& network, float* kept, float* outputs, float* scratch, int64_t first, int64_t end);
+  // The outputs alone, to the same bits. Reads spans and the network's own weights.
+  void (*outputs)(const PaddedPoints& network, float* outputs, float* scratch, int64_t first, int64_t end);
   void (*backward)(const PaddedPoints& network, const float* kept, const float* by_outputs, float* by_inputs,
                    float* sums, float* scratch, int64_t first, int64_t end);
 };

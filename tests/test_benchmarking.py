@@ -18,7 +18,7 @@ from mien.benchmarking import headgas_step, mono_step, train_step
 from mien.benchmarking import render as render_benchmark
 from mien.benchmarking.charts import write_scaling_chart
 from mien.benchmarking.scenes import head_scene
-from mien.benchmarking.timing import BenchmarkRow, measure_machine, time_function
+from mien.benchmarking.timing import BenchmarkRow, Timing, measure_machine, time_function
 from mien.cli import main
 from mien.face import load_face_model
 from mien.render import rasterize
@@ -128,6 +128,12 @@ def test_a_mono_gaussian_avatar_case_trains() -> None:
         step(state, data, train_step.SETTINGS)
     assert before.shape == (4000, 3)
     assert not torch.equal(before, state.avatar.gaussian_store()["means"])
+
+
+def test_times_of_a_step_are_those_of_one_frame() -> None:
+    state, _ = mono_step.mono_case(load_face_model(), 3000, (64, 48), frames=4)
+    assert state.avatar.frames_per_step == 4
+    assert mono_step.per_frame(Timing(8.0, 12.0, 16.0), 4) == Timing(2.0, 3.0, 4.0)
 
 
 def test_waiting_for_a_picture_is_measured_with_and_without_the_worker() -> None:

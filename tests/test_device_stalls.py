@@ -14,7 +14,7 @@ from mien.avatar import METHODS, MethodConfig, Moments
 from mien.camera import Camera
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
-from mien.training import TrainSettings, trainer
+from mien.training import TrainSettings, batch, trainer
 from mien.training.frames import FrameOrder, training_frames
 from mien.training.sequence import Targets
 from toy_scene import toy_sequence
@@ -45,7 +45,7 @@ CONFIGS = configs()
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
 def test_a_step_of_training_asks_for_no_number(config: MethodConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     """The trainer's own step reads no number, in a run whose pictures are composited in every step."""
-    monkeypatch.setattr(trainer, "rasterize", _rendered)
+    monkeypatch.setattr(batch, "rasterize", _rendered)
     face_model, sequence = toy_sequence(timesteps=3, size=32)
     settings = TrainSettings(steps=1_000_000, split="none", background="random", record_every=1_000_000)
     state = trainer.start([sequence], face_model, config, settings, META)

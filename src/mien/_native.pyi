@@ -479,3 +479,26 @@ def skin_points(points: SkinPoints, posed: Tensor) -> None:
     """Fills `posed` [b, n, 3]."""
 
 def skin_points_backward(points: SkinPoints, gradients: SkinPointsGradients) -> None: ...
+
+# native/bind_baked_points.cpp; n points
+
+class RawPoints(NamedTuple):
+    changes: Tensor
+    """[n, 11]: log scales, quaternion, opacity logit, colour."""
+    log_scales: Tensor
+    quats: Tensor
+    opacity_logits: Tensor
+    colours: Tensor
+
+class ActivatedPoints(NamedTuple):
+    """Filled."""
+
+    scales: Tensor
+    quats: Tensor
+    opacities: Tensor
+    sh: Tensor
+
+def add_bone(shaped: Tensor, weights: Tensor, transform: Tensor, posed: Tensor) -> None:
+    """Adds to `posed` [n, 3] what a bone that is no joint of the face contributes; `transform` is [3, 4]."""
+
+def activate_points(raw: RawPoints, gain: float, offset: float, out: ActivatedPoints) -> None: ...

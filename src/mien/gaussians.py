@@ -47,6 +47,20 @@ class Gaussians:
         }
         return Gaussians(**picked)
 
+    def timesteps(self) -> list["Gaussians"]:
+        """All entries of the batch axis. Unbatched Gaussians are one entry.
+
+        The backward pass of all entries together is as fast as that of one: it fills each gradient once.
+        """
+        lengths = {len(tensor) for tensor, ndim in self._tensors_with_ndim() if tensor.ndim > ndim}
+        if not lengths:
+            return [self]
+        (count,) = lengths
+        columns = [
+            tensor.unbind() if tensor.ndim > ndim else [tensor] * count for tensor, ndim in self._tensors_with_ndim()
+        ]
+        return [Gaussians(*entry) for entry in zip(*columns, strict=True)]
+
     def select(self, mask: Tensor) -> "Gaussians":
         """The Gaussians that a bool mask [n] selects, or those at the given indices."""
         return replace(

@@ -127,6 +127,18 @@ def point_network_backward(native: Any, rng: Rng) -> Arguments:
     return [layers, inputs, normal(rng, len(inputs), kept), by_outputs, gradients, by_inputs]
 
 
+def add_bone(native: Any, rng: Rng) -> Arguments:
+    n = few(rng)
+    return [normal(rng, n, 3), normal(rng, n), normal(rng, 3, 4), normal(rng, n, 3)]
+
+
+def activate_points(native: Any, rng: Rng) -> Arguments:
+    n = few(rng)
+    raw = native.RawPoints(normal(rng, n, 11), normal(rng, n, 3), normal(rng, n, 4), normal(rng, n), normal(rng, n, 3))
+    out = native.ActivatedPoints(empty(n, 3), empty(n, 4), empty(n), empty(n, 1, 3))
+    return [raw, 0.5, 0.1, out]
+
+
 def skin_arrays(native: Any, rng: Rng) -> tuple[Any, tuple[int, int, int]]:
     n, b, k = few(rng), int(rng.integers(0, 4)), int(rng.integers(1, 7))
     points = normal(rng, n, 3), normal(rng, b, n, 3), normal(rng, n, k), normal(rng, k, 3, 4), normal(rng, b, k, 3, 4)
@@ -348,7 +360,7 @@ BASELINES: dict[str, Baseline] = {
         sigmoid, sigmoid_backward, expression_activations, expression_activations_backward, expression_change,
         expression_change_backward,
         feature_network, feature_network_backward, factored_update, point_network, point_network_backward, skin_points,
-        skin_points_backward,
+        skin_points_backward, add_bone, activate_points,
         make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
         compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,

@@ -118,7 +118,7 @@ class Avatar(nn.Module, ABC):
 
     @abstractmethod
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
-        """The method's own loss terms, already weighted."""
+        """The method's own loss terms, already weighted. Of several frames, `rendering` is that of the first."""
 
     @abstractmethod
     def parameter_groups(self) -> list[ParameterGroup]:
@@ -131,6 +131,11 @@ class Avatar(nn.Module, ABC):
     @abstractmethod
     def density(self) -> DensityControl:
         """The density control, with this method's hooks."""
+
+    @property
+    def frames_per_step(self) -> int:
+        """Number of training frames that the next optimiser step uses. Most methods use one."""
+        return 1
 
     @property
     def wants_first_colors(self) -> bool:

@@ -9,7 +9,7 @@ world while the head moves: it can hold hair and shoulders.
 Differences from the paper and its code: the face model is any `FaceModel` (a jaw may follow the expression); each head
 predicts its own attribute, while the published code mixes up columns of scales and rotations; attributes change with
 the motion within the head frame, so that a turn of the head alone changes none of the head's; schedules are fractions
-of the run, which spans `epochs` epochs of the paper; the optimiser's moments survive rounds; each step uses one frame.
+of the run, which spans `epochs` epochs of the paper; the optimiser's moments survive rounds.
 """
 
 from dataclasses import replace
@@ -89,6 +89,11 @@ class MonoGaussianAvatar(Avatar):
         sh = sh_from_rgb(sigmoid(raw["sh"]))[..., None, :]
         return Posed(Gaussians(means, quats, scales, opacities, sh, head_poses(face)), {})
 
+    @property
+    def frames_per_step(self) -> int:
+        """Fewer than the settings' if there are many points."""
+        return max(1, min(self.config.frames_per_step, self.config.points_per_step // len(self.store)))
+
     def canonical_face(self) -> FaceParams:
         """The canonical expression and joints, at the subject's usual head pose."""
         expression, joints = self.get_buffer("canonical_expression"), self.get_buffer("canonical_joints")
@@ -104,7 +109,8 @@ class MonoGaussianAvatar(Avatar):
         paper's weights are for FLAME).
         """
         n = len(self.store)
-        chosen = torch.arange(progress.step * self.config.face_points, (progress.step + 1) * self.config.face_points)
+        turn = progress.step // progress.frames
+        chosen = torch.arange(turn * self.config.face_points, (turn + 1) * self.config.face_points)
         means = self.store["means"].detach()
         means = means[chosen[:n].to(means.device) % n]
         model = self.face_model

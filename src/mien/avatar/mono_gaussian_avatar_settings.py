@@ -34,6 +34,12 @@ class MonoGaussianAvatarConfig(MethodConfig):
     face_tuning: FaceTuning = field(default_factory=_face_tuning)
     """Whether and how fast training changes the tracked face parameters of each frame. As in the paper, this begins
     with epoch 10."""
+    frames_per_step: Annotated[int, Range(1, 64)] = 1
+    """Largest number of frames that one optimiser step uses (paper: 8). They share what depends on the points alone,
+    so that a frame takes less time; but the run then has fewer updates, since each frame counts as a step."""
+    points_per_step: Annotated[int, Range(1, 100_000_000)] = 102_400
+    """Largest number of points, summed over the frames of an optimiser step. With more points, steps have fewer
+    frames, but at least one."""
     points: Annotated[int, Range(1, 1_000_000), ToLoad(1)] = 400
     """Number of Gaussians at the start, on a sphere."""
     sphere_radius: Annotated[float, Range(1e-3, 10)] = 0.125
@@ -101,6 +107,7 @@ def _paper() -> MonoGaussianAvatarConfig:
     return MonoGaussianAvatarConfig(
         photometric=Photometric(l1_weight=1.0, ssim_weight=0.25, perceptual=perceptual),
         face_tuning=FaceTuning(expression=rate, joints=rate, head_rotation=rate, head_translation=Rate(0.0)),
+        frames_per_step=8,
         max_points=100_000,
         epochs=_PAPER_EPOCHS,
         schedule="paper",

@@ -1,6 +1,7 @@
 """Progress of a run, and learning rates that depend on it. Needs no torch, because settings hold such rates."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -20,11 +21,17 @@ class Progress:
     extent: float = 1.0
     """Extent of the training cameras, in metres (`mien.training.frames.camera_extent`). The unit of some rates and
     sizes."""
+    frames: int = 1
+    """Number of training frames that this step uses. It counts as so many steps."""
 
     @property
     def fraction(self) -> float:
         """0 at the first step, 1 after the last."""
         return self.step / self.steps
+
+    def completes(self, steps: Iterable[int]) -> bool:
+        """Whether one of these numbers of steps is done after this step, and was not before it."""
+        return any(self.step < count <= self.step + self.frames for count in steps)
 
 
 def active_degree(degree: int, warmup: float, progress: Progress) -> int:

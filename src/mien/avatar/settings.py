@@ -4,7 +4,7 @@ Every number has its range beside it (`mien.ranges`), and every field a descript
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 from mien.avatar.schedules import Rate
@@ -38,6 +38,10 @@ class PerceptualLoss:
         """Whether a step of a run of `steps` has this loss."""
         return self.weight > 0 and step % self.every == 0 and step >= self.start * steps
 
+    def scaled(self, share: float) -> "PerceptualLoss":
+        """This loss times a number."""
+        return self if share == 1 else replace(self, weight=share * self.weight)
+
 
 @dataclass(frozen=True)
 class Photometric:
@@ -58,6 +62,19 @@ class Photometric:
     def needs_parts(self) -> bool:
         """Whether a loss needs the boxes around eyes and mouth."""
         return self.part_weight > 0 or self.perceptual.weight > 0
+
+    def scaled(self, share: float) -> "Photometric":
+        """These losses times a number."""
+        if share == 1:
+            return self
+        # Parts count relative to the picture's own weights.
+        return replace(
+            self,
+            l1_weight=share * self.l1_weight,
+            ssim_weight=share * self.ssim_weight,
+            alpha_weight=share * self.alpha_weight,
+            perceptual=self.perceptual.scaled(share),
+        )
 
 
 @dataclass(frozen=True)

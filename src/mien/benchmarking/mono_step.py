@@ -13,7 +13,7 @@ from mien import _native, runtime
 from mien.avatar import MonoGaussianAvatar, make_portable
 from mien.avatar.mono_gaussian_avatar_settings import PRESETS
 from mien.benchmarking.render import thread_counts
-from mien.benchmarking.timing import BenchmarkRow, benchmark_row, time_function
+from mien.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, time_function
 from mien.benchmarking.train_step import SETTINGS, TIMESTEPS, benchmark_sequence, paint_targets, runtime_frame
 from mien.face import FaceModel, load_face_model
 from mien.training.checkpoint import TrainingState
@@ -22,18 +22,23 @@ from mien.training.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 
 COUNT, FRAME_COUNT, SIZE = 10_000, 30_000, (512, 512)
+FRAMES_PER_STEP = (1, 4, 8)
 _LATE_STEP = round(0.9 * SETTINGS.steps) + 1
 """A step late in the run, when radii are small. No round of density control is near it."""
 
 
 def mono_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
-    """Measure whole steps with the sizes of the preset `standard`, and frames of the runtime, by threads."""
+    """Measure whole steps with the sizes of the preset `standard`, and frames of the runtime, by threads.
+
+    Times of a step are divided by its number of frames.
+    """
     face_model = load_face_model()
-    state, data = mono_case(face_model, COUNT, SIZE)
-    for threads in thread_counts():
-        _native.set_thread_count(threads)
-        timing = time_function(lambda: step(state, data, SETTINGS), seconds)
-        yield benchmark_row("mono_step", COUNT, SIZE, timing)
+    for frames in FRAMES_PER_STEP:
+        state, data = mono_case(face_model, COUNT, SIZE, frames)
+        for threads in thread_counts():
+            _native.set_thread_count(threads)
+            timing = time_function(lambda state=state, data=data: step(state, data, SETTINGS), seconds)
+            yield benchmark_row(f"mono_step_{frames}_frames", COUNT, SIZE, per_frame(timing, frames))
     late, others = mono_case(face_model, FRAME_COUNT, SIZE)
     camera, face, frames = others.targets[0].camera(0), late.track.params(), counting()
     portable = runtime.Avatar(make_portable(late.avatar, camera, "benchmark"))
@@ -43,10 +48,21 @@ def mono_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
         yield benchmark_row("mono_runtime_frame", FRAME_COUNT, SIZE, timing)
 
 
-def mono_case(face_model: FaceModel, count: int, size: tuple[int, int]) -> tuple[TrainingState, TrainingData]:
-    """Return a state late in a run with `count` points near the mesh, and its pictures of (width, height) `size`."""
+def per_frame(timing: Timing, frames: int) -> Timing:
+    """The times of one of a step's frames."""
+    return Timing(timing.min_ms / frames, timing.median_ms / frames, timing.cpu_ms / frames)
+
+
+def mono_case(
+    face_model: FaceModel, count: int, size: tuple[int, int], frames: int = 1
+) -> tuple[TrainingState, TrainingData]:
+    """Return a state late in a run with `count` points near the mesh, and its pictures of (width, height) `size`.
+
+    Steps use `frames` frames.
+    """
     sequence = benchmark_sequence(face_model, *size)
-    state = start([sequence], face_model, replace(PRESETS["standard"], points=len(face_model.template)), SETTINGS)
+    config = replace(PRESETS["standard"], points=len(face_model.template), frames_per_step=frames)
+    state = start([sequence], face_model, config, SETTINGS)
     assert isinstance(state.avatar, MonoGaussianAvatar)
     _fill(state.avatar, count)
     state.step = _LATE_STEP

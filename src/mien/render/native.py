@@ -20,15 +20,15 @@ _INPUTS = 9
 
 
 def render_native(
-    views: Sequence[View], background: Float[Tensor, " 3"], means2d_offsets: Sequence[Float[Tensor, "n 2"]]
+    views: Sequence[View], backgrounds: Sequence[Float[Tensor, " 3"]], means2d_offsets: Sequence[Float[Tensor, "n 2"]]
 ) -> list[Rendering]:
     """Render views of unbatched float32 CPU Gaussians, given in their camera's world. Each of several gets one thread.
 
-    The result is differentiable in the Gaussians, the background, `means2d_offsets` (their values are not read),
+    The result is differentiable in the Gaussians, the backgrounds, `means2d_offsets` (their values are not read),
     `camera.viewmat` and `camera.K`. It does not depend on the number of threads.
     """
     inputs: list[Tensor] = []
-    for (gaussians, camera), offset in zip(views, means2d_offsets, strict=True):
+    for (gaussians, camera), background, offset in zip(views, backgrounds, means2d_offsets, strict=True):
         means = gaussians.means
         if means.is_cuda or means.dtype != torch.float32:
             raise ValueError(
@@ -43,7 +43,7 @@ def render_native(
     try:
         outputs: tuple[Tensor, ...] = _Rasterize.apply(sizes, *inputs)  # pyright: ignore[reportAssignmentType]
     except _NotFiniteError as error:
-        check_finite(*views[error.view], background)
+        check_finite(*views[error.view], backgrounds[error.view])
         raise
     return [
         Rendering(*outputs[3 * index : 3 * index + 3], means2d_offset=offset)

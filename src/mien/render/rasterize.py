@@ -20,13 +20,18 @@ from mien.rotation import compose_rigid
 Backend = Literal["auto", "native", "gsplat", "reference"]
 RenderView = Callable[[Gaussians, Camera, Tensor, Tensor], Rendering]
 """Renders unbatched Gaussians, given in the camera's world, over a background, with offsets of the 2D centres."""
-RenderViews = Callable[[Sequence[View], Tensor, Sequence[Tensor]], list[Rendering]]
-"""Renders several views over one background, each with its own offsets."""
+RenderViews = Callable[[Sequence[View], Sequence[Tensor], Sequence[Tensor]], list[Rendering]]
+"""Renders several views, each with its own background and offsets."""
 
 
 def _one_by_one(render_view: RenderView) -> RenderViews:
-    def render_views(views: Sequence[View], background: Tensor, offsets: Sequence[Tensor]) -> list[Rendering]:
-        return [render_view(*view, background, offset) for view, offset in zip(views, offsets, strict=True)]
+    def render_views(
+        views: Sequence[View], backgrounds: Sequence[Tensor], offsets: Sequence[Tensor]
+    ) -> list[Rendering]:
+        return [
+            render_view(*view, background, offset)
+            for view, background, offset in zip(views, backgrounds, offsets, strict=True)
+        ]
 
     return render_views
 
@@ -74,10 +79,10 @@ def rasterize(
     if batch is None:
         assert isinstance(camera, Camera)
         view = _in_local_frame(gaussians, camera)
-        picture = render_views([view], background, [offset])[0]
+        picture = render_views([view], [background], [offset])[0]
         return replace(picture, depth=_depths([view], [picture], render_views)[0]) if depth else picture
     views = [_in_local_frame(*view) for view in batch]
-    pictures = render_views(views, background, offset.unbind())
+    pictures = render_views(views, [background] * len(views), offset.unbind())
     return Rendering(
         torch.stack([picture.image for picture in pictures]),
         torch.stack([picture.alpha for picture in pictures]),
@@ -87,6 +92,25 @@ def rasterize(
     )
 
 
+def rasterize_each(views: Sequence[View], backgrounds: Sequence[Float[Tensor, " 3"]]) -> list[Rendering]:
+    """Render views of unbatched Gaussians, each over its own background, as `rasterize` does. Sizes may differ.
+
+    As the native back end draws each of several views with one thread, there should be at least as many views as
+    threads.
+
+    Raises:
+        ValueError: as `rasterize`.
+    """
+    for (gaussians, _), background in zip(views, backgrounds, strict=True):
+        check_shapes(gaussians, background)
+    like = views[0][0].means
+    # One leaf for each view, so that each has its own gradient.
+    offsets = [
+        like.new_zeros(()).expand(len(gaussians), 2).requires_grad_(torch.is_grad_enabled()) for gaussians, _ in views
+    ]
+    return _BACKENDS[choose_backend(like)]([_in_local_frame(*view) for view in views], backgrounds, offsets)
+
+
 def _depths(views: Sequence[View], pictures: Sequence[Rendering], render_views: RenderViews) -> list[Tensor]:
     """The expected depth of each view: depths blended like colours, divided by the sum of their weights."""
     coloured = []
@@ -94,7 +118,7 @@ def _depths(views: Sequence[View], pictures: Sequence[Rendering], render_views: 
         depths = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
         coloured.append((replace(gaussians, sh=sh_from_rgb(depths[:, None, None].expand(-1, 1, 3))), camera))
     black, offsets = views[0][0].means.new_zeros(3), [torch.zeros_like(picture.means2d_offset) for picture in pictures]
-    blended = [picture.image[..., 0] for picture in render_views(coloured, black, offsets)]
+    blended = [picture.image[..., 0] for picture in render_views(coloured, [black] * len(views), offsets)]
     return [
         torch.where(picture.alpha > 0, sums / picture.alpha.clamp_min(1e-6), 0)
         for sums, picture in zip(blended, pictures, strict=True)

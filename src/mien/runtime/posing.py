@@ -22,6 +22,7 @@ from mien.runtime.baked import (
 _MOST_LAYERS = 64
 _UNBOUNDED = np.array([np.finfo(np.float32).max])
 """A reach that no face goes beyond."""
+_POINT_OUTPUTS = ("log_scales", "quats", "opacity_logits", "sh")
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * coefficient."""
 
@@ -84,8 +85,10 @@ def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
     shaped, centres = shaped_and_posed(baked.rig, face)
     if baked.still_weights is not None and baked.still_pose is not None:
         still = np.linalg.inv(face.T_world_head.astype(np.float64)) @ baked.still_pose
-        moved = shaped @ still[:3, :3].T.astype(np.float32) + still[:3, 3].astype(np.float32)
-        centres = centres + baked.still_weights[:, None] * moved
+        transform = np.ascontiguousarray(still[:3], np.float32)
+        _native.add_bone(shaped, _contiguous_row(baked.still_weights), transform, centres)
+    if _has_native_activations(baked):
+        return _with_native_activations(baked, centres, face)
     raw = _raw_values(baked.attributes, baked.bases, baked.network, centres - baked.rig.template, face)
     if baked.scale_activation == "sigmoid":
         scales = baked.scale_gain * sigmoid(raw["log_scales"]) + baked.scale_offset
@@ -93,6 +96,36 @@ def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
         scales = np.exp(raw["log_scales"])
     sh = (sigmoid(raw["sh"]) - 0.5) / SH_C0 if baked.colour_activation == "sigmoid" else raw["sh"]
     return _contiguous(centres, raw["quats"], scales, sigmoid(raw["opacity_logits"]), sh, face.T_world_head)
+
+
+def _has_native_activations(baked: BlendSkinned) -> bool:
+    """Whether all changes of attributes are those of one network of points, as mono_gaussian_avatar has it."""
+    network = baked.network
+    return (
+        network is not None
+        and _has_native_layers(network)
+        and network.outputs == _POINT_OUTPUTS
+        and baked.bases is None
+        and (baked.scale_activation, baked.colour_activation) == ("sigmoid", "sigmoid")
+        and baked.attributes.sh.shape[1] == 1
+    )
+
+
+def _with_native_activations(baked: BlendSkinned, centres: Float32[np.ndarray, "n 3"], face: Face) -> Gaussians:
+    """The Gaussians of such an avatar, with the bits that numpy gives."""
+    assert baked.network is not None
+    changes = _run_layers(baked.network, centres - baked.rig.template)
+    raw, n = baked.attributes, len(centres)
+    own = (raw.log_scales, raw.quats, raw.opacity_logits, raw.sh[:, 0])
+    out = tuple(np.empty(shape, np.float32) for shape in ((n, 3), (n, 4), (n,), (n, 1, 3)))
+    _native.activate_points(
+        _native.RawPoints(changes, *(_contiguous_row(part) for part in own)),
+        baked.scale_gain,
+        baked.scale_offset,
+        _native.ActivatedPoints(*out),
+    )
+    scales, quats, opacities, sh = out
+    return Gaussians(np.ascontiguousarray(centres), quats, scales, opacities, sh, face.T_world_head)
 
 
 def rig_points(rig: Rig, face: Face, in_world: bool = False) -> Float32[np.ndarray, "m 3"]:
@@ -240,7 +273,9 @@ def _run_layers(network: AttributeNetwork, displacement: Float32[np.ndarray, "n 
         _native.PointLayer(_contiguous_row(weight), _contiguous_row(bias), int(index + 1 < len(network.weights)), -1)
         for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True))
     ]
-    inputs = np.concatenate([network.base, displacement], axis=1, dtype=np.float32)
+    width = network.base.shape[1]
+    inputs = np.empty((len(displacement), width + 3), np.float32)
+    inputs[:, :width], inputs[:, width:] = network.base, displacement
     outputs = np.empty((len(inputs), len(network.biases[-1])), np.float32)
     _native.point_network(layers, inputs, None, outputs)
     return outputs

@@ -21,7 +21,8 @@ class TrainSettings:
     """Settings of a training run. Losses, rates and density control are settings of the method."""
 
     steps: Annotated[int, Range(1, 1_000_000_000)] = 12_000
-    """Number of optimiser steps, one frame each. All schedules stretch with it."""
+    """Number of training frames, one for each optimiser step. All schedules stretch with it. A method may use several
+    frames in one optimiser step, which then counts as so many."""
     split: Split = "blocks"
     """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none).
     gaussian-avatars is the split of that paper on NeRSemble: a sequence of each subject, and camera 08."""

@@ -1,4 +1,4 @@
-"""The training loop: one frame per step, for every method."""
+"""The training loop, for every method."""
 
 import signal
 import threading
@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Items
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +17,6 @@ from mien import _native
 from mien.avatar import (
     Avatar,
     MethodConfig,
-    PerceptualLoss,
     Progress,
     load_avatar,
     measure_filmed,
@@ -32,32 +31,28 @@ from mien.face.checks import check_face_params
 from mien.locks import hold
 from mien.perceptual import load_training_features
 from mien.progress import Advance, progress_bar
-from mien.render import rasterize
 from mien.render.validation import CannotDrawError
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
-from mien.training.ahead import TargetQueue, targets_ahead
+from mien.training.ahead import targets_ahead
+from mien.training.batch import TrainingData, compare, compare_features, draw, face_groups, next_batch
 from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.coverage import coverage
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
 from mien.training.frames import (
-    MIN_EXTENT,
     FrameOrder,
-    background_at,
     camera_extent,
-    crop_random,
     density_random,
-    disguise_random,
     expression_rarity,
     training_frames,
 )
 from mien.training.hidden import inside_triangles
-from mien.training.inside import disguise, inside_of
-from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses, train_psnr
+from mien.training.inside import inside_of
+from mien.training.losses import train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
-from mien.training.sequence import Sequence, Target, Targets
+from mien.training.sequence import Sequence, Targets
 from mien.training.settings import TrainSettings
 from mien.training.unseen import moved, spare_fills, unseen_of
 from mien.training.vertex_colors import vertex_colors
@@ -66,37 +61,6 @@ ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
 """(title, total, completed) -> a context manager whose value moves the bar on."""
 Watch = Callable[[Avatar], None]
 """Is called with the avatar after each step."""
-
-
-@dataclass(frozen=True, eq=False)
-class TrainingData:
-    """Data that training reads and never changes."""
-
-    order: FrameOrder
-    targets: tuple[Targets, ...]
-    """One entry per sequence."""
-    extent: float = MIN_EXTENT
-    """Extent of the training cameras, in metres."""
-    ahead: TargetQueue | None = None
-    """Prepares the targets of the next steps in another thread. If it is None, each step makes its own."""
-
-    def target(self, step: int, settings: TrainSettings) -> Target:
-        """The target of a step. It does not depend on `ahead`."""
-        frame, _ = self.order.at(step)
-        targets = self.targets[frame.sequence]
-        if self.ahead is not None:
-            return targets.moved(self.ahead.target(step))
-        background = background_at(settings, step)
-        return targets.target(frame.timestep, frame.camera, background, keep=settings.background == "white")
-
-    def goal(
-        self, target: Target, perceptual: PerceptualLoss, step: int, settings: TrainSettings
-    ) -> Callable[[], PerceptualGoal]:
-        """A function that returns the goal of a step's perceptual loss. With `ahead`, it is made meanwhile."""
-        make = partial(perceptual_goal, target, perceptual, crop_random(settings, step))
-        return (
-            make if self.ahead is None or target.background.device.type != "cpu" else self.ahead.meanwhile(make).result
-        )
 
 
 def train(
@@ -169,14 +133,15 @@ def _train_to_the_end(
         data = replace(data, ahead=ahead)
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
+                before = state.step
                 try:
                     status = step(state, data, settings)
                 except CannotDrawError as error:
                     raise _diverged(run_dir, state, str(error)) from None
-                advance(1, status)
+                advance(state.step - before, status)
                 if watch is not None:
                     watch(state.avatar)
-                if state.step % settings.checkpoint_every == 0 or interrupted():
+                if passed(before, state.step, settings.checkpoint_every) or interrupted():
                     _check_finite(run_dir, state)
                     write_checkpoint(run_dir / "checkpoints", state)
                 if interrupted():
@@ -264,55 +229,58 @@ def start(
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
-    """Run one training step: pose, render, compare, update, add and prune. Returns a text for the progress bar."""
-    began = time.perf_counter()
-    frame, epoch = data.order.at(state.step)
-    progress = Progress(state.step, settings.steps, epoch, data.extent)
-    target = data.target(state.step, settings)
-    avatar, weights = state.avatar, state.avatar.config.photometric
-    perceptual = weights.perceptual
-    wanted = data.goal(target, perceptual, state.step, settings) if perceptual.due(state.step, settings.steps) else None
+    """Run one training step: pose, render, compare, update, add and prune. Returns a text for the progress bar.
 
-    index = state.track.index_of(frame.sequence, frame.timestep)
-    face = state.track.face(index)
+    The avatar says how many frames the step uses. The losses of pictures are means over them, and the step counts as so
+    many.
+    """
+    began = time.perf_counter()
+    avatar, perceptual = state.avatar, state.avatar.config.photometric.perceptual
+    batch = next_batch(state, data, settings)
+    epoch = data.order.at(state.step)[1]
+    progress = Progress(state.step, settings.steps, epoch, data.extent, len(batch))
     if state.inside is not None:
-        state.inside.furnish(avatar, state.step, settings.steps)
-    posed = disguise(avatar.pose(face, progress), avatar, target.hidden, disguise_random(settings, state.step))
-    rendering = rasterize(
-        posed.gaussians.timestep(0), data.targets[frame.sequence].camera(frame.camera), target.background
-    )
-    shown = rendering if state.colors is None else state.colors.seen_by(rendering, target.background, frame)
-    compared = weights if state.unseen is None else state.unseen.weights(weights)
-    losses = picture_losses(shown, target, compared) | avatar.regularizers(posed, rendering, progress)
-    if wanted is not None:
-        losses["perceptual"] = perceptual_loss(shown, wanted(), perceptual)
+        for one in batch:
+            state.inside.furnish(avatar, one.number, settings.steps)
+    whole, posed, renderings = draw(state, data, settings, batch, progress)
+    shown = [one.seen(rendering, state) for one, rendering in zip(batch, renderings, strict=True)]
+    losses = compare(state, batch, shown) | avatar.regularizers(whole, renderings[0], progress)
+    losses |= compare_features(state, batch, shown)
     torch.autograd.backward(list(losses.values()))
     if state.unseen is not None:
-        state.unseen.guard(avatar, rendering)
+        state.unseen.guard(avatar, *renderings)
 
-    groups = [*avatar.parameter_groups(), *state.track.parameter_groups(index)]
+    groups = [*avatar.parameter_groups(), *face_groups(state, batch)]
     groups += [] if state.colors is None else state.colors.parameter_groups()
-    state.density.observe(posed, rendering)
+    for own, rendering in zip(posed, renderings, strict=True):
+        state.density.observe(own, rendering)
     state.adam.step(groups, progress)
-    state.track.confine(index)
+    for one in batch:
+        state.track.confine(one.index)
     random = partial(density_random, settings, state.step)
-    state.density.adapt(avatar.gaussian_store(), posed, progress, random)
+    state.density.adapt(avatar.gaussian_store(), posed[0], progress, random)
     if state.unseen is not None:
         avatar.keep_to(state.unseen.prior)
 
-    state.step += 1
+    before = state.step
+    state.step += len(batch)
     elapsed = time.perf_counter() - began
     state.seconds += elapsed
-    if state.step % settings.record_every != 0 and state.step != settings.steps:
+    if not passed(before, state.step, settings.record_every) and state.step != settings.steps:
         return ""
     entry = {name: float(value.detach()) for name, value in losses.items()}
     if perceptual.weight > 0:
         entry.setdefault("perceptual", 0.0)
-    entry |= {"step": state.step, "loss": sum(entry.values()), "psnr": train_psnr(shown, target)}
-    entry |= {"gaussians": len(avatar.gaussian_store()), "step_ms": elapsed * 1000}
+    entry |= {"step": state.step, "loss": sum(entry.values()), "psnr": train_psnr(shown[0], batch[0].target)}
+    entry |= {"gaussians": len(avatar.gaussian_store()), "step_ms": elapsed * 1000 / len(batch)}
     for name, value in entry.items():
         state.curves.setdefault(name, []).append(value)
     return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"
+
+
+def passed(before: int, now: int, every: int) -> bool:
+    """Whether a multiple of `every` was reached since `before`."""
+    return now // every > before // every
 
 
 @contextmanager

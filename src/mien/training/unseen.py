@@ -61,7 +61,7 @@ class Unseen:
         triangles = avatar.triangles()
         return None if self.prior.made_up is None or triangles is None else self.prior.made_up[triangles]
 
-    def guard(self, avatar: Avatar, rendering: Rendering) -> None:
+    def guard(self, avatar: Avatar, *renderings: Rendering) -> None:
         """Take the gradients from what is made up, after the backward pass, but for strong ones of its height."""
         made_up = self.made_up(avatar)
         if made_up is None:
@@ -77,8 +77,9 @@ class Unseen:
             if height is not None:
                 strong = height.sign() * (height.abs() - _CONTRADICTION).clamp_min(0)
                 gradient[:, 1] = torch.where(made_up, strong, height)
-        if rendering.means2d_offset.grad is not None:
-            rendering.means2d_offset.grad.masked_fill_(made_up[:, None], 0)
+        for rendering in renderings:
+            if rendering.means2d_offset.grad is not None:
+                rendering.means2d_offset.grad.masked_fill_(made_up[:, None], 0)
 
 
 def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:

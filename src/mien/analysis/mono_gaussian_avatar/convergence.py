@@ -14,7 +14,7 @@ from mien.evaluation.experiment import Experiment, target_image
 from mien.evaluation.metrics import crop_to, psnr
 from mien.evaluation.plots import Axes, Series
 from mien.pictures import side_by_side, to_uint8
-from mien.progress import track_progress
+from mien.progress import progress_bar
 from mien.render import rasterize
 from mien.threads import one_torch_thread
 from mien.training.frames import Frame, FrameOrder, camera_extent, expression_rarity, spread_frames, training_frames
@@ -84,12 +84,14 @@ def _snapshots(
     targets = tuple(Targets(one, settings.resolution, len(sequences), torch.zeros(()), parts_of) for one in sequences)
     data = TrainingData(order, targets, camera_extent(sequences, trained))
     found = []
-    with one_torch_thread():
+    with one_torch_thread(), progress_bar("convergence", settings.steps) as advance:
         state = start(sequences, model, config, settings)
-        for _ in track_progress(range(settings.steps), "convergence", settings.steps):
+        while state.step < settings.steps:
+            before = state.step
             step(state, data, settings)
-            if state.step in steps:
-                progress = Progress(state.step - 1, settings.steps, order.at(state.step - 1)[1], data.extent)
+            advance(state.step - before)
+            progress = Progress(before, settings.steps, order.at(before)[1], data.extent, state.step - before)
+            if progress.completes(steps):
                 pictures = [_drawn(state.avatar, experiment, frame, progress) for frame in frames]
                 found.append((state.step, len(state.avatar.gaussian_store()), pictures))
     return found

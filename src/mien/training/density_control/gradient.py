@@ -62,14 +62,13 @@ class GradientStrategy(DensityStrategy):
     def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
         """Add and prune Gaussians in rounds, and reset opacities at their times."""
         settings = self._density.settings
-        done = progress.step + 1
-        changed = done in _round_steps(settings.start, settings.stop, settings.rounds, progress.steps)
+        changed = progress.completes(_round_steps(settings.start, settings.stop, settings.rounds, progress.steps))
         if changed:
             self._grow_and_prune(store, posed, progress, random())
             self._restart(len(store))
         name = self._density.opacity_logits
         resets = settings.opacity_resets if settings.rules.reset_opacities else ()
-        if name is not None and done in {max(1, round(time * progress.steps)) for time in resets}:
+        if name is not None and progress.completes(max(1, round(time * progress.steps)) for time in resets):
             ceiling = torch.logit(torch.tensor(settings.reset_opacity))
             logits = store[name].detach()
             lowered = logits.clamp_max(float(ceiling))

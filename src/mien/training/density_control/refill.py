@@ -41,7 +41,7 @@ class RefillStrategy(DensityStrategy):
         due = [
             target
             for time, target in zip(settings.times, settings.targets, strict=True)
-            if max(1, round(time * progress.steps)) == progress.step + 1
+            if progress.completes([max(1, round(time * progress.steps))])
         ]
         if not due:
             return False

@@ -18,7 +18,7 @@ class DensityStrategy(ABC):
 
     @abstractmethod
     def observe(self, posed: Posed, rendering: Rendering) -> None:
-        """Update the statistics after a step's backward pass. `posed` holds one timestep."""
+        """Update the statistics after a step's backward pass, once for each frame. `posed` holds one timestep."""
 
     @abstractmethod
     def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:

@@ -1,0 +1,143 @@
+"""The frames of one optimiser step: which they are, their pictures, and their losses.
+
+Most methods use one frame in a step. Of several, networks of positions run once.
+"""
+
+from collections.abc import Callable, Iterable
+from collections.abc import Sequence as Items
+from dataclasses import dataclass, replace
+from functools import partial
+
+from jaxtyping import Float
+from torch import Tensor
+
+from mien import _native
+from mien.avatar import ParameterGroup, PerceptualLoss, Posed, Progress
+from mien.face import concatenate
+from mien.render import rasterize
+from mien.render.rasterize import rasterize_each
+from mien.render.rendering import Rendering
+from mien.training.ahead import TargetQueue
+from mien.training.checkpoint import TrainingState
+from mien.training.frames import MIN_EXTENT, Frame, FrameOrder, background_at, crop_random, disguise_random
+from mien.training.inside import disguise
+from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses
+from mien.training.sequence import Target, Targets
+from mien.training.settings import TrainSettings
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """Data that training reads and never changes."""
+
+    order: FrameOrder
+    targets: tuple[Targets, ...]
+    """One entry per sequence."""
+    extent: float = MIN_EXTENT
+    """Extent of the training cameras, in metres."""
+    ahead: TargetQueue | None = None
+    """Prepares the targets of the next steps in another thread. If it is None, each step makes its own."""
+
+    def target(self, step: int, settings: TrainSettings) -> Target:
+        """The target of a step. It does not depend on `ahead`."""
+        frame, _ = self.order.at(step)
+        targets = self.targets[frame.sequence]
+        if self.ahead is not None:
+            return targets.moved(self.ahead.target(step))
+        background = background_at(settings, step)
+        return targets.target(frame.timestep, frame.camera, background, keep=settings.background == "white")
+
+    def goal(
+        self, target: Target, perceptual: PerceptualLoss, step: int, settings: TrainSettings
+    ) -> Callable[[], PerceptualGoal]:
+        """A function that returns the goal of a step's perceptual loss. With `ahead`, it is made meanwhile."""
+        make = partial(perceptual_goal, target, perceptual, crop_random(settings, step))
+        return (
+            make if self.ahead is None or target.background.device.type != "cpu" else self.ahead.meanwhile(make).result
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class BatchFrame:
+    """One frame of a step."""
+
+    number: int
+    """Number of frames that the run used before it."""
+    frame: Frame
+    index: int
+    """Its timestep in the track."""
+    target: Target
+    goal: Callable[[], PerceptualGoal] | None
+    """Makes the goal of the perceptual loss. None if the frame is compared without that loss."""
+
+    def seen(self, rendering: Rendering, state: TrainingState) -> Rendering:
+        """The rendering in the colours of the frame's camera."""
+        return (
+            rendering if state.colors is None else state.colors.seen_by(rendering, self.target.background, self.frame)
+        )
+
+
+def next_batch(state: TrainingState, data: TrainingData, settings: TrainSettings) -> list[BatchFrame]:
+    """The frames of the next step: as many as the avatar asks for and the run has left."""
+    perceptual = state.avatar.config.photometric.perceptual
+    count, batch = max(1, min(state.avatar.frames_per_step, settings.steps - state.step)), []
+    for number in range(state.step, state.step + count):
+        frame, _ = data.order.at(number)
+        target, due = data.target(number, settings), perceptual.due(number, settings.steps)
+        goal = data.goal(target, perceptual, number, settings) if due else None
+        batch.append(BatchFrame(number, frame, state.track.index_of(frame.sequence, frame.timestep), target, goal))
+    return batch
+
+
+def draw(
+    state: TrainingState, data: TrainingData, settings: TrainSettings, batch: Items[BatchFrame], progress: Progress
+) -> tuple[Posed, list[Posed], list[Rendering]]:
+    """The Gaussians of all frames, posed together; the same frame by frame, as they are drawn; and their pictures."""
+    faces = [state.track.face(one.index) for one in batch]
+    posed = state.avatar.pose(faces[0] if len(faces) == 1 else concatenate(faces), progress)
+    each = [posed] if len(batch) == 1 else [replace(posed, gaussians=own) for own in posed.gaussians.timesteps()]
+    each = [
+        disguise(own, state.avatar, one.target.hidden, disguise_random(settings, one.number))
+        for one, own in zip(batch, each, strict=True)
+    ]
+    views = [
+        (own.gaussians.timestep(0), data.targets[one.frame.sequence].camera(one.frame.camera))
+        for one, own in zip(batch, each, strict=True)
+    ]
+    backgrounds = [one.target.background for one in batch]
+    whole = each[0] if len(batch) == 1 else posed
+    if len(batch) == 1 or len(batch) < _native.thread_count():  # A view that is drawn alone uses all threads.
+        return whole, each, [rasterize(*view, background) for view, background in zip(views, backgrounds, strict=True)]
+    return whole, each, rasterize_each(views, backgrounds)
+
+
+def compare(state: TrainingState, batch: Items[BatchFrame], shown: Items[Rendering]) -> dict[str, Float[Tensor, ""]]:
+    """The losses that compare pictures, by name: means over the frames."""
+    weights = state.avatar.config.photometric
+    weights = (weights if state.unseen is None else state.unseen.weights(weights)).scaled(1 / len(batch))
+    return _summed(picture_losses(image, one.target, weights) for one, image in zip(batch, shown, strict=True))
+
+
+def compare_features(
+    state: TrainingState, batch: Items[BatchFrame], shown: Items[Rendering]
+) -> dict[str, Float[Tensor, ""]]:
+    """The perceptual loss, if it is due in one of the frames: the mean over all frames."""
+    settings = state.avatar.config.photometric.perceptual.scaled(1 / len(batch))
+    return _summed(
+        {"perceptual": perceptual_loss(image, one.goal(), settings)}
+        for one, image in zip(batch, shown, strict=True)
+        if one.goal is not None
+    )
+
+
+def _summed(losses: Iterable[dict[str, Float[Tensor, ""]]]) -> dict[str, Float[Tensor, ""]]:
+    total: dict[str, Tensor] = {}
+    for own in losses:
+        for name, loss in own.items():
+            total[name] = total[name] + loss if name in total else loss
+    return total
+
+
+def face_groups(state: TrainingState, batch: Items[BatchFrame]) -> list[ParameterGroup]:
+    """The parameters of the frames' faces. A timestep that comes twice is updated once, which clears its gradient."""
+    return [group for one in batch for group in state.track.parameter_groups(one.index)]

@@ -1,0 +1,212 @@
+"""Several frames in one optimiser step: the mean of their losses, the same order of frames, and exact resuming."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from mien import _native
+from mien.adam import Moments
+from mien.avatar import Avatar, MonoGaussianAvatarConfig, PerceptualLoss, Photometric, Progress
+from mien.cli import main
+from mien.errors import UserError
+from mien.progress import Advance
+from mien.render import rasterize
+from mien.render.rasterize import rasterize_each
+from mien.training import TrainSettings, read_curves, train
+from mien.training.batch import TrainingData, next_batch
+from mien.training.checkpoint import TrainingState, checkpoint_files
+from mien.training.frames import FrameOrder, training_frames
+from mien.training.sequence import Targets
+from mien.training.trainer import passed, start, step
+from test_methods import new_avatar
+from test_training_resume import assert_same_results
+from toy_scene import toy_camera, toy_face, toy_sequence
+
+SMALL = MonoGaussianAvatarConfig(
+    points=60, max_points=120, epochs=6, attribute_width=32, deformation_width=16, change_width=16, frames_per_step=4
+)
+SETTINGS = TrainSettings(steps=30, split="none", background="random", checkpoint_every=7, record_every=5)
+
+
+@contextmanager
+def silence(title: str, total: int, completed: int) -> Iterator[Advance]:
+    yield lambda amount=1, status="": None
+
+
+def new_state(
+    config: MonoGaussianAvatarConfig = SMALL, settings: TrainSettings = SETTINGS, timesteps: int = 7
+) -> tuple[TrainingState, TrainingData]:
+    face_model, sequence = toy_sequence(timesteps, 32)
+    state = start([sequence], face_model, config, settings)
+    order = FrameOrder(training_frames([sequence], settings), settings.seed)
+    return state, TrainingData(order, (Targets(sequence, 0),))
+
+
+def pull_at(state: TrainingState, data: TrainingData, frame: int, settings: TrainSettings = SETTINGS) -> torch.Tensor:
+    """Return the gradient of the points in the first step, which begins at a frame: ten times the first moments."""
+    state.step = frame
+    step(state, data, settings)
+    return 10 * means_moments(state).first
+
+
+def means_moments(state: TrainingState) -> Moments:
+    moments = state.avatar.gaussian_store().moments["means"]
+    assert isinstance(moments, Moments)
+    return moments
+
+
+def test_a_step_follows_the_mean_of_its_frames() -> None:
+    both = pull_at(*new_state(replace(SMALL, frames_per_step=2)), 2)
+    own = [pull_at(*new_state(replace(SMALL, frames_per_step=1)), frame) for frame in (2, 3)]
+    assert (own[0] - own[1]).abs().max() > 0.1 * own[0].abs().max()
+    torch.testing.assert_close(both, (own[0] + own[1]) / 2, rtol=1e-4, atol=1e-4 * float(both.abs().max()))
+
+
+def test_every_loss_of_a_picture_is_a_mean() -> None:
+    weights = Photometric(0.7, 0.3, 0.2, 0.5, PerceptualLoss(0.4))
+    assert weights.scaled(1.0) is weights
+    half = weights.scaled(0.5)
+    # Parts count relative to the whole picture, whose weight is halved.
+    assert half == Photometric(0.35, 0.15, 0.1, 0.5, PerceptualLoss(0.2))
+
+
+def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    state, data = new_state()
+    rounds, adapt = [], state.density.adapt
+    monkeypatch.setattr(state.density, "adapt", lambda *given: rounds.append(adapt(*given)))
+    seen = []
+    while state.step < SETTINGS.steps:
+        batch = next_batch(state, data, SETTINGS)
+        assert [one.number for one in batch] == list(range(state.step, state.step + len(batch)))
+        seen += [one.frame for one in batch]
+        step(state, data, SETTINGS)
+    assert seen == [data.order.at(number)[0] for number in range(SETTINGS.steps)]
+    # Seven steps of four frames, and one of the two that are left.
+    assert means_moments(state).step == 8
+    # Six numbers of steps at which the curves have an entry, of which the steps reach three alone.
+    assert state.curves["step"] == [8, 12, 16, 20, 28, 30]
+    # No round of density control is left out: those after 5, 10, .., 25 frames.
+    assert rounds == [False, True, True, True, True, False, True, False]
+    assert len(state.avatar.gaussian_store()) == 120
+
+
+def test_a_timestep_that_comes_twice_is_updated_once() -> None:
+    settings = replace(SETTINGS, steps=10)
+    config = replace(
+        SMALL, face_tuning=replace(SMALL.face_tuning, expression=replace(SMALL.face_tuning.expression, begin=0.0))
+    )
+    state, data = new_state(config, settings, timesteps=3)
+    step(state, data, settings)
+    moments = state.track.state()
+    assert sorted(moments["expression.step"].tolist()) == [1, 1, 1]
+
+
+def test_many_points_mean_fewer_frames() -> None:
+    state, _ = new_state(replace(SMALL, frames_per_step=8, points_per_step=200))
+    store, found = state.avatar.gaussian_store(), []
+    for count in (20, 25, 26, 60, 100, 101, 200, 500):
+        store.select(torch.arange(count) % len(store))
+        found.append(state.avatar.frames_per_step)
+    assert found == [8, 8, 7, 3, 2, 1, 1, 1]
+    with pytest.raises(UserError, match="frames-per-step 0"):
+        replace(SMALL, frames_per_step=0).check()
+
+
+@pytest.mark.parametrize("method", ["gaussian_avatars", "headgas"])
+def test_other_methods_use_one_frame_and_have_no_such_setting(
+    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert new_avatar(method).frames_per_step == 1
+    assert main(["train", str(tmp_path), "--method", method, "--method.frames-per-step", "4"]) == 2
+    assert "frames-per-step" in capsys.readouterr().err
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    """Pictures of a step are drawn side by side, or one by one if there are more threads than frames."""
+    results, before = [], _native.thread_count()
+    try:
+        for threads in (1, 3, 6):
+            _native.set_thread_count(threads)
+            state, data = new_state()
+            for _ in range(3):
+                step(state, data, SETTINGS)
+            results.append(state.avatar.state_dict())
+    finally:
+        _native.set_thread_count(before)
+    for other in results[1:]:
+        assert all(torch.equal(tensor, other[name]) for name, tensor in results[0].items())
+
+
+class StoppedError(Exception):
+    """Ends a run, as a crash would."""
+
+
+def test_a_stopped_run_ends_with_the_same_bytes(tmp_path: Path) -> None:
+    """It stops between checkpoints, and once the number of frames in a step has changed."""
+    config = replace(SMALL, points_per_step=240)
+    face_model, sequence = toy_sequence(7, 32)
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    train([sequence], face_model, config, SETTINGS, whole, silence)
+    counts = []
+    for crash_after in (3, 5):
+        steps = 0
+
+        def watch(avatar: Avatar, last: int = crash_after) -> None:
+            nonlocal steps
+            steps += 1
+            counts.append(avatar.frames_per_step)
+            if steps == last:
+                raise StoppedError
+
+        with pytest.raises(StoppedError):
+            train([sequence], face_model, config, SETTINGS, stopped, silence, watch)
+    assert checkpoint_files(stopped / "checkpoints")
+    assert set(counts) == {4, 2}
+    train([sequence], face_model, config, SETTINGS, stopped, silence)
+    assert_same_results(stopped, whole)
+    assert read_curves(whole)["step"][-1] == SETTINGS.steps
+
+
+def test_steps_pass_every_multiple_once() -> None:
+    assert [now for now in range(1, 30, 4) if passed(now - 4 if now > 1 else 0, now, 10)] == [13, 21]
+    assert not passed(10, 11, 10)
+    progress = Progress(8, 100, frames=4)
+    assert [count for count in range(20) if progress.completes([count])] == [9, 10, 11, 12]
+
+
+def test_entries_of_a_batch_are_its_timesteps() -> None:
+    avatar, face = new_avatar("mono_gaussian_avatar"), toy_face(3)
+    together = avatar.pose(face, Progress(0, 10)).gaussians
+    one_by_one = [together.timestep(index) for index in range(3)]
+    for found, expected in zip(together.timesteps(), one_by_one, strict=True):
+        for name in ("means", "quats", "scales", "opacities", "sh", "T_world_local"):
+            assert torch.equal(getattr(found, name), getattr(expected, name))
+    assert one_by_one[0].timesteps() == [one_by_one[0]]
+
+
+def test_views_with_their_own_backgrounds_and_sizes_are_drawn_as_alone() -> None:
+    avatar, face = new_avatar("mono_gaussian_avatar"), toy_face(2)
+    backgrounds = [torch.ones(3), torch.tensor([0.1, 0.5, 0.9])]
+    cameras = [toy_camera(24), toy_camera(40)]
+
+    def gradient(together: bool) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+        own = avatar.pose(face, Progress(0, 10)).gaussians.timesteps()
+        if together:
+            pictures = rasterize_each(list(zip(own, cameras, strict=True)), backgrounds)
+        else:
+            pictures = [rasterize(*view) for view in zip(own, cameras, backgrounds, strict=True)]
+        sum((picture.image * picture.image).sum() for picture in pictures).backward()  # type: ignore[union-attr]
+        found = [avatar.gaussian_store()["means"].grad, *(picture.means2d_offset.grad for picture in pictures)]
+        avatar.gaussian_store()["means"].grad = None
+        return [picture.image for picture in pictures], [one for one in found if one is not None]
+
+    (images, pulls), (alone, pulls_alone) = gradient(True), gradient(False)
+    assert [tuple(image.shape) for image in images] == [(24, 24, 3), (40, 40, 3)]
+    assert all(torch.equal(a, b) for a, b in zip(images, alone, strict=True))
+    assert len(pulls) == 3
+    for a, b in zip(pulls, pulls_alone, strict=True):
+        torch.testing.assert_close(a, b)
