@@ -152,12 +152,13 @@ def _coded(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
 
 def _add_palette(pictures: dict[str, bytes], higher: np.ndarray, width: int) -> dict[str, Any]:
     """Add the coefficients of higher degrees to the pictures, and return their part of meta.json."""
-    labels = _cells(higher.reshape(len(higher), -1), 1 << _PALETTE_BITS)
+    rows = higher.reshape(len(higher), 3 * higher.shape[1])
+    labels = _cells(rows, 1 << _PALETTE_BITS)
     size = int(labels.max(initial=0)) + 1
-    palette, _ = _means(higher.reshape(len(higher), -1), labels, size)
+    palette, _ = _means(rows, labels, size)
     codes, book = _coded(palette.reshape(size, *higher.shape[1:]))
-    rows = -(-size // _PALETTE_COLUMNS)
-    padded = np.zeros((rows * _PALETTE_COLUMNS, *higher.shape[1:]), np.uint8)
+    lines = -(-size // _PALETTE_COLUMNS)
+    padded = np.zeros((lines * _PALETTE_COLUMNS, *higher.shape[1:]), np.uint8)
     padded[:size] = codes
     pictures["shN_centroids.webp"] = _picture(padded.reshape(-1, 3), _PALETTE_COLUMNS * higher.shape[1])
     split = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1).astype(np.uint8)

@@ -20,7 +20,7 @@ def finite_arrays(path: Path, gaussians: Gaussians) -> tuple[np.ndarray, ...]:
     arrays = tuple(getattr(gaussians, name).detach().cpu().float().numpy() for name in _NAMES)
     bad = np.zeros(len(gaussians), bool)
     for array in arrays:
-        bad |= ~np.isfinite(array.reshape(len(array), -1)).all(1)
+        bad |= ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     if bad.any():
         raise UserError(f"{path}: {bad.sum()} of {len(bad)} Gaussians are NaN or infinite; train it again")
     return arrays

@@ -47,7 +47,7 @@ def write_usd(path: Path, poses: Iterable[Gaussians], fps: float | None = None) 
         field = UsdVol.ParticleField3DGaussianSplat.Define(stage, _SPLATS)
         count = 0
         for count, gaussians in enumerate(poses, 1):  # noqa: B007
-            _add_pose(path, field, gaussians, None if fps is None else count - 1)
+            _add_pose(path, field, gaussians, None if fps is None else float(count - 1))
         if fps is not None:
             stage.SetTimeCodesPerSecond(fps)
             stage.SetFramesPerSecond(fps)
