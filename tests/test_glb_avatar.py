@@ -148,9 +148,9 @@ def test_foreign_and_damaged_files_are_refused(glb: Path, tmp_path: Path) -> Non
         (tensor(bufferView=99999), "is damaged"),
         (tensor(bufferView=0), "is damaged|checksum"),
         (tensor(bufferView="0"), "is damaged"),
-        (lambda content: content.update(bufferViews=[7] * 99, accessors=[]), "is damaged"),
-        (lambda content: content["bufferViews"][-1].update(byteLength=10**12), "is damaged|checksum"),
-        (lambda content: content["bufferViews"][-1].update(byteOffset=-4), "is damaged|checksum"),
+        (lambda content: content["bufferViews"].clear(), "is damaged"),
+        (lambda content: content["bufferViews"][-1].update(byteLength=10**12), "is damaged"),
+        (lambda content: content["bufferViews"][-1].update(byteOffset=-4), "is damaged"),
         (lambda content: content["extensions"][EXTENSION]["avatar"].update(sha256="0"), "does not match its checksum"),
     ):
         rewritten(glb, path, edit)

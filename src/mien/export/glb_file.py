@@ -141,10 +141,16 @@ class Glb:
         return values[:, 0] if width == 1 else values
 
     def bytes_of(self, view: int) -> bytes:
-        """The bytes of a buffer view."""
+        """The bytes of a buffer view.
+
+        Raises:
+            ValueError: it reaches beyond the buffer.
+        """
         described = self.content["bufferViews"][view]
-        start = described.get("byteOffset", 0)
-        return self.buffer[start : start + described["byteLength"]]
+        start, size = described.get("byteOffset", 0), described["byteLength"]
+        if view < 0 or start < 0 or size < 0 or start + size > len(self.buffer):
+            raise ValueError(f"buffer view {view} reaches beyond the buffer")
+        return self.buffer[start : start + size]
 
     @staticmethod
     def _kind(component: int) -> np.dtype:

@@ -122,7 +122,7 @@ def _decoded(members: zipfile.ZipFile, meta: dict[str, Any]) -> tuple[np.ndarray
     sh = book("sh0")[shades[:, :3]][:, None]
     if "shN" in meta:
         rest = (meta["shN"]["bands"] + 1) ** 2 - 1
-        labels = pixels("shN", 1, 2).astype(int) @ [1, 256]
+        labels = pixels("shN", 1, 2).astype(int) @ np.array([1, 256])
         palette = pixels("shN", 0, 3).reshape(-1, rest, 3)
         sh = np.concatenate([sh, book("shN")[palette[labels]]], axis=1)
     return (

@@ -1,5 +1,6 @@
 """USD files with a ParticleField3DGaussianSplat (OpenUSD 26.03 or newer, by usd-core): a pose, or a sequence."""
 
+import importlib
 import math
 import tempfile
 from collections.abc import Iterable
@@ -30,7 +31,7 @@ def write_usd(path: Path, poses: Iterable[Gaussians], fps: float | None = None) 
         UserError: usd-core is missing or too old, or a value is NaN or infinite.
     """
     check_usd(path)
-    from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdVol
+    Sdf, Usd, UsdGeom, UsdUtils, UsdVol = _pxr("Sdf", "Usd", "UsdGeom", "UsdUtils", "UsdVol")
 
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         version = ".".join(map(str, Usd.GetVersion()))
@@ -73,7 +74,7 @@ def read_usd(path: Path, time: float | None = None) -> Gaussians:
         UserError: usd-core is missing, or the file is missing, damaged, or without Gaussians.
     """
     check_usd(path)
-    from pxr import Tf, Usd, UsdVol
+    Tf, Usd, UsdVol = _pxr("Tf", "Usd", "UsdVol")
 
     try:
         stage = Usd.Stage.Open(str(path))
@@ -96,8 +97,13 @@ def read_usd(path: Path, time: float | None = None) -> Gaussians:
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
 
 
+def _pxr(*names: str) -> list[Any]:
+    """Modules of usd-core, which have no types."""
+    return [importlib.import_module(f"pxr.{name}") for name in names]
+
+
 def _add_pose(path: Path, field: Any, gaussians: Gaussians, time: float | None) -> None:
-    from pxr import Usd, Vt
+    Usd, Vt = _pxr("Usd", "Vt")
 
     assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
     assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
