@@ -33,7 +33,7 @@ COMMANDS = {
     "render": "avatar -> a still or a video along a camera path, at any expression",
     "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
     "view": "avatar -> a viewer in the browser: turn it, move its face, play a motion",
-    "export": "avatar -> .mien (runs without torch), .ply at some expressions, or GaussianAvatars' folder",
+    "export": "avatar -> .mien (runs without torch), .html, .glb, Gaussians in a pose, or GaussianAvatars' folder",
     "import": "GaussianAvatars' folder -> an avatar that can be rendered, driven and exported",
     "face-models": "list the face models and bake them ahead of time",
     "bench": "speed of this machine; quality on reference captures with known truth",

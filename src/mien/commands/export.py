@@ -2,31 +2,42 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from mien.commands.options import check_driver
 from mien.errors import UserError
+from mien.export.usd_package import USD_ENDINGS, check_usd
 from mien.workspace import Workspace, open_workspace
 
-_ENDINGS = (".ply", ".mien", ".html", ".packed", ".glb")
+if TYPE_CHECKING:
+    import mien.gaussians
+
+_POSES = (".ply", ".spz", ".sog", *USD_ENDINGS)
 _PAGES = (".html", ".packed")
+_ENDINGS = (".mien", *_PAGES, ".glb", *_POSES)
+_Format = Literal[
+    "mien", "html", "packed", "glb", "ply", "spz", "sog", "usd", "usda", "usdc", "usdz", "gaussian-avatars"
+]
+_FILES = (".mien", ".glb")
+"""Endings of avatars that can be read."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Write an avatar: .mien (all of it), .html (a page), .packed (for pages), .glb (mesh), .ply (a pose), a folder."""
+    """Write an avatar: .mien (all of it), .html and .packed (for pages), .glb (for engines), a pose, or a folder."""
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Workspace folder."""
+    """Workspace folder. Also a .mien or .glb file, whose avatar becomes a .mien, a .html or .packed, or the pose at
+    rest."""
     out: Path
-    """The .mien, .html, .packed, .glb or .ply file to write. With --series, the .ply files get numbers:
-    NAME_000000.ply. With --format gaussian-avatars, a folder."""
-    format: Literal["mien", "html", "packed", "glb", "ply", "gaussian-avatars"] | None = None
-    """Format of the output: mien, html, packed, glb, ply (default: by the ending of --out), or gaussian-avatars: a
-    folder with point_cloud.ply, whose Gaussians are bound to triangles, and flame_param.npz with all timesteps of the
-    run's training."""
+    """The file to write: .mien, .html, .packed, .glb, or Gaussians in a pose: .ply, .spz, .sog, .usd, .usda, .usdc or
+    .usdz. With --series, .ply, .spz and .sog files get numbers: NAME_000000.ply; a USD file has all frames. With
+    --format gaussian-avatars, a folder."""
+    format: _Format | None = None
+    """Format of the output (default: by the ending of --out), or gaussian-avatars: a folder with point_cloud.ply, whose
+    Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's training."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()
@@ -34,7 +45,7 @@ class Command:
     (default: the person's neutral)."""
     series: str | None = None
     """A motion: the name of a sequence of the workspace, or anything that `mien drive --by` takes. A page plays it. For
-    .ply, every frame becomes a file, and the head stays at the origin."""
+    .ply, .spz and .sog, every frame becomes a file, and for USD a time sample; the head stays at the origin."""
     every: int = 1
     """With --series, take only every n-th frame."""
 
@@ -42,17 +53,16 @@ class Command:
         """Check options and paths without heavy libraries."""
         from mien.files import check_writable
 
+        if self.workspace.suffix.lower() in _FILES and not self.workspace.is_dir():
+            self._check_file()
+            return
         workspace = open_workspace(self.workspace)
         workspace.pick_run(self.run_name)
         kind = self.out.suffix.lower()
         if self.format == "gaussian-avatars":
             self._check_folder()
             return
-        if kind not in _ENDINGS:
-            told = f"{self.out}: cannot write {kind or 'a file without ending'}; use .ply, .mien, .html, .packed or"
-            raise UserError(f"{told} .glb, or --format gaussian-avatars for a folder")
-        if self.format is not None and kind != f".{self.format}":
-            raise UserError(f"{self.out}: does not end in .{self.format}, as --format {self.format} asks; rename it")
+        self._check_ending(_ENDINGS, ", or --format gaussian-avatars for a folder")
         if kind == ".mien" and (self.set or self.series):
             raise UserError(f"{self.out}: a .mien file holds every expression; leave --set and --series out")
         if kind == ".glb" and (self.set or self.series):
@@ -65,12 +75,16 @@ class Command:
             raise UserError(f"--every {self.every}: give 1 or more, together with --series")
         if self.series is not None and self.series not in workspace.sequence_names():
             check_driver(Path(self.series), None)
-        check_writable(self._numbered(0) if self.series is not None and kind == ".ply" else self.out)
+        numbered = self.series is not None and kind in _POSES and kind not in USD_ENDINGS
+        check_writable(self._numbered(0) if numbered else self.out)
 
     def run(self) -> None:
         """Pose the avatar and write the files."""
         from mien.avatar import load_avatar
 
+        if self.workspace.suffix.lower() in _FILES and not self.workspace.is_dir():
+            self._convert()
+            return
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         avatar = load_avatar(run_dir)
@@ -86,6 +100,36 @@ class Command:
             self._write_one(avatar)
         else:
             self._write_series(avatar, workspace, self.series)
+
+    def _check_ending(self, endings: tuple[str, ...], others: str) -> None:
+        kind = self.out.suffix.lower()
+        if kind not in endings:
+            use = f"{', '.join(endings[:-1])} or {endings[-1]}"
+            raise UserError(f"{self.out}: cannot write {kind or 'a file without ending'}; use {use}{others}")
+        if self.format is not None and kind != f".{self.format}":
+            raise UserError(f"{self.out}: does not end in .{self.format}, as --format {self.format} asks; rename it")
+        if kind in USD_ENDINGS:
+            check_usd(self.out)
+
+    def _check_file(self) -> None:
+        from mien.files import check_writable
+
+        if not self.workspace.is_file():
+            raise UserError(f"{self.workspace}: no such file; give a workspace, or a file that `mien export` wrote")
+        if self.run_name or self.set or self.series or self.every != 1:
+            raise UserError(
+                f"{self.workspace}: a file holds one avatar at rest; leave --run, --set, --series and --every out, or "
+                "give its workspace"
+            )
+        self._check_ending(tuple(ending for ending in _ENDINGS if ending != ".glb"), "")
+        if self.out.exists() and self.out.samefile(self.workspace):
+            raise UserError(f"{self.out}: is the file that is read; choose another name")
+        check_writable(self.out)
+
+    def _convert(self) -> None:
+        from mien.commands.stages.converting import convert
+
+        convert(self.workspace, self.out)
 
     def _check_folder(self) -> None:
         from mien.files import check_writable
@@ -158,17 +202,25 @@ class Command:
 
     def _write_one(self, avatar) -> None:
         from mien.commands.expression import with_expression
+        from mien.export import write_pose
         from mien.progress import say
 
         face = with_expression(avatar.subject, avatar.face_model, self.set)
-        say(f"{self.out}: {_write_ply(self.out, avatar, face):,} Gaussians")
+        write_pose(self.out, _posed(avatar, face))
+        say(f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians")
 
     def _write_series(self, avatar, workspace: Workspace, series: str) -> None:
+        from mien.export import write_pose, write_usd
         from mien.progress import say, track_progress
 
-        driven, _ = self._driven(avatar, workspace, series, with_head_pose=False)
-        for index in track_progress(range(len(driven)), "Exporting", len(driven)):
-            _write_ply(self._numbered(index), avatar, driven[index])
+        driven, fps = self._driven(avatar, workspace, series, with_head_pose=False)
+        indices = track_progress(range(len(driven)), "Exporting", len(driven))
+        if self.out.suffix.lower() in USD_ENDINGS:
+            count = write_usd(self.out, (_posed(avatar, driven[index]) for index in indices), fps / self.every)
+            say(f"{self.out}: {count} time samples, {self.out.stat().st_size / 1e6:.1f} MB")
+            return
+        for index in indices:
+            write_pose(self._numbered(index), _posed(avatar, driven[index]))
         say(f"{self._numbered(0)} ... {self._numbered(len(driven) - 1).name}: {len(driven)} files")
 
     def _driven(self, avatar, workspace: Workspace, series: str, with_head_pose: bool):
@@ -184,16 +236,15 @@ class Command:
         return with_expression(driven[:: self.every], avatar.face_model, self.set), driver.fps
 
     def _numbered(self, index: int) -> Path:
-        return self.out.with_name(f"{self.out.stem}_{index:06d}.ply")
+        return self.out.with_name(f"{self.out.stem}_{index:06d}{self.out.suffix.lower()}")
 
 
-def _write_ply(path: Path, avatar, face) -> int:
-    """Write one timestep and return the number of Gaussians. The head is at the origin, +y up, +z out of the face."""
+def _posed(avatar, face) -> "mien.gaussians.Gaussians":
+    """The Gaussians of one timestep in the world. The head is at the origin, +y up, +z out of the face."""
     import torch
 
-    from mien.export import in_world, write_ply
+    from mien.export import in_world
 
     origin = torch.zeros_like(face.head_rotation)
     gaussians = avatar.pose(replace(face, head_rotation=origin, head_translation=origin)).gaussians.detach()
-    write_ply(path, in_world(gaussians.timestep(0)))
-    return len(gaussians)
+    return in_world(gaussians.timestep(0))

@@ -11,9 +11,14 @@ if TYPE_CHECKING:
         write_gaussian_avatars_folder,
     )
     from mien.export.glb import MeshModel, WrittenGlb, write_glb
+    from mien.export.glb_avatar import read_glb_avatar
     from mien.export.glb_file import Glb, read_glb
     from mien.export.packed import Motion, pack, unpacked
     from mien.export.ply import read_ply, write_ply
+    from mien.export.pose_files import write_pose
+    from mien.export.sog import read_sog, write_sog
+    from mien.export.spz import read_spz, write_spz
+    from mien.export.usd import read_usd, write_usd
     from mien.export.web_page import WrittenPage, write_packed, write_page
     from mien.export.world_space import in_world
 else:
@@ -25,9 +30,14 @@ else:
             ],
             "world_space": ["in_world"],
             "glb": ["MeshModel", "WrittenGlb", "write_glb"],
+            "glb_avatar": ["read_glb_avatar"],
             "glb_file": ["Glb", "read_glb"],
             "packed": ["Motion", "pack", "unpacked"],
             "ply": ["read_ply", "write_ply"],
+            "pose_files": ["write_pose"],
+            "sog": ["read_sog", "write_sog"],
+            "spz": ["read_spz", "write_spz"],
+            "usd": ["read_usd", "write_usd"],
             "web_page": ["WrittenPage", "write_packed", "write_page"],
         },
     )  # fmt: skip
@@ -43,11 +53,19 @@ __all__ = [
     "pack",
     "read_gaussian_avatars_folder",
     "read_glb",
+    "read_glb_avatar",
     "read_ply",
+    "read_sog",
+    "read_spz",
+    "read_usd",
     "unpacked",
     "write_gaussian_avatars_folder",
     "write_glb",
     "write_packed",
     "write_page",
     "write_ply",
+    "write_pose",
+    "write_sog",
+    "write_spz",
+    "write_usd",
 ]

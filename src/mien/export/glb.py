@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, Int
 from mien import runtime
 from mien.driving.motion import ARKIT_NAMES, gaze_of, within_lids
 from mien.errors import UserError
+from mien.export.glb_avatar import EXTENSION, avatar_extension
 from mien.export.glb_file import INDICES, VERTICES, GlbWriter
 from mien.export.texture import FRONT_VIEWS, Shot, Surface, bake_texture
 from mien.files import check_writable
@@ -24,7 +25,7 @@ from mien.runtime import Face, Gaussians, MeshBound, PortableAvatar, Rig
 from mien.runtime.posing import SH_C0, rig_points
 from mien.runtime.rotation import matrix_from_axis_angle
 
-FORMAT, VERSION = "mien.glb", 1
+FORMAT, VERSION = "mien.glb", 2
 TEXTURE_SIZE = 1024
 """Side of the texture in texels."""
 _JPEG_QUALITY = 92
@@ -35,8 +36,8 @@ _JAW, _LOOK, _HIDDEN = 0.7, 0.4, 0.01
 _MOVED = 1e-6
 """Distance in metres below which a morph target does not move a vertex."""
 _ANIMATES = (
-    "Morph targets and skin move the mesh. The Gaussians show the person at rest and do not move; a .mien file of the "
-    "same avatar has what moves them."
+    "Morph targets and skin move the mesh. The Gaussians show the person at rest and do not move in programs that do "
+    f"not know {EXTENSION}, which has what moves them."
 )
 _SPLATS = "KHR_gaussian_splatting"
 
@@ -92,7 +93,8 @@ def write_glb(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size
         "asset": {"version": "2.0", "generator": f"mien {avatar.about.mien}", "extras": {"mien": about}},
         "scene": 0,
         "scenes": [{"name": "mesh", "nodes": [0, 1]}, {"name": "gaussians", "nodes": [len(content["nodes"]) - 1]}],
-        "extensionsUsed": ["KHR_materials_unlit", _SPLATS],
+        "extensionsUsed": ["KHR_materials_unlit", _SPLATS, EXTENSION],
+        "extensions": {EXTENSION: avatar_extension(path, writer, avatar)},
     }
     size = writer.write(path, content)
     return WrittenGlb(size, names, tuple(name for name in ARKIT_NAMES if name not in names))

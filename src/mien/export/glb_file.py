@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from mien.bounded import parse_json, read_bytes
 from mien.errors import UserError
 from mien.files import write_atomically
 
 _MAGIC, _VERSION = 0x46546C67, 2
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
+_MAX_BYTES = 1 << 30
+"""Largest file that is read, in bytes. The largest that mien writes has some tens of megabytes."""
 _COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123, np.dtype("u1"): 5121}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 VERTICES, INDICES = 34962, 34963
@@ -138,10 +141,16 @@ class Glb:
         return values[:, 0] if width == 1 else values
 
     def bytes_of(self, view: int) -> bytes:
-        """The bytes of a buffer view."""
+        """The bytes of a buffer view.
+
+        Raises:
+            ValueError: it reaches beyond the buffer.
+        """
         described = self.content["bufferViews"][view]
-        start = described.get("byteOffset", 0)
-        return self.buffer[start : start + described["byteLength"]]
+        start, size = described.get("byteOffset", 0), described["byteLength"]
+        if view < 0 or start < 0 or size < 0 or start + size > len(self.buffer):
+            raise ValueError(f"buffer view {view} reaches beyond the buffer")
+        return self.buffer[start : start + size]
 
     @staticmethod
     def _kind(component: int) -> np.dtype:
@@ -157,8 +166,8 @@ def read_glb(path: Path) -> Glb:
     remedy = "write it again with `mien export`"
     if not path.is_file():
         raise UserError(f"{path}: no such file; {remedy}")
-    data = path.read_bytes()
     try:
+        data = read_bytes(path, _MAX_BYTES)
         magic, version, size = struct.unpack_from("<III", data)
         if (magic, version, size) != (_MAGIC, _VERSION, len(data)):
             raise ValueError("its header is wrong")
@@ -166,6 +175,9 @@ def read_glb(path: Path) -> Glb:
         rest, binary = struct.unpack_from("<II", data, 20 + length)
         if (kind, binary) != (_JSON, _BINARY) or 28 + length + rest != len(data):
             raise ValueError("its chunks are wrong")
-        return Glb(json.loads(data[20 : 20 + length]), data[28 + length :])
-    except (ValueError, struct.error, RecursionError) as error:
+        content = parse_json(data[20 : 20 + length].decode())
+        if not isinstance(content, dict):
+            raise ValueError("its json is no object")
+        return Glb(content, data[28 + length :])
+    except (ValueError, struct.error, OSError) as error:
         raise UserError(f"{path}: is damaged, or not a .glb file ({str(error)[:100]}); {remedy}") from None

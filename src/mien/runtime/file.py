@@ -34,10 +34,7 @@ def write_portable(path: Path, avatar: PortableAvatar) -> None:
         UserError: the path cannot be written, or an array holds NaN or infinity.
     """
     check_writable(path)
-    check(avatar, str(path))
-    arrays: dict[str, np.ndarray] = {}
-    content = _tree(avatar, "", arrays)
-    header = {"format": FORMAT, "version": _version(avatar), "sha256": _digest(content, arrays), "content": content}
+    header, arrays = to_arrays(path, avatar)
     # A single entry, because safetensors writes several in random order.
     write_arrays(path, arrays, {"mien": json.dumps(header, allow_nan=False, sort_keys=True)})
 
@@ -57,6 +54,31 @@ def read_portable(path: Path) -> PortableAvatar:
         raise UserError(f"{path}: is damaged, or not a .mien file ({reason}); {_REMEDY}") from None
     try:
         header = parse_json(metadata.get("mien", "{}"))
+    except ValueError as error:
+        raise UserError(f"{path}: is damaged ({repr(error)[:200]}); export it again with `mien export`") from None
+    return from_arrays(path, header, arrays)
+
+
+def to_arrays(path: Path, avatar: PortableAvatar) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The header of the metadata, and the arrays by name, as the .mien file of an avatar has them.
+
+    Raises:
+        UserError: an array holds NaN or infinity. The message names `path`.
+    """
+    check(avatar, str(path))
+    arrays: dict[str, np.ndarray] = {}
+    content = _tree(avatar, "", arrays)
+    header = {"format": FORMAT, "version": _version(avatar), "sha256": _digest(content, arrays), "content": content}
+    return header, arrays
+
+
+def from_arrays(path: Path, header: Any, arrays: dict[str, np.ndarray]) -> PortableAvatar:
+    """The avatar of a header and arrays as `to_arrays` returns them. All of its content is checked.
+
+    Raises:
+        UserError: they are damaged, of another version, or not of a .mien file. The message names `path`.
+    """
+    try:
         found = (header.get("format"), header.get("version"))
         if found == (None, None):
             raise UserError(f"{path}: is not a .mien file; {_REMEDY}")

@@ -1,0 +1,136 @@
+"""The .spz format (Niantic, version 3): Gaussians with 8 to 24 bits a number, column by column, gzipped.
+
+Source: the README of github.com/nianticlabs/spz, which describes the header, the order of the columns and their bits.
+"""
+
+import gzip
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mien.bounded import read_bytes
+from mien.errors import UserError
+from mien.export.splats import finite_arrays, unit_quats
+from mien.files import write_atomically
+from mien.gaussians import Gaussians
+
+_MAGIC, _VERSION = 0x5053474E, 3
+_HEADER = struct.Struct("<IIIBBBB")
+_MAX_FRACTION = 16
+"""Most bits of a position behind the point: steps of 15 micrometres."""
+_FIXED_BITS = 23
+"""Bits of a position without its sign."""
+_COLOUR_SCALE = 0.15
+_LOG_SCALE_OFFSET, _LOG_SCALE_STEPS = 10, 16
+_SH_STEPS = 128
+_QUAT_STEPS = 511
+_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
+"""Degree of the spherical harmonics by the number of coefficients."""
+_MAX_BYTES, _MAX_GAUSSIANS = 1 << 28, 2_000_000
+_REMEDY = "give a .spz of version 3, as `mien export` writes"
+
+
+def write_spz(path: Path, gaussians: Gaussians) -> None:
+    """Write unbatched Gaussians in world space as .spz: +x right, +y up, +z to the viewer, in metres.
+
+    Positions have steps of 2^-16 m (of more if one is beyond 128 m), scales steps of 6 %, colour coefficients steps of
+    0.026 (0.0073 in colour), opacities steps of 1/255, higher coefficients steps of 1/128 within -1 to 1, and rotations
+    10 bits for each of the three smallest components. The same Gaussians give the same bytes.
+
+    Raises:
+        UserError: a value is NaN or infinite, or a position is too far away.
+    """
+    assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
+    assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
+    means, quats, scales, opacities, sh = finite_arrays(path, gaussians)
+    reach = float(np.abs(means).max(initial=0))
+    fraction = min(_MAX_FRACTION, _FIXED_BITS - 1 - int(np.ceil(np.log2(max(reach, 1e-6)))))
+    if fraction < 0:
+        raise UserError(f"{path}: a Gaussian is {reach:.3g} m away, too far for .spz; write a .ply")
+    fixed = np.round(means.astype(np.float64) * 2**fraction).astype("<i4")
+    columns = (
+        fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3],
+        _bytes(opacities * 255),
+        _bytes((sh[:, 0] * _COLOUR_SCALE + 0.5) * 255),
+        _bytes((np.log(np.maximum(scales, 1e-30)) + _LOG_SCALE_OFFSET) * _LOG_SCALE_STEPS),
+        _packed_quats(unit_quats(quats)),
+        _bytes(sh[:, 1:] * _SH_STEPS + _SH_STEPS),
+    )
+    header = _HEADER.pack(_MAGIC, _VERSION, len(means), _DEGREES[sh.shape[1]], fraction, 0, 0)
+    data = gzip.compress(header + b"".join(column.tobytes() for column in columns), mtime=0)
+    write_atomically(path, lambda temporary: temporary.write_bytes(data))
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Read a .spz file of version 3.
+
+    Raises:
+        UserError: the file is missing, damaged, of another version, or too large.
+    """
+    try:
+        packed = read_bytes(path, _MAX_BYTES)
+        with gzip.GzipFile(fileobj=io.BytesIO(packed)) as file:
+            magic, version, count, degree, fraction, _, _ = _HEADER.unpack(file.read(_HEADER.size))
+            if (magic, version) != (_MAGIC, _VERSION) or degree > 3 or fraction > _FIXED_BITS:
+                raise ValueError("it is of another version")
+            if count > _MAX_GAUSSIANS:
+                raise ValueError(f"it has {count:,} Gaussians, and at most {_MAX_GAUSSIANS:,} are read")
+            rest = (degree + 1) ** 2 - 1
+            shapes = [(count, 3, 3), (count,), (count, 3), (count, 3), (count, 4), (count, rest, 3)]
+            columns = [_column(file, shape) for shape in shapes]
+    except (OSError, EOFError, ValueError, struct.error) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{path}: cannot be read as .spz ({reason}); {_REMEDY}") from None
+    places, opacities, colours, scales, quats, higher = columns
+    wide = np.concatenate([np.zeros((count, 3, 1), np.uint8), places], axis=2)
+    means = (wide.reshape(count, 12).view("<i4") >> 8) / 2**fraction
+    first = (colours.astype(np.float32) / 255 - 0.5) / _COLOUR_SCALE
+    sh = np.concatenate([first[:, None], (higher.astype(np.float32) - _SH_STEPS) / _SH_STEPS], axis=1)
+    arrays = (
+        means,
+        _unpacked_quats(quats),
+        np.exp(scales.astype(np.float64) / _LOG_SCALE_STEPS - _LOG_SCALE_OFFSET),
+        opacities / 255,
+        sh,
+    )
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays))
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.round(values), 0, 255).astype(np.uint8)
+
+
+def _column(file: gzip.GzipFile, shape: tuple[int, ...]) -> np.ndarray:
+    size = int(np.prod(shape))
+    data = file.read(size)
+    if len(data) < size:
+        raise ValueError("it is truncated")
+    return np.frombuffer(data, np.uint8).reshape(shape)
+
+
+def _packed_quats(quats: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz in 32 bits: the index of the largest component of xyzw, and sign and size of the other three."""
+    turned = quats[:, [1, 2, 3, 0]]
+    largest = np.abs(turned).argmax(1)
+    turned = turned * np.where(np.take_along_axis(turned, largest[:, None], 1) < 0, -1, 1)
+    size = np.clip(np.round(np.abs(turned) * np.sqrt(2) * _QUAT_STEPS), 0, _QUAT_STEPS).astype(np.uint32)
+    fields = size | ((turned < 0).astype(np.uint32) << 9)
+    word = largest.astype(np.uint32)
+    for component in range(4):
+        word = np.where(largest == component, word, (word << 10) | fields[:, component])
+    return word.astype("<u4").view(np.uint8).reshape(-1, 4)
+
+
+def _unpacked_quats(packed: np.ndarray) -> np.ndarray:
+    word = np.ascontiguousarray(packed).view("<u4")[:, 0].astype(np.int64)
+    largest, quats = word >> 30, np.zeros((len(word), 4))
+    for component in (3, 2, 1, 0):
+        stored = largest != component
+        size = (word & _QUAT_STEPS) / _QUAT_STEPS / np.sqrt(2)
+        quats[:, component] = np.where(stored, np.where(word & 512, -size, size), 0)
+        word = np.where(stored, word >> 10, word)
+    quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(1 - (quats**2).sum(1), 0))
+    return quats[:, [3, 0, 1, 2]]

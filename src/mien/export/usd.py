@@ -1,0 +1,126 @@
+"""USD files with a ParticleField3DGaussianSplat (OpenUSD 26.03 or newer, by usd-core): a pose, or a sequence."""
+
+import importlib
+import math
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mien.errors import UserError
+from mien.export.splats import finite_arrays, unit_quats
+from mien.export.usd_package import check_usd
+from mien.files import write_atomically
+from mien.gaussians import Gaussians
+
+_ROOT, _SPLATS = "/avatar", "/avatar/gaussians"
+_REACH = 3.0
+"""Standard deviations that the extent has around a centre."""
+
+
+def write_usd(path: Path, poses: Iterable[Gaussians], fps: float | None = None) -> int:
+    """Write unbatched Gaussians in world space (+y up, metres) as a USD stage, and return the number of poses.
+
+    Values are float32 and not compressed with loss. With `fps`, each pose is a time sample (0, 1, 2, ...); without it,
+    there is one pose and no time. The ending of `path` chooses the container (`USD_ENDINGS`).
+
+    Raises:
+        UserError: usd-core is missing or too old, or a value is NaN or infinite.
+    """
+    check_usd(path)
+    Sdf, Usd, UsdGeom, UsdUtils, UsdVol = _pxr("Sdf", "Usd", "UsdGeom", "UsdUtils", "UsdVol")
+
+    if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
+        version = ".".join(map(str, Usd.GetVersion()))
+        raise UserError(f"{path}: needs usd-core 26.3 or newer, not {version}; run `pip install -U 'mien[usd]'`")
+    with tempfile.TemporaryDirectory() as folder:
+        # A package is made of a finished file.
+        inner = Path(folder) / (path.with_suffix(".usdc").name if path.suffix.lower() == ".usdz" else path.name)
+        stage = Usd.Stage.CreateNew(str(inner))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        root = UsdGeom.Xform.Define(stage, _ROOT)
+        stage.SetDefaultPrim(root.GetPrim())
+        Usd.ModelAPI(root.GetPrim()).SetKind("component")
+        field = UsdVol.ParticleField3DGaussianSplat.Define(stage, _SPLATS)
+        count = 0
+        for count, gaussians in enumerate(poses, 1):  # noqa: B007
+            _add_pose(path, field, gaussians, None if fps is None else float(count - 1))
+        if fps is not None:
+            stage.SetTimeCodesPerSecond(fps)
+            stage.SetFramesPerSecond(fps)
+            stage.SetStartTimeCode(0)
+            stage.SetEndTimeCode(max(count - 1, 0))
+        stage.GetRootLayer().Save()
+        del stage
+
+        def finish(temporary: Path) -> None:
+            if inner.suffix != path.suffix:
+                UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inner)), str(temporary))
+            else:
+                temporary.write_bytes(inner.read_bytes())
+
+        write_atomically(path, finish)
+    return count
+
+
+def read_usd(path: Path, time: float | None = None) -> Gaussians:
+    """Read the Gaussians of a USD file at a time sample (default: without time).
+
+    Raises:
+        UserError: usd-core is missing, or the file is missing, damaged, or without Gaussians.
+    """
+    check_usd(path)
+    Tf, Usd, UsdVol = _pxr("Tf", "Usd", "UsdVol")
+
+    try:
+        stage = Usd.Stage.Open(str(path))
+        prims = (prim for prim in stage.Traverse() if prim.IsA(UsdVol.ParticleField3DGaussianSplat))
+        field = UsdVol.ParticleField3DGaussianSplat(next(prims))
+    except (Tf.ErrorException, StopIteration):
+        raise UserError(f"{path}: is missing, damaged, or has no Gaussians; give a USD file of `mien export`") from None
+    at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+    attributes = (
+        field.GetPositionsAttr(), field.GetOrientationsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr(),
+        field.GetRadianceSphericalHarmonicsCoefficientsAttr(),
+    )  # fmt: skip
+    values = [attribute.Get(at) for attribute in attributes]
+    if any(value is None for value in values):
+        raise UserError(f"{path}: has no Gaussians at time {time}; give a time of its samples")
+    means, turns, scales, opacities, sh = (np.array(value, np.float32) for value in values)
+    if not len(means) == len(turns) == len(scales) == len(opacities) or len(sh) % max(len(means), 1):
+        raise UserError(f"{path}: its arrays have different lengths; give a USD file of `mien export`")
+    arrays = (means, turns[:, [3, 0, 1, 2]], scales, opacities, sh.reshape(len(means), -1, 3))
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
+
+
+def _pxr(*names: str) -> list[Any]:
+    """Modules of usd-core, which have no types."""
+    return [importlib.import_module(f"pxr.{name}") for name in names]
+
+
+def _add_pose(path: Path, field: Any, gaussians: Gaussians, time: float | None) -> None:
+    Usd, Vt = _pxr("Usd", "Vt")
+
+    assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
+    assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
+    means, quats, scales, opacities, sh = finite_arrays(path, gaussians)
+    at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+    degree = math.isqrt(sh.shape[1]) - 1
+    turns = np.ascontiguousarray(unit_quats(quats)[:, [1, 2, 3, 0]])  # USD keeps the real part last in memory
+    reach = _REACH * scales.max(1, keepdims=True)
+    extent = np.stack([(means - reach).min(0), (means + reach).max(0)]) if len(means) else np.zeros((2, 3), np.float32)
+    field.CreatePositionsAttr().Set(Vt.Vec3fArray.FromNumpy(means), at)
+    field.CreateOrientationsAttr().Set(Vt.QuatfArray.FromNumpy(turns), at)
+    field.CreateScalesAttr().Set(Vt.Vec3fArray.FromNumpy(scales), at)
+    field.CreateOpacitiesAttr().Set(Vt.FloatArray.FromNumpy(opacities), at)
+    coefficients = np.ascontiguousarray(sh.reshape(-1, 3))
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr().Set(Vt.Vec3fArray.FromNumpy(coefficients), at)
+    field.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), at)
+    if not field.GetRadianceSphericalHarmonicsDegreeAttr().HasAuthoredValue():
+        field.CreateRadianceSphericalHarmonicsDegreeAttr().Set(degree)
+        field.CreateProjectionModeHintAttr().Set("perspective")
+        field.CreateSortingModeHintAttr().Set("zDepth")
