@@ -9,7 +9,7 @@ type Tree = null | boolean | number | string | Tree[] | { [key: string]: Tree };
 /** A file that cannot be read. Its message is for the user. */
 export class AvatarError extends Error {}
 
-const VERSIONS = [1, 2, 3, 4, 5];
+const VERSIONS = [1, 2, 3, 4, 5, 6];
 const BEYOND = "is damaged: an array lies beyond its end";
 
 /** The avatar in a .mien file. The checksum is not checked: that is the work of `mien`. */

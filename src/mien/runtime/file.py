@@ -22,7 +22,7 @@ from mien.files import check_writable, expect_whole, read_safetensors, write_arr
 from mien.runtime.baked import PortableAvatar
 from mien.runtime.checks import check
 
-FORMAT, VERSIONS = "mien.baked", (1, 2, 3, 4, 5)
+FORMAT, VERSIONS = "mien.baked", (1, 2, 3, 4, 5, 6)
 ENDING = ".mien"
 _REMEDY = "write one with `mien export DIR --out me.mien`"
 
