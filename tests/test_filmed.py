@@ -14,6 +14,7 @@ from mien.driving import keep_to_filmed
 from mien.errors import UserError
 from mien.face import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.runtime import file
 from mien.runtime.filmed import ROOM, head_angles, soft_limits, within_filmed_inputs, within_filmed_poses
 from toy_scene import toy_camera, toy_face_model, toy_sequence
 
@@ -122,6 +123,49 @@ def test_it_is_kept_in_a_run_and_in_a_mien_file(tmp_path: Path) -> None:
         assert found is not None
         for name in ("lowest", "highest", "directions", "reach", "head_angles"):
             assert np.array_equal(getattr(found, name), getattr(avatar.filmed, name)), name
+
+
+def test_a_mien_file_keeps_the_confidence_of_each_triangle(tmp_path: Path) -> None:
+    plain = make_portable(_avatar(toy_sequence()[1].tracking.face), toy_camera(32), "toy")
+    assert isinstance(plain.baked, runtime.MeshBound)
+    confidence = np.linspace(0, 1, len(plain.baked.faces), dtype=np.float32)
+    for name in ("a.mien", "b.mien"):
+        runtime.write_portable(tmp_path / name, replace(plain, confidence=confidence))
+    assert (tmp_path / "a.mien").read_bytes() == (tmp_path / "b.mien").read_bytes()
+    assert b'\\"version\\": 6}' in (tmp_path / "a.mien").read_bytes()
+    found = runtime.read_portable(tmp_path / "a.mien").confidence
+    assert found is not None
+    assert found.tobytes() == confidence.tobytes()
+    runtime.write_portable(tmp_path / "old.mien", plain)
+    assert b'\\"version\\": 1}' in (tmp_path / "old.mien").read_bytes()
+    assert runtime.read_portable(tmp_path / "old.mien").confidence is None
+
+
+def test_a_program_that_knows_only_older_versions_names_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = make_portable(_avatar(toy_sequence()[1].tracking.face), toy_camera(32), "toy")
+    confidence = np.ones(len(toy_face_model().faces), np.float32)
+    runtime.write_portable(tmp_path / "a.mien", replace(plain, confidence=confidence))
+    monkeypatch.setattr(file, "VERSIONS", (1, 2, 3, 4, 5))
+    with pytest.raises(UserError, match="version 6, expected 'mien.baked' version 1, 2, 3, 4 or 5"):
+        runtime.read_portable(tmp_path / "a.mien")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_confidence_that_does_not_fit_is_refused(method: str, tmp_path: Path) -> None:
+    kind = METHODS[method]
+    avatar = kind.avatar(kind.config(), toy_face_model(), toy_sequence()[1].tracking.face)
+    plain = make_portable(avatar, toy_camera(32), "toy")
+    good = np.full(len(toy_face_model().faces), 0.5, np.float32)
+    wrong = [good + 1, good - 1, good * np.float32("nan")]
+    if isinstance(plain.baked, runtime.MeshBound):
+        wrong += [good[1:], good[:0]]
+    for confidence in wrong:
+        with pytest.raises(UserError, match="confidence"):
+            runtime.write_portable(tmp_path / "a.mien", replace(plain, confidence=confidence))
+    runtime.write_portable(tmp_path / "a.mien", replace(plain, confidence=good))
+    found = runtime.read_portable(tmp_path / "a.mien").confidence
+    assert found is not None
+    assert np.array_equal(found, good)
 
 
 def test_a_range_that_does_not_fit_is_refused(tmp_path: Path) -> None:

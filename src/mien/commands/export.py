@@ -158,13 +158,16 @@ class Command:
             )
 
     def _write_mien(self, avatar, run_dir: Path) -> None:
-        from mien.avatar import make_portable
+        from mien.avatar import as_array, make_portable
         from mien.progress import say
         from mien.runtime import write_portable
-        from mien.training import run_camera
+        from mien.training import read_coverage, run_camera
 
-        name = self.workspace.resolve().name
-        write_portable(self.out, make_portable(avatar, run_camera(run_dir), name))
+        portable = make_portable(avatar, run_camera(run_dir), self.workspace.resolve().name)
+        covered = read_coverage(run_dir, avatar.face_model)
+        if covered is not None:
+            portable = replace(portable, confidence=as_array(covered.seen))
+        write_portable(self.out, portable)
         say(f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians, {self.out.stat().st_size / 1e6:.1f} MB")
 
     def _write_page(self, avatar, run_dir: Path, workspace: Workspace) -> None:

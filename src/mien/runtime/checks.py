@@ -78,6 +78,8 @@ def _faults(avatar: PortableAvatar) -> Iterator[str]:
         fault = filmed_fault(avatar.filmed, e + 3 * len(avatar.joint_names))
         if fault is not None:
             yield fault
+    if avatar.confidence is not None:
+        yield from _confidence_faults(avatar.confidence, baked)
     camera = avatar.camera
     fault = camera_fault(camera.K, camera.viewmat, camera.width, camera.height)
     if fault is not None:
@@ -85,6 +87,13 @@ def _faults(avatar: PortableAvatar) -> Iterator[str]:
     texts = [getattr(avatar.about, f.name) for f in fields(avatar.about)]
     if not all(map(is_one_line, (*texts, *avatar.expression_names, *avatar.joint_names))):
         yield "a name in it has several lines"
+
+
+def _confidence_faults(confidence: np.ndarray, baked: BakedAvatar) -> Iterator[str]:
+    if isinstance(baked, MeshBound) and len(confidence) != len(baked.faces):
+        yield f"it has the confidence of {len(confidence)} triangles, but {len(baked.faces)} triangles"
+    if not ((confidence >= 0) & (confidence <= 1)).all():
+        yield "a confidence is not a number from 0 to 1"
 
 
 def _names(baked: BakedAvatar) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -130,7 +130,7 @@ def _of_workspace(root: Path, run: str | None) -> Viewed:
 
 def _mesh_of(portable: PortableAvatar) -> Mesh | None:
     baked = portable.baked
-    return Mesh(baked.rig, baked.faces) if isinstance(baked, MeshBound) else None
+    return Mesh(baked.rig, baked.faces, portable.confidence) if isinstance(baked, MeshBound) else None
 
 
 def _clip_of(viewed: Viewed, by: Path, sequence: str | None) -> Callable[[], Clip]:
