@@ -12,7 +12,7 @@ from mien.runtime import PortableAvatar, read_portable, write_portable
 
 
 def convert(source: Path, out: Path) -> None:
-    """Write the avatar in a file as .mien, as a page or for pages, or at rest with the head at the origin, and report what it is.
+    """Write the avatar in a file as .mien, .html, .packed, or at rest with the head at the origin, and report it.
 
     Raises:
         UserError: the file is missing, damaged or foreign, or the avatar cannot be written so.
