@@ -282,7 +282,9 @@ def test_a_run_keeps_its_coverage_and_resumes_exactly(toy: tuple[FaceModel, Sequ
     again = train([sequence], model, config, SETTINGS, tmp_path / "cut")
     assert torch.equal(again.gaussian_store()["means"], whole.gaussian_store()["means"])
     plain = train([sequence], model, config, replace(SETTINGS, unseen="trained"), tmp_path / "plain")
-    assert read_coverage(tmp_path / "plain", model) is None
+    of_plain = read_coverage(tmp_path / "plain", model)
+    assert of_plain is not None, "each run knows what was filmed"
+    assert torch.equal(of_plain.seen, kept.seen)
     assert len(plain.gaussian_store()["face_index"].unique()) == len(model.faces)
 
 

@@ -111,6 +111,9 @@ def train(
         ]
         data = TrainingData(order, tuple(targets), extent)
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
+        faces = [sequence.tracking.face for sequence in sequences]
+        covered = None if state.unseen is None else state.unseen.coverage
+        write_results(run_dir, state, covered or coverage(face_model, sequences, faces, frames))
     return state.avatar
 
 
@@ -122,7 +125,7 @@ def _train_to_the_end(
     progress: ProgressBar,
     watch: Watch | None,
 ) -> None:
-    """Continue from the newest checkpoint, if there is one, and write the results."""
+    """Continue from the newest checkpoint, if there is one, and take all steps that are left."""
     resume(run_dir / "checkpoints", state)
     with (
         one_torch_thread(),
@@ -147,7 +150,6 @@ def _train_to_the_end(
                 if interrupted():
                     raise KeyboardInterrupt
         _check_finite(run_dir, state)
-        write_results(run_dir, state)
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:
