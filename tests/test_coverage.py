@@ -183,7 +183,7 @@ def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
     made_up = facing(model) <= 0
     colors = torch.tensor([0.2, 0.4, 0.6]).expand(len(made_up), 3)
-    avatar.close(SurfacePrior(torch.zeros(len(made_up)), colors, made_up.float(), made_up))
+    avatar.close(SurfacePrior(torch.zeros(len(made_up)), None, colors, made_up.float(), made_up))
     assert len(avatar.gaussian_store()) == len(made_up)
     vertices = model.head_vertices(avatar.subject)[0]
     camera = view_of_head(vertices, 180)
@@ -193,7 +193,7 @@ def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     assert rendering.alpha[middle, middle].min() > 0.95
     color = rendering.image[middle, middle].reshape(-1, 3).mean(0)
     torch.testing.assert_close(color, colors[0], atol=0.03, rtol=0)
-    hair = SurfacePrior(torch.full((len(made_up),), 0.02), colors, made_up.float(), made_up)
+    hair = SurfacePrior(torch.full((len(made_up),), 0.02), None, colors, made_up.float(), made_up)
     avatar.close(hair)
     assert (avatar.gaussian_store()["means"][:, 1] > 0).all()
 
@@ -203,12 +203,26 @@ def test_colours_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Seque
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
     doubt = (facing(model) <= 0).float()
     before = avatar.gaussian_store()["sh_constant"].detach().clone()
-    prior = SurfacePrior(0 * doubt, torch.ones(len(doubt), 3), doubt, doubt > 0)
+    prior = SurfacePrior(0 * doubt, None, torch.ones(len(doubt), 3), doubt, doubt > 0)
     for _ in range(200):
         avatar.keep_to(prior)
     colors = avatar.gaussian_store()["sh_constant"].detach()
     assert torch.equal(colors[doubt == 0], before[doubt == 0])
     torch.testing.assert_close(rgb_from_sh(colors[doubt > 0][:, 0]), torch.ones(int(doubt.sum()), 3), atol=1e-3, rtol=0)
+
+
+def test_hanging_hair_may_stand_out_from_the_surface(toy: tuple[FaceModel, Sequence]) -> None:
+    """Fills have limits to the surface, and hair that hangs beside a triangle widens them there alone."""
+    model, sequence = toy
+    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    count = len(model.faces)
+    hanging = 0.05 * (torch.arange(count) % 2).float()
+    with torch.no_grad():
+        avatar.gaussian_store()["means"][:, 1] = 1e3
+    avatar.keep_to(SurfacePrior(torch.zeros(count), hanging, None, None, torch.zeros(count, dtype=torch.bool)))
+    bound, limits = avatar.gaussian_store()["face_index"], avatar.config.surface
+    height = avatar.gaussian_store()["means"][:, 1] * avatar._sizes[bound]
+    torch.testing.assert_close(height, limits.depth + limits.hair_share * hanging[bound])
 
 
 @pytest.mark.parametrize(("hair", "loose"), [(0.0, 1.0), (0.01, 1.0), (0.0, 2.0)])
