@@ -29,10 +29,11 @@ from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh
 from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
+from mien.runtime.baked import Filmed
 from mien.training import Sequence, TrainSettings, filmed_words, read_coverage, train
 from mien.training.coverage import Coverage, coverage, drawn_share, smoothstep
 from mien.training.density_control import density_strategy
-from mien.training.filmed import FILE, filmed_yaws, view_of_head, write_coverage
+from mien.training.filmed import FILE, filmed_yaws, view_of_head, with_shown_angles, write_coverage
 from mien.training.frames import Frame, training_frames
 from mien.training.unseen import Unseen, spare_fills, unseen_of
 from toy_scene import toy_face, toy_sequence
@@ -359,6 +360,25 @@ def test_words_say_which_sides_were_filmed(toy: tuple[FaceModel, Sequence]) -> N
         model, vertices, front_and_left
     )
     assert "made up" in filmed_words(model, vertices, Coverage(0 * ones, colors, ones))
+
+
+def test_a_filled_head_may_turn_where_half_of_it_was_filmed(toy: tuple[FaceModel, Sequence]) -> None:
+    """The angles grow to the side that was filmed, to the person's left, and never shrink."""
+    model = toy[0]
+    vertices, ones = model.head_vertices(toy_face(1))[0], torch.ones(len(model.faces))
+    colors, middle = torch.zeros(len(ones), 3), model.template[model.faces].mean(1)
+    zeros = np.zeros(1, np.float32)
+    known = Filmed(zeros, zeros, zeros[:, None], zeros, np.array([[-0.3, 0.1], [-0.2, 0.2]], np.float32))
+    left = Coverage((middle[:, 0] > 0).float(), colors, ones)
+    (low, high), (down, up) = with_shown_angles(known, model, vertices, left).head_angles
+    assert low == np.float32(-0.3)
+    assert high == pytest.approx(np.radians(60))
+    assert down <= np.float32(-0.2)
+    assert up >= np.float32(0.2)
+    everything = with_shown_angles(known, model, vertices, Coverage(ones, colors, ones)).head_angles
+    np.testing.assert_allclose(np.degrees(everything), [[-60, 60], [-30, 30]], atol=1e-4)
+    nothing = with_shown_angles(known, model, vertices, Coverage(0 * ones, colors, ones)).head_angles
+    np.testing.assert_array_equal(nothing, known.head_angles)
 
 
 def test_smoothstep_is_flat_at_both_ends() -> None:

@@ -41,6 +41,7 @@ from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.coverage import coverage
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
+from mien.training.filmed import with_shown_angles
 from mien.training.frames import (
     FrameOrder,
     camera_extent,
@@ -215,6 +216,9 @@ def start(
     if filled or avatar.wants_surface:
         unseen = unseen_of(avatar, sequences, faces, frames, filled=filled)
         avatar.close(unseen.prior)
+        if unseen.coverage is not None:
+            neutral = face_model.head_vertices(avatar.subject)[0].detach()
+            avatar.filmed = with_shown_angles(avatar.filmed, face_model, neutral, unseen.coverage)
     inside = None
     if settings.inside == "furnished" and avatar.triangles() is not None:
         known = None if unseen is None else unseen.coverage
