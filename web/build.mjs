@@ -9,12 +9,17 @@ import { gzipSync } from "node:zlib";
 const here = dirname(fileURLToPath(import.meta.url));
 const folder = process.argv[2];
 const options = { bundle: true, minify: true, target: "es2022", charset: "ascii", legalComments: "none", write: false, absWorkingDir: here };
+/** A number of a shader with no more digits than a float has. */
+const shorter = (number) => {
+  const exact = Math.fround(number);
+  for (let digits = 1; ; ++digits) if (Math.fround(exact.toPrecision(digits)) === exact) return String(Number(exact.toPrecision(digits)));
+};
 /** Shaders without comments and blanks. */
 const shaders = {
   name: "shaders",
   setup: (on) =>
     on.onLoad({ filter: /shaders\.ts$/ }, async ({ path }) => ({
-      contents: (await readFile(path, "utf8")).replace(/(?<!:)\/\/ .*$/gm, "").replace(/^ +/gm, "").replace(/ *([=+*/<>?:,;{}()&|-]) */g, "$1"),
+      contents: (await readFile(path, "utf8")).replace(/(?<!:)\/\/ .*$/gm, "").replace(/^ +/gm, "").replace(/\d+\.\d{7,}/g, shorter).replace(/ *([=+*/<>?:,;{}()&|-]) */g, "$1"),
       loader: "ts",
     })),
 };
@@ -31,6 +36,6 @@ const write = async (path, text) => {
 const script = await bundle("src/page.ts", "iife");
 if (script.includes("</script")) throw new Error("the script would end its own element");
 const template = await readFile(join(here, "src/page.html"), "utf8");
-for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"]])
+for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"], ["webgpu.js", "src/webgpu.ts"]])
   await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm")) + "\n");
 await write(folder ? join(folder, "page.html") : join(here, "../src/mien/export/page.html"), template.replace("{{script}}", () => script));
