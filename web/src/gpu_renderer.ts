@@ -1,16 +1,16 @@
 // Draws posed Gaussians with WebGPU: compute passes project and sort them, then one quad each is blended into half floats.
 
 import type { Avatar } from "./avatar";
-import { AvatarError } from "./format";
-import { DRAW, PROJECT, SCREEN, SORT, THREADS, TILE } from "./gpu_shaders";
+import { dispatch, Memory } from "./gpu_memory";
+import { GpuPoser, type Posed } from "./gpu_pose";
+import { DRAW, PROJECT, SCREEN, THREADS } from "./gpu_shaders";
+import { GpuSorter, SortPipelines } from "./gpu_sort";
 import { spread, type Colour, type Drawer, type View } from "./renderer";
 import type { Poser } from "./rig";
 import type { SkinnedPoser } from "./skinned";
 
-// TypeScript has the types of WebGPU, but not these.
-declare const GPUBufferUsage: Record<"COPY_DST" | "STORAGE" | "UNIFORM" | "INDIRECT", number>;
+// TypeScript has the types of WebGPU, but not this.
 declare const GPUTextureUsage: Record<"RENDER_ATTACHMENT" | "TEXTURE_BINDING", number>;
-declare const GPUShaderStage: { COMPUTE: number };
 
 const PICTURE: GPUTextureFormat = "rgba16float";
 /** Numbers of the structure `View` of the shaders. */
@@ -22,24 +22,14 @@ const VISIBLE_AT = 8;
 /** What a device has compiled. It serves any number of avatars. */
 export class Pipelines {
   readonly project: GPUComputePipeline;
-  /** Both passes of the sort have these three; their bind groups have one layout. */
-  readonly sort: { count: GPUComputePipeline; scan: GPUComputePipeline; scatter: GPUComputePipeline }[];
-  readonly sortLayout: GPUBindGroupLayout;
+  readonly sort: SortPipelines;
   readonly draw: GPURenderPipeline;
   readonly screen: GPURenderPipeline;
 
   constructor(readonly device: GPUDevice, readonly format: GPUTextureFormat) {
     const compiled = (code: string) => device.createShaderModule({ code });
     this.project = device.createComputePipeline({ layout: "auto", compute: { module: compiled(PROJECT) } });
-    const types: GPUBufferBindingType[] = ["uniform", ...Array(3).fill("read-only-storage"), ...Array(3).fill("storage")];
-    this.sortLayout = device.createBindGroupLayout({
-      entries: types.map((type, binding) => ({ binding, visibility: GPUShaderStage.COMPUTE, buffer: { type } })),
-    });
-    const layout = device.createPipelineLayout({ bindGroupLayouts: [this.sortLayout] }), sort = compiled(SORT);
-    this.sort = [1, 0].map((FIRST) => {
-      const of = (entryPoint: string) => device.createComputePipeline({ layout, compute: { module: sort, entryPoint, constants: { FIRST } } });
-      return { count: of("count"), scan: of("scan"), scatter: of("scatter") };
-    });
+    this.sort = new SortPipelines(device);
     const over: GPUBlendComponent = { srcFactor: "one", dstFactor: "one-minus-src-alpha" };
     const drawing = (code: string, target: GPUColorTargetState, topology: GPUPrimitiveTopology) => {
       const module = compiled(code);
@@ -51,89 +41,78 @@ export class Pipelines {
 }
 
 export class GpuRenderer implements Drawer {
-  private readonly device: GPUDevice;
-  private readonly buffers: GPUBuffer[] = [];
-  private readonly count: number;
-  private readonly shRest: number;
-  private readonly frames: GPUBuffer;
-  private readonly means: GPUBuffer;
+  private readonly memory: Memory;
+  private readonly posed: Posed;
   private readonly shapes: GPUBuffer;
-  private readonly colours: GPUBuffer;
   private readonly view: GPUBuffer;
   private readonly state: GPUBuffer;
-  /** Numbers of `means`, `shapes` and `colours`. */
-  private readonly meanValues: Float32Array<ArrayBuffer>;
-  private readonly shapeValues: Float32Array<ArrayBuffer>;
-  private readonly colourValues: Float32Array<ArrayBuffer>;
-  private readonly groups: { project: GPUBindGroup; sort: GPUBindGroup[]; draw: GPUBindGroup };
+  /** Null for Gaussians that the CPU poses. */
+  private readonly gpuPoser: GpuPoser | null;
+  private readonly sorter: GpuSorter;
+  /** Numbers of `means`, `colours` and `shapes`. */
+  private readonly means: Float32Array;
+  private readonly colours: Float32Array;
+  private readonly shapeValues: Float32Array;
+  private readonly project: GPUBindGroup;
+  private readonly splats: GPUBindGroup;
+  private readonly count: number;
+  private readonly shRest: number;
   private picture: GPUTexture | null = null;
   private screen: GPUBindGroup | null = null;
 
   constructor(private readonly pipelines: Pipelines, private readonly context: GPUCanvasContext, avatar: Avatar, private readonly poser: Poser) {
-    const { device } = pipelines, { attributes, faces, face_index } = avatar.baked, { STORAGE, UNIFORM, INDIRECT } = GPUBufferUsage;
-    this.device = device;
+    const { device } = pipelines, { baked } = avatar, { attributes, faces, face_index } = baked, memory = (this.memory = new Memory(device));
     const count = (this.count = face_index.length);
     this.shRest = attributes.sh.length / 3 / Math.max(count, 1) - 1;
-    [this.frames, this.means, this.shapes, this.colours] = [4 * faces.length, 4 * count, 8 * count, 4 * count].map((size) => this.buffer(size, STORAGE));
-    const sh = this.buffer(4 * count * this.shRest, STORAGE), splats = this.buffer(12 * count, STORAGE);
-    const [keys, order, otherKeys, otherOrder] = Array.from({ length: 4 }, () => this.buffer(count, STORAGE));
-    const starts = this.buffer(256 * Math.ceil(count / TILE), STORAGE);
-    this.view = this.buffer(VIEW_SIZE, UNIFORM);
-    this.state = this.buffer(EMPTY_STATE.length, STORAGE | INDIRECT);
-    this.meanValues = new Float32Array(4 * count);
-    this.shapeValues = new Float32Array(8 * count);
-    this.colourValues = new Float32Array(4 * count);
-    face_index.forEach((face, i) => (this.meanValues[4 * i + 3] = face));
+    [this.means, this.colours, this.shapeValues] = [4, 4, 8].map((width) => new Float32Array(width * count));
+    face_index.forEach((face, i) => (this.means[4 * i + 3] = face));
+    spread(baked.means, this.means);
+    for (let i = 0; i < count; ++i) {
+      const at = 3 * i * (1 + this.shRest);
+      this.colours.set([...attributes.sh.subarray(at, at + 3), attributes.opacity_logits[i]], 4 * i);
+    }
     const rest = new Float32Array(4 * count * this.shRest);
     for (let i = 0; i < count * this.shRest; ++i) {
       const from = 3 * (i + Math.floor(i / this.shRest) + 1);
       rest.set(attributes.sh.subarray(from, from + 3), 4 * i);
     }
-    this.write(sh, rest);
+    const posed = (this.posed = { frames: memory.storage(4 * faces.length), means: memory.storage(this.means), colours: memory.storage(this.colours) });
+    this.shapes = memory.storage(8 * count);
+    this.view = memory.uniform(VIEW_SIZE);
+    this.state = memory.indirect(EMPTY_STATE);
+    this.sorter = new GpuSorter(pipelines.sort, memory, count, this.view, this.state);
+    const splats = memory.storage(12 * count), sorted = this.sorter;
+    const inputs = [posed.frames, posed.means, this.shapes, posed.colours, memory.storage(rest)];
+    this.project = memory.group(pipelines.project.getBindGroupLayout(0), [this.view, ...inputs, splats, sorted.keys, this.state]);
+    this.splats = memory.group(pipelines.draw.getBindGroupLayout(0), [this.view, splats, sorted.order]);
     this.uploadShapes(attributes.quats, attributes.log_scales.map(Math.exp));
-    this.uploadChanged();
-    const { view, state } = this, { project, sortLayout, draw } = pipelines;
-    this.groups = {
-      project: this.group(project.getBindGroupLayout(0), [view, this.frames, this.means, this.shapes, this.colours, sh, splats, keys, state]),
-      sort: [[keys, order, otherKeys, otherOrder], [otherKeys, otherOrder, keys, order]].map((four) => this.group(sortLayout, [view, state, ...four, starts])),
-      draw: this.group(draw.getBindGroupLayout(0), [view, splats, order]),
-    };
+    this.gpuPoser = baked.skinned ? null : new GpuPoser(memory, baked, posed, this.means, this.colours);
     context.configure({ device, format: pipelines.format, alphaMode: "premultiplied" });
   }
 
-  /** Takes over what the poser has computed for a new face. */
+  /** Takes over what the poser has computed for a new face, and poses the rest. */
   upload(): void {
-    this.write(this.frames, this.poser.frames);
-    if (this.poser.changed) this.uploadChanged();
+    if (this.gpuPoser) this.gpuPoser.run(this.poser);
+    else this.uploadPosed(this.poser, this.poser.skinned!);
   }
 
   /** Draws the Gaussians over a background. The order is the GPU's own. */
   draw(_order: () => Uint32Array, view: View, background: Colour): void {
-    const { device, pipelines, groups, count } = this, [red, green, blue, alpha] = background, d = view.directions;
+    const { pipelines, count } = this, { device } = pipelines, [red, green, blue, alpha] = background, d = view.directions;
     const told = new Float32Array(VIEW_SIZE);
     told.set(view.head);
     told.set([d[0], d[1], d[2], 0, d[3], d[4], d[5], 0, d[6], d[7], d[8]], 12);
     told.set([...view.focal, ...view.centre, view.width, view.height], 24);
     new Uint32Array(told.buffer).set([count, this.shRest], 30);
     told.set([red * alpha, green * alpha, blue * alpha, alpha], 32);
-    this.write(this.view, told);
-    this.write(this.state, EMPTY_STATE);
-    const encoder = device.createCommandEncoder();
-    const pass = encoder.beginComputePass();
-    const run = (pipeline: GPUComputePipeline, group: GPUBindGroup, workgroups: number) => {
-      pass.setPipeline(pipeline);
-      pass.setBindGroup(0, group);
-      pass.dispatchWorkgroups(workgroups);
-    };
-    run(pipelines.project, groups.project, Math.ceil(count / THREADS));
-    pipelines.sort.forEach((sort, digit) => {
-      run(sort.count, groups.sort[digit], Math.ceil(count / TILE));
-      run(sort.scan, groups.sort[digit], 1);
-      run(sort.scatter, groups.sort[digit], Math.ceil(count / TILE));
-    });
+    this.memory.write(this.view, told);
+    this.memory.write(this.state, EMPTY_STATE);
+    const encoder = device.createCommandEncoder(), pass = encoder.beginComputePass();
+    dispatch(pass, pipelines.project, this.project, Math.ceil(count / THREADS));
+    this.sorter.run(pass);
     pass.end();
     const picture = this.pictureOf(view.width, view.height);
-    this.render(encoder, picture.createView(), pipelines.draw, groups.draw, (to) => to.drawIndirect(this.state, VISIBLE_AT));
+    this.render(encoder, picture.createView(), pipelines.draw, this.splats, (to) => to.drawIndirect(this.state, VISIBLE_AT));
     this.render(encoder, this.context.getCurrentTexture().createView(), pipelines.screen, this.screen!, (to) => to.draw(3));
     device.queue.submit([encoder.finish()]);
   }
@@ -141,7 +120,7 @@ export class GpuRenderer implements Drawer {
   /** Frees the memory of the avatar. */
   dispose(): void {
     this.picture?.destroy();
-    for (const buffer of this.buffers) buffer.destroy();
+    this.memory.free();
   }
 
   private render(encoder: GPUCommandEncoder, view: GPUTextureView, pipeline: GPURenderPipeline, group: GPUBindGroup, draw: (pass: GPURenderPassEncoder) => void) {
@@ -153,7 +132,7 @@ export class GpuRenderer implements Drawer {
   }
 
   private pictureOf(width: number, height: number): GPUTexture {
-    const { device, pipelines } = this;
+    const { pipelines } = this, { device } = pipelines;
     if (this.picture?.width === width && this.picture.height === height) return this.picture;
     this.picture?.destroy();
     const { RENDER_ATTACHMENT, TEXTURE_BINDING } = GPUTextureUsage;
@@ -165,15 +144,15 @@ export class GpuRenderer implements Drawer {
     return picture;
   }
 
-  private uploadChanged(): void {
-    const { poser, meanValues, colourValues } = this;
-    spread(poser.means, meanValues);
-    spread(poser.colours, colourValues);
-    poser.opacityLogits.forEach((logit, i) => (colourValues[4 * i + 3] = 1 / (1 + Math.exp(-logit))));
-    this.write(this.means, meanValues);
-    this.write(this.colours, colourValues);
-    const posed: SkinnedPoser | null = poser.skinned;
-    if (posed) this.uploadShapes(posed.quats, posed.scales);
+  private uploadPosed(poser: Poser, skinned: SkinnedPoser): void {
+    const { memory, posed, means, colours } = this;
+    spread(poser.means, means);
+    spread(poser.colours, colours);
+    poser.opacityLogits.forEach((logit, i) => (colours[4 * i + 3] = logit));
+    memory.write(posed.frames, poser.frames);
+    memory.write(posed.means, means);
+    memory.write(posed.colours, colours);
+    this.uploadShapes(skinned.quats, skinned.scales);
   }
 
   private uploadShapes(quats: Float32Array, scales: Float32Array): void {
@@ -182,23 +161,6 @@ export class GpuRenderer implements Drawer {
       for (let k = 0; k < 4; ++k) shapeValues[8 * i + k] = quats[4 * i + k];
       for (let k = 0; k < 3; ++k) shapeValues[8 * i + 4 + k] = scales[3 * i + k];
     }
-    this.write(this.shapes, shapeValues);
-  }
-
-  /** A buffer of so many numbers. */
-  private buffer(size: number, usage: GPUBufferUsageFlags): GPUBuffer {
-    const bytes = Math.max(16, 4 * size);
-    if (bytes > this.device.limits.maxStorageBufferBindingSize) throw new AvatarError("has more Gaussians than this device can hold");
-    const buffer = this.device.createBuffer({ size: bytes, usage: usage | GPUBufferUsage.COPY_DST });
-    this.buffers.push(buffer);
-    return buffer;
-  }
-
-  private write(buffer: GPUBuffer, values: Float32Array | Uint32Array): void {
-    this.device.queue.writeBuffer(buffer, 0, values as Float32Array<ArrayBuffer>);
-  }
-
-  private group(layout: GPUBindGroupLayout, buffers: GPUBuffer[]): GPUBindGroup {
-    return this.device.createBindGroup({ layout, entries: buffers.map((buffer, binding) => ({ binding, resource: { buffer } })) });
+    this.memory.write(this.shapes, shapeValues);
   }
 }

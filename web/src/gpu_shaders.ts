@@ -1,8 +1,108 @@
 // The compute passes and the pictures of WebGPU. The kernel and its constants are those of shaders.ts.
 
+import { SLOPE } from "./features";
+
 /** Threads of a workgroup, and Gaussians that a workgroup sorts. */
 export const THREADS = 256;
 export const TILE = 1024;
+
+/** Most activations of an avatar. */
+export const MOST_RANK = 128;
+
+/** What the passes know of a face. */
+const POSE = `
+struct Pose {
+  count: u32, triangles: u32, columns: u32,
+  bias: vec4f,  // of the network's outputs
+  activations: array<vec4f, ${MOST_RANK / 4}>,
+}
+@group(0) @binding(0) var<uniform> pose: Pose;
+fn activation(k: u32) -> f32 { return pose.activations[k >> 2][k & 3]; }`;
+
+/** Frames of triangles: `triangleFrames` of rig.ts. */
+export const FRAMES = `${POSE}
+@group(0) @binding(1) var<storage, read> points: array<f32>;
+@group(0) @binding(2) var<storage, read> faces: array<u32>;
+@group(0) @binding(3) var<storage, read_write> frames: array<vec4f>;
+const DEGENERATE_LENGTH = 1e-7;
+fn at(i: u32) -> vec3f { return vec3f(points[3 * i], points[3 * i + 1], points[3 * i + 2]); }
+
+@compute @workgroup_size(${THREADS})
+fn main(@builtin(global_invocation_id) id: vec3u) {
+  let f = id.x;
+  if (f >= pose.triangles) { return; }
+  let a = at(faces[3 * f]); let b = at(faces[3 * f + 1]); let c = at(faces[3 * f + 2]);
+  var first = b - a;
+  var side = c - a;
+  var edge = length(first);
+  if (edge < DEGENERATE_LENGTH || length(cross(first, side)) < DEGENERATE_LENGTH * edge) {
+    first = vec3f(DEGENERATE_LENGTH, 0, 0);
+    side = vec3f(0, DEGENERATE_LENGTH, 0);
+    edge = DEGENERATE_LENGTH;
+  }
+  first /= edge;
+  var normal = cross(first, side);
+  let height = length(normal); let k = (edge + height) / 2;
+  normal /= height;
+  let last = cross(first, normal); let middle = (a + b + c) / 3;
+  for (var row = 0u; row < 3; row++) { frames[3 * f + row] = vec4f(k * first[row], k * normal[row], k * last[row], middle[row]); }
+}`;
+
+/** Centres, first colours and raw opacities at the activations. A basis has centres and opacity, then colours. */
+export const CHANGE = `${POSE}
+@group(0) @binding(1) var<storage, read> restMeans: array<vec4f>;
+@group(0) @binding(2) var<storage, read> restColours: array<vec4f>;
+@group(0) @binding(3) var<storage, read> basis: array<vec4f>;
+@group(0) @binding(4) var<storage, read_write> means: array<vec4f>;
+@group(0) @binding(5) var<storage, read_write> colours: array<vec4f>;
+
+@compute @workgroup_size(${THREADS})
+fn main(@builtin(global_invocation_id) id: vec3u) {
+  let i = id.x;
+  if (i >= pose.count) { return; }
+  var mean = restMeans[i];
+  var colour = restColours[i];
+  for (var k = 0u; k < pose.columns; k++) {
+    let a = activation(k); let first = basis[2 * (i * pose.columns + k)];
+    mean += a * vec4f(first.xyz, 0);
+    colour += a * vec4f(basis[2 * (i * pose.columns + k) + 1].xyz, first.w);
+  }
+  means[i] = mean;
+  colours[i] = colour;
+}`;
+
+/** Adds the network of features.ts: with `texels` of features, `rank` directions, `hidden` units. */
+export function featureNetwork(texels: number, rank: number, hidden: number): string {
+  return `${POSE}
+@group(0) @binding(1) var<storage, read> neutral: array<vec2u>;
+@group(0) @binding(2) var<storage, read> basis: array<vec2u>;
+@group(0) @binding(3) var<storage, read> own: array<vec2u>;
+@group(0) @binding(4) var<storage, read> weights: array<vec4f>;
+@group(0) @binding(5) var<storage, read_write> colours: array<vec4f>;
+fn four(halves: vec2u) -> vec4f { return vec4f(unpack2x16float(halves.x), unpack2x16float(halves.y)); }
+
+@compute @workgroup_size(${THREADS})
+fn main(@builtin(global_invocation_id) id: vec3u) {
+  let i = id.x;
+  if (i >= pose.count) { return; }
+  var f: array<vec4f, ${texels}>;
+  for (var t = 0u; t < ${texels}; t++) { f[t] = four(neutral[i * ${texels} + t]); }
+  for (var k = 0u; k < ${rank}; k++) {
+    let a = activation(k);
+    if (a != 0) {
+      for (var t = 0u; t < ${texels}; t++) { f[t] += a * four(basis[(i * ${rank} + k) * ${texels} + t]); }
+    }
+  }
+  var sum = pose.bias;
+  for (var h = 0u; h < ${hidden}; h++) {
+    let w = h * ${texels + 1};
+    var x = four(own[i * ${hidden / 4} + (h >> 2)])[h & 3];
+    for (var t = 0u; t < ${texels}; t++) { x += dot(weights[w + t], f[t]); }
+    sum += weights[w + ${texels}] * select(x, ${SLOPE} * x, x < 0);
+  }
+  colours[i] += sum;
+}`;
+}
 
 /** What all passes know of a picture: 144 bytes. */
 const VIEW = `
@@ -32,7 +132,7 @@ struct State { ${STATE_FIELDS.replace(/NUMBER/g, "atomic<u32>")} }
 @group(0) @binding(1) var<storage, read> frames: array<vec4f>;  // three for each triangle
 @group(0) @binding(2) var<storage, read> means: array<vec4f>;   // and the triangle
 @group(0) @binding(3) var<storage, read> shapes: array<vec4f>;  // rotation and scales
-@group(0) @binding(4) var<storage, read> colours: array<vec4f>; // and the opacity
+@group(0) @binding(4) var<storage, read> colours: array<vec4f>; // and the raw opacity
 @group(0) @binding(5) var<storage, read> sh: array<vec4f>;
 @group(0) @binding(6) var<storage, read_write> splats: array<Splat>;
 @group(0) @binding(7) var<storage, read_write> keys: array<u32>;
@@ -84,7 +184,7 @@ fn project(i: u32) -> u32 {
   let head = vec4f(dot(a, local), dot(b, local), dot(c, local), 1);
   let v = view.head;
   let p = vec3f(dot(v[0], head), dot(v[1], head), dot(v[2], head));
-  let log2Opacity = log2(max(colour.a, 1e-30));
+  let log2Opacity = -log2(1. + exp(min(-colour.a, 80.)));
   if (p.z <= NEAR || log2Opacity < LOG2_ALPHA_MIN) { return UNSEEN; }
   let tangent = p.xy / p.z;
   let margin = FOV_MARGIN * .5 * view.size / view.focal;
@@ -138,8 +238,8 @@ fn main(@builtin(global_invocation_id) id: vec3u, @builtin(local_invocation_inde
 }`;
 
 /**
- * One digit of a radix sort that keeps the order of equal keys: \`count\` counts the digits of each tile, \`scan\` finds
- * where each tile's share of a digit begins, \`scatter\` moves. The first pass makes the keys: 1/65535 of the range of
+ * One digit of a radix sort that keeps the order of equal keys: `count` counts the digits of each tile, `scan` finds
+ * where each tile's share of a digit begins, `scatter` moves. The first pass makes the keys: 1/65535 of the range of
  * depths, farthest first; those that cannot be seen come last.
  */
 export const SORT = `${VIEW}

@@ -43,7 +43,7 @@ async function deviceFor(name: BackendName): Promise<GPUDevice> {
  * canvas takes over pictures of one that is not seen.
  */
 class LastingRenderer implements Drawer {
-  private hidden: OffscreenCanvas;
+  private hidden = new OffscreenCanvas(1, 1);
   private readonly screen: CanvasRenderingContext2D;
   private drawer: Drawer;
   private disposed = false;
@@ -53,13 +53,24 @@ class LastingRenderer implements Drawer {
     avatar: Avatar, poser: Poser, change: () => void, WebGl2: typeof Renderer,
   ) {
     this.screen = canvas.getContext("2d")!;
-    this.hidden = new OffscreenCanvas(1, 1);
-    this.drawer = new GpuRenderer(pipelines, this.hidden.getContext("webgpu") as unknown as GPUCanvasContext, avatar, poser);
+    const fallBack = (reason: string) => {
+      tell(reason);
+      poser.binds = true;
+      // What the poser holds is of no face: it has computed little of the last one.
+      poser.activations.fill(NaN);
+      this.hidden = new OffscreenCanvas(1, 1);
+      return new WebGl2(this.hidden, avatar, poser);
+    };
+    poser.binds = false;
+    try {
+      this.drawer = new GpuRenderer(pipelines, this.hidden.getContext("webgpu") as unknown as GPUCanvasContext, avatar, poser);
+    } catch (error) {
+      this.drawer = fallBack(`this avatar ${(error as Error).message}`);
+      return;
+    }
     lost.then(({ message }) => {
       if (this.disposed) return;
-      tell(`the WebGPU device is lost (${message.trim() || "no reason is given"})`);
-      this.hidden = new OffscreenCanvas(1, 1);
-      this.drawer = new WebGl2(this.hidden, avatar, poser);
+      this.drawer = fallBack(`the WebGPU device is lost (${message.trim() || "no reason is given"})`);
       change();
     });
   }
