@@ -58,8 +58,13 @@ class LastingRenderer implements Drawer {
       poser.binds = true;
       // What the poser holds is of no face: it has computed little of the last one.
       poser.activations.fill(NaN);
-      this.hidden = new OffscreenCanvas(1, 1);
-      return new WebGl2(this.hidden, avatar, poser);
+      const hidden = (this.hidden = new OffscreenCanvas(1, 1));
+      hidden.addEventListener("webglcontextlost", (event) => event.preventDefault());
+      hidden.addEventListener("webglcontextrestored", () => {
+        this.drawer = new WebGl2(hidden, avatar, poser);
+        change();
+      });
+      return new WebGl2(hidden, avatar, poser);
     };
     poser.binds = false;
     try {
