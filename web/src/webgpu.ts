@@ -77,7 +77,7 @@ class LastingRenderer implements Drawer {
       if (this.disposed) return;
       this.drawer = fallBack(`the WebGPU device is lost (${message.trim() || "no reason is given"})`);
       change();
-    });
+    }).catch((error: Error) => console.error(`mien: ${error.message}`));
   }
 
   upload(): void {
