@@ -66,7 +66,8 @@ def browse(
         fragment: What follows the address after a #.
         webgpu: Whether the browser has WebGPU, in software.
     """
-    given = {"width": size[0], "height": size[1], "scripts": scripts, "screenshots": screenshots or [], "webgpu": webgpu}
+    given = {"width": size[0], "height": size[1], "scripts": scripts, "screenshots": screenshots or []}
+    given["webgpu"] = webgpu
     told = json.dumps(given | ({"downloads": str(downloads)} if downloads else {}))
     address = f"{page}#{fragment}" if fragment else str(page)
     command = [node(), str(WEB / "tests" / "browser.mjs"), chromium(), address]

@@ -36,9 +36,7 @@ class WrittenPage:
     with all expressions at a quarter of their range, 512x512, over white."""
 
 
-def write_page(
-    path: Path, avatar: PortableAvatar, motion: Motion | None = None, webgpu: bool = False
-) -> WrittenPage:
+def write_page(path: Path, avatar: PortableAvatar, motion: Motion | None = None, webgpu: bool = False) -> WrittenPage:
     """Write a page with an avatar, and a motion that it can play, as one file.
 
     Args:
