@@ -19,6 +19,7 @@ HAS_GPU = "there is a GPU"
 NO_NODE = "no Node.js"
 NO_NODE_PACKAGES = "no packages in web/node_modules"
 NO_CHROMIUM = "no Chromium"
+NO_WEBGPU = "Chromium has no adapter of WebGPU"
 NO_VALIDATOR = "no gltf-validator in web/node_modules"
 NO_SPLAT_TRANSFORM = "no @playcanvas/splat-transform in web/node_modules"
 
@@ -34,6 +35,7 @@ _REMEDIES = {
     NO_SPLAT_TRANSFORM: "run `make web-packages`",
     NO_NODE: "install Node.js 20 or newer with npm, then run `make web-packages`",
     NO_CHROMIUM: "run `apt-get install chromium`, or set MIEN_CHROMIUM to a Chromium's path",
+    NO_WEBGPU: "install Chromium 156 or newer, whose WebGPU can run in software",
     HAS_GPU: "run them with CUDA_VISIBLE_DEVICES=",
 }
 

@@ -53,6 +53,7 @@ def browse(
     screenshots: list[str | None] | None = None,
     downloads: Path | None = None,
     fragment: str = "",
+    webgpu: bool = False,
 ) -> dict[str, Any]:
     """Run scripts in a page, one after the other: their `results`, all `requests`, and `messages` of the console.
 
@@ -63,8 +64,10 @@ def browse(
         screenshots: A file for the window after each script, or None.
         downloads: Folder for the files that the page saves.
         fragment: What follows the address after a #.
+        webgpu: Whether the browser has WebGPU, in software.
     """
     given = {"width": size[0], "height": size[1], "scripts": scripts, "screenshots": screenshots or []}
+    given["webgpu"] = webgpu
     told = json.dumps(given | ({"downloads": str(downloads)} if downloads else {}))
     address = f"{page}#{fragment}" if fragment else str(page)
     command = [node(), str(WEB / "tests" / "browser.mjs"), chromium(), address]

@@ -5,6 +5,7 @@ import type { Motion } from "./avatar";
 import { addTurning, fit } from "./controls";
 import { AvatarError, readAny } from "./format";
 import { Viewer } from "./viewer";
+import type { BackendName } from "./webgpu";
 
 const RADIANS = Math.PI / 180;
 const STYLE = ":host{display:inline-block;width:320px;height:320px}canvas{display:block;width:100%;height:100%;outline-offset:-2px}:host([controls]) canvas{touch-action:none;cursor:grab}";
@@ -14,6 +15,7 @@ const STYLE = ":host{display:inline-block;width:320px;height:320px}canvas{displa
  * `src`: address of a .packed or .mien file.
  * `expression`: names and strengths, `jawOpen:0.5 eyeBlinkLeft:1`; all others are those of the person at rest.
  * `yaw`, `pitch`, `zoom`: the camera, in degrees to the person's left and upwards.
+ * `backend`: `auto` or `webgpu` loads webgpu.js, which lies beside this file; without it, WebGL2 draws.
  * `controls`: may be turned by hand. `idle`: blinks and moves a little.
  *
  * Events: `load` when it can be seen, `error` (a CustomEvent whose detail is the message) when it cannot.
@@ -93,13 +95,15 @@ export class MienAvatar extends HTMLElement {
       const answer = await fetch(this.src, { signal: loading.signal });
       if (!answer.ok) throw new AvatarError(`cannot be fetched: the server answers ${answer.status}`);
       const { avatar, motion } = await readAny(new Uint8Array(await answer.arrayBuffer()));
+      const named = this.getAttribute("backend") as BackendName | null;
+      const backend = named && named !== "webgl2" ? await webgpu(named) : undefined;
       if (loading.signal.aborted) return;
       const root = this.shadowRoot ?? this.attachShadow({ mode: "open" }), canvas = document.createElement("canvas");
       const style = document.createElement("style");
       style.textContent = STYLE;
       root.replaceChildren(style, canvas);
       if (!this.hasAttribute("aria-label")) this.setAttribute("aria-label", `Avatar of ${avatar.about.name}`);
-      const viewer = (this.viewer = new Viewer(canvas, avatar, motion));
+      const viewer = (this.viewer = new Viewer(canvas, avatar, motion, backend));
       if (this.hasAttribute("controls")) {
         canvas.tabIndex = 0;
         addTurning(viewer);
@@ -148,6 +152,10 @@ export class MienAvatar extends HTMLElement {
     if (this.hasAttribute("idle")) this.beating = requestAnimationFrame(beat);
   }
 }
+
+/** The back end of webgpu.js, which a page need not have. */
+const webgpu = (named: BackendName) =>
+  import("./webgpu.js").then(({ findBackend }) => findBackend(named), (error) => void console.warn(`<mien-avatar>: ${error.message}; WebGL2 draws instead`));
 
 if (!customElements.get("mien-avatar")) customElements.define("mien-avatar", MienAvatar);
 

@@ -6,6 +6,7 @@ import { addTurning, fit } from "./controls";
 import { AvatarError, readPacked } from "./format";
 import { readSeries } from "./series";
 import { Viewer } from "./viewer";
+import type { BackendName } from "./webgpu";
 
 const GROUPS: [string, RegExp][] = [
   ["Jaw", /^jaw|^tongue/],
@@ -172,7 +173,10 @@ function addRest(viewer: Viewer, moveSliders: () => void): void {
 async function open(): Promise<Viewer> {
   const text = find("avatar").textContent!.trim();
   const { avatar, motion } = await readPacked(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)));
-  const viewer = new Viewer(find<HTMLCanvasElement>("view"), avatar, motion);
+  // `mien export --webgpu` puts webgpu.ts into the page. NAME.html#webgl2 and NAME.html#webgpu choose by hand.
+  const { mienWebGpu } = window as unknown as { mienWebGpu?: typeof import("./webgpu") };
+  const named = /^#(webgl2|webgpu)$/.exec(location.hash)?.[1] as BackendName | undefined;
+  const viewer = new Viewer(find<HTMLCanvasElement>("view"), avatar, motion, await mienWebGpu?.findBackend(named));
   const moveSliders = addSliders(viewer, find("sliders"));
   moveSliders();
   addTurning(viewer);

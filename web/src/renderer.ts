@@ -24,6 +24,18 @@ export interface View {
 /** RGB and alpha, 0 to 1. */
 export type Colour = [number, number, number, number];
 
+/** What draws the avatar of a viewer. */
+export interface Drawer {
+  /** Takes over what the poser has computed for a new face. */
+  upload(): void;
+  /** Draws over a background. `order` sorts the Gaussians, for those that cannot. */
+  draw(order: () => Uint32Array, view: View, background: Colour): void;
+  dispose(): void;
+}
+
+/** Makes what draws on a canvas. It calls `change` when the face has to be posed and drawn again. */
+export type Backend = (canvas: HTMLCanvasElement, avatar: Avatar, poser: Poser, change: () => void, WebGl2: typeof Renderer) => Drawer;
+
 /** An array of float texels in a texture. */
 class ArrayTexture {
   readonly values: Float32Array;
@@ -55,7 +67,7 @@ class ArrayTexture {
 
 const ARRAYS = ["frames", "means", "quats", "scales", "colours", "sh"] as const;
 
-export class Renderer {
+export class Renderer implements Drawer {
   private readonly gl: WebGL2RenderingContext;
   private readonly splats: Program;
   private readonly screen: Program;
@@ -67,7 +79,7 @@ export class Renderer {
   private readonly picture: Picture;
   private readonly features: FeaturePass | null;
 
-  constructor(canvas: HTMLCanvasElement, avatar: Avatar, private readonly poser: Poser) {
+  constructor(canvas: HTMLCanvasElement | OffscreenCanvas, avatar: Avatar, private readonly poser: Poser) {
     const gl = canvas.getContext("webgl2", { antialias: false, depth: false, premultipliedAlpha: true, powerPreference: "high-performance" });
     if (!gl) throw new AvatarError("needs WebGL2, which this browser lacks or has switched off");
     this.gl = gl;
@@ -117,7 +129,7 @@ export class Renderer {
   }
 
   /** Draws the Gaussians in the given order over a background. */
-  draw(order: Uint32Array, view: View, background: Colour): void {
+  draw(order: () => Uint32Array, view: View, background: Colour): void {
     const { gl, splats, screen } = this;
     this.picture.begin(view.width, view.height);
     splats.use();
@@ -136,7 +148,7 @@ export class Renderer {
     gl.uniform1i(splats.uniform("u_shRest"), this.shRest);
     gl.bindVertexArray(this.attributes);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order());
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
@@ -177,7 +189,7 @@ export class Renderer {
 }
 
 /** Rows of three into rows of four. The fourth number stays. */
-function spread(from: Float32Array, to: Float32Array): void {
+export function spread(from: Float32Array, to: Float32Array): void {
   for (let i = 0, o = 0; i < from.length; i += 3, o += 4) {
     to[o] = from[i];
     to[o + 1] = from[i + 1];

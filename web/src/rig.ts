@@ -192,6 +192,8 @@ export class Poser {
   changed = false;
   /** Whether posing runs the network of features. Not where the renderer runs it on the GPU. */
   runsNetwork = true;
+  /** Whether posing goes beyond the rig's points and the activations. Not where the renderer does all else on the GPU. */
+  binds = true;
   private readonly restColours: Float32Array;
   private readonly network: FeatureNetwork | null;
   private posed = false;
@@ -220,7 +222,7 @@ export class Poser {
       return;
     }
     this.points = this.rig.pose(face);
-    triangleFrames(this.points, this.baked.faces, this.frames);
+    if (this.binds) triangleFrames(this.points, this.baked.faces, this.frames);
     const { changes, attributes } = this.baked;
     if (!changes) return;
     const weights = activations(changes, face), before = this.activations;
@@ -229,6 +231,7 @@ export class Poser {
     this.changed = !this.posed || weights.some((weight, k) => weight !== before[k]);
     if (!this.changed) return;
     this.posed = true;
+    if (!this.binds) return;
     changed(this.baked.means, changes.means, weights, this.means);
     changed(attributes.opacity_logits, changes.opacity_logits, weights, this.opacityLogits);
     changed(this.restColours, changes.colour, weights, this.colours);

@@ -1,7 +1,7 @@
 // An avatar on a canvas: face, camera, a packed motion, and drawing when something has changed.
 
 import { copyFace, motionFace, motionLength, type Avatar, type Face, type Motion } from "./avatar";
-import { Renderer, type Colour, type View } from "./renderer";
+import { Renderer, type Backend, type Colour, type Drawer, type View } from "./renderer";
 import { Poser } from "./rig";
 import { chained, moved, rigid, rotationMatrix } from "./rigid";
 import { DepthSorter } from "./sort";
@@ -40,14 +40,14 @@ export class Viewer {
   private readonly sorter: DepthSorter;
   private readonly depths: Float32Array;
   private readonly middle: number[];
-  private renderer: Renderer;
+  private renderer: Drawer;
   private posed = false;
   private waiting = 0;
   private stale = true;
   private before = 0;
   private since = 0;
 
-  constructor(readonly canvas: HTMLCanvasElement, readonly avatar: Avatar, public motion: Motion | null = null) {
+  constructor(readonly canvas: HTMLCanvasElement, readonly avatar: Avatar, public motion: Motion | null = null, backend?: Backend) {
     this.face = copyFace(avatar.neutral);
     this.poser = new Poser(avatar.baked);
     const count = avatar.baked.face_index.length;
@@ -56,7 +56,7 @@ export class Viewer {
     // A rig of one triangle holds Gaussians that follow no mesh.
     const { rig, means } = avatar.baked;
     this.middle = middleOf(rig.template.length > 9 ? rig.template : means);
-    this.renderer = new Renderer(canvas, avatar, this.poser);
+    this.renderer = backend?.(canvas, avatar, this.poser, () => this.change(), Renderer) ?? new Renderer(canvas, avatar, this.poser);
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => {
       this.renderer = new Renderer(canvas, avatar, this.poser);
@@ -159,8 +159,11 @@ export class Viewer {
       this.posed = true;
     }
     const view = this.view(width, height);
-    this.poser.depths(Array.prototype.slice.call(view.head, 8, 12), this.depths);
-    this.renderer.draw(this.sorter.sort(this.depths), view, this.background);
+    const order = () => {
+      this.poser.depths(Array.prototype.slice.call(view.head, 8, 12), this.depths);
+      return this.sorter.sort(this.depths);
+    };
+    this.renderer.draw(order, view, this.background);
     this.milliseconds = performance.now() - began;
   }
 

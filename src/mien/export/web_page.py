@@ -16,6 +16,7 @@ from mien.files import check_writable, write_atomically
 from mien.runtime import PortableAvatar
 
 TEMPLATE = Path(__file__).with_name("page.html")
+WEBGPU = Path(__file__).with_name("webgpu.js")
 _SIDE = 512
 """Sides of the pictures that the loss is measured on, in pixels."""
 _SHARE = 0.25
@@ -35,8 +36,14 @@ class WrittenPage:
     with all expressions at a quarter of their range, 512x512, over white."""
 
 
-def write_page(path: Path, avatar: PortableAvatar, motion: Motion | None = None) -> WrittenPage:
+def write_page(path: Path, avatar: PortableAvatar, motion: Motion | None = None, webgpu: bool = False) -> WrittenPage:
     """Write a page with an avatar, and a motion that it can play, as one file.
+
+    Args:
+        path: The file to write.
+        avatar: The avatar.
+        motion: What the page can play. None for nothing.
+        webgpu: Whether the page draws with WebGPU where the browser has it on a GPU. WebGL2 is the default.
 
     Raises:
         UserError: pages cannot draw the avatar's network, or the path cannot be written.
@@ -44,6 +51,8 @@ def write_page(path: Path, avatar: PortableAvatar, motion: Motion | None = None)
     check_writable(path)
     packed = base64.b64encode(pack(avatar, motion)).decode()
     page = TEMPLATE.read_text(encoding="utf-8").replace("{{title}}", html.escape(avatar.about.name))
+    gpu = f"\n<script>{WEBGPU.read_text(encoding='utf-8').strip()}</script>" if webgpu else ""
+    page = page.replace("{{webgpu}}", gpu)
     content = page.replace("{{avatar}}", packed).encode()
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
     return WrittenPage(len(content), _psnr(avatar))

@@ -11,8 +11,10 @@ from mien.progress import say
 from mien.runtime import PortableAvatar, read_portable, write_portable
 
 
-def convert(source: Path, out: Path) -> None:
+def convert(source: Path, out: Path, webgpu: bool = False) -> None:
     """Write the avatar in a file as .mien, .html, .packed, or at rest with the head at the origin, and report it.
+
+    `webgpu` says whether a .html page draws with WebGPU where the browser has it.
 
     Raises:
         UserError: the file is missing, damaged or foreign, or the avatar cannot be written so.
@@ -22,7 +24,7 @@ def convert(source: Path, out: Path) -> None:
     if ending == ".mien":
         write_portable(out, avatar)
     elif ending == ".html":
-        write_page(out, avatar)
+        write_page(out, avatar, webgpu=webgpu)
     elif ending == ".packed":
         write_packed(out, avatar)
     else:

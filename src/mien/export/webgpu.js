@@ -1,0 +1,317 @@
+"use strict";var mienWebGpu=(()=>{var S=Object.defineProperty;var Z=Object.getOwnPropertyDescriptor;var Q=Object.getOwnPropertyNames;var ee=Object.prototype.hasOwnProperty;var re=(i,e)=>{for(var r in e)S(i,r,{get:e[r],enumerable:!0})},te=(i,e,r,t)=>{if(e&&typeof e=="object"||typeof e=="function")for(let a of Q(e))!ee.call(i,a)&&a!==r&&S(i,a,{get:()=>e[a],enumerable:!(t=Z(e,a))||t.enumerable});return i};var ae=i=>te(S({},"__esModule",{value:!0}),i);var de={};re(de,{findBackend:()=>ue});function L({neutral:i,basis:e,biases:r},t){return{width:i.length/Math.max(t,1),rank:e.length/Math.max(i.length,1),hidden:r[0].length}}function z({own:i,weights:e,biases:r},t,a){let o=r[0].length,s=i.length/Math.max(t,1),n=new Float32Array(t*o);for(let u=0;u<t;++u)for(let c=0;c<o;++c){let d=r[0][c];for(let l=0,h=c*(a+s)+a;l<s;++l)d+=e[0][h+l]*i[u*s+l];n[u*o+c]=d}return n}var E=class extends Error{};var k=class{constructor(e){this.device=e}device;buffers=[];storage(e,r=0){let{STORAGE:t,COPY_SRC:a}=GPUBufferUsage,{maxStorageBufferBindingSize:o,maxBufferSize:s}=this.device.limits,n=4*(typeof e=="number"?e:e.length);if(n>Math.min(o,s))throw new E("has more Gaussians than this device can hold");let u=this.buffer(n,t|a|r);return typeof e!="number"&&this.write(u,e),u}indirect(e){return this.storage(e,GPUBufferUsage.INDIRECT)}uniform(e){return this.buffer(4*e,GPUBufferUsage.UNIFORM)}write(e,r){this.device.queue.writeBuffer(e,0,r)}group(e,r){return this.device.createBindGroup({layout:e,entries:r.map((t,a)=>({binding:a,resource:{buffer:t}}))})}free(){for(let e of this.buffers)e.destroy()}buffer(e,r){let t=this.device.createBuffer({size:Math.max(64,e),usage:r|GPUBufferUsage.COPY_DST});return this.buffers.push(t),t}};function w(i,e,r,t){i.setPipeline(e),i.setBindGroup(0,r),i.dispatchWorkgroups(t)}var g=256,b=1024,A=128,N=`
+struct Pose{
+count:u32,triangles:u32,columns:u32,
+bias:vec4f,
+activations:array<vec4f,${A/4}>,
+}
+@group(0)@binding(0)var<uniform>pose:Pose;
+fn activation(k:u32)->f32{return pose.activations[k>>2][k&3];}`,M=`${N}
+@group(0)@binding(1)var<storage,read>points:array<f32>;
+@group(0)@binding(2)var<storage,read>faces:array<u32>;
+@group(0)@binding(3)var<storage,read_write>frames:array<vec4f>;
+const DEGENERATE_LENGTH=1e-7;
+fn at(i:u32)->vec3f{return vec3f(points[3*i],points[3*i+1],points[3*i+2]);}
+
+@compute @workgroup_size(${g})
+fn main(@builtin(global_invocation_id)id:vec3u){
+let f=id.x;
+if(f>=pose.triangles){return;}
+let a=at(faces[3*f]);let b=at(faces[3*f+1]);let c=at(faces[3*f+2]);
+var first=b-a;
+var side=c-a;
+var edge=length(first);
+if(edge<DEGENERATE_LENGTH||length(cross(first,side))<DEGENERATE_LENGTH*edge){
+first=vec3f(DEGENERATE_LENGTH,0,0);
+side=vec3f(0,DEGENERATE_LENGTH,0);
+edge=DEGENERATE_LENGTH;
+}
+first/=edge;
+var normal=cross(first,side);
+let height=length(normal);let k=(edge+height)/2;
+normal/=height;
+let last=cross(first,normal);let middle=(a+b+c)/3;
+for(var row=0u;row<3;row++){frames[3*f+row]=vec4f(k*first[row],k*normal[row],k*last[row],middle[row]);}
+}`,O=`${N}
+@group(0)@binding(1)var<storage,read>restMeans:array<vec4f>;
+@group(0)@binding(2)var<storage,read>restColours:array<vec4f>;
+@group(0)@binding(3)var<storage,read>basis:array<vec4f>;
+@group(0)@binding(4)var<storage,read_write>means:array<vec4f>;
+@group(0)@binding(5)var<storage,read_write>colours:array<vec4f>;
+
+@compute @workgroup_size(${g})
+fn main(@builtin(global_invocation_id)id:vec3u){
+let i=id.x;
+if(i>=pose.count){return;}
+var mean=restMeans[i];
+var colour=restColours[i];
+for(var k=0u;k<pose.columns;k++){
+let a=activation(k);let first=basis[2*(i*pose.columns+k)];
+mean+=a*vec4f(first.xyz,0);
+colour+=a*vec4f(basis[2*(i*pose.columns+k)+1].xyz,first.w);
+}
+means[i]=mean;
+colours[i]=colour;
+}`;function D(i,e,r){return`${N}
+@group(0)@binding(1)var<storage,read>neutral:array<vec2u>;
+@group(0)@binding(2)var<storage,read>basis:array<vec2u>;
+@group(0)@binding(3)var<storage,read>own:array<vec2u>;
+@group(0)@binding(4)var<storage,read>weights:array<vec4f>;
+@group(0)@binding(5)var<storage,read_write>colours:array<vec4f>;
+fn four(halves:vec2u)->vec4f{return vec4f(unpack2x16float(halves.x),unpack2x16float(halves.y));}
+
+@compute @workgroup_size(${g})
+fn main(@builtin(global_invocation_id)id:vec3u){
+let i=id.x;
+if(i>=pose.count){return;}
+var f:array<vec4f,${i}>;
+for(var t=0u;t<${i};t++){f[t]=four(neutral[i*${i}+t]);}
+for(var k=0u;k<${e};k++){
+let a=activation(k);
+if(a !=0){
+for(var t=0u;t<${i};t++){f[t]+=a*four(basis[(i*${e}+k)*${i}+t]);}
+}
+}
+var sum=pose.bias;
+for(var h=0u;h<${r};h++){
+let w=h*${i+1};
+var x=four(own[i*${r/4}+(h>>2)])[h&3];
+for(var t=0u;t<${i};t++){x+=dot(weights[w+t],f[t]);}
+sum+=weights[w+${i}]*select(x,${.01}*x,x<0);
+}
+colours[i]+=sum;
+}`}var T=`
+struct View{
+head:array<vec4f,3>,
+directions:array<vec4f,3>,
+focal:vec2f,centre:vec2f,size:vec2f,
+count:u32,shRest:u32,
+background:vec4f,
+}`,I=`
+struct Splat{
+place:vec4f,
+shape:vec4f,
+colour:vec4f,
+}`,$="near:NUMBER,far:NUMBER,vertices:u32,visible:NUMBER,firstVertex:u32,firstInstance:u32",V=`${T}${I}
+struct State{${$.replace(/NUMBER/g,"atomic<u32>")}}
+@group(0)@binding(0)var<uniform>view:View;
+@group(0)@binding(1)var<storage,read>frames:array<vec4f>;
+@group(0)@binding(2)var<storage,read>means:array<vec4f>;
+@group(0)@binding(3)var<storage,read>shapes:array<vec4f>;
+@group(0)@binding(4)var<storage,read>colours:array<vec4f>;
+@group(0)@binding(5)var<storage,read>sh:array<vec4f>;
+@group(0)@binding(6)var<storage,read_write>splats:array<Splat>;
+@group(0)@binding(7)var<storage,read_write>keys:array<u32>;
+@group(0)@binding(8)var<storage,read_write>state:State;
+var<workgroup>near:atomic<u32>;
+var<workgroup>far:atomic<u32>;
+var<workgroup>visible:atomic<u32>;
+const NEAR=0.01;
+const DILATION=0.3;
+const FOV_MARGIN=0.3;
+const LOG2_ALPHA_MIN=-7.9943533;
+const HALF_LOG2E=0.7213475;
+const UNSEEN=0xffffffffu;
+
+fn turn(quaternion:vec4f)->mat3x3f{
+let q=normalize(quaternion);
+let w=q.x;let x=q.y;let y=q.z;let z=q.w;
+return mat3x3f(1.-2.*(y*y+z*z),2.*(x*y+w*z),2.*(x*z-w*y),
+2.*(x*y-w*z),1.-2.*(x*x+z*z),2.*(y*z+w*x),
+2.*(x*z+w*y),2.*(y*z-w*x),1.-2.*(x*x+y*y));
+}
+
+fn shRest(i:u32,d:vec3f)->vec3f{
+let x=d.x;let y=d.y;let z=d.z;let xx=x*x;let yy=y*y;let zz=z*z;
+let s=i*view.shRest;
+var c=-0.48860252*y*sh[s].rgb+0.48860252*z*sh[s+1].rgb-0.48860252*x*sh[s+2].rgb;
+if(view.shRest>3){
+c+=1.0925485*x*y*sh[s+3].rgb-1.0925485*y*z*sh[s+4].rgb
++0.31539157*(2.*zz-xx-yy)*sh[s+5].rgb-1.0925485*x*z*sh[s+6].rgb
++0.54627424*(xx-yy)*sh[s+7].rgb;
+}
+if(view.shRest>8){
+c+=-0.5900436*y*(3.*xx-yy)*sh[s+8].rgb+2.8906114*x*y*z*sh[s+9].rgb
+-0.4570458*y*(4.*zz-xx-yy)*sh[s+10].rgb
++0.37317634*z*(2.*zz-3.*xx-3.*yy)*sh[s+11].rgb
+-0.4570458*x*(4.*zz-xx-yy)*sh[s+12].rgb
++1.4453057*z*(xx-yy)*sh[s+13].rgb-0.5900436*x*(xx-3.*yy)*sh[s+14].rgb;
+}
+return c;
+}
+
+
+fn project(i:u32)->u32{
+let colour=colours[i];
+let mean=means[i];
+let f=3*u32(mean.w);
+let a=frames[f];let b=frames[f+1];let c=frames[f+2];
+let local=vec4f(mean.xyz,1);
+let head=vec4f(dot(a,local),dot(b,local),dot(c,local),1);
+let v=view.head;
+let p=vec3f(dot(v[0],head),dot(v[1],head),dot(v[2],head));
+let log2Opacity=-log2(1.+exp(min(-colour.a,80.)));
+if(p.z<=NEAR||log2Opacity<LOG2_ALPHA_MIN){return UNSEEN;}
+let tangent=p.xy/p.z;
+let margin=FOV_MARGIN*.5*view.size/view.focal;
+let centre=view.focal*tangent+view.centre;
+let clamped=clamp(tangent,-view.centre/view.focal-margin,(view.size-view.centre)/view.focal+margin);
+let j=view.focal/p.z;
+let n0=j.x*(v[0].xyz-clamped.x*v[2].xyz);
+let n1=j.y*(v[1].xyz-clamped.y*v[2].xyz);
+let frame=transpose(mat3x3f(a.xyz,b.xyz,c.xyz))*turn(shapes[2*i]);
+let scale=shapes[2*i+1].xyz;
+let u0=(n0*frame)*scale;let u1=(n1*frame)*scale;let area=cross(u0,u1);
+var xx=dot(u0,u0);var yy=dot(u1,u1);let xy=dot(u0,u1);
+let determinant=dot(area,area)+DILATION*(xx+yy)+DILATION*DILATION;
+xx+=DILATION;yy+=DILATION;
+if(!(xx<1e30&&yy<1e30&&determinant<1e30)){return UNSEEN;}
+
+let reach=sqrt(max((log2Opacity-LOG2_ALPHA_MIN)*1.3862944,0.))+.1;
+let box=reach*sqrt(vec2f(xx,yy));
+if(any(centre+box<vec2f(0))||any(centre-box>view.size)){return UNSEEN;}
+var rgb=0.5+0.2820948*colour.rgb;
+if(view.shRest>0){
+let eye=-(v[0].w*v[0].xyz+v[1].w*v[1].xyz+v[2].w*v[2].xyz);
+let d=normalize(head.xyz-eye);let t=view.directions;
+rgb+=shRest(i,vec3f(dot(t[0].xyz,d),dot(t[1].xyz,d),dot(t[2].xyz,d)));
+}
+splats[i]=Splat(vec4f(centre,xy/yy,log2Opacity),
+vec4f(sqrt(yy/determinant*HALF_LOG2E),sqrt(HALF_LOG2E/yy),sqrt(determinant/yy),sqrt(yy)),vec4f(max(rgb,vec3f(0)),reach));
+return bitcast<u32>(p.z);
+}
+
+@compute @workgroup_size(${g})
+fn main(@builtin(global_invocation_id)id:vec3u,@builtin(local_invocation_index)thread:u32){
+if(thread==0){atomicStore(&near,UNSEEN);}
+workgroupBarrier();
+let i=id.x;
+if(i<view.count){
+let key=project(i);
+keys[i]=key;
+if(key !=UNSEEN){
+atomicMin(&near,key);
+atomicMax(&far,key);
+atomicAdd(&visible,1);
+}
+}
+workgroupBarrier();
+if(thread==0&&atomicLoad(&visible)>0){
+atomicMin(&state.near,atomicLoad(&near));
+atomicMax(&state.far,atomicLoad(&far));
+atomicAdd(&state.visible,atomicLoad(&visible));
+}
+}`,X=`${T}
+struct State{${$.replace(/NUMBER/g,"u32")}}
+override FIRST:bool;
+@group(0)@binding(0)var<uniform>view:View;
+@group(0)@binding(1)var<storage,read>state:State;
+@group(0)@binding(2)var<storage,read>keysIn:array<u32>;
+@group(0)@binding(3)var<storage,read>orderIn:array<u32>;
+@group(0)@binding(4)var<storage,read_write>keysOut:array<u32>;
+@group(0)@binding(5)var<storage,read_write>orderOut:array<u32>;
+@group(0)@binding(6)var<storage,read_write>starts:array<u32>;
+var<workgroup>counts:array<atomic<u32>,256>;
+var<workgroup>sums:array<u32,256>;
+var<workgroup>masks:array<atomic<u32>,2048>;
+
+fn keyOf(i:u32)->u32{
+let key=keysIn[i];
+if(!FIRST){return key;}
+if(key==0xffffffffu){return 65535;}
+let near=bitcast<f32>(state.near);let far=bitcast<f32>(state.far);
+return min(u32((far-bitcast<f32>(key))*(65535/max(far-near,1e-20))),65534);
+}
+
+fn digitOf(key:u32)->u32{return select(key>>8,key&255,FIRST);}
+
+@compute @workgroup_size(${g})
+fn count(@builtin(workgroup_id)group:vec3u,@builtin(local_invocation_index)thread:u32){
+for(var round=0u;round<${b/g};round++){
+let i=group.x*${b}+round*${g}+thread;
+if(i<view.count){atomicAdd(&counts[digitOf(keyOf(i))],1);}
+}
+workgroupBarrier();
+starts[group.x*256+thread]=atomicLoad(&counts[thread]);
+}
+
+
+@compute @workgroup_size(${g})
+fn scan(@builtin(local_invocation_index)thread:u32){
+let end=(view.count+${b-1})/${b}*256;
+var sum=0u;
+for(var k=thread;k<end;k+=256){sum+=starts[k];}
+sums[thread]=sum;
+workgroupBarrier();
+var before=0u;
+for(var digit=0u;digit<thread;digit++){before+=sums[digit];}
+for(var k=thread;k<end;k+=256){
+let here=starts[k];
+starts[k]=before;
+before+=here;
+}
+}
+
+@compute @workgroup_size(${g})
+fn scatter(@builtin(workgroup_id)group:vec3u,@builtin(local_invocation_index)thread:u32){
+let word=thread>>5;let bit=1u<<(thread&31);
+sums[thread]=starts[group.x*256+thread];
+for(var round=0u;round<${b/g};round++){
+for(var k=thread*8;k<thread*8+8;k++){atomicStore(&masks[k],0);}
+workgroupBarrier();
+let i=group.x*${b}+round*${g}+thread;let valid=i<view.count;
+var key=0u;var digit=0u;
+if(valid){
+key=keyOf(i);
+digit=digitOf(key);
+atomicOr(&masks[digit*8+word],bit);
+}
+workgroupBarrier();
+if(valid){
+var to=sums[digit]+countOneBits(atomicLoad(&masks[digit*8+word])&(bit-1));
+for(var k=digit*8;k<digit*8+word;k++){to+=countOneBits(atomicLoad(&masks[k]));}
+if(FIRST){
+keysOut[to]=key;
+orderOut[to]=i;
+}else{orderOut[to]=orderIn[i];}
+}
+workgroupBarrier();
+for(var k=thread*8;k<thread*8+8;k++){sums[thread]+=countOneBits(atomicLoad(&masks[k]));}
+}
+}`,q=`${T}${I}
+@group(0)@binding(0)var<uniform>view:View;
+@group(0)@binding(1)var<storage,read>splats:array<Splat>;
+@group(0)@binding(2)var<storage,read>order:array<u32>;
+struct Corner{
+@builtin(position)position:vec4f,
+@location(0)@interpolate(flat)place:vec4f,
+@location(1)@interpolate(flat)roots:vec2f,
+@location(2)@interpolate(flat)colour:vec3f,
+}
+
+@vertex fn corner(@builtin(vertex_index)vertex:u32,@builtin(instance_index)instance:u32)->Corner{
+let s=splats[order[instance]];
+let at=s.colour.a*(vec2f(f32(vertex&1),f32(vertex>>1))*2.-1.)*s.shape.zw;
+let pixel=s.place.xy+vec2f(s.place.z*at.y+at.x,at.y);
+return Corner(vec4f(2.*pixel.x/view.size.x-1.,1.-2.*pixel.y/view.size.y,0,1),s.place,s.shape.xy,s.colour.rgb);
+}
+
+@fragment fn blend(c:Corner)->@location(0)vec4f{
+let d=c.position.xy-c.place.xy;
+let r=c.roots*vec2f(d.x-c.place.z*d.y,d.y);
+let power=c.place.w-dot(r,r);
+if(power<-7.9943533){discard;}
+let alpha=min(exp2(power),0.999);
+return vec4f(c.colour*alpha,alpha);
+}`,H=`${T}
+@group(0)@binding(0)var<uniform>view:View;
+@group(0)@binding(1)var picture:texture_2d<f32>;
+
+@vertex fn corner(@builtin(vertex_index)vertex:u32)->@builtin(position)vec4f{
+return vec4f(vec2f(f32(vertex&1),f32(vertex>>1))*4.-1.,0,1);
+}
+
+@fragment fn show(@builtin(position)at:vec4f)->@location(0)vec4f{
+var c=textureLoad(picture,vec2i(at.xy),0);
+c+=(1.-c.a)*view.background;
+return vec4f(clamp(c.rgb,vec3f(0),vec3f(c.a)),c.a);
+}`;var W=8,R=class{constructor(e,r,t,a,o){this.memory=e;let{rig:s,faces:n,changes:u}=r,c=r.face_index.length,d=n.length/3;this.points=e.storage(s.template.length),this.told=new Float32Array(W+A),this.pose=e.uniform(this.told.length);let l=new Uint32Array(this.told.buffer);if(l[0]=c,l[1]=d,this.frames=this.step(M,d,[this.pose,this.points,e.storage(n),t.frames]),!u)return;if(u.directions.length/u.rest.length>A)throw new E(`has more than ${A} activations`);let{basis:h,columns:p}=oe(u,c);l[2]=p;let m=[a,o].map(y=>e.storage(y));this.changes.push(this.step(O,c,[this.pose,...m,e.storage(h),t.means,t.colours])),u.features&&this.addNetwork(u.features,c,t.colours)}memory;points;pose;frames;changes=[];told;run(e){let{device:r}=this.memory;this.memory.write(this.points,e.points);let t=r.createCommandEncoder(),a=t.beginComputePass(),o=[this.frames];e.changed&&(this.told.set(e.activations,W),o.push(...this.changes)),this.memory.write(this.pose,this.told);for(let{pipeline:s,group:n,threads:u}of o)w(a,s,n,Math.ceil(u/g));a.end(),r.queue.submit([t.finish()])}addNetwork(e,r,t){let{memory:a}=this,{width:o,rank:s,hidden:n}=L(e,r),{weights:u,biases:c}=e,d=Math.ceil(o/4),l=4*Math.ceil(n/4),h=u[0].length/n,p=new Float32Array(4*(d+1)*l);for(let f=0;f<n;++f){let v=4*(d+1)*f;p.set(u[0].subarray(f*h,f*h+o),v);for(let P=0;P<4;++P)p[v+4*d+P]=u[1][P*n+f]}this.told.set(c[1],4);let m=(f,v)=>a.storage(ie(se(f,v))),y=m(z(e,r,o),n),x=[m(e.neutral,o),m(e.basis,o),y,a.storage(p)];this.changes.push(this.step(D(d,s,l),r,[this.pose,...x,t]))}step(e,r,t){let{device:a}=this.memory,o=a.createComputePipeline({layout:"auto",compute:{module:a.createShaderModule({code:e})}});return{pipeline:o,group:this.memory.group(o.getBindGroupLayout(0),t),threads:r}}};function oe({means:i,opacity_logits:e,colour:r},t){let a=[{part:i,width:3,at:0},{part:e,width:1,at:3},{part:r,width:3,at:4}],o=(u,c)=>(u?.length??0)/c/Math.max(t,1),s=Math.max(...a.map(({part:u,width:c})=>o(u,c))),n=new Float32Array(8*t*s);for(let{part:u,width:c,at:d}of a){let l=o(u,c);for(let h=0,p=0;h<t;++h)for(let m=0;m<c;++m)for(let y=0;y<l;++y)n[8*(h*s+y)+d+m]=u[p++]}return{basis:n,columns:s}}function se(i,e){let r=4*Math.ceil(e/4),t=i.length/e;if(r===e)return i;let a=new Float32Array(t*r);for(let o=0;o<t;++o)a.set(i.subarray(o*e,(o+1)*e),o*r);return a}function ie(i){if(typeof Float16Array>"u")throw new E("needs half floats, which this browser's WebGPU lacks");return new Uint32Array(new Float16Array(i).buffer)}var U=class{layout;digits;constructor(e){let r=["uniform",...Array(3).fill("read-only-storage"),...Array(3).fill("storage")];this.layout=e.createBindGroupLayout({entries:r.map((o,s)=>({binding:s,visibility:GPUShaderStage.COMPUTE,buffer:{type:o}}))});let t=e.createPipelineLayout({bindGroupLayouts:[this.layout]}),a=e.createShaderModule({code:X});this.digits=[1,0].map(o=>{let s=n=>e.createComputePipeline({layout:t,compute:{module:a,entryPoint:n,constants:{FIRST:o}}});return{count:s("count"),scan:s("scan"),scatter:s("scatter")}})}},_=class{constructor(e,r,t,a,o){this.pipelines=e;this.count=t;let[s,n,u,c]=Array.from({length:4},()=>r.storage(t)),d=r.storage(256*Math.ceil(t/b)),l=[[s,n,u,c],[u,c,s,n]];this.groups=l.map(h=>r.group(e.layout,[a,o,...h,d])),[this.keys,this.order]=[s,n]}pipelines;count;keys;order;groups;run(e){let r=Math.ceil(this.count/b);this.pipelines.digits.forEach(({count:t,scan:a,scatter:o},s)=>{let n=this.groups[s];w(e,t,n,r),w(e,a,n,1),w(e,o,n,r)})}};function G(i,e){for(let r=0,t=0;r<i.length;r+=3,t+=4)e[t]=i[r],e[t+1]=i[r+1],e[t+2]=i[r+2]}var J="rgba16float",j=36,Y=Uint32Array.of(4294967295,0,4,0,0,0),ne=8,B=class{constructor(e,r){this.device=e;this.format=r;let t=s=>e.createShaderModule({code:s});this.project=e.createComputePipeline({layout:"auto",compute:{module:t(V)}}),this.sort=new U(e);let a={srcFactor:"one",dstFactor:"one-minus-src-alpha"},o=(s,n,u)=>{let c=t(s);return e.createRenderPipeline({layout:"auto",vertex:{module:c},fragment:{module:c,targets:[n]},primitive:{topology:u}})};this.draw=o(q,{format:J,blend:{color:a,alpha:a}},"triangle-strip"),this.screen=o(H,{format:r},"triangle-list")}device;format;project;sort;draw;screen},F=class{constructor(e,r,t,a){this.pipelines=e;this.context=r;this.poser=a;let{device:o}=e,{baked:s}=t,{attributes:n,faces:u,face_index:c}=s,d=this.memory=new k(o),l=this.count=c.length;this.shRest=n.sh.length/3/Math.max(l,1)-1,[this.means,this.colours,this.shapeValues]=[4,4,8].map(f=>new Float32Array(f*l)),c.forEach((f,v)=>this.means[4*v+3]=f),G(s.means,this.means);for(let f=0;f<l;++f){let v=3*f*(1+this.shRest);this.colours.set([...n.sh.subarray(v,v+3),n.opacity_logits[f]],4*f)}let h=new Float32Array(4*l*this.shRest);for(let f=0;f<l*this.shRest;++f){let v=3*(f+Math.floor(f/this.shRest)+1);h.set(n.sh.subarray(v,v+3),4*f)}let p=this.posed={frames:d.storage(4*u.length),means:d.storage(this.means),colours:d.storage(this.colours)};this.shapes=d.storage(8*l),this.view=d.uniform(j),this.state=d.indirect(Y),this.sorter=new _(e.sort,d,l,this.view,this.state);let m=d.storage(12*l),y=this.sorter,x=[p.frames,p.means,this.shapes,p.colours,d.storage(h)];this.project=d.group(e.project.getBindGroupLayout(0),[this.view,...x,m,y.keys,this.state]),this.splats=d.group(e.draw.getBindGroupLayout(0),[this.view,m,y.order]),this.uploadShapes(n.quats,n.log_scales.map(Math.exp)),this.gpuPoser=s.skinned?null:new R(d,s,p,this.means,this.colours),r.configure({device:o,format:e.format,alphaMode:"premultiplied"})}pipelines;context;poser;memory;posed;shapes;view;state;gpuPoser;sorter;means;colours;shapeValues;project;splats;count;shRest;picture=null;screen=null;upload(){this.gpuPoser?this.gpuPoser.run(this.poser):this.uploadPosed(this.poser,this.poser.skinned)}draw(e,r,t){let{pipelines:a,count:o}=this,{device:s}=a,[n,u,c,d]=t,l=r.directions,h=new Float32Array(j);h.set(r.head),h.set([l[0],l[1],l[2],0,l[3],l[4],l[5],0,l[6],l[7],l[8]],12),h.set([...r.focal,...r.centre,r.width,r.height],24),new Uint32Array(h.buffer).set([o,this.shRest],30),h.set([n*d,u*d,c*d,d],32),this.memory.write(this.view,h),this.memory.write(this.state,Y);let p=s.createCommandEncoder(),m=p.beginComputePass();w(m,a.project,this.project,Math.ceil(o/g)),this.sorter.run(m),m.end();let y=this.pictureOf(r.width,r.height);this.render(p,y.createView(),a.draw,this.splats,x=>x.drawIndirect(this.state,ne)),this.render(p,this.context.getCurrentTexture().createView(),a.screen,this.screen,x=>x.draw(3)),s.queue.submit([p.finish()])}dispose(){this.picture?.destroy(),this.memory.free()}render(e,r,t,a,o){let s=e.beginRenderPass({colorAttachments:[{view:r,loadOp:"clear",storeOp:"store"}]});s.setPipeline(t),s.setBindGroup(0,a),o(s),s.end()}pictureOf(e,r){let{pipelines:t}=this,{device:a}=t;if(this.picture?.width===e&&this.picture.height===r)return this.picture;this.picture?.destroy();let{RENDER_ATTACHMENT:o,TEXTURE_BINDING:s}=GPUTextureUsage,n=this.picture=a.createTexture({size:[e,r],format:J,usage:o|s});return this.screen=a.createBindGroup({layout:t.screen.getBindGroupLayout(0),entries:[{binding:0,resource:{buffer:this.view}},{binding:1,resource:n.createView()}]}),n}uploadPosed(e,r){let{memory:t,posed:a,means:o,colours:s}=this;G(e.means,o),G(e.colours,s),e.opacityLogits.forEach((n,u)=>s[4*u+3]=n),t.write(a.frames,e.frames),t.write(a.means,o),t.write(a.colours,s),this.uploadShapes(r.quats,r.scales)}uploadShapes(e,r){let{shapeValues:t}=this;for(let a=0;a<this.count;++a){for(let o=0;o<4;++o)t[8*a+o]=e[4*a+o];for(let o=0;o<3;++o)t[8*a+4+o]=r[3*a+o]}this.memory.write(this.shapes,t)}};async function ue(i="auto"){if(i!=="webgl2")try{let e=await ce(i),r=e.lost;e.pushErrorScope("validation");let t=new B(e,navigator.gpu.getPreferredCanvasFormat()),a=await e.popErrorScope();if(a)throw new Error(a.message);return(...o)=>new C(t,r,...o)}catch(e){K(e.message);return}}var K=i=>console.warn(`mien: ${i}; WebGL2 draws instead`);async function ce(i){if(!navigator.gpu)throw new Error("this browser has no WebGPU, or the page has no secure address");let e=await navigator.gpu.requestAdapter({powerPreference:"high-performance"});if(!e)throw new Error("WebGPU has no adapter here");if(i==="auto"&&e.info.isFallbackAdapter)throw new Error("WebGPU has an adapter in software only");let{maxStorageBufferBindingSize:r,maxBufferSize:t}=e.limits;return e.requestDevice({requiredLimits:{maxStorageBufferBindingSize:r,maxBufferSize:t}})}var C=class{hidden=new OffscreenCanvas(1,1);screen;drawer;disposed=!1;constructor(e,r,t,a,o,s,n){this.screen=t.getContext("2d");let u=c=>{K(c),o.binds=!0,o.activations.fill(NaN);let d=this.hidden=new OffscreenCanvas(1,1);return d.addEventListener("webglcontextlost",l=>l.preventDefault()),d.addEventListener("webglcontextrestored",()=>{this.drawer=new n(d,a,o),s()}),new n(d,a,o)};o.binds=!1;try{this.drawer=new F(e,this.hidden.getContext("webgpu"),a,o)}catch(c){this.drawer=u(`this avatar ${c.message}`);return}r.then(({message:c})=>{this.disposed||(this.drawer=u(`the WebGPU device is lost (${c.trim()||"no reason is given"})`),s())}).catch(c=>console.error(`mien: ${c.message}`))}upload(){this.drawer.upload()}draw(e,r,t){let{hidden:a,screen:o}=this,{width:s,height:n}=r;(a.width!==s||a.height!==n)&&([a.width,a.height]=[s,n]),this.drawer.draw(e,r,t),o.globalCompositeOperation="copy",o.drawImage(a,0,0)}dispose(){this.disposed=!0,this.drawer.dispose()}};return ae(de);})();

@@ -1,0 +1,295 @@
+"""The back end in WebGPU draws as the native renderer does, and WebGL2 takes over where it is missing or lost."""
+
+import base64
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mien import runtime
+from mien.cli import main
+from mien.export import unpacked, write_packed, write_page
+from mien.export.web_page import WEBGPU
+from mien.runtime.posing import expression_changes
+from needs import NO_WEBGPU
+from test_web import POSE as POSE_PAGE
+from test_web import REST, SIDE, SLIDE, picture, psnr
+from test_web_element import LOADED, SHOT, script, served
+from test_web_skinned import skinned_head
+from web_case import as_json, browse, build, chromium, drawn_head, faces_of, painted_head
+
+ADAPTER = "(async () => Boolean(await navigator.gpu?.requestAdapter()))()"
+PAGE = '<link rel="icon" href="data:,"><canvas id="view" width="512" height="512"></canvas>'
+OPEN = """
+const { readAny, Viewer } = await import("./mien.js"), { findBackend } = await import("./webgpu.js");
+const file = new Uint8Array(await (await fetch("NAME.packed")).arrayBuffer());
+const { avatar } = await readAny(file), canvas = document.getElementById("view");
+window.viewer = new Viewer(canvas, avatar, null, await findBackend("BACKEND"));
+viewer.background = [1, 1, 1, 1];
+"""
+DRAW = """
+viewer.draw();
+return canvas.toDataURL("image/png");
+"""
+POSE = """
+const { canvas } = viewer, face = FACE;
+viewer.take(Object.fromEntries(Object.entries(face).map(([name, values]) => [name, Float32Array.from(values)])));
+"""
+RESIZE = """
+[canvas.width, canvas.height] = [300, 300];
+"""
+CLEAR = "viewer.background = [0, 0, 0, 0];"
+LOSE = """
+const { drawer } = viewer.renderer;
+drawer.pipelines.device.destroy();
+while (viewer.renderer.drawer === drawer) await new Promise((done) => setTimeout(done, 10));
+"""
+BUFFERS = """
+viewer.draw();
+const { pipelines, posed, sorter, state } = viewer.renderer.drawer, { device } = pipelines;
+const read = async (buffer) => {
+  const copy = device.createBuffer({ size: buffer.size, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
+  const encoder = device.createCommandEncoder();
+  encoder.copyBufferToBuffer(buffer, 0, copy, 0, buffer.size);
+  device.queue.submit([encoder.finish()]);
+  await copy.mapAsync(GPUMapMode.READ);
+  const bytes = new Uint8Array(copy.getMappedRange());
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+  return btoa(text);
+};
+return { frames: await read(posed.frames), means: await read(posed.means), colours: await read(posed.colours),
+  keys: await read(sorter.keys), order: await read(sorter.order), state: await read(state) };
+"""
+"""Reads back what the compute passes have written, in base64."""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the package and an empty page, or skip the test if the browser has no WebGPU."""
+    chromium()
+    folder = build(tmp_path_factory.mktemp("site"))
+    (folder / "index.html").write_text(PAGE)
+    with served(folder) as address:
+        if browse(f"{address}/index.html", [ADAPTER], webgpu=True)["results"] != [True]:
+            pytest.skip(NO_WEBGPU)
+    return folder
+
+
+def opened(name: str, backend: str = "webgpu") -> str:
+    return OPEN.replace("NAME", name).replace("BACKEND", backend)
+
+
+def run(site: Path, scripts: list[str], webgpu: bool = True) -> dict[str, Any]:
+    with served(site) as address:
+        return browse(f"{address}/index.html", scripts, webgpu=webgpu)
+
+
+HEADS = {
+    "gaussian_avatars": lambda: drawn_head(12_000, rank=2, sh=4, sh_frame="world"),
+    "headgas": lambda: painted_head(5000),
+    "mono_gaussian_avatar": skinned_head,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", HEADS)
+def test_webgpu_draws_as_the_native_renderer(site: Path, method: str) -> None:
+    portable = HEADS[method]()
+    write_packed(site / f"{method}.packed", portable)
+    faces = [runtime.Face(**vars(portable.neutral)), *faces_of(portable, 2)]
+    poses = [script(POSE.replace("FACE", json.dumps(face)), DRAW) for face in as_json(faces)]
+    told = run(site, [script(opened(method)), *poses])
+    assert told["messages"] == []
+    exact = runtime.Avatar(portable)
+    camera = exact.camera.resized(SIDE, SIDE)
+    expected = [exact.render(runtime.pose(portable.baked, face), camera)[0] for face in faces]
+    for truth, address in zip(expected, told["results"][1:], strict=True):
+        assert psnr(picture(address)[..., :3], truth) >= 45
+    assert psnr(expected[1], expected[2]) < 35
+
+
+def numbers(told: dict[str, str], name: str, dtype: Any = np.float32) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(told[name]), dtype)
+
+
+@pytest.mark.parametrize("method", ["gaussian_avatars", "some columns", "headgas"])
+def test_the_gpu_poses_as_python(site: Path, method: str) -> None:
+    """Centres to 1e-5 m, outputs of the network to 1e-3. The second face is the first one with another expression."""
+    heads = {
+        "gaussian_avatars": drawn_head(2000, 3),
+        "some columns": drawn_head(1999, 5, columns=2),
+        "headgas": painted_head(300),
+    }
+    portable = heads[method]
+    write_packed(site / "posed.packed", portable)
+    portable = unpacked(portable)
+    baked, faces = portable.baked, faces_of(portable, 2)
+    assert isinstance(baked, runtime.MeshBound)
+    poses = [script(POSE.replace("FACE", json.dumps(face)), BUFFERS) for face in as_json(faces)]
+    told = run(site, [script(opened("posed")), *poses])
+    n, moved = len(baked.face_index), []
+    for face, found in zip(faces, told["results"][1:], strict=True):
+        frames = numbers(found, "frames")[: 12 * len(baked.faces)].reshape(-1, 3, 4)[baked.face_index]
+        means, colours = (numbers(found, name)[: 4 * n].reshape(n, 4) for name in ("means", "colours"))
+        np.testing.assert_array_equal(means[:, 3], baked.face_index)
+        centres = np.einsum("nij,nj->ni", frames[..., :3], means[:, :3]) + frames[..., 3]
+        in_head = replace(face, head_rotation=np.zeros(3, np.float32), head_translation=np.zeros(3, np.float32))
+        np.testing.assert_allclose(centres, runtime.pose(baked, in_head).means, rtol=0, atol=1e-5)
+        assert baked.changes is not None
+        changes = expression_changes(baked.changes, face)
+        np.testing.assert_allclose(
+            colours[:, :3], baked.attributes.sh[:, 0] + changes.get("colour", 0), rtol=0, atol=1e-3
+        )
+        logits = baked.attributes.opacity_logits + changes.get("opacity_logits", 0)
+        np.testing.assert_allclose(colours[:, 3], logits, rtol=0, atol=1e-3)
+        moved.append(colours)
+    assert np.abs(moved[0] - moved[1]).max() > 0.1
+
+
+@pytest.mark.parametrize("count", [1, 1000, 100_003])
+def test_the_gpu_sorts_from_far_to_near(site: Path, count: int) -> None:
+    """Equal depths keep their order, and what cannot be seen comes last."""
+    portable = drawn_head(count)
+    baked = portable.baked
+    assert isinstance(baked, runtime.MeshBound)
+    # 700 places for all, so that many depths are equal. Small Gaussians are drawn faster.
+    place = np.arange(count) % 700 % count
+    attributes = replace(baked.attributes, log_scales=np.full((count, 3), -5, np.float32))
+    baked = replace(baked, face_index=baked.face_index[place], means=baked.means[place], attributes=attributes)
+    runtime.write_portable(site / "sorted.packed", replace(portable, baked=baked))
+    zoomed = "[viewer.canvas.width, viewer.canvas.height] = [64, 64]; viewer.zoom = ZOOM; viewer.look();"
+    steps = [script(zoomed.replace("ZOOM", zoom), BUFFERS) for zoom in ("1", "4")]
+    told = run(site, [script(opened("sorted")), *steps])
+    seen = []
+    for found in told["results"][1:]:
+        keys, order = (numbers(found, name, np.uint32)[:count] for name in ("keys", "order"))
+        visible = keys != 0xFFFFFFFF
+        np.testing.assert_array_equal(np.sort(order), np.arange(count))
+        assert numbers(found, "state", np.uint32)[3] == visible.sum()
+        assert not visible[order[visible.sum() :]].any()
+        front = order[: visible.sum()]
+        depths = keys.view(np.float32)[front]
+        steps_back = np.diff(depths)
+        assert steps_back.max(initial=0) <= np.ptp(depths) / 65000
+        equal = steps_back == 0
+        assert (np.diff(front.astype(int))[equal] > 0).all()
+        seen.append(visible.mean())
+    if count > 1:
+        assert 1 > seen[0] > seen[1] > 0
+
+
+@pytest.mark.slow
+def test_size_background_and_a_lost_device(site: Path) -> None:
+    portable = drawn_head(3000, rank=2)
+    write_packed(site / "small.packed", portable)
+    face = faces_of(portable, 1)
+    (told_face,) = as_json(face)
+    pose = POSE.replace("FACE", json.dumps(told_face))
+    resize, clear, lose = (script("const { canvas } = viewer;", part, DRAW) for part in (RESIZE, CLEAR, LOSE))
+    told = run(site, [script(opened("small")), script(pose, DRAW), resize, clear, lose, script("viewer.dispose();")])
+    _, first, smaller, clear, after, _ = told["results"]
+    exact = runtime.Avatar(portable)
+    posed = runtime.pose(portable.baked, face[0])
+    large, small = (exact.camera.resized(side, side) for side in (SIDE, 300))
+    assert psnr(picture(first)[..., :3], exact.render(posed, large)[0]) >= 45
+    assert picture(smaller).shape[:2] == (300, 300)
+    assert psnr(picture(smaller)[..., :3], exact.render(posed, small)[0]) >= 45
+    alpha = exact.render(posed, small)[1]
+    assert np.abs(picture(clear)[..., 3] - alpha).max() < 0.02
+    # WebGL2 has drawn the face that WebGPU had posed.
+    assert np.abs(picture(after)[..., 3] - alpha).max() < 0.02
+    assert psnr(picture(after)[alpha > 0.9], picture(clear)[alpha > 0.9]) >= 45
+    (message,) = told["messages"]
+    assert message.startswith("mien: the WebGPU device is lost (")
+    assert message.endswith("; WebGL2 draws instead")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("backend", "webgpu", "reason"),
+    [
+        ("webgpu", False, "WebGPU has no adapter here"),
+        ("auto", True, "WebGPU has an adapter in software only"),
+        ("webgl2", True, None),
+    ],
+)
+def test_webgl2_draws_where_webgpu_is_missing(site: Path, backend: str, webgpu: bool, reason: str | None) -> None:
+    portable = drawn_head(500)
+    write_packed(site / "few.packed", portable)
+    draw = script("const { canvas } = viewer;", DRAW)
+    told = run(site, [script(opened("few", backend)), draw], webgpu=webgpu)
+    # Chromium itself has a word to say about adapters.
+    ours = [message for message in told["messages"] if message.startswith("mien")]
+    assert ours == ([f"mien: {reason}; WebGL2 draws instead"] if reason else [])
+    exact = runtime.Avatar(portable)
+    expected, _ = exact.render(camera=exact.camera.resized(SIDE, SIDE))
+    assert psnr(picture(told["results"][1])[..., :3], expected) >= 45
+
+
+@pytest.mark.slow
+def test_an_avatar_that_does_not_fit_is_drawn_with_webgl2(site: Path) -> None:
+    """A browser without half floats stands for a device with too little memory."""
+    portable = painted_head(300)
+    write_packed(site / "small.packed", portable)
+    lacking = script("delete window.Float16Array;", opened("small"))
+    told = run(site, [lacking, script("const { canvas } = viewer;", DRAW)])
+    assert told["messages"] == [
+        "mien: this avatar needs half floats, which this browser's WebGPU lacks; WebGL2 draws instead"
+    ]
+    exact = runtime.Avatar(portable)
+    expected, _ = exact.render(camera=exact.camera.resized(SIDE, SIDE))
+    assert psnr(picture(told["results"][1])[..., :3], expected) >= 45
+
+
+@pytest.mark.slow
+def test_a_page_draws_with_webgpu(site: Path, tmp_path: Path) -> None:
+    """If it is asked to by its address. By itself it does so on a GPU only."""
+    assert (site / "webgpu_page.js").read_text() == WEBGPU.read_text(), "webgpu.js is older than web/: run `make web`"
+    portable = drawn_head(3000, rank=2)
+    page = tmp_path / "a.html"
+    write_page(page, portable, webgpu=True)
+    plain = write_page(tmp_path / "b.html", portable)
+    assert 0 < page.stat().st_size - plain.size < 25_000
+    (face,) = faces_of(portable, 1)
+    scripts = [POSE_PAGE % json.dumps(as_json([face])[0]), REST, SLIDE]
+    exact = runtime.Avatar(portable)
+    expected, _ = exact.render(runtime.pose(portable.baked, face), exact.camera.resized(SIDE, SIDE))
+    in_software = "mien: WebGPU has an adapter in software only; WebGL2 draws instead"
+    for fragment, messages in (("webgpu", []), ("", [in_software])):
+        told = browse(page, scripts, fragment=fragment, webgpu=True)
+        assert told["requests"] == []
+        assert told["messages"] == messages
+        posed, rest, slid = map(picture, told["results"])
+        assert psnr(posed[..., :3], expected) >= 45
+        assert np.abs(slid - rest).max() > 0.1
+
+
+@pytest.mark.slow
+def test_the_element_draws_with_webgpu(site: Path) -> None:
+    write_packed(site / "me.packed", drawn_head(3000, rank=2))
+    (site / "element.html").write_text(
+        '<link rel="icon" href="data:,"><script type="module" src="element.js"></script>'
+        '<mien-avatar src="me.packed" backend="webgpu" expression="jawOpen:0.5"></mien-avatar>'
+    )
+    with served(site) as address:
+        page = f"{address}/element.html"
+        told = browse(page, [script(LOADED, SHOT), "Boolean(avatar.viewer.renderer.drawer)"], webgpu=True)
+        (site / "webgpu.js").rename(site / "elsewhere.js")
+        without = browse(page, [script(LOADED, SHOT)], webgpu=True)
+        (site / "elsewhere.js").rename(site / "webgpu.js")
+    assert told["messages"] == []
+    assert told["results"][1] is True
+    assert without["messages"][-1].endswith("WebGL2 draws instead")
+    exact = runtime.Avatar(drawn_head(3000, rank=2))
+    expected, _ = exact.render(exact.pose({"jawOpen": 0.5}), exact.camera.resized(320, 320))
+    for results in (told["results"], without["results"]):
+        assert psnr(picture(results[0])[..., :3], expected) >= 45
+
+
+def test_only_a_page_takes_webgpu(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(tmp_path), "--out", str(tmp_path / "a.packed"), "--webgpu"]) == 2
+    assert "only an .html page draws with WebGPU; leave --webgpu out" in capsys.readouterr().err
