@@ -18,8 +18,8 @@ const shaders = {
       loader: "ts",
     })),
 };
-const bundle = async (entry, format) => {
-  const result = await build({ ...options, plugins: [shaders], entryPoints: [entry], format });
+const bundle = async (entry, format, define = {}) => {
+  const result = await build({ ...options, plugins: [shaders], entryPoints: [entry], format, define });
   return result.outputFiles[0].text.trimEnd();
 };
 const write = async (path, text) => {
@@ -30,7 +30,12 @@ const write = async (path, text) => {
 
 const script = await bundle("src/page.ts", "iife");
 if (script.includes("</script")) throw new Error("the script would end its own element");
+const detector = { DETECTOR: JSON.stringify(await bundle("src/webcam_detector.ts", "iife")) };
+const camera = await bundle("src/webcam_page.ts", "iife", detector);
+if (camera.includes("</script")) throw new Error("the camera's script would end its own element");
 const template = await readFile(join(here, "src/page.html"), "utf8");
-for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"]])
-  await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm")) + "\n");
-await write(folder ? join(folder, "page.html") : join(here, "../src/mien/export/page.html"), template.replace("{{script}}", () => script));
+for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"], ["webcam.js", "src/webcam.ts"]])
+  await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm", detector)) + "\n");
+const page = (name, text) => write(folder ? join(folder, name) : join(here, "../src/mien/export", name), text);
+await page("page.html", template.replace("{{script}}", () => script));
+await page("webcam.html", (await readFile(join(here, "src/webcam_page.html"), "utf8")).replace("{{script}}", () => camera));

@@ -12,6 +12,7 @@ from mien.export.usd_package import USD_ENDINGS, check_usd
 from mien.workspace import Workspace, open_workspace
 
 if TYPE_CHECKING:
+    import mien.export
     import mien.gaussians
 
 _POSES = (".ply", ".spz", ".sog", *USD_ENDINGS)
@@ -48,11 +49,17 @@ class Command:
     .ply, .spz and .sog, every frame becomes a file, and for USD a time sample; the head stays at the origin."""
     every: int = 1
     """With --series, take only every n-th frame."""
+    webcam: bool = False
+    """For .html: a button with which the viewer's own face drives the avatar. The page becomes 9 MB larger; nothing of
+    the camera leaves it. Needs `make web-packages`, and MediaPipe's model."""
+    webcam_model: Path | None = None
+    """With --webcam, MediaPipe's face_landmarker.task (default: the file of that name in mien's cache)."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         from mien.files import check_writable
 
+        self._check_webcam()
         if self.workspace.suffix.lower() in _FILES and not self.workspace.is_dir():
             self._check_file()
             return
@@ -101,6 +108,21 @@ class Command:
         else:
             self._write_series(avatar, workspace, self.series)
 
+    def _check_webcam(self) -> None:
+        from mien.export.webcam import find_webcam_files
+
+        if self.webcam_model is not None and not self.webcam:
+            raise UserError(f"--webcam-model {self.webcam_model}: give it together with --webcam")
+        if self.webcam and self.out.suffix.lower() != ".html":
+            raise UserError(f"{self.out}: only an .html page has a webcam; leave --webcam out, or write a .html file")
+        if self.webcam:
+            find_webcam_files(self.webcam_model)
+
+    def _webcam_files(self) -> "mien.export.WebcamFiles | None":
+        from mien.export import find_webcam_files
+
+        return find_webcam_files(self.webcam_model) if self.webcam else None
+
     def _check_ending(self, endings: tuple[str, ...], others: str) -> None:
         kind = self.out.suffix.lower()
         if kind not in endings:
@@ -129,7 +151,7 @@ class Command:
     def _convert(self) -> None:
         from mien.commands.stages.converting import convert
 
-        convert(self.workspace, self.out)
+        convert(self.workspace, self.out, self._webcam_files())
 
     def _check_folder(self) -> None:
         from mien.files import check_writable
@@ -182,7 +204,10 @@ class Command:
             driven, fps = self._driven(avatar, workspace, self.series, with_head_pose=True)
             fields = (driven.expression, driven.joints, driven.head_rotation, driven.head_translation)
             motion = Motion(*(tensor.detach().float().numpy() for tensor in fields), fps=fps / self.every)
-        page = (write_page if self.out.suffix.lower() == ".html" else write_packed)(self.out, portable, motion)
+        if self.out.suffix.lower() == ".html":
+            page = write_page(self.out, portable, motion, self._webcam_files())
+        else:
+            page = write_packed(self.out, portable, motion)
         moves = "" if motion is None else f", a motion of {len(motion):,} frames"
         say(
             f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians{moves}, {page.size / 1e6:.1f} MB; compression "

@@ -5,14 +5,16 @@ from pathlib import Path
 import torch
 
 from mien import runtime
-from mien.export import in_world, read_glb_avatar, write_packed, write_page, write_pose
+from mien.export import WebcamFiles, in_world, read_glb_avatar, write_packed, write_page, write_pose
 from mien.gaussians import Gaussians
 from mien.progress import say
 from mien.runtime import PortableAvatar, read_portable, write_portable
 
 
-def convert(source: Path, out: Path) -> None:
+def convert(source: Path, out: Path, webcam: WebcamFiles | None = None) -> None:
     """Write the avatar in a file as .mien, .html, .packed, or at rest with the head at the origin, and report it.
+
+    `webcam` are files of the face landmarker for a .html page.
 
     Raises:
         UserError: the file is missing, damaged or foreign, or the avatar cannot be written so.
@@ -22,7 +24,7 @@ def convert(source: Path, out: Path) -> None:
     if ending == ".mien":
         write_portable(out, avatar)
     elif ending == ".html":
-        write_page(out, avatar)
+        write_page(out, avatar, webcam=webcam)
     elif ending == ".packed":
         write_packed(out, avatar)
     else:
