@@ -21,6 +21,7 @@ NO_NODE_PACKAGES = "no packages in web/node_modules"
 NO_CHROMIUM = "no Chromium"
 NO_VALIDATOR = "no gltf-validator in web/node_modules"
 NO_SPLAT_TRANSFORM = "no @playcanvas/splat-transform in web/node_modules"
+NO_TASKS_VISION = "no @mediapipe/tasks-vision in web/node_modules"
 
 _REMEDIES = {
     NO_GPU: "run `make gpu` on a machine with an NVIDIA GPU and the CUDA toolkit",
@@ -32,6 +33,7 @@ _REMEDIES = {
     NO_NODE_PACKAGES: "run `make web-packages`",
     NO_VALIDATOR: "run `make web-packages`",
     NO_SPLAT_TRANSFORM: "run `make web-packages`",
+    NO_TASKS_VISION: "run `make web-packages`",
     NO_NODE: "install Node.js 20 or newer with npm, then run `make web-packages`",
     NO_CHROMIUM: "run `apt-get install chromium`, or set MIEN_CHROMIUM to a Chromium's path",
     HAS_GPU: "run them with CUDA_VISIBLE_DEVICES=",

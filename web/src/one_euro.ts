@@ -8,7 +8,7 @@ export interface Smoothing {
 }
 
 /** Cutoff of the speed itself, in Hz. */
-const SPEED_CUTOFF = 1;
+const SPEED_CUTOFF = 3;
 
 export class OneEuro {
   private value = 0;

@@ -1,7 +1,8 @@
 // What runs in the worker of webcam.ts: MediaPipe's face landmarker, on one picture at a time.
 // Its own script, because detection would hold up the drawing of the page for several milliseconds.
 
-import type { DetectorParts, Found } from "./webcam";
+import type { Found } from "./follower";
+import type { DetectorParts } from "./webcam";
 
 interface Landmarker {
   detectForVideo(picture: ImageBitmap, milliseconds: number): {
@@ -35,6 +36,9 @@ async function open({ vision, loader, wasm, model }: Record<keyof DetectorParts,
     },
   );
 }
+
+// MediaPipe's messages are for its own developers; what goes wrong is an error, and goes to the page.
+for (const way of ["log", "info", "warn", "error"] as const) console[way] = () => {};
 
 scope.onmessage = async ({ data }) => {
   try {

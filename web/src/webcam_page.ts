@@ -29,7 +29,8 @@ function addCamera(viewer: Viewer): Webcam {
   const webcam = new Webcam(parts), button = find<HTMLButtonElement>("camera"), neutral = find<HTMLButtonElement>("neutral");
   const mirrored = find<HTMLInputElement>("mirrored"), preview = find<HTMLInputElement>("preview"), told = find("camera-state");
   const more = find("camera-more"), { video } = webcam;
-  webcam.attach(viewer, () => viewer.onMotion());
+  webcam.attach(viewer);
+  webcam.onReading = () => viewer.playing || viewer.onMotion();
   video.hidden = true;
   video.setAttribute("aria-label", "Your camera's picture");
   more.append(video);
@@ -52,6 +53,9 @@ function addCamera(viewer: Viewer): Webcam {
       if (on && box.checked) box.click();
       box.disabled = on;
     }
+    if (on || viewer.playing) return;
+    viewer.take(viewer.avatar.neutral);
+    viewer.onMotion();
   };
   button.addEventListener("click", async () => {
     if (webcam.state !== "off") return webcam.stop();

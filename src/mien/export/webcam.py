@@ -22,7 +22,7 @@ MODEL_ADDRESS = (
     "https://storage.googleapis.com/mediapipe-models/face_landmarker/face_landmarker/float16/1/face_landmarker.task"
 )
 """Where MediaPipe's documentation publishes the model (Apache-2.0)."""
-POLICY = " blob: 'wasm-unsafe-eval'; worker-src blob:; connect-src 'none'"
+POLICY = " blob: 'wasm-unsafe-eval'; worker-src blob:; connect-src 'none'; form-action 'none'; base-uri 'none'"
 """What the page's policy allows in addition: scripts and a worker that are in the page itself. Nothing else, and no
 connection at all."""
 _FILES = {
