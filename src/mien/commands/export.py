@@ -53,7 +53,7 @@ class Command:
     """For .html: a button with which the viewer's own face drives the avatar. The page becomes 9 MB larger; nothing of
     the camera leaves it. Needs `make web-packages`, and MediaPipe's model."""
     webcam_model: Path | None = None
-    """With --webcam, MediaPipe's face_landmarker.task (default: the file of that name in mien's cache)."""
+    """With --webcam, MediaPipe's face_landmarker.task (default: the file that MIEN_FACE_LANDMARKER names)."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mien.errors import UserError
-from mien.face.cache import cache_folder
 
 TEMPLATE = Path(__file__).with_name("webcam.html")
 PACKAGE, VERSION = "@mediapipe/tasks-vision", "0.10.35"
 """The npm package, and the version that pages are tested with. Later versions send statistics to their maker."""
+PACKAGE_VARIABLE, MODEL_VARIABLE = "MIEN_TASKS_VISION", "MIEN_FACE_LANDMARKER"
+"""Environment variables that name the package's folder and the model's file."""
 MODEL_ADDRESS = (
     "https://storage.googleapis.com/mediapipe-models/face_landmarker/face_landmarker/float16/1/face_landmarker.task"
 )
@@ -52,7 +53,7 @@ def find_webcam_files(model: Path | None = None) -> WebcamFiles:
     The package is in the folder that MIEN_TASKS_VISION names, or else in web/node_modules of the checkout.
 
     Args:
-        model: The model's file. None for face_landmarker.task in the user's cache (`mien.face.cache.cache_folder`).
+        model: The model's file. None for the one that MIEN_FACE_LANDMARKER names.
 
     Raises:
         UserError: one of them is missing, is of another version, or is no such model.
@@ -83,11 +84,11 @@ def _packed(path: Path) -> str:
 
 
 def _package() -> Path:
-    named = os.environ.get("MIEN_TASKS_VISION")
+    named = os.environ.get(PACKAGE_VARIABLE)
     folder = Path(named) if named else Path(__file__).parents[3] / "web" / "node_modules" / PACKAGE
     remedy = (
         f"run `make web-packages` in mien's checkout, or unpack the result of `npm pack {PACKAGE}@{VERSION}` and set "
-        "MIEN_TASKS_VISION to its folder"
+        f"{PACKAGE_VARIABLE} to its folder"
     )
     try:
         version = json.loads((folder / "package.json").read_text(encoding="utf-8")).get("version")
@@ -102,12 +103,14 @@ def _package() -> Path:
 
 
 def _model(given: Path | None) -> Path:
-    path = given or cache_folder() / "face_landmarker.task"
-    if not path.is_file():
+    named = os.environ.get(MODEL_VARIABLE)
+    path = given or (Path(named) if named else None)
+    if path is None or not path.is_file():
+        missing = f"{path}: no such file" if path else "--webcam: no model"
         raise UserError(
-            f"{path}: no such file. --webcam needs MediaPipe's model face_landmarker.task (Apache-2.0, 4 MB), which "
-            f"does not come with mien. Download it from {MODEL_ADDRESS}, and put it there, or give its place with "
-            "--webcam-model FILE"
+            f"{missing}; --webcam needs MediaPipe's face_landmarker.task (Apache-2.0, 4 MB), which does not come with "
+            f"mien. Download it from {MODEL_ADDRESS}, and give its place with --webcam-model FILE, or set "
+            f"{MODEL_VARIABLE} to it"
         )
     try:
         if path.stat().st_size > _MOST_BYTES:
