@@ -215,7 +215,7 @@ async function camera(): Promise<MediaStream> {
   if (!navigator.mediaDevices?.getUserMedia)
     throw new WebcamError(
       location.protocol === "file:"
-        ? "This browser gives no camera to a page from a file. Open the file with Chrome, Edge or Firefox, or put it on a web server with https."
+        ? "This browser gives no camera to a page from a file. Open the file with Chrome or Edge, or put it on a web server with https."
         : location.protocol === "http:"
           ? "Browsers give a camera only to pages with https. Open this page by its https address."
           : "This browser gives no camera to this page. Open it with another browser.",
