@@ -22,6 +22,7 @@ NO_CHROMIUM = "no Chromium"
 NO_WEBGPU = "Chromium has no adapter of WebGPU"
 NO_VALIDATOR = "no gltf-validator in web/node_modules"
 NO_SPLAT_TRANSFORM = "no @playcanvas/splat-transform in web/node_modules"
+NO_TASKS_VISION = "no @mediapipe/tasks-vision in web/node_modules"
 
 _REMEDIES = {
     NO_GPU: "run `make gpu` on a machine with an NVIDIA GPU and the CUDA toolkit",
@@ -33,6 +34,7 @@ _REMEDIES = {
     NO_NODE_PACKAGES: "run `make web-packages`",
     NO_VALIDATOR: "run `make web-packages`",
     NO_SPLAT_TRANSFORM: "run `make web-packages`",
+    NO_TASKS_VISION: "run `make web-packages`",
     NO_NODE: "install Node.js 20 or newer with npm, then run `make web-packages`",
     NO_CHROMIUM: "run `apt-get install chromium`, or set MIEN_CHROMIUM to a Chromium's path",
     NO_WEBGPU: "install Chromium 156 or newer, whose WebGPU can run in software",

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import subprocess
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import torch
 from mien import runtime
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, HeadGas, HeadGasConfig, make_portable
 from mien.face import load_face_model
-from needs import NO_CHROMIUM, NO_NODE, NO_NODE_PACKAGES
+from needs import NO_CHROMIUM, NO_NODE, NO_NODE_PACKAGES, NO_TASKS_VISION
 from toy_scene import toy_camera
 
 WEB = Path(__file__).parent.parent / "web"
@@ -40,6 +41,15 @@ def chromium() -> str:
     return found
 
 
+def tasks_vision() -> Path:
+    """Return the folder of MediaPipe's face landmarker for pages, or skip the test."""
+    node()
+    folder = WEB / "node_modules" / "@mediapipe" / "tasks-vision"
+    if not folder.is_dir():
+        pytest.skip(NO_TASKS_VISION)
+    return folder
+
+
 def build(folder: Path) -> Path:
     """Build mien.js and page.html into a folder, and return it."""
     subprocess.run([node(), str(WEB / "build.mjs"), str(folder)], check=True, capture_output=True)
@@ -54,6 +64,7 @@ def browse(
     downloads: Path | None = None,
     fragment: str = "",
     webgpu: bool = False,
+    flags: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Run scripts in a page, one after the other: their `results`, all `requests`, and `messages` of the console.
 
@@ -65,9 +76,10 @@ def browse(
         downloads: Folder for the files that the page saves.
         fragment: What follows the address after a #.
         webgpu: Whether the browser has WebGPU, in software.
+        flags: Further options of Chromium.
     """
     given = {"width": size[0], "height": size[1], "scripts": scripts, "screenshots": screenshots or []}
-    given["webgpu"] = webgpu
+    given |= {"webgpu": webgpu, "flags": list(flags)}
     told = json.dumps(given | ({"downloads": str(downloads)} if downloads else {}))
     address = f"{page}#{fragment}" if fragment else str(page)
     command = [node(), str(WEB / "tests" / "browser.mjs"), chromium(), address]

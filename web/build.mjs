@@ -1,5 +1,5 @@
-// Builds dist/mien.js, dist/motion.js, dist/element.js and dist/webgpu.js (the package), and src/mien/export/page.html and webgpu.js (the page that
-// `mien export` fills, and what --webgpu puts into it; they are committed, so that the Python package needs no node). `node build.mjs FOLDER` writes both into FOLDER instead.
+// Builds dist/ (the package), and src/mien/export/page.html, webgpu.js and webcam.html (the page that
+// `mien export` fills, and what --webgpu and --webcam put into it; they are committed, so that the Python package needs no node). `node build.mjs FOLDER` writes all into FOLDER instead.
 import { build } from "esbuild";
 import { mkdir, readFile, writeFile } from "node:fs/promises";
 import { dirname, join } from "node:path";
@@ -23,8 +23,8 @@ const shaders = {
       loader: "ts",
     })),
 };
-const bundle = async (entry, format) => {
-  const result = await build({ ...options, plugins: [shaders], entryPoints: [entry], format });
+const bundle = async (entry, format, define = {}) => {
+  const result = await build({ ...options, plugins: [shaders], entryPoints: [entry], format, define });
   return result.outputFiles[0].text.trimEnd();
 };
 const write = async (path, text) => {
@@ -35,9 +35,14 @@ const write = async (path, text) => {
 
 const script = await bundle("src/page.ts", "iife");
 if (script.includes("</script")) throw new Error("the script would end its own element");
+const detector = { DETECTOR: JSON.stringify(await bundle("src/webcam_detector.ts", "iife")) };
+const camera = await bundle("src/webcam_page.ts", "iife", detector);
+if (camera.includes("</script")) throw new Error("the camera's script would end its own element");
 const template = await readFile(join(here, "src/page.html"), "utf8");
-for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"], ["webgpu.js", "src/webgpu.ts"]])
-  await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm")) + "\n");
-await write(folder ? join(folder, "page.html") : join(here, "../src/mien/export/page.html"), template.replace("{{script}}", () => script));
+for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"], ["webgpu.js", "src/webgpu.ts"], ["webcam.js", "src/webcam.ts"]])
+  await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm", detector)) + "\n");
+const page = (name, text, own = name) => write(folder ? join(folder, own) : join(here, "../src/mien/export", name), text);
+await page("page.html", template.replace("{{script}}", () => script));
+await page("webcam.html", (await readFile(join(here, "src/webcam_page.html"), "utf8")).replace("{{script}}", () => camera));
 const gpu = await build({ ...options, plugins: [shaders], entryPoints: ["src/webgpu.ts"], format: "iife", globalName: "mienWebGpu" });
-await write(folder ? join(folder, "webgpu_page.js") : join(here, "../src/mien/export/webgpu.js"), gpu.outputFiles[0].text);
+await page("webgpu.js", gpu.outputFiles[0].text, "webgpu_page.js");

@@ -1,9 +1,10 @@
 // Motions that other programs record: the csv of Live Link Face, and blend shapes as json (a plain list of frames, or
 // results of MediaPipe's FaceLandmarker). It follows src/mien/driving: live_link_face.py, blendshape_json.py, transfer.py.
 
-import type { Avatar, Motion } from "./avatar";
+import { motionFace, type Avatar, type Motion } from "./avatar";
 import { AvatarError } from "./format";
 import { axisAngle, multiplied, rotationMatrix, transposed } from "./rigid";
+import { transfer } from "./transfer";
 
 /** What a recording says about one timestep. */
 interface Row {
@@ -13,10 +14,6 @@ interface Row {
   head: ArrayLike<number>;
 }
 
-/** Angle of the eyes at a coefficient eyeLook of 1, in radians. */
-const LOOK_ANGLE = Math.PI / 6;
-/** Pitch that eyes come near but do not exceed, up and down, in radians: beyond it, the lids would cover the iris. */
-const MOST_UP = (14 * Math.PI) / 180, MOST_DOWN = (18 * Math.PI) / 180;
 const STILL = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 
 /** The motion in a recording, for an avatar. Its errors complete the sentence "NAME ...". */
@@ -106,31 +103,14 @@ function rateOf(seconds: number[]): number {
 
 /** Motion relative to the recording at rest, added to the avatar at rest. At rest, coefficients are 0 and the head has its median turn. */
 function transferred(rows: Row[], fps: number, avatar: Avatar): Motion {
-  const { neutral, expression_names: names, expression_bounds: bounds, joint_names: joints } = avatar, count = rows.length;
+  const { neutral } = avatar, count = rows.length;
   const heads = rows.map((row) => axisAngle(row.head));
   const median = [0, 1, 2].map((axis) => heads.map((head) => head[axis]).sort((a, b) => a - b)[(count - 1) >> 1]);
-  const rest = rotationMatrix(neutral.head_rotation, 0), back = transposed(rotationMatrix(median, 0));
+  const back = transposed(rotationMatrix(median, 0));
   const motion: Motion = {
-    expression: new Float32Array(count * names.length), joints: new Float32Array(count * neutral.joints.length),
+    expression: new Float32Array(count * neutral.expression.length), joints: new Float32Array(count * neutral.joints.length),
     head_rotation: new Float32Array(3 * count), head_translation: new Float32Array(3 * count), fps,
   };
-  rows.forEach(({ scores, head }, t) => {
-    const score = (name: string) => scores.get(name) ?? 0;
-    names.forEach((name, e) => {
-      const value = neutral.expression[e] + score(name.toLowerCase());
-      motion.expression[t * names.length + e] = Math.min(Math.max(value, bounds[2 * e]), bounds[2 * e + 1]);
-    });
-    motion.joints.set(neutral.joints, t * neutral.joints.length);
-    for (const [joint, side, left, right] of [["left_eye", "left", "out", "in"], ["right_eye", "right", "in", "out"]]) {
-      const j = joints.indexOf(joint);
-      if (j < 0) continue;
-      const look = (way: string) => LOOK_ANGLE * score(`eyelook${way}${side}`);
-      const pitch = look("down") - look("up"), most = pitch < 0 ? MOST_UP : MOST_DOWN;
-      const gaze = rotationMatrix([most * Math.tanh(pitch / most), look(left) - look(right), 0], 0);
-      motion.joints.set(axisAngle(multiplied(rotationMatrix(neutral.joints, 3 * j), gaze)), t * neutral.joints.length + 3 * j);
-    }
-    motion.head_rotation.set(axisAngle(multiplied(rest, multiplied(back, head))), 3 * t);
-    motion.head_translation.set(neutral.head_translation, 3 * t);
-  });
+  rows.forEach(({ scores, head }, t) => transfer(scores, multiplied(back, head), avatar, motionFace(motion, t)));
   return motion;
 }

@@ -12,6 +12,7 @@ from mien.export.usd_package import USD_ENDINGS, check_usd
 from mien.workspace import Workspace, open_workspace
 
 if TYPE_CHECKING:
+    import mien.export
     import mien.gaussians
 
 _POSES = (".ply", ".spz", ".sog", *USD_ENDINGS)
@@ -51,6 +52,11 @@ class Command:
     webgpu: bool = False
     """For .html: the page draws with WebGPU where the browser has it on a GPU, and with WebGL2 elsewhere. The page
     becomes 22 kB larger."""
+    webcam: bool = False
+    """For .html: a button with which the viewer's own face drives the avatar. The page becomes 9 MB larger; nothing of
+    the camera leaves it. Needs `make web-packages`, and MediaPipe's model."""
+    webcam_model: Path | None = None
+    """With --webcam, MediaPipe's face_landmarker.task (default: the file that MIEN_FACE_LANDMARKER names)."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
@@ -58,6 +64,7 @@ class Command:
 
         if self.webgpu and self.out.suffix.lower() != ".html":
             raise UserError(f"{self.out}: only an .html page draws with WebGPU; leave --webgpu out")
+        self._check_webcam()
         if self.workspace.suffix.lower() in _FILES and not self.workspace.is_dir():
             self._check_file()
             return
@@ -106,6 +113,21 @@ class Command:
         else:
             self._write_series(avatar, workspace, self.series)
 
+    def _check_webcam(self) -> None:
+        from mien.export.webcam import find_webcam_files
+
+        if self.webcam_model is not None and not self.webcam:
+            raise UserError(f"--webcam-model {self.webcam_model}: give it together with --webcam")
+        if self.webcam and self.out.suffix.lower() != ".html":
+            raise UserError(f"{self.out}: only an .html page has a webcam; leave --webcam out, or write a .html file")
+        if self.webcam:
+            find_webcam_files(self.webcam_model)
+
+    def _webcam_files(self) -> "mien.export.WebcamFiles | None":
+        from mien.export import find_webcam_files
+
+        return find_webcam_files(self.webcam_model) if self.webcam else None
+
     def _check_ending(self, endings: tuple[str, ...], others: str) -> None:
         kind = self.out.suffix.lower()
         if kind not in endings:
@@ -134,7 +156,7 @@ class Command:
     def _convert(self) -> None:
         from mien.commands.stages.converting import convert
 
-        convert(self.workspace, self.out, self.webgpu)
+        convert(self.workspace, self.out, self._webcam_files(), self.webgpu)
 
     def _check_folder(self) -> None:
         from mien.files import check_writable
@@ -188,7 +210,7 @@ class Command:
             fields = (driven.expression, driven.joints, driven.head_rotation, driven.head_translation)
             motion = Motion(*(tensor.detach().float().numpy() for tensor in fields), fps=fps / self.every)
         if self.out.suffix.lower() == ".html":
-            page = write_page(self.out, portable, motion, webgpu=self.webgpu)
+            page = write_page(self.out, portable, motion, self._webcam_files(), self.webgpu)
         else:
             page = write_packed(self.out, portable, motion)
         moves = "" if motion is None else f", a motion of {len(motion):,} frames"

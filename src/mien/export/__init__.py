@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mien.export.spz import read_spz, write_spz
     from mien.export.usd import read_usd, write_usd
     from mien.export.web_page import WrittenPage, write_packed, write_page
+    from mien.export.webcam import WebcamFiles, find_webcam_files
     from mien.export.world_space import in_world
 else:
     __getattr__, __dir__ = lazy_names(
@@ -39,6 +40,7 @@ else:
             "spz": ["read_spz", "write_spz"],
             "usd": ["read_usd", "write_usd"],
             "web_page": ["WrittenPage", "write_packed", "write_page"],
+            "webcam": ["WebcamFiles", "find_webcam_files"],
         },
     )  # fmt: skip
 
@@ -47,8 +49,10 @@ __all__ = [
     "Glb",
     "MeshModel",
     "Motion",
+    "WebcamFiles",
     "WrittenGlb",
     "WrittenPage",
+    "find_webcam_files",
     "in_world",
     "pack",
     "read_gaussian_avatars_folder",

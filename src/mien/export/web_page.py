@@ -12,6 +12,7 @@ import numpy as np
 
 from mien import runtime
 from mien.export.packed import Motion, pack, unpacked
+from mien.export.webcam import POLICY, WebcamFiles, webcam_part
 from mien.files import check_writable, write_atomically
 from mien.runtime import PortableAvatar
 
@@ -36,21 +37,30 @@ class WrittenPage:
     with all expressions at a quarter of their range, 512x512, over white."""
 
 
-def write_page(path: Path, avatar: PortableAvatar, motion: Motion | None = None, webgpu: bool = False) -> WrittenPage:
+def write_page(
+    path: Path,
+    avatar: PortableAvatar,
+    motion: Motion | None = None,
+    webcam: WebcamFiles | None = None,
+    webgpu: bool = False,
+) -> WrittenPage:
     """Write a page with an avatar, and a motion that it can play, as one file.
 
     Args:
         path: The file to write.
         avatar: The avatar.
         motion: What the page can play. None for nothing.
+        webcam: Files of the face landmarker, with which a webcam can drive the avatar. None for no webcam.
         webgpu: Whether the page draws with WebGPU where the browser has it on a GPU. WebGL2 is the default.
 
     Raises:
-        UserError: pages cannot draw the avatar's network, or the path cannot be written.
+        UserError: pages cannot draw the avatar's network, a file cannot be read, or the path cannot be written.
     """
     check_writable(path)
     packed = base64.b64encode(pack(avatar, motion)).decode()
-    page = TEMPLATE.read_text(encoding="utf-8").replace("{{title}}", html.escape(avatar.about.name))
+    page = TEMPLATE.read_text(encoding="utf-8").replace("{{policy}}", POLICY if webcam else "")
+    page = page.replace("{{webcam}}", webcam_part(webcam) if webcam else "")
+    page = page.replace("{{title}}", html.escape(avatar.about.name))
     gpu = f"\n<script>{WEBGPU.read_text(encoding='utf-8').strip()}</script>" if webgpu else ""
     page = page.replace("{{webgpu}}", gpu)
     content = page.replace("{{avatar}}", packed).encode()

@@ -5,16 +5,17 @@ from pathlib import Path
 import torch
 
 from mien import runtime
-from mien.export import in_world, read_glb_avatar, write_packed, write_page, write_pose
+from mien.export import WebcamFiles, in_world, read_glb_avatar, write_packed, write_page, write_pose
 from mien.gaussians import Gaussians
 from mien.progress import say
 from mien.runtime import PortableAvatar, read_portable, write_portable
 
 
-def convert(source: Path, out: Path, webgpu: bool = False) -> None:
+def convert(source: Path, out: Path, webcam: WebcamFiles | None = None, webgpu: bool = False) -> None:
     """Write the avatar in a file as .mien, .html, .packed, or at rest with the head at the origin, and report it.
 
-    `webgpu` says whether a .html page draws with WebGPU where the browser has it.
+    `webcam` are files of the face landmarker for a .html page, and `webgpu` says whether it draws with WebGPU where the
+    browser has it.
 
     Raises:
         UserError: the file is missing, damaged or foreign, or the avatar cannot be written so.
@@ -24,7 +25,7 @@ def convert(source: Path, out: Path, webgpu: bool = False) -> None:
     if ending == ".mien":
         write_portable(out, avatar)
     elif ending == ".html":
-        write_page(out, avatar, webgpu=webgpu)
+        write_page(out, avatar, webcam=webcam, webgpu=webgpu)
     elif ending == ".packed":
         write_packed(out, avatar)
     else:

@@ -1,0 +1,452 @@
+"""A webcam in the exported page: a drawn head drives it, and nothing leaves the page."""
+
+import json
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mien import runtime
+from mien.cli import main
+from mien.errors import UserError
+from mien.export import find_webcam_files, write_packed, write_page
+from mien.export.webcam import POLICY, TEMPLATE, VERSION
+from test_web_element import served
+from web_case import WEB, browse, build, chromium, drawn_head, node, tasks_vision
+from webcam_case import CELL, STILL, TRUE, Clip, write_clip
+
+FAKE = "--use-fake-device-for-media-stream"
+ALLOWED = "--use-fake-ui-for-media-stream"
+DENIED = "--deny-permission-prompts"
+WINDOW = (640, 320)
+CORRELATION = 0.9
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("built"))
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
+    return write_clip(tmp_path_factory.mktemp("clip"))
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory, test_data: Path) -> Path:
+    """A page with few Gaussians, so that software WebGL leaves time for the detector."""
+    chromium()
+    tasks_vision()
+    path = tmp_path_factory.mktemp("page") / "me.html"
+    write_page(path, drawn_head(150), webcam=find_webcam_files(test_data / "mediapipe" / "face_landmarker.task"))
+    return path
+
+
+def in_front(clip: Clip) -> list[str]:
+    return [FAKE, ALLOWED, f"--use-file-for-fake-video-capture={clip.path}"]
+
+
+def test_the_committed_part_of_the_page_is_that_of_a_fresh_build(built: Path) -> None:
+    fresh = (built / "webcam.html").read_text()
+    assert fresh == TEMPLATE.read_text(), "webcam.html is older than web/: run `make web`, and commit it"
+
+
+RECORD = """(async () => {
+  const viewer = await mien, camera = await webcam, log = { frames: [], faces: [], states: [] };
+  const columns = %s.map((name) => viewer.avatar.expression_names.indexOf(name));
+  const brush = new OffscreenCanvas(1, 440).getContext("2d", { willReadFrequently: true });
+  const until = async (ready) => { while (!ready()) await new Promise((done) => setTimeout(done, 20)); };
+  const { onState, onReading, video } = camera, button = document.getElementById("camera");
+  camera.onState = (state, why) => (onState(state, why), log.states.push(state));
+  camera.onReading = (reading) => {
+    onReading(reading);
+    const { expression, head_rotation } = viewer.face, driven = columns.map((k) => expression[k]);
+    log.faces.push([performance.now(), reading.milliseconds, reading.work, head_rotation[1], ...driven]);
+  };
+  document.getElementById("mirrored").click();
+  button.click();
+  await until(() => camera.state === "calibrating");
+  const see = (now) => {
+    brush.drawImage(video, %d, 0, 1, 440, 0, 0, 1, 440);
+    const pixels = brush.getImageData(0, 0, 1, 440).data, bit = (k) => +(pixels[4 * (40 * k + 20)] > 128);
+    let number = 0, parity = 0;
+    for (let k = 0; k < 10; ++k) (number += bit(k) << k), (parity ^= bit(k));
+    if (parity === bit(10)) log.frames.push([now, number]);
+    if (video.srcObject) video.requestVideoFrameCallback(see);
+  };
+  video.requestVideoFrameCallback(see);
+  const frame = () => log.frames.at(-1)?.[1] ?? -1;
+  // The automatic neutral face may be any; the button takes that of the still part.
+  await until(() => camera.state === "running");
+  await until(() => frame() > 90);
+  await until(() => frame() < 3);
+  document.getElementById("neutral").click();
+  await until(() => camera.state === "running");
+  log.start = log.faces.length;
+  await until(() => frame() > 90);
+  await until(() => frame() < 3);
+  await until(() => frame() > 90);
+  const tracks = video.srcObject.getTracks();
+  button.click();
+  log.ended = tracks.every((track) => track.readyState === "ended");
+  const rest = viewer.avatar.neutral.expression;
+  log.rested = viewer.face.expression.every((value, k) => value === rest[k]);
+  log.label = button.textContent;
+  return log;
+})()"""
+
+
+@pytest.mark.slow
+def test_a_drawn_head_drives_jaw_and_blinks(page: Path, clip: Clip) -> None:
+    """Coefficients of the avatar against the true ones of the picture that the detector saw."""
+    told = browse(page, [RECORD % (json.dumps(TRUE), CELL // 2)], WINDOW, flags=in_front(clip))
+    (log,) = told["results"]
+    assert told["messages"] == []
+    # The worker's script and two scripts of MediaPipe, all from the page's own memory.
+    assert [address.partition(":")[0] for address in told["requests"]] == ["blob"] * len(told["requests"])
+    assert log["states"] == ["opening", "calibrating", "running", "calibrating", "running", "off"]
+    assert log["ended"] is True
+    assert log["rested"] is True
+    assert log["label"] == "Use my camera"
+
+    frames = np.array(log["frames"])
+    faces = np.array(log["faces"][log["start"] :])
+    shown, seen, driven = faces[:, 0], faces[:, 1], faces[:, 4:]
+    number = frames[np.abs(frames[:, :1] - seen).argmin(0), 1].astype(int)
+    rate, delays = 1000 * (len(faces) - 1) / (shown[-1] - shown[0]), []
+    for column, name in enumerate(TRUE):
+        r = np.corrcoef(clip.truth[number, column], driven[:, column])[0, 1]
+        delays.append(delay(frames[:, 0], clip.truth[frames[:, 1].astype(int), column], shown, driven[:, column]))
+        print(f"{name}: r = {r:.3f}, {delays[-1]:.0f} ms after the picture, {rate:.1f} faces a second")
+        assert r >= CORRELATION
+        assert np.abs(driven[number < STILL, column]).mean() < 0.1
+        assert driven[:, column].max() > 0.7 * clip.truth[:, column].max()
+    print(f"median: {np.median(faces[:, 2]):.0f} ms of the detector, {np.median(shown - seen):.0f} ms until driven")
+    assert 0 <= max(delays) < 2000
+    turned = faces[:, 3] - float(drawn_head(1).neutral.head_rotation[1])
+    assert np.corrcoef(clip.yaw[number], turned)[0, 1] >= CORRELATION
+    assert np.polyfit(clip.yaw[number], turned, 1)[0] == pytest.approx(1, abs=0.3)
+
+
+def delay(told: np.ndarray, truth: np.ndarray, shown: np.ndarray, driven: np.ndarray) -> float:
+    """Return how long after a picture the page shows it, in ms: where the cross correlation is largest."""
+    grid = np.arange(shown[0] + 2000, shown[-1], 10.0)
+
+    def held(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+        return values[np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(values) - 1)]
+
+    now = held(shown, driven, grid)
+    lags = np.arange(0, 2000, 10.0)
+    return float(lags[np.argmax([np.corrcoef(held(told, truth, grid - lag), now)[0, 1] for lag in lags])])
+
+
+PRESS = """(async () => {
+  await webcam;
+  %s
+  const button = document.getElementById("camera"), told = document.getElementById("camera-state");
+  button.click();
+  const said = () => /^(The camera|There|This|Browsers)/.test(told.textContent);
+  for (let i = 0; i < 500 && !said(); ++i) await new Promise((done) => setTimeout(done, 20));
+  return [told.textContent, button.textContent, told.getAttribute("role"), (await webcam).state];
+})()"""
+NO_CAMERA_API = "Object.defineProperty(navigator, 'mediaDevices', { value: undefined });"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("flags", "before", "message"),
+    [
+        ([FAKE, DENIED], "", "The camera is not allowed. Allow it for this page"),
+        ([ALLOWED], "", "There is no camera. Connect one"),
+        ([], NO_CAMERA_API, "This browser gives no camera to a page from a file. Open the file with Chrome"),
+    ],
+)
+def test_what_is_wrong_is_said(page: Path, flags: list[str], before: str, message: str) -> None:
+    told = browse(page, [PRESS % before], WINDOW, flags=flags)
+    text, label, role, state = told["results"][0]
+    assert text.startswith(message)
+    assert (label, role, state) == ("Use my camera", "status", "off")
+    assert told["requests"] == []
+
+
+HIDE = """(async () => {
+  const camera = await webcam, { video } = camera;
+  document.getElementById("camera").click();
+  while (camera.state !== "running") await new Promise((done) => setTimeout(done, 20));
+  const tracks = video.srcObject.getTracks();
+  const before = tracks.map((track) => track.readyState);
+  Object.defineProperty(document, "hidden", { value: true, configurable: true });
+  document.dispatchEvent(new Event("visibilitychange"));
+  const after = tracks.map((track) => track.readyState);
+  delete document.hidden;
+  const text = document.getElementById("camera-state").textContent;
+  document.getElementById("camera").click();
+  while (camera.state !== "running") await new Promise((done) => setTimeout(done, 20));
+  camera.stop();
+  return [before, after, text, camera.state];
+})()"""
+
+TRY_TO_SEND = """(async () => {
+  const away = "https://example.com/", refused = new Set();
+  document.addEventListener("securitypolicyviolation", (event) => refused.add(event.effectiveDirective));
+  fetch(away).catch(() => {});
+  try { new WebSocket("wss://example.com/"); } catch {}
+  navigator.sendBeacon(away, "x");
+  const [image, form, frame, script] = ["img", "form", "iframe", "script"].map((name) => document.createElement(name));
+  image.src = frame.src = script.src = form.action = away;
+  document.body.append(form, frame, script);
+  form.submit();
+  await new Promise((done) => setTimeout(done, 1000));
+  return [...refused].sort();
+})()"""
+
+
+@pytest.mark.slow
+def test_the_camera_stops_when_the_page_is_hidden_and_starts_again(page: Path, clip: Clip) -> None:
+    told = browse(page, [HIDE], WINDOW, flags=in_front(clip))
+    before, after, text, state = told["results"][0]
+    assert (before, after, state) == (["live"], ["ended"], "off")
+    assert text == "The camera is off, because the page was hidden."
+
+
+@pytest.mark.slow
+def test_the_page_could_send_nothing(page: Path) -> None:
+    """Its own policy forbids every way out."""
+    told = browse(page, [TRY_TO_SEND], WINDOW)
+    assert told["results"][0] == ["connect-src", "form-action", "frame-src", "img-src", "script-src-elem"]
+
+
+CONTROLS = """(async () => {
+  const camera = await webcam;
+  camera.onState("running");
+  const controls = document.querySelectorAll("#camera-controls button, #camera-controls input");
+  return [...controls].map((control) => [control.id, control.tabIndex, control.offsetParent !== null,
+    (control.labels?.[0]?.textContent ?? control.textContent).trim()]);
+})()"""
+
+
+@pytest.mark.slow
+def test_every_control_has_a_name_and_is_reached_by_keys(page: Path) -> None:
+    told = browse(page, [CONTROLS], (900, 900))
+    assert told["results"][0] == [
+        ["camera", 0, True, "Stop the camera"],
+        ["neutral", 0, True, "This is my neutral face"],
+        ["mirrored", 0, True, "As in a mirror"],
+        ["preview", 0, True, "Show my picture"],
+    ]
+
+
+def found(
+    seconds: float, scores: dict[str, float], rotvec: Sequence[float] = (0, 0, 0), at: Sequence[float] = (0, 0, 0)
+):
+    """Return what a detector says about a picture: a head in front of the camera, with place in metres."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = 1.1 * Rotation.from_rotvec(rotvec).as_matrix()
+    matrix[:3, 3] = 100 * np.asarray(at) + (0, 0, -40)
+    return {
+        "scores": list(scores.items()), "matrix": matrix.T.reshape(-1).tolist(), "milliseconds": 1000 * seconds,
+        "work": 1,
+    }  # fmt: skip
+
+
+def followed(built: Path, mirrored: bool, pictures: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    given = json.dumps({"mirrored": mirrored, "found": pictures, **more})
+    command = [node(), str(WEB / "tests" / "webcam.mjs"), str(built / "webcam.js")]
+    done = subprocess.run(command, input=given, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+AT_REST = {"jawOpen": 0.1, "eyeBlinkLeft": 0.2, "eyeBlinkRight": 0.15, "mouthSmileLeft": 0.3, "mouthSmileRight": 0.3}
+REST_TURN = [0.1, 0.2, -0.05]
+
+
+def second_at_rest() -> list[dict[str, Any]]:
+    """A second of a face at rest, with a blink in it."""
+    blink = AT_REST | {"eyeBlinkLeft": 0.7, "eyeBlinkRight": 0.7}
+    return [found(i / 30, blink if i in (9, 10, 11) else AT_REST, REST_TURN, (0.02, 0, 0)) for i in range(31)]
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_faces_are_relative_to_the_neutral_one(built: Path, mirrored: bool) -> None:
+    """Held for two seconds, so that no smoothing is left."""
+    held = {"jawOpen": 1.0, "eyeBlinkLeft": 0.75, "eyeBlinkRight": 0.15, "mouthSmileLeft": 0.1, "mouthSmileRight": 0.3}
+    turn = (Rotation.from_rotvec(REST_TURN) * Rotation.from_rotvec([0.2, 0.3, 0.1])).as_rotvec()
+    at = np.array([0.02, 0, 0]) + Rotation.from_rotvec(REST_TURN).as_matrix() @ [0.01, 0.02, -0.005]
+    rest = second_at_rest()
+    told = followed(built, mirrored, rest + [found(1.1 + i / 30, held, turn, at) for i in range(60)])["readings"]
+    assert told[: len(rest) - 1] == [None] * (len(rest) - 1)
+    first, last = told[len(rest) - 1], told[-1]
+    assert all(abs(value) < 1e-6 for value in first["scores"].values())
+    np.testing.assert_allclose(first["turn"], np.eye(3).reshape(-1), atol=1e-6)
+    closed, open_ = ("eyeblinkright", "eyeblinkleft") if mirrored else ("eyeblinkleft", "eyeblinkright")
+    less, same = ("mouthsmileright", "mouthsmileleft") if mirrored else ("mouthsmileleft", "mouthsmileright")
+    expected = {"jawopen": 1, closed: 1, open_: 0, less: -0.2, same: 0}
+    assert last["scores"] == pytest.approx(expected, abs=1e-3)
+    side = -1 if mirrored else 1
+    expected_turn = Rotation.from_rotvec([0.2, side * 0.3, side * 0.1]).as_matrix()
+    np.testing.assert_allclose(np.reshape(last["turn"], (3, 3)), expected_turn, atol=1e-2)
+    np.testing.assert_allclose(last["shift"], [side * 0.01, 0.02, -0.005], atol=1e-3)
+
+
+def test_the_button_takes_another_neutral_face(built: Path) -> None:
+    smile = AT_REST | {"mouthSmileLeft": 0.6, "mouthSmileRight": 0.6}
+    pictures = second_at_rest() + [found(1.1 + i / 30, smile) for i in range(60)]
+    told = followed(built, False, pictures, recalibrate=40)["readings"]
+    assert told[45]["calibrating"] is True
+    assert told[45]["scores"]["mouthsmileleft"] > 0.2
+    assert told[-1]["calibrating"] is False
+    assert abs(told[-1]["scores"]["mouthsmileleft"]) < 1e-2
+
+
+def test_pictures_without_a_face_say_nothing(built: Path) -> None:
+    lost = {"scores": None, "matrix": None, "milliseconds": 2000, "work": 1}
+    assert followed(built, True, [*second_at_rest(), lost])["readings"][-1] is None
+
+
+def test_a_head_that_goes_far_away_stays_in_the_picture(built: Path) -> None:
+    far = [found(1.1 + i / 30, AT_REST, REST_TURN, (0.5, -0.4, -1)) for i in range(60)]
+    last = followed(built, False, second_at_rest() + far)["readings"][-1]
+    assert np.abs(last["shift"]).max() <= 0.08
+
+
+def test_smoothing_calms_what_is_still_and_follows_what_is_fast(built: Path) -> None:
+    """Tremble falls to less than half; a blink keeps nine tenths of its height and comes less than a picture late."""
+    random, step = np.random.default_rng(0), 1 / 30
+    time = np.arange(300) * step
+    blink = np.where((time > 5) & (time < 5.3), np.sin(np.pi * (time - 5) / 0.3) ** 2, 0)
+    values = 0.006 * random.standard_normal(300) + blink
+    smooth = {"smoothing": {"rest": 1, "follow": 8}, "values": values.tolist(), "step": step}
+    smoothed = np.array(followed(built, False, [], smooth=smooth)["smoothed"])
+    still = np.s_[30:140]
+    assert np.diff(smoothed[still]).std() < 0.45 * np.diff(values[still]).std()
+    assert smoothed.max() > 0.9 * values.max()
+    fine = np.arange(4.8, 5.6, 0.001)
+    late = [
+        np.corrcoef(np.interp(fine - lag, time, values), np.interp(fine, time, smoothed))[0, 1] for lag in (0, 0.0333)
+    ]
+    assert late[0] > 0.95
+    assert late[0] > late[1]
+
+
+def test_a_page_without_a_webcam_has_nothing_of_it(tmp_path: Path, test_data: Path) -> None:
+    tasks_vision()
+    files = find_webcam_files(test_data / "mediapipe" / "face_landmarker.task")
+    portable = drawn_head(10)
+    write_page(tmp_path / "a.html", portable)
+    write_page(tmp_path / "b.html", portable, webcam=files)
+    plain, camera = (tmp_path / "a.html").read_text(), (tmp_path / "b.html").read_text()
+    assert "webcam" not in plain
+    assert "{{" not in plain
+    assert "blob:" not in plain
+    assert "{{" not in camera.replace(camera[camera.index('id="webcam-vision"') :], "")
+    assert f"script-src 'unsafe-inline'{POLICY}; style-src" in camera
+    assert "connect-src 'none'" in POLICY
+    assert "Nothing leaves this page" in camera
+    assert 5_000_000 < len(camera) < 10_000_000
+    write_page(tmp_path / "c.html", portable, webcam=files)
+    assert (tmp_path / "c.html").read_text() == camera
+
+
+@pytest.fixture
+def avatar_file(tmp_path: Path) -> Path:
+    path = tmp_path / "me.mien"
+    runtime.write_portable(path, drawn_head(10))
+    return path
+
+
+def exported(avatar_file: Path, *more: str) -> int:
+    return main(["export", str(avatar_file), "--out", str(avatar_file.with_name("me.html")), *more])
+
+
+def test_the_command_writes_a_webcam(avatar_file: Path, test_data: Path) -> None:
+    tasks_vision()
+    model = test_data / "mediapipe" / "face_landmarker.task"
+    assert exported(avatar_file, "--webcam", "--webcam-model", str(model)) == 0
+    assert 'id="webcam-model"' in avatar_file.with_name("me.html").read_text()
+
+
+def test_a_missing_model_is_explained(
+    avatar_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    tasks_vision()
+    monkeypatch.delenv("MIEN_FACE_LANDMARKER", raising=False)
+    assert exported(avatar_file, "--webcam") == 2
+    told = capsys.readouterr().err
+    assert "--webcam: no model" in told
+    assert "--webcam-model FILE" in told
+    assert "https://" in told
+    model = tmp_path / "any.task"
+    monkeypatch.setenv("MIEN_FACE_LANDMARKER", str(model))
+    assert exported(avatar_file, "--webcam") == 2
+    assert f"{model}: no such file" in capsys.readouterr().err
+    for content in (b"", b"PK\x03\x04 no archive"):
+        model.write_bytes(content)
+        assert exported(avatar_file, "--webcam") == 2
+        assert "is no face_landmarker.task with blend shapes" in capsys.readouterr().err
+    assert not avatar_file.with_name("me.html").exists()
+
+
+def test_a_missing_or_other_package_is_explained(
+    avatar_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "package"
+    folder.mkdir()
+    monkeypatch.setenv("MIEN_TASKS_VISION", str(folder))
+    assert exported(avatar_file, "--webcam") == 2
+    told = capsys.readouterr().err
+    assert "make web-packages" in told
+    assert f"@mediapipe/tasks-vision@{VERSION}" in told
+    (folder / "package.json").write_text('{"version": "1.0.1"}')
+    assert exported(avatar_file, "--webcam") == 2
+    assert "is version 1.0.1" in capsys.readouterr().err
+    (folder / "package.json").write_text(json.dumps({"version": VERSION}))
+    with pytest.raises(UserError, match=r"lacks vision_bundle\.cjs"):
+        find_webcam_files(tmp_path / "any")
+
+
+def test_options_that_do_not_fit_are_refused(avatar_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exported(avatar_file, "--webcam-model", "a.task") == 2
+    assert "together with --webcam" in capsys.readouterr().err
+    assert main(["export", str(avatar_file), "--out", "me.packed", "--webcam"]) == 2
+    assert "only an .html page has a webcam" in capsys.readouterr().err
+
+
+def test_the_pinned_version_is_the_same_everywhere() -> None:
+    package = json.loads((WEB / "package.json").read_text())
+    assert package["devDependencies"]["@mediapipe/tasks-vision"] == VERSION
+
+
+CLASS = """(async () => {
+  const avatar = document.querySelector("mien-avatar"), told = document.querySelector("span");
+  const until = async (ready) => { while (!ready()) await new Promise((done) => setTimeout(done, 20)); };
+  await until(() => avatar.viewer);
+  document.querySelector("button").click();
+  await until(() => told.textContent === "running" || told.textContent.includes("fetched"));
+  if (told.textContent !== "running") return told.textContent;
+  const jaw = avatar.viewer.avatar.expression_names.indexOf("jawOpen"), { expression } = avatar.viewer.face;
+  await until(() => expression[jaw] > 0.25);
+  await until(() => expression[jaw] < 0.1);
+  return told.textContent;
+})()"""
+
+
+@pytest.mark.slow
+def test_the_class_drives_the_element(tmp_path: Path, built: Path, clip: Clip, test_data: Path) -> None:
+    """The example page, from a web server, with files of the package and the model beside it."""
+    write_packed(tmp_path / "me.packed", drawn_head(150))
+    for name in ("element.js", "webcam.js"):
+        shutil.copy(built / name, tmp_path)
+    shutil.copy(WEB / "examples" / "webcam.html", tmp_path / "index.html")
+    (tmp_path / "tasks-vision").symlink_to(tasks_vision())
+    with served(tmp_path) as address:
+        without = browse(f"{address}/index.html", [CLASS], WINDOW, flags=in_front(clip))
+        (tmp_path / "face_landmarker.task").symlink_to(test_data / "mediapipe" / "face_landmarker.task")
+        told = browse(f"{address}/index.html", [CLASS], WINDOW, flags=in_front(clip))
+    assert without["results"] == ["face_landmarker.task cannot be fetched: the server answers 404."]
+    assert told["results"] == ["running"]
+    assert all(request.startswith((address, "blob:")) for request in told["requests"])

@@ -1,0 +1,36 @@
+// From a driver's face to an avatar's, as src/mien/driving/transfer.py does it: what moves relative to the driver at rest
+// is added to the avatar at rest, within the limits that the avatar has.
+
+import type { Avatar, Face } from "./avatar";
+import { axisAngle, multiplied, rotationMatrix } from "./rigid";
+
+/** Angle of the eyes at a coefficient eyeLook of 1, in radians. */
+const LOOK_ANGLE = Math.PI / 6;
+/** Pitch that eyes come near but do not exceed, up and down, in radians: beyond it, the lids would cover the iris. */
+const MOST_UP = (14 * Math.PI) / 180, MOST_DOWN = (18 * Math.PI) / 180;
+
+/**
+ * Fills `face` with a driver's face.
+ * @param scores Coefficients by the names of ARKit in lower case; missing names are 0, as the driver at rest.
+ * @param turn Rotation of the head relative to the driver at rest, row-major.
+ * @param shift Motion of the head relative to the driver at rest, in the axes of the head at rest, in metres.
+ */
+export function transfer(scores: ReadonlyMap<string, number>, turn: ArrayLike<number>, avatar: Avatar, face: Face, shift: readonly number[] = [0, 0, 0]): void {
+  const { neutral, expression_names: names, expression_bounds: bounds, joint_names: joints } = avatar;
+  const score = (name: string) => scores.get(name) ?? 0;
+  names.forEach((name, e) => {
+    face.expression[e] = Math.min(Math.max(neutral.expression[e] + score(name.toLowerCase()), bounds[2 * e]), bounds[2 * e + 1]);
+  });
+  face.joints.set(neutral.joints);
+  for (const [joint, side, left, right] of [["left_eye", "left", "out", "in"], ["right_eye", "right", "in", "out"]]) {
+    const j = joints.indexOf(joint);
+    if (j < 0) continue;
+    const look = (way: string) => LOOK_ANGLE * score(`eyelook${way}${side}`);
+    const pitch = look("down") - look("up"), most = pitch < 0 ? MOST_UP : MOST_DOWN;
+    const gaze = rotationMatrix([most * Math.tanh(pitch / most), look(left) - look(right), 0], 0);
+    face.joints.set(axisAngle(multiplied(rotationMatrix(neutral.joints, 3 * j), gaze)), 3 * j);
+  }
+  const rest = rotationMatrix(neutral.head_rotation, 0);
+  face.head_rotation.set(axisAngle(multiplied(rest, turn)));
+  face.head_translation.set(neutral.head_translation.map((at, k) => at + rest[3 * k] * shift[0] + rest[3 * k + 1] * shift[1] + rest[3 * k + 2] * shift[2]));
+}

@@ -1,0 +1,235 @@
+// A webcam as a driver: MediaPipe's face landmarker in a worker, relative to one's own neutral face, smoothed.
+
+import { Follower, type Found, type Reading } from "./follower";
+import { transfer } from "./transfer";
+import type { Viewer } from "./viewer";
+
+/** The worker's script (build.mjs). */
+declare const DETECTOR: string;
+
+export { Follower } from "./follower";
+export type { Found, Reading } from "./follower";
+export { OneEuro } from "./one_euro";
+export type { Smoothing } from "./one_euro";
+
+/** Files of the npm package @mediapipe/tasks-vision, version 0.10.35, and the model: each by its address, or its content. */
+export interface DetectorParts {
+  /** vision_bundle.cjs. */
+  vision: string | ArrayBuffer;
+  /** wasm/vision_wasm_internal.js. */
+  loader: string | ArrayBuffer;
+  /** wasm/vision_wasm_internal.wasm. */
+  wasm: string | ArrayBuffer;
+  /** face_landmarker.task. */
+  model: string | ArrayBuffer;
+}
+
+export type WebcamState = "off" | "opening" | "calibrating" | "running" | "no face";
+
+/** What went wrong. Its message tells a person what to do. */
+export class WebcamError extends Error {}
+
+/** Milliseconds without a face after which the state says so. */
+const LOST_AFTER = 1000;
+
+export class Webcam {
+  /** The camera's picture, for a preview. */
+  readonly video = document.createElement("video");
+  /** Called with each face, after the avatars have taken it. */
+  onReading: (reading: Reading) => void = () => {};
+  /** Called when the state changes. `why` is set when the camera has stopped by itself. */
+  onState: (state: WebcamState, why?: string) => void = () => {};
+
+  private current: WebcamState = "off";
+  private worker: Worker | null = null;
+  private opened: Promise<void> | null = null;
+  private busy = false;
+  private run = 0;
+  private last = -1;
+  private seen = 0;
+  private send: () => void = () => {};
+  private follower = new Follower();
+  private readonly viewers = new Set<Viewer>();
+  private readonly hide = () => document.hidden && this.stop("The camera is off, because the page was hidden.");
+  private readonly leave = () => this.stop();
+
+  /** `parts` is called at the first start, so that a page loads nothing large before. */
+  constructor(private readonly parts: () => DetectorParts | Promise<DetectorParts>) {
+    this.video.muted = this.video.playsInline = true;
+  }
+
+  get state(): WebcamState {
+    return this.current;
+  }
+
+  /** Whether left and right are exchanged, as in a mirror; at first they are. */
+  get mirrored(): boolean {
+    return this.follower.mirrored;
+  }
+
+  set mirrored(mirrored: boolean) {
+    this.follower.mirrored = mirrored;
+  }
+
+  /**
+   * Asks for the camera, and starts. The first second is taken as the neutral face.
+   * @throws WebcamError if there is no camera, or it may not be used.
+   */
+  async start(): Promise<void> {
+    if (this.current !== "off") return;
+    const run = ++this.run;
+    this.become("opening");
+    try {
+      const stream = await camera();
+      if (run !== this.run) return stop(stream);
+      this.video.srcObject = stream;
+      stream.getVideoTracks()[0].addEventListener("ended", () => this.stop("The camera was taken away or switched off."));
+      document.addEventListener("visibilitychange", this.hide);
+      addEventListener("pagehide", this.leave);
+      await Promise.all([this.video.play(), (this.opened ??= this.open())]);
+      if (run !== this.run) return;
+    } catch (error) {
+      if (run !== this.run) return; // stopped while it opened
+      this.stop();
+      throw error instanceof WebcamError ? error : new WebcamError(`The camera cannot be used: ${(error as Error).message ?? error}`);
+    }
+    const { mirrored } = this;
+    this.follower = new Follower();
+    this.mirrored = mirrored;
+    this.seen = performance.now();
+    this.become("calibrating");
+    this.watch(run);
+  }
+
+  /** Switches the camera off. */
+  stop(why?: string): void {
+    if (this.current === "off") return;
+    ++this.run;
+    stop(this.video.srcObject as MediaStream | null);
+    this.video.srcObject = null;
+    document.removeEventListener("visibilitychange", this.hide);
+    removeEventListener("pagehide", this.leave);
+    this.become("off", why);
+  }
+
+  /** Takes the face of the next second as the neutral one. */
+  calibrate(): void {
+    if (this.current === "off") return;
+    this.follower.calibrate();
+    this.become("calibrating");
+  }
+
+  /** Drives an avatar, until the function that it returns is called. A motion that plays has precedence. */
+  attach(viewer: Viewer): () => void {
+    this.viewers.add(viewer);
+    return () => void this.viewers.delete(viewer);
+  }
+
+  private become(state: WebcamState, why?: string): void {
+    if (state === this.current && !why) return;
+    this.current = state;
+    this.onState(state, why);
+  }
+
+  /** Starts the worker. It stays for later starts. */
+  private async open(): Promise<void> {
+    try {
+      const parts: Record<string, ArrayBuffer> = {};
+      for (const [name, given] of Object.entries(await this.parts())) parts[name] = await bytes(given);
+      const address = URL.createObjectURL(new Blob([DETECTOR], { type: "text/javascript" }));
+      const worker = (this.worker = new Worker(address));
+      await new Promise<void>((done, fail) => {
+        worker.onerror = (event) => fail(new WebcamError(`The face detector does not start: ${event.message}`));
+        worker.onmessage = ({ data }) => (data.ready ? done() : fail(new WebcamError(`The face detector does not start: ${data.error}`)));
+        worker.postMessage({ parts }, Object.values(parts));
+      });
+      URL.revokeObjectURL(address);
+      worker.onerror = (event) => this.stop(`The face detector has failed: ${event.message}`);
+      worker.onmessage = ({ data }) => {
+        this.busy = false;
+        if (data.error) return this.stop(`The face detector has failed: ${data.error}`);
+        if (this.current !== "off" && this.current !== "opening") this.take(data);
+      };
+    } catch (error) {
+      this.worker?.terminate();
+      this.worker = this.opened = null;
+      throw error;
+    }
+  }
+
+  /** Sends each new picture to the worker. Pictures that come while it works are left out. */
+  private watch(run: number): void {
+    const { video } = this;
+    let newest = 0, sent = 0;
+    this.send = async () => {
+      if (this.run !== run || this.busy || newest <= sent) return;
+      this.busy = true;
+      // MediaPipe wants times that increase.
+      const milliseconds = (this.last = Math.max(newest, this.last + 1));
+      sent = newest;
+      try {
+        const picture = await createImageBitmap(video);
+        this.worker!.postMessage({ picture, milliseconds }, [picture]);
+      } catch {
+        this.busy = false; // the camera has just stopped
+      }
+    };
+    // Firefox has the first since version 132. The second may send a picture twice.
+    const wait = () => ("requestVideoFrameCallback" in video ? video.requestVideoFrameCallback(see) : requestAnimationFrame(see));
+    const see = (now: number) => {
+      if (this.run !== run) return;
+      newest = now;
+      this.send();
+      wait();
+    };
+    wait();
+  }
+
+  private take(found: Found): void {
+    this.send();
+    if (found.scores) this.seen = found.milliseconds;
+    else if (found.milliseconds - this.seen > LOST_AFTER) this.become("no face");
+    const reading = this.follower.follow(found);
+    if (found.scores) this.become(this.follower.calibrating ? "calibrating" : "running");
+    if (!reading) return;
+    for (const viewer of this.viewers) {
+      if (viewer.playing) continue;
+      transfer(reading.scores, reading.turn, viewer.avatar, viewer.face, reading.shift);
+      viewer.change();
+    }
+    this.onReading(reading);
+  }
+}
+
+const stop = (stream: MediaStream | null) => stream?.getTracks().forEach((track) => track.stop());
+
+async function bytes(given: string | ArrayBuffer): Promise<ArrayBuffer> {
+  if (typeof given !== "string") return given;
+  const answer = await fetch(given);
+  if (!answer.ok) throw new WebcamError(`${given} cannot be fetched: the server answers ${answer.status}.`);
+  return answer.arrayBuffer();
+}
+
+/** Opens the camera that faces the user, or says why not in words that help. */
+async function camera(): Promise<MediaStream> {
+  if (!navigator.mediaDevices?.getUserMedia)
+    throw new WebcamError(
+      location.protocol === "file:"
+        ? "This browser gives no camera to a page from a file. Open the file with Chrome or Edge, or put it on a web server with https."
+        : location.protocol === "http:"
+          ? "Browsers give a camera only to pages with https. Open this page by its https address."
+          : "This browser gives no camera to this page. Open it with another browser.",
+    );
+  try {
+    return await navigator.mediaDevices.getUserMedia({ audio: false, video: { facingMode: "user", width: { ideal: 640 }, height: { ideal: 480 }, frameRate: { ideal: 30 } } });
+  } catch (error) {
+    const { name, message } = error as DOMException;
+    const words: Record<string, string> = {
+      NotAllowedError: "The camera is not allowed. Allow it for this page (the camera sign beside the address), and press the button again. A page in a frame needs allow=\"camera\" there.",
+      NotFoundError: "There is no camera. Connect one, and press the button again.",
+      NotReadableError: "The camera does not answer. Close other programs that use it, and press the button again.",
+    };
+    const same: Record<string, string> = { SecurityError: "NotAllowedError", OverconstrainedError: "NotFoundError", DevicesNotFoundError: "NotFoundError", AbortError: "NotReadableError" };
+    throw new WebcamError(words[same[name] ?? name] ?? `The camera cannot be used: ${message || name}`);
+  }
+}
