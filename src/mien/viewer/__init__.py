@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mien.viewer.drawing import Look, Mesh, View
     from mien.viewer.loop import DrawingLoop
     from mien.viewer.server import serve
-    from mien.viewer.session import Clip, Session
+    from mien.viewer.session import Clip, Seen, Session
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
@@ -21,8 +21,8 @@ else:
             "drawing": ["Look", "Mesh", "View"],
             "loop": ["DrawingLoop"],
             "server": ["serve"],
-            "session": ["Clip", "Session"],
+            "session": ["Clip", "Seen", "Session"],
         },
     )
 
-__all__ = ["Clip", "Door", "DrawingLoop", "Look", "Mesh", "Session", "View", "is_loopback", "serve"]
+__all__ = ["Clip", "Door", "DrawingLoop", "Look", "Mesh", "Seen", "Session", "View", "is_loopback", "serve"]

@@ -53,7 +53,7 @@ class Place:
 
 def run_viewing_stage(avatar: Path, run: str | None, play: str | None, place: Place, follow: bool = False) -> None:
     """Show an avatar in browsers until Ctrl-C. With `follow`, show its file anew each time it changes."""
-    viewed = _of_file(avatar) if avatar.is_file() else _of_workspace(avatar, run)
+    viewed = open_viewed(avatar, run)
     clips = {name: _clip_of(viewed, folder, name) for name, folder in viewed.sequences.items()}
     if play is not None:
         clips[Path(play).name] = _clip_of(viewed, Path(play), None)
@@ -93,6 +93,11 @@ def _changed_at(path: Path) -> int | None:
         return path.stat().st_mtime_ns
     except OSError:
         return None
+
+
+def open_viewed(avatar: Path, run: str | None) -> Viewed:
+    """Open a .mien file, or a run of a workspace."""
+    return _of_file(avatar) if avatar.is_file() else _of_workspace(avatar, run)
 
 
 def _of_file(path: Path) -> Viewed:
@@ -142,7 +147,7 @@ def _clip_of(viewed: Viewed, by: Path, sequence: str | None) -> Callable[[], Cli
         face = drive(driver.face, driver.at_rest, subject, model.expression_bounds, True, str(by))
         portable = viewed.portable
         if portable.filmed is not None:
-            eye = _position(portable.camera)
+            eye = position(portable.camera)
             face, _ = keep_to_filmed(face, portable.filmed, subject, model.expression_bounds, eye)
         fields = (face.expression, face.joints, face.head_rotation, face.head_translation)
         return Clip(Motion(*map(as_array, fields), fps=driver.fps), driver.pictures)
@@ -150,6 +155,6 @@ def _clip_of(viewed: Viewed, by: Path, sequence: str | None) -> Callable[[], Cli
     return load
 
 
-def _position(camera: runtime.Camera) -> torch.Tensor:
+def position(camera: runtime.Camera) -> torch.Tensor:
     """The camera's centre in world space, in metres."""
     return torch.from_numpy((-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]).astype(np.float32))
