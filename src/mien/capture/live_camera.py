@@ -28,7 +28,7 @@ MOST_SIDE = 640
 _ASKED = {"framerate": "30", "video_size": "640x480"}
 """What a device is asked for first. One that cannot do it gives its own default."""
 _STREAM = {"fflags": "nobuffer", "flags": "low_delay", "timeout": "5000000"}
-_RETRY_SECONDS = 1.0
+_RETRY_SECONDS, _PATIENCE_SECONDS = 1.0, 2.0
 _FPS = 25.0
 
 
@@ -73,14 +73,17 @@ class LiveCamera:
         self._thread = threading.Thread(target=self._run, name="mien-camera", daemon=True)
 
     def __enter__(self) -> "LiveCamera":
-        """Open the camera, and start to read it.
+        """Open the camera.
 
         Raises:
             UserError: it cannot be opened. The message names the cameras that exist.
         """
-        self._first = self._open()
-        self._thread.start()
+        self._opened = self._open()
         return self
+
+    def start(self) -> None:
+        """Start to read."""
+        self._thread.start()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -88,8 +91,9 @@ class LiveCamera:
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
-        # A device may block in its driver; the thread is a daemon, and ends with the process.
-        self._thread.join(2.0)
+        if self._thread.is_alive():
+            # A device may block in its driver; the thread is a daemon, and ends with the process.
+            self._thread.join(_PATIENCE_SECONDS)
 
     def newest(self, after: int, seconds: float) -> LiveFrame | None:
         """The newest frame whose number is above `after`. Wait for it; None if none comes in time."""
@@ -107,7 +111,7 @@ class LiveCamera:
 
     def _run(self) -> None:
         try:
-            opened = self._first
+            opened = self._opened
             while not self._stopping:
                 if opened is None:
                     opened = self._reopen()

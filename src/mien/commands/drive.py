@@ -21,8 +21,8 @@ class Command:
     """Workspace folder of the avatar. For a camera, also a .mien file."""
     by: str
     """The driver: a workspace (also the avatar's own), a video file (tracked first, and kept in the cache), a .csv of
-    Live Link Face, a .json of blend shapes, or camera, which opens a viewer (docs/using.md). camera:/dev/video0 names
-    the device; camera:clip.mp4 plays a file as a camera."""
+    Live Link Face, a .json of blend shapes, a voice (.wav, .mp3, ...), or camera, which opens a viewer (docs/using.md).
+    camera:/dev/video0 names the device; camera:clip.mp4 plays a file as a camera."""
     out: Path | None = None
     """Output: an .mp4, a .webm, a folder or NAME_%06d.png. If the driver has pictures, they are on the left. A camera
     needs none; with an .mp4, it is recorded."""

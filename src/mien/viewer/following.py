@@ -105,6 +105,7 @@ class CameraSwitch:
     def _run(self, camera: LiveCamera, follower: Follower) -> None:
         try:
             with LandmarkDetector(several_faces=False) as detector:
+                camera.start()  # Only now, because the detector takes seconds to load.
                 self._follow(camera, follower, detector)
             self.error = camera.error
         except BaseException as error:  # noqa: BLE001
@@ -122,7 +123,7 @@ class CameraSwitch:
                     self._show(follower, None, last, time.monotonic())
                 continue
             number, last = frame.number, frame
-            for _ in range(camera.frames - frames):
+            for _ in range(camera.frames - frames if frames else 1):
                 self.meters.count("camera", frame.seconds)
             frames = camera.frames
             faces = detector.detect(frame.picture)

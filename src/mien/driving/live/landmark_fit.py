@@ -170,7 +170,7 @@ class LandmarkFit:
         pose_only: bool = False,
     ) -> Fitted:
         """Gauss-Newton steps from a start. Coefficients at a bound that a step would push beyond it take no part."""
-        at, rows = start, weights > 0
+        at, rows = start, slice(None) if weights.all() else np.flatnonzero(weights)
         pixels, share = centred[rows], weights[rows]
         for _ in range(steps):
             points = self._points(at)[rows]
@@ -185,7 +185,7 @@ class LandmarkFit:
             by_world[:, 0, 0], by_world[:, 1, 1] = focal / depth, -focal / depth
             by_world[:, 0, 2] = focal * world[:, 0] / depth**2
             by_world[:, 1, 2] = -focal * world[:, 1] / depth**2
-            by_turn = np.cross(turned[:, None], by_world)
+            by_turn = by_world @ _crosses(-turned)
             parts = [by_turn, by_world]
             if not pose_only:
                 parts.append((by_world @ at.rotation) @ self._basis[rows])
@@ -214,3 +214,10 @@ class LandmarkFit:
             error = float(np.sqrt((share * (offset**2).sum(1)).sum() / share.sum()))
             at = Fitted(rotation, translation, coefficients, error)
         return at
+
+
+def _crosses(vectors: Float[np.ndarray, "l 3"]) -> Float[np.ndarray, "l 3 3"]:
+    """The matrices that multiply a vector by these from the left, as a cross product."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
