@@ -78,7 +78,7 @@ def remedy() -> str:
     """What a message advises if a camera cannot be opened."""
     found = devices()
     if found:
-        return f"there are {', '.join(found)}"
+        return f"give camera: and one of these: {', '.join(found)}"
     return (
         "no camera was found on this machine; connect one, check that you may read it (on Linux, be in the group "
         "video), or let a video file play as a camera: --by camera:clip.mp4"

@@ -143,7 +143,7 @@ class LiveCamera:
         return opened
 
     def _read(self, frames: Iterator[tuple[float, av.VideoFrame]]) -> None:
-        """Keep each frame until the next one, at the time at which it comes, until the end or an error of the device."""
+        """Keep each frame when it comes, until the end or an error of the device."""
         display = Display(str(self.name), 1.0, MOST_SIDE)
         began: float | None = None
         with contextlib.suppress(av.error.FFmpegError, OSError):
@@ -193,12 +193,13 @@ def _device(name: CameraName) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]
     container = _open_device(name)
     with container:
         if not container.streams.video:
-            raise UserError(f"--by {name}: has no pictures; {remedy()}")
+            raise UserError(f"--by {name}: has no pictures; {_remedy(name)}")
         yield _timed(container, _FPS)
 
 
 def _open_device(name: CameraName) -> InputContainer:
     attempts = [_STREAM] if name.is_stream else [_ASKED, {}]
+    reason = ""
     for options in attempts:
         try:
             return av.open(name.device, "r", format=None if name.is_stream else name.format, options=options)
@@ -210,7 +211,11 @@ def _open_device(name: CameraName) -> InputContainer:
             reason = error.strerror or str(error)
             if isinstance(error, FileNotFoundError):
                 break
-    raise UserError(f"--by {name}: cannot be opened ({reason}); {remedy()}")
+    raise UserError(f"--by {name}: cannot be opened ({reason}); {_remedy(name)}")
+
+
+def _remedy(name: CameraName) -> str:
+    return "check the address, and that it can be reached from here" if name.is_stream else remedy()
 
 
 def _timed(container: InputContainer, fps: float) -> Iterator[tuple[float, av.VideoFrame]]:

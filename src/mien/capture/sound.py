@@ -50,7 +50,7 @@ def _packets(stream: "av.AudioStream", path: Path, samples: int) -> Iterator[av.
         if done >= samples:
             break
         content = np.zeros((2, samples - done), np.float32) if frame is None else frame.to_ndarray()
-        content = np.ascontiguousarray(content[:, : samples - done])
+        content = np.ascontiguousarray(content[:, : samples - done], np.float32)
         if content.shape[1] == 0:
             continue
         piece = av.AudioFrame.from_ndarray(content, format="fltp", layout="stereo")

@@ -147,11 +147,17 @@ def write_video(
     if first is None:
         raise UserError(f"{path}: no frames to write; check the selection of frames")
     options = {"crf": str(crf), "preset": preset}
-    write_atomically(path, lambda aside: _encode(aside, itertools.chain([first], iterator), first.shape, fps, options, sound))
+    write_atomically(
+        path, lambda aside: _encode(aside, itertools.chain([first], iterator), first.shape, fps, options, sound)
+    )
 
 
 def _encode(
-    path: Path, frames: Iterable[np.ndarray], shape: tuple[int, ...], fps: int | float, options: dict[str, str],
+    path: Path,
+    frames: Iterable[np.ndarray],
+    shape: tuple[int, ...],
+    fps: int | float,
+    options: dict[str, str],
     sound: tuple[Path, float] | None = None,
 ) -> None:
     height, width = shape[:2]
@@ -183,7 +189,7 @@ def _encode(
             )
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-        container.mux(packet for packet in (heard, *packets) if packet is not None)
+        container.mux([packet for packet in (heard, *packets) if packet is not None])
 
 
 def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:

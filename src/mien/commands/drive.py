@@ -55,7 +55,7 @@ class Command:
             raise UserError(f"--camera-format and --port: are for --by camera, and --by is {self.by}; leave them out")
         open_workspace(self.workspace).pick_run(self.run_name)
         if self.out is None:
-            raise UserError(f"--by {self.by}: needs --out FILE.mp4; only a camera has a viewer")
+            raise UserError(f"--by {self.by}: needs --out FILE.mp4; to watch it in a browser, use `mien view --play`")
         # The number of frames is known only after tracking, but a video or numbered pictures take any number.
         self.picture.plan(self.out, 2)
         check_driver(Path(self.by), self.sequence, self.fps)

@@ -257,8 +257,9 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
     if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
         raise UserError(f"--fps {fps:g}: is for the timecode of a .csv; give a number above 0, at most 1000")
     if not by.exists():
-        raise UserError(f"{by}: no such file or folder; give a workspace, a video, a csv of Live Link Face, a json, or "
-            "a sound file")
+        raise UserError(
+            f"{by}: no such file or folder; give a workspace, a video, a csv of Live Link Face, a json, or a sound file"
+        )
     if suffix in (".csv", ".json", *SOUND_ENDINGS) and sequence is not None:
         raise UserError(f"--sequence {sequence}: {by} has no sequences; leave --sequence out")
     if not by.is_file():

@@ -28,7 +28,7 @@ _LEAST_RANGE, _MOST_RANGE = 25.0, 45.0
 _GATE = 0.15
 """Share of this distance above the noise floor that still counts as silence."""
 _SILENCE = -55.0
-"""Loudness of full silence in dB below the loudest possible sound: files that are never louder do not move the mouth."""
+"""Loudness of silence in dB, where 0 is the loudest possible. Files that are never louder do not move the mouth."""
 _SHAPE = 1.6
 """Exponent from loudness to opening: between loudness in dB (1) and pressure (about 2)."""
 _SPLIT_LOW, _SPLIT_HIGH = 700.0, 2500.0
@@ -37,6 +37,8 @@ _JAW, _LOWER_LIP, _UPPER_LIP, _FUNNEL, _STRETCH = 0.55, 0.25, 0.12, 0.35, 0.3
 """Largest coefficients."""
 _LESS_JAW = 0.6
 """Share of the jaw's opening that high sounds take away."""
+_SWAY = (0.012, 0.02, 0.008)
+"""Sizes of the head's slow waves about x, y and z, in radians."""
 _BETWEEN, _CLOSING, _OPENING = 3.5, 0.08, 0.17
 """Mean time between blinks, and the times to close and to open, in seconds: as in the exported page."""
 
@@ -130,10 +132,12 @@ def _random(seed: int) -> float:
 
 
 def sway_at(seconds: Float[np.ndarray, " t"]) -> Float32[np.ndarray, "t 3"]:
-    """Turns of a head that is never quite still, as axis-angle vectors in radians: sums of slow waves. It starts at 0."""
-    waves = np.stack([
-        size * (np.sin(seconds * 0.61 * (1 + 0.37 * k) + 2.1 * k) + 0.6 * np.sin(seconds * 1.13 * (1 + 0.21 * k) + 4.3 * k))
-        for k, size in enumerate((0.012, 0.02, 0.008))
-    ], axis=1)  # fmt: skip
+    """Turns of a head that is never quite still, as axis-angle vectors in radians: sums of slow waves from 0."""
+    waves = np.stack([size * _wave(seconds, k) for k, size in enumerate(_SWAY)], axis=1)
     turns = matrix_from_axis_angle(waves)
     return axis_angle_from_matrix(turns[0].T @ turns).astype(np.float32)
+
+
+def _wave(seconds: Float[np.ndarray, " t"], k: int) -> Float[np.ndarray, " t"]:
+    slow, fast = 0.61 * (1 + 0.37 * k), 1.13 * (1 + 0.21 * k)
+    return np.sin(slow * seconds + 2.1 * k) + 0.6 * np.sin(fast * seconds + 4.3 * k)

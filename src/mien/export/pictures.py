@@ -30,7 +30,10 @@ _WEBM_QUALITY = 24
 """VP9's constant quality, from 0 (lossless) to 63 (worst)."""
 
 
-def write_pictures(output: Output, pictures: Iterable[UInt8[np.ndarray, "h w _"]], fps: int | float,
+def write_pictures(
+    output: Output,
+    pictures: Iterable[UInt8[np.ndarray, "h w _"]],
+    fps: int | float,
     sound: tuple[Path, float] | None = None,
 ) -> None:
     """Write pictures (RGB, or RGBA if `output.transparent`), all of one size. Each file is written atomically.

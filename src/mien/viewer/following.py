@@ -4,6 +4,9 @@ import threading
 import time
 from collections.abc import Callable
 
+import numpy as np
+from jaxtyping import Float
+
 from mien.capture.faces import LandmarkDetector
 from mien.capture.live_camera import LiveCamera, LiveFrame
 from mien.driving.live import Follower
@@ -130,9 +133,11 @@ class CameraSwitch:
             self._show(follower, faces[0] if len(faces) else None, frame, frame.seconds)
             self.meters.count("tracking", time.monotonic())
 
-    def _show(self, follower: Follower, landmarks: object, frame: LiveFrame, seconds: float) -> None:
+    def _show(
+        self, follower: Follower, landmarks: Float[np.ndarray, "l 2"] | None, frame: LiveFrame, seconds: float
+    ) -> None:
         height, width = frame.picture.shape[:2]
-        face = follower(landmarks, width, height, seconds)  # pyright: ignore[reportArgumentType]
+        face = follower(landmarks, width, height, seconds)
         seen = Seen(frame.picture, seconds)
         self._session.follow(face, seen)
         if self.watch is not None:

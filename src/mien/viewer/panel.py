@@ -13,8 +13,8 @@ from mien.errors import UserError
 from mien.terminal import printable
 from mien.viewer.drawing import BACKGROUNDS, Surface, View
 from mien.viewer.faces import grouped, matches, presets_for, readable
-from mien.viewer.following import CameraSwitch
 from mien.viewer.files import Stopped, screenshot, video
+from mien.viewer.following import CameraSwitch
 from mien.viewer.session import Session, centre_of
 
 MAX_ANGLE = 0.5

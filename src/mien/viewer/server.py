@@ -65,9 +65,7 @@ def serve(
 class Serving:
     """A server that runs."""
 
-    def __init__(
-        self, session: Session, door: Door, port: int, title: str, camera: CameraSwitch | None = None
-    ) -> None:
+    def __init__(self, session: Session, door: Door, port: int, title: str, camera: CameraSwitch | None = None) -> None:
         """Start the server; the arguments are those of `serve`."""
         self._camera = camera
         chosen = _free_port(door.host, port)

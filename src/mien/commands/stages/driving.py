@@ -29,8 +29,7 @@ from mien.workspace import Workspace, open_workspace
 
 
 def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None) -> Driver:
-    """Open a driver: a workspace, a video (captured, tracked and kept in the cache), a csv or json
-    file, or a voice.
+    """Open a driver: a workspace, a video (captured, tracked and kept in the cache), a csv, a json, or a voice.
 
     Args:
         by: The workspace or file.

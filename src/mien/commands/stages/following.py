@@ -17,19 +17,16 @@ from mien import runtime
 from mien.avatar import as_array
 from mien.camera import Camera
 from mien.capture.camera_names import CameraName
-from mien.capture.live_camera import LiveCamera
 from mien.capture.video import write_video
 from mien.commands.picture import PictureOptions
-from mien.commands.stages.viewing import Place, Viewed, open_viewed, position
-from mien.driving.live import Follower, FollowOptions
+from mien.commands.stages.viewing import Place, Viewed, open_viewed, switch_of
+from mien.driving.live import FollowOptions
 from mien.errors import UserError
 from mien.export.pictures import to_rgb
 from mien.pictures import side_by_side
 from mien.progress import say
 from mien.storage import cannot_write
-from mien.viewer import Door, Session, serve
-from mien.viewer.following import CameraSwitch
-from mien.viewer.session import Seen
+from mien.viewer import CameraSwitch, Door, Seen, Session, serve
 
 FPS = 25
 """Frames a second of a recording."""
@@ -68,23 +65,11 @@ def run_following_stage(avatar: Path, run: str | None, name: CameraName, options
         pass
     finally:
         switch.stop()
-        for line in switch.meters.words():
-            say(line)
+        if switch.meters.rates()["tracking"]:
+            for line in switch.meters.words():
+                say(line)
     if isinstance(switch.error, Exception):
         raise switch.error
-
-
-def switch_of(
-    session: Session, viewed: Viewed, name: CameraName, follow: FollowOptions, again: bool = True
-) -> CameraSwitch:
-    """What lets the avatar of a session follow a camera."""
-
-    def make() -> Follower:
-        model, person = viewed.person()
-        eye = as_array(position(viewed.portable.camera))
-        return Follower(model, person, viewed.portable.filmed, eye, follow)
-
-    return CameraSwitch(session, lambda: LiveCamera(name, again, say), make)
 
 
 def _wait(

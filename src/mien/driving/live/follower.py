@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -101,9 +101,7 @@ class Follower:
         with self._lock:
             self._must_learn = True
 
-    def __call__(
-        self, landmarks: Float[np.ndarray, "l 2"] | None, width: int, height: int, seconds: float
-    ) -> Face:
+    def __call__(self, landmarks: Float[np.ndarray, "l 2"] | None, width: int, height: int, seconds: float) -> Face:
         """The avatar's face after the next frame.
 
         Args:

@@ -11,13 +11,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mien.avatar import as_array
 from mien.face import FaceModel, FaceParams
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import TrackingSettings
 from mien.tracking.fitting import layout_of
-from mien.tracking.landmarks import EYE_CORNERS, NOSE, read_response, reduce_face_model
-from mien.tracking.landmarks.groups import landmark_weights
+from mien.tracking.landmarks import EYE_CORNERS, NOSE, landmark_weights, read_response, reduce_face_model
 
 _STEP = 0.5
 """Part of a coefficient over which landmarks are taken as linear; for joints, in radians, a quarter of that."""
