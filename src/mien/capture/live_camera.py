@@ -27,7 +27,8 @@ MOST_SIDE = 640
 """Longest side in pixels of the pictures that are kept. MediaPipe looks at 192 x 192 pixels around the face."""
 _ASKED = {"framerate": "30", "video_size": "640x480"}
 """What a device is asked for first. One that cannot do it gives its own default."""
-_STREAM = {"fflags": "nobuffer", "flags": "low_delay", "timeout": "5000000"}
+_STREAM = {"flags": "low_delay", "timeout": "5000000"}
+"""What a stream is asked for: no reordering, and an error after five seconds without an answer (in microseconds)."""
 _RETRY_SECONDS, _PATIENCE_SECONDS = 1.0, 2.0
 _FPS = 25.0
 
@@ -121,9 +122,8 @@ class LiveCamera:
                 opened = None
                 if self.name.is_file and not self._again:
                     break
-                if not self.name.is_file and not self._stopping:
-                    self.is_lost = True
-                    self._say(f"{self.name}: gives no more pictures; mien waits until it is back")
+                if not self.name.is_file:
+                    self._lose()
         except BaseException as error:  # noqa: BLE001
             self.error = error
         with self._changed:
@@ -131,16 +131,19 @@ class LiveCamera:
             self._changed.notify_all()
 
     def _reopen(self) -> "contextlib.AbstractContextManager[Iterator[tuple[float, av.VideoFrame]]] | None":
-        try:
-            opened = self._open()
-        except UserError:
+        if not self.name.is_file:
             with self._changed:
                 self._changed.wait_for(lambda: self._stopping, _RETRY_SECONDS)
+        try:
+            return None if self._stopping else self._open()
+        except UserError:
             return None
-        if self.is_lost:
-            self.is_lost = False
-            self._say(f"{self.name}: is back")
-        return opened
+
+    def _lose(self) -> None:
+        """Say once that the camera is away."""
+        if not self.is_lost and not self._stopping:
+            self.is_lost = True
+            self._say(f"{self.name}: gives no more pictures; mien waits until it is back")
 
     def _read(self, frames: Iterator[tuple[float, av.VideoFrame]]) -> None:
         """Keep each frame when it comes, until the end or an error of the device."""
@@ -159,6 +162,9 @@ class LiveCamera:
                 self._keep(LiveFrame(self.frames, now, np.ascontiguousarray(display.show(frame))))
 
     def _keep(self, frame: LiveFrame) -> None:
+        if self.is_lost:
+            self.is_lost = False
+            self._say(f"{self.name}: is back")
         with self._changed:
             self._newest = frame
             self.frames += 1

@@ -27,7 +27,8 @@ def read_sound(path: Path) -> Float32[np.ndarray, " n"]:
     Raises:
         UserError: the file is missing, has no sound, is damaged from its beginning, or is longer than an hour.
     """
-    parts = [frame.to_ndarray().reshape(-1) for frame in _resampled(path, "fltp", "mono", RATE)]
+    # FFmpeg would make one channel of two louder than each.
+    parts = [frame.to_ndarray().mean(0) for frame in _resampled(path, "fltp", None, RATE)]
     return np.nan_to_num(np.concatenate(parts).astype(np.float32))
 
 
@@ -60,7 +61,7 @@ def _packets(stream: "av.AudioStream", path: Path, samples: int) -> Iterator[av.
     yield from stream.encode()
 
 
-def _resampled(path: Path, sample: str, layout: str, rate: int) -> Iterator[av.AudioFrame]:
+def _resampled(path: Path, sample: str, layout: str | None, rate: int) -> Iterator[av.AudioFrame]:
     """The decoded sound. Damaged parts after the beginning are left out."""
     count, resampler = 0, AudioResampler(format=sample, layout=layout, rate=rate)
     with open_sound(path) as (container, stream):

@@ -137,9 +137,9 @@ def _why_not(path: Path, error: av.error.FFmpegError | OSError, kind: str) -> st
     """Return what a file that FFmpeg refused is, as far as its beginning shows, and what to do."""
     with path.open("rb") as file:
         start = file.read(_SNIFFED)
-    for pattern, kind in _LISTS:
+    for pattern, listed in _LISTS:
         if re.search(pattern, start):
-            return f"is {kind}, which names other files; mien opens none of those: give the video itself"
+            return f"is {listed}, which names other files; mien opens none of those: give the video itself"
     if isinstance(error, av.error.ArgumentError):
         return "is a file of a kind that mien does not open; convert it to .mp4 or .mov"
     if kind == "sound":

@@ -131,6 +131,19 @@ class LandmarkFit:
         start = self._facing(centred, focal)
         return self._descend(start, centred, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
 
+    def pixels(
+        self,
+        rotation: Float[np.ndarray, "3 3"],
+        translation: Float[np.ndarray, " 3"],
+        coefficients: Float[np.ndarray, " k"],
+        width: int,
+        height: int,
+    ) -> Float[np.ndarray, "l 2"]:
+        """Where the landmarks of a face are in a picture: what `__call__` fits."""
+        points = self._points(Fitted(rotation, translation, coefficients, 0.0))
+        projected = self._project(points @ rotation.T + translation, _FOCAL * max(width, height))
+        return projected + (0.5 * width, 0.5 * height)
+
     def face_of(
         self, rotation: Float[np.ndarray, " 3"], translation: Float[np.ndarray, " 3"], coefficients: np.ndarray
     ) -> FaceParams:
