@@ -29,10 +29,11 @@ from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh
 from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
+from mien.runtime.baked import Filmed
 from mien.training import Sequence, TrainSettings, filmed_words, read_coverage, train
 from mien.training.coverage import Coverage, coverage, drawn_share, smoothstep
 from mien.training.density_control import density_strategy
-from mien.training.filmed import FILE, filmed_yaws, view_of_head, write_coverage
+from mien.training.filmed import FILE, filmed_yaws, view_of_head, with_shown_angles, write_coverage
 from mien.training.frames import Frame, training_frames
 from mien.training.unseen import Unseen, spare_fills, unseen_of
 from toy_scene import toy_face, toy_sequence
@@ -183,7 +184,7 @@ def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
     made_up = facing(model) <= 0
     colors = torch.tensor([0.2, 0.4, 0.6]).expand(len(made_up), 3)
-    avatar.close(SurfacePrior(torch.zeros(len(made_up)), colors, made_up.float(), made_up))
+    avatar.close(SurfacePrior(torch.zeros(len(made_up)), None, colors, made_up.float(), made_up))
     assert len(avatar.gaussian_store()) == len(made_up)
     vertices = model.head_vertices(avatar.subject)[0]
     camera = view_of_head(vertices, 180)
@@ -193,7 +194,7 @@ def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     assert rendering.alpha[middle, middle].min() > 0.95
     color = rendering.image[middle, middle].reshape(-1, 3).mean(0)
     torch.testing.assert_close(color, colors[0], atol=0.03, rtol=0)
-    hair = SurfacePrior(torch.full((len(made_up),), 0.02), colors, made_up.float(), made_up)
+    hair = SurfacePrior(torch.full((len(made_up),), 0.02), None, colors, made_up.float(), made_up)
     avatar.close(hair)
     assert (avatar.gaussian_store()["means"][:, 1] > 0).all()
 
@@ -203,12 +204,26 @@ def test_colours_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Seque
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
     doubt = (facing(model) <= 0).float()
     before = avatar.gaussian_store()["sh_constant"].detach().clone()
-    prior = SurfacePrior(0 * doubt, torch.ones(len(doubt), 3), doubt, doubt > 0)
+    prior = SurfacePrior(0 * doubt, None, torch.ones(len(doubt), 3), doubt, doubt > 0)
     for _ in range(200):
         avatar.keep_to(prior)
     colors = avatar.gaussian_store()["sh_constant"].detach()
     assert torch.equal(colors[doubt == 0], before[doubt == 0])
     torch.testing.assert_close(rgb_from_sh(colors[doubt > 0][:, 0]), torch.ones(int(doubt.sum()), 3), atol=1e-3, rtol=0)
+
+
+def test_hanging_hair_may_stand_out_from_the_surface(toy: tuple[FaceModel, Sequence]) -> None:
+    """Fills have limits to the surface, and hair that hangs beside a triangle widens them there alone."""
+    model, sequence = toy
+    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    count = len(model.faces)
+    hanging = 0.05 * (torch.arange(count) % 2).float()
+    with torch.no_grad():
+        avatar.gaussian_store()["means"][:, 1] = 1e3
+    avatar.keep_to(SurfacePrior(torch.zeros(count), hanging, None, None, torch.zeros(count, dtype=torch.bool)))
+    bound, limits = avatar.gaussian_store()["face_index"], avatar.config.surface
+    height = avatar.gaussian_store()["means"][:, 1] * avatar._sizes[bound]
+    torch.testing.assert_close(height, limits.depth + limits.hair_share * hanging[bound])
 
 
 @pytest.mark.parametrize(("hair", "loose"), [(0.0, 1.0), (0.01, 1.0), (0.0, 2.0)])
@@ -282,7 +297,9 @@ def test_a_run_keeps_its_coverage_and_resumes_exactly(toy: tuple[FaceModel, Sequ
     again = train([sequence], model, config, SETTINGS, tmp_path / "cut")
     assert torch.equal(again.gaussian_store()["means"], whole.gaussian_store()["means"])
     plain = train([sequence], model, config, replace(SETTINGS, unseen="trained"), tmp_path / "plain")
-    assert read_coverage(tmp_path / "plain", model) is None
+    of_plain = read_coverage(tmp_path / "plain", model)
+    assert of_plain is not None, "each run knows what was filmed"
+    assert torch.equal(of_plain.seen, kept.seen)
     assert len(plain.gaussian_store()["face_index"].unique()) == len(model.faces)
 
 
@@ -343,6 +360,25 @@ def test_words_say_which_sides_were_filmed(toy: tuple[FaceModel, Sequence]) -> N
         model, vertices, front_and_left
     )
     assert "made up" in filmed_words(model, vertices, Coverage(0 * ones, colors, ones))
+
+
+def test_a_filled_head_may_turn_where_half_of_it_was_filmed(toy: tuple[FaceModel, Sequence]) -> None:
+    """The angles grow to the side that was filmed, to the person's left, and never shrink."""
+    model = toy[0]
+    vertices, ones = model.head_vertices(toy_face(1))[0], torch.ones(len(model.faces))
+    colors, middle = torch.zeros(len(ones), 3), model.template[model.faces].mean(1)
+    zeros = np.zeros(1, np.float32)
+    known = Filmed(zeros, zeros, zeros[:, None], zeros, np.array([[-0.3, 0.1], [-0.2, 0.2]], np.float32))
+    left = Coverage((middle[:, 0] > 0).float(), colors, ones)
+    (low, high), (down, up) = with_shown_angles(known, model, vertices, left).head_angles
+    assert low == np.float32(-0.3)
+    assert high == pytest.approx(np.radians(60))
+    assert down <= np.float32(-0.2)
+    assert up >= np.float32(0.2)
+    everything = with_shown_angles(known, model, vertices, Coverage(ones, colors, ones)).head_angles
+    np.testing.assert_allclose(np.degrees(everything), [[-60, 60], [-30, 30]], atol=1e-4)
+    nothing = with_shown_angles(known, model, vertices, Coverage(0 * ones, colors, ones)).head_angles
+    np.testing.assert_array_equal(nothing, known.head_angles)
 
 
 def test_smoothstep_is_flat_at_both_ends() -> None:

@@ -17,10 +17,11 @@ from mien.training.filmed import FILE
 from toy_workspace import write_toy_workspace
 
 
+@pytest.mark.parametrize("unseen", ["trained", "filled"])
 def test_a_mien_file_and_the_viewer_have_the_confidence_of_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    unseen: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(train_toy, "SETTINGS", replace(train_toy.SETTINGS, steps=2, unseen="filled"))
+    monkeypatch.setattr(train_toy, "SETTINGS", replace(train_toy.SETTINGS, steps=2, unseen=unseen))
     write_toy_workspace(tmp_path / "me")
     run = tmp_path / "me" / "runs" / "toy"
     covered = read_coverage(run, load_avatar(run).face_model)

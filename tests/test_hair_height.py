@@ -11,7 +11,7 @@ from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.tracking import Tracking
 from mien.training import Sequence
 from mien.training.frames import Frame
-from mien.training.hair_height import hair_height
+from mien.training.hair_height import hair_height, hanging_hair
 from mien.training.head_parts import head_parts
 
 _SIZE, _TIMESTEPS = 160, 7
@@ -22,15 +22,15 @@ def anny() -> FaceModel:
     return load_face_model("anny")
 
 
-def _sequence(model: FaceModel, height: float) -> Sequence:
-    """A head that turns and nods, in mattes on which its scalp stands out by a height in metres."""
+def _sequence(model: FaceModel, height: float, grows: torch.Tensor | None = None) -> Sequence:
+    """A head that turns and nods, in mattes on which some triangles (the scalp) stand out by a height in metres."""
     angles = torch.linspace(-0.4, 0.4, _TIMESTEPS)
     face = model.neutral(_TIMESTEPS)
     face.head_rotation[:, 1], face.head_rotation[:, 0] = angles, 0.5 * angles.abs() - 0.1
     face.head_translation[:, 2] = -0.8
     camera = camera_from_fov(0.5, _SIZE, _SIZE, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     grown = torch.zeros(len(model.template), dtype=torch.bool)
-    grown[model.faces[head_parts(model).scalp]] = True
+    grown[model.faces[head_parts(model).scalp if grows is None else grows]] = True
     mattes = np.zeros((_TIMESTEPS, 1, _SIZE, _SIZE), np.uint8)
     for timestep in range(_TIMESTEPS):
         vertices = model(face[timestep])[0]
@@ -71,3 +71,19 @@ def test_without_an_outline_there_is_no_height(anny):
     sequence.capture.mattes[:] = 255
     found = _height(anny, sequence)
     assert (found == 0).all()
+
+
+def test_hair_that_hangs_beside_the_neck(anny):
+    """The sides of the neck stand out by two centimetres, as hair does that hangs there; cheeks and scalp do not."""
+    parts, middles = head_parts(anny), anny.template[anny.faces].mean(1)
+    neck = parts.neck & (middles[:, 0].abs() > 0.03)
+    sequence = _sequence(anny, 0.02, neck)
+    frames = [Frame(0, timestep, 0) for timestep in range(_TIMESTEPS)]
+    found = hanging_hair(anny, [sequence], [sequence.tracking.face], frames, threads=1)
+    sides = neck & (middles[:, 0].abs() > 0.05) & (middles[:, 1] > middles[neck, 1].median())
+    assert 0.012 < float(found[sides].median()) < 0.03
+    bare = _sequence(anny, 0.0)
+    without = hanging_hair(anny, [bare], [bare.tracking.face], frames, threads=1)
+    assert float(without[sides].median()) < 0.004
+    assert float(found[parts.face].median()) < 0.004
+    assert not found[parts.scalp | parts.interior].any()

@@ -42,6 +42,8 @@ class SurfacePrior:
 
     hair: Float[Tensor, " f"]
     """Height of hair along the triangle's normal, in metres; 0 on skin."""
+    hanging: Float[Tensor, " f"] | None = None
+    """How far hair that hangs beside skin and neck stands out along the normal, in metres. None means 0."""
     colors: Float[Tensor, "f 3"] | None = None
     """Colours, 0..1, completed where no picture shows any. None if nothing was completed."""
     doubt: Float[Tensor, " f"] | None = None

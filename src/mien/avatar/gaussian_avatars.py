@@ -229,7 +229,8 @@ class GaussianAvatars(Avatar):
     def keep_to(self, prior: SurfacePrior) -> None:
         """Apply `SurfaceLimits`, and pull the colours of what is rarely seen towards the completed ones."""
         if self.config.surface.enabled or prior.made_up is not None:
-            keep_on_surface(self.store, self.config.surface, self._sizes, prior.hair, prior.looseness)
+            hair = prior.hair if prior.hanging is None else torch.maximum(prior.hair, prior.hanging)
+            keep_on_surface(self.store, self.config.surface, self._sizes, hair, prior.looseness)
         if prior.colors is not None and prior.doubt is not None:
             bound, own = self.store["face_index"], self.store["sh_constant"].detach()[:, 0]
             pull = _PULL * prior.doubt[bound, None]

@@ -25,7 +25,7 @@ from mien.render.mesh import render_mesh
 from mien.rotation import align_centred
 from mien.synthetic import Truth
 from mien.synthetic.recipe import SIDES
-from mien.tracking import make_scoring
+from mien.tracking import NeckParts, head_crop, head_cutter
 from mien.training.completion import complete_colors, vertex_means
 from mien.training.coverage import coverage
 from mien.training.sequence import composite
@@ -97,7 +97,8 @@ def score_side_views(
 ) -> tuple[Figures, Float[np.ndarray, "h w 3"]]:
     """Figures by angle for the avatar and the mesh in completed colours, and a sheet: truth, avatar, mesh by angle.
 
-    The pictures are cut and cropped as in every other protocol: over white, above the cut at the neck of the true head.
+    The pictures are cut and cropped as in every other protocol: over white, above the cut at the neck of the posed
+    head.
     An avatar is posed as in `experiment`, and seen by the true camera at the place that it has relative to the tracked
     face.
 
@@ -109,7 +110,7 @@ def score_side_views(
     """
     index = [one.name for one in experiment.sequences].index(sequence)
     model, truth = experiment.avatar.face_model, pictures.truth
-    scoring = make_scoring(pictures.capture, truth.tracking, model)
+    neck = NeckParts.of(model)
     colors = _completed_colors(experiment, settings.threads or None)
     metric, judged = perceptual_metric(settings), _judged(len(pictures.timesteps), settings.perceptual_frames)
     tracked, used = experiment.sequences[index].tracking.face, experiment.faces[index]
@@ -121,14 +122,15 @@ def score_side_views(
         camera = camera_beside(truth.tracking.cameras[view.camera], points, true_points[view.moment])
         gaussians = experiment.avatar.pose(used[timestep]).gaussians.timestep(0)
         place = (view.moment, view.camera)
+        mask = head_cutter(model, neck, used[timestep])(np.asarray(pictures.capture.mattes[place]), camera)
         white = np.full(3, 255, np.uint8)
-        picture = composite(np.asarray(pictures.capture.images[place]), np.asarray(scoring.masks[place]), white)
+        picture = composite(np.asarray(pictures.capture.images[place]), mask, white)
         vertices = model(used[timestep])[0]
         images = {
             AVATAR: rasterize(gaussians, camera, torch.ones(3)).image.clamp(0, 1),
             MESH: render_mesh(vertices, model.faces, camera, colors, supersample=2)[0].clamp(0, 1),
         }
-        left, top, width, height = (int(value) for value in scoring.crops[place])
+        left, top, width, height = (int(value) for value in head_crop(mask))
         return view, images, torch.from_numpy(picture).float() / 255, (left, top, width, height)
 
     def score(job: _Job) -> tuple[_View, dict[str, Scores]]:

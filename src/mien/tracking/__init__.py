@@ -18,7 +18,7 @@ if TYPE_CHECKING:
         write_overlay,
         write_residual_report,
     )
-    from mien.tracking.scoring import Scoring, make_scoring
+    from mien.tracking.scoring import Scoring, head_crop, head_cutter, make_scoring
     from mien.tracking.scoring_files import read_scoring, read_scoring_hash, scoring_exists, write_scoring
     from mien.tracking.settings import PaperSettings, PhotometricSettings, SmoothnessSettings, TrackingSettings
     from mien.tracking.tracking import Appearance, Tracking
@@ -39,7 +39,7 @@ else:
                 "write_overlay",
                 "write_residual_report",
             ],
-            "scoring": ["Scoring", "make_scoring"],
+            "scoring": ["Scoring", "head_crop", "head_cutter", "make_scoring"],
             "scoring_files": ["read_scoring", "read_scoring_hash", "scoring_exists", "write_scoring"],
             "settings": ["PaperSettings", "PhotometricSettings", "SmoothnessSettings", "TrackingSettings"],
             "tracking": ["Appearance", "Tracking"],
@@ -62,6 +62,8 @@ __all__ = [
     "fit_neck_cut",
     "frontal_camera",
     "has_enough_faces",
+    "head_crop",
+    "head_cutter",
     "make_scoring",
     "overlay_stride",
     "read_scoring",

@@ -1,5 +1,6 @@
 """The scoring mask: the part of each picture that shows the head, fixed once per sequence so that runs compare."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,8 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.face import FaceModel
+from mien.face import FaceModel, FaceParams
 from mien.picture_files import PictureStack
 from mien.progress import track_progress
 from mien.render.mesh import rasterize_mesh
@@ -39,18 +41,29 @@ def make_scoring(capture: Capture, tracking: Tracking, face_model: FaceModel, sc
     """
     masks = PictureStack(capture.mattes.shape, scratch)
     crops = np.zeros((*capture.mattes.shape[:2], 4), np.int64)
-    head_faces = face_model.faces[~face_model.region_mask("neck")]
     neck = NeckParts.of(face_model)
     for timestep in track_progress(range(capture.timesteps), "Scoring masks", capture.timesteps):
-        face = tracking.face[timestep]
-        vertices = face_model(face)[0]
-        cut = fit_neck_cut(neck, vertices, face.T_world_head[0, :3, 1])
+        cut = head_cutter(face_model, neck, tracking.face[timestep])
         for index, camera in enumerate(tracking.cameras):
-            head = rasterize_mesh(vertices, head_faces, camera).face_index.numpy() >= 0
-            mask = cut_matte(np.asarray(capture.mattes[timestep, index]), head, above_neck_cut(cut, camera))
+            mask = cut(np.asarray(capture.mattes[timestep, index]), camera)
             masks.write(timestep, index, mask)
             crops[timestep, index] = head_crop(mask)
     return Scoring(masks.array(), crops)
+
+
+def head_cutter(
+    face_model: FaceModel, neck: NeckParts, face: FaceParams
+) -> Callable[[UInt8[np.ndarray, "h w"], Camera], UInt8[np.ndarray, "h w"]]:
+    """A function that turns a camera's matte into the mask of the head, for one timestep (`make_scoring`)."""
+    vertices = face_model(face)[0]
+    head_faces = face_model.faces[~face_model.region_mask("neck")]
+    cut = fit_neck_cut(neck, vertices, face.T_world_head[0, :3, 1])
+
+    def mask_of(matte: UInt8[np.ndarray, "h w"], camera: Camera) -> UInt8[np.ndarray, "h w"]:
+        head = rasterize_mesh(vertices, head_faces, camera).face_index.numpy() >= 0
+        return cut_matte(matte, head, above_neck_cut(cut, camera))
+
+    return mask_of
 
 
 def cut_matte(

@@ -1,8 +1,11 @@
 """Which sides of a head were filmed: the coverage of a run on disk, and what it says about views of the avatar."""
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,6 +14,7 @@ from mien.camera import Camera, camera_from_fov
 from mien.face import FaceModel
 from mien.render.camera_paths import aside
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
+from mien.runtime.baked import Filmed
 from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.training.coverage import Coverage
 
@@ -20,6 +24,10 @@ _FIELDS = ("seen", "colors", "above")
 _REMEDY = "train it again"
 _FILMED = 0.85
 """Mean confidence of the visible surface from which a view counts as filmed."""
+_SHOWN = 0.5
+"""The same from which the head of a filled avatar may turn there."""
+_MOST_YAW, _MOST_PITCH = 60, 30
+"""Degrees beyond which that does not hold. Fills have neither strands nor folds."""
 _STEP, _SIZE, _FIELD, _DISTANCE = 5, 128, 0.4, 1.0
 """Degrees between the views that are tried; their size in pixels, field of view in radians and distance in metres."""
 _MADE_UP = (0.93, 0.45, 0.30)
@@ -77,11 +85,32 @@ def filmed_yaws(face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage:
 
     if not is_filmed(0):
         return None
-    reached = []
-    for side in (-1, 1):
-        turns = range(_STEP, 181, _STEP)
-        reached.append(next((turn - _STEP for turn in turns if not is_filmed(side * turn)), 180))
-    return reached[0], reached[1]
+    return _reached(lambda turn: is_filmed(-turn), 180), _reached(is_filmed, 180)
+
+
+def with_shown_angles(
+    filmed: Filmed, face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage: Coverage
+) -> Filmed:
+    """`filmed` with head angles that also have the views of which at least half was filmed.
+
+    It is for avatars whose other half is filled. What moves the head keeps softly to these angles (`keep_to_filmed`).
+    """
+
+    def is_shown(yaw: int, pitch: int) -> bool:
+        return filmed_share(vertices, face_model, coverage, view_of_head(vertices, yaw, pitch=pitch)) >= _SHOWN
+
+    if not is_shown(0, 0):
+        return filmed
+    right, left = (_reached(lambda turn, to=to: is_shown(to * turn, 0), _MOST_YAW) for to in (-1, 1))
+    down, up = (_reached(lambda turn, to=to: is_shown(0, to * turn), _MOST_PITCH) for to in (-1, 1))
+    shown, known = np.radians(np.array([[-right, left], [-down, up]], np.float32)), filmed.head_angles
+    lowest, highest = np.minimum(known[:, 0], shown[:, 0]), np.maximum(known[:, 1], shown[:, 1])
+    return replace(filmed, head_angles=np.stack([lowest, highest], axis=1))
+
+
+def _reached(holds: Callable[[int], bool], most: int) -> int:
+    """The largest angle in degrees, in steps and up to `most`, up to which all angles hold."""
+    return next((turn - _STEP for turn in range(_STEP, most + 1, _STEP) if not holds(turn)), most)
 
 
 def filmed_words(face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage: Coverage) -> str:
@@ -95,12 +124,12 @@ def filmed_words(face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage
     return f"filmed: from {right} degrees on the person's right to {left} on the left; what is beyond is made up"
 
 
-def view_of_head(vertices: Float[Tensor, "v 3"], yaw: int, size: int = _SIZE) -> Camera:
-    """A camera that looks at a head in the head frame from `yaw` degrees to the person's left."""
+def view_of_head(vertices: Float[Tensor, "v 3"], yaw: int, size: int = _SIZE, pitch: int = 0) -> Camera:
+    """A camera that looks at a head in the head frame from `yaw` degrees to the person's left and `pitch` above."""
     centre = (vertices.amin(0) + vertices.amax(0)) / 2
     viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
     viewmat[:3, 3] = -viewmat[:3, :3] @ (centre + torch.tensor([0.0, 0.0, _DISTANCE]))
-    return aside(camera_from_fov(_FIELD, size, size, viewmat), centre, math.radians(yaw), 0.0)
+    return aside(camera_from_fov(_FIELD, size, size, viewmat), centre, math.radians(yaw), math.radians(pitch))
 
 
 @torch.no_grad()

@@ -4,7 +4,7 @@ from collections.abc import Sequence as Items
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
@@ -30,6 +30,8 @@ _SAME_HAIR = 1.3
 """Largest height where nothing was measured, as a multiple of the median height on top of the head."""
 _FADING_ROUNDS = 6
 """Rings of triangles over which the height fades to 0 at the hairline."""
+_NEAR_ROUNDS = 4
+"""Rings of triangles around an outline that hanging hair may cover too."""
 
 
 @torch.no_grad()
@@ -54,20 +56,8 @@ def hair_height(
         threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no bit.
     """
     scalp = head_parts(face_model).scalp
-    chosen = scalp.nonzero()[:, 0]
-
-    def measured_in(frame: Frame) -> Tensor:
-        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
-        return _measured(sequences[frame.sequence], frame, vertices, face_model.faces, chosen)
-
-    used = spread_frames(frames, _MAX_FRAMES)
-    heights = torch.stack(list(stream_in_threads(measured_in, used, threads))) if used else torch.zeros(0, len(chosen))
-    height = torch.zeros(len(scalp), 1)
-    known = torch.zeros(len(scalp))
-    found = heights.isfinite().any(0)
-    height[chosen[found], 0] = heights[:, found].nanquantile(_QUANTILE, dim=0) if bool(found.any()) else 0.0
-    known[chosen[found]] = heights.isfinite().sum(0)[found].clamp_max(3) / 3
-    if not bool(found.any()):
+    height, known = _outline_heights(face_model, sequences, faces, frames, scalp, threads)
+    if not bool(known.any()):
         return height[:, 0]
     surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
     spread = surface.spread(height, known, scalp)
@@ -76,6 +66,56 @@ def hair_height(
         height = torch.minimum(height, surface.around(height, torch.ones_like(known)))
         height[~scalp] = 0
     return height[:, 0].clamp(0, _HIGHEST)
+
+
+@torch.no_grad()
+def hanging_hair(
+    face_model: FaceModel,
+    sequences: Items[Sequence],
+    faces: Items[FaceParams],
+    frames: Items[Frame],
+    threads: int | None = None,
+) -> Float[Tensor, " f"]:
+    """Return how far the outline stands out beside skin and neck, in metres, 0..0.08; 0 on the scalp.
+
+    Long hair hangs off the scalp, beside cheeks and neck, and rings hang from ears. Unlike `hair_height`, nothing is
+    concluded about triangles that are far from any outline. The arguments are those of `hair_height`.
+    """
+    parts = head_parts(face_model)
+    beside = parts.skin | parts.neck
+    height, known = _outline_heights(face_model, sequences, faces, frames, beside, threads)
+    if not bool(known.any()):
+        return height[:, 0]
+    surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
+    for _ in range(_NEAR_ROUNDS):
+        height = torch.maximum(height, surface.around(height, torch.ones_like(known)))
+        height[~beside] = 0
+    return height[:, 0].clamp(0, _HIGHEST)
+
+
+def _outline_heights(
+    face_model: FaceModel,
+    sequences: Items[Sequence],
+    faces: Items[FaceParams],
+    frames: Items[Frame],
+    region: Bool[Tensor, " f"],
+    threads: int | None,
+) -> tuple[Float[Tensor, "f 1"], Float[Tensor, " f"]]:
+    """Return the height of the outline above the triangles of a region, and how sure it is, 0..1; 0 elsewhere."""
+    chosen = region.nonzero()[:, 0]
+
+    def measured_in(frame: Frame) -> Tensor:
+        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
+        return _measured(sequences[frame.sequence], frame, vertices, face_model.faces, chosen)
+
+    used = spread_frames(frames, _MAX_FRAMES)
+    heights = torch.stack(list(stream_in_threads(measured_in, used, threads))) if used else torch.zeros(0, len(chosen))
+    height, known = torch.zeros(len(region), 1), torch.zeros(len(region))
+    found = heights.isfinite().any(0)
+    if bool(found.any()):
+        height[chosen[found], 0] = heights[:, found].nanquantile(_QUANTILE, dim=0)
+        known[chosen[found]] = heights.isfinite().sum(0)[found].clamp_max(3) / 3
+    return height, known
 
 
 def _on_top(surface: Surface, height: Float[Tensor, "f 1"], known: Float[Tensor, " f"]) -> float:

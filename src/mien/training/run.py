@@ -26,6 +26,7 @@ from mien.runtime.baked import Filmed
 from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
 from mien.tracking import Tracking
 from mien.training.checkpoint import CURVES, TrainingState
+from mien.training.coverage import Coverage
 from mien.training.filmed import write_coverage
 from mien.training.sequence import Sequence
 from mien.training.settings import TrainSettings
@@ -208,12 +209,11 @@ def check_untouched(run_dir: Path) -> None:
         check_free(run_dir, BUSY_REMEDY)
 
 
-def write_results(run_dir: Path, state: TrainingState) -> None:
+def write_results(run_dir: Path, state: TrainingState, covered: Coverage) -> None:
     """Write everything that is kept after training. training.json is last and marks the run as finished."""
     write_avatar(run_dir / "avatar", state.avatar)
     write_tensors(run_dir / _TRACK, state.track.params().tensors())
-    if state.unseen is not None and state.unseen.coverage is not None:
-        write_coverage(run_dir, state.unseen.coverage)
+    write_coverage(run_dir, covered)
     curves = {name: torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     write_tensors(run_dir / "curves.safetensors", curves)
     summary = {

@@ -41,6 +41,7 @@ from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.coverage import coverage
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
+from mien.training.filmed import with_shown_angles
 from mien.training.frames import (
     FrameOrder,
     camera_extent,
@@ -111,6 +112,9 @@ def train(
         ]
         data = TrainingData(order, tuple(targets), extent)
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
+        faces = [sequence.tracking.face for sequence in sequences]
+        covered = None if state.unseen is None else state.unseen.coverage
+        write_results(run_dir, state, covered or coverage(face_model, sequences, faces, frames))
     return state.avatar
 
 
@@ -122,7 +126,7 @@ def _train_to_the_end(
     progress: ProgressBar,
     watch: Watch | None,
 ) -> None:
-    """Continue from the newest checkpoint, if there is one, and write the results."""
+    """Continue from the newest checkpoint, if there is one, and take all steps that are left."""
     resume(run_dir / "checkpoints", state)
     with (
         one_torch_thread(),
@@ -147,7 +151,6 @@ def _train_to_the_end(
                 if interrupted():
                     raise KeyboardInterrupt
         _check_finite(run_dir, state)
-        write_results(run_dir, state)
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:
@@ -213,6 +216,9 @@ def start(
     if filled or avatar.wants_surface:
         unseen = unseen_of(avatar, sequences, faces, frames, filled=filled)
         avatar.close(unseen.prior)
+        if unseen.coverage is not None:
+            neutral = face_model.head_vertices(avatar.subject)[0].detach()
+            avatar.filmed = with_shown_angles(avatar.filmed, face_model, neutral, unseen.coverage)
     inside = None
     if settings.inside == "furnished" and avatar.triangles() is not None:
         known = None if unseen is None else unseen.coverage

@@ -19,7 +19,7 @@ from mien.render.rendering import Rendering
 from mien.training.completion import complete_colors
 from mien.training.coverage import Coverage, coverage, drawn_share, smoothstep
 from mien.training.frames import Frame, spread_frames
-from mien.training.hair_height import hair_height
+from mien.training.hair_height import hair_height, hanging_hair
 from mien.training.head_parts import head_parts
 from mien.training.hidden import hidden_triangles
 from mien.training.sequence import Sequence
@@ -104,8 +104,9 @@ def unseen_of(
     """What some frames show of an avatar's head. The avatar is on the CPU, in float32."""
     model = avatar.face_model
     hair = hair_height(model, sequences, faces, frames)
+    hanging = hanging_hair(model, sequences, faces, frames)
     if not filled:
-        return Unseen(None, SurfacePrior(hair))
+        return Unseen(None, SurfacePrior(hair, hanging))
     found = coverage(model, sequences, faces, frames)
     neutral = model.head_vertices(avatar.subject)[0].detach()
     parts = head_parts(model)
@@ -115,11 +116,11 @@ def unseen_of(
     shown = drawn_share(model, found)
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
     if avatar.triangles() is None:
-        return Unseen(found, SurfacePrior(hair, colors, doubt))
+        return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
     made_up = (shown < _RARE) & (found.above > 0.5)
     made_up |= hidden_inside(model, parts.interior, sequences, faces, frames)
     looseness = looser_where_faces_move(model, neutral, parts.interior)
-    return Unseen(found, SurfacePrior(hair, colors, doubt, made_up, made_up | parts.interior, looseness))
+    return Unseen(found, SurfacePrior(hair, hanging, colors, doubt, made_up, made_up | parts.interior, looseness))
 
 
 def looser_where_faces_move(
@@ -165,6 +166,7 @@ def moved(unseen: Unseen, like: Tensor) -> Unseen:
     """The same on the device of `like`."""
     prior = unseen.prior
     put = {
+        "hanging": None if prior.hanging is None else prior.hanging.to(like),
         "colors": None if prior.colors is None else prior.colors.to(like),
         "doubt": None if prior.doubt is None else prior.doubt.to(like),
         "made_up": None if prior.made_up is None else prior.made_up.to(like.device),
