@@ -17,6 +17,7 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from mien.capture.display import ACCURATE, Display
+from mien.capture.sound import add_sound
 from mien.capture.tone import HLG, PQ
 from mien.capture.video_file import TOO_MANY_PIXELS, create_video, open_video
 from mien.errors import UserError
@@ -126,6 +127,7 @@ def write_video(
     fps: int | float,
     crf: int = 18,
     preset: str = "medium",
+    sound: tuple[Path, float] | None = None,
 ) -> None:
     """Write sRGB frames as H.264 (yuv420p, BT.709), atomically. Odd sizes get a repeated last row or column.
 
@@ -135,6 +137,7 @@ def write_video(
         fps: frames per second.
         crf: x264's constant rate factor: 0 is lossless, 18 looks lossless, 51 is worst.
         preset: x264's preset. `veryfast` takes a third of the time and compresses somewhat worse.
+        sound: a file with sound for the video, and the video's length in seconds.
 
     Raises:
         UserError: `frames` is empty, or the file cannot be written.
@@ -144,11 +147,18 @@ def write_video(
     if first is None:
         raise UserError(f"{path}: no frames to write; check the selection of frames")
     options = {"crf": str(crf), "preset": preset}
-    write_atomically(path, lambda aside: _encode(aside, itertools.chain([first], iterator), first.shape, fps, options))
+    write_atomically(
+        path, lambda aside: _encode(aside, itertools.chain([first], iterator), first.shape, fps, options, sound)
+    )
 
 
 def _encode(
-    path: Path, frames: Iterable[np.ndarray], shape: tuple[int, ...], fps: int | float, options: dict[str, str]
+    path: Path,
+    frames: Iterable[np.ndarray],
+    shape: tuple[int, ...],
+    fps: int | float,
+    options: dict[str, str],
+    sound: tuple[Path, float] | None = None,
 ) -> None:
     height, width = shape[:2]
     with create_video(path) as container:
@@ -159,8 +169,14 @@ def _encode(
         # Players assume BT.709 for matrix, primaries and transfer, and studio range. The file also says so.
         context.colorspace = context.color_primaries = context.color_trc = 1
         context.color_range = ColorRange.MPEG
+        packets = add_sound(container, *sound) if sound is not None else iter(())
+        heard = next(packets, None)
         reformatter = VideoReformatter()
-        for image in frames:
+        for number, image in enumerate(frames):
+            # Sound goes into the file just before the pictures of its time.
+            while heard is not None and float((heard.pts or 0) * (heard.time_base or 0)) <= number / fps:
+                container.mux(heard)
+                heard = next(packets, None)
             assert image.shape == shape, f"frames of {shape}, then one of {image.shape}"
             assert image.dtype == np.uint8, image.dtype
             even = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
@@ -173,6 +189,7 @@ def _encode(
             )
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+        container.mux([packet for packet in (heard, *packets) if packet is not None])
 
 
 def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:

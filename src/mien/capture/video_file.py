@@ -14,6 +14,7 @@ from typing import IO, Any
 import av
 import av.error
 import av.logging
+from av.audio.stream import AudioStream
 from av.container import InputContainer, OutputContainer
 from av.stream import Disposition
 from av.video.stream import VideoStream
@@ -65,10 +66,33 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         UserError: the file is missing, is no video, has a container or codec that is not supported, or has pictures of
             more than `MAX_FRAME_PIXELS` pixels.
     """
+    with _open_container(path, "video") as container:
+        stream = _moving_pictures(path, container)
+        _check_size(path, stream.codec_context.width, stream.codec_context.height)
+        stream.codec_context.options = {"max_pixels": str(MAX_FRAME_PIXELS)}
+        yield container, stream
+
+
+@contextmanager
+def open_sound(path: Path) -> Iterator[tuple[InputContainer, AudioStream]]:
+    """Open a file and its first stream of sound, ready to be decoded.
+
+    Raises:
+        UserError: the file is missing, is neither sound nor video, or has no sound that can be decoded.
+    """
+    with _open_container(path, "sound") as container:
+        streams = [stream for stream in container.streams.audio if stream.codec_context is not None]
+        if not streams:
+            raise UserError(f"{path}: has no sound; give a file with sound in it, such as a .wav")
+        yield container, streams[0]
+
+
+@contextmanager
+def _open_container(path: Path, kind: str) -> Iterator[InputContainer]:
     if not path.exists():
         raise UserError(f"{path}: no such file; check the path")
     if not path.is_file():
-        raise UserError(f"{path}: is not a file; give a video file")
+        raise UserError(f"{path}: is not a file; give a {kind} file")
     if path.stat().st_size == 0:
         raise UserError(f"{path}: is empty; copy or record it again")
     try:
@@ -88,12 +112,9 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
                 **_ANY_TITLE,
             )
         except (av.error.FFmpegError, OSError) as error:
-            raise UserError(f"{path}: {_why_not(path, error)}") from None
+            raise UserError(f"{path}: {_why_not(path, error, kind)}") from None
         with container:
-            stream = _moving_pictures(path, container)
-            _check_size(path, stream.codec_context.width, stream.codec_context.height)
-            stream.codec_context.options = {"max_pixels": str(MAX_FRAME_PIXELS)}
-            yield container, stream
+            yield container
 
 
 @contextmanager
@@ -112,15 +133,17 @@ def _check_size(path: Path, width: int, height: int) -> None:
         raise UserError(f"{path}: its pictures have {width}x{height} pixels, {TOO_MANY_PIXELS}; make it smaller")
 
 
-def _why_not(path: Path, error: av.error.FFmpegError | OSError) -> str:
+def _why_not(path: Path, error: av.error.FFmpegError | OSError, kind: str) -> str:
     """Return what a file that FFmpeg refused is, as far as its beginning shows, and what to do."""
     with path.open("rb") as file:
         start = file.read(_SNIFFED)
-    for pattern, kind in _LISTS:
+    for pattern, listed in _LISTS:
         if re.search(pattern, start):
-            return f"is {kind}, which names other files; mien opens none of those: give the video itself"
+            return f"is {listed}, which names other files; mien opens none of those: give the video itself"
     if isinstance(error, av.error.ArgumentError):
         return "is a file of a kind that mien does not open; convert it to .mp4 or .mov"
+    if kind == "sound":
+        return f"cannot be read as sound ({error.strerror or error}); convert it to .wav or .mp3"
     named_so = path.suffix.lower() in _VIDEO_ENDINGS
     remedy = "incomplete? copy it again" if named_so else "give a video file, such as .mp4 or .mov"
     return f"cannot be read as a video ({error.strerror or error}); {remedy}"

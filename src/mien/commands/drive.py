@@ -6,22 +6,26 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.options import check_driver
+from mien.capture.camera_names import CameraFormat, camera_named, is_camera
+from mien.commands.options import check_avatar, check_driver, check_port, check_viewer, has_viewer
 from mien.commands.picture import PictureOptions
+from mien.errors import UserError
 from mien.workspace import open_workspace
 
 
 @dataclass(frozen=True)
 class Command:
-    """Make an avatar follow somebody else: a video, a sequence, or a recording of a phone or of MediaPipe."""
+    """Make an avatar follow somebody else: a video, a camera, a sequence, or a recording."""
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Workspace folder of the avatar."""
-    by: Path
+    """Workspace folder of the avatar. For a camera, also a .mien file."""
+    by: str
     """The driver: a workspace (also the avatar's own), a video file (tracked first, and kept in the cache), a .csv of
-    Live Link Face, or a .json of blend shapes (docs/using.md)."""
-    out: Path
-    """Output: an .mp4, a .webm, a folder or NAME_%06d.png. If the driver has pictures, they are on the left."""
+    Live Link Face, a .json of blend shapes, a voice (.wav, .mp3, ...), or camera, which opens a viewer (docs/using.md).
+    camera:/dev/video0 names the device; camera:clip.mp4 plays a file as a camera."""
+    out: Path | None = None
+    """Output: an .mp4, a .webm, a folder or NAME_%06d.png. If the driver has pictures, they are on the left. A camera
+    needs none; with an .mp4, it is recorded."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the avatar's run (default: the only one)."""
     sequence: str | None = None
@@ -36,22 +40,59 @@ class Command:
     fps: float | None = None
     """Frame rate of the timecode in a .csv, in frames per second (default: the smallest usual rate above its frame
     numbers)."""
+    camera_format: CameraFormat | None = None
+    """What reads the camera: v4l2 (Linux), avfoundation (macOS) or dshow (Windows). The default is the platform's."""
+    port: int = 0
+    """Port of the camera's viewer, from 1 to 65535. 0 means a free one."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
+        if is_camera(self.by):
+            self._check_camera()
+            return
+        if self.camera_format is not None or self.port:
+            raise UserError(f"--camera-format and --port: are for --by camera, and --by is {self.by}; leave them out")
         open_workspace(self.workspace).pick_run(self.run_name)
+        if self.out is None:
+            raise UserError(f"--by {self.by}: needs --out FILE.mp4; to watch it in a browser, use `mien view --play`")
         # The number of frames is known only after tracking, but a video or numbered pictures take any number.
         self.picture.plan(self.out, 2)
-        check_driver(self.by, self.sequence, self.fps)
+        check_driver(Path(self.by), self.sequence, self.fps)
+
+    def _check_camera(self) -> None:
+        check_avatar(self.workspace, self.run_name)
+        for name, given in (("--sequence", self.sequence), ("--fps", self.fps)):
+            if given is not None:
+                raise UserError(f"{name} {given}: is for recordings, and --by is a camera; leave it out")
+        camera_named(self.by, self.camera_format)
+        check_port(self.port)
+        if self.out is None:
+            check_viewer()
+        elif self.picture.plan(self.out, 2).kind != "mp4":
+            raise UserError(f"--out {self.out}: a camera is recorded as .mp4; choose such a name")
 
     def run(self) -> None:
-        """Track the driver if necessary, then pose and render every timestep."""
+        """Track the driver if necessary, then pose and render every timestep. Follow a camera until Ctrl-C."""
+        if is_camera(self.by):
+            self._follow()
+            return
         from mien.commands.stages.driving import DriveOptions, run_driving_stage
         from mien.commands.stages.pictures import warn_of_white
 
+        assert self.out is not None, "checked"
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         warn_of_white(self.picture, run_dir)
         options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps, self.unlimited)
-        run_driving_stage(run_dir, self.by, self.out, options, self.picture)
+        run_driving_stage(run_dir, Path(self.by), self.out, options, self.picture)
+
+    def _follow(self) -> None:
+        from mien.commands.stages.following import CameraOptions, run_following_stage
+        from mien.commands.stages.viewing import Place
+        from mien.driving.live import FollowOptions
+
+        place = Place("127.0.0.1", self.port) if has_viewer() else None
+        follow = FollowOptions(self.head_pose, self.unlimited)
+        options = CameraOptions(follow, self.picture, self.out, self.alone, place)
+        run_following_stage(self.workspace, self.run_name, camera_named(self.by, self.camera_format), options)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin,
 import tyro
 
 from mien.avatar import DEFAULT_METHOD, METHODS, MethodConfig
+from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.commands.config_file import ConfigFile, read_config_file
 from mien.commands.help_text import subclass_with
 from mien.commands.settings_options import apply_options, check_names, leaves, options_type
@@ -26,6 +27,7 @@ else:
     MethodName = Literal[tuple(METHODS)]
     PresetName = Literal[tuple(PRESETS)]
 
+_MAX_PORT = 65535
 _IN_DETAIL = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]
 """Options that depend on the method. `with_settings` fills them in."""
 
@@ -203,13 +205,45 @@ def _chosen(arguments: Sequence[str]) -> argparse.Namespace:
     return parser.parse_known_args(list(arguments))[0]
 
 
+def check_avatar(avatar: Path, run: str | None) -> None:
+    """Check before any work that there is an avatar: a .mien file, or a run of a workspace.
+
+    Raises:
+        UserError: there is none, or a file is given with a run.
+    """
+    if avatar.is_file():
+        if run is not None:
+            raise UserError(f"--run {run}: a file holds one avatar; leave --run out")
+        if avatar.suffix.lower() != ".mien":
+            raise UserError(f"{avatar}: is no .mien file; give one, or a workspace's folder")
+    elif avatar.suffix.lower() == ".mien" and not avatar.exists():
+        raise UserError(f"{avatar}: no such file; write one with `mien export DIR --out me.mien`")
+    else:
+        open_workspace(avatar).pick_run(run)
+
+
+def check_port(port: int) -> None:
+    """Check the port of a viewer.
+
+    Raises:
+        UserError: it is out of range.
+    """
+    if not 0 <= port <= _MAX_PORT:
+        raise UserError(f"--port {port}: give a number from 1 to {_MAX_PORT}, or 0 for a free one")
+
+
+def has_viewer() -> bool:
+    """Whether the package of the viewer's page is installed."""
+    return importlib.util.find_spec("viser") is not None
+
+
 def check_viewer() -> None:
     """Check that the package of the viewer's page is installed.
 
     Raises:
         UserError: it is missing.
     """
-    if importlib.util.find_spec("viser") is None:
+    if not has_viewer():
         raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")
 
 
@@ -223,8 +257,10 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
     if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
         raise UserError(f"--fps {fps:g}: is for the timecode of a .csv; give a number above 0, at most 1000")
     if not by.exists():
-        raise UserError(f"{by}: no such file or folder; give a workspace, a video, a csv of Live Link Face, or a json")
-    if suffix in (".csv", ".json") and sequence is not None:
+        raise UserError(
+            f"{by}: no such file or folder; give a workspace, a video, a csv of Live Link Face, a json, or a sound file"
+        )
+    if suffix in (".csv", ".json", *SOUND_ENDINGS) and sequence is not None:
         raise UserError(f"--sequence {sequence}: {by} has no sequences; leave --sequence out")
     if not by.is_file():
         open_workspace(by).pick_sequence(sequence)

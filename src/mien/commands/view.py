@@ -6,11 +6,9 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.options import check_driver, check_viewer
+from mien.commands.options import check_avatar, check_driver, check_port, check_viewer
 from mien.errors import UserError
-from mien.workspace import open_workspace
 
-_MAX_PORT = 65535
 _LOOPBACK = "127.0.0.1"
 
 
@@ -33,19 +31,10 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        if self.avatar.is_file():
-            if self.run_name is not None:
-                raise UserError(f"--run {self.run_name}: a file holds one avatar; leave --run out")
-            if self.avatar.suffix.lower() != ".mien":
-                raise UserError(f"{self.avatar}: is no .mien file; give one, or a workspace's folder")
-        elif self.avatar.suffix.lower() == ".mien" and not self.avatar.exists():
-            raise UserError(f"{self.avatar}: no such file; write one with `mien export DIR --out me.mien`")
-        else:
-            open_workspace(self.avatar).pick_run(self.run_name)
+        check_avatar(self.avatar, self.run_name)
         if self.follow and not self.avatar.is_file():
             raise UserError(f"--follow: needs a .mien file, and {self.avatar} is a workspace; leave --follow out")
-        if not 0 <= self.port <= _MAX_PORT:
-            raise UserError(f"--port {self.port}: give a number from 1 to {_MAX_PORT}, or 0 for a free one")
+        check_port(self.port)
         if self.play is not None:
             check_driver(Path(self.play), None)
         check_viewer()

@@ -8,8 +8,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.avatar import neutral_of
+from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.driving.blendshape_json import read_blendshape_json
 from mien.driving.live_link_face import read_live_link_face
+from mien.driving.speech import read_speech
 from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
@@ -28,10 +30,12 @@ class Driver:
     fps: float
     pictures: Callable[[int], UInt8[np.ndarray, "h w 3"]] | None
     """Returns the driver's picture at a timestep. None if there are no pictures."""
+    sound: Path | None = None
+    """A file whose sound belongs to the motion."""
 
 
 def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) -> Driver:
-    """Read a driver from a recording of another program: a .csv of Live Link Face or a .json of blend shapes.
+    """Read a driver from a recording: a .csv of Live Link Face, a .json of blend shapes, or a voice.
 
     Args:
         path: The file. Its ending decides its format.
@@ -41,12 +45,16 @@ def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) 
     Raises:
         UserError: the file is damaged, or the face model has none of ARKit's expressions.
     """
-    is_csv = path.suffix.lower() == ".csv"
-    motion = read_live_link_face(path, fps) if is_csv else read_blendshape_json(path)
+    suffix = path.suffix.lower()
+    is_voice = suffix in SOUND_ENDINGS
+    if is_voice:
+        motion = read_speech(path)
+    else:
+        motion = read_live_link_face(path, fps) if suffix == ".csv" else read_blendshape_json(path)
     if motion.lost:
         say(f"{path}: {motion.lost} of {len(motion)} frames have no face; each repeats the frame before it")
     face, at_rest = face_of_motion(motion, face_model)
-    return Driver(face, at_rest, motion.fps, None)
+    return Driver(face, at_rest, motion.fps, None, path if is_voice else None)
 
 
 def read_tracked_driver(folders: Sequence[Path]) -> Driver:

@@ -30,15 +30,22 @@ _WEBM_QUALITY = 24
 """VP9's constant quality, from 0 (lossless) to 63 (worst)."""
 
 
-def write_pictures(output: Output, pictures: Iterable[UInt8[np.ndarray, "h w _"]], fps: int | float) -> None:
+def write_pictures(
+    output: Output,
+    pictures: Iterable[UInt8[np.ndarray, "h w _"]],
+    fps: int | float,
+    sound: tuple[Path, float] | None = None,
+) -> None:
     """Write pictures (RGB, or RGBA if `output.transparent`), all of one size. Each file is written atomically.
+
+    An .mp4 may have the sound of a file, for a length in seconds.
 
     Raises:
         UserError: there are no pictures, or they cannot be written.
     """
     try:
         if output.kind == "mp4":
-            write_video(output.path, pictures, fps)
+            write_video(output.path, pictures, fps, sound=sound)
         elif output.kind == "webm":
             _write_webm(output, pictures, fps)
         else:

@@ -10,19 +10,33 @@ from mien.lazy import lazy_names
 if TYPE_CHECKING:
     from mien.viewer.access import Door, is_loopback
     from mien.viewer.drawing import Look, Mesh, View
+    from mien.viewer.following import CameraSwitch
     from mien.viewer.loop import DrawingLoop
     from mien.viewer.server import serve
-    from mien.viewer.session import Clip, Session
+    from mien.viewer.session import Clip, Seen, Session
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
             "access": ["Door", "is_loopback"],
             "drawing": ["Look", "Mesh", "View"],
+            "following": ["CameraSwitch"],
             "loop": ["DrawingLoop"],
             "server": ["serve"],
-            "session": ["Clip", "Session"],
+            "session": ["Clip", "Seen", "Session"],
         },
     )
 
-__all__ = ["Clip", "Door", "DrawingLoop", "Look", "Mesh", "Session", "View", "is_loopback", "serve"]
+__all__ = [
+    "CameraSwitch",
+    "Clip",
+    "Door",
+    "DrawingLoop",
+    "Look",
+    "Mesh",
+    "Seen",
+    "Session",
+    "View",
+    "is_loopback",
+    "serve",
+]

@@ -24,6 +24,8 @@ _LINE_SHARE = 0.6
 """Colour of the wireframe, and its share in a pixel that it covers."""
 _MADE_UP, _SEEN = (0.93, 0.45, 0.30), (0.25, 0.55, 0.80)
 """Colours of the mesh where nothing was filmed, and where everything was: those of the report."""
+_CORNER, _MARGIN = 0.25, 0.02
+"""Height of the camera's picture in a corner, and its distance from the edges, as shares of the picture's height."""
 MIN_SIDE, MAX_SIDE = 16, 2048
 """Smallest and largest side of a picture, in pixels."""
 
@@ -133,6 +135,18 @@ def beside(
     fitted = cv2.resize(filmed, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
     left[top : top + size[1], start : start + size[0]] = fitted
     return np.concatenate([left, shown], axis=1)
+
+
+def in_corner(seen: UInt8[np.ndarray, "_ _ 3"], shown: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with what the camera saw in its lower left corner."""
+    height, width = shown.shape[:2]
+    scale = min(_CORNER * height / seen.shape[0], _CORNER * width / seen.shape[1])
+    wide, high = (max(1, round(scale * side)) for side in (seen.shape[1], seen.shape[0]))
+    small = cv2.resize(seen, (wide, high), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    bottom, left = height - round(_MARGIN * height), min(round(_MARGIN * height), width - wide)
+    picture = shown.copy()
+    picture[bottom - high : bottom, left : left + wide] = small
+    return picture
 
 
 def words_about_view(filmed: runtime.Filmed | None, face: runtime.Face, view: View) -> str:

@@ -14,6 +14,7 @@ from mien.terminal import printable
 from mien.viewer.drawing import BACKGROUNDS, Surface, View
 from mien.viewer.faces import grouped, matches, presets_for, readable
 from mien.viewer.files import Stopped, screenshot, video
+from mien.viewer.following import CameraSwitch
 from mien.viewer.session import Session, centre_of
 
 MAX_ANGLE = 0.5
@@ -29,7 +30,14 @@ _FOLLOW_SECONDS = 0.25
 class Panel:
     """The controls of one session."""
 
-    def __init__(self, server: viser.ViserServer, session: Session, title: str, view_of: Callable[..., View]) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        title: str,
+        view_of: Callable[..., View],
+        camera: CameraSwitch | None = None,
+    ) -> None:
         """Add the controls to a server.
 
         Args:
@@ -37,16 +45,21 @@ class Panel:
             session: What the controls change.
             title: Name of the avatar, for people and for the files that are saved.
             view_of: Returns the view of a client.
+            camera: What lets the avatar follow a camera, if there is one.
         """
         self._server, self._session, self._view_of = server, session, view_of
         self._title = printable(Path(title).name) or "avatar"
         self._sliders: dict[str, viser.GuiSliderHandle[float]] = {}
         self._time: viser.GuiSliderHandle[int] | None = None
+        self._report: viser.GuiMarkdownHandle | None = None
         self._followed_at, self._stopping = 0.0, False
         self._recording = threading.Lock()
         about = session.avatar.portable.about
         count = len(session.avatar.portable.baked.attributes.opacity_logits)
         server.gui.add_markdown(f"**{_plain(self._title)}**: {count:,} Gaussians, {_plain(about.method)}")
+        self._camera = camera
+        if camera is not None:
+            self._add_camera(camera)
         if session.clip_names:
             self._add_motion()
         self._add_faces()
@@ -60,11 +73,14 @@ class Panel:
         self._stopping = True
 
     def follow(self) -> None:
-        """Move the sliders to the face that is shown, now and then while a motion plays."""
+        """Move the sliders to the face that is shown, now and then while a motion plays or a camera is followed."""
         now = time.monotonic()
-        if self._session.playing and now - self._followed_at < _FOLLOW_SECONDS:
+        moves = self._session.playing or (self._camera is not None and self._camera.is_on)
+        if moves and now - self._followed_at < _FOLLOW_SECONDS:
             return
         self._followed_at = now
+        if self._report is not None and self._camera is not None:
+            self._report.content = _plain_lines(self._camera.report())
         if self._time is not None:
             self._time.value = self._session.timestep
 
@@ -78,6 +94,34 @@ class Panel:
             slider.value = _rounded(values[name], slider.min, slider.max)
         if self._time is not None:
             self._time.value = self._session.timestep
+
+    def _add_camera(self, camera: CameraSwitch) -> None:
+        gui, session = self._server.gui, self._session
+        with gui.add_folder("Camera"):
+            follow = gui.add_checkbox("Follow camera", camera.is_on)
+            learn = gui.add_button("This is my face at rest", hint="Look ahead for a second, with a relaxed face")
+            inset = gui.add_checkbox("Camera picture in the corner", session.with_camera)
+            self._report = gui.add_markdown("")
+
+        @follow.on_update
+        def _(event: Any) -> None:
+            try:
+                if follow.value:
+                    camera.start()
+                else:
+                    camera.stop()
+            except UserError as error:
+                self._complain(event.client, str(error))
+                follow.value = False
+            self.move_sliders()
+
+        @learn.on_click
+        async def _(event: Any) -> None:
+            camera.learn_rest()
+
+        @inset.on_update
+        async def _(event: Any) -> None:
+            session.show(with_camera=inset.value)
 
     def _add_motion(self) -> None:
         gui, session = self._server.gui, self._session
@@ -289,3 +333,7 @@ def _rounded(value: float, low: float, high: float) -> float:
 def _plain(text: str) -> str:
     """A text without characters that Markdown or HTML would read."""
     return "".join(character if character.isalnum() or character in " -._" else " " for character in printable(text))
+
+
+def _plain_lines(lines: list[str]) -> str:
+    return "  \n".join(_plain(line) for line in lines)

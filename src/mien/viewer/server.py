@@ -21,6 +21,7 @@ from websockets.http11 import Request, Response
 from mien.errors import UserError
 from mien.viewer.access import Door
 from mien.viewer.drawing import View
+from mien.viewer.following import CameraSwitch
 from mien.viewer.loop import DrawingLoop
 from mien.viewer.panel import Panel, filmed_from
 from mien.viewer.session import Session, centre_of
@@ -32,8 +33,15 @@ _MOST_FIELD = math.pi - 0.01
 _WATCH_SECONDS = 0.5
 
 
-def serve(session: Session, door: Door, port: int, title: str, ready: Callable[[str], None]) -> None:
-    """Show a session to browsers until Ctrl-C or SIGTERM.
+def serve(
+    session: Session,
+    door: Door,
+    port: int,
+    title: str,
+    ready: Callable[[str], None],
+    camera: CameraSwitch | None = None,
+) -> None:
+    """Show a session to browsers until Ctrl-C or SIGTERM, or until its camera ends.
 
     Args:
         session: The session.
@@ -41,11 +49,12 @@ def serve(session: Session, door: Door, port: int, title: str, ready: Callable[[
         port: The port, or 0 for a free one.
         title: Name of the avatar.
         ready: Is called with the address, as soon as browsers can open it.
+        camera: What lets the avatar follow a camera, if there is one.
 
     Raises:
-        UserError: the host or the port cannot be used.
+        UserError: the host or the port cannot be used, or the camera fails.
     """
-    serving = Serving(session, door, port, title)
+    serving = Serving(session, door, port, title, camera)
     try:
         ready(serving.address)
         serving.wait()
@@ -56,8 +65,9 @@ def serve(session: Session, door: Door, port: int, title: str, ready: Callable[[
 class Serving:
     """A server that runs."""
 
-    def __init__(self, session: Session, door: Door, port: int, title: str) -> None:
+    def __init__(self, session: Session, door: Door, port: int, title: str, camera: CameraSwitch | None = None) -> None:
         """Start the server; the arguments are those of `serve`."""
+        self._camera = camera
         chosen = _free_port(door.host, port)
         # A client that vanishes in the middle of a request is no error of the viewer.
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
@@ -80,8 +90,8 @@ class Serving:
         self.address = door.address(shown, self.port)
 
     def wait(self) -> None:
-        """Wait until the loop fails, which is a bug. Ctrl-C and SIGTERM end the wait, too."""
-        while self.loop.running:
+        """Wait until the camera ends, or the loop fails, which is a bug. Ctrl-C and SIGTERM end the wait, too."""
+        while self.loop.running and not (self._camera is not None and self._camera.ended):
             self.loop.wait(_WATCH_SECONDS)
         if self.loop.error is not None:
             raise self.loop.error
@@ -108,7 +118,7 @@ class Serving:
         server.initial_camera.fov = 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
         self.loop = DrawingLoop(session.picture, session.advance)
         session.changed = self.loop.change
-        self._panel = Panel(server, session, title, view_of)
+        self._panel = Panel(server, session, title, view_of, self._camera)
         self.loop.start()
         # A browser may leave while its picture is drawn; viser would warn about that.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
@@ -121,6 +131,9 @@ class Serving:
         def show(picture: Any, full: bool) -> None:
             quality = _STILL_QUALITY if full else _MOVING_QUALITY
             client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+            seen = self._session.taken()
+            if seen is not None and self._camera is not None:
+                self._camera.shown(seen)
             self._panel.follow()
             if not self._session.playing:
                 view = view_of(client.camera)

@@ -15,7 +15,7 @@ from mien import runtime
 from mien.export import Motion
 from mien.runtime import Face
 from mien.runtime.filmed import within_filmed_inputs
-from mien.viewer.drawing import Look, Mesh, View, beside, draw, words_about_view
+from mien.viewer.drawing import Look, Mesh, View, beside, draw, in_corner, words_about_view
 from mien.viewer.faces import preset_expression, random_expression
 
 DEFAULT_HEIGHT = 512
@@ -31,6 +31,15 @@ class Clip:
     motion: Motion
     pictures: Callable[[int], UInt8[np.ndarray, "_ _ 3"]] | None = None
     """Returns the filmed frame at a timestep. None if there are none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a camera saw, from which the face that is shown was made."""
+
+    picture: UInt8[np.ndarray, "_ _ 3"]
+    seconds: float
+    """Time of `time.monotonic` at which the frame came."""
 
 
 class Session:
@@ -56,7 +65,12 @@ class Session:
         self._timestep = 0
         self._playing_since: float | None = None
         """Time at which timestep 0 was due, or None if nothing plays."""
+        self._seen: Seen | None = None
+        self._drawn: Seen | None = None
+        self._last_seen: Seen | None = None
         self.look, self.height, self.side_by_side = Look(), DEFAULT_HEIGHT, False
+        self.with_camera = True
+        """Whether pictures show in a corner what the camera saw."""
         self.changed: Callable[[], None] = lambda: None
         """Is called after each change."""
 
@@ -180,11 +194,29 @@ class Session:
                 self._change()
             return self._playing_since + (steps + 1) / motion.fps
 
+    def follow(self, face: Face, seen: Seen) -> None:
+        """Show the face that a camera saw. A motion that plays is paused."""
+        with self._lock:
+            self._seen = seen
+            self._take(face)
+
+    def stop_following(self) -> None:
+        """Show no longer what a camera saw, and the person at rest."""
+        with self._lock:
+            self._seen = None
+            self.rest()
+
+    def taken(self) -> Seen | None:
+        """What the camera saw for the last picture of a view. It is returned once for each frame."""
+        drawn, self._drawn = self._drawn, None
+        return drawn
+
     def show(self, **changes: Any) -> None:
-        """Change `look` (fields of `Look`), `height` or `side_by_side`."""
+        """Change `look` (fields of `Look`), `height`, `side_by_side` or `with_camera`."""
         with self._lock:
             self.height = int(changes.pop("height", self.height))
             self.side_by_side = bool(changes.pop("side_by_side", self.side_by_side))
+            self.with_camera = bool(changes.pop("with_camera", self.with_camera))
             self.look = replace(self.look, **changes)
             self._change()
 
@@ -200,7 +232,7 @@ class Session:
             timestep: Timestep of the motion to draw (default: the face that is shown).
         """
         with self._lock:
-            face, look, clip = self._face, self.look, self._clip
+            face, look, clip, seen = self._face, self.look, self._clip, self._seen
             most, side_by_side = height or self.height, self.side_by_side
             if timestep is None:
                 timestep = self._timestep
@@ -214,7 +246,10 @@ class Session:
         with self._drawing:
             camera = view.camera(wide if filmed is None else max(1, wide // 2), high)
             shown = draw(self._gaussians(face), face, self.mesh, look, camera)
-            return shown if filmed is None else beside(filmed(timestep), shown, look.background)
+            picture = shown if filmed is None else beside(filmed(timestep), shown, look.background)
+            if seen is not self._last_seen:
+                self._drawn = self._last_seen = seen
+            return in_corner(seen.picture, picture) if seen is not None and self.with_camera else picture
 
     def words(self, view: View) -> str:
         """One line about whether a view shows a side that was filmed."""

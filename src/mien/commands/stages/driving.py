@@ -9,6 +9,7 @@ import numpy as np
 
 from mien.avatar import load_avatar
 from mien.capture import CaptureSettings
+from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.commands.options import check_driver
 from mien.commands.picture import PictureOptions
 from mien.commands.stages.capturing import run_capture_stage
@@ -28,7 +29,7 @@ from mien.workspace import Workspace, open_workspace
 
 
 def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None) -> Driver:
-    """Open a driver: a workspace, a video (captured, tracked and kept in the cache), or a csv or json file.
+    """Open a driver: a workspace, a video (captured, tracked and kept in the cache), a csv, a json, or a voice.
 
     Args:
         by: The workspace or file.
@@ -41,7 +42,7 @@ def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: floa
     """
     check_driver(by, sequence, fps)
     suffix = by.suffix.lower() if by.is_file() else ""
-    if suffix in (".csv", ".json"):
+    if suffix in (".csv", ".json", *SOUND_ENDINGS):
         return read_recording(by, face_model, fps)
     if by.is_file():
         workspace, names = _tracked_video(by, face_model.name)
@@ -107,5 +108,9 @@ def run_driving_stage(
         return side_by_side([cv2.resize(theirs, (width, camera.height), interpolation=cv2.INTER_AREA), shown])
 
     frames = (frame(timestep) for timestep in itertools.islice(itertools.count(), len(driven)))
-    write_pictures(output, track_progress(frames, "Driving", len(driven)), driver.fps)
+    sound = None if driver.sound is None else (driver.sound, len(driven) / driver.fps)
+    if sound is not None and output.kind != "mp4":
+        say(f"{out}: has no sound; only an .mp4 gets that of {driver.sound}")
+        sound = None
+    write_pictures(output, track_progress(frames, "Driving", len(driven)), driver.fps, sound)
     say(f"{out}: {len(driven)} frames")

@@ -14,9 +14,12 @@ import torch
 
 from mien import runtime
 from mien.avatar import as_array, bake_rig, load_avatar, make_portable
+from mien.capture.camera_names import CameraName, camera_named, devices
+from mien.capture.live_camera import LiveCamera
 from mien.commands.stages.driving import open_driver
 from mien.commands.stages.live_view import PARENT
 from mien.driving import drive, keep_to_filmed
+from mien.driving.live import Follower, FollowOptions
 from mien.errors import UserError
 from mien.export import Motion
 from mien.face import FaceModel, FaceParams, load_face_model
@@ -24,7 +27,7 @@ from mien.progress import say
 from mien.runtime import MeshBound, PortableAvatar, read_portable
 from mien.training import read_coverage, run_camera
 from mien.training.run import filmed_range
-from mien.viewer import Clip, Door, Mesh, Session, serve
+from mien.viewer import CameraSwitch, Clip, Door, Mesh, Session, is_loopback, serve
 from mien.workspace import open_workspace
 
 _FOLLOW_SECONDS = 0.5
@@ -53,7 +56,7 @@ class Place:
 
 def run_viewing_stage(avatar: Path, run: str | None, play: str | None, place: Place, follow: bool = False) -> None:
     """Show an avatar in browsers until Ctrl-C. With `follow`, show its file anew each time it changes."""
-    viewed = _of_file(avatar) if avatar.is_file() else _of_workspace(avatar, run)
+    viewed = open_viewed(avatar, run)
     clips = {name: _clip_of(viewed, folder, name) for name, folder in viewed.sequences.items()}
     if play is not None:
         clips[Path(play).name] = _clip_of(viewed, Path(play), None)
@@ -66,9 +69,37 @@ def run_viewing_stage(avatar: Path, run: str | None, play: str | None, place: Pl
     if follow:
         threading.Thread(target=_follow, args=(session, avatar), daemon=True).start()
     try:
-        serve(session, door, place.port, viewed.portable.about.name, ready)
+        serve(session, door, place.port, viewed.portable.about.name, ready, _camera_switch(session, viewed, place))
     except KeyboardInterrupt:
         say("The viewer is closed")
+
+
+def _camera_switch(session: Session, viewed: Viewed, place: Place) -> CameraSwitch | None:
+    """The switch of this machine's first camera, if it has one. Browsers of other machines must not turn it on."""
+    if not devices() or not is_loopback(place.host) or os.environ.get(PARENT) is not None:
+        return None
+    return switch_of(session, viewed, camera_named("camera", None), FollowOptions())
+
+
+def switch_of(
+    session: Session, viewed: Viewed, name: CameraName, follow: FollowOptions, again: bool = True
+) -> CameraSwitch:
+    """What lets the avatar of a session follow a camera.
+
+    Args:
+        session: The session.
+        viewed: Its avatar.
+        name: The camera.
+        follow: How the avatar follows.
+        again: Whether a file starts again at its end.
+    """
+
+    def make() -> Follower:
+        model, person = viewed.person()
+        eye = as_array(position(viewed.portable.camera))
+        return Follower(model, person, viewed.portable.filmed, eye, follow)
+
+    return CameraSwitch(session, lambda: LiveCamera(name, again, say), make)
 
 
 def _follow(session: Session, path: Path) -> None:
@@ -93,6 +124,11 @@ def _changed_at(path: Path) -> int | None:
         return path.stat().st_mtime_ns
     except OSError:
         return None
+
+
+def open_viewed(avatar: Path, run: str | None) -> Viewed:
+    """Open a .mien file, or a run of a workspace."""
+    return _of_file(avatar) if avatar.is_file() else _of_workspace(avatar, run)
 
 
 def _of_file(path: Path) -> Viewed:
@@ -142,7 +178,7 @@ def _clip_of(viewed: Viewed, by: Path, sequence: str | None) -> Callable[[], Cli
         face = drive(driver.face, driver.at_rest, subject, model.expression_bounds, True, str(by))
         portable = viewed.portable
         if portable.filmed is not None:
-            eye = _position(portable.camera)
+            eye = position(portable.camera)
             face, _ = keep_to_filmed(face, portable.filmed, subject, model.expression_bounds, eye)
         fields = (face.expression, face.joints, face.head_rotation, face.head_translation)
         return Clip(Motion(*map(as_array, fields), fps=driver.fps), driver.pictures)
@@ -150,6 +186,6 @@ def _clip_of(viewed: Viewed, by: Path, sequence: str | None) -> Callable[[], Cli
     return load
 
 
-def _position(camera: runtime.Camera) -> torch.Tensor:
+def position(camera: runtime.Camera) -> torch.Tensor:
     """The camera's centre in world space, in metres."""
     return torch.from_numpy((-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]).astype(np.float32))

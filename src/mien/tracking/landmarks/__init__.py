@@ -14,6 +14,7 @@ from mien.tracking.landmarks.groups import (
     RIGHT_EYELIDS,
     RIGHT_IRIS,
     RIGHT_LID_PAIRS,
+    landmark_weights,
 )
 from mien.tracking.landmarks.model import LandmarkModel, reduce_face_model
 from mien.tracking.landmarks.outcome import as_tracking
@@ -44,6 +45,7 @@ __all__ = [
     "embed_landmarks",
     "fit_bias",
     "fit_landmarks",
+    "landmark_weights",
     "follow_landmarks",
     "move_subject",
     "quiet_landmarks",

@@ -1,0 +1,191 @@
+"""From landmarks of a camera's frames to the face of an avatar: calibration, smoothing, limits, and rest."""
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from mien.avatar import as_array
+from mien.driving.keeping import keep_to_filmed
+from mien.driving.live.landmark_fit import Fitted, LandmarkFit
+from mien.driving.live.one_euro import OneEuro
+from mien.driving.transfer import drive
+from mien.face import FaceModel, FaceParams
+from mien.runtime import Face, Filmed
+from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+
+State = Literal["waiting", "learning", "following", "resting"]
+"""waiting: there was no face yet. learning: the face at rest is being learnt. following. resting: the face is away."""
+LEARN_SECONDS = 1.0
+"""Time over which the face at rest is learnt, in seconds."""
+_LEAST_FRAMES = 8
+AWAY_SECONDS = 0.4
+"""Time without a face after which the avatar goes to rest. Until then it keeps its face, because detectors miss some
+frames."""
+REST_SECONDS = 0.35
+"""Time in which the avatar goes two thirds of the way to rest, in seconds."""
+_CUTOFFS = {"head": (1.2, 12.0), "place": (1.0, 40.0), "eye": (2.5, 4.0), "mouth": (2.0, 4.0), "rest": (1.2, 2.0)}
+"""Cutoffs of the smoothing at rest in Hz, and their growth in Hz for a speed of 1 a second: of the head's angles in
+radians, its place in metres, eyes and lids, jaw and mouth, and the other coefficients."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, " 3"]
+
+
+@dataclass(frozen=True)
+class FollowOptions:
+    """How an avatar follows."""
+
+    head_pose: bool = True
+    """Whether the head follows the person's."""
+    unlimited: bool = False
+    """Whether the avatar follows also beyond what it was filmed with."""
+
+
+class Follower:
+    """Makes an avatar follow landmarks, frame after frame. `recalibrate` may be called from any thread."""
+
+    def __init__(
+        self,
+        model: FaceModel,
+        person: FaceParams,
+        filmed: Filmed | None,
+        eye: Float[np.ndarray, " 3"],
+        options: FollowOptions | None = None,
+    ) -> None:
+        """Prepare to follow.
+
+        Args:
+            model: The avatar's face model.
+            person: One timestep of the avatar's person at rest.
+            filmed: What the avatar was filmed with; None for no limits.
+            eye: Position of the camera that sees the avatar, in world space, in metres.
+            options: How it follows.
+        """
+        self._options = options or FollowOptions()
+        self._model, self._person = model, person
+        self._filmed = None if self._options.unlimited else filmed
+        self._eye = torch.from_numpy(np.asarray(eye, np.float32))
+        self._fit = LandmarkFit(model, person)
+        self._lock = threading.Lock()
+        self._learning: deque[tuple[float, np.ndarray]] = deque(maxlen=120)
+        self._rest: _Pose | None = None
+        self._seen_at: float | None = None
+        self._values = np.zeros(6 + len(self._fit.names))
+        self._driven_at = 0.0
+        self._smoothing = self._new_smoothing()
+        self._must_learn = False
+        self.state: State = "waiting"
+        self.error = float("nan")
+        """Weighted root mean square distance in pixels between landmarks and their fit in the last frame."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what is followed, besides the head: expressions, then components of joints."""
+        return self._fit.names
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The smoothed coefficients by name, as differences from the person at rest."""
+        return dict(zip(self._fit.names, self._values[6:].tolist(), strict=True))
+
+    def recalibrate(self) -> None:
+        """Learn the face at rest anew from the next second."""
+        with self._lock:
+            self._must_learn = True
+
+    def __call__(self, landmarks: Float[np.ndarray, "l 2"] | None, width: int, height: int, seconds: float) -> Face:
+        """The avatar's face after the next frame.
+
+        Args:
+            landmarks: MediaPipe's landmarks of the person in pixels, or None if there is no face.
+            width: Width of the frame in pixels.
+            height: Height of the frame in pixels.
+            seconds: Time of the frame. Times increase.
+        """
+        with self._lock:
+            if self._must_learn:
+                self._must_learn, self._rest = False, None
+                self._learning.clear()
+        if landmarks is None:
+            self._without_face(seconds)
+        elif self._rest is None:
+            self._seen_at = seconds
+            self._learn(landmarks, width, height, seconds)
+            self._towards_rest(seconds)
+        else:
+            self._seen_at = seconds
+            self._follow(self._fit(landmarks, width, height), seconds)
+        self._driven_at = seconds
+        return self._face()
+
+    def _learn(self, landmarks: Float[np.ndarray, "l 2"], width: int, height: int, seconds: float) -> None:
+        self.state = "learning"
+        if self._learning and seconds - self._learning[-1][0] > AWAY_SECONDS:
+            self._learning.clear()
+        self._learning.append((seconds, landmarks))
+        if seconds - self._learning[0][0] < LEARN_SECONDS or len(self._learning) < _LEAST_FRAMES:
+            return
+        seen = [one for _, one in self._learning]
+        # A handful of frames says as much as all of them, and a picture must not wait.
+        seen = seen[:: max(1, len(seen) // _LEAST_FRAMES)]
+        self._fit.learn_rest(seen, width, height)
+        poses = [self._fit.rest_pose(one, width, height) for one in seen]
+        middle = poses[len(poses) // 2].rotation
+        turns = axis_angle_from_matrix(np.stack([middle.T @ pose.rotation for pose in poses]))
+        rotation = middle @ matrix_from_axis_angle(np.median(turns, axis=0)[None])[0]
+        self._rest = _Pose(rotation, np.median([pose.translation for pose in poses], axis=0))
+        self._learning.clear()
+        self._smoothing = self._new_smoothing()
+        self._smoothing(self._values, self._driven_at)
+
+    def _follow(self, fitted: Fitted, seconds: float) -> None:
+        self.state, self.error = "following", fitted.error
+        rest = self._rest
+        assert rest is not None
+        turn = axis_angle_from_matrix((rest.rotation.T @ fitted.rotation)[None])[0]
+        moved = rest.rotation.T @ (fitted.translation - rest.translation)
+        self._values = self._smoothing(np.concatenate([turn, moved, fitted.coefficients]), seconds)
+
+    def _without_face(self, seconds: float) -> None:
+        if self._seen_at is None or seconds - self._seen_at > AWAY_SECONDS:
+            self.state = "waiting" if self._rest is None else "resting"
+            self._fit.forget()
+            self._towards_rest(seconds)
+
+    def _towards_rest(self, seconds: float) -> None:
+        """Go to rest gently. When the face is back, the smoothing starts from here."""
+        self._values = self._values * np.exp(-max(0.0, seconds - self._driven_at) / REST_SECONDS)
+        self._smoothing = self._new_smoothing()
+        self._smoothing(self._values, seconds)
+
+    def _face(self) -> Face:
+        still = np.zeros(3)
+        driver = self._fit.face_of(self._values[:3], self._values[3:6], self._values[6:])
+        at_rest = self._fit.face_of(still, still, np.zeros(len(self._fit.names)))
+        bounds = self._model.expression_bounds
+        face = drive(driver, at_rest, self._person, bounds, self._options.head_pose)
+        if self._filmed is not None:
+            face, _ = keep_to_filmed(face, self._filmed, self._person, bounds, self._eye)
+        return Face(
+            *(as_array(field)[0] for field in (face.expression, face.joints, face.head_rotation, face.head_translation))
+        )
+
+    def _new_smoothing(self) -> OneEuro:
+        kinds = ["head"] * 3 + ["place"] * 3 + [_kind(name) for name in self._fit.names]
+        cutoff, beta = np.array([_CUTOFFS[kind] for kind in kinds]).T
+        return OneEuro(cutoff, beta)
+
+
+def _kind(name: str) -> str:
+    lowered = name.lower()
+    if "eye" in lowered:
+        return "eye"
+    return "mouth" if lowered.startswith(("mouth", "jaw", "tongue")) else "rest"

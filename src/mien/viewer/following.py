@@ -1,0 +1,144 @@
+"""An avatar that follows a camera: one thread tracks the newest frame, and the session shows the face."""
+
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from mien.capture.faces import LandmarkDetector
+from mien.capture.live_camera import LiveCamera, LiveFrame
+from mien.driving.live import Follower
+from mien.viewer.meters import Meters
+from mien.viewer.session import Seen, Session
+
+STAGES = ("camera", "tracking", "drawing")
+_PATIENCE_SECONDS = 0.04
+"""Time without a frame after which the avatar goes on to rest, in seconds."""
+_WORDS = {
+    "waiting": "Nobody is seen. Look into the camera.",
+    "learning": "Look ahead for a second, with a relaxed face.",
+    "following": "Following.",
+    "resting": "The face is away, so the avatar rests.",
+}
+
+
+class CameraSwitch:
+    """Follows a camera while it is on. Methods may be called from any thread."""
+
+    def __init__(self, session: Session, open_camera: Callable[[], LiveCamera], make: Callable[[], Follower]) -> None:
+        """Prepare to follow; nothing is opened before `start`.
+
+        Args:
+            session: What shows the avatar.
+            open_camera: Returns the camera, not opened yet.
+            make: Returns a new follower.
+        """
+        self._session, self._open, self._make = session, open_camera, make
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._camera: LiveCamera | None = None
+        self._follower: Follower | None = None
+        self.meters = Meters(STAGES)
+        self.watch: Callable[[Seen], None] | None = None
+        """Is called after each frame that was followed."""
+        self.error: BaseException | None = None
+        """What ended the thread, if anything did."""
+        self.ended = False
+        """Whether the camera's file has ended, or the thread has failed."""
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the camera is followed."""
+        return self._thread is not None
+
+    def start(self) -> None:
+        """Open the camera and follow it. If it is on already, nothing changes.
+
+        Raises:
+            UserError: the camera cannot be opened.
+        """
+        with self._lock:
+            if self._thread is not None:
+                return
+            follower = self._make()
+            camera = self._open()
+            camera.__enter__()
+            self._stopping.clear()
+            self._camera, self._follower = camera, follower
+            self._thread = threading.Thread(
+                target=self._run, args=(camera, follower), name="mien-tracking", daemon=True
+            )
+            self._thread.start()
+
+    def stop(self) -> None:
+        """Close the camera, and show the person at rest. If it is off already, nothing changes."""
+        with self._lock:
+            thread, camera = self._thread, self._camera
+            self._thread = self._camera = None
+            if thread is None or camera is None:
+                return
+            self._stopping.set()
+            camera.__exit__(None, None, None)
+            thread.join()
+            self._session.stop_following()
+
+    def learn_rest(self) -> None:
+        """Learn the person's face at rest anew."""
+        if self._follower is not None:
+            self._follower.recalibrate()
+
+    def shown(self, seen: Seen) -> None:
+        """Take account of a picture that went out."""
+        now = time.monotonic()
+        self.meters.count("drawing", now)
+        self.meters.delay(now - seen.seconds)
+
+    def report(self) -> list[str]:
+        """Lines for people: what happens, rates, and delays."""
+        camera, follower = self._camera, self._follower
+        if camera is None or follower is None:
+            return ["The camera is off."]
+        if camera.is_lost:
+            return ["The camera is away. mien waits for it."]
+        return [_WORDS[follower.state], *self.meters.words(time.monotonic())]
+
+    def _run(self, camera: LiveCamera, follower: Follower) -> None:
+        try:
+            with LandmarkDetector(several_faces=False) as detector:
+                camera.start()  # Only now, because the detector takes seconds to load.
+                self._follow(camera, follower, detector)
+            self.error = camera.error
+        except BaseException as error:  # noqa: BLE001
+            self.error = error
+        self.ended = self.error is not None or camera.ended
+
+    def _follow(self, camera: LiveCamera, follower: Follower, detector: LandmarkDetector) -> None:
+        number, frames, last = -1, 0, None
+        while not self._stopping.is_set():
+            frame = camera.newest(number, _PATIENCE_SECONDS)
+            if frame is None:
+                if camera.ended:
+                    return
+                if last is not None and camera.is_lost:
+                    self._show(follower, None, last, time.monotonic())
+                continue
+            number, last = frame.number, frame
+            for _ in range(camera.frames - frames if frames else 1):
+                self.meters.count("camera", frame.seconds)
+            frames = camera.frames
+            faces = detector.detect(frame.picture)
+            self._show(follower, faces[0] if len(faces) else None, frame, frame.seconds)
+            self.meters.count("tracking", time.monotonic())
+
+    def _show(
+        self, follower: Follower, landmarks: Float[np.ndarray, "l 2"] | None, frame: LiveFrame, seconds: float
+    ) -> None:
+        height, width = frame.picture.shape[:2]
+        face = follower(landmarks, width, height, seconds)
+        seen = Seen(frame.picture, seconds)
+        self._session.follow(face, seen)
+        if self.watch is not None:
+            self.watch(seen)

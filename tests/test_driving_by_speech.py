@@ -1,0 +1,168 @@
+"""A voice drives an avatar: silence, loudness, high and low sounds, and the sound in the video."""
+
+import wave
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from mien.capture.sound import RATE, read_sound
+from mien.capture.video import count_frames, read_video_frames, write_video
+from mien.cli import main
+from mien.commands.stages import driving
+from mien.driving import Driver
+from mien.driving.motion import ARKIT_NAMES
+from mien.driving.speech import FPS, blink_at, motion_of_sound, read_speech, sway_at
+from mien.errors import UserError
+from mien.face import load_face_model
+from toy_scene import toy_face_model
+from toy_workspace import write_toy_workspace
+
+SECONDS = 6.0
+MOUTH = [index for index, name in enumerate(ARKIT_NAMES) if name.startswith(("jaw", "mouth"))]
+
+
+def column(values: np.ndarray, name: str) -> np.ndarray:
+    return values[:, ARKIT_NAMES.index(name)]
+
+
+def write_wav(path: Path, samples: np.ndarray, rate: int = RATE, channels: int = 1) -> Path:
+    with wave.open(str(path), "wb") as file:
+        file.setnchannels(channels)
+        file.setsampwidth(2)
+        file.setframerate(rate)
+        file.writeframes(np.repeat(samples * 32767, channels).astype("<i2").tobytes())
+    return path
+
+
+def tone(frequency: float, loudness: float = 0.5, rate: int = RATE) -> tuple[np.ndarray, np.ndarray]:
+    """Return a tone that begins after a second and swells and fades, with its envelope (0..1)."""
+    seconds = np.arange(round(SECONDS * rate)) / rate
+    envelope = (0.5 - 0.5 * np.cos(2 * np.pi * (seconds - 1) / 1.1)) * (seconds > 1)
+    return (loudness * envelope * np.sin(2 * np.pi * frequency * seconds)).astype(np.float32), envelope
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3])
+def test_silence_keeps_the_mouth_shut(noise: float) -> None:
+    samples = (noise * np.random.default_rng(0).standard_normal(round(SECONDS * RATE))).astype(np.float32)
+    motion = motion_of_sound(samples)
+    assert len(motion) == SECONDS * FPS
+    assert motion.fps == FPS
+    assert (motion.coefficients[:, MOUTH] == 0).all()
+    assert column(motion.coefficients, "eyeBlinkLeft").max() > 0.6, "the avatar lives"
+    assert 0.005 < np.abs(motion.head_rotation).max() < 0.1
+
+
+@pytest.mark.parametrize("loudness", [0.9, 0.05])
+@pytest.mark.parametrize("frequency", [150.0, 1200.0])
+def test_the_jaw_follows_the_envelope(frequency: float, loudness: float) -> None:
+    samples, envelope = tone(frequency, loudness)
+    samples = samples + 1e-4 * np.random.default_rng(0).standard_normal(len(samples)).astype(np.float32)
+    motion = motion_of_sound(samples)
+    jaw = column(motion.coefficients, "jawOpen")
+    sampled = np.interp(np.arange(len(motion)) / FPS, np.arange(len(samples)) / RATE, envelope)
+    by_lag = {lag: np.corrcoef(np.roll(jaw, -lag), sampled)[0, 1] for lag in (-2, -1, 0, 1, 2)}
+    assert by_lag[0] >= 0.9
+    assert max(by_lag, key=lambda lag: by_lag[lag]) == 0, "there is no lag"
+    assert jaw[:25].max() < 0.02, "it is silent before the tone"
+    assert 0.4 < jaw.max() <= 0.6
+
+
+def test_pauses_in_noise_close_the_mouth() -> None:
+    samples, envelope = tone(300.0, 0.3)
+    noisy = samples + 0.005 * np.random.default_rng(0).standard_normal(len(samples)).astype(np.float32)
+    jaw = column(motion_of_sound(noisy).coefficients, "jawOpen")
+    assert jaw[:25].max() < 0.05
+    assert jaw.max() > 0.4
+
+
+def test_low_sounds_round_the_lips_and_high_ones_stretch_them() -> None:
+    most = {}
+    for name, frequency in (("low", 200.0), ("high", 5000.0)):
+        coefficients = motion_of_sound(tone(frequency)[0]).coefficients
+        most[name] = {one: column(coefficients, one).max() for one in ("jawOpen", "mouthFunnel", "mouthStretchLeft")}
+    assert most["low"]["mouthFunnel"] > 0.2 > 0.05 > most["high"]["mouthFunnel"]
+    assert most["high"]["mouthStretchLeft"] > 0.2 > 0.05 > most["low"]["mouthStretchLeft"]
+    assert most["high"]["jawOpen"] < 0.6 * most["low"]["jawOpen"]
+
+
+def test_idle_motion() -> None:
+    lids = np.array([blink_at(moment) for moment in np.arange(0, 60, 0.01)])
+    assert lids.max() > 0.95
+    assert 0.02 < (lids > 0).mean() < 0.12
+    assert ((lids[1:] > 0) & (lids[:-1] == 0)).sum() in range(14, 20), "a blink every three and a half seconds"
+    turns = sway_at(np.arange(0, 60, 0.1))
+    np.testing.assert_array_equal(turns[0], 0)
+    assert np.abs(turns).max() < 0.1
+
+
+def test_sound_is_read_from_several_kinds_of_files(tmp_path: Path) -> None:
+    samples, _ = tone(440.0, rate=44_100)
+    stereo = write_wav(tmp_path / "a.wav", samples, 44_100, channels=2)
+    read = read_sound(stereo)
+    assert len(read) == pytest.approx(SECONDS * RATE, abs=50)
+    reference, _ = tone(440.0)
+    assert np.abs(read[: len(reference)] - reference[: len(read)]).max() < 0.02
+    write_video(tmp_path / "film.mp4", [np.zeros((32, 32, 3), np.uint8)] * 50, 25, sound=(stereo, 2.0))
+    assert len(read_sound(tmp_path / "film.mp4")) == pytest.approx(2 * RATE, abs=RATE // 10)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("gone.wav", "no such file"),
+        ("empty.wav", "is empty"),
+        ("text.wav", "cannot be read as sound.*convert it to .wav"),
+        ("film.mp4", "has no sound; give a file with sound"),
+        ("header.wav", "no sound of it can be decoded"),
+        (".", "is not a file; give a sound file"),
+    ],
+)
+def test_files_without_sound_are_refused(name: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "empty.wav").touch()
+    (tmp_path / "text.wav").write_text("la la la " * 100)
+    write_wav(tmp_path / "header.wav", np.zeros(0))
+    write_video(tmp_path / "film.mp4", [np.zeros((32, 32, 3), np.uint8)] * 2, 25)
+    with pytest.raises(UserError, match=message):
+        read_speech(tmp_path / name)
+
+
+@pytest.mark.parametrize("pictures", [30, 90])
+def test_the_video_has_sound_of_its_own_length(tmp_path: Path, pictures: int) -> None:
+    """Sound of two seconds is cut, or followed by silence."""
+    given = write_wav(tmp_path / "a.wav", tone(440.0)[0][: 2 * RATE])
+    out = tmp_path / "out.mp4"
+    write_video(out, [np.zeros((32, 32, 3), np.uint8)] * pictures, 30, sound=(given, pictures / 30))
+    assert count_frames(out) == pictures
+    with av.open(str(out)) as container:
+        lengths = [float((stream.duration or 0) * (stream.time_base or 0)) for stream in container.streams]
+        assert [stream.type for stream in container.streams] == ["video", "audio"]
+    assert lengths == pytest.approx([pictures / 30] * 2, abs=0.05)
+
+
+def test_the_command_writes_a_talking_avatar(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_toy_workspace(tmp_path / "w")
+    voice = write_wav(tmp_path / "voice.wav", tone(440.0)[0][: 3 * RATE])
+    told = driving.open_driver(voice, None, load_face_model("anny"))
+    assert told.sound == voice
+    assert told.pictures is None
+
+    def open_driver(*_: object) -> Driver:
+        face = toy_face_model().neutral(len(told.face))
+        return Driver(face, face[0], told.fps, None, told.sound)
+
+    # The toy head has none of ARKit's expressions.
+    monkeypatch.setattr(driving, "open_driver", open_driver)
+    out = tmp_path / "talking.mp4"
+    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--out", str(out), "--size", "32"]) == 0
+    assert len(list(read_video_frames(out))) == 90
+    assert len(read_sound(out)) == pytest.approx(3 * RATE, abs=RATE // 10)
+    silent = tmp_path / "talking.webm"
+    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--out", str(silent), "--size", "32"]) == 0
+    assert "has no sound; only an .mp4" in capsys.readouterr().err
+    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--sequence", "a", "--out", str(out)]) == 2
+    assert main(["drive", str(tmp_path / "w"), "--by", str(voice)]) == 2
+    assert "needs --out" in capsys.readouterr().err
