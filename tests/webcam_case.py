@@ -13,8 +13,8 @@ from mien.synthetic.painter import develop, draw, to_uint8
 from mien.synthetic.posing import head_pose
 from mien.synthetic.subject import pose_subject
 
-FPS = 8.0
-"""Frames per second. Few, because software WebGL on a busy machine leaves the detector few."""
+FPS = 4.0
+"""Frames per second. Few, because software WebGL leaves the detector four to eight on a busy machine."""
 STILL = 20
 """Frames at the start in which nothing moves."""
 TRUE = ("jawOpen", "eyeBlinkLeft", "eyeBlinkRight")
