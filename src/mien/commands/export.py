@@ -14,6 +14,7 @@ from mien.workspace import Workspace, open_workspace
 if TYPE_CHECKING:
     import mien.export
     import mien.gaussians
+    import mien.runtime
 
 _POSES = (".ply", ".spz", ".sog", *USD_ENDINGS)
 _PAGES = (".html", ".packed")
@@ -184,17 +185,20 @@ class Command:
                 "GaussianAvatars' viewer opens only avatars on FLAME with teeth"
             )
 
-    def _write_mien(self, avatar, run_dir: Path) -> None:
+    def _portable(self, avatar, run_dir: Path) -> "mien.runtime.PortableAvatar":
+        """The avatar with everything that the run knows of it."""
         from mien.avatar import as_array, make_portable
-        from mien.progress import say
-        from mien.runtime import write_portable
         from mien.training import read_coverage, run_camera
 
         portable = make_portable(avatar, run_camera(run_dir), self.workspace.resolve().name)
         covered = read_coverage(run_dir, avatar.face_model)
-        if covered is not None:
-            portable = replace(portable, confidence=as_array(covered.seen))
-        write_portable(self.out, portable)
+        return portable if covered is None else replace(portable, confidence=as_array(covered.seen))
+
+    def _write_mien(self, avatar, run_dir: Path) -> None:
+        from mien.progress import say
+        from mien.runtime import write_portable
+
+        write_portable(self.out, self._portable(avatar, run_dir))
         say(f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians, {self.out.stat().st_size / 1e6:.1f} MB")
 
     def _write_page(self, avatar, run_dir: Path, workspace: Workspace) -> None:
@@ -220,12 +224,11 @@ class Command:
         )
 
     def _write_glb(self, avatar, run_dir: Path) -> None:
-        from mien.avatar import as_array, bake_rig, make_portable
+        from mien.avatar import as_array, bake_rig
         from mien.export import MeshModel, write_glb
         from mien.progress import say
-        from mien.training import run_camera
 
-        portable, model = make_portable(avatar, run_camera(run_dir), self.workspace.resolve().name), avatar.face_model
+        portable, model = self._portable(avatar, run_dir), avatar.face_model
         mesh = MeshModel(bake_rig(model, avatar.subject), *map(as_array, (model.faces, model.uv, model.uv_faces)))
         written = write_glb(self.out, portable, mesh)
         say(

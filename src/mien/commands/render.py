@@ -106,6 +106,7 @@ class Command:
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         avatar = load_avatar(run_dir)
         covered = read_coverage(run_dir, avatar.face_model)
+        neutral = avatar.face_model.head_vertices(avatar.subject)[0].detach()
         motion = None
         if self.sequence is not None:
             motion = read_sequence(workspace.sequence_dir(workspace.pick_sequence(self.sequence))).tracking.face
@@ -146,7 +147,6 @@ class Command:
         count, first = len(avatar.gaussian_store()), cameras[0]
         say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
         if covered is not None:
-            neutral = avatar.face_model.head_vertices(subject)[0].detach().cpu().float()
             say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
 
     def _camera(self, run_dir: Path, subject: "mien.face.FaceParams") -> "mien.camera.Camera":
