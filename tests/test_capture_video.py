@@ -34,6 +34,20 @@ def test_colours_keep_their_level(tmp_path):
         assert np.abs(frame.astype(int) - colour).max() <= 3, colour
 
 
+def test_equal_pictures_give_equal_files(tmp_path):
+    """The encoder may not depend on what lies in memory that it has not written."""
+    random = np.random.default_rng(0)
+    disc = np.hypot(*np.mgrid[-1:1:80j, -1:1:80j]) < 0.7
+    picture = np.where(disc[..., None], random.integers(80, 200, (80, 80, 3)), 255).astype(np.uint8)
+    moved, path, files = np.roll(picture, 1, 1), tmp_path / "clip.mp4", set()
+    for _ in range(20):
+        litter = [random.random(size) for size in random.integers(1, 100_000, 50)]
+        write_video(path, [picture, moved, moved, picture, picture, picture], 25)
+        files.add(path.read_bytes())
+        del litter
+    assert len(files) == 1
+
+
 def test_odd_sizes_are_padded_by_the_border(tmp_path):
     path = tmp_path / "odd.mp4"
     picture = np.full((33, 41, 3), 90, np.uint8)

@@ -146,7 +146,8 @@ def write_video(
     first = next(iterator, None)
     if first is None:
         raise UserError(f"{path}: no frames to write; check the selection of frames")
-    options = {"crf": str(crf), "preset": preset}
+    # x264's macroblock tree reads memory that it has not written, so equal pictures could give different files.
+    options = {"crf": str(crf), "preset": preset, "mbtree": "0"}
     write_atomically(
         path, lambda aside: _encode(aside, itertools.chain([first], iterator), first.shape, fps, options, sound)
     )
