@@ -306,7 +306,8 @@ def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path
     assert np.abs(session.face.expression - session.avatar.portable.neutral.expression).max() > 0
     assert np.abs(again.astype(int) - random).mean() < 3, "a new page has the same face, seen from the front"
     saved = read(tmp_path / "saved.png")
-    assert len(saved) == 700
+    assert [len(saved)] == told["heights"]
+    assert len(saved) > 500
     visible = {
         name for name, slider in serving._panel._sliders.items() if slider.visible and name[0] != name[0].upper()
     }
