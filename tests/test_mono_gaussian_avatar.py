@@ -13,16 +13,17 @@ from mien.avatar.mono_gaussian_avatar import (
     canonical_face,
     nearest_vertices,
 )
-from mien.avatar.mono_gaussian_avatar_settings import LENGTH_UNIT
+from mien.avatar.mono_gaussian_avatar_settings import LENGTH_UNIT, PRESETS
 from mien.avatar.mono_networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
 from mien.avatar.mono_schedule import Schedule, ScheduleName
+from mien.avatar.surface_places import at_places, random_places
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import rgb_from_sh
 from mien.render.rendering import Rendering
 from toy_scene import toy_face, toy_face_model
 
-SMALL = MonoGaussianAvatarConfig(points=30, max_points=60)
+SMALL = MonoGaussianAvatarConfig(points=30, max_points=60, own_rate=Rate(1e-2))
 
 
 def new_avatar(
@@ -35,6 +36,8 @@ def new_avatar(
             for network in (avatar.attributes, avatar.deformation, avatar.change):
                 for parameter in network.parameters():
                     parameter.add_(0.05 * torch.randn(parameter.shape))
+            if "own_attributes" in avatar.store.names():
+                avatar.store["own_attributes"].normal_(std=0.05)
     return avatar
 
 
@@ -207,7 +210,7 @@ def test_attributes_are_those_at_rest_and_their_change() -> None:
     avatar, face = new_avatar(), toy_face(5)[3]
     got = avatar.pose(face, Progress(50, 100)).gaussians
     moved = (got.means[0] - canonical_places(avatar)) / LENGTH_UNIT
-    raw = avatar.attributes(avatar.store["means"] / LENGTH_UNIT) + avatar.change(moved)
+    raw = avatar.attributes(avatar.store["means"] / LENGTH_UNIT) + avatar.store["own_attributes"] + avatar.change(moved)
     radius = Schedule("code", 100, 30).rendering_radius(0.5)
     torch.testing.assert_close(got.scales[0], 0.00625 * raw[:, :3].sigmoid() + radius)
     torch.testing.assert_close(got.quats[0], raw[:, 3:7] / raw[:, 3:7].norm(dim=-1, keepdim=True))
@@ -369,7 +372,9 @@ def test_children_are_around_their_parents() -> None:
 
 
 def test_rates_halve_at_their_times() -> None:
-    avatar = new_avatar(replace(SMALL, network_rate=Rate(1e-3), means_rate=Rate(1e-4), rate_halvings=(0.5, 0.75)))
+    constant = Rate(1e-3)
+    config = replace(SMALL, network_rate=constant, own_rate=constant, means_rate=constant, rate_halvings=(0.5, 0.75))
+    avatar = new_avatar(config)
     for group in avatar.parameter_groups():
         rates = [group.rate_at(Progress(step, 100)) / group.rate_at(Progress(0, 100)) for step in (0, 49, 50, 75, 99)]
         assert rates == [1, 1, 0.5, 0.25, 0.25], group.name
@@ -378,6 +383,64 @@ def test_rates_halve_at_their_times() -> None:
 def test_an_avatar_of_an_older_version_is_refused_in_one_line() -> None:
     with pytest.raises(UserError, match="older version of mono_gaussian_avatar"):
         MonoGaussianAvatarConfig.upgraded({"points": 400, "rounds": 50})
+
+
+def test_points_without_attributes_of_their_own() -> None:
+    """The preset `paper` has none, nor have avatars of older versions, which get the defaults."""
+    assert MonoGaussianAvatarConfig().own_rate == PRESETS["paper"].own_rate == Rate(0.0)
+    avatar = new_avatar(replace(SMALL, own_rate=Rate(0.0)))
+    assert avatar.store.names() == ("means",)
+    assert [group.name for group in avatar.parameter_groups()] == ["means", "attributes", "deformation", "change"]
+    face = toy_face(5)[2]
+    trained, baked = avatar.pose(face).gaussians, avatar.eval().pose(face).gaussians
+    torch.testing.assert_close(baked.sh, trained.sh, atol=1e-5, rtol=0)
+
+
+def test_children_inherit_what_is_their_parents_own() -> None:
+    avatar = new_avatar()
+    own = avatar.store["own_attributes"].detach().clone()
+    avatar.store.append(torch.tensor([3, 3, 7]), {"means": torch.zeros(3, 3)})
+    assert torch.equal(avatar.store["own_attributes"][30:], own[[3, 3, 7]])
+
+
+def test_points_start_on_the_canonical_face() -> None:
+    avatar = new_avatar(replace(SMALL, start="face", points=200), disturbed=False)
+    vertices = avatar.face_model.head_vertices(avatar.canonical_face())[0]
+    a, b, c = vertices[avatar.face_model.faces].unbind(1)
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    # Each point lies in the plane of a triangle.
+    heights = ((avatar.store["means"][:, None] - a) * normals).sum(-1).abs().min(dim=1).values
+    assert heights.max() < 1e-6
+    assert len({tuple(point) for point in avatar.store["means"].tolist()}) == 200
+
+
+def test_lessons_teach_the_motion_of_the_face_model() -> None:
+    face = toy_face(5)
+
+    def error(lessons: int) -> float:
+        avatar = new_avatar(replace(SMALL, start="face", points=200, lessons=lessons), disturbed=False)
+        torch.manual_seed(1)
+        corners, weights = random_places(avatar._at_rest().vertices, avatar.face_model.faces, 200)
+        with torch.no_grad():
+            avatar.store["means"].copy_(at_places(avatar._at_rest().vertices, corners, weights))
+        assert len(list(avatar.lessons(face))) == avatar.lesson_count == lessons
+        target = at_places(avatar.face_model.head_vertices(face), corners, weights)
+        return float((avatar.pose(face).gaussians.means - target).norm(dim=-1).mean().detach())
+
+    untaught = error(0)
+    assert error(60) < 0.5 * untaught
+
+
+def test_a_run_may_begin_at_a_later_epoch() -> None:
+    whole, late = Schedule("code", 100, 400), Schedule("code", 100, 400, 60)
+    assert late.rounds() == tuple(epoch / 40 for epoch in range(1, 40))
+    for fraction in (0.0, 0.25, 0.5, 0.975):
+        at = 0.6 + 0.4 * fraction
+        assert late.rendering_radius(fraction) == whole.rendering_radius(at)
+        assert late.points_at(fraction) == whole.points_at(at)
+        assert late.face_decay(fraction) == whole.face_decay(at)
+    with pytest.raises(UserError, match="--method.first-epoch 60: has to be smaller than --method.epochs 60"):
+        MonoGaussianAvatarConfig(epochs=60, first_epoch=60).check()
 
 
 def test_nearest_vertices() -> None:

@@ -5,7 +5,7 @@ a method"). Methods that stay keep their settings in a file of their own, which 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from jaxtyping import Bool, Float, Int
@@ -138,6 +138,15 @@ class Avatar(nn.Module, ABC):
     def frames_per_step(self) -> int:
         """Number of training frames that the next optimiser step uses. Most methods use one."""
         return 1
+
+    @property
+    def lesson_count(self) -> int:
+        """Number of lessons before the first step. Most methods need none."""
+        return 0
+
+    def lessons(self, face: FaceParams) -> Iterator[None]:
+        """Teach a new avatar what needs no pictures, given all training timesteps; yields after each lesson."""
+        yield from ()
 
     @property
     def wants_first_colors(self) -> bool:

@@ -46,6 +46,7 @@ from mien.avatar.headgas_variants import (
 )
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
+from mien.avatar.surface_places import sample_surface
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians
@@ -319,19 +320,6 @@ def spread_out(points: Float[Tensor, "t k"], count: int) -> Float[Tensor, "c k"]
         from_it = (points - points[chosen[-1]]).norm(dim=-1)
         distances = from_it if len(chosen) == 1 else torch.minimum(distances, from_it)
     return points[chosen]
-
-
-def sample_surface(vertices: Float[Tensor, "v 3"], faces: Tensor, count: int) -> Float[Tensor, "n 3"]:
-    """Random points on a mesh, uniform by area, from torch's default generator."""
-    corners = vertices[faces]
-    v0, v1, v2 = corners.unbind(1)
-    areas = torch.linalg.cross(v1 - v0, v2 - v0).norm(dim=-1)
-    chosen = torch.multinomial(areas, count, replacement=True)
-    # The square root makes the points uniform over a triangle.
-    along, across = torch.rand(2, count, 1).to(vertices)
-    along = along.sqrt()
-    weights = torch.cat([1 - along, along * (1 - across), along * across], dim=-1)
-    return (weights[:, :, None] * corners[chosen]).sum(1)
 
 
 def neighbour_distances(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

@@ -9,9 +9,14 @@ world while the head moves: it can hold hair and shoulders.
 Differences from the paper and its code: the face model is any `FaceModel` (a jaw may follow the expression); each head
 predicts its own attribute, while the published code mixes up columns of scales and rotations; attributes change with
 the motion within the head frame, so that a turn of the head alone changes none of the head's; schedules are fractions
-of the run, which spans `epochs` epochs of the paper; the optimiser's moments survive rounds.
+of the run, which spans epochs `first_epoch` to `epochs` of the paper; the optimiser's moments survive rounds.
+
+Options beyond the paper, which the presets `draft` and `standard` use: points start on the face model (`start`), the
+deformation network learns the face model's motion before the first picture (`lessons`), and each point adds attributes
+of its own to those that the network gives to its position (`own_rate`).
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -38,6 +43,7 @@ from mien.avatar.schedules import TRAINED, Progress
 from mien.avatar.settings import RefillSettings
 from mien.avatar.skin_points import blend_transforms, skin_points, unskin
 from mien.avatar.store import GaussianStore
+from mien.avatar.surface_places import at_places, random_places, sample_surface
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.rendering import Rendering
@@ -46,6 +52,11 @@ from mien.runtime.baked import AttributeNetwork, Attributes, BlendSkinned
 
 CANONICAL_JAW = 0.4
 """Angle by which the jaw is open in the canonical face, in radians."""
+_LESSON_POINTS, _LESSON_FRAMES, _LESSON_RATE = 1024, 4, 3e-3
+"""Points and frames of a lesson in the face model's motion, and the learning rate of the first lesson."""
+_LESSON_WEIGHT = 10.0
+"""Weight of the distance between points and their places on the moved mesh, beside the losses that keep the networks
+near the face model."""
 
 
 class MonoGaussianAvatar(Avatar):
@@ -56,9 +67,6 @@ class MonoGaussianAvatar(Avatar):
     def __init__(self, config: MonoGaussianAvatarConfig, face_model: FaceModel, face: FaceParams):
         super().__init__(config, face_model, face)
         like = face_model.template
-        # Uniform in a cube, then projected onto the sphere, as in the published code.
-        cube = 2 * torch.rand(config.points, 3).to(like) - 1
-        self.store = GaussianStore({"means": config.sphere_radius * torch.nn.functional.normalize(cube, dim=-1)})
         e, k = face.expression.shape[1], len(face_model.joint_names)
         sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
         self.attributes = AttributeNet(*sizes, config.sphere_start).to(like)
@@ -69,6 +77,16 @@ class MonoGaussianAvatar(Avatar):
         self.register_buffer("canonical_joints", joints)
         self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
         self._baked, self._rest = Kept[BlendSkinned](), Kept[_AtRest]()
+        if config.start == "sphere":
+            # Uniform in a cube, then projected onto the sphere, as in the published code.
+            cube = 2 * torch.rand(config.points, 3).to(like) - 1
+            means = config.sphere_radius * torch.nn.functional.normalize(cube, dim=-1)
+        else:
+            means = sample_surface(self._at_rest().vertices, face_model.faces, config.points)
+        trained = {"means": means}
+        if config.own_rate.start > 0:
+            trained["own_attributes"] = means.new_zeros(config.points, sum(ATTRIBUTE_WIDTHS))
+        self.store = GaussianStore(trained)
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in the head frame, one batch entry per timestep.
@@ -81,7 +99,7 @@ class MonoGaussianAvatar(Avatar):
         means, displacement = self._deformed(face)
         # Detached, as in the published code: attributes do not pull on the points.
         change = self.change(displacement.detach() / LENGTH_UNIT)
-        raw = split_attributes(self.attributes(self.store["means"].detach() / LENGTH_UNIT) + change)
+        raw = split_attributes(self._attributes_at_rest() + change)
         radius = self._schedule().rendering_radius(progress.fraction)
         scales = self.config.scale_gain * sigmoid(raw["log_scales"]) + radius
         quats = torch.nn.functional.normalize(raw["quats"], dim=-1)
@@ -112,7 +130,12 @@ class MonoGaussianAvatar(Avatar):
         turn = progress.step // progress.frames
         chosen = torch.arange(turn * self.config.face_points, (turn + 1) * self.config.face_points)
         means = self.store["means"].detach()
-        means = means[chosen[:n].to(means.device) % n]
+        losses = self._face_losses(means[chosen[:n].to(means.device) % n])
+        weight = self.config.face_weight * self._schedule().face_decay(progress.fraction)
+        return {name: weight * loss for name, loss in losses.items()}
+
+    def _face_losses(self, means: Float[Tensor, "p 3"]) -> dict[str, Float[Tensor, ""]]:
+        """The same losses for some points, without the weight that they all have."""
         model = self.face_model
         found = self.deformation.whole(means / LENGTH_UNIT)
         canonical = means + LENGTH_UNIT * found.offset.detach()
@@ -132,14 +155,40 @@ class MonoGaussianAvatar(Avatar):
             basis = model.pose_basis
             correctives = 0 if basis is None else basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
             losses["pose_correctives"] = 10 * _mean_square(10 * (found.pose - correctives))
-        weight = self.config.face_weight * self._schedule().face_decay(progress.fraction)
-        return {name: weight * loss for name, loss in losses.items()}
+        return losses
+
+    @property
+    def lesson_count(self) -> int:
+        """Number of lessons in the face model's motion."""
+        return self.config.lessons
+
+    def lessons(self, face: FaceParams) -> Iterator[None]:
+        """Teach the deformation network the face model's motion in training frames.
+
+        The published network starts without any motion, and needs some hundred thousand steps to find it.
+        """
+        optimizer = torch.optim.Adam(self.deformation.parameters(), lr=_LESSON_RATE)
+        canonical, faces = self._at_rest().vertices, self.face_model.faces
+        for lesson in range(self.config.lessons):
+            optimizer.param_groups[0]["lr"] = _LESSON_RATE * 0.1 ** (lesson / self.config.lessons)
+            frames = face[torch.randint(len(face), (_LESSON_FRAMES,))].detach()
+            corners, weights = random_places(canonical, faces, _LESSON_POINTS)
+            means = at_places(canonical, corners, weights)
+            target = at_places(self.face_model.head_vertices(frames), corners, weights)
+            found, _ = self._deformed_from(means, frames)
+            distance = (found - target).norm(dim=-1).mean() / LENGTH_UNIT
+            optimizer.zero_grad()
+            torch.autograd.backward([_LESSON_WEIGHT * distance, *self._face_losses(means).values()])
+            optimizer.step()
+            yield
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group for the points, and one per network."""
         rate, halvings = self.config.network_rate, self.config.rate_halvings
         networks = {"attributes": self.attributes, "deformation": self.deformation, "change": self.change}
         groups = [store_group(self.store, "means", self.config.means_rate)]
+        if "own_attributes" in self.store.names():
+            groups.append(store_group(self.store, "own_attributes", self.config.own_rate))
         groups += [network_group(name, network, rate) for name, network in networks.items()]
         return [replace(group, halvings=halvings) for group in groups]
 
@@ -150,7 +199,7 @@ class MonoGaussianAvatar(Avatar):
     def density(self) -> RefillDensity:
         """Deletes points that no view of the last epoch has shown, then refills up to the scheduled number."""
         config, schedule = self.config, self._schedule()
-        times = tuple(epoch / config.epochs for epoch in range(1, config.epochs))
+        times = schedule.rounds()
         targets = tuple(min(config.max_points, schedule.points_at(time)) for time in times)
 
         def near_parents(
@@ -175,7 +224,7 @@ class MonoGaussianAvatar(Avatar):
         skinning = blend_transforms(found.weights, self._transforms(face))[0]
         coefficients = self._coefficients(face, absolute=True)
         rest = unskin(canonical, skinning) - torch.cat([expression, pose], dim=-1) @ coefficients[0]
-        raw = split_attributes(self.attributes(means / LENGTH_UNIT))
+        raw = split_attributes(self._attributes_at_rest())
         layers = self.change.layers()
         rig = replace(
             bake_rig(self.face_model, self.subject),
@@ -217,8 +266,14 @@ class MonoGaussianAvatar(Avatar):
             still_pose=as_array(face.T_world_head[0]),
         )
 
+    def _attributes_at_rest(self) -> Float[Tensor, "n 11"]:
+        """Raw attributes that the network predicts for the points' positions, and what each point adds to them."""
+        raw = self.attributes(self.store["means"].detach() / LENGTH_UNIT)
+        return raw + self.store["own_attributes"] if "own_attributes" in self.store.names() else raw
+
     def _schedule(self) -> Schedule:
-        return Schedule(self.config.schedule, self.config.epochs, self.config.points)
+        config = self.config
+        return Schedule(config.schedule, config.epochs, config.points, config.first_epoch)
 
     def _transforms(self, face: FaceParams) -> Float[Tensor, "b k 3 4"]:
         """The joints' transforms in the head frame, then that of the bone which stands still in the world."""
@@ -246,7 +301,11 @@ class MonoGaussianAvatar(Avatar):
 
     def _deformed(self, face: FaceParams) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
         """Points in the head frame, and their motion from the canonical positions, both in metres."""
-        means = self.store["means"]
+        return self._deformed_from(self.store["means"], face)
+
+    def _deformed_from(
+        self, means: Float[Tensor, "n 3"], face: FaceParams
+    ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
         offset, moved, weights = self.deformation(means / LENGTH_UNIT, self._coefficients(face))
         canonical = means + LENGTH_UNIT * offset
         at_rest = self._at_rest().transforms

@@ -40,15 +40,23 @@ class MonoGaussianAvatarConfig(MethodConfig):
     points_per_step: Annotated[int, Range(1, 100_000_000)] = 102_400
     """Largest number of points, summed over the frames of an optimiser step. With more points, steps have fewer
     frames, but at least one."""
+    start: Literal["sphere", "face"] = "sphere"
+    """Where points start: on a sphere around the head (paper), or on the surface of the face model."""
+    lessons: Annotated[int, Range(0, 1_000_000)] = 0
+    """Number of steps before the first picture, in which the deformation network learns the motion of the face model
+    (paper: none)."""
     points: Annotated[int, Range(1, 1_000_000), ToLoad(1)] = 400
-    """Number of Gaussians at the start, on a sphere."""
+    """Number of Gaussians at the start."""
     sphere_radius: Annotated[float, Range(1e-3, 10)] = 0.125
     """Radius of the initial sphere around the origin of the head frame, in metres."""
     max_points: Annotated[int, GAUSSIAN_COUNT] = 10_000
     """Largest number of Gaussians. Growth stops there (paper: 100,000)."""
     epochs: Annotated[int, Range(1, 100_000)] = _EPOCHS
-    """Number of the paper's epochs that the run spans. After each, points are pruned and refilled; number of points,
+    """The paper's epoch with which the run ends. After each epoch, points are pruned and refilled; number of points,
     radii and the weight of the face model's terms follow the epochs."""
+    first_epoch: Annotated[int, Range(0, 100_000)] = 0
+    """The paper's epoch with which the run begins. It has to be smaller than `epochs`. Points that start on the face
+    need no large radii."""
     schedule: Literal["paper", "code"] = "code"
     """Whose numbers of points and radii: those of the paper, whose children are on a sphere around their parents, or
     those of the published code, whose children are in a cube."""
@@ -73,6 +81,9 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Learning rate of the points, in metres per step (paper: 2.5e-5)."""
     network_rate: Rate = Rate(1e-3, 1e-4)
     """Learning rate of the networks, per step (paper: 1e-4, over some hundred thousand steps)."""
+    own_rate: Rate = Rate(0.0)
+    """Learning rate of each point's own attributes, per step. They are added to the raw attributes that the network
+    predicts for its position, which are smooth. With 0, points have none (paper)."""
     rate_halvings: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = ()
     """Times at which the rates of points and networks are halved, as fractions of the run (paper: epochs 80 and
     100)."""
@@ -94,6 +105,19 @@ class MonoGaussianAvatarConfig(MethodConfig):
                 "train it again under another name (`mien train --method mono_gaussian_avatar --run NAME`)"
             )
         return dict(stored)
+
+    def check(self) -> None:
+        """Check the numbers' ranges, and that the run has epochs.
+
+        Raises:
+            UserError: a number is out of range, or `first_epoch` is not smaller than `epochs`.
+        """
+        super().check()
+        if self.first_epoch >= self.epochs:
+            raise UserError(
+                f"--method.first-epoch {self.first_epoch}: has to be smaller than --method.epochs {self.epochs}; "
+                "choose a smaller one, or more epochs"
+            )
 
 
 _PAPER_EPOCHS, _PAPER_FRAMES = 120, 2_500
@@ -124,7 +148,26 @@ def _paper() -> MonoGaussianAvatarConfig:
     )
 
 
-PRESETS = {"draft": MonoGaussianAvatarConfig(), "standard": MonoGaussianAvatarConfig(), "paper": _paper()}
+def _standard() -> MonoGaussianAvatarConfig:
+    """Points that start on the face, with attributes of their own and networks that know the face model's motion."""
+    rate = Rate(4e-4, begin=0.1)
+    return MonoGaussianAvatarConfig(
+        face_tuning=FaceTuning(
+            expression=rate, joints=rate, head_rotation=rate, head_translation=Rate(1.2e-4, begin=0.1)
+        ),
+        frames_per_step=4,
+        start="face",
+        lessons=1_000,
+        points=10_000,
+        max_points=20_000,
+        first_epoch=60,
+        epochs=115,
+        network_rate=Rate(5e-4, 5e-5),
+        own_rate=Rate(5e-2, 2e-3),
+    )
+
+
+PRESETS = {"draft": _standard(), "standard": _standard(), "paper": _paper()}
 """Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
-PRESET_STEPS = {"paper": _PAPER_EPOCHS * _PAPER_FRAMES}
+PRESET_STEPS = {"standard": 20_000, "paper": _PAPER_EPOCHS * _PAPER_FRAMES}
 """Number of steps of the presets for which the method has its own."""

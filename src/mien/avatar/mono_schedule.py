@@ -34,11 +34,17 @@ _FACE_HALVINGS = (20, 30, 50, 70)
 
 @dataclass(frozen=True)
 class Schedule:
-    """Times are fractions of a run that spans `epochs` epochs. What would happen after its last step never does."""
+    """Times are fractions of a run from epoch `first_epoch` to epoch `epochs`. What would come later never happens."""
 
     name: ScheduleName
     epochs: int
     first_count: int
+    first_epoch: int = 0
+
+    def rounds(self) -> tuple[float, ...]:
+        """Times at which an epoch ends, but for the last one."""
+        length = self.epochs - self.first_epoch
+        return tuple(epoch / length for epoch in range(1, length))
 
     def rendering_radius(self, fraction: float) -> float:
         """Length added to all scales, in metres."""
@@ -64,5 +70,6 @@ class Schedule:
 
     def _epoch(self, fraction: float) -> int:
         """Number of whole epochs before a time; after the run, the number of its last one."""
-        # Times of rounds are epoch / epochs, which multiplied by epochs may be a little less than the epoch.
-        return min(int(fraction * self.epochs + 1e-6), self.epochs - 1)
+        # Times of rounds are epoch / length, which multiplied by the length may be a little less than the epoch.
+        passed = int(fraction * (self.epochs - self.first_epoch) + 1e-6)
+        return min(self.first_epoch + passed, self.epochs - 1)

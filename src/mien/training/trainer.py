@@ -135,6 +135,8 @@ def _train_to_the_end(
         targets_ahead(data.order, data.targets, settings) as ahead,
     ):
         data = replace(data, ahead=ahead)
+        if state.step == 0 and state.avatar.lesson_count > 0:
+            _teach(state, settings, progress, interrupted)
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
                 before = state.step
@@ -151,6 +153,19 @@ def _train_to_the_end(
                 if interrupted():
                     raise KeyboardInterrupt
         _check_finite(run_dir, state)
+
+
+def _teach(
+    state: TrainingState, settings: TrainSettings, progress: ProgressBar, interrupted: Callable[[], bool]
+) -> None:
+    """Give the avatar its lessons. A run that stops here starts again, as nothing was trained."""
+    avatar = state.avatar
+    with torch.random.fork_rng(devices=[]), progress("lessons in the face's motion", avatar.lesson_count, 0) as advance:
+        torch.manual_seed(settings.seed)
+        for _ in avatar.lessons(state.track.params()):
+            advance()
+            if interrupted():
+                raise KeyboardInterrupt
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:
