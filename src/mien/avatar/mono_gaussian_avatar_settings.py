@@ -169,5 +169,5 @@ def _standard() -> MonoGaussianAvatarConfig:
 
 PRESETS = {"draft": _standard(), "standard": _standard(), "paper": _paper()}
 """Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
-PRESET_STEPS = {"standard": 20_000, "paper": _PAPER_EPOCHS * _PAPER_FRAMES}
+PRESET_STEPS = {"paper": _PAPER_EPOCHS * _PAPER_FRAMES}
 """Number of steps of the presets for which the method has its own."""
