@@ -155,11 +155,11 @@ def _standard() -> MonoGaussianAvatarConfig:
         face_tuning=FaceTuning(
             expression=rate, joints=rate, head_rotation=rate, head_translation=Rate(1.2e-4, begin=0.1)
         ),
-        frames_per_step=4,
+        frames_per_step=2,
         start="face",
         lessons=1_000,
         points=10_000,
-        max_points=20_000,
+        max_points=30_000,
         first_epoch=60,
         epochs=115,
         network_rate=Rate(5e-4, 5e-5),

@@ -22,7 +22,7 @@ from mien.training.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 
 COUNT, FRAME_COUNT, SIZE = 10_000, 30_000, (512, 512)
-FRAMES_PER_STEP = (1, 4, 8)
+FRAMES_PER_STEP = (1, 2, 4, 8)
 _LATE_STEP = round(0.9 * SETTINGS.steps) + 1
 """A step late in the run, when radii are small. No round of density control is near it."""
 
