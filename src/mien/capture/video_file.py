@@ -124,8 +124,26 @@ def create_video(path: Path) -> Iterator[OutputContainer]:
     Raises:
         OSError: the file cannot be written; it carries the system's reason.
     """
-    with path.open("wb") as file, av.open(_Local(file, f"video{path.suffix}"), "w") as container:
-        yield container
+    with path.open("wb") as file:
+        local = _Local(file, f"video{path.suffix}")
+        failed: list[OSError] = []
+
+        def write(content: Any) -> int:
+            try:
+                return file.write(content)
+            except OSError as error:
+                failed.append(error)
+                raise
+
+        local.write = write
+        try:
+            with av.open(local, "w") as container:
+                yield container
+        except av.error.FFmpegError:
+            # A container whose pictures could not be written cannot be closed either, which would hide the reason.
+            if failed:
+                raise failed[0] from None
+            raise
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
