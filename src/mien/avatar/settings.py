@@ -95,6 +95,9 @@ class FaceTuning:
     """Learning rate of the head's rotation, in radians per step."""
     head_translation: Rate = Rate(3e-4)
     """Learning rate of the head's position, in metres per step."""
+    keep_mean_pose: bool = False
+    """Whether the corrections of the head's pose have a mean of zero, in the head's own frame. With one camera, heads
+    and Gaussians otherwise move away from the camera together, which shows from aside."""
     within_bounds: bool = False
     """Whether expression coefficients stay within the face model's bounds. Those that were tracked beyond a bound may
     stay there."""

@@ -17,6 +17,7 @@ from mien.training.camera_colors import CameraColors
 from mien.training.density_control import DensityStrategy
 from mien.training.face_track import FaceTrack
 from mien.training.inside import Inside
+from mien.training.side_views import SideViews
 from mien.training.unseen import Unseen
 
 _KEPT_CHECKPOINTS = 2
@@ -43,6 +44,8 @@ class TrainingState:
     """What no training picture shows, if it is filled. It depends on the data alone, so checkpoints lack it."""
     inside: Inside | None = None
     """What is inside the mouth, if it is furnished. Checkpoints lack it for the same reason."""
+    aside: SideViews | None = None
+    """Views from aside, if sides are filled. Checkpoints lack it for the same reason."""
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:

@@ -76,6 +76,22 @@ class FaceTrack:
             low, high = (bound[index] for bound in self._bounds)
             self._fields["expression"][index].clamp_(low, high)
 
+    @torch.no_grad()
+    def keep_mean_pose(self) -> None:
+        """Take the mean correction of the head's pose from all timesteps that were tuned, if settings ask for it.
+
+        Only the sum of Gaussians and poses shows in the pictures of one camera, so both could move together.
+        """
+        seen = self._seen()
+        if not (self._tuning.enabled and self._tuning.keep_mean_pose and bool(seen.any())):
+            return
+        start, now = self._start[seen], replace(self._start, **self._fields)[seen]
+        rotation, translation = mean_pose_correction(start, now)
+        upright = start.T_world_head[:, :3, :3]
+        turned = now.T_world_head[:, :3, :3] @ rotation.T
+        self._fields["head_rotation"][seen] = axis_angle_from_matrix(turned)
+        self._fields["head_translation"][seen] -= upright @ translation
+
     def _row(self, index: int) -> "_Row":
         # Cached, because a dozen views would otherwise be made in every step. The track's tensors are never replaced.
         if index not in self._rows:

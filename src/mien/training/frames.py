@@ -17,7 +17,7 @@ from mien.training.sequence import Sequence
 from mien.training.settings import Split, TrainSettings, check_held_out
 
 Item = TypeVar("Item")
-_ORDER, _BACKGROUND, _DENSITY, _CROP, _DISGUISE = range(5)
+_ORDER, _BACKGROUND, _DENSITY, _CROP, _DISGUISE, _ASIDE = range(6)
 """Purposes of random numbers."""
 _BLOCK, _EVERY = 10, 5
 _TAIL_SHARE = 0.2
@@ -190,6 +190,11 @@ def crop_random(settings: TrainSettings, step: int) -> torch.Generator:
 def disguise_random(settings: TrainSettings, step: int) -> torch.Generator:
     """The random numbers for the colour of a step's hidden Gaussians."""
     return random_at(settings.seed, _DISGUISE, step)
+
+
+def aside_random(settings: TrainSettings, step: int) -> torch.Generator:
+    """The random numbers for a step's side view."""
+    return random_at(settings.seed, _ASIDE, step)
 
 
 def random_at(seed: int, purpose: int, step: int) -> torch.Generator:

@@ -9,7 +9,7 @@ from mien.avatar.settings import MethodConfig
 from mien.bounded import MAX_SIDE
 from mien.devices import DeviceName
 from mien.errors import UserError
-from mien.ranges import POSITIVE, Range, check_ranges
+from mien.ranges import NOT_NEGATIVE, POSITIVE, Range, check_ranges
 
 Split = Literal["blocks", "tail", "none", "gaussian-avatars"]
 """Name of the rule that holds out timesteps (`mien.training.held_out`). gaussian-avatars holds out a sequence and a
@@ -38,12 +38,15 @@ class TrainSettings:
     cameras (mean). A step takes longer with it."""
     camera_color_rate: Annotated[float, POSITIVE] = 1e-3
     """Learning rate of these changes, per step. It ends at a tenth."""
-    unseen: Literal["trained", "filled"] = "trained"
+    unseen: Literal["trained", "filled", "auto"] = "trained"
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
     broken from aside. Filled: they are a closed surface in completed colours from the first step on, and so is what no
     picture shows of the inside of the mouth; what is seen is kept flat on the mesh, less so around mouth and eyes; and
-    alpha is compared with the matte (weight 0.2 or more). Methods that bind no Gaussians to triangles train all sides
-    in either case."""
+    alpha is compared with the matte (weight 0.2 or more). Auto: filled if one camera filmed, trained if there are
+    several. Methods that bind no Gaussians to triangles train all sides in either case."""
+    side_weight: Annotated[float, NOT_NEGATIVE] = 0.1
+    """Weight of the views from aside and of raised expressions, in which filled heads are compared with the completed
+    mesh."""
     inside: Literal["free", "covered", "furnished"] = "free"
     """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
     them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in
@@ -143,8 +146,8 @@ class Preset:
 PRESETS = {
     preset.name: preset
     for preset in (
-        Preset("draft", TrainSettings(steps=8_000, inside="covered")),
-        Preset("standard", TrainSettings(inside="covered")),
+        Preset("draft", TrainSettings(steps=8_000, inside="covered", unseen="auto")),
+        Preset("standard", TrainSettings(inside="covered", unseen="auto")),
         Preset("paper", TrainSettings()),
     )
 }

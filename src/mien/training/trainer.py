@@ -43,7 +43,9 @@ from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
 from mien.training.filmed import with_shown_angles
 from mien.training.frames import (
+    Frame,
     FrameOrder,
+    aside_random,
     camera_extent,
     density_random,
     expression_rarity,
@@ -55,8 +57,12 @@ from mien.training.losses import train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Targets
 from mien.training.settings import TrainSettings
-from mien.training.unseen import moved, spare_fills, unseen_of
+from mien.training.side_views import SideViews, side_views
+from mien.training.unseen import Unseen, moved, spare_fills, unseen_of
 from mien.training.vertex_colors import vertex_colors
+
+_MEAN_POSE_EVERY = 25
+"""Number of steps after which the mean correction of the head's pose is taken away, if settings ask for it."""
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
 """(title, total, completed) -> a context manager whose value moves the bar on."""
@@ -227,7 +233,7 @@ def start(
     if avatar.wants_first_colors:
         avatar.paint(vertex_colors(face_model, sequences, faces, frames))
     colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
-    unseen, filled = None, settings.unseen == "filled"
+    unseen, filled = None, fills_sides(frames, settings)
     if filled or avatar.wants_surface:
         unseen = unseen_of(avatar, sequences, faces, frames, filled=filled)
         avatar.close(unseen.prior)
@@ -243,10 +249,11 @@ def start(
         face = face.to(like)
         unseen = None if unseen is None else moved(unseen, like)
         inside = None if inside is None else inside.to(like)
+    aside = _aside(avatar, unseen, settings)
     density = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     track = FaceTrack(face, method_config.face_tuning, lengths, face_model.expression_bounds)
-    return TrainingState(avatar, Adam(), density, track, {}, colors, unseen=unseen, inside=inside)
+    return TrainingState(avatar, Adam(), density, track, {}, colors, unseen=unseen, inside=inside, aside=aside)
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
@@ -267,6 +274,12 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     shown = [one.seen(rendering, state) for one, rendering in zip(batch, renderings, strict=True)]
     losses = compare(state, batch, shown) | avatar.regularizers(whole, renderings[0], progress)
     losses |= compare_features(state, batch, shown)
+    aside = state.aside
+    if aside is not None and any(aside.due(one.number) for one in batch):
+        one = next(one for one in batch if aside.due(one.number))
+        random = aside_random(settings, one.number)
+        view = data.targets[one.frame.sequence].camera(one.frame.camera)
+        losses["aside"] = aside.loss(avatar, state.track.face(one.index), view, progress, one.number, random)
     torch.autograd.backward(list(losses.values()))
     if state.unseen is not None:
         state.unseen.guard(avatar, *renderings)
@@ -278,6 +291,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     state.adam.step(groups, progress)
     for one in batch:
         state.track.confine(one.index)
+    if passed(state.step, state.step + len(batch), _MEAN_POSE_EVERY):
+        state.track.keep_mean_pose()
     random = partial(density_random, settings, state.step)
     state.density.adapt(avatar.gaussian_store(), posed[0], progress, random)
     if state.unseen is not None:
@@ -292,11 +307,32 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     entry = {name: float(value.detach()) for name, value in losses.items()}
     if perceptual.weight > 0:
         entry.setdefault("perceptual", 0.0)
+    if state.aside is not None:
+        entry.setdefault("aside", 0.0)
     entry |= {"step": state.step, "loss": sum(entry.values()), "psnr": train_psnr(shown[0], batch[0].target)}
     entry |= {"gaussians": len(avatar.gaussian_store()), "step_ms": elapsed * 1000 / len(batch)}
     for name, value in entry.items():
         state.curves.setdefault(name, []).append(value)
     return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"
+
+
+def fills_sides(frames: Items[Frame], settings: TrainSettings) -> bool:
+    """Whether sides that no picture shows are filled: as the settings say, or if one camera took all frames."""
+    if settings.unseen == "auto":
+        return len({frame.camera for frame in frames}) == 1
+    return settings.unseen == "filled"
+
+
+def _aside(avatar: Avatar, unseen: Unseen | None, settings: TrainSettings) -> SideViews | None:
+    """The side views of a filled head, if Gaussians follow its mesh."""
+    if unseen is None or unseen.coverage is None or unseen.prior.made_up is None or settings.side_weight == 0:
+        return None
+    model, prior = avatar.face_model, unseen.prior
+    like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
+    assert prior.colors is not None
+    assert prior.doubt is not None
+    colors, doubt, hair = (values.to(like) for values in (prior.colors, prior.doubt, prior.hair))
+    return side_views(model.to(like), settings.side_weight, colors, doubt, hair, unseen.coverage.above.to(like))
 
 
 def passed(before: int, now: int, every: int) -> bool:

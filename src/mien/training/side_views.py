@@ -1,0 +1,160 @@
+"""Training pictures that no camera took: the head from aside, and with raised expressions.
+
+One camera in front shows half of a head at a few expressions. Between its pictures, Gaussians may do as they like: they
+leave the surface, and show as shards and holes once the head turns. A side view is compared with the completed mesh: in
+front and from aside, the head is as opaque as the mesh with its hair, and what is far from the mesh's colours is pulled
+towards them. A difference that a real head could have is free.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien.avatar import Avatar, Progress
+from mien.camera import Camera
+from mien.face import FaceModel, FaceParams
+from mien.render import rasterize
+from mien.render.mesh import rasterize_mesh, vertex_normals
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.training.head_parts import head_parts
+
+_EVERY = 8
+"""Number of steps between two side views. Views of raised expressions take turns with those from aside."""
+_SIDE = 256
+"""Longer side of these pictures, in pixels. The completed colours are no finer."""
+_LEAST, _MOST = 30.0, 180.0
+"""Angles between which the head turns aside, in degrees."""
+_EXPRESSION_MOST = 45.0
+"""Largest angle at which a raised expression is seen, in degrees."""
+_RAISED = 6
+"""Number of coefficients that are raised."""
+_FREE = 0.06
+"""Difference of colour (0..1) between an avatar and the completed mesh that costs nothing in raised expressions."""
+_FILL = 0.5
+"""Height of the mesh above the scalp as a share of the hair's, which is that of fills."""
+_FADING = 0.5
+"""Share of a triangle above the cut at the neck from which it is drawn."""
+
+
+@dataclass(frozen=True, eq=False)
+class SideViews:
+    """The completed head that side views are compared with. All tensors are on the CPU."""
+
+    face_model: FaceModel
+    weight: float
+    """Weight of the mean absolute differences of colour and of alpha."""
+    colors: Float[Tensor, "f 3"]
+    """Completed colours of the triangles, 0..1."""
+    doubt: Float[Tensor, " f"]
+    """1 for triangles whose colour is made up, 0 for those that pictures show well."""
+    height: Float[Tensor, " v"]
+    """Height of the surface above each vertex, in metres."""
+    drawn: Bool[Tensor, " f"]
+    """Triangles above the cut at the neck."""
+    compared: Bool[Tensor, " f"]
+    """Triangles whose colours are compared in raised expressions: skin, lips and the inside of the mouth."""
+
+    def due(self, step: int) -> bool:
+        """Whether a step has a side view."""
+        return self.weight > 0 and step % (_EVERY // 2) == 0
+
+    def loss(
+        self, avatar: Avatar, face: FaceParams, camera: Camera, progress: Progress, step: int, random: torch.Generator
+    ) -> Float[Tensor, ""]:
+        """The weighted difference between the avatar and the completed mesh in one side view.
+
+        Args:
+            avatar: The avatar, on any device.
+            face: One timestep. Its joints and its place are kept, and its expression is that of views from aside. It
+                gets no gradient.
+            camera: The camera in front of the head.
+            progress: How far training is.
+            step: The step, which says whether the head is turned or the expression raised.
+            random: Draws the angle and the coefficients.
+        """
+        raised = step % _EVERY != 0
+        angle = _drawn_angle(raised, random)
+        face = turned_aside(face.detach(), angle)
+        if raised:
+            face = replace(face, expression=self._raised(face.expression, random))
+        scale = _SIDE / max(camera.width, camera.height)
+        small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        background = torch.rand(3, generator=random)
+        picture, alpha, share = self._target(face, small, background, raised=raised)
+        like = face.expression
+        seen = rasterize(avatar.pose(face, progress).gaussians.timestep(0), small, background.to(like))
+        difference = (seen.image - picture.to(like)).abs()
+        if raised:
+            difference = (difference - _FREE).clamp_min(0)
+        colors = (difference * share.to(like)[..., None]).mean()
+        outline = torch.zeros_like(colors) if raised else (seen.alpha - alpha.to(like)).abs().mean()
+        return self.weight * (colors + outline)
+
+    @torch.no_grad()
+    def _target(
+        self, face: FaceParams, camera: Camera, background: Float[Tensor, " 3"], *, raised: bool
+    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        """The completed mesh, its alpha, and how much each pixel's colour counts, 0..1."""
+        vertices = self.face_model(face.to(self.colors))[0]
+        vertices = vertices + self.height[:, None] * vertex_normals(vertices, self.face_model.faces)
+        index = rasterize_mesh(vertices, self.face_model.faces[self.drawn], camera.to(self.colors)).face_index.long()
+        hit = index >= 0
+        triangle: Int[Tensor, "h w"] = self.drawn.nonzero()[:, 0][index.clamp_min(0)]
+        picture = torch.where(hit[..., None], self.colors[triangle], background)
+        share = self.compared[triangle].float() if raised else self.doubt[triangle]
+        return picture, hit.float(), torch.where(hit, share, 0.0 if raised else 1.0)
+
+    def _raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
+        """The expression with some coefficients anywhere between 0 and their largest value."""
+        count = expression.shape[1]
+        chosen = torch.randperm(count, generator=random)[:_RAISED]
+        values = torch.rand(len(chosen), generator=random) * self.face_model.expression_bounds[chosen, 1].float().cpu()
+        result = expression.clone()
+        result[0, chosen.to(expression.device)] = values.to(expression)
+        return result
+
+
+def side_views(
+    face_model: FaceModel,
+    weight: float,
+    colors: Float[Tensor, "f 3"],
+    doubt: Float[Tensor, " f"],
+    hair: Float[Tensor, " f"],
+    above: Float[Tensor, " f"],
+) -> SideViews:
+    """The side views of a head.
+
+    Args:
+        face_model: The face model, on the CPU in float32.
+        weight: Weight of the loss.
+        colors: Completed colours of the triangles, 0..1.
+        doubt: How far they are made up, 0..1.
+        hair: Height of hair above each triangle, in metres.
+        above: 1 for triangles above the cut at the neck, 0 for those below.
+    """
+    parts, corners = head_parts(face_model), face_model.faces.long().T.flatten()
+    own = torch.stack([hair, torch.ones_like(hair)], dim=1).repeat(3, 1)
+    total = torch.zeros(len(face_model.template), 2).index_add(0, corners, own)
+    height = _FILL * total[:, 0] / total[:, 1].clamp_min(1)
+    compared = parts.skin | parts.interior | torch.stack(parts.painted).any(0)
+    return SideViews(face_model, weight, colors, doubt, height, above > _FADING, compared)
+
+
+def turned_aside(face: FaceParams, angle: float) -> FaceParams:
+    """The head turned about its own upright axis by an angle in radians, at the same place.
+
+    A camera sees it as one that goes around the head by this angle.
+    """
+    turn = matrix_from_axis_angle(torch.tensor([0.0, angle, 0.0]).to(face.head_rotation))
+    rotation = matrix_from_axis_angle(face.head_rotation) @ turn
+    return replace(face, head_rotation=axis_angle_from_matrix(rotation))
+
+
+def _drawn_angle(raised: bool, random: torch.Generator) -> float:
+    """An angle to either side, in radians."""
+    share, side = torch.rand(2, generator=random, dtype=torch.float64).tolist()
+    low, high = (0.0, _EXPRESSION_MOST) if raised else (_LEAST, _MOST)
+    degrees = low + share * (high - low)
+    return float(torch.deg2rad(torch.tensor(degrees if side < 0.5 else -degrees, dtype=torch.float64)))
