@@ -324,6 +324,28 @@ def test_the_mean_correction_is_given_in_the_head_frame() -> None:
     torch.testing.assert_close(found_shift, shift)
 
 
+@pytest.mark.parametrize("keeps", [True, False])
+def test_a_shift_that_all_poses_share_is_taken_away(keeps: bool) -> None:
+    """The heads look in four directions. The second half was never trained, and stays as it was tracked."""
+    turns = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
+    tracked = replace(_still_face(4), head_rotation=turns)
+    track = FaceTrack(tracked, FaceTuning(enabled=True, keep_mean_pose=keeps))
+    shift = torch.tensor([0.001, 0.002, -0.003])
+    for index in (0, 1):
+        face, groups = track.face(index), track.parameter_groups(index)
+        own = (1.5 if index else 0.5) * shift
+        with torch.no_grad():
+            face.head_translation[0] += tracked.T_world_head[index, :3, :3] @ own
+        for group in groups:
+            next(iter(group.moments.values())).step += 1
+    track.keep_mean_pose()
+    moved = torch.cat([track.face(index).head_translation.detach() for index in range(4)]) - tracked.head_translation
+    in_head = (tracked.T_world_head[:, :3, :3].mT @ moved[:, :, None])[:, :, 0]
+    expected = (torch.tensor([-0.5, 0.5]) if keeps else torch.tensor([0.5, 1.5]))[:, None] * shift
+    torch.testing.assert_close(in_head[:2], expected, atol=1e-6, rtol=0)
+    assert moved[2:].abs().max() == 0
+
+
 def _still_face(timesteps: int) -> FaceParams:
     return FaceParams(
         identity=torch.zeros(1),

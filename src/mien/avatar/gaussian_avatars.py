@@ -40,7 +40,7 @@ _PULL = 0.05
 """Share of the difference to the completed colour that a step takes away where no picture shows a triangle."""
 _OPAQUE = 0.97
 """Opacity of a fill."""
-_FILL_HEIGHT = 0.5
+_FILL_HEIGHT = 0.9
 """Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it."""
 _HEAD_RADIUS = 0.1
 """Radius of a head, in metres."""

@@ -61,7 +61,8 @@ def hair_height(
         return height[:, 0]
     surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
     spread = surface.spread(height, known, scalp)
-    height = torch.where(known[:, None] > 0, spread, spread.clamp_max(_SAME_HAIR * _on_top(surface, height, known)))
+    guess = _by_level(surface, height, known)[:, None] * scalp[:, None]
+    height = torch.where(known[:, None] > 0, spread, guess.clamp_max(_SAME_HAIR * _on_top(surface, height, known)))
     for _ in range(_FADING_ROUNDS):
         height = torch.minimum(height, surface.around(height, torch.ones_like(known)))
         height[~scalp] = 0
@@ -123,6 +124,19 @@ def _on_top(surface: Surface, height: Float[Tensor, "f 1"], known: Float[Tensor,
     measured = known > 0
     level = surface.middles[measured, 1].median()
     return float(height[measured & (surface.middles[:, 1] >= level)].median())
+
+
+def _by_level(surface: Surface, height: Float[Tensor, "f 1"], known: Float[Tensor, " f"]) -> Float[Tensor, " f"]:
+    """Return the height that the level on the head predicts, at least 0: a line through what was measured.
+
+    Hair gets thinner towards the nape, which no front picture shows, as it does towards the temples, which many show.
+    """
+    level, weight = surface.middles[:, 1].double(), known.double()
+    mean = (weight * level).sum() / weight.sum()
+    tall = (weight * height[:, 0]).sum() / weight.sum()
+    spread = (weight * (level - mean).square()).sum()
+    slope = (weight * (level - mean) * (height[:, 0] - tall)).sum() / spread.clamp_min(1e-9)
+    return (tall + slope.clamp_min(0) * (level - mean)).clamp_min(0).to(height)
 
 
 def _measured(

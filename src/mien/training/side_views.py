@@ -30,9 +30,10 @@ _EXPRESSION_MOST = 45.0
 """Largest angle at which a raised expression is seen, in degrees."""
 _RAISED = 6
 """Number of coefficients that are raised."""
-_FREE = 0.06
-"""Difference of colour (0..1) between an avatar and the completed mesh that costs nothing in raised expressions."""
-_FILL = 0.5
+_FREE, _FREE_ASIDE = 0.06, 0.15
+"""Differences of colour (0..1) between an avatar and the completed mesh that cost nothing where pictures show the
+triangle: in raised expressions, and from aside. The mesh knows neither hair nor pores."""
+_FILL = 0.9
 """Height of the mesh above the scalp as a share of the hair's, which is that of fills."""
 _FADING = 0.5
 """Share of a triangle above the cut at the neck from which it is drawn."""
@@ -82,12 +83,11 @@ class SideViews:
         scale = _SIDE / max(camera.width, camera.height)
         small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
         background = torch.rand(3, generator=random)
-        picture, alpha, share = self._target(face, small, background, raised=raised)
+        picture, alpha, share, free = self._target(face, small, background, raised=raised)
         like = face.expression
         seen = rasterize(avatar.pose(face, progress).gaussians.timestep(0), small, background.to(like))
         difference = (seen.image - picture.to(like)).abs()
-        if raised:
-            difference = (difference - _FREE).clamp_min(0)
+        difference = (difference - free.to(like)[..., None]).clamp_min(0)
         colors = (difference * share.to(like)[..., None]).mean()
         outline = torch.zeros_like(colors) if raised else (seen.alpha - alpha.to(like)).abs().mean()
         return self.weight * (colors + outline)
@@ -95,16 +95,19 @@ class SideViews:
     @torch.no_grad()
     def _target(
         self, face: FaceParams, camera: Camera, background: Float[Tensor, " 3"], *, raised: bool
-    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        """The completed mesh, its alpha, and how much each pixel's colour counts, 0..1."""
+    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        """The completed mesh, its alpha, whether each pixel's colour counts (0 or 1), and which difference is free."""
         vertices = self.face_model(face.to(self.colors))[0]
         vertices = vertices + self.height[:, None] * vertex_normals(vertices, self.face_model.faces)
         index = rasterize_mesh(vertices, self.face_model.faces[self.drawn], camera.to(self.colors)).face_index.long()
         hit = index >= 0
         triangle: Int[Tensor, "h w"] = self.drawn.nonzero()[:, 0][index.clamp_min(0)]
         picture = torch.where(hit[..., None], self.colors[triangle], background)
-        share = self.compared[triangle].float() if raised else self.doubt[triangle]
-        return picture, hit.float(), torch.where(hit, share, 0.0 if raised else 1.0)
+        if raised:
+            share, free = self.compared[triangle] & hit, torch.full(hit.shape, _FREE)
+        else:
+            share, free = torch.ones_like(hit), torch.where(hit, _FREE_ASIDE * (1 - self.doubt[triangle]), 0.0)
+        return picture, hit.float(), share.float(), free
 
     def _raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
         """The expression with some coefficients anywhere between 0 and their largest value."""

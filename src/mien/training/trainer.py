@@ -233,7 +233,7 @@ def start(
     if avatar.wants_first_colors:
         avatar.paint(vertex_colors(face_model, sequences, faces, frames))
     colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
-    unseen, filled = None, fills_sides(frames, settings)
+    unseen, filled = None, fills_sides(frames, settings, bound=avatar.triangles() is not None)
     if filled or avatar.wants_surface:
         unseen = unseen_of(avatar, sequences, faces, frames, filled=filled)
         avatar.close(unseen.prior)
@@ -316,10 +316,13 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"
 
 
-def fills_sides(frames: Items[Frame], settings: TrainSettings) -> bool:
-    """Whether sides that no picture shows are filled: as the settings say, or if one camera took all frames."""
+def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -> bool:
+    """Whether sides that no picture shows are filled.
+
+    If the settings leave it open, they are if one camera took all frames and Gaussians are `bound` to triangles.
+    """
     if settings.unseen == "auto":
-        return len({frame.camera for frame in frames}) == 1
+        return bound and len({frame.camera for frame in frames}) == 1
     return settings.unseen == "filled"
 
 

@@ -1,0 +1,125 @@
+"""Side views: pictures that no camera took, of a head from aside and of raised expressions."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mien.avatar import Progress, method_named
+from mien.camera import camera_from_fov
+from mien.face import FaceModel, load_face_model
+from mien.render.mesh import rasterize_mesh
+from mien.rotation import matrix_from_axis_angle
+from mien.training import PRESETS
+from mien.training.frames import Frame
+from mien.training.side_views import SideViews, side_views, turned_aside
+from mien.training.trainer import fills_sides
+
+_PROGRESS = Progress(0, 100, 0, 1.0, 1)
+_HAIR = 0.02
+
+
+@pytest.fixture(scope="module")
+def anny() -> FaceModel:
+    return load_face_model("anny")
+
+
+def _camera():
+    return camera_from_fov(0.5, 128, 128, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+
+
+def _face(model: FaceModel):
+    face = model.neutral(1)
+    face.head_translation[:, 2] = -0.8
+    return face
+
+
+def _views(model: FaceModel, color: float = 0.5, hair: float = 0.0) -> SideViews:
+    count = len(model.faces)
+    return side_views(
+        model, 0.1, torch.full((count, 3), color), torch.ones(count), torch.full((count,), hair), torch.ones(count)
+    )
+
+
+def _random(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def _opaque_avatar(model: FaceModel, color: float):
+    """One flat opaque Gaussian of one colour on each triangle."""
+    torch.manual_seed(0)
+    avatar = method_named("gaussian_avatars").avatar(PRESETS["paper"].config("gaussian_avatars"), model, _face(model))
+    avatar.furnish(torch.ones(len(model.faces), dtype=torch.bool), 0.97, torch.full((len(model.faces), 3), color))
+    return avatar
+
+
+def test_a_head_turns_about_its_own_upright_axis(anny):
+    face = _face(anny)
+    face.head_rotation[:, 0] = 0.3
+    turned = turned_aside(face, math.pi / 2)
+    before, after = (matrix_from_axis_angle(one.head_rotation[0]) for one in (face, turned))
+    torch.testing.assert_close(after[:, 1], before[:, 1])
+    torch.testing.assert_close(after[:, 2], before[:, 0], atol=1e-6, rtol=0)
+    assert turned.head_translation.equal(face.head_translation)
+
+
+@pytest.mark.parametrize("step", [0, 4])
+def test_a_head_in_the_colours_of_the_mesh_costs_less_than_one_in_others(anny, step):
+    views = _views(anny)
+    costs = [
+        float(views.loss(_opaque_avatar(anny, color), _face(anny), _camera(), _PROGRESS, step, _random()).detach())
+        for color in (0.5, 0.9)
+    ]
+    assert costs[0] < 0.3 * costs[1]
+
+
+def test_transparent_sides_cost(anny):
+    views, avatar = _views(anny), _opaque_avatar(anny, 0.5)
+    closed = float(views.loss(avatar, _face(anny), _camera(), _PROGRESS, 0, _random()).detach())
+    avatar.store.assign("opacity_logits", torch.full_like(avatar.store["opacity_logits"], -4.0))
+    opened = views.loss(avatar, _face(anny), _camera(), _PROGRESS, 0, _random())
+    assert float(opened.detach()) > 3 * closed
+
+
+def test_gradients_reach_gaussians_and_not_the_face(anny):
+    avatar, face = _opaque_avatar(anny, 0.9), _face(anny)
+    face = replace(face, head_translation=face.head_translation.requires_grad_())
+    _views(anny).loss(avatar, face, _camera(), _PROGRESS, 0, _random()).backward()
+    assert float(avatar.store["sh_constant"].grad.abs().sum()) > 0
+    assert face.head_translation.grad is None
+
+
+def test_raised_expressions_stay_within_the_bounds_and_change_with_the_random_numbers(anny):
+    views, rest = _views(anny), _face(anny).expression
+    raised = [views._raised(rest, _random(seed)) for seed in (0, 1)]
+    for one in raised:
+        assert bool((one <= anny.expression_bounds[:, 1] + 1e-6).all())
+        assert 1 <= int((one != rest).sum()) <= 6
+    assert not raised[0].equal(raised[1])
+
+
+def test_the_outline_has_the_hair(anny):
+    face, camera = _face(anny), _camera()
+    white = torch.ones(3)
+    alphas = [_views(anny, hair=hair)._target(face, camera, white, raised=False)[1] for hair in (0.0, _HAIR)]
+    bare = rasterize_mesh(anny(face)[0], anny.faces, camera).face_index >= 0
+    assert alphas[0].bool().equal(bare)
+    assert float(alphas[1].sum()) > 1.05 * float(alphas[0].sum())
+
+
+def test_every_fourth_step_has_a_view(anny):
+    views = _views(anny)
+    assert [step for step in range(17) if views.due(step)] == [0, 4, 8, 12, 16]
+    assert not replace(views, weight=0.0).due(0)
+
+
+@pytest.mark.parametrize(("cameras", "filled"), [(1, True), (3, False)])
+def test_sides_are_filled_by_themselves_if_one_camera_filmed(cameras, filled):
+    frames = [Frame(0, 0, camera) for camera in range(cameras)]
+    settings = PRESETS["standard"].settings_of("gaussian_avatars")
+    assert settings.unseen == "auto"
+    assert fills_sides(frames, settings, bound=True) is filled
+    assert fills_sides(frames, replace(settings, unseen="filled"), bound=False)
+    assert not fills_sides(frames, replace(settings, unseen="trained"), bound=True)
+    assert not fills_sides(frames, settings, bound=False), "headgas has nothing to fill"
