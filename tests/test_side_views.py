@@ -14,7 +14,7 @@ from mien.rotation import matrix_from_axis_angle
 from mien.training import PRESETS
 from mien.training.frames import Frame
 from mien.training.side_views import SideViews, side_views, turned_aside
-from mien.training.trainer import fills_sides
+from mien.training.unseen import fills_sides
 
 _PROGRESS = Progress(0, 100, 0, 1.0, 1)
 _HAIR = 0.02

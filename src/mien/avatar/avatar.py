@@ -36,6 +36,10 @@ class Posed:
     """Tensors that the method's own regularizers need, computed once."""
 
 
+_FILL_HEIGHT = 0.9
+"""Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it."""
+
+
 @dataclass(frozen=True, eq=False)
 class SurfacePrior:
     """What is known of each of the f triangles of a head without training: from the mesh, the mattes and symmetry."""
@@ -55,6 +59,11 @@ class SurfacePrior:
     is trained where pictures show it. None if these are the made-up ones."""
     looseness: Float[Tensor, " f"] | None = None
     """Factors on the limits to the surface (`Avatar.keep_to`), for parts that the mesh fits less well. None means 1."""
+
+    @property
+    def fill_height(self) -> Float[Tensor, " f"]:
+        """Height at which a fill lies above its triangle, in metres."""
+        return _FILL_HEIGHT * self.hair
 
 
 @dataclass(frozen=True, eq=False)

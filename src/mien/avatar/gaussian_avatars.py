@@ -40,8 +40,6 @@ _PULL = 0.05
 """Share of the difference to the completed colour that a step takes away where no picture shows a triangle."""
 _OPAQUE = 0.97
 """Opacity of a fill."""
-_FILL_HEIGHT = 0.9
-"""Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it."""
 _HEAD_RADIUS = 0.1
 """Radius of a head, in metres."""
 _BASES = ("colour_basis", "opacity_basis", "offset_basis")
@@ -215,7 +213,7 @@ class GaussianAvatars(Avatar):
         store, bound = self.store, self.store["face_index"]
         store.assign("sh_constant", sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None])
         quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
-        height = _FILL_HEIGHT * prior.hair[bound]
+        height = prior.fill_height[bound]
         store.assign("means", torch.stack([0 * height, height / self._sizes[bound], 0 * height], 1))
         filled = closed[bound]
         store.assign("quats", torch.where(filled[:, None], quats[bound], store["quats"]))

@@ -18,8 +18,8 @@ class SurfaceLimits:
     """
 
     enabled: bool = False
-    """Whether the limits are kept, by a correction after each step. They are always kept with `--training.unseen
-    filled`."""
+    """Whether the limits are kept, by a correction after each step. They are always kept where sides are filled
+    (`--training.unseen`)."""
     depth: Annotated[float, Range(0, 0.1)] = 0.003
     """Largest distance of a centre from the mesh along the triangle's normal, in metres."""
     hair_share: Annotated[float, Range(0, 10)] = 1.3

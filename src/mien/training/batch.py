@@ -19,7 +19,15 @@ from mien.render.rasterize import rasterize_each
 from mien.render.rendering import Rendering
 from mien.training.ahead import TargetQueue
 from mien.training.checkpoint import TrainingState
-from mien.training.frames import MIN_EXTENT, Frame, FrameOrder, background_at, crop_random, disguise_random
+from mien.training.frames import (
+    MIN_EXTENT,
+    Frame,
+    FrameOrder,
+    aside_random,
+    background_at,
+    crop_random,
+    disguise_random,
+)
 from mien.training.inside import disguise
 from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses
 from mien.training.sequence import Target, Targets
@@ -128,6 +136,19 @@ def compare_features(
         for one, image in zip(batch, shown, strict=True)
         if one.goal is not None
     )
+
+
+def compare_aside(
+    state: TrainingState, data: TrainingData, settings: TrainSettings, batch: Items[BatchFrame], progress: Progress
+) -> dict[str, Float[Tensor, ""]]:
+    """The loss of a side view, if one of the frames is due for it: that of the first such frame."""
+    aside = state.aside
+    due = [] if aside is None else [one for one in batch if aside.due(one.number)]
+    if aside is None or not due:
+        return {}
+    one = due[0]
+    camera, random = data.targets[one.frame.sequence].camera(one.frame.camera), aside_random(settings, one.number)
+    return {"aside": aside.loss(state.avatar, state.track.face(one.index), camera, progress, one.number, random)}
 
 
 def _summed(losses: Iterable[dict[str, Float[Tensor, ""]]]) -> dict[str, Float[Tensor, ""]]:

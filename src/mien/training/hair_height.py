@@ -45,8 +45,9 @@ def hair_height(
     """Return the height of hair above each triangle along its normal, in metres, 0..0.08; 0 outside of the scalp.
 
     A triangle of the scalp is measured in frames in which it is on the outline of the mesh: its height is the distance
-    along its normal to the border of the matte. Triangles that are never on the outline take the height of those
-    around them. The height fades to 0 at the hairline. Without any measurement it is 0.
+    along its normal to the border of the matte. Triangles that are never on the outline have the height that their
+    level on the head predicts: a line through what was measured. The height fades to 0 at the hairline. Without any
+    measurement it is 0.
 
     Args:
         face_model: The face model, float32 on the CPU.

@@ -18,7 +18,9 @@ from mien.face import FaceModel, FaceParams
 from mien.render import rasterize
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.training.completion import vertex_means
 from mien.training.head_parts import head_parts
+from mien.training.unseen import Unseen
 
 _EVERY = 8
 """Number of steps between two side views. Views of raised expressions take turns with those from aside."""
@@ -33,8 +35,6 @@ _RAISED = 6
 _FREE, _FREE_ASIDE = 0.06, 0.15
 """Differences of colour (0..1) between an avatar and the completed mesh that cost nothing where pictures show the
 triangle: in raised expressions, and from aside. The mesh knows neither hair nor pores."""
-_FILL = 0.9
-"""Height of the mesh above the scalp as a share of the hair's, which is that of fills."""
 _FADING = 0.5
 """Share of a triangle above the cut at the neck from which it is drawn."""
 
@@ -124,7 +124,7 @@ def side_views(
     weight: float,
     colors: Float[Tensor, "f 3"],
     doubt: Float[Tensor, " f"],
-    hair: Float[Tensor, " f"],
+    height: Float[Tensor, " f"],
     above: Float[Tensor, " f"],
 ) -> SideViews:
     """The side views of a head.
@@ -134,15 +134,24 @@ def side_views(
         weight: Weight of the loss.
         colors: Completed colours of the triangles, 0..1.
         doubt: How far they are made up, 0..1.
-        hair: Height of hair above each triangle, in metres.
+        height: Height of the surface above each triangle, in metres, which is that of fills.
         above: 1 for triangles above the cut at the neck, 0 for those below.
     """
-    parts, corners = head_parts(face_model), face_model.faces.long().T.flatten()
-    own = torch.stack([hair, torch.ones_like(hair)], dim=1).repeat(3, 1)
-    total = torch.zeros(len(face_model.template), 2).index_add(0, corners, own)
-    height = _FILL * total[:, 0] / total[:, 1].clamp_min(1)
+    parts, over = head_parts(face_model), vertex_means(face_model, height[:, None].expand(-1, 3))[:, 0]
     compared = parts.skin | parts.interior | torch.stack(parts.painted).any(0)
-    return SideViews(face_model, weight, colors, doubt, height, above > _FADING, compared)
+    return SideViews(face_model, weight, colors, doubt, over, above > _FADING, compared)
+
+
+def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideViews | None:
+    """The side views of a filled head, or None if nothing is filled or the weight is 0."""
+    if unseen is None or unseen.coverage is None or unseen.prior.made_up is None or weight == 0:
+        return None
+    model, prior = avatar.face_model, unseen.prior
+    like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
+    assert prior.colors is not None
+    assert prior.doubt is not None
+    colors, doubt, height = (values.to(like) for values in (prior.colors, prior.doubt, prior.fill_height))
+    return side_views(model.to(like), weight, colors, doubt, height, unseen.coverage.above.to(like))
 
 
 def turned_aside(face: FaceParams, angle: float) -> FaceParams:

@@ -35,7 +35,7 @@ from mien.render.validation import CannotDrawError
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.ahead import targets_ahead
-from mien.training.batch import TrainingData, compare, compare_features, draw, face_groups, next_batch
+from mien.training.batch import TrainingData, compare, compare_aside, compare_features, draw, face_groups, next_batch
 from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.coverage import coverage
@@ -43,9 +43,7 @@ from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
 from mien.training.filmed import with_shown_angles
 from mien.training.frames import (
-    Frame,
     FrameOrder,
-    aside_random,
     camera_extent,
     density_random,
     expression_rarity,
@@ -57,8 +55,8 @@ from mien.training.losses import train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Targets
 from mien.training.settings import TrainSettings
-from mien.training.side_views import SideViews, side_views
-from mien.training.unseen import Unseen, moved, spare_fills, unseen_of
+from mien.training.side_views import side_views_of
+from mien.training.unseen import fills_sides, moved, spare_fills, unseen_of
 from mien.training.vertex_colors import vertex_colors
 
 _MEAN_POSE_EVERY = 25
@@ -249,7 +247,7 @@ def start(
         face = face.to(like)
         unseen = None if unseen is None else moved(unseen, like)
         inside = None if inside is None else inside.to(like)
-    aside = _aside(avatar, unseen, settings)
+    aside = side_views_of(avatar, unseen, settings.side_weight)
     density = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     track = FaceTrack(face, method_config.face_tuning, lengths, face_model.expression_bounds)
@@ -274,12 +272,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     shown = [one.seen(rendering, state) for one, rendering in zip(batch, renderings, strict=True)]
     losses = compare(state, batch, shown) | avatar.regularizers(whole, renderings[0], progress)
     losses |= compare_features(state, batch, shown)
-    aside = state.aside
-    if aside is not None and any(aside.due(one.number) for one in batch):
-        one = next(one for one in batch if aside.due(one.number))
-        random = aside_random(settings, one.number)
-        view = data.targets[one.frame.sequence].camera(one.frame.camera)
-        losses["aside"] = aside.loss(avatar, state.track.face(one.index), view, progress, one.number, random)
+    losses |= compare_aside(state, data, settings, batch, progress)
     torch.autograd.backward(list(losses.values()))
     if state.unseen is not None:
         state.unseen.guard(avatar, *renderings)
@@ -314,28 +307,6 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     for name, value in entry.items():
         state.curves.setdefault(name, []).append(value)
     return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"
-
-
-def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -> bool:
-    """Whether sides that no picture shows are filled.
-
-    If the settings leave it open, they are if one camera took all frames and Gaussians are `bound` to triangles.
-    """
-    if settings.unseen == "auto":
-        return bound and len({frame.camera for frame in frames}) == 1
-    return settings.unseen == "filled"
-
-
-def _aside(avatar: Avatar, unseen: Unseen | None, settings: TrainSettings) -> SideViews | None:
-    """The side views of a filled head, if Gaussians follow its mesh."""
-    if unseen is None or unseen.coverage is None or unseen.prior.made_up is None or settings.side_weight == 0:
-        return None
-    model, prior = avatar.face_model, unseen.prior
-    like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
-    assert prior.colors is not None
-    assert prior.doubt is not None
-    colors, doubt, hair = (values.to(like) for values in (prior.colors, prior.doubt, prior.hair))
-    return side_views(model.to(like), settings.side_weight, colors, doubt, hair, unseen.coverage.above.to(like))
 
 
 def passed(before: int, now: int, every: int) -> bool:

@@ -23,6 +23,7 @@ from mien.training.hair_height import hair_height, hanging_hair
 from mien.training.head_parts import head_parts
 from mien.training.hidden import hidden_triangles
 from mien.training.sequence import Sequence
+from mien.training.settings import TrainSettings
 
 _RARE = 0.02
 """Confidence below which a triangle is made up."""
@@ -80,6 +81,16 @@ class Unseen:
         for rendering in renderings:
             if rendering.means2d_offset.grad is not None:
                 rendering.means2d_offset.grad.masked_fill_(made_up[:, None], 0)
+
+
+def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -> bool:
+    """Whether sides that no picture shows are filled.
+
+    If the settings leave it open, they are if one camera took all frames and Gaussians are `bound` to triangles.
+    """
+    if settings.unseen == "auto":
+        return bound and len({frame.camera for frame in frames}) == 1
+    return settings.unseen == "filled"
 
 
 def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
