@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,6 +12,7 @@ from mien.camera import camera_from_fov
 from mien.face import FaceModel, load_face_model
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
+from mien.tracking import NeckParts, head_cutter
 from mien.training import PRESETS
 from mien.training.frames import Frame
 from mien.training.side_views import SideViews, side_views, turned_aside
@@ -37,9 +39,7 @@ def _face(model: FaceModel):
 
 def _views(model: FaceModel, color: float = 0.5, hair: float = 0.0) -> SideViews:
     count = len(model.faces)
-    return side_views(
-        model, 0.1, torch.full((count, 3), color), torch.ones(count), torch.full((count,), hair), torch.ones(count)
-    )
+    return side_views(model, 0.1, torch.full((count, 3), color), torch.full((count,), hair))
 
 
 def _random(seed: int = 0) -> torch.Generator:
@@ -64,14 +64,14 @@ def test_a_head_turns_about_its_own_upright_axis(anny):
     assert turned.head_translation.equal(face.head_translation)
 
 
-@pytest.mark.parametrize("step", [0, 4])
-def test_a_head_in_the_colours_of_the_mesh_costs_less_than_one_in_others(anny, step):
+@pytest.mark.parametrize(("step", "most"), [(0, 0.7), (4, 0.3)])  # From aside, the neck below the cut costs too.
+def test_a_head_in_the_colours_of_the_mesh_costs_less_than_one_in_others(anny, step, most):
     views = _views(anny)
     costs = [
         float(views.loss(_opaque_avatar(anny, color), _face(anny), _camera(), _PROGRESS, step, _random()).detach())
         for color in (0.5, 0.9)
     ]
-    assert costs[0] < 0.3 * costs[1]
+    assert costs[0] < most * costs[1]
 
 
 def test_transparent_sides_cost(anny):
@@ -102,10 +102,22 @@ def test_raised_expressions_stay_within_the_bounds_and_change_with_the_random_nu
 def test_the_outline_has_the_hair(anny):
     face, camera = _face(anny), _camera()
     white = torch.ones(3)
-    alphas = [_views(anny, hair=hair)._target(face, camera, white, raised=False)[1] for hair in (0.0, _HAIR)]
-    bare = rasterize_mesh(anny(face)[0], anny.faces, camera).face_index >= 0
-    assert alphas[0].bool().equal(bare)
+    alphas = [_views(anny, hair=hair)._target(face, camera, white)[1] for hair in (0.0, _HAIR)]
+    head_faces = anny.faces[~anny.region_mask("neck")]
+    head = rasterize_mesh(anny(face)[0], head_faces, camera).face_index >= 0
+    assert bool((alphas[0][head] == 1).all())
     assert float(alphas[1].sum()) > 1.05 * float(alphas[0].sum())
+
+
+def test_the_outline_ends_at_the_cut_at_the_neck(anny):
+    face, camera = turned_aside(_face(anny), 1.0), _camera()
+    views = _views(anny)
+    picture, alpha, _ = views._target(face, camera, torch.tensor([1.0, 0.0, 0.0]))
+    bare = np.where(rasterize_mesh(anny(face)[0], anny.faces, camera).face_index.numpy() >= 0, 255, 0).astype(np.uint8)
+    expected = head_cutter(anny, NeckParts.of(anny), face)(bare, camera)
+    assert alpha.equal(torch.from_numpy(expected).float() / 255)
+    assert float(alpha.sum()) < 0.97 * (bare > 0).sum(), "the mesh goes on below the cut"
+    torch.testing.assert_close(picture[alpha == 0], torch.tensor([1.0, 0.0, 0.0]).expand(int((alpha == 0).sum()), 3))
 
 
 def test_every_fourth_step_has_a_view(anny):

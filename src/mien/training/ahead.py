@@ -66,7 +66,7 @@ class TargetQueue:
         kept = targets.kept(frame.timestep, frame.camera, background)
         if kept is not None:
             return kept
-        keep = self._settings.background == "white"
+        keep = self._settings.background != "random"
         return self._worker.submit(targets.composed, frame.timestep, frame.camera, background, keep)
 
 

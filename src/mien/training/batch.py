@@ -53,7 +53,7 @@ class TrainingData:
         if self.ahead is not None:
             return targets.moved(self.ahead.target(step))
         background = background_at(settings, step)
-        return targets.target(frame.timestep, frame.camera, background, keep=settings.background == "white")
+        return targets.target(frame.timestep, frame.camera, background, keep=settings.background != "random")
 
     def goal(
         self, target: Target, perceptual: PerceptualLoss, step: int, settings: TrainSettings

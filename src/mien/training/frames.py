@@ -5,6 +5,7 @@ Every random draw depends only on the seed and the step, so that runs resume exa
 
 import hashlib
 from collections.abc import Sequence as Items
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -169,9 +170,14 @@ class FrameOrder:
         return self._frames[self._order[step % len(self._frames)]], epoch
 
 
+def resolved_background(settings: TrainSettings, *, filled: bool) -> TrainSettings:
+    """The settings with a background that depends on nothing else: `auto` is random for filled sides, else white."""
+    return replace(settings, background="random" if filled else "white") if settings.background == "auto" else settings
+
+
 def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]:
     """The background colour of a step, 0 to 255."""
-    if settings.background == "white":
+    if settings.background != "random":
         return np.full(3, 255, dtype=np.uint8)
     generator = random_at(settings.seed, _BACKGROUND, step)
     return torch.randint(256, (3,), generator=generator).numpy().astype(np.uint8)

@@ -28,8 +28,12 @@ _QUANTILE = 0.3
 """Share of the measured heights below the one that counts. Single strands and other things behind make some higher."""
 _SAME_HAIR = 1.3
 """Largest height where nothing was measured, as a multiple of the median height on top of the head."""
-_FADING_ROUNDS = 6
-"""Rings of triangles over which the height fades to 0 at the hairline."""
+_LEVEL, _NEAR = 0.012, 0.03
+"""Difference of level and distance, in metres, within which measured heights count alike for what is never measured."""
+_SMOOTHING_ROUNDS = 2
+"""Rings of triangles over which heights are averaged. More would flatten the hair on top."""
+_FADING_ROUNDS = 2
+"""Rings of triangles over which the height fades at the hairline."""
 _NEAR_ROUNDS = 4
 """Rings of triangles around an outline that hanging hair may cover too."""
 
@@ -45,9 +49,8 @@ def hair_height(
     """Return the height of hair above each triangle along its normal, in metres, 0..0.08; 0 outside of the scalp.
 
     A triangle of the scalp is measured in frames in which it is on the outline of the mesh: its height is the distance
-    along its normal to the border of the matte. Triangles that are never on the outline have the height that their
-    level on the head predicts: a line through what was measured. The height fades to 0 at the hairline. Without any
-    measurement it is 0.
+    along its normal to the border of the matte. Triangles that are never on the outline have the height of what
+    was measured at their level on the head. The height fades at the hairline. Without any measurement it is 0.
 
     Args:
         face_model: The face model, float32 on the CPU.
@@ -61,13 +64,15 @@ def hair_height(
     if not bool(known.any()):
         return height[:, 0]
     surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
-    spread = surface.spread(height, known, scalp)
-    guess = _by_level(surface, height, known)[:, None] * scalp[:, None]
-    height = torch.where(known[:, None] > 0, spread, guess.clamp_max(_SAME_HAIR * _on_top(surface, height, known)))
+    guess = _by_level(surface, height, known, scalp).clamp_max(_SAME_HAIR * _on_top(surface, height, known))
+    height = torch.lerp(guess, height, known[:, None])
+    inside = scalp.to(height)
+    for _ in range(_SMOOTHING_ROUNDS):
+        height = surface.around(height, inside) * inside[:, None]
+    share = inside[:, None]
     for _ in range(_FADING_ROUNDS):
-        height = torch.minimum(height, surface.around(height, torch.ones_like(known)))
-        height[~scalp] = 0
-    return height[:, 0].clamp(0, _HIGHEST)
+        share = torch.minimum(share, surface.around(share, torch.ones_like(known))) * inside[:, None]
+    return (height * share)[:, 0].clamp(0, _HIGHEST)
 
 
 @torch.no_grad()
@@ -127,17 +132,20 @@ def _on_top(surface: Surface, height: Float[Tensor, "f 1"], known: Float[Tensor,
     return float(height[measured & (surface.middles[:, 1] >= level)].median())
 
 
-def _by_level(surface: Surface, height: Float[Tensor, "f 1"], known: Float[Tensor, " f"]) -> Float[Tensor, " f"]:
-    """Return the height that the level on the head predicts, at least 0: a line through what was measured.
+def _by_level(
+    surface: Surface, height: Float[Tensor, "f 1"], known: Float[Tensor, " f"], among: Bool[Tensor, " f"]
+) -> Float[Tensor, "f 1"]:
+    """Return the mean of the measured heights at each triangle's level on the head, most of all of the near ones.
 
     Hair gets thinner towards the nape, which no front picture shows, as it does towards the temples, which many show.
     """
-    level, weight = surface.middles[:, 1].double(), known.double()
-    mean = (weight * level).sum() / weight.sum()
-    tall = (weight * height[:, 0]).sum() / weight.sum()
-    spread = (weight * (level - mean).square()).sum()
-    slope = (weight * (level - mean) * (height[:, 0] - tall)).sum() / spread.clamp_min(1e-9)
-    return (tall + slope.clamp_min(0) * (level - mean)).clamp_min(0).to(height)
+    targets, sources = among.nonzero()[:, 0], (known > 0).nonzero()[:, 0]
+    apart = surface.middles[targets, None] - surface.middles[sources]
+    alike = torch.exp(-0.5 * (apart[..., 1] / _LEVEL).square()) + 1e-9
+    weight = alike * known[sources] / (apart.square().sum(-1) + _NEAR**2)
+    guess = torch.zeros_like(height)
+    guess[targets, 0] = (weight * height[sources, 0]).sum(1) / weight.sum(1)
+    return guess
 
 
 def _measured(

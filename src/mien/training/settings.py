@@ -26,9 +26,10 @@ class TrainSettings:
     split: Split = "blocks"
     """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none).
     gaussian-avatars is the split of that paper on NeRSemble: a sequence of each subject, and camera 08."""
-    background: Literal["white", "random"] = "white"
+    background: Literal["white", "random", "auto"] = "white"
     """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
-    which can show as white needles in new poses. It costs 0.1 to 0.4 dB compared with white."""
+    which can show as white needles in new poses. It costs 0.1 to 0.4 dB compared with white. Auto: random where sides
+    are filled (`--training.unseen`), where white ears would show from aside, else white."""
     frame_order: Literal["even", "rare"] = "even"
     """How often frames are drawn: each equally often, or those with a rare expression up to four times as often as
     those with a common one."""
@@ -146,8 +147,8 @@ class Preset:
 PRESETS = {
     preset.name: preset
     for preset in (
-        Preset("draft", TrainSettings(steps=8_000, inside="covered", unseen="auto")),
-        Preset("standard", TrainSettings(inside="covered", unseen="auto")),
+        Preset("draft", TrainSettings(steps=8_000, background="auto", inside="covered", unseen="auto")),
+        Preset("standard", TrainSettings(background="auto", inside="covered", unseen="auto")),
         Preset("paper", TrainSettings()),
     )
 }

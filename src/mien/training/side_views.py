@@ -1,13 +1,14 @@
 """Training pictures that no camera took: the head from aside, and with raised expressions.
 
 One camera in front shows half of a head at a few expressions. Between its pictures, Gaussians may do as they like: they
-leave the surface, and show as shards and holes once the head turns. A side view is compared with the completed mesh: in
-front and from aside, the head is as opaque as the mesh with its hair, and what is far from the mesh's colours is pulled
-towards them. A difference that a real head could have is free.
+leave the surface, and show as shards and holes once the head turns. A side view is compared with the completed mesh:
+from aside, the head is opaque exactly where the mesh with its hair is, above the cut at the neck, and colours are
+pulled towards those of the mesh. In raised expressions, a difference that a real head could have is free.
 """
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -18,6 +19,7 @@ from mien.face import FaceModel, FaceParams
 from mien.render import rasterize
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.tracking import NeckParts, head_cutter
 from mien.training.completion import vertex_means
 from mien.training.head_parts import head_parts
 from mien.training.unseen import Unseen
@@ -26,17 +28,17 @@ _EVERY = 8
 """Number of steps between two side views. Views of raised expressions take turns with those from aside."""
 _SIDE = 256
 """Longer side of these pictures, in pixels. The completed colours are no finer."""
-_LEAST, _MOST = 30.0, 180.0
-"""Angles between which the head turns aside, in degrees."""
+_LEAST, _MOST = 45.0, 180.0
+"""Angles between which the head turns aside, in degrees. Pictures know the outline nearer to the front better."""
 _EXPRESSION_MOST = 45.0
 """Largest angle at which a raised expression is seen, in degrees."""
 _RAISED = 6
 """Number of coefficients that are raised."""
-_FREE, _FREE_ASIDE = 0.06, 0.15
-"""Differences of colour (0..1) between an avatar and the completed mesh that cost nothing where pictures show the
-triangle: in raised expressions, and from aside. The mesh knows neither hair nor pores."""
-_FADING = 0.5
-"""Share of a triangle above the cut at the neck from which it is drawn."""
+_FREE = 0.06
+"""Difference of colour (0..1) between an avatar and the completed mesh that costs nothing in raised expressions. The
+mesh knows neither hair nor pores."""
+_OUTLINE = 3.0
+"""Weight of the difference of alpha from aside against that of colours. Most errors from aside are at the outline."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +50,10 @@ class SideViews:
     """Weight of the mean absolute differences of colour and of alpha."""
     colors: Float[Tensor, "f 3"]
     """Completed colours of the triangles, 0..1."""
-    doubt: Float[Tensor, " f"]
-    """1 for triangles whose colour is made up, 0 for those that pictures show well."""
     height: Float[Tensor, " v"]
     """Height of the surface above each vertex, in metres."""
-    drawn: Bool[Tensor, " f"]
-    """Triangles above the cut at the neck."""
+    neck: NeckParts
+    """Where the neck is cut."""
     compared: Bool[Tensor, " f"]
     """Triangles whose colours are compared in raised expressions: skin, lips and the inside of the mouth."""
 
@@ -83,31 +83,29 @@ class SideViews:
         scale = _SIDE / max(camera.width, camera.height)
         small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
         background = torch.rand(3, generator=random)
-        picture, alpha, share, free = self._target(face, small, background, raised=raised)
+        picture, alpha, compared = self._target(face, small, background)
         like = face.expression
         seen = rasterize(avatar.pose(face, progress).gaussians.timestep(0), small, background.to(like))
         difference = (seen.image - picture.to(like)).abs()
-        difference = (difference - free.to(like)[..., None]).clamp_min(0)
-        colors = (difference * share.to(like)[..., None]).mean()
-        outline = torch.zeros_like(colors) if raised else (seen.alpha - alpha.to(like)).abs().mean()
-        return self.weight * (colors + outline)
+        if raised:
+            difference = (difference - _FREE).clamp_min(0) * compared.to(like)[..., None]
+            return self.weight * difference.mean()
+        return self.weight * (difference.mean() + _OUTLINE * (seen.alpha - alpha.to(like)).abs().mean())
 
     @torch.no_grad()
     def _target(
-        self, face: FaceParams, camera: Camera, background: Float[Tensor, " 3"], *, raised: bool
-    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        """The completed mesh, its alpha, whether each pixel's colour counts (0 or 1), and which difference is free."""
-        vertices = self.face_model(face.to(self.colors))[0]
+        self, face: FaceParams, camera: Camera, background: Float[Tensor, " 3"]
+    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+        """The completed mesh over the background, its alpha, and which pixels show triangles of `compared`."""
+        face, camera = face.to(self.colors), camera.to(self.colors)
+        vertices = self.face_model(face)[0]
         vertices = vertices + self.height[:, None] * vertex_normals(vertices, self.face_model.faces)
-        index = rasterize_mesh(vertices, self.face_model.faces[self.drawn], camera.to(self.colors)).face_index.long()
-        hit = index >= 0
-        triangle: Int[Tensor, "h w"] = self.drawn.nonzero()[:, 0][index.clamp_min(0)]
-        picture = torch.where(hit[..., None], self.colors[triangle], background)
-        if raised:
-            share, free = self.compared[triangle] & hit, torch.full(hit.shape, _FREE)
-        else:
-            share, free = torch.ones_like(hit), torch.where(hit, _FREE_ASIDE * (1 - self.doubt[triangle]), 0.0)
-        return picture, hit.float(), share.float(), free
+        index = rasterize_mesh(vertices, self.face_model.faces, camera).face_index.long()
+        matte = np.where(index.numpy() >= 0, 255, 0).astype(np.uint8)
+        alpha = torch.from_numpy(head_cutter(self.face_model, self.neck, face)(matte, camera)).float() / 255
+        triangle: Int[Tensor, "h w"] = index.clamp_min(0)
+        picture = background + alpha[..., None] * (self.colors[triangle] - background)
+        return picture, alpha, self.compared[triangle] & (alpha > 0)
 
     def _raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
         """The expression with some coefficients anywhere between 0 and their largest value."""
@@ -120,12 +118,7 @@ class SideViews:
 
 
 def side_views(
-    face_model: FaceModel,
-    weight: float,
-    colors: Float[Tensor, "f 3"],
-    doubt: Float[Tensor, " f"],
-    height: Float[Tensor, " f"],
-    above: Float[Tensor, " f"],
+    face_model: FaceModel, weight: float, colors: Float[Tensor, "f 3"], height: Float[Tensor, " f"]
 ) -> SideViews:
     """The side views of a head.
 
@@ -133,25 +126,21 @@ def side_views(
         face_model: The face model, on the CPU in float32.
         weight: Weight of the loss.
         colors: Completed colours of the triangles, 0..1.
-        doubt: How far they are made up, 0..1.
         height: Height of the surface above each triangle, in metres, which is that of fills.
-        above: 1 for triangles above the cut at the neck, 0 for those below.
     """
     parts, over = head_parts(face_model), vertex_means(face_model, height[:, None].expand(-1, 3))[:, 0]
     compared = parts.skin | parts.interior | torch.stack(parts.painted).any(0)
-    return SideViews(face_model, weight, colors, doubt, over, above > _FADING, compared)
+    return SideViews(face_model, weight, colors, over, NeckParts.of(face_model), compared)
 
 
 def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideViews | None:
     """The side views of a filled head, or None if nothing is filled or the weight is 0."""
-    if unseen is None or unseen.coverage is None or unseen.prior.made_up is None or weight == 0:
+    if unseen is None or unseen.prior.made_up is None or weight == 0:
         return None
     model, prior = avatar.face_model, unseen.prior
     like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
     assert prior.colors is not None
-    assert prior.doubt is not None
-    colors, doubt, height = (values.to(like) for values in (prior.colors, prior.doubt, prior.fill_height))
-    return side_views(model.to(like), weight, colors, doubt, height, unseen.coverage.above.to(like))
+    return side_views(model.to(like), weight, prior.colors.to(like), prior.fill_height.to(like))
 
 
 def turned_aside(face: FaceParams, angle: float) -> FaceParams:

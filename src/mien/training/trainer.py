@@ -47,6 +47,7 @@ from mien.training.frames import (
     camera_extent,
     density_random,
     expression_rarity,
+    resolved_background,
     training_frames,
 )
 from mien.training.hidden import inside_triangles
@@ -115,6 +116,7 @@ def train(
             Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside) for sequence in sequences
         ]
         data = TrainingData(order, tuple(targets), extent)
+        settings = resolved_background(settings, filled=state.unseen is not None and state.unseen.fills)
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
         faces = [sequence.tracking.face for sequence in sequences]
         covered = None if state.unseen is None else state.unseen.coverage

@@ -51,9 +51,14 @@ class Unseen:
     """None if only limits to the surface were asked for."""
     prior: SurfacePrior
 
+    @property
+    def fills(self) -> bool:
+        """Whether some sides are filled rather than trained."""
+        return self.prior.made_up is not None
+
     def weights(self, weights: Photometric) -> Photometric:
         """The weights of the losses, with a loss of alpha if anything is filled."""
-        if self.prior.made_up is None:
+        if not self.fills:
             return weights
         return replace(weights, alpha_weight=max(weights.alpha_weight, _ALPHA))
 

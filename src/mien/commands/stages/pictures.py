@@ -33,7 +33,8 @@ def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8
 
 def warn_of_white(options: PictureOptions, run_dir: Path) -> None:
     """Warn if transparent pictures are asked for but the run was trained over white."""
-    if options.background == "transparent" and read_run_config(run_dir)["settings"].get("background") == "white":
+    trained_over = read_run_config(run_dir)["settings"].get("background")
+    if options.background == "transparent" and trained_over in ("white", "auto"):
         say(
             "warning: this avatar was trained over white, so bright skin and outlines may be partly transparent; "
             "`mien train --background random` avoids that"
