@@ -57,6 +57,8 @@ class SurfacePrior:
     closed: Bool[Tensor, " f"] | None = None
     """Triangles that are an opaque surface before the first step: the made-up ones, and the inside of the mouth, which
     is trained where pictures show it. None if these are the made-up ones."""
+    strands: Bool[Tensor, " f"] | None = None
+    """Made-up triangles that are covered with strands of hair. None means none."""
     looseness: Float[Tensor, " f"] | None = None
     """Factors on the limits to the surface (`Avatar.keep_to`), for parts that the mesh fits less well. None means 1."""
 

@@ -21,6 +21,7 @@ from mien.avatar.density import GradientDensity, highest_opacities_seen
 from mien.avatar.expression_changes import ExpressionActivations, expression_change
 from mien.avatar.feature_appearance import FeatureAppearance, feature_tensors
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
+from mien.avatar.hair_strands import strand_gaussians
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.avatar.surface_limits import keep_on_surface
@@ -206,7 +207,10 @@ class GaussianAvatars(Avatar):
 
     @torch.no_grad()
     def close(self, prior: SurfacePrior) -> None:
-        """Completed colours everywhere, and an opaque flat Gaussian at the height of hair on what no picture shows."""
+        """Completed colours everywhere, and an opaque flat Gaussian at the height of hair on what no picture shows.
+
+        Strands of hair are added where the prior says so.
+        """
         closed = prior.made_up if prior.closed is None else prior.closed
         if prior.colors is None or closed is None:
             return
@@ -222,6 +226,11 @@ class GaussianAvatars(Avatar):
         store.assign("log_scales", torch.where(filled[:, None], log_scales[bound] + wider, store["log_scales"]))
         logits = store["opacity_logits"]
         store.assign("opacity_logits", torch.where(filled, torch.logit(torch.full_like(logits, _OPAQUE)), logits))
+        if prior.strands is not None and bool(prior.strands.any()):
+            vertices, faces = self.face_model.head_vertices(self.subject)[0], self.face_model.faces
+            own = strand_gaussians(vertices, faces, prior.strands, prior.fill_height, prior.colors)
+            rest = {name: store[name].new_zeros(len(own["means"]), *store[name].shape[1:]) for name in store.trained}
+            store.append(torch.zeros(len(own["means"]), dtype=torch.long), rest | own)
 
     @torch.no_grad()
     def keep_to(self, prior: SurfacePrior) -> None:
@@ -231,7 +240,9 @@ class GaussianAvatars(Avatar):
             keep_on_surface(self.store, self.config.surface, self._sizes, hair, prior.looseness)
         if prior.colors is not None and prior.doubt is not None:
             bound, own = self.store["face_index"], self.store["sh_constant"].detach()[:, 0]
-            pull = _PULL * prior.doubt[bound, None]
+            # What is made up has the colours that it was given, strand by strand.
+            doubt = prior.doubt if prior.made_up is None else prior.doubt.masked_fill(prior.made_up, 0)
+            pull = _PULL * doubt[bound, None]
             own += pull * (sh_from_rgb(prior.colors)[bound] - own)
 
     @property

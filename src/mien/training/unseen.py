@@ -34,6 +34,8 @@ _MOVING, _LOOSE = ("lips", "eyelids", "eyes", "irises"), 3.0
 there, and its folds are not those of the skin."""
 _NEAR = (0.008, 0.024)
 """Distances in metres from these regions between which the factor falls to 1."""
+_STRANDS_FROM = 0.003
+"""Height of hair in metres from which made-up hair has strands."""
 _CONTRADICTION = 1e-6
 """Gradient of a centre, in triangle units, from which pictures contradict the height of a fill. A little light shines
 through every avatar, so smaller gradients reach what is hidden."""
@@ -136,7 +138,10 @@ def unseen_of(
     made_up = (shown < _RARE) & (found.above > 0.5)
     made_up |= hidden_inside(model, parts.interior, sequences, faces, frames)
     looseness = looser_where_faces_move(model, neutral, parts.interior)
-    return Unseen(found, SurfacePrior(hair, hanging, colors, doubt, made_up, made_up | parts.interior, looseness))
+    strands = made_up & parts.scalp & (hair > _STRANDS_FROM)
+    return Unseen(
+        found, SurfacePrior(hair, hanging, colors, doubt, made_up, made_up | parts.interior, strands, looseness)
+    )
 
 
 def looser_where_faces_move(
@@ -187,6 +192,7 @@ def moved(unseen: Unseen, like: Tensor) -> Unseen:
         "doubt": None if prior.doubt is None else prior.doubt.to(like),
         "made_up": None if prior.made_up is None else prior.made_up.to(like.device),
         "closed": None if prior.closed is None else prior.closed.to(like.device),
+        "strands": None if prior.strands is None else prior.strands.to(like.device),
         "looseness": None if prior.looseness is None else prior.looseness.to(like),
     }
     return replace(unseen, prior=SurfacePrior(prior.hair.to(like), **put))
