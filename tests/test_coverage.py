@@ -20,6 +20,7 @@ from mien.avatar import (
     load_avatar,
     make_portable,
 )
+from mien.avatar.density import GradientDensity
 from mien.avatar.gaussian_avatars_settings import SurfaceLimits
 from mien.avatar.surface_limits import keep_on_surface
 from mien.avatar.triangle_frames import triangle_ellipses
@@ -154,7 +155,11 @@ def test_fills_keep_their_opacity_at_resets(toy: tuple[FaceModel, Sequence]) -> 
     unseen = known(toy, avatar)
     avatar.close(unseen.prior)
     before = avatar.gaussian_store()["opacity_logits"].sigmoid()
-    density = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store())
+    control, fills = spare_fills(avatar, unseen), unseen.made_up(avatar)
+    assert isinstance(control, GradientDensity)
+    assert fills is not None
+    assert control.settings.max_gaussians == GaussianAvatarsConfig().density.max_gaussians + int(fills.sum())
+    density = density_strategy(control, avatar.gaussian_store())
     posed = avatar.pose(sequence.tracking.face[0])
     density.adapt(avatar.gaussian_store(), posed, Progress(39, 100, 0, 1.0), lambda: torch.Generator())
     opacities, made_up = avatar.gaussian_store()["opacity_logits"].sigmoid(), unseen.made_up(avatar)

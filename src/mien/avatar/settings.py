@@ -161,7 +161,8 @@ class GradientSettings:
     reset_opacity: Annotated[float, Range(1e-6, 1)] = 0.01
     """Highest opacity that remains after a reset."""
     max_gaussians: Annotated[int, GAUSSIAN_COUNT] = 40_000
-    """Largest number of Gaussians. Growth stops there; Gaussians with the largest gradients grow first."""
+    """Largest number of Gaussians. Growth stops there; Gaussians with the largest gradients grow first. Fills of sides
+    that no picture shows do not count."""
     rules: DensityRules = field(default_factory=DensityRules)
     """A switch for each rule."""
 

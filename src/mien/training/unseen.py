@@ -101,7 +101,7 @@ def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -
 
 
 def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
-    """The avatar's density control, with closed surfaces that keep their opacity at resets."""
+    """The avatar's density control. Closed surfaces keep their opacity at resets, and fills do not count to its limit."""
     density = avatar.density()
     if unseen is None or unseen.prior.closed is None or not isinstance(density, GradientDensity):
         return density
@@ -112,7 +112,10 @@ def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
         assert triangles is not None
         return ~closed[triangles]
 
-    return replace(density, may_reset=may_reset)
+    made_up = unseen.made_up(avatar)
+    fills = 0 if made_up is None else int(made_up.sum())
+    settings = replace(density.settings, max_gaussians=density.settings.max_gaussians + fills)
+    return replace(density, settings=settings, may_reset=may_reset)
 
 
 @torch.no_grad()
