@@ -101,7 +101,7 @@ def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -
 
 
 def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
-    """The avatar's density control. Closed surfaces keep their opacity at resets, and fills do not count to its limit."""
+    """The avatar's density control. Closed surfaces keep their opacity at resets; fills do not count to its limit."""
     density = avatar.density()
     if unseen is None or unseen.prior.closed is None or not isinstance(density, GradientDensity):
         return density
