@@ -53,7 +53,7 @@ def test_strands_lie_just_below_the_top_of_the_hair(anny):
     strands = _strands(anny)
     size = triangle_frames(anny.template, anny.faces).k[strands["face_index"]]
     above = strands["means"][:, 1] * size
-    assert float(above.min()) > _HEIGHT - 0.0011
+    assert float(above.min()) > _HEIGHT - 0.0031
     assert float(above.max()) <= _HEIGHT + 1e-6
 
 

@@ -16,7 +16,7 @@ _DOWN, _BACK, _DISORDER = 1.0, 0.6, 0.15
 """The direction of strands in the head frame, and the standard deviation of each coordinate."""
 _CONTRAST = 0.2
 """Standard deviation of the logarithm of a strand's brightness."""
-_BELOW = 0.001
+_BELOW = 0.003
 """Range below the top of the hair in which strands lie, in metres. Above it, they would widen the outline."""
 _HEAD_RADIUS = 0.1
 """Radius in metres of the head that hair is a shell around."""
