@@ -50,8 +50,8 @@ class TrainOptions:
     subject: str | None = None
     """Subject of --split gaussian-avatars, for example 306 (default: the number in the workspace's name)."""
     background: Literal["white", "random", "auto"] = "auto"
-    """Background of the training pictures. random suits transparent renderings (no white in skin and outlines) and
-    costs 0.1 to 0.4 dB. auto: random where sides are filled, else white."""
+    """Background of the training pictures. random: no white in skin and outlines, for 0.1 to 0.4 dB. auto: random
+    where sides are filled, else white."""
     steps: int = 0
     """Number of optimiser steps, over which all schedules stretch. 0 means the preset's number."""
     seed: int = 0
