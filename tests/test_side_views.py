@@ -13,8 +13,8 @@ from mien.face import FaceModel, load_face_model
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import NeckParts, head_cutter
-from mien.training import PRESETS
-from mien.training.frames import Frame
+from mien.training import PRESETS, TrainSettings
+from mien.training.frames import Frame, resolved_background
 from mien.training.side_views import SideViews, side_views, turned_aside
 from mien.training.unseen import fills_sides
 
@@ -135,3 +135,9 @@ def test_sides_are_filled_by_themselves_if_one_camera_filmed(cameras, filled):
     assert fills_sides(frames, replace(settings, unseen="filled"), bound=False)
     assert not fills_sides(frames, replace(settings, unseen="trained"), bound=True)
     assert not fills_sides(frames, settings, bound=False), "headgas has nothing to fill"
+
+
+@pytest.mark.parametrize(("filled", "expected"), [(True, "random"), (False, "white")])
+def test_the_background_follows_the_sides(filled: bool, expected: str) -> None:
+    assert resolved_background(TrainSettings(background="auto"), filled=filled).background == expected
+    assert resolved_background(TrainSettings(background="white"), filled=filled).background == "white"

@@ -33,7 +33,6 @@ from mien.training.frames import (
     background_at,
     density_random,
     expression_rarity,
-    resolved_background,
     training_frames,
 )
 from mien.training.losses import picture_losses
@@ -112,12 +111,6 @@ def test_order_shows_each_frame_once_a_pass_and_depends_on_the_step_only() -> No
     assert passes[0] != passes[1]
     assert FrameOrder(frames, seed=5).at(17) == (passes[1][5], 1)
     assert [FrameOrder(frames, seed=6).at(step)[0] for step in range(12)] != passes[0]
-
-
-@pytest.mark.parametrize(("filled", "expected"), [(True, "random"), (False, "white")])
-def test_the_background_follows_the_sides(filled: bool, expected: str) -> None:
-    assert resolved_background(TrainSettings(background="auto"), filled=filled).background == expected
-    assert resolved_background(TrainSettings(background="white"), filled=filled).background == "white"
 
 
 def test_random_backgrounds_and_density_draws_depend_on_seed_and_step() -> None:

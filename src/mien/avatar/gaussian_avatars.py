@@ -21,7 +21,7 @@ from mien.avatar.density import GradientDensity, highest_opacities_seen
 from mien.avatar.expression_changes import ExpressionActivations, expression_change
 from mien.avatar.feature_appearance import FeatureAppearance, feature_tensors
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
-from mien.avatar.hair_strands import strand_gaussians
+from mien.avatar.hair_strands import HEAD_RADIUS, strand_gaussians
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.avatar.surface_limits import keep_on_surface
@@ -41,8 +41,6 @@ _PULL = 0.05
 """Share of the difference to the completed colour that a step takes away where no picture shows a triangle."""
 _OPAQUE = 0.97
 """Opacity of a fill."""
-_HEAD_RADIUS = 0.1
-"""Radius of a head, in metres."""
 _BASES = ("colour_basis", "opacity_basis", "offset_basis")
 """Names of the bases of changes with the expression."""
 
@@ -222,7 +220,7 @@ class GaussianAvatars(Avatar):
         filled = closed[bound]
         store.assign("quats", torch.where(filled[:, None], quats[bound], store["quats"]))
         # Hair is a shell around the head, so its ellipses are larger than the triangles.
-        wider = (height / _HEAD_RADIUS).log1p()[:, None] * log_scales.new_tensor([1.0, 0.0, 1.0])
+        wider = (height / HEAD_RADIUS).log1p()[:, None] * log_scales.new_tensor([1.0, 0.0, 1.0])
         store.assign("log_scales", torch.where(filled[:, None], log_scales[bound] + wider, store["log_scales"]))
         logits = store["opacity_logits"]
         store.assign("opacity_logits", torch.where(filled, torch.logit(torch.full_like(logits, _OPAQUE)), logits))

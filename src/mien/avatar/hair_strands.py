@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.avatar.triangle_frames import TriangleFrames, triangle_frames
+from mien.face.mirror import triangle_geometry
 from mien.gaussians import sh_from_rgb
 
 _PER_AREA = 150_000.0
@@ -18,7 +19,7 @@ _CONTRAST = 0.2
 """Standard deviation of the logarithm of a strand's brightness."""
 _BELOW = 0.003
 """Range below the top of the hair in which strands lie, in metres. Above it, they would widen the outline."""
-_HEAD_RADIUS = 0.1
+HEAD_RADIUS = 0.1
 """Radius in metres of the head that hair is a shell around."""
 
 
@@ -50,7 +51,7 @@ def strand_gaussians(
     triangles = _evenly_drawn(vertices, faces, chosen)
     count, size, high = len(triangles), frames.k[triangles], height[triangles]
     means = _to_triangles(frames, triangles, _places(vertices, faces, triangles, random) - frames.T[triangles])
-    means = means * (1 + high / _HEAD_RADIUS)[:, None]
+    means = means * (1 + high / HEAD_RADIUS)[:, None]
     means[:, 1] = high - _BELOW * torch.rand(count, generator=random)
     direction = torch.tensor([0.0, -_DOWN, -_BACK]) + _DISORDER * torch.randn(count, 3, generator=random)
     along = _to_triangles(frames, triangles, direction)
@@ -72,9 +73,8 @@ def _evenly_drawn(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], chosen: Bool[Tensor, " f"]
 ) -> Int[Tensor, " n"]:
     """The triangle of each strand. A triangle has as many as its area says, rounded down or up."""
-    a, b, c = (vertices[faces[:, corner].long()].double() for corner in range(3))
-    areas = 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1) * chosen
-    ends = (areas * _PER_AREA).cumsum(0)
+    areas = triangle_geometry(vertices.double(), faces)[1]
+    ends = (areas * chosen * _PER_AREA).cumsum(0)
     points = torch.arange(int(ends[-1])) + 0.5
     return torch.searchsorted(ends, points.double(), right=True)
 

@@ -6,6 +6,7 @@ from aside, the head is opaque exactly where the mesh with its hair is, above th
 pulled towards those of the mesh. In raised expressions, a difference that a real head could have is free.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,7 +54,7 @@ class SideViews:
     height: Float[Tensor, " v"]
     """Height of the surface above each vertex, in metres."""
     neck: NeckParts
-    """Where the neck is cut."""
+    """The parts of the neck that tell where it is cut."""
     compared: Bool[Tensor, " f"]
     """Triangles whose colours are compared in raised expressions: skin, lips and the inside of the mouth."""
 
@@ -158,4 +159,4 @@ def _drawn_angle(raised: bool, random: torch.Generator) -> float:
     share, side = torch.rand(2, generator=random, dtype=torch.float64).tolist()
     low, high = (0.0, _EXPRESSION_MOST) if raised else (_LEAST, _MOST)
     degrees = low + share * (high - low)
-    return float(torch.deg2rad(torch.tensor(degrees if side < 0.5 else -degrees, dtype=torch.float64)))
+    return math.radians(degrees if side < 0.5 else -degrees)
