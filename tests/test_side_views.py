@@ -9,6 +9,8 @@ import torch
 
 from mien.avatar import Progress, method_named
 from mien.camera import camera_from_fov
+from mien.commands.picture import PictureOptions
+from mien.commands.stages import pictures
 from mien.face import FaceModel, load_face_model
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
@@ -141,3 +143,22 @@ def test_sides_are_filled_by_themselves_if_one_camera_filmed(cameras, filled):
 def test_the_background_follows_the_sides(filled: bool, expected: str) -> None:
     assert resolved_background(TrainSettings(background="auto"), filled=filled).background == expected
     assert resolved_background(TrainSettings(background="white"), filled=filled).background == "white"
+
+
+@pytest.mark.parametrize(
+    ("kind", "background", "unseen", "white"),
+    [
+        ("gaussian_avatars", "auto", "auto", False),
+        ("gaussian_avatars", "auto", "trained", True),
+        ("gaussian_avatars", "white", "auto", True),
+        ("gaussian_avatars", "random", "trained", False),
+        ("headgas", "auto", "auto", True),
+    ],
+)
+def test_transparent_pictures_warn_of_white_only_where_it_was(kind, background, unseen, white, tmp_path, monkeypatch):
+    config = {"method": {"kind": kind}, "settings": {"background": background, "unseen": unseen}}
+    said: list[str] = []
+    monkeypatch.setattr(pictures, "read_run_config", lambda run_dir: config)
+    monkeypatch.setattr(pictures, "say", said.append)
+    pictures.warn_of_white(PictureOptions(background="transparent"), tmp_path)
+    assert bool(said) is white

@@ -1,6 +1,7 @@
 """From posed Gaussians to pictures, with the options of the command line."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,9 +34,15 @@ def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8
 
 def warn_of_white(options: PictureOptions, run_dir: Path) -> None:
     """Warn if transparent pictures are asked for but the run was trained over white."""
-    trained_over = read_run_config(run_dir)["settings"].get("background")
-    if options.background == "transparent" and trained_over in ("white", "auto"):
+    if options.background == "transparent" and _trained_over_white(read_run_config(run_dir)):
         say(
             "warning: this avatar was trained over white, so bright skin and outlines may be partly transparent; "
             "`mien train --background random` avoids that"
         )
+
+
+def _trained_over_white(config: dict[str, Any]) -> bool:
+    """Whether a run had a white background. `auto` counts as random where the method and the settings can fill sides."""
+    background, unseen = (config["settings"].get(name) for name in ("background", "unseen"))
+    may_fill = config["method"]["kind"] == "gaussian_avatars" and unseen != "trained"
+    return background == "white" or (background == "auto" and not may_fill)
