@@ -42,7 +42,7 @@ def warn_of_white(options: PictureOptions, run_dir: Path) -> None:
 
 
 def _trained_over_white(config: dict[str, Any]) -> bool:
-    """Whether a run had a white background. `auto` counts as random where the method and the settings can fill sides."""
+    """Whether a run had a white background. `auto` is random where method and settings can fill sides."""
     background, unseen = (config["settings"].get(name) for name in ("background", "unseen"))
     may_fill = config["method"]["kind"] == "gaussian_avatars" and unseen != "trained"
     return background == "white" or (background == "auto" and not may_fill)
