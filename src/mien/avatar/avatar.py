@@ -186,6 +186,16 @@ class Avatar(nn.Module, ABC):
     def keep_to(self, prior: SurfacePrior) -> None:
         """Bring Gaussians back that have left what is known of the surface, after each step."""
 
+    def height_gradient(self) -> Float[Tensor, " f"] | None:
+        """Derivative of the loss by the height of each triangle's Gaussians above it, per metre, after a backward pass.
+
+        It is the sum over the triangle's Gaussians. None if there is none, or for methods that bind no Gaussians.
+        """
+        return None
+
+    def raise_surface(self, shift: Float[Tensor, " f"]) -> None:
+        """Move Gaussians along the normals of their triangles, by metres, between two steps."""
+
     def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
         """Close the surface of those of the chosen triangles that are less than half opaque, between two steps.
 

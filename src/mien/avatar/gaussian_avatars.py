@@ -243,6 +243,20 @@ class GaussianAvatars(Avatar):
             pull = _PULL * doubt[bound, None]
             own += pull * (sh_from_rgb(prior.colors)[bound] - own)
 
+    @torch.no_grad()
+    def height_gradient(self) -> Float[Tensor, " f"] | None:
+        """Derivative of the loss by the height of each triangle's Gaussians: that of their second local coordinate."""
+        gradient, bound = self.store["means"].grad, self.store["face_index"]
+        if gradient is None:
+            return None
+        return torch.zeros_like(self._sizes).index_add(0, bound, gradient[:, 1] / self._sizes[bound])
+
+    @torch.no_grad()
+    def raise_surface(self, shift: Float[Tensor, " f"]) -> None:
+        """Move Gaussians along the second axis of their triangles' frames, which is the normal."""
+        bound = self.store["face_index"]
+        self.store["means"].detach()[:, 1] += (shift / self._sizes)[bound]
+
     @property
     def _sizes(self) -> Float[Tensor, " f"]:
         """Sizes of the triangles of the neutral head, in metres per triangle unit."""

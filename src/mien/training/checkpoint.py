@@ -1,6 +1,6 @@
 """Checkpoints: everything that the rest of a run depends on. Each is one file, written atomically."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -16,6 +16,7 @@ from mien.training.adam import Adam
 from mien.training.camera_colors import CameraColors
 from mien.training.density_control import DensityStrategy
 from mien.training.face_track import FaceTrack
+from mien.training.hair_surface import HairSurface
 from mien.training.inside import Inside
 from mien.training.side_views import SideViews
 from mien.training.unseen import Unseen
@@ -46,6 +47,17 @@ class TrainingState:
     """What is inside the mouth, if it is furnished. Checkpoints lack it for the same reason."""
     aside: SideViews | None = None
     """Views from aside, if sides are filled. Checkpoints lack it for the same reason."""
+    hair: HairSurface | None = None
+    """The surface of the hair, if sides are filled."""
+
+    def follow_hair(self) -> None:
+        """Let what is known of the surface follow the hair."""
+        if self.hair is None or self.unseen is None:
+            return
+        prior = self.hair.prior()
+        self.unseen = replace(self.unseen, prior=prior)
+        if self.aside is not None:
+            self.aside = self.aside.at_height(prior.fill_height)
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
@@ -55,6 +67,8 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
     tensors |= {f"track.{name}": tensor for name, tensor in state.track.state().items()}
     if state.colors is not None:
         tensors |= {f"colors.{name}": tensor for name, tensor in state.colors.state().items()}
+    if state.hair is not None:
+        tensors |= {f"hair.{name}": tensor for name, tensor in state.hair.state.items()}
     tensors |= {f"curves.{name}": torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     for owner, moments in (("store", state.avatar.gaussian_store().moments), ("adam", state.adam.state())):
         for name, own in moments.items():
@@ -125,6 +139,10 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
     if state.colors is not None:
         _check_like(part("colors."), state.colors.state(), None)
         state.colors.load_state(part("colors."))
+    if state.hair is not None:
+        _check_like(part("hair."), state.hair.state, None)
+        state.hair.load_state(part("hair."))
+        state.follow_hair()
     state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
     curves = part("curves.")
     if state.step < 0 or state.seconds < 0 or any(curve.ndim != 1 for curve in curves.values()):

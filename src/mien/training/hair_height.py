@@ -24,12 +24,15 @@ _GRAZING = 0.4
 """Cosine between a triangle's normal and the direction to the camera up to which the outline tells its height."""
 _CLEAR = 0.008
 """Height in metres at which nothing of the mesh may be behind or in front of a triangle at the outline."""
-_QUANTILE = 0.3
+_QUANTILE = 0.2
 """Share of the measured heights below the one that counts. Single strands and other things behind make some higher."""
 _SAME_HAIR = 1.3
 """Largest height where nothing was measured, as a multiple of the median height on top of the head."""
-_LEVEL, _NEAR = 0.012, 0.03
-"""Difference of level and distance, in metres, within which measured heights count alike for what is never measured."""
+_SLOPE, _NEAR = 0.12, 0.03
+"""Difference of slope (the upward part of a normal) and distance in metres, within which measured heights count alike
+for what is never measured."""
+_AT_HAIRLINE, _RISE = 0.004, 0.4
+"""Largest height in metres at the hairline of the face where nothing was measured, and how much it grows per metre."""
 _SMOOTHING_ROUNDS = 2
 """Rings of triangles over which heights are averaged. More would flatten the hair on top."""
 _FADING_ROUNDS = 2
@@ -50,7 +53,7 @@ def hair_height(
 
     A triangle of the scalp is measured in frames in which it is on the outline of the mesh: its height is the distance
     along its normal to the border of the matte. Triangles that are never on the outline have the height of what
-    was measured at their level on the head. The height fades at the hairline. Without any measurement it is 0.
+    was measured where the head is as steep, and rise slowly from the face. The height fades at the hairline. Without any measurement it is 0.
 
     Args:
         face_model: The face model, float32 on the CPU.
@@ -59,12 +62,15 @@ def hair_height(
         frames: The frames to look at. At most 60 of them, evenly spread, are used.
         threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no bit.
     """
-    scalp = head_parts(face_model).scalp
+    parts = head_parts(face_model)
+    scalp = parts.scalp
     height, known = _outline_heights(face_model, sequences, faces, frames, scalp, threads)
     if not bool(known.any()):
         return height[:, 0]
-    surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
-    guess = _by_level(surface, height, known, scalp).clamp_max(_SAME_HAIR * _on_top(surface, height, known))
+    vertices = face_model.rest_vertices(faces[0])
+    surface, upward = Surface.of(vertices, face_model.faces), triangle_geometry(vertices, face_model.faces)[2][:, 1]
+    guess = _by_slope(surface, upward, height, known, scalp).clamp_max(_SAME_HAIR * _on_top(surface, height, known))
+    guess[scalp, 0] = guess[scalp, 0].minimum(_behind_hairline(surface, scalp, parts.skin))
     height = torch.lerp(guess, height, known[:, None])
     inside = scalp.to(height)
     for _ in range(_SMOOTHING_ROUNDS):
@@ -132,20 +138,34 @@ def _on_top(surface: Surface, height: Float[Tensor, "f 1"], known: Float[Tensor,
     return float(height[measured & (surface.middles[:, 1] >= level)].median())
 
 
-def _by_level(
-    surface: Surface, height: Float[Tensor, "f 1"], known: Float[Tensor, " f"], among: Bool[Tensor, " f"]
+def _by_slope(
+    surface: Surface,
+    upward: Float[Tensor, " f"],
+    height: Float[Tensor, "f 1"],
+    known: Float[Tensor, " f"],
+    among: Bool[Tensor, " f"],
 ) -> Float[Tensor, "f 1"]:
-    """Return the mean of the measured heights at each triangle's level on the head, most of all of the near ones.
+    """Return the mean of the measured heights where the head is as steep, most of all of the near ones.
 
-    Hair gets thinner towards the nape, which no front picture shows, as it does towards the temples, which many show.
+    Hair is short on the walls of a head and long where it curves to the top, behind as at the sides. `upward` is the
+    upward part of the triangles' normals.
     """
     targets, sources = among.nonzero()[:, 0], (known > 0).nonzero()[:, 0]
     apart = surface.middles[targets, None] - surface.middles[sources]
-    alike = torch.exp(-0.5 * (apart[..., 1] / _LEVEL).square()) + 1e-9
+    alike = torch.exp(-0.5 * ((upward[targets, None] - upward[sources]) / _SLOPE).square()) + 1e-9
     weight = alike * known[sources] / (apart.square().sum(-1) + _NEAR**2)
     guess = torch.zeros_like(height)
     guess[targets, 0] = (weight * height[sources, 0]).sum(1) / weight.sum(1)
     return guess
+
+
+def _behind_hairline(surface: Surface, scalp: Bool[Tensor, " f"], skin: Bool[Tensor, " f"]) -> Float[Tensor, " k"]:
+    """Return the largest height of hair on each triangle of the scalp. Hair over a forehead grows out of the skin."""
+    if not bool(skin.any()):
+        return surface.middles.new_full((int(scalp.sum()),), _HIGHEST)
+    from_scalp, to_skin = surface.middles[scalp], surface.middles[skin]
+    apart = torch.cdist(from_scalp, to_skin, compute_mode="donot_use_mm_for_euclid_dist")
+    return _AT_HAIRLINE + _RISE * apart.amin(1)
 
 
 def _measured(

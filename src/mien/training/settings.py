@@ -48,6 +48,10 @@ class TrainSettings:
     side_weight: Annotated[float, NOT_NEGATIVE] = 0.1
     """Weight of the views from aside and of raised expressions, in which filled heads are compared with the completed
     mesh."""
+    hair_rate: Annotated[float, Range(0, 0.01)] = 6e-4
+    """Largest distance in metres by which the surface of the hair rises or sinks in one correction, where pictures of
+    filled heads say so. There is one after every 8 steps, and they get smaller during the run. 0 keeps the hair where
+    the mattes and what is guessed from them put it."""
     inside: Literal["free", "covered", "furnished"] = "free"
     """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
     them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in

@@ -58,6 +58,10 @@ class SideViews:
     compared: Bool[Tensor, " f"]
     """Triangles whose colours are compared in raised expressions: skin, lips and the inside of the mouth."""
 
+    def at_height(self, height: Float[Tensor, " f"]) -> "SideViews":
+        """The same views of a head whose triangles have another height, in metres."""
+        return replace(self, height=_at_vertices(self.face_model, height.to(self.colors)))
+
     def due(self, step: int) -> bool:
         """Whether a step has a side view."""
         return self.weight > 0 and step % (_EVERY // 2) == 0
@@ -129,9 +133,14 @@ def side_views(
         colors: Completed colours of the triangles, 0..1.
         height: Height of the surface above each triangle, in metres, which is that of fills.
     """
-    parts, over = head_parts(face_model), vertex_means(face_model, height[:, None].expand(-1, 3))[:, 0]
+    parts, over = head_parts(face_model), _at_vertices(face_model, height)
     compared = parts.skin | parts.interior | torch.stack(parts.painted).any(0)
     return SideViews(face_model, weight, colors, over, NeckParts.of(face_model), compared)
+
+
+def _at_vertices(face_model: FaceModel, values: Float[Tensor, " f"]) -> Float[Tensor, " v"]:
+    """The mean value of the triangles around each vertex."""
+    return vertex_means(face_model, values[:, None].expand(-1, 3))[:, 0]
 
 
 def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideViews | None:

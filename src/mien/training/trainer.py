@@ -50,6 +50,7 @@ from mien.training.frames import (
     resolved_background,
     training_frames,
 )
+from mien.training.hair_surface import EVERY, hair_surface
 from mien.training.hidden import inside_triangles
 from mien.training.inside import inside_of
 from mien.training.losses import train_psnr
@@ -250,10 +251,13 @@ def start(
         unseen = None if unseen is None else moved(unseen, like)
         inside = None if inside is None else inside.to(like)
     aside = side_views_of(avatar, unseen, settings.side_weight)
+    hair = hair_surface(avatar, unseen.prior) if unseen is not None and unseen.fills else None
     density = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     track = FaceTrack(face, method_config.face_tuning, lengths, face_model.expression_bounds)
-    return TrainingState(avatar, Adam(), density, track, {}, colors, unseen=unseen, inside=inside, aside=aside)
+    return TrainingState(
+        avatar, Adam(), density, track, {}, colors, unseen=unseen, inside=inside, aside=aside, hair=hair
+    )
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:
@@ -276,6 +280,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     losses |= compare_features(state, batch, shown)
     losses |= compare_aside(state, data, settings, batch, progress)
     torch.autograd.backward(list(losses.values()))
+    if state.hair is not None:
+        state.hair.collect(avatar)
     if state.unseen is not None:
         state.unseen.guard(avatar, *renderings)
 
@@ -295,6 +301,9 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
 
     before = state.step
     state.step += len(batch)
+    if state.hair is not None and passed(before, state.step, EVERY):
+        state.hair.correct(avatar, state.step / settings.steps, settings.hair_rate)
+        state.follow_hair()
     elapsed = time.perf_counter() - began
     state.seconds += elapsed
     if not passed(before, state.step, settings.record_every) and state.step != settings.steps:
