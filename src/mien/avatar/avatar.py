@@ -186,6 +186,13 @@ class Avatar(nn.Module, ABC):
     def keep_to(self, prior: SurfacePrior) -> None:
         """Bring Gaussians back that have left what is known of the surface, after each step."""
 
+    def restore(self, rows: Int[Tensor, " k"], prior: SurfacePrior, *, close: bool) -> None:
+        """Give some Gaussians the completed colours of their triangles, between two steps.
+
+        With `close`, they also get place, shape and opacity of fills, as at the start. Nothing happens for methods that
+        bind no Gaussians.
+        """
+
     def height_gradient(self) -> Float[Tensor, " f"] | None:
         """Derivative of the loss by the height of each triangle's Gaussians above it, per metre, after a backward pass.
 

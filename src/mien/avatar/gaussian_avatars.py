@@ -244,6 +244,22 @@ class GaussianAvatars(Avatar):
             own += pull * (sh_from_rgb(prior.colors)[bound] - own)
 
     @torch.no_grad()
+    def restore(self, rows: Int[Tensor, " k"], prior: SurfacePrior, *, close: bool) -> None:
+        """Completed colours and, with `close`, what `close` gives to fills."""
+        if prior.colors is None or not len(rows):
+            return
+        store, bound = self.store, self.store["face_index"][rows]
+        values = {"sh_constant": sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None]}
+        if close:
+            quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
+            height = (prior.fill_height / self._sizes)[bound]
+            values |= {"means": torch.stack([0 * height, height, 0 * height], 1)}
+            values |= {"quats": quats[bound], "log_scales": log_scales[bound]}
+            values |= {"opacity_logits": torch.logit(torch.full_like(height, _OPAQUE))}
+        for name, own in values.items():
+            store.assign_rows(name, rows, own)
+
+    @torch.no_grad()
     def height_gradient(self) -> Float[Tensor, " f"] | None:
         """Derivative of the loss by the height of each triangle's Gaussians: that of their second local coordinate."""
         gradient, bound = self.store["means"].grad, self.store["face_index"]

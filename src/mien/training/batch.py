@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mien import _native
 from mien.avatar import ParameterGroup, PerceptualLoss, Posed, Progress
+from mien.camera import Camera
 from mien.face import concatenate
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
@@ -43,8 +44,14 @@ class TrainingData:
     """One entry per sequence."""
     extent: float = MIN_EXTENT
     """Extent of the training cameras, in metres."""
+    telling: tuple[Frame, ...] = ()
+    """A few frames that show the head from all the sides that were filmed."""
     ahead: TargetQueue | None = None
     """Prepares the targets of the next steps in another thread. If it is None, each step makes its own."""
+
+    def camera(self, frame: Frame) -> Camera:
+        """The camera of a frame, at training resolution."""
+        return self.targets[frame.sequence].camera(frame.camera)
 
     def target(self, step: int, settings: TrainSettings) -> Target:
         """The target of a step. It does not depend on `ahead`."""

@@ -91,11 +91,25 @@ def coverage(
     return Coverage(seen, colors, smoothstep(2 * above / len(chosen) - 1))
 
 
-def telling_frames(faces: Items[FaceParams], sequences: Items[Sequence], frames: Items[Frame]) -> list[Frame]:
-    """Evenly spread frames, and those in which the camera sees the head furthest from each side, above and below."""
-    chosen = spread_frames(frames, _EVEN_FRAMES)
+def telling_frames(
+    faces: Items[FaceParams],
+    sequences: Items[Sequence],
+    frames: Items[Frame],
+    even: int = _EVEN_FRAMES,
+    turned: int = _TURNED_FRAMES,
+) -> list[Frame]:
+    """Evenly spread frames, and those in which the camera sees the head furthest from each side, above and below.
+
+    Args:
+        faces: Face parameters of each sequence, with all its timesteps.
+        sequences: The sequences that the frames count in.
+        frames: The frames to choose from.
+        even: Number of evenly spread frames.
+        turned: Number of the others, a quarter for each direction.
+    """
+    chosen = spread_frames(frames, even)
     directions = torch.stack([_camera_direction(faces, sequences, frame) for frame in frames])
-    share = _TURNED_FRAMES // 4
+    share = turned // 4
     for axis in (0, 1):
         order = directions[:, axis].argsort(stable=True).tolist()
         chosen += [frames[index] for index in (*order[:share], *order[len(order) - share :])]

@@ -24,7 +24,7 @@ _GRAZING = 0.4
 """Cosine between a triangle's normal and the direction to the camera up to which the outline tells its height."""
 _CLEAR = 0.008
 """Height in metres at which nothing of the mesh may be behind or in front of a triangle at the outline."""
-_QUANTILE = 0.2
+_QUANTILE = 0.3
 """Share of the measured heights below the one that counts. Single strands and other things behind make some higher."""
 _SAME_HAIR = 1.3
 """Largest height where nothing was measured, as a multiple of the median height on top of the head."""
@@ -52,8 +52,9 @@ def hair_height(
     """Return the height of hair above each triangle along its normal, in metres, 0..0.08; 0 outside of the scalp.
 
     A triangle of the scalp is measured in frames in which it is on the outline of the mesh: its height is the distance
-    along its normal to the border of the matte. Triangles that are never on the outline have the height of what
-    was measured where the head is as steep, and rise slowly from the face. The height fades at the hairline. Without any measurement it is 0.
+    along its normal to the border of the matte. Triangles that are never on the outline have the height of what was
+    measured where the head is as steep, but near the face no more than hair that rises slowly from the hairline. The
+    height fades at the hairline. Without any measurement it is 0.
 
     Args:
         face_model: The face model, float32 on the CPU.

@@ -1,11 +1,11 @@
 """The surface of hair, which rises and sinks as a whole during training.
 
-How high hair stands is measured only where it was on an outline. Elsewhere its height is a guess, and pictures of a head
-that turns would tell better: at a wrong height, hair slides over the scalp. One Gaussian alone cannot follow, because
+How high hair stands is measured only where it was on an outline. Elsewhere its height is a guess, and pictures of a
+head that turns tell better: at a wrong height, hair slides over the scalp. One Gaussian alone cannot follow, because
 its neighbours hide what it would gain. So the gradients of all Gaussians on a patch of scalp are added up, and the
 patch moves along its normals together with the limits of the surface. What no picture shows moves with what is beside
-it. The preconditioner follows Nicolet et al. 2021 (Large steps in inverse rendering of geometry): smoothed gradients
-make steps of geometry large and smooth.
+it. That smoothed gradients make large and smooth steps of geometry is from Nicolet et al. 2021 (Large steps in inverse
+rendering of geometry).
 """
 
 from dataclasses import dataclass, replace

@@ -16,6 +16,7 @@ from torch import Tensor
 from mien import _native
 from mien.avatar import (
     Avatar,
+    GradientDensity,
     MethodConfig,
     Progress,
     load_avatar,
@@ -38,7 +39,8 @@ from mien.training.ahead import targets_ahead
 from mien.training.batch import TrainingData, compare, compare_aside, compare_features, draw, face_groups, next_batch
 from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
-from mien.training.coverage import coverage
+from mien.training.contribution import tidy
+from mien.training.coverage import coverage, telling_frames
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack
 from mien.training.filmed import with_shown_angles
@@ -63,6 +65,9 @@ from mien.training.vertex_colors import vertex_colors
 
 _MEAN_POSE_EVERY = 25
 """Number of steps after which the mean correction of the head's pose is taken away, if settings ask for it."""
+
+_TELLING = 12
+"""Number of evenly spread frames, and of frames that show turned heads, in which hidden Gaussians are looked for."""
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
 """(title, total, completed) -> a context manager whose value moves the bar on."""
@@ -116,10 +121,11 @@ def train(
         targets = [
             Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside) for sequence in sequences
         ]
-        data = TrainingData(order, tuple(targets), extent)
+        faces = [sequence.tracking.face for sequence in sequences]
+        telling = telling_frames(faces, sequences, frames, _TELLING, _TELLING)
+        data = TrainingData(order, tuple(targets), extent, tuple(telling))
         settings = resolved_background(settings, filled=state.unseen is not None and state.unseen.fills)
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
-        faces = [sequence.tracking.face for sequence in sequences]
         covered = None if state.unseen is None else state.unseen.coverage
         write_results(run_dir, state, covered or coverage(face_model, sequences, faces, frames))
     return state.avatar
@@ -295,7 +301,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     if passed(state.step, state.step + len(batch), _MEAN_POSE_EVERY):
         state.track.keep_mean_pose()
     random = partial(density_random, settings, state.step)
-    state.density.adapt(avatar.gaussian_store(), posed[0], progress, random)
+    changed = state.density.adapt(avatar.gaussian_store(), posed[0], progress, random)
     if state.unseen is not None:
         avatar.keep_to(state.unseen.prior)
 
@@ -304,6 +310,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     if state.hair is not None and passed(before, state.step, EVERY):
         state.hair.correct(avatar, state.step / settings.steps, settings.hair_rate)
         state.follow_hair()
+    _tidy(state, data, changed=changed, last=state.step >= settings.steps)
     elapsed = time.perf_counter() - began
     state.seconds += elapsed
     if not passed(before, state.step, settings.record_every) and state.step != settings.steps:
@@ -318,6 +325,20 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     for name, value in entry.items():
         state.curves.setdefault(name, []).append(value)
     return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"
+
+
+def _tidy(state: TrainingState, data: TrainingData, *, changed: bool, last: bool) -> None:
+    """Remove what no picture shows of a filled head, after a round of density control and at the end."""
+    avatar, unseen = state.avatar, state.unseen
+    if unseen is None or not unseen.fills or not (changed or last) or not data.telling:
+        return
+    if not isinstance(avatar.density(), GradientDensity):
+        return
+    views = [
+        (state.track.face(state.track.index_of(frame.sequence, frame.timestep)).detach(), data.camera(frame))
+        for frame in data.telling
+    ]
+    state.density.remove(avatar.gaussian_store(), tidy(avatar, unseen, views, close=not last))
 
 
 def passed(before: int, now: int, every: int) -> bool:

@@ -77,6 +77,11 @@ class GradientStrategy(DensityStrategy):
             store.assign(name, lowered)
         return changed
 
+    def remove(self, store: GaussianStore, removed: Bool[Tensor, " n"]) -> None:
+        """Remove Gaussians between two rounds. The statistics start again."""
+        store.select(~removed)
+        self._restart(len(store))
+
     def state(self) -> dict[str, Tensor]:
         """The statistics since the last round, under the names that checkpoints have always used."""
         return {

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from mien.avatar import GaussianStore, Posed, Progress
@@ -28,6 +29,10 @@ class DensityStrategy(ABC):
         """
 
     @abstractmethod
+    def remove(self, store: GaussianStore, removed: Bool[Tensor, " n"]) -> None:
+        """Remove Gaussians between two rounds. The statistics start again."""
+
+    @abstractmethod
     def state(self) -> dict[str, Tensor]:
         """Tensors that a checkpoint has to save."""
 
@@ -45,6 +50,10 @@ class FixedStrategy(DensityStrategy):
     def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
         """Return False, because the store never changes."""
         return False
+
+    def remove(self, store: GaussianStore, removed: Bool[Tensor, " n"]) -> None:
+        """Remove them from the store."""
+        store.select(~removed)
 
     def state(self) -> dict[str, Tensor]:
         """An empty dict."""
