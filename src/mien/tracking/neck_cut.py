@@ -35,6 +35,13 @@ class NeckCut:
         origin, up = (torch.from_numpy(vector).to(points) for vector in (self.origin, self.axes[2]))
         return (points - origin) @ up
 
+    def margins(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Distances of points from what is cut off, below the plane and beside the neck, in metres; negative there."""
+        origin, axes, radii = (torch.from_numpy(array).to(points) for array in (self.origin, self.axes, self.radii))
+        local = (points - origin) @ axes.T
+        beside = radii.prod().sqrt() * (_BESIDE - (local[:, :2] / radii).norm(dim=1)) + _SLOPE * local[:, 2]
+        return torch.minimum(local[:, 2], beside)
+
 
 @dataclass(frozen=True, eq=False)
 class NeckParts:

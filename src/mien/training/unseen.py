@@ -19,11 +19,13 @@ from mien.render.rendering import Rendering
 from mien.training.completion import complete_colors
 from mien.training.coverage import Coverage, coverage, drawn_share, smoothstep
 from mien.training.frames import Frame, spread_frames
+from mien.training.hair_curtain import hair_curtain
 from mien.training.hair_height import hair_height, hanging_hair
 from mien.training.head_parts import head_parts
 from mien.training.hidden import hidden_triangles
 from mien.training.sequence import Sequence
 from mien.training.settings import TrainSettings
+from mien.training.spreading import Surface
 
 _RARE = 0.02
 """Confidence below which a triangle is made up."""
@@ -141,10 +143,25 @@ def unseen_of(
     made_up = (shown < _RARE) & (found.above > 0.5)
     made_up |= hidden_inside(model, parts.interior, sequences, faces, frames)
     looseness = looser_where_faces_move(model, neutral, parts.interior)
-    strands = made_up & parts.scalp & (hair > _STRANDS_FROM)
+    curtain = hair_curtain(model, neutral, hair, hanging)
+    behind = made_up & (curtain > hair)
+    colors = torch.where(behind[:, None], _hair_colors(model, neutral, parts.scalp, behind, colors), colors)
+    hair, hanging = torch.where(behind, curtain, hair), torch.maximum(hanging, curtain)
+    strands = made_up & (parts.scalp | behind) & (hair > _STRANDS_FROM)
     return Unseen(
         found, SurfacePrior(hair, hanging, colors, doubt, made_up, made_up | parts.interior, strands, looseness)
     )
+
+
+def _hair_colors(
+    face_model: FaceModel,
+    vertices: Float[Tensor, "v 3"],
+    scalp: Bool[Tensor, " f"],
+    behind: Bool[Tensor, " f"],
+    colors: Float[Tensor, "f 3"],
+) -> Float[Tensor, "f 3"]:
+    """Colours in which those of the scalp go on over triangles behind hanging hair."""
+    return Surface.of(vertices, face_model.faces).spread(colors, scalp.to(colors), scalp | behind)
 
 
 def looser_where_faces_move(
