@@ -11,9 +11,8 @@ from mien import _native
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, GaussianStore, Progress
 from mien.avatar.gaussian_avatars import (
     never_empty_a_triangle,
-    triangle_penalties,
-    triangle_penalties_reference,
 )
+from mien.avatar.triangle_penalties import triangle_penalties, triangle_penalties_reference
 from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh, world_means
 from mien.render import rasterize

@@ -5,15 +5,12 @@ matters. Lengths and scales in the store are in units of the triangle's own scal
 Changes with the expression beside those of the mesh (`expression_rank`, `appearance`) are not part of the paper.
 """
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from mien import _native
-from mien.arrays import unpacked
 from mien.avatar.avatar import Avatar, ParameterGroup, Posed, SurfacePrior, store_group
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.bound_gaussians import pose_bound_gaussians
@@ -21,18 +18,17 @@ from mien.avatar.density import GradientDensity, highest_opacities_seen
 from mien.avatar.expression_changes import ExpressionActivations, expression_change
 from mien.avatar.feature_appearance import FeatureAppearance, feature_tensors
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
-from mien.avatar.hair_strands import HEAD_RADIUS, strand_gaussians
+from mien.avatar.hair_strands import shell_growth, strand_gaussians
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.avatar.surface_limits import keep_on_surface
 from mien.avatar.triangle_frames import triangle_ellipses, triangle_frames
+from mien.avatar.triangle_penalties import triangle_penalties
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import sh_from_rgb, stack_timesteps
 from mien.render.rendering import Rendering
 from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
-_Pair = tuple[float, float]
-"""A value for centres, and one for scales."""
 _OPEN = 0.5
 """Sum of the opacities of a triangle's Gaussians below which its surface is open."""
 _FEATURES = ("feature_colour", "feature_opacity")
@@ -213,22 +209,30 @@ class GaussianAvatars(Avatar):
         if prior.colors is None or closed is None:
             return
         store, bound = self.store, self.store["face_index"]
+        filled, fills = closed[bound], {name: values[bound] for name, values in self._fills(prior).items()}
         store.assign("sh_constant", sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None])
-        quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
-        height = prior.fill_height[bound]
-        store.assign("means", torch.stack([0 * height, height / self._sizes[bound], 0 * height], 1))
-        filled = closed[bound]
-        store.assign("quats", torch.where(filled[:, None], quats[bound], store["quats"]))
-        # Hair is a shell around the head, so its ellipses are larger than the triangles.
-        wider = (height / HEAD_RADIUS).log1p()[:, None] * log_scales.new_tensor([1.0, 0.0, 1.0])
-        store.assign("log_scales", torch.where(filled[:, None], log_scales[bound] + wider, store["log_scales"]))
-        logits = store["opacity_logits"]
-        store.assign("opacity_logits", torch.where(filled, torch.logit(torch.full_like(logits, _OPAQUE)), logits))
+        store.assign("means", fills["means"])
+        for name in ("quats", "log_scales", "opacity_logits"):
+            chosen = filled.view(-1, *[1] * (store[name].ndim - 1))
+            store.assign(name, torch.where(chosen, fills[name], store[name]))
         if prior.strands is not None and bool(prior.strands.any()):
             vertices, faces = self.face_model.head_vertices(self.subject)[0], self.face_model.faces
             own = strand_gaussians(vertices, faces, prior.strands, prior.fill_height, prior.colors)
             rest = {name: store[name].new_zeros(len(own["means"]), *store[name].shape[1:]) for name in store.trained}
             store.append(torch.zeros(len(own["means"]), dtype=torch.long), rest | own)
+
+    def _fills(self, prior: SurfacePrior) -> dict[str, Tensor]:
+        """Place, shape and opacity of each triangle's fill: opaque, flat, at the height of hair."""
+        vertices, faces = self.face_model.head_vertices(self.subject)[0], self.face_model.faces
+        quats, log_scales = triangle_ellipses(vertices, faces)
+        height = prior.fill_height
+        wider = shell_growth(vertices, faces, height).log()[:, None] * log_scales.new_tensor([1.0, 0.0, 1.0])
+        return {
+            "means": torch.stack([0 * height, height / self._sizes, 0 * height], 1),
+            "quats": quats,
+            "log_scales": log_scales + wider,
+            "opacity_logits": torch.logit(torch.full_like(height, _OPAQUE)),
+        }
 
     @torch.no_grad()
     def keep_to(self, prior: SurfacePrior) -> None:
@@ -251,11 +255,7 @@ class GaussianAvatars(Avatar):
         store, bound = self.store, self.store["face_index"][rows]
         values = {"sh_constant": sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None]}
         if close:
-            quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
-            height = (prior.fill_height / self._sizes)[bound]
-            values |= {"means": torch.stack([0 * height, height, 0 * height], 1)}
-            values |= {"quats": quats[bound], "log_scales": log_scales[bound]}
-            values |= {"opacity_logits": torch.logit(torch.full_like(height, _OPAQUE))}
+            values |= {name: own[bound] for name, own in self._fills(prior).items()}
         for name, own in values.items():
             store.assign_rows(name, rows, own)
 
@@ -364,63 +364,3 @@ def never_empty_a_triangle(store: GaussianStore, prune: Bool[Tensor, " n"]) -> B
     kept = torch.zeros(int(face_index.max()) + 1, dtype=torch.bool, device=prune.device)
     kept[face_index[~prune]] = True
     return prune & kept[face_index]
-
-
-def triangle_penalties(
-    means: Float[Tensor, "n 3"],
-    log_scales: Float[Tensor, "n 3"],
-    radii: Int[Tensor, " n"],
-    thresholds: _Pair,
-    weights: _Pair,
-) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Weighted means, over the visible Gaussians, of how far centres and scales exceed their thresholds (section 3.4).
-
-    Lengths are in units of the triangle's size. `thresholds` and `weights` hold the value for centres, then for scales.
-    Differentiable in `means` and `log_scales`; native for float32 on a CPU.
-
-    Args:
-        means: Centres in the frames of their triangles.
-        log_scales: Logarithms of the scales in the same units.
-        radii: Radii on screen in pixels, 0 if not visible.
-        thresholds: Distance and scale up to which there is no penalty.
-        weights: Weights of the two penalties.
-    """
-    if means.dtype != torch.float32 or means.device.type != "cpu":
-        return triangle_penalties_reference(means, log_scales, radii, thresholds, weights)
-    return _TrianglePenalties.apply(means, log_scales, radii, thresholds, weights)
-
-
-def triangle_penalties_reference(
-    means: Float[Tensor, "n 3"],
-    log_scales: Float[Tensor, "n 3"],
-    radii: Int[Tensor, " n"],
-    thresholds: _Pair,
-    weights: _Pair,
-) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """`triangle_penalties` in plain PyTorch, any dtype and device."""
-    in_view = radii > 0
-    share = in_view / in_view.sum().clamp_min(1)
-    too_far = torch.relu(torch.linalg.vector_norm(means, dim=-1) - thresholds[0])
-    too_large = torch.linalg.vector_norm(torch.relu(log_scales.exp() - thresholds[1]), dim=-1)
-    return weights[0] * (too_far * share).sum(), weights[1] * (too_large * share).sum()
-
-
-class _TrianglePenalties(torch.autograd.Function):
-    """Values and gradients come from one native pass; `backward` only scales the gradients."""
-
-    @staticmethod
-    def forward(ctx: Any, means: Tensor, log_scales: Tensor, radii: Tensor, thresholds: _Pair, weights: _Pair):
-        inputs = unpacked(*(tensor.detach().contiguous() for tensor in (means, log_scales, radii)))
-        gradients, values = (torch.empty_like(means), torch.empty_like(log_scales)), (torch.empty(()), torch.empty(()))
-        _native.triangle_penalties(thresholds, weights, *inputs, *unpacked(*gradients, *values))
-        ctx.save_for_backward(*gradients)
-        return values
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:
-        scaled = [
-            gradient if float(factor) == 1 else gradient * factor
-            for gradient, factor in zip(ctx.saved_tensors, output_gradients, strict=True)
-        ]
-        return *scaled, None, None, None

@@ -19,8 +19,8 @@ _CONTRAST = 0.2
 """Standard deviation of the logarithm of a strand's brightness."""
 _BELOW = 0.003
 """Range below the top of the hair in which strands lie, in metres. Above it, they would widen the outline."""
-HEAD_RADIUS = 0.1
-"""Radius in metres of the head that hair is a shell around."""
+_HEAD_RADIUS, _NECK_RADIUS, _CHIN = 0.1, 0.055, -0.05
+"""Radii in metres of the head and of the neck that hair is a shell around, and the level below which it is the neck."""
 
 
 def strand_gaussians(
@@ -51,7 +51,7 @@ def strand_gaussians(
     triangles = _evenly_drawn(vertices, faces, chosen)
     count, size, high = len(triangles), frames.k[triangles], height[triangles]
     means = _to_triangles(frames, triangles, _places(vertices, faces, triangles, random) - frames.T[triangles])
-    means = means * (1 + high / HEAD_RADIUS)[:, None]
+    means = means * shell_growth(vertices, faces, height)[triangles, None]
     means[:, 1] = high - _BELOW * torch.rand(count, generator=random)
     direction = torch.tensor([0.0, -_DOWN, -_BACK]) + _DISORDER * torch.randn(count, 3, generator=random)
     along = _to_triangles(frames, triangles, direction)
@@ -67,6 +67,17 @@ def strand_gaussians(
         "opacity_logits": torch.logit(torch.full((count,), _OPACITY)),
         "sh_constant": sh_from_rgb((colors[triangles] * light).clamp(0, 1))[:, None],
     }
+
+
+def shell_growth(
+    vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], height: Float[Tensor, " f"]
+) -> Float[Tensor, " f"]:
+    """How much larger than its triangle a patch of hair is, as a factor on lengths, at a height above it in metres.
+
+    Hair is a shell around the head or, where it hangs, around the neck, which is thinner.
+    """
+    below = triangle_geometry(vertices.detach(), faces)[0][:, 1] < _CHIN
+    return 1 + height / torch.where(below, _NECK_RADIUS, _HEAD_RADIUS).to(height)
 
 
 def _evenly_drawn(
