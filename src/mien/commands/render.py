@@ -56,7 +56,7 @@ class Command:
     """Frames per second of the video."""
     span: float = 40.0
     """Angle that the camera swings through, in degrees, up to 360, which goes all the way round. 40 is about what one
-    camera films; sides that were not filmed look broken."""
+    camera films; sides that were not filmed are made up, or look broken if they were trained."""
     tilt: float = 15.0
     """Angle that orbit and sway go up and down, in degrees."""
     yaw: float = 0.0
