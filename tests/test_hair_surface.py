@@ -1,4 +1,4 @@
-"""The surface of hair rises and sinks as a whole where pictures say so, and takes all that is known of it along."""
+"""The surface of hair rises and sinks as a whole where that lowers the loss. Limits and side views follow it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from toy_scene import toy_sequence
 
 _HAIR, _RATE = 0.02, 1e-3
 CONFIG = PRESETS["draft"].config("gaussian_avatars")
-SETTINGS = TrainSettings(steps=64, split="none", unseen="filled", checkpoint_every=16, record_every=8, side_weight=0.0)
+SETTINGS = TrainSettings(steps=64, split="none", unseen="filled", checkpoint_every=12, record_every=8, side_weight=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_a_filled_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     def stop(_: object) -> None:
         nonlocal steps
         steps += 1
-        if steps == 36:
+        if steps == 14:
             raise Stop
 
     with pytest.raises(Stop):

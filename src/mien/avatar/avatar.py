@@ -45,7 +45,7 @@ class SurfacePrior:
     """What is known of each of the f triangles of a head without training: from the mesh, the mattes and symmetry."""
 
     hair: Float[Tensor, " f"]
-    """Height of hair along the triangle's normal, in metres; 0 on skin."""
+    """Height of hair along the triangle's normal, in metres; 0 on skin that no hair hangs over."""
     hanging: Float[Tensor, " f"] | None = None
     """How far hair that hangs beside skin and neck stands out along the normal, in metres. None means 0."""
     colors: Float[Tensor, "f 3"] | None = None

@@ -256,6 +256,8 @@ class GaussianAvatars(Avatar):
         values = {"sh_constant": sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None]}
         if close:
             values |= {name: own[bound] for name, own in self._fills(prior).items()}
+            rest = [name for name in store.trained if name not in values]
+            values |= {name: torch.zeros_like(store[name][rows]) for name in rest}
         for name, own in values.items():
             store.assign_rows(name, rows, own)
 

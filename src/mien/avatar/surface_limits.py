@@ -24,7 +24,7 @@ def keep_on_surface(
         store: Gaussians with `face_index, means, quats, log_scales` in the frames of their triangles.
         limits: The limits.
         sizes: Sizes of the triangles, in metres per triangle unit.
-        hair: Height of hair above each triangle, in metres; 0 on skin.
+        hair: Height of hair above each triangle, in metres; 0 where there is none.
         looseness: Factors on the depth, the thickness and the tilt. None means 1.
     """
     bound = store["face_index"]

@@ -139,7 +139,7 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
     if state.colors is not None:
         _check_like(part("colors."), state.colors.state(), None)
         state.colors.load_state(part("colors."))
-    if state.hair is not None:
+    if state.hair is not None and part("hair."):  # Versions before it have left none.
         _check_like(part("hair."), state.hair.state, None)
         state.hair.load_state(part("hair."))
         state.follow_hair()

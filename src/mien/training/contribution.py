@@ -1,9 +1,9 @@
-"""How much each Gaussian adds to the training pictures, and what becomes of those that add nothing.
+"""How much each Gaussian adds to training pictures, and what becomes of those that add nothing.
 
-Density control duplicates what pictures pull at. Soon many Gaussians lie under others, where no picture shows them.
-They are not trained any more, they count to the limit, and from aside they show as specks in odd colours. After each
-round, those that hardly add to any picture are removed. The last one on a triangle stays, and becomes what it was in
-the beginning: a closed surface in the completed colour.
+Density control duplicates Gaussians with strong gradients. Soon many of them lie under others, where no picture shows
+them. They are not trained any more, count towards the limit, and show as specks in odd colours from aside. After each
+round, those that hardly add to any of a few pictures are removed. If all Gaussians of a triangle are such, one stays
+and becomes what it was in the beginning: a closed surface in the completed colour.
 """
 
 from collections.abc import Sequence as Items
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar import Avatar, GradientDensity
+from mien.avatar import Avatar
 from mien.camera import Camera
 from mien.face import FaceParams
 from mien.gaussians import SH_C0
@@ -21,7 +21,7 @@ from mien.render import rasterize
 from mien.training.unseen import Unseen
 
 _HIDDEN = 0.03
-"""Contribution below which a Gaussian counts as hidden, in pixels of the picture that shows it best."""
+"""Contribution below which a Gaussian counts as hidden, in pixels of the training picture that shows it best."""
 
 
 def contributions(avatar: Avatar, views: Items[tuple[FaceParams, Camera]]) -> Float[Tensor, " n"]:
@@ -49,21 +49,24 @@ def contributions(avatar: Avatar, views: Items[tuple[FaceParams, Camera]]) -> Fl
 def tidy(avatar: Avatar, unseen: Unseen, views: Items[tuple[FaceParams, Camera]], *, close: bool) -> Bool[Tensor, " n"]:
     """Deal with Gaussians that hardly add to any view, and return which are to be removed.
 
-    Of a triangle, the last Gaussian stays. It gets the completed colour and, with `close`, also place, shape and
-    opacity of a fill. Made-up sides and the inside of the mouth are left alone.
+    One Gaussian stays on each triangle. If it is hidden, it gets the completed colour and, with `close`, also place,
+    shape and opacity of a fill. Made-up sides and the inside of the mouth are left alone.
 
     Args:
-        avatar: An avatar with bound Gaussians and density control by gradients.
+        avatar: An avatar with bound Gaussians.
         unseen: What the training pictures do not show of the head.
         views: Views of the training, as for `contributions`.
         close: Whether what stays becomes a surface, which training then fits to the pictures.
     """
-    density, store, triangles = avatar.density(), avatar.gaussian_store(), avatar.triangles()
-    assert isinstance(density, GradientDensity)
+    triangles, prior = avatar.triangles(), unseen.prior
     assert triangles is not None
-    kept = unseen.prior.made_up if unseen.prior.closed is None else unseen.prior.closed
+    kept = prior.made_up if prior.closed is None else prior.closed
     assert kept is not None
     hidden = (contributions(avatar, views) < _HIDDEN) & ~kept[triangles]
-    removed = density.may_prune(store, hidden)
-    avatar.restore((hidden & ~removed).nonzero()[:, 0], unseen.prior, close=close)
-    return removed
+    shown = torch.zeros_like(kept).index_put((triangles[~hidden],), torch.ones_like(hidden[~hidden]))
+    order = torch.arange(len(hidden), device=hidden.device)
+    first = torch.full_like(kept, len(hidden), dtype=torch.long)
+    first = first.scatter_reduce(0, triangles[hidden].long(), order[hidden], "amin")
+    stays = hidden & ~shown[triangles] & (order == first[triangles])
+    avatar.restore(stays.nonzero()[:, 0], prior, close=close)
+    return hidden & ~stays

@@ -32,7 +32,7 @@ _SLOPE, _NEAR = 0.12, 0.03
 """Difference of slope (the upward part of a normal) and distance in metres, within which measured heights count alike
 for what is never measured."""
 _AT_HAIRLINE, _RISE = 0.004, 0.4
-"""Largest height in metres at the hairline of the face where nothing was measured, and how much it grows per metre."""
+"""Largest height in metres at the hairline where nothing was measured, and how much it grows per metre from skin."""
 _SMOOTHING_ROUNDS = 2
 """Rings of triangles over which heights are averaged. More would flatten the hair on top."""
 _FADING_ROUNDS = 2
@@ -53,8 +53,8 @@ def hair_height(
 
     A triangle of the scalp is measured in frames in which it is on the outline of the mesh: its height is the distance
     along its normal to the border of the matte. Triangles that are never on the outline have the height of what was
-    measured where the head is as steep, but near the face no more than hair that rises slowly from the hairline. The
-    height fades at the hairline. Without any measurement it is 0.
+    measured where the head is as steep. Near skin, ears included, they have no more than hair that rises slowly from
+    the hairline, where the height fades. Without any measurement it is 0.
 
     Args:
         face_model: The face model, float32 on the CPU.

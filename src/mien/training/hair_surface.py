@@ -1,11 +1,12 @@
 """The surface of hair, which rises and sinks as a whole during training.
 
-How high hair stands is measured only where it was on an outline. Elsewhere its height is a guess, and pictures of a
-head that turns tell better: at a wrong height, hair slides over the scalp. One Gaussian alone cannot follow, because
-its neighbours hide what it would gain. So the gradients of all Gaussians on a patch of scalp are added up, and the
-patch moves along its normals together with the limits of the surface. What no picture shows moves with what is beside
-it. That smoothed gradients make large and smooth steps of geometry is from Nicolet et al. 2021 (Large steps in inverse
-rendering of geometry).
+How high hair stands is measured only where it was on an outline. Elsewhere its height is a guess, although a head that
+turns shows it: at a wrong height, hair slides over the scalp. One Gaussian alone cannot follow, because its neighbours
+hide what it would gain. So the gradients of all Gaussians on a patch of scalp are added up, and the patch moves along
+its normals together with the limits of the surface. What no picture shows moves with what is beside it. Nicolet et al.
+2021 (Large steps in inverse rendering of geometry) show that smoothed gradients make large and smooth steps.
+
+The gradient is that of all losses. The position penalty of a method is among them and pulls towards the scalp.
 """
 
 from dataclasses import dataclass, replace
@@ -57,21 +58,23 @@ class HairSurface:
         if gradient is not None:
             self.state["gradient"] += gradient[self.scalp].to(self.kernel) * self.shown
 
-    def correct(self, avatar: Avatar, fraction: float, rate: float) -> None:
-        """Move the avatar's Gaussians along the normals, if the run is in the time of corrections.
+    def correct(self, avatar: Avatar, fraction: float, rate: float) -> bool:
+        """Move the avatar's Gaussians along the normals if it is time for that. Return whether they moved.
 
         Args:
             avatar: The avatar.
             fraction: How far the run is, 0..1.
-            rate: Size of a first correction in metres, where all pictures agree.
+            rate: Size of a first correction in metres, where all gradients agree.
         """
-        if rate > 0 and _BEGIN <= fraction < _END:
+        moves = rate > 0 and _BEGIN <= fraction < _END
+        if moves:
             step = self._step() * rate * (_END - fraction) / (_END - _BEGIN)
             before = self.state["shift"].clone()
             lowest = _LOWEST - self.start.hair[self.scalp]
             self.state["shift"] = (before - step).clamp(-_FURTHEST, _FURTHEST).maximum(lowest)
             avatar.raise_surface(self._on_all(self.state["shift"] - before))
         self.state["gradient"] = torch.zeros_like(self.state["gradient"])
+        return moves
 
     def prior(self) -> SurfacePrior:
         """What is known of the surface now."""

@@ -49,9 +49,9 @@ class TrainSettings:
     """Weight of the views from aside and of raised expressions, in which filled heads are compared with the completed
     mesh."""
     hair_rate: Annotated[float, Range(0, 0.01)] = 6e-4
-    """Largest distance in metres by which the surface of the hair rises or sinks in one correction, where pictures of
-    filled heads say so. There is one after every 8 steps, and they get smaller during the run. 0 keeps the hair where
-    the mattes and what is guessed from them put it."""
+    """Largest distance in metres by which the surface of the hair of a filled head rises or sinks in one correction,
+    where that lowers the loss. There is one after every 8 steps from 3 to 60 % of the run, and they get smaller. 0
+    keeps the hair at the height that was measured on mattes or guessed from it."""
     inside: Literal["free", "covered", "furnished"] = "free"
     """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
     them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in

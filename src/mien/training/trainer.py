@@ -42,6 +42,7 @@ from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.contribution import tidy
 from mien.training.coverage import coverage, telling_frames
 from mien.training.density_control import density_strategy
+from mien.training.density_control.gradient import GradientStrategy
 from mien.training.face_track import FaceTrack
 from mien.training.filmed import with_shown_angles
 from mien.training.frames import (
@@ -66,6 +67,8 @@ from mien.training.vertex_colors import vertex_colors
 _MEAN_POSE_EVERY = 25
 """Number of steps after which the mean correction of the head's pose is taken away, if settings ask for it."""
 
+_AFTER_RESET = 0.03
+"""Time after a reset of opacities in which nothing is judged by its contribution, as a fraction of the run."""
 _TELLING = 12
 """Number of evenly spread frames, and of frames that show turned heads, in which hidden Gaussians are looked for."""
 
@@ -307,10 +310,10 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
 
     before = state.step
     state.step += len(batch)
-    if state.hair is not None and passed(before, state.step, EVERY):
-        state.hair.correct(avatar, state.step / settings.steps, settings.hair_rate)
+    hair = state.hair if passed(before, state.step, EVERY) else None
+    if hair is not None and hair.correct(avatar, state.step / settings.steps, settings.hair_rate):
         state.follow_hair()
-    _tidy(state, data, changed=changed, last=state.step >= settings.steps)
+    _tidy(state, data, settings, changed=changed)
     elapsed = time.perf_counter() - began
     state.seconds += elapsed
     if not passed(before, state.step, settings.record_every) and state.step != settings.steps:
@@ -327,18 +330,22 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"
 
 
-def _tidy(state: TrainingState, data: TrainingData, *, changed: bool, last: bool) -> None:
-    """Remove what no picture shows of a filled head, after a round of density control and at the end."""
-    avatar, unseen = state.avatar, state.unseen
+def _tidy(state: TrainingState, data: TrainingData, settings: TrainSettings, *, changed: bool) -> None:
+    """Remove Gaussians of a filled head that pictures do not show, after a round of density control and at the end."""
+    unseen, last, fraction = state.unseen, state.step >= settings.steps, state.step / settings.steps
+    density, strategy = state.avatar.density(), state.density
     if unseen is None or not unseen.fills or not (changed or last) or not data.telling:
         return
-    if not isinstance(avatar.density(), GradientDensity):
+    if not isinstance(density, GradientDensity) or not isinstance(strategy, GradientStrategy):
+        return
+    resets = density.settings.opacity_resets if density.settings.rules.reset_opacities else ()
+    if any(0 <= fraction - time < _AFTER_RESET for time in resets) and not last:
         return
     views = [
         (state.track.face(state.track.index_of(frame.sequence, frame.timestep)).detach(), data.camera(frame))
         for frame in data.telling
     ]
-    state.density.remove(avatar.gaussian_store(), tidy(avatar, unseen, views, close=not last))
+    strategy.remove(state.avatar.gaussian_store(), tidy(state.avatar, unseen, views, close=not last))
 
 
 def passed(before: int, now: int, every: int) -> bool:

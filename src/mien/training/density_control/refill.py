@@ -15,7 +15,6 @@ is one count per tensor, goes on.
 """
 
 import torch
-from jaxtyping import Bool
 from torch import Tensor
 
 from mien.avatar import GaussianStore, Posed, Progress, RefillDensity
@@ -61,11 +60,6 @@ class RefillStrategy(DensityStrategy):
             store.append(parents, self._density.refill(store, parents, noise, progress.fraction))
         self._highest_opacities = torch.zeros(len(store), device=self._highest_opacities.device)
         return True
-
-    def remove(self, store: GaussianStore, removed: Bool[Tensor, " n"]) -> None:
-        """Remove Gaussians between two rounds. The statistics start again."""
-        store.select(~removed)
-        self._highest_opacities = torch.zeros(len(store), device=self._highest_opacities.device)
 
     def state(self) -> dict[str, Tensor]:
         """The statistics since the last round."""

@@ -4,7 +4,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool
 from torch import Tensor
 
 from mien.avatar import GaussianStore, Posed, Progress
@@ -29,10 +28,6 @@ class DensityStrategy(ABC):
         """
 
     @abstractmethod
-    def remove(self, store: GaussianStore, removed: Bool[Tensor, " n"]) -> None:
-        """Remove Gaussians between two rounds. The statistics start again."""
-
-    @abstractmethod
     def state(self) -> dict[str, Tensor]:
         """Tensors that a checkpoint has to save."""
 
@@ -50,10 +45,6 @@ class FixedStrategy(DensityStrategy):
     def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
         """Return False, because the store never changes."""
         return False
-
-    def remove(self, store: GaussianStore, removed: Bool[Tensor, " n"]) -> None:
-        """Remove them from the store."""
-        store.select(~removed)
 
     def state(self) -> dict[str, Tensor]:
         """An empty dict."""
