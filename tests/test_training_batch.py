@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -76,8 +77,14 @@ def test_every_loss_of_a_picture_is_a_mean() -> None:
 
 def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     state, data = new_state()
-    rounds, adapt = [], state.density.adapt
-    monkeypatch.setattr(state.density, "adapt", lambda *given: rounds.append(adapt(*given)))
+    rounds: list[bool] = []
+    adapt = state.density.adapt
+
+    def adapt_and_note(*given: Any) -> bool:
+        rounds.append(adapt(*given))
+        return rounds[-1]
+
+    monkeypatch.setattr(state.density, "adapt", adapt_and_note)
     seen = []
     while state.step < SETTINGS.steps:
         batch = next_batch(state, data, SETTINGS)
