@@ -53,7 +53,7 @@ def _pull(avatar: GaussianAvatars, surface: HairSurface, slope: float, rounds: i
         means = avatar.store["means"]
         means.grad = torch.zeros_like(means)
         means.grad[:, 1] = slope * avatar._sizes[avatar.store["face_index"]]
-        surface.collect(avatar)
+        surface.collect(avatar, 0.1)
         surface.correct(avatar, 0.1, _RATE)
 
 
@@ -120,7 +120,7 @@ def test_outside_of_its_time_nothing_moves(anny):
     means = avatar.store["means"]
     for fraction, rate in ((0.01, _RATE), (0.7, _RATE), (0.2, 0.0)):
         means.grad = torch.ones_like(means)
-        surface.collect(avatar)
+        surface.collect(avatar, 0.1)
         surface.correct(avatar, fraction, rate)
         assert not surface.shift.any()
         assert not surface.state["gradient"].any()

@@ -15,6 +15,7 @@ from torch import Tensor
 from mien.face import FaceModel
 from mien.face.mirror import triangle_geometry
 from mien.tracking import NeckParts, fit_neck_cut
+from mien.training.hair_height import HIGHEST
 from mien.training.head_parts import head_parts
 
 _HANGS = 0.015
@@ -29,8 +30,8 @@ _ALIKE = math.radians(15)
 """Difference of angle about the axis within which hair above decides about hair below."""
 _BEHIND = 0.0
 """Forward part of a triangle's normal up to which it is behind. Hair in front of the shoulders is not made up."""
-_HIGHEST, _CLEAR = 0.08, 0.006
-"""Largest height of hair, and its least distance from the cut at the neck, in metres."""
+_CLEAR = 0.006
+"""Least distance of hair from the cut at the neck, in metres."""
 
 
 @torch.no_grad()
@@ -54,7 +55,8 @@ def hair_curtain(
     parts, curtain = head_parts(face_model), torch.zeros_like(hair)
     if not bool(parts.scalp.any()) or not bool((hair > 0).any()):
         return curtain
-    axis = middles[parts.scalp][:, [0, 2]].amin(0).add(middles[parts.scalp][:, [0, 2]].amax(0)) / 2
+    scalp = middles[parts.scalp][:, [0, 2]]
+    axis = (scalp.amin(0) + scalp.amax(0)) / 2
     flat, outwards = middles[:, [0, 2]] - axis, normals[:, [0, 2]]
     angle = torch.atan2(flat[:, 0], flat[:, 1])  # 0 in front, +-90 degrees at the sides
     above = flat + hair[:, None] * outwards
@@ -71,7 +73,7 @@ def hair_curtain(
     b, c = (flat * outwards).sum(1), flat.square().sum(1) - widest.square()
     distance = (-b + (b * b - a * c).clamp_min(0).sqrt()) / a
     useful = behind & (distance > hair) & (a > 0.25)
-    distance = torch.where(useful, distance, curtain).clamp(0, _HIGHEST)
+    distance = torch.where(useful, distance, curtain).clamp(0, HIGHEST)
     return distance * _above_cut(face_model, vertices, middles, distance[:, None] * normals)
 
 

@@ -18,7 +18,7 @@ from mien.training.sequence import Sequence
 from mien.training.spreading import Surface
 
 _MAX_FRAMES = 60
-_STEP, _HIGHEST = 0.002, 0.08
+_STEP, HIGHEST = 0.002, 0.08
 """Distance between the points that are tested above the scalp, and the largest height that counts, in metres."""
 _GRAZING = 0.4
 """Cosine between a triangle's normal and the direction to the camera up to which the outline tells its height."""
@@ -79,7 +79,7 @@ def hair_height(
     share = inside[:, None]
     for _ in range(_FADING_ROUNDS):
         share = torch.minimum(share, surface.around(share, torch.ones_like(known))) * inside[:, None]
-    return (height * share)[:, 0].clamp(0, _HIGHEST)
+    return (height * share)[:, 0].clamp(0, HIGHEST)
 
 
 @torch.no_grad()
@@ -104,7 +104,7 @@ def hanging_hair(
     for _ in range(_NEAR_ROUNDS):
         height = torch.maximum(height, surface.around(height, torch.ones_like(known)))
         height[~beside] = 0
-    return height[:, 0].clamp(0, _HIGHEST)
+    return height[:, 0].clamp(0, HIGHEST)
 
 
 def _outline_heights(
@@ -163,7 +163,7 @@ def _by_slope(
 def _behind_hairline(surface: Surface, scalp: Bool[Tensor, " f"], skin: Bool[Tensor, " f"]) -> Float[Tensor, " k"]:
     """Return the largest height of hair on each triangle of the scalp. Hair over a forehead grows out of the skin."""
     if not bool(skin.any()):
-        return surface.middles.new_full((int(scalp.sum()),), _HIGHEST)
+        return surface.middles.new_full((int(scalp.sum()),), HIGHEST)
     from_scalp, to_skin = surface.middles[scalp], surface.middles[skin]
     apart = torch.cdist(from_scalp, to_skin, compute_mode="donot_use_mm_for_euclid_dist")
     return _AT_HAIRLINE + _RISE * apart.amin(1)
@@ -178,7 +178,7 @@ def _measured(
     empty = rasterize_mesh(vertices, faces, camera).face_index < 0
     middles, _, normals = (values[chosen] for values in triangle_geometry(vertices, faces))
     cosine = (normals * normalize(camera.position - middles, dim=-1)).sum(-1)
-    steps = torch.arange(0.0, _HIGHEST + _STEP / 2, _STEP)
+    steps = torch.arange(0.0, HIGHEST + _STEP / 2, _STEP)
     pixels, depth = camera.project(middles[:, None] + steps[:, None] * normals[:, None])
     grid = pixels / torch.tensor([camera.width, camera.height]) * 2 - 1
     inside = _sample(matte, grid) > 0.5

@@ -47,14 +47,19 @@ class HairSurface:
     shown: Bool[Tensor, " k"]
     """Triangles with Gaussians that pictures train. Gradients of others do not count."""
     start: SurfacePrior
-    """What was known before training."""
+    """The surface as it was known before training."""
     state: dict[str, Tensor]
     """Tensors that training changes, by name: `shift` in metres along the normals, its moments, and the gradient since
     the last correction, [k] each; `count`, the number of corrections."""
 
-    def collect(self, avatar: Avatar) -> None:
-        """Add the gradients of a step, after its backward pass."""
-        gradient = avatar.height_gradient()
+    def collect(self, avatar: Avatar, fraction: float) -> None:
+        """Add the gradients of a step, after its backward pass, unless no correction follows.
+
+        Args:
+            avatar: The avatar.
+            fraction: How far the run was before the step, 0..1.
+        """
+        gradient = avatar.height_gradient() if fraction < _END else None
         if gradient is not None:
             self.state["gradient"] += gradient[self.scalp].to(self.kernel) * self.shown
 
@@ -77,7 +82,7 @@ class HairSurface:
         return moves
 
     def prior(self) -> SurfacePrior:
-        """What is known of the surface now."""
+        """Return the surface as it is known now: the hair moved, the rest as at the start."""
         return replace(self.start, hair=(self.start.hair + self.shift).clamp_min(0))
 
     @property

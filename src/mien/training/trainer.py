@@ -16,7 +16,6 @@ from torch import Tensor
 from mien import _native
 from mien.avatar import (
     Avatar,
-    GradientDensity,
     MethodConfig,
     Progress,
     load_avatar,
@@ -290,7 +289,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     losses |= compare_aside(state, data, settings, batch, progress)
     torch.autograd.backward(list(losses.values()))
     if state.hair is not None:
-        state.hair.collect(avatar)
+        state.hair.collect(avatar, state.step / settings.steps)
     if state.unseen is not None:
         state.unseen.guard(avatar, *renderings)
 
@@ -332,14 +331,13 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
 
 def _tidy(state: TrainingState, data: TrainingData, settings: TrainSettings, *, changed: bool) -> None:
     """Remove Gaussians of a filled head that pictures do not show, after a round of density control and at the end."""
-    unseen, last, fraction = state.unseen, state.step >= settings.steps, state.step / settings.steps
-    density, strategy = state.avatar.density(), state.density
+    unseen, strategy, last = state.unseen, state.density, state.step >= settings.steps
     if unseen is None or not unseen.fills or not (changed or last) or not data.telling:
         return
-    if not isinstance(density, GradientDensity) or not isinstance(strategy, GradientStrategy):
+    if not isinstance(strategy, GradientStrategy):
         return
-    resets = density.settings.opacity_resets if density.settings.rules.reset_opacities else ()
-    if any(0 <= fraction - time < _AFTER_RESET for time in resets) and not last:
+    since = (state.step / settings.steps - time for time in strategy.resets)
+    if any(0 <= time < _AFTER_RESET for time in since) and not last:
         return
     views = [
         (state.track.face(state.track.index_of(frame.sequence, frame.timestep)).detach(), data.camera(frame))

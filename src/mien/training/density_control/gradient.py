@@ -67,8 +67,7 @@ class GradientStrategy(DensityStrategy):
             self._grow_and_prune(store, posed, progress, random())
             self._restart(len(store))
         name = self._density.opacity_logits
-        resets = settings.opacity_resets if settings.rules.reset_opacities else ()
-        if name is not None and progress.completes(max(1, round(time * progress.steps)) for time in resets):
+        if name is not None and progress.completes(max(1, round(time * progress.steps)) for time in self.resets):
             ceiling = torch.logit(torch.tensor(settings.reset_opacity))
             logits = store[name].detach()
             lowered = logits.clamp_max(float(ceiling))
@@ -76,6 +75,12 @@ class GradientStrategy(DensityStrategy):
                 lowered = torch.where(self._density.may_reset(store), lowered, logits)
             store.assign(name, lowered)
         return changed
+
+    @property
+    def resets(self) -> tuple[float, ...]:
+        """The times at which opacities are lowered, as fractions of the run."""
+        settings = self._density.settings
+        return settings.opacity_resets if settings.rules.reset_opacities else ()
 
     def remove(self, store: GaussianStore, removed: Bool[Tensor, " n"]) -> None:
         """Remove Gaussians between two rounds. The statistics start again."""
