@@ -126,7 +126,7 @@ def test_options_reach_every_depth(choices: Any) -> None:
         means_rate=Rate(4e-3, 4e-5),
         photometric=replace(STANDARD.photometric, alpha_weight=0.1),
         density=GradientSettings(max_gaussians=20_000, opacity_resets=(0.2, 0.5)),
-        face_tuning=FaceTuning(head_translation=Rate(3e-4, begin=0.5), keep_mean_pose=True),
+        face_tuning=FaceTuning(head_translation=Rate(3e-4, begin=0.5), keep_mean_pose=True, keep_turns=True),
     )
     assert settings == replace(RUN, steps=70, resolution=256, checkpoint_every=50, record_every=5, threads=1)
 
@@ -138,7 +138,7 @@ def test_options_are_those_of_the_method(choices: Any) -> None:
 
 @pytest.mark.parametrize("line", ["--no-face-tuning", "--method.face-tuning.enabled False"])
 def test_face_tuning_has_two_options_that_agree(line: str, choices: Any) -> None:
-    off = FaceTuning(enabled=False, keep_mean_pose=True)
+    off = FaceTuning(enabled=False, keep_mean_pose=True, keep_turns=True)
     assert choices(line)[0] == replace(STANDARD, face_tuning=off)
     file = {"method": {"face_tuning": {"enabled": False}}}
     assert choices("", file)[0] == replace(STANDARD, face_tuning=off)

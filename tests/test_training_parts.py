@@ -27,7 +27,7 @@ from mien.render.rendering import Rendering
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.training import TrainSettings, held_out
 from mien.training.adam import Adam
-from mien.training.face_track import FaceTrack, mean_pose_correction, spread_corrections
+from mien.training.face_track import FaceTrack, mean_pose_correction, spread_corrections, without_turns
 from mien.training.frames import (
     FrameOrder,
     background_at,
@@ -344,12 +344,45 @@ def test_a_shift_that_all_poses_share_is_taken_away(keeps: bool) -> None:
             face.head_translation[0] += tracked.T_world_head[index, :3, :3] @ own
         for group in groups:
             next(iter(group.moments.values())).step += 1
-    track.keep_mean_pose()
+    track.steady_pose()
     moved = torch.cat([track.face(index).head_translation.detach() for index in range(4)]) - tracked.head_translation
     in_head = (tracked.T_world_head[:, :3, :3].mT @ moved[:, :, None])[:, :, 0]
     expected = (torch.tensor([-0.5, 0.5]) if keeps else torch.tensor([0.5, 1.5]))[:, None] * shift
     torch.testing.assert_close(in_head[:2], expected, atol=1e-6, rtol=0)
     assert moved[2:].abs().max() == 0
+
+
+@pytest.mark.parametrize(("keeps", "mean"), [(True, True), (True, False), (False, True)])
+def test_corrections_that_follow_the_turns_are_taken_away(keeps: bool, mean: bool) -> None:
+    """A head turns by 20 degrees to both sides. Its corrections grow with the turn; one timestep has more of its own."""
+    tracked = replace(_still_face(41), head_rotation=torch.zeros(41, 3))
+    angles = torch.linspace(-0.35, 0.35, 41)
+    tracked.head_rotation[:, 1] = angles
+    track = FaceTrack(tracked, FaceTuning(enabled=True, keep_mean_pose=mean, keep_turns=keeps))
+    with torch.no_grad():
+        for index in range(41):
+            face, groups = track.face(index), track.parameter_groups(index)
+            face.head_rotation[0, 1] += 0.01 + 0.05 * angles[index] + (0.02 if index == 20 else 0.0)
+            face.head_translation[0] += tracked.T_world_head[index, :3, :3] @ torch.tensor([0.004, 0, 0]) * angles[index]
+            for group in groups:
+                next(iter(group.moments.values())).step += 1
+    track.steady_pose()
+    tuned = torch.cat([track.face(index).head_rotation.detach() for index in range(41)])[:, 1] - angles
+    moved = torch.cat([track.face(index).head_translation.detach() for index in range(41)])
+    slope = float(((tuned - tuned.mean()) * angles).sum() / angles.square().sum())
+    assert slope == pytest.approx(0.0 if keeps else 0.05, abs=1e-3)
+    assert float(moved.norm(dim=1).max()) == pytest.approx(0.0 if keeps else 0.0014, abs=5e-5)
+    assert float(tuned.mean()) == pytest.approx(0.0 if mean else 0.01 + 0.02 / 41, abs=1e-4)
+    assert float(tuned[20] - tuned[19]) == pytest.approx(0.02, abs=1e-3), "a timestep's own correction stays"
+
+
+def test_a_head_that_hardly_turns_keeps_its_corrections() -> None:
+    tracked = replace(_still_face(40), head_rotation=torch.zeros(40, 3))
+    tracked.head_rotation[:, 1] = torch.linspace(-0.004, 0.004, 40)
+    shifts = torch.zeros(40, 3)
+    shifts[:, 0] = torch.linspace(-0.001, 0.001, 40)
+    _, rest = without_turns(tracked, torch.zeros(40, 3), shifts, mean=True)
+    torch.testing.assert_close(rest, shifts, atol=3e-5, rtol=0)
 
 
 def _still_face(timesteps: int) -> FaceParams:

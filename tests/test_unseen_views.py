@@ -3,31 +3,65 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from mien.benchmarking.quality import unseen_lines
-from mien.camera import camera_from_fov, look_at
-from mien.evaluation.unseen_views import angle_names, camera_beside, write_unseen_chart
+from mien.camera import Camera, camera_from_fov, look_at
+from mien.evaluation.unseen_views import Front, angle_names, camera_beside, write_unseen_chart
 from mien.rotation import matrix_from_axis_angle
 from mien.synthetic import REFERENCES
 from mien.synthetic.recipe import SIDES
 
 
-def test_a_camera_sees_the_tracked_face_where_it_sees_the_true_one() -> None:
-    """The tracked face is turned, moved and a tenth larger; through the placed camera every point is at its pixel."""
+def test_the_front_camera_is_that_of_the_tracking() -> None:
+    """Whatever the tracked face, focal length and distance are, the avatar is seen as it was trained."""
+    own = _camera(0.48, (0.02, 0.1, 0.8))
+    front = Front(_camera(0.5, (0.0, 0.1, 0.9)), own, np.array([0.01, 0.0, 0.02]), np.array([0.03, -0.01, 0.05]))
+    placed = camera_beside(front.true, front)
+    torch.testing.assert_close(placed.viewmat, own.viewmat)
+    torch.testing.assert_close(placed.K, own.K)
+
+
+def test_a_camera_aside_sees_a_true_tracking_where_it_sees_the_person() -> None:
+    """The tracked world is turned, moved and a tenth larger; through the placed camera every point is at its pixel."""
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
-    turn = matrix_from_axis_angle(torch.tensor([0.3, -0.2, 0.1])).numpy()
-    tracked = 1.1 * points @ turn.T + np.array([0.05, -0.02, 0.3])
-    viewmat = look_at(torch.tensor([0.5, 0.1, 0.9]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
-    camera = camera_from_fov(0.5, 320, 320, viewmat)
-    placed = camera_beside(camera, tracked, points)
+    turn = matrix_from_axis_angle(torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)).numpy()
+    shift = np.array([0.05, -0.02, 0.3])
+    tracked = 1.1 * points @ turn.T + shift
+    true = _camera(0.5, (0.0, 0.1, 0.9))
+    view = true.viewmat.double().numpy()
+    moved = np.eye(4)
+    moved[:3, :3] = view[:3, :3] @ turn.T
+    moved[:3, 3] = 1.1 * view[:3, 3] - moved[:3, :3] @ shift
+    own = replace(true, viewmat=torch.from_numpy(moved).float())
+    front = Front(true, own, points.mean(0), tracked.mean(0))
+    aside = _camera(0.5, (0.5, 0.1, 0.7))
+    placed = camera_beside(aside, front)
     seen, _ = placed.project(torch.from_numpy(tracked).float())
-    expected, _ = camera.project(torch.from_numpy(points).float())
+    expected, _ = aside.project(torch.from_numpy(points).float())
     torch.testing.assert_close(seen, expected, atol=1e-2, rtol=0)
-    rotation = placed.viewmat[:3, :3]
-    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
-    elsewhere = camera_beside(camera, tracked + 0.05, points)
-    assert not torch.allclose(elsewhere.viewmat, placed.viewmat, atol=1e-3)
+    torch.testing.assert_close(placed.viewmat[:3, :3] @ placed.viewmat[:3, :3].T, torch.eye(3), atol=1e-5, rtol=0)
+
+
+def test_a_tracked_face_that_is_too_far_aside_is_so_in_all_pictures() -> None:
+    """The tracking sees the face a centimetre too far right and with a shorter lens: cameras aside see that, too."""
+    true, own = _camera(0.5, (0.0, 0.0, 0.9)), _camera(0.55, (0.0, 0.0, 0.81))
+    middle = np.array([0.01, 0.0, 0.0])
+    front = Front(true, own, np.zeros(3), middle)
+    for azimuth in (-0.3, 0.4):
+        aside = _camera(0.5, (0.9 * float(np.sin(azimuth)), 0.0, 0.9 * float(np.cos(azimuth))))
+        placed = camera_beside(aside, front)
+        seen, _ = placed.project(torch.from_numpy(middle)[None].float())
+        in_front, _ = own.project(torch.from_numpy(middle)[None].float())
+        assert float(seen[0, 0]) - 160 > 0.9 * np.cos(azimuth) * (float(in_front[0, 0]) - 160)
+        assert float(placed.K[0, 0] / aside.K[0, 0]) == pytest.approx(float(own.K[0, 0] / true.K[0, 0]))
+        assert float(np.linalg.norm(placed.position.numpy() - middle)) == pytest.approx(0.81, rel=0.02)
+
+
+def _camera(field_of_view: float, place: tuple[float, float, float]) -> Camera:
+    viewmat = look_at(torch.tensor(place), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    return camera_from_fov(field_of_view, 320, 320, viewmat)
 
 
 def test_rows_are_angles() -> None:

@@ -174,7 +174,7 @@ def _draft() -> GaussianAvatarsConfig:
         expression_rank=_RANK,
         expression_colour_rate=Rate(0.0),
         expression_opacity_rate=Rate(0.0),
-        face_tuning=FaceTuning(keep_mean_pose=True),
+        face_tuning=FaceTuning(keep_mean_pose=True, keep_turns=True),
     )
 
 

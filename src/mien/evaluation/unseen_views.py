@@ -22,7 +22,6 @@ from mien.pictures import Box
 from mien.progress import track_progress
 from mien.render import rasterize
 from mien.render.mesh import render_mesh
-from mien.rotation import align_centred
 from mien.synthetic import Truth
 from mien.synthetic.recipe import SIDES
 from mien.tracking import NeckParts, head_crop, head_cutter
@@ -72,23 +71,53 @@ def angle_names() -> list[str]:
     return names
 
 
-def camera_beside(camera: Camera, tracked: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> Camera:
-    """A true camera in the world of a tracking, whose face may have another place and size.
+@dataclass(frozen=True, eq=False)
+class Front:
+    """The front camera at one moment, as it truly is and as the tracking has it, and the face before both."""
+
+    true: Camera
+    tracked: Camera
+    true_middle: Float[np.ndarray, " 3"]
+    """Middle of the true face in the true world, in metres."""
+    tracked_middle: Float[np.ndarray, " 3"]
+    """Middle of the same vertices of the tracked face in the tracking's world, in its metres."""
+
+
+def camera_beside(camera: Camera, front: Front) -> Camera:
+    """A true camera in the world of a tracking, which sees the avatar as it sees the person.
+
+    Cameras stand beside each other as they truly do: their rotations relative to the front camera are exact. The front
+    camera itself becomes the tracking's own, so that the avatar is seen from the front as it was trained. The face
+    therefore has the tracked place and size in the front picture, and a camera aside keeps its distance relative to the
+    front camera's. Focal lengths differ from the true ones as much as the front camera's does.
+
+    A similarity that aligns the tracked vertices with the true ones would do for a perfect shape. But vertices that are
+    off by a millimetre along the skin make it half a percent too large or small, and shift it by a quarter of a pixel.
 
     Args:
         camera: The camera in the true world.
-        tracked: Vertices of the tracked face in the tracking's world, in its metres.
-        true: The same vertices in the true world, in metres.
+        front: The front camera.
     """
-    source, target = tracked.astype(np.float64), true.astype(np.float64)
-    middle, goal = source.mean(0), target.mean(0)
-    rotation, scale = align_centred(source - middle, target - goal)
-    view = camera.viewmat.double().numpy()
+    side, true, own = (one.viewmat.double().numpy() for one in (camera, front.true, front.tracked))
+    focal = (front.tracked.K.diagonal() / front.true.K.diagonal()).double().numpy()
+    lens, true_lens = camera.K.double().numpy(), front.true.K.double().numpy()
+    near, far = _before(own, front.tracked_middle), _before(true, front.true_middle)
+    # The point at the true distance that the front camera sees where the tracking sees the face.
+    pixel = front.tracked.K.double().numpy() @ near / near[2]
+    point = true[:3, :3].T @ (np.linalg.solve(true_lens, pixel) * far[2] - true[:3, 3])
+    seen = _before(side, point)
+    own_lens = lens.copy()
+    own_lens[[0, 1], [0, 1]] *= focal[:2]
+    place = np.linalg.solve(own_lens, lens @ seen) * near[2] / far[2]
     moved = np.eye(4)
-    moved[:3, :3] = view[:3, :3] @ rotation
-    # Dividing by the scale changes no projected point, and keeps the matrix rigid.
-    moved[:3, 3] = (view[:3, :3] @ (goal - scale * rotation @ middle) + view[:3, 3]) / scale
-    return replace(camera, viewmat=torch.from_numpy(moved).to(camera.viewmat))
+    moved[:3, :3] = side[:3, :3] @ true[:3, :3].T @ own[:3, :3]
+    moved[:3, 3] = place - moved[:3, :3] @ front.tracked_middle
+    return replace(camera, K=torch.from_numpy(own_lens).to(camera.K), viewmat=torch.from_numpy(moved).to(camera.viewmat))
+
+
+def _before(view: Float[np.ndarray, "4 4"], point: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """A point of the world in a camera's frame."""
+    return view[:3, :3] @ point + view[:3, 3]
 
 
 @torch.no_grad()
@@ -99,8 +128,8 @@ def score_side_views(
 
     The pictures are cut and cropped as in every other protocol: over white, above the cut at the neck of the posed
     head.
-    An avatar is posed as in `experiment`, and seen by the true camera at the place that it has relative to the tracked
-    face.
+    An avatar is posed as in `experiment`, and seen by the true cameras as they stand beside the front camera
+    (`camera_beside`).
 
     Args:
         experiment: The trained avatar with its sequences.
@@ -113,13 +142,14 @@ def score_side_views(
     neck = NeckParts.of(model)
     colors = _completed_colors(experiment, settings.threads or None)
     metric, judged = perceptual_metric(settings), _judged(len(pictures.timesteps), settings.perceptual_frames)
-    tracked, used = experiment.sequences[index].tracking.face, experiment.faces[index]
-    true_points = truth.vertices_world
+    tracking, used = experiment.sequences[index].tracking, experiment.faces[index]
+    true_points, cameras = truth.vertices_world.astype(np.float64), truth.tracking.cameras
 
     def drawn(view: _View) -> _Job:
         timestep = pictures.timesteps[view.moment]
-        points = model(tracked[timestep])[0].numpy()[truth.vertex_index]
-        camera = camera_beside(truth.tracking.cameras[view.camera], points, true_points[view.moment])
+        points = model(tracking.face[timestep])[0].numpy()[truth.vertex_index].astype(np.float64)
+        front = Front(cameras[0], tracking.cameras[0], true_points[view.moment].mean(0), points.mean(0))
+        camera = camera_beside(cameras[view.camera], front)
         gaussians = experiment.avatar.pose(used[timestep]).gaussians.timestep(0)
         place = (view.moment, view.camera)
         mask = head_cutter(model, neck, used[timestep])(np.asarray(pictures.capture.mattes[place]), camera)

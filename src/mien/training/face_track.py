@@ -13,6 +13,8 @@ from mien.face import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 _FIELDS = ("expression", "joints", "head_rotation", "head_translation")
+_STILL = 0.02
+"""Standard deviation of a head's turns below which they hardly count as turns, in radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,20 +79,24 @@ class FaceTrack:
             self._fields["expression"][index].clamp_(low, high)
 
     @torch.no_grad()
-    def keep_mean_pose(self) -> None:
-        """Take the mean correction of the head's pose from all timesteps that were tuned, if settings ask for it.
+    def steady_pose(self) -> None:
+        """Take from the corrections of the head's pose what the settings do not allow: their mean, and what follows turns.
 
-        Only the sum of Gaussians and poses shows in the pictures of one camera, so both could move together.
+        Only the sum of Gaussians and poses shows in the pictures of one camera, so both could move together, and a head
+        that is too deep could turn less.
         """
-        seen = self._seen()
-        if not (self._tuning.enabled and self._tuning.keep_mean_pose and bool(seen.any())):
+        tuning, seen = self._tuning, self._seen()
+        if not (tuning.enabled and (tuning.keep_mean_pose or tuning.keep_turns) and bool(seen.any())):
             return
         start, now = self._start[seen], replace(self._start, **self._fields)[seen]
-        rotation, translation = mean_pose_correction(start, now)
+        turns, shifts = pose_corrections(start, now)
+        if tuning.keep_turns:
+            turns, shifts = without_turns(start, turns, shifts, mean=tuning.keep_mean_pose)
+        else:
+            turns, shifts = turns - turns.mean(0), shifts - shifts.mean(0)
         upright = start.T_world_head[:, :3, :3]
-        turned = now.T_world_head[:, :3, :3] @ rotation.T
-        self._fields["head_rotation"][seen] = axis_angle_from_matrix(turned)
-        self._fields["head_translation"][seen] -= upright @ translation
+        self._fields["head_rotation"][seen] = axis_angle_from_matrix(upright @ matrix_from_axis_angle(turns))
+        self._fields["head_translation"][seen] = start.head_translation + (upright @ shifts[:, :, None])[:, :, 0]
 
     def _row(self, index: int) -> "_Row":
         # Cached, because a dozen views would otherwise be made in every step. The track's tensors are never replaced.
@@ -154,16 +160,42 @@ class FaceTrack:
                 own.copy_(state[name])
 
 
+def pose_corrections(tracked: FaceParams, tuned: FaceParams) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t 3"]]:
+    """What training changed in each head pose, in the tracked head frame: rotation vectors, and shifts in metres."""
+    from_tracked = tracked.T_world_head[:, :3, :3].mT
+    shift = from_tracked @ (tuned.head_translation - tracked.head_translation)[:, :, None]
+    return axis_angle_from_matrix(from_tracked @ tuned.T_world_head[:, :3, :3]), shift[:, :, 0]
+
+
 def mean_pose_correction(tracked: FaceParams, tuned: FaceParams) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:
     """The part of training's corrections that all timesteps share, in the head frame: a rotation and a shift in metres.
 
     Gaussians and poses can move together during training, since only their sum shows in the pictures. On 16 cameras,
     the head moves by 1.6 mm, with a deviation between timesteps of 0.2 mm.
     """
-    from_tracked = tracked.T_world_head[:, :3, :3].mT
-    shift = from_tracked @ (tuned.head_translation - tracked.head_translation)[:, :, None]
-    turn = axis_angle_from_matrix(from_tracked @ tuned.T_world_head[:, :3, :3])
-    return matrix_from_axis_angle(turn.mean(0)), shift[:, :, 0].mean(0)
+    turns, shifts = pose_corrections(tracked, tuned)
+    return matrix_from_axis_angle(turns.mean(0)), shifts.mean(0)
+
+
+def without_turns(
+    tracked: FaceParams, turns: Float[Tensor, "t 3"], shifts: Float[Tensor, "t 3"], *, mean: bool
+) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t 3"]]:
+    """Corrections without the part that is linear in the head's turns from its mean pose, nor their mean if `mean`.
+
+    Turns of less than a degree explain nothing, so heads that hardly turn keep their corrections.
+    """
+    rotation = tracked.T_world_head[:, :3, :3].double()
+    left, _, right = torch.linalg.svd(rotation.mean(0))
+    away = axis_angle_from_matrix((left @ right).mT @ rotation)
+    known = torch.cat([torch.ones_like(away[:, :1]), away - away.mean(0)], 1)
+    normal = known.T @ known
+    normal.diagonal()[1:] += len(away) * _STILL**2
+    corrections = torch.cat([turns, shifts], 1).double()
+    slopes = torch.linalg.solve(normal, known.T @ corrections)
+    if not mean:
+        slopes[0] = 0
+    rest = (corrections - known @ slopes).to(turns)
+    return rest[:, :3], rest[:, 3:]
 
 
 def spread_corrections(tuned: Tensor, tracked: Tensor, seen: Tensor) -> None:

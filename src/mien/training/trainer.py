@@ -63,8 +63,8 @@ from mien.training.side_views import side_views_of
 from mien.training.unseen import fills_sides, moved, spare_fills, unseen_of
 from mien.training.vertex_colors import vertex_colors
 
-_MEAN_POSE_EVERY = 25
-"""Number of steps after which the mean correction of the head's pose is taken away, if settings ask for it."""
+_STEADY_EVERY = 25
+"""Number of steps after which corrections of the head's pose lose what settings do not allow (`steady_pose`)."""
 
 _AFTER_RESET = 0.03
 """Time after a reset of opacities in which nothing is judged by its contribution, as a fraction of the run."""
@@ -262,7 +262,10 @@ def start(
     hair = hair_surface(avatar, unseen.prior) if unseen is not None and unseen.fills else None
     density = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
-    track = FaceTrack(face, method_config.face_tuning, lengths, face_model.expression_bounds)
+    tuning = method_config.face_tuning
+    if any(len(sequence.tracking.cameras) > 1 for sequence in sequences):
+        tuning = replace(tuning, keep_turns=False)
+    track = FaceTrack(face, tuning, lengths, face_model.expression_bounds)
     return TrainingState(
         avatar, Adam(), density, track, {}, colors, unseen=unseen, inside=inside, aside=aside, hair=hair
     )
@@ -300,8 +303,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     state.adam.step(groups, progress)
     for one in batch:
         state.track.confine(one.index)
-    if passed(state.step, state.step + len(batch), _MEAN_POSE_EVERY):
-        state.track.keep_mean_pose()
+    if passed(state.step, state.step + len(batch), _STEADY_EVERY):
+        state.track.steady_pose()
     random = partial(density_random, settings, state.step)
     changed = state.density.adapt(avatar.gaussian_store(), posed[0], progress, random)
     if state.unseen is not None:
