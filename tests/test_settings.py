@@ -27,7 +27,7 @@ from mien.training import MAIN_SETTINGS, PRESETS, TrainSettings
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
-RUN = TrainSettings(inside="covered", background="auto", unseen="auto")
+RUN = TrainSettings(inside="covered", background="auto", edges="auto", unseen="auto")
 """Settings of a run by the preset `standard`."""
 STANDARD = cast(GaussianAvatarsConfig, PRESETS["standard"].config("gaussian_avatars"))
 

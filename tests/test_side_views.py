@@ -16,7 +16,7 @@ from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import NeckParts, head_cutter
 from mien.training import PRESETS, TrainSettings
-from mien.training.frames import Frame, resolved_background
+from mien.training.frames import Frame, resolved
 from mien.training.side_views import SideViews, side_views, turned_aside
 from mien.training.unseen import fills_sides
 
@@ -140,9 +140,11 @@ def test_sides_are_filled_by_themselves_if_one_camera_filmed(cameras, filled):
 
 
 @pytest.mark.parametrize(("filled", "expected"), [(True, "random"), (False, "white")])
-def test_the_background_follows_the_sides(filled: bool, expected: str) -> None:
-    assert resolved_background(TrainSettings(background="auto"), filled=filled).background == expected
-    assert resolved_background(TrainSettings(background="white"), filled=filled).background == "white"
+def test_background_and_edges_follow_the_sides(filled: bool, expected: str) -> None:
+    assert resolved(TrainSettings(background="auto"), filled=filled).background == expected
+    assert resolved(TrainSettings(background="white"), filled=filled).background == "white"
+    assert resolved(TrainSettings(edges="auto"), filled=filled).edges == ("cleaned" if filled else "filmed")
+    assert resolved(TrainSettings(edges="cleaned"), filled=filled).edges == "cleaned"
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_an_error_in_the_worker_reaches_the_trainer_and_ends_it(
 ) -> None:
     face_model, sequence = toy_sequence(6, 32)
 
-    def unreadable(*_: object) -> Target:
+    def unreadable(*_: object, **__: object) -> Target:
         raise OSError("the disk is gone")
 
     monkeypatch.setattr(Targets, "_compose", unreadable)

@@ -354,7 +354,7 @@ def test_a_shift_that_all_poses_share_is_taken_away(keeps: bool) -> None:
 
 @pytest.mark.parametrize(("keeps", "mean"), [(True, True), (True, False), (False, True)])
 def test_corrections_that_follow_the_turns_are_taken_away(keeps: bool, mean: bool) -> None:
-    """A head turns by 20 degrees to both sides. Its corrections grow with the turn; one timestep has more of its own."""
+    """A head turns by 20 degrees to both sides. Its corrections grow with the turn; one timestep has a larger one."""
     tracked = replace(_still_face(41), head_rotation=torch.zeros(41, 3))
     angles = torch.linspace(-0.35, 0.35, 41)
     tracked.head_rotation[:, 1] = angles
@@ -363,7 +363,8 @@ def test_corrections_that_follow_the_turns_are_taken_away(keeps: bool, mean: boo
         for index in range(41):
             face, groups = track.face(index), track.parameter_groups(index)
             face.head_rotation[0, 1] += 0.01 + 0.05 * angles[index] + (0.02 if index == 20 else 0.0)
-            face.head_translation[0] += tracked.T_world_head[index, :3, :3] @ torch.tensor([0.004, 0, 0]) * angles[index]
+            shift = torch.tensor([0.004, 0, 0]) * angles[index]
+            face.head_translation[0] += tracked.T_world_head[index, :3, :3] @ shift
             for group in groups:
                 next(iter(group.moments.values())).step += 1
     track.steady_pose()

@@ -36,8 +36,12 @@ def test_a_camera_aside_sees_a_true_tracking_where_it_sees_the_person() -> None:
     moved[:3, 3] = 1.1 * view[:3, 3] - moved[:3, :3] @ shift
     own = replace(true, viewmat=torch.from_numpy(moved).float())
     front = Front(true, own, points.mean(0), tracked.mean(0))
+    assert front.scale == pytest.approx(1 / 1.1)
+    behind = front.behind(np.array([0.0, 0.6, 0.8]))
+    expected = 1.1 * (points.mean(0) - 0.08 * np.array([0.0, 0.6, 0.8])) @ turn.T + shift
+    np.testing.assert_allclose(behind.tracked_middle, expected, atol=1e-6)
     aside = _camera(0.5, (0.5, 0.1, 0.7))
-    placed = camera_beside(aside, front)
+    placed = camera_beside(aside, behind)
     seen, _ = placed.project(torch.from_numpy(tracked).float())
     expected, _ = aside.project(torch.from_numpy(points).float())
     torch.testing.assert_close(seen, expected, atol=1e-2, rtol=0)

@@ -30,6 +30,8 @@ from mien.training.coverage import coverage
 from mien.training.sequence import composite
 
 AVATAR, MESH = "avatar", "mesh"
+_DEPTH_OF_MIDDLE = 0.08
+"""Distance of the head's middle behind that of the face, in metres."""
 Figures = dict[str, dict[str, Any]]
 """Mean figures (`mean_scores`) by angle and by what is scored."""
 
@@ -73,23 +75,47 @@ def angle_names() -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """The front camera at one moment, as it truly is and as the tracking has it, and the face before both."""
+    """The front camera at one moment, as it truly is and as the tracking has it, and the head before both."""
 
     true: Camera
     tracked: Camera
     true_middle: Float[np.ndarray, " 3"]
-    """Middle of the true face in the true world, in metres."""
+    """Middle of the true head in the true world, in metres."""
     tracked_middle: Float[np.ndarray, " 3"]
-    """Middle of the same vertices of the tracked face in the tracking's world, in its metres."""
+    """Middle of the tracked head in the tracking's world, in its metres."""
+
+    @property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """The rotation from the true world to that of the tracking: both cameras look the same way."""
+        true, own = (one.viewmat[:3, :3].double().numpy() for one in (self.true, self.tracked))
+        return own.T @ true
+
+    @property
+    def scale(self) -> float:
+        """Size of the tracking's metres in the front picture, as a share of that of true metres."""
+        true, own = (
+            one.K[0, 0].item() / _before(one, middle)[2]
+            for one, middle in ((self.true, self.true_middle), (self.tracked, self.tracked_middle))
+        )
+        return own / true
+
+    def behind(self, ahead: Float[np.ndarray, " 3"], distance: float = _DEPTH_OF_MIDDLE) -> "Front":
+        """With points at a distance in true metres behind these ones. `ahead` is where the true head looks."""
+        back = -distance * ahead
+        return replace(
+            self,
+            true_middle=self.true_middle + back,
+            tracked_middle=self.tracked_middle + self.rotation @ back / self.scale,
+        )
 
 
 def camera_beside(camera: Camera, front: Front) -> Camera:
     """A true camera in the world of a tracking, which sees the avatar as it sees the person.
 
     Cameras stand beside each other as they truly do: their rotations relative to the front camera are exact. The front
-    camera itself becomes the tracking's own, so that the avatar is seen from the front as it was trained. The face
-    therefore has the tracked place and size in the front picture, and a camera aside keeps its distance relative to the
-    front camera's. Focal lengths differ from the true ones as much as the front camera's does.
+    camera itself becomes the tracking's own, so that the avatar is seen from the front as it was trained. The middle of
+    the head therefore has the tracked place and size in the front picture, and a camera aside has the same distance
+    from it relative to the front camera's. Focal lengths differ from the true ones as much as the front camera's does.
 
     A similarity that aligns the tracked vertices with the true ones would do for a perfect shape. But vertices that are
     off by a millimetre along the skin make it half a percent too large or small, and shift it by a quarter of a pixel.
@@ -98,25 +124,25 @@ def camera_beside(camera: Camera, front: Front) -> Camera:
         camera: The camera in the true world.
         front: The front camera.
     """
-    side, true, own = (one.viewmat.double().numpy() for one in (camera, front.true, front.tracked))
-    focal = (front.tracked.K.diagonal() / front.true.K.diagonal()).double().numpy()
-    lens, true_lens = camera.K.double().numpy(), front.true.K.double().numpy()
-    near, far = _before(own, front.tracked_middle), _before(true, front.true_middle)
-    # The point at the true distance that the front camera sees where the tracking sees the face.
-    pixel = front.tracked.K.double().numpy() @ near / near[2]
+    side, true = (one.viewmat.double().numpy() for one in (camera, front.true))
+    lens, true_lens, tracked_lens = (one.K.double().numpy() for one in (camera, front.true, front.tracked))
+    near, far = _before(front.tracked, front.tracked_middle), _before(front.true, front.true_middle)
+    # The point at the true distance that the true front camera sees where the tracking sees the head.
+    pixel = tracked_lens @ near / near[2]
     point = true[:3, :3].T @ (np.linalg.solve(true_lens, pixel) * far[2] - true[:3, 3])
-    seen = _before(side, point)
     own_lens = lens.copy()
-    own_lens[[0, 1], [0, 1]] *= focal[:2]
-    place = np.linalg.solve(own_lens, lens @ seen) * near[2] / far[2]
+    own_lens[[0, 1], [0, 1]] *= (tracked_lens.diagonal() / true_lens.diagonal())[:2]
+    place = np.linalg.solve(own_lens, lens @ _before(camera, point)) * near[2] / far[2]
     moved = np.eye(4)
-    moved[:3, :3] = side[:3, :3] @ true[:3, :3].T @ own[:3, :3]
+    moved[:3, :3] = side[:3, :3] @ front.rotation.T
     moved[:3, 3] = place - moved[:3, :3] @ front.tracked_middle
-    return replace(camera, K=torch.from_numpy(own_lens).to(camera.K), viewmat=torch.from_numpy(moved).to(camera.viewmat))
+    view = torch.from_numpy(moved).to(camera.viewmat)
+    return replace(camera, K=torch.from_numpy(own_lens).to(camera.K), viewmat=view)
 
 
-def _before(view: Float[np.ndarray, "4 4"], point: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+def _before(camera: Camera, point: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
     """A point of the world in a camera's frame."""
+    view = camera.viewmat.double().numpy()
     return view[:3, :3] @ point + view[:3, 3]
 
 
@@ -148,8 +174,9 @@ def score_side_views(
     def drawn(view: _View) -> _Job:
         timestep = pictures.timesteps[view.moment]
         points = model(tracking.face[timestep])[0].numpy()[truth.vertex_index].astype(np.float64)
-        front = Front(cameras[0], tracking.cameras[0], true_points[view.moment].mean(0), points.mean(0))
-        camera = camera_beside(cameras[view.camera], front)
+        face = Front(cameras[0], tracking.cameras[0], true_points[view.moment].mean(0), points.mean(0))
+        ahead = truth.tracking.face[view.moment].T_world_head[0, :3, 2].double().numpy()
+        camera = camera_beside(cameras[view.camera], face.behind(ahead))
         gaussians = experiment.avatar.pose(used[timestep]).gaussians.timestep(0)
         place = (view.moment, view.camera)
         mask = head_cutter(model, neck, used[timestep])(np.asarray(pictures.capture.mattes[place]), camera)

@@ -80,7 +80,7 @@ class FaceTrack:
 
     @torch.no_grad()
     def steady_pose(self) -> None:
-        """Take from the corrections of the head's pose what the settings do not allow: their mean, and what follows turns.
+        """Take their mean and what follows the head's turns from the corrections of its pose, if settings ask for it.
 
         Only the sum of Gaussians and poses shows in the pictures of one camera, so both could move together, and a head
         that is too deep could turn less.

@@ -170,9 +170,11 @@ class FrameOrder:
         return self._frames[self._order[step % len(self._frames)]], epoch
 
 
-def resolved_background(settings: TrainSettings, *, filled: bool) -> TrainSettings:
-    """The settings with a background that depends on nothing else: `auto` is random for filled sides, else white."""
-    return replace(settings, background="random" if filled else "white") if settings.background == "auto" else settings
+def resolved(settings: TrainSettings, *, filled: bool) -> TrainSettings:
+    """The settings without `auto`: filled sides have random backgrounds and cleaned edges, others white and filmed."""
+    if settings.background == "auto":
+        settings = replace(settings, background="random" if filled else "white")
+    return replace(settings, edges="cleaned" if filled else "filmed") if settings.edges == "auto" else settings
 
 
 def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]:

@@ -17,6 +17,7 @@ from mien.face import FaceModel, part_boxes
 from mien.locks import read_beside_writers
 from mien.pictures import Box
 from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, read_tracking
+from mien.training.foreground import foreground_colors
 from mien.training.hidden import hidden_triangles
 
 _CACHE_BYTES = 1 << 30
@@ -133,6 +134,7 @@ class Targets:
         like: Cameras and targets have its float dtype and its device.
         face_model: The face model, on the CPU, if targets shall have the boxes around eyes and mouth.
         inside: The triangles inside the head, if targets shall say which of them are hidden. Needs `face_model`.
+        cleaned: Whether soft edges have the colours of the person alone (`foreground_colors`).
     """
 
     def __init__(
@@ -143,8 +145,10 @@ class Targets:
         like: Tensor = _ON_CPU,
         face_model: FaceModel | None = None,
         inside: Bool[Tensor, " f"] | None = None,
+        *,
+        cleaned: bool = False,
     ):
-        self._sequence = sequence
+        self._sequence, self._cleaned = sequence, cleaned
         longest = max(sequence.capture.width, sequence.capture.height)
         scale = min(1.0, resolution / longest) if resolution > 0 else 1.0
         self.width = max(1, round(sequence.capture.width * scale))
@@ -154,6 +158,8 @@ class Targets:
         self._like = like
         self._on_cpu = like.device.type == "cpu" and like.dtype == torch.float32
         self._cache: dict[tuple[int, int, bytes], Target] = {}
+        self._people: dict[tuple[int, int], np.ndarray] = {}
+        """Cleaned pictures that will be composited on other backgrounds."""
         self._face_model, self._inside = face_model, inside
         self._boxes: dict[tuple[int, int], tuple[Box, tuple[Box, ...], Tensor | None]] = {}
         """Boxes of the mattes and of the parts, and hidden triangles, by timestep and camera."""
@@ -174,7 +180,7 @@ class Targets:
 
     def composed(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool) -> Target:
         """The target, made anew in the CPU's memory. `keep` caches it. One other thread may do this."""
-        target = self._compose(timestep, camera, background)
+        target = self._compose(timestep, camera, background, again=not keep)
         if keep and len(self._cache) < self._max_cached:
             self._cache[timestep, camera, background.tobytes()] = target
         return target
@@ -183,8 +189,8 @@ class Targets:
         """The target with the dtype and device of the cameras."""
         return target if self._on_cpu else target.to(self._like)
 
-    def _compose(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"]) -> Target:
-        image = self._resize(self._sequence.capture.images[timestep, camera])
+    def _compose(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], *, again: bool) -> Target:
+        image = self._image(timestep, camera, again=again)
         # A copy: the pages of a mapped file are given back.
         matte = np.array(self._resize(self._sequence.scoring[timestep, camera]))
         boxes = self._boxes.get((timestep, camera))
@@ -194,6 +200,20 @@ class Targets:
         picture, colour = composite(image, matte, background, boxes[0]), torch.from_numpy(background) / 255
         target = Target(torch.from_numpy(picture), torch.from_numpy(matte), boxes[0], colour, *boxes[1:])
         return target.pinned() if self._like.is_cuda else target
+
+    def _image(self, timestep: int, camera: int, *, again: bool) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture at training resolution. `again` says that another background will need it."""
+        capture = self._sequence.capture
+        if not self._cleaned:
+            return self._resize(capture.images[timestep, camera])
+        kept = self._people.get((timestep, camera))
+        if kept is not None:
+            return kept
+        pictures = (self._resize(part[timestep, camera]) for part in (capture.images, capture.mattes))
+        image = foreground_colors(*(np.ascontiguousarray(picture) for picture in pictures))
+        if again and len(self._people) < self._max_cached:
+            self._people[timestep, camera] = image
+        return image
 
     @torch.no_grad()
     def _tracked(self, timestep: int, camera: int) -> tuple[tuple[Box, ...], Tensor | None]:

@@ -49,7 +49,7 @@ from mien.training.frames import (
     camera_extent,
     density_random,
     expression_rarity,
-    resolved_background,
+    resolved,
     training_frames,
 )
 from mien.training.hair_surface import EVERY, hair_surface
@@ -120,13 +120,15 @@ def train(
         covers = settings.inside != "free" and state.avatar.triangles() is not None
         inside = inside_triangles(face_model) if covers else None
         parts_of = face_model if method_config.photometric.needs_parts or inside is not None else None
+        settings = resolved(settings, filled=state.unseen is not None and state.unseen.fills)
+        cleaned = settings.edges == "cleaned"
         targets = [
-            Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside) for sequence in sequences
+            Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside, cleaned=cleaned)
+            for sequence in sequences
         ]
         faces = [sequence.tracking.face for sequence in sequences]
         telling = telling_frames(faces, sequences, frames, _TELLING, _TELLING)
         data = TrainingData(order, tuple(targets), extent, tuple(telling))
-        settings = resolved_background(settings, filled=state.unseen is not None and state.unseen.fills)
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
         covered = None if state.unseen is None else state.unseen.coverage
         write_results(run_dir, state, covered or coverage(face_model, sequences, faces, frames))
