@@ -53,7 +53,7 @@ def test_loading_does_not_disturb_random_numbers(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no trained avatar"):
+    with pytest.raises(UserError, match="holds no trained avatar \\(no avatar.json\\)"):
         load_avatar(tmp_path)
     write_avatar(tmp_path, new_avatar())
     edit_json(tmp_path / "avatar.json", lambda content: None)

@@ -151,7 +151,7 @@ def test_a_run_that_is_being_trained_cannot_be_rendered_yet(
             assert f"process {other.pid} on" in line
             assert line.endswith("; try again when it is done\n")
         assert main(render) == 2
-        assert "holds no trained avatar" in capsys.readouterr().err
+        assert "its training was not finished; run the same `mien train`" in capsys.readouterr().err
     finally:
         shutil.rmtree(run)
 
