@@ -79,8 +79,8 @@ def _load_avatar(folder: Path) -> Avatar:
     if not (folder / "avatar.json").is_file():
         if (folder / "config.json").is_file():
             raise UserError(
-                f"{folder}: holds no trained avatar, because its training was not finished; run the same `mien train` or "
-                "`mien create` again, which goes on from its last checkpoint"
+                f"{folder}: holds no trained avatar, because its training was not finished; run the same `mien train` "
+                "or `mien create` again, which goes on from its last checkpoint"
             )
         raise UserError(
             f"{folder}: holds no trained avatar (no avatar.json); train one with `mien train` or `mien create`"
