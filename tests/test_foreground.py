@@ -1,26 +1,31 @@
 """Colours of the person alone at soft edges of the matte."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from mien.training.foreground import foreground_colors
+import train_toy
+from mien.training import train
+from mien.training.foreground import foreground_colors, soft_pixels
 from mien.training.sequence import Targets, composite
 from toy_scene import toy_sequence
 
-PERSON, WALL = np.array([150.0, 90.0, 60.0]), np.array([210.0, 220.0, 235.0])
+WALL = np.array([210.0, 220.0, 235.0])
 
 
-def _filmed(side: int = 480) -> tuple[np.ndarray, np.ndarray]:
-    """A brown disc with a soft rim of 8 pixels and a brighter lower half, before a light wall; and its matte."""
+def _filmed(side: int = 480, red: float = 150.0) -> tuple[np.ndarray, np.ndarray]:
+    """A disc with a soft rim of 8 pixels and a darker lower half, before a light wall; and its matte."""
     rows, columns = np.mgrid[:side, :side] - side / 2
     alpha = np.clip((0.3 * side - np.hypot(rows, columns)) / 8 + 0.5, 0, 1)
     matte = np.rint(alpha * 255).astype(np.uint8)
     share = matte[..., None] / 255.0
-    return np.rint(share * _person(side) + (1 - share) * WALL).astype(np.uint8), matte
+    return np.rint(share * _person(side, red) + (1 - share) * WALL).astype(np.uint8), matte
 
 
-def _person(side: int) -> np.ndarray:
-    return PERSON + np.where(np.arange(side) > side / 2, 20.0, 0.0)[:, None, None]
+def _person(side: int, red: float = 150.0) -> np.ndarray:
+    return np.array([red, 90.0, 60.0]) - np.where(np.arange(side) > side / 2, 20.0, 0.0)[:, None, None]
 
 
 def test_soft_edges_have_the_colour_of_the_person() -> None:
@@ -46,23 +51,62 @@ def test_solid_pixels_stay_and_empty_ones_are_black() -> None:
 def test_only_what_is_near_the_edge_counts() -> None:
     """Another wall far from the head changes nothing; one beside it does."""
     image, matte = _filmed()
-    found = foreground_colors(image, matte)
+    found, soft = foreground_colors(image, matte), soft_pixels(matte)
     far, near = image.copy(), image.copy()
     far[:, :10] = 0
-    near[:, :150] = 0
+    near[matte == 0] = 0
     assert np.array_equal(foreground_colors(far, matte), found)
-    assert not np.array_equal(foreground_colors(near, matte), found)
+    assert (foreground_colors(near, matte)[soft] != found[soft]).any()
 
 
-@pytest.mark.parametrize("keep", [True, False])
-def test_training_pictures_are_cleaned_with_the_capture_s_matte(keep: bool) -> None:
+def test_large_pictures_are_cleaned_as_well() -> None:
+    """A window of 273 pixels holds a sum of colours that 32 bits do not."""
+    image, matte = _filmed(3000, 250.0)
+    part = (slice(1400, 1600), slice(2300, 2500))
+    share, soft = matte[part][..., None] / 255.0, soft_pixels(matte[part])
+    error = np.abs(foreground_colors(image, matte)[part] - _person(3000, 250.0)[1400:1600]) * share
+    assert error[soft].mean() < 3
+
+
+def test_training_pictures_are_cleaned_with_the_capture_s_matte(monkeypatch: pytest.MonkeyPatch) -> None:
     """The cut at the neck is no edge of the person; the scored mask only says what is shown."""
     _, sequence = toy_sequence(2, 32)
+    cut = np.array(sequence.scoring)
+    cut[:, :, 18:] //= 2
+    sequence = replace(sequence, scoring=cut)
     background = np.array([10, 20, 30], np.uint8)
     image, matte = (np.array(part[1, 0]) for part in (sequence.capture.images, sequence.capture.mattes))
-    expected = composite(foreground_colors(image, matte), np.array(sequence.scoring[1, 0]), background)
-    targets = Targets(sequence, 0, cleaned=True)
-    for _ in range(2):
-        assert np.array_equal(targets.target(1, 0, background, keep=keep).picture.numpy(), expected)
-    plain = Targets(sequence, 0).target(1, 0, background, keep=keep).picture.numpy()
-    assert np.array_equal(plain, composite(image, np.array(sequence.scoring[1, 0]), background))
+    assert soft_pixels(matte).any()
+    expected = composite(foreground_colors(image, matte), cut[1, 0], background)
+    cleaned: list[int] = []
+
+    def counted(*pictures: np.ndarray) -> np.ndarray:
+        cleaned.append(1)
+        return foreground_colors(*pictures)
+
+    monkeypatch.setattr("mien.training.sequence.foreground_colors", counted)
+    for keep in (True, False):
+        targets = Targets(sequence, 0, cleaned=True)
+        cleaned.clear()
+        for _ in range(2):
+            assert np.array_equal(targets.target(1, 0, background, keep=keep).picture.numpy(), expected)
+        other = targets.target(1, 0, 255 - background, keep=keep).picture.numpy()
+        assert np.array_equal(other, composite(foreground_colors(image, matte), cut[1, 0], 255 - background))
+        assert len(cleaned) == (2 if keep else 1), "once for each kept picture, or once for all backgrounds"
+    plain = Targets(sequence, 0).target(1, 0, background, keep=False).picture.numpy()
+    assert np.array_equal(plain, composite(image, cut[1, 0], background))
+
+
+@pytest.mark.parametrize("edges", ["filmed", "cleaned"])
+def test_training_reads_the_setting(edges: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    face_model, sequence = toy_sequence(6, 32)
+    asked: list[int] = []
+
+    def counted(*pictures: np.ndarray) -> np.ndarray:
+        asked.append(1)
+        return foreground_colors(*pictures)
+
+    monkeypatch.setattr("mien.training.sequence.foreground_colors", counted)
+    settings = replace(train_toy.SETTINGS, edges=edges)  # type: ignore[arg-type]
+    train([sequence], face_model, train_toy.CONFIG, settings, tmp_path)
+    assert bool(asked) == (edges == "cleaned")

@@ -27,7 +27,13 @@ from mien.render.rendering import Rendering
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.training import TrainSettings, held_out
 from mien.training.adam import Adam
-from mien.training.face_track import FaceTrack, mean_pose_correction, spread_corrections, without_turns
+from mien.training.face_track import (
+    FaceTrack,
+    mean_pose_correction,
+    spread_corrections,
+    turns_from_mean,
+    without_turns,
+)
 from mien.training.frames import (
     FrameOrder,
     background_at,
@@ -38,7 +44,7 @@ from mien.training.frames import (
 from mien.training.losses import picture_losses
 from mien.training.photometric import photometric_loss
 from mien.training.sequence import Target, Targets, composite
-from mien.training.trainer import start
+from mien.training.trainer import start, tuning_for
 from toy_scene import toy_face, toy_sequence
 
 
@@ -378,12 +384,35 @@ def test_corrections_that_follow_the_turns_are_taken_away(keeps: bool, mean: boo
 
 
 def test_a_head_that_hardly_turns_keeps_its_corrections() -> None:
-    tracked = replace(_still_face(40), head_rotation=torch.zeros(40, 3))
-    tracked.head_rotation[:, 1] = torch.linspace(-0.004, 0.004, 40)
-    shifts = torch.zeros(40, 3)
-    shifts[:, 0] = torch.linspace(-0.001, 0.001, 40)
-    _, rest = without_turns(tracked, torch.zeros(40, 3), shifts, mean=True)
-    torch.testing.assert_close(rest, shifts, atol=3e-5, rtol=0)
+    away = torch.zeros(40, 3, dtype=torch.float64)
+    away[:, 1] = torch.linspace(-0.004, 0.004, 40)
+    corrections = torch.zeros(40, 6)
+    corrections[:, 3] = torch.linspace(-0.001, 0.001, 40)
+    rest = without_turns(corrections, away, torch.zeros(40, dtype=torch.int64))
+    torch.testing.assert_close(rest, corrections, atol=3e-5, rtol=0)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_corrections_may_follow_turns_that_several_cameras_see(count: int) -> None:
+    _, sequence = toy_sequence(2, 16)
+    cameras = tuple(sequence.tracking.cameras) * count
+    seen = replace(sequence, tracking=replace(sequence.tracking, cameras=cameras))
+    assert tuning_for(FaceTuning(keep_turns=True), [sequence, seen]).keep_turns == (count == 1)
+
+
+def test_what_tells_sequences_apart_does_not_count_as_a_turn() -> None:
+    """Two sequences look to different sides, and one of them is 4 mm off: neither follows turns within a sequence."""
+    angles = torch.cat([torch.linspace(-0.4, -0.2, 20), torch.linspace(0.2, 0.4, 20)])
+    tracked = replace(_still_face(40), head_rotation=torch.stack([0 * angles, angles, 0 * angles], 1))
+    away, sequence = turns_from_mean(tracked), torch.arange(2).repeat_interleave(20)
+    torch.testing.assert_close(away[:, 1].float(), angles, atol=1e-6, rtol=0)
+    corrections = torch.zeros(40, 6)
+    corrections[20:, 3] = 0.004
+    torch.testing.assert_close(without_turns(corrections, away, sequence), corrections, atol=1e-9, rtol=0)
+    corrections[:, 4] = 0.01 * angles
+    rest = without_turns(corrections, away, sequence)
+    assert float(rest[:, 4].abs().max()) < 0.2 * 0.004
+    torch.testing.assert_close(rest[:, 3], corrections[:, 3], atol=1e-9, rtol=0)
 
 
 def _still_face(timesteps: int) -> FaceParams:

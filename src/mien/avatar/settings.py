@@ -99,8 +99,9 @@ class FaceTuning:
     """Whether the corrections of the head's pose have a mean of zero, in the head's own frame. With one camera, heads
     and Gaussians otherwise move away from the camera together, which shows from aside."""
     keep_turns: bool = False
-    """Whether no correction of the head's pose follows the head's turns. A head that is too deep otherwise turns less,
-    which a front camera hardly sees and which shows from aside. It is used only with one camera."""
+    """Whether what follows the head's turns is removed from the corrections of its pose. A head that is too deep
+    otherwise turns less, which a front camera hardly sees and which shows from aside. It is used only with one
+    camera."""
     within_bounds: bool = False
     """Whether expression coefficients stay within the face model's bounds. Those that were tracked beyond a bound may
     stay there."""

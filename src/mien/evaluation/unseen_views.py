@@ -75,7 +75,7 @@ def angle_names() -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """The front camera at one moment, as it truly is and as the tracking has it, and the head before both."""
+    """The front camera at one moment, as it truly is and as the tracking has it, and the head in front of both."""
 
     true: Camera
     tracked: Camera
@@ -100,7 +100,12 @@ class Front:
         return own / true
 
     def behind(self, ahead: Float[np.ndarray, " 3"], distance: float = _DEPTH_OF_MIDDLE) -> "Front":
-        """With points at a distance in true metres behind these ones. `ahead` is where the true head looks."""
+        """This front camera, with both middles moved back by a distance in true metres.
+
+        Args:
+            ahead: Direction in which the true head looks, in the true world.
+            distance: The distance.
+        """
         back = -distance * ahead
         return replace(
             self,
@@ -115,7 +120,8 @@ def camera_beside(camera: Camera, front: Front) -> Camera:
     Cameras stand beside each other as they truly do: their rotations relative to the front camera are exact. The front
     camera itself becomes the tracking's own, so that the avatar is seen from the front as it was trained. The middle of
     the head therefore has the tracked place and size in the front picture, and a camera aside has the same distance
-    from it relative to the front camera's. Focal lengths differ from the true ones as much as the front camera's does.
+    from it relative to the front camera's. Focal lengths and principal points differ from the true ones as the front
+    camera's do.
 
     A similarity that aligns the tracked vertices with the true ones would do for a perfect shape. But vertices that are
     off by a millimetre along the skin make it half a percent too large or small, and shift it by a quarter of a pixel.
@@ -132,6 +138,7 @@ def camera_beside(camera: Camera, front: Front) -> Camera:
     point = true[:3, :3].T @ (np.linalg.solve(true_lens, pixel) * far[2] - true[:3, 3])
     own_lens = lens.copy()
     own_lens[[0, 1], [0, 1]] *= (tracked_lens.diagonal() / true_lens.diagonal())[:2]
+    own_lens[:2, 2] += (tracked_lens - true_lens)[:2, 2]
     place = np.linalg.solve(own_lens, lens @ _before(camera, point)) * near[2] / far[2]
     moved = np.eye(4)
     moved[:3, :3] = side[:3, :3] @ front.rotation.T

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.avatar import FaceTuning, Moments, ParameterGroup
@@ -14,7 +14,8 @@ from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 _FIELDS = ("expression", "joints", "head_rotation", "head_translation")
 _STILL = 0.02
-"""Standard deviation of a head's turns below which they hardly count as turns, in radians."""
+"""Standard deviation of a head's turns at which half of what follows them is removed, in radians. Less is removed of
+what follows smaller turns, which explain less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,7 @@ class FaceTrack:
         tuning: Whether and how fast they change.
         lengths: Number of timesteps of each sequence. Default: one sequence.
         bounds: Range of each expression coefficient, for settings that keep to it. Default: no bounds.
+        away: `turns_from_mean` of `face`. By default it is computed, which waits for a GPU that holds `face`.
     """
 
     def __init__(
@@ -43,6 +45,7 @@ class FaceTrack:
         tuning: FaceTuning,
         lengths: Items[int] = (),
         bounds: Float[Tensor, "e 2"] | None = None,
+        away: Float[Tensor, "t 3"] | None = None,
     ):
         self._start = face.detach()
         self._bounds = None
@@ -53,6 +56,8 @@ class FaceTrack:
         assert sum(self._lengths) == len(face), "timesteps of the sequences"
         self._tuning = tuning
         self._fields = {name: getattr(self._start, name).clone() for name in _FIELDS}
+        self._away = turns_from_mean(self._start) if away is None else away
+        self._sequence = torch.arange(len(self._lengths)).repeat_interleave(torch.tensor(self._lengths))
         self._rows: dict[int, _Row] = {}
         names = _FIELDS if tuning.enabled else ()
         self._moments = {name: Moments.zeros(self._fields[name]) for name in names}
@@ -80,20 +85,22 @@ class FaceTrack:
 
     @torch.no_grad()
     def steady_pose(self) -> None:
-        """Take their mean and what follows the head's turns from the corrections of its pose, if settings ask for it.
+        """Remove from the corrections of head poses what the settings do not allow.
 
-        Only the sum of Gaussians and poses shows in the pictures of one camera, so both could move together, and a head
-        that is too deep could turn less.
+        That is their mean over all timesteps that were tuned, and what is linear in the head's turns. Only the sum of
+        Gaussians and poses shows in the pictures of one camera, so both could move together, and a head that is too
+        deep could turn less.
         """
         tuning, seen = self._tuning, self._seen()
         if not (tuning.enabled and (tuning.keep_mean_pose or tuning.keep_turns) and bool(seen.any())):
             return
         start, now = self._start[seen], replace(self._start, **self._fields)[seen]
-        turns, shifts = pose_corrections(start, now)
+        corrections = torch.cat(pose_corrections(start, now), 1)
         if tuning.keep_turns:
-            turns, shifts = without_turns(start, turns, shifts, mean=tuning.keep_mean_pose)
-        else:
-            turns, shifts = turns - turns.mean(0), shifts - shifts.mean(0)
+            corrections = without_turns(corrections, self._away[seen], self._sequence[seen])
+        if tuning.keep_mean_pose:
+            corrections = corrections - corrections.mean(0)
+        turns, shifts = corrections[:, :3], corrections[:, 3:]
         upright = start.T_world_head[:, :3, :3]
         self._fields["head_rotation"][seen] = axis_angle_from_matrix(upright @ matrix_from_axis_angle(turns))
         self._fields["head_translation"][seen] = start.head_translation + (upright @ shifts[:, :, None])[:, :, 0]
@@ -177,25 +184,32 @@ def mean_pose_correction(tracked: FaceParams, tuned: FaceParams) -> tuple[Float[
     return matrix_from_axis_angle(turns.mean(0)), shifts.mean(0)
 
 
-def without_turns(
-    tracked: FaceParams, turns: Float[Tensor, "t 3"], shifts: Float[Tensor, "t 3"], *, mean: bool
-) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t 3"]]:
-    """Corrections without the part that is linear in the head's turns from its mean pose, nor their mean if `mean`.
-
-    Turns of less than a degree explain nothing, so heads that hardly turn keep their corrections.
-    """
-    rotation = tracked.T_world_head[:, :3, :3].double()
+def turns_from_mean(tracked: FaceParams) -> Float[Tensor, "t 3"]:
+    """Rotation vectors of head poses from their mean, in radians, on the CPU."""
+    rotation = tracked.T_world_head[:, :3, :3].double().cpu()
     left, _, right = torch.linalg.svd(rotation.mean(0))
-    away = axis_angle_from_matrix((left @ right).mT @ rotation)
-    known = torch.cat([torch.ones_like(away[:, :1]), away - away.mean(0)], 1)
-    normal = known.T @ known
-    normal.diagonal()[1:] += len(away) * _STILL**2
-    corrections = torch.cat([turns, shifts], 1).double()
-    slopes = torch.linalg.solve(normal, known.T @ corrections)
-    if not mean:
-        slopes[0] = 0
-    rest = (corrections - known @ slopes).to(turns)
-    return rest[:, :3], rest[:, 3:]
+    left[:, 2] *= torch.linalg.det(left @ right).sign()
+    return axis_angle_from_matrix((left @ right).mT @ rotation)
+
+
+def without_turns(
+    corrections: Float[Tensor, "t c"], away: Float[Tensor, "t 3"], sequence: Int[Tensor, " t"]
+) -> Float[Tensor, "t c"]:
+    """Corrections without the part that is linear in the head's turns. Their mean stays.
+
+    All sequences share the slopes, which come from the turns within each of them: how a sequence differs from another
+    may have other reasons.
+
+    Args:
+        corrections: The corrections, on any device.
+        away: `turns_from_mean`, float64 on the CPU. Nothing here waits for a GPU.
+        sequence: Index of each timestep's sequence, on the CPU.
+    """
+    within = away.clone()
+    for index in sequence.unique():
+        within[sequence == index] -= away[sequence == index].mean(0)
+    slopes_of = torch.linalg.solve(within.T @ within + len(away) * _STILL**2 * torch.eye(3).to(away), within.T)
+    return corrections - (away - away.mean(0)).to(corrections) @ (slopes_of.to(corrections) @ corrections)
 
 
 def spread_corrections(tuned: Tensor, tracked: Tensor, seen: Tensor) -> None:

@@ -1,15 +1,16 @@
 """Colours of the person alone at soft edges of the matte.
 
-A pixel at a soft edge, such as a strand of hair, holds some of the filmed background. Composited over another
-background it keeps that, and an avatar learns it: light slivers on the edges of hair and neck, which show from aside
-and over dark pages. The colours are estimated by blur fusion (Forte, "Approximate Fast Foreground Colour Estimation",
-ICIP 2021): those of person and background are averaged near each pixel, and both share what the pixel's own colour
-differs from their mixture. A second pass with a small window sharpens the result of the first.
+A pixel at a soft edge, such as a strand of hair, holds some of the filmed background. When it is composited over
+another background, it keeps this share, and an avatar learns it: light slivers on the edges of hair and neck, which
+show from aside and over dark pages. The colours are estimated by blur fusion (Forte, "Approximate Fast Foreground
+Colour Estimation", ICIP 2021): colours of person and background are averaged near each pixel, and the rest, by which
+the pixel's own colour differs from their mixture, is divided between both. A second pass with a small window sharpens
+the result of the first.
 """
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 _WINDOWS = (1 / 11, 1 / 73)
 """Sides of the windows of both passes, as shares of the picture's longer side: 45 and 7 pixels of 500."""
@@ -48,15 +49,20 @@ def foreground_colors(image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray
     return result
 
 
+def soft_pixels(matte: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The pixels whose colours `foreground_colors` estimates: neither empty nor solid."""
+    return (matte > 0) & (matte < _SOLID)
+
+
 def _mean(
     colors: UInt8[np.ndarray, "h w 3"], weights: UInt8[np.ndarray, "h w"], window: int
 ) -> Float[np.ndarray, "h w 3"]:
     """Weighted mean of the colours around each pixel; 0 where all weights are 0."""
-    weighted = np.multiply(colors, weights[..., None], dtype=np.uint16)
-    # Sums of integers are exact in any order.
+    weighted = np.multiply(colors, weights[..., None], dtype=np.float32)
+    # Products and sums are integers, which a double holds exactly, so their order does not matter.
     total, weight = (
-        cv2.boxFilter(values, cv2.CV_32S, (window, window), normalize=False, borderType=cv2.BORDER_REFLECT)
-        for values in (weighted, weights.astype(np.uint16))
+        cv2.boxFilter(values, cv2.CV_64F, (window, window), normalize=False, borderType=cv2.BORDER_REFLECT)
+        for values in (weighted, weights.astype(np.float32))
     )
     return total.astype(np.float32) / np.maximum(weight, 1).astype(np.float32)[..., None]
 

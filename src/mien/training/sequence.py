@@ -17,7 +17,7 @@ from mien.face import FaceModel, part_boxes
 from mien.locks import read_beside_writers
 from mien.pictures import Box
 from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, read_tracking
-from mien.training.foreground import foreground_colors
+from mien.training.foreground import foreground_colors, soft_pixels
 from mien.training.hidden import hidden_triangles
 
 _CACHE_BYTES = 1 << 30
@@ -125,7 +125,9 @@ class Target:
 
 
 class Targets:
-    """The pictures of one sequence at training resolution, composited. Pictures over a fixed background are cached.
+    """The pictures of one sequence at training resolution, composited.
+
+    Pictures over a fixed background are cached, and of cleaned pictures over changing ones the soft pixels.
 
     Args:
         sequence: The sequence.
@@ -158,8 +160,9 @@ class Targets:
         self._like = like
         self._on_cpu = like.device.type == "cpu" and like.dtype == torch.float32
         self._cache: dict[tuple[int, int, bytes], Target] = {}
-        self._people: dict[tuple[int, int], np.ndarray] = {}
-        """Cleaned pictures that will be composited on other backgrounds."""
+        self._soft: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+        """Indices of soft pixels, in rows, and their cleaned colours, by timestep and camera."""
+        self._soft_room = _CACHE_BYTES // share
         self._face_model, self._inside = face_model, inside
         self._boxes: dict[tuple[int, int], tuple[Box, tuple[Box, ...], Tensor | None]] = {}
         """Boxes of the mattes and of the parts, and hidden triangles, by timestep and camera."""
@@ -204,15 +207,22 @@ class Targets:
     def _image(self, timestep: int, camera: int, *, again: bool) -> UInt8[np.ndarray, "h w 3"]:
         """The picture at training resolution. `again` says that another background will need it."""
         capture = self._sequence.capture
+        image = self._resize(capture.images[timestep, camera])
         if not self._cleaned:
-            return self._resize(capture.images[timestep, camera])
-        kept = self._people.get((timestep, camera))
-        if kept is not None:
-            return kept
-        pictures = (self._resize(part[timestep, camera]) for part in (capture.images, capture.mattes))
-        image = foreground_colors(*(np.ascontiguousarray(picture) for picture in pictures))
-        if again and len(self._people) < self._max_cached:
-            self._people[timestep, camera] = image
+            return image
+        kept = self._soft.get((timestep, camera))
+        if kept is None:
+            # Copies: the pages of a mapped file are given back.
+            image, matte = np.array(image), np.array(self._resize(capture.mattes[timestep, camera]))
+            place = np.flatnonzero(soft_pixels(matte)).astype(np.int32)
+            kept = place, foreground_colors(image, matte).reshape(-1, 3)[place]
+            size = kept[0].nbytes + kept[1].nbytes
+            if again and size <= self._soft_room:
+                self._soft_room -= size
+                self._soft[timestep, camera] = kept
+        else:
+            image = np.array(image)
+        image.reshape(-1, 3)[kept[0]] = kept[1]
         return image
 
     @torch.no_grad()

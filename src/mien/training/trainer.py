@@ -16,6 +16,7 @@ from torch import Tensor
 from mien import _native
 from mien.avatar import (
     Avatar,
+    FaceTuning,
     MethodConfig,
     Progress,
     load_avatar,
@@ -42,7 +43,7 @@ from mien.training.contribution import tidy
 from mien.training.coverage import coverage, telling_frames
 from mien.training.density_control import density_strategy
 from mien.training.density_control.gradient import GradientStrategy
-from mien.training.face_track import FaceTrack
+from mien.training.face_track import FaceTrack, turns_from_mean
 from mien.training.filmed import with_shown_angles
 from mien.training.frames import (
     FrameOrder,
@@ -255,6 +256,7 @@ def start(
     if settings.inside == "furnished" and avatar.triangles() is not None:
         known = None if unseen is None else unseen.coverage
         inside = inside_of(avatar, coverage(face_model, sequences, faces, frames) if known is None else known)
+    away = turns_from_mean(face)
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
@@ -264,13 +266,17 @@ def start(
     hair = hair_surface(avatar, unseen.prior) if unseen is not None and unseen.fills else None
     density = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
-    tuning = method_config.face_tuning
-    if any(len(sequence.tracking.cameras) > 1 for sequence in sequences):
-        tuning = replace(tuning, keep_turns=False)
-    track = FaceTrack(face, tuning, lengths, face_model.expression_bounds)
+    tuning = tuning_for(method_config.face_tuning, sequences)
+    track = FaceTrack(face, tuning, lengths, face_model.expression_bounds, away)
     return TrainingState(
         avatar, Adam(), density, track, {}, colors, unseen=unseen, inside=inside, aside=aside, hair=hair
     )
+
+
+def tuning_for(tuning: FaceTuning, sequences: Items[Sequence]) -> FaceTuning:
+    """The settings for these sequences: several cameras see how far a head turns, so corrections may follow turns."""
+    several = any(len(sequence.tracking.cameras) > 1 for sequence in sequences)
+    return replace(tuning, keep_turns=False) if several else tuning
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:

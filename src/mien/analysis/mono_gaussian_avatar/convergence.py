@@ -17,7 +17,15 @@ from mien.pictures import side_by_side, to_uint8
 from mien.progress import progress_bar
 from mien.render import rasterize
 from mien.threads import one_torch_thread
-from mien.training.frames import Frame, FrameOrder, camera_extent, expression_rarity, spread_frames, training_frames
+from mien.training.frames import (
+    Frame,
+    FrameOrder,
+    camera_extent,
+    expression_rarity,
+    resolved,
+    spread_frames,
+    training_frames,
+)
 from mien.training.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 
@@ -75,13 +83,18 @@ def _snapshots(
     context: Context, experiment: Experiment, frames: list[Frame], steps: list[int]
 ) -> list[tuple[int, int, list[torch.Tensor]]]:
     """Step, number of Gaussians and pictures of `frames` at each of some steps, from one training."""
-    settings, sequences = replace(context.settings, steps=context.options.steps), context.sequences
+    # This method fills no sides.
+    settings = resolved(replace(context.settings, steps=context.options.steps), filled=False)
+    sequences = context.sequences
     trained = training_frames(sequences, settings)
     weights = expression_rarity(sequences, trained) if settings.frame_order == "rare" else None
     order = FrameOrder(trained, settings.seed, weights)
     model, config = context.avatar.face_model, context.avatar.config
     parts_of = model if config.photometric.needs_parts else None
-    targets = tuple(Targets(one, settings.resolution, len(sequences), torch.zeros(()), parts_of) for one in sequences)
+    like, cleaned = torch.zeros(()), settings.edges == "cleaned"
+    targets = tuple(
+        Targets(one, settings.resolution, len(sequences), like, parts_of, cleaned=cleaned) for one in sequences
+    )
     data = TrainingData(order, targets, camera_extent(sequences, trained))
     found = []
     with one_torch_thread(), progress_bar("convergence", settings.steps) as advance:
