@@ -80,9 +80,9 @@ class Front:
     true: Camera
     tracked: Camera
     true_middle: Float[np.ndarray, " 3"]
-    """Middle of the true head in the true world, in metres."""
+    """Middle of the true face or head in the true world, in metres."""
     tracked_middle: Float[np.ndarray, " 3"]
-    """Middle of the tracked head in the tracking's world, in its metres."""
+    """Middle of the tracked face or head in the tracking's world, in its metres."""
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
@@ -99,14 +99,13 @@ class Front:
         )
         return own / true
 
-    def behind(self, ahead: Float[np.ndarray, " 3"], distance: float = _DEPTH_OF_MIDDLE) -> "Front":
-        """This front camera, with both middles moved back by a distance in true metres.
+    def behind(self, ahead: Float[np.ndarray, " 3"]) -> "Front":
+        """Return this front camera with both middles moved from that of the face to that of the head.
 
         Args:
             ahead: Direction in which the true head looks, in the true world.
-            distance: The distance.
         """
-        back = -distance * ahead
+        back = -_DEPTH_OF_MIDDLE * ahead
         return replace(
             self,
             true_middle=self.true_middle + back,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mien.avatar import FaceTuning, Moments, ParameterGroup
 from mien.face import FaceParams
-from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.rotation import align_centred, axis_angle_from_matrix, matrix_from_axis_angle
 
 _FIELDS = ("expression", "joints", "head_rotation", "head_translation")
 _STILL = 0.02
@@ -95,7 +95,7 @@ class FaceTrack:
         if not (tuning.enabled and (tuning.keep_mean_pose or tuning.keep_turns) and bool(seen.any())):
             return
         start, now = self._start[seen], replace(self._start, **self._fields)[seen]
-        corrections = torch.cat(pose_corrections(start, now), 1)
+        corrections = pose_corrections(start, now)
         if tuning.keep_turns:
             corrections = without_turns(corrections, self._away[seen], self._sequence[seen])
         if tuning.keep_mean_pose:
@@ -167,11 +167,11 @@ class FaceTrack:
                 own.copy_(state[name])
 
 
-def pose_corrections(tracked: FaceParams, tuned: FaceParams) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t 3"]]:
-    """What training changed in each head pose, in the tracked head frame: rotation vectors, and shifts in metres."""
+def pose_corrections(tracked: FaceParams, tuned: FaceParams) -> Float[Tensor, "t 6"]:
+    """Return training's changes of head poses in the tracked head frame: rotation vectors, then shifts in metres."""
     from_tracked = tracked.T_world_head[:, :3, :3].mT
     shift = from_tracked @ (tuned.head_translation - tracked.head_translation)[:, :, None]
-    return axis_angle_from_matrix(from_tracked @ tuned.T_world_head[:, :3, :3]), shift[:, :, 0]
+    return torch.cat([axis_angle_from_matrix(from_tracked @ tuned.T_world_head[:, :3, :3]), shift[:, :, 0]], 1)
 
 
 def mean_pose_correction(tracked: FaceParams, tuned: FaceParams) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:
@@ -180,16 +180,16 @@ def mean_pose_correction(tracked: FaceParams, tuned: FaceParams) -> tuple[Float[
     Gaussians and poses can move together during training, since only their sum shows in the pictures. On 16 cameras,
     the head moves by 1.6 mm, with a deviation between timesteps of 0.2 mm.
     """
-    turns, shifts = pose_corrections(tracked, tuned)
-    return matrix_from_axis_angle(turns.mean(0)), shifts.mean(0)
+    mean = pose_corrections(tracked, tuned).mean(0)
+    return matrix_from_axis_angle(mean[:3]), mean[3:]
 
 
 def turns_from_mean(tracked: FaceParams) -> Float[Tensor, "t 3"]:
-    """Rotation vectors of head poses from their mean, in radians, on the CPU."""
-    rotation = tracked.T_world_head[:, :3, :3].double().cpu()
-    left, _, right = torch.linalg.svd(rotation.mean(0))
-    left[:, 2] *= torch.linalg.det(left @ right).sign()
-    return axis_angle_from_matrix((left @ right).mT @ rotation)
+    """Return the rotation vectors of head poses from their mean, in radians, in float64 on the CPU."""
+    rotations = tracked.T_world_head[:, :3, :3].double().cpu()
+    # The rotation that is nearest to the mean matrix aligns the axes with its columns.
+    mean, _ = align_centred(np.eye(3), rotations.mean(0).T.numpy())
+    return axis_angle_from_matrix(torch.from_numpy(mean).mT @ rotations)
 
 
 def without_turns(
@@ -202,7 +202,7 @@ def without_turns(
 
     Args:
         corrections: The corrections, on any device.
-        away: `turns_from_mean`, float64 on the CPU. Nothing here waits for a GPU.
+        away: `turns_from_mean` of the same timesteps, on the CPU, so that nothing here waits for a GPU.
         sequence: Index of each timestep's sequence, on the CPU.
     """
     within = away.clone()

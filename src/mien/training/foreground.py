@@ -19,9 +19,9 @@ _SOLID = 252
 
 
 def foreground_colors(image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture with estimated colours of the person where the matte is soft, and 0 where it is empty.
+    """Return the picture with estimated colours of the person where the matte is soft, and 0 where it is empty.
 
-    Solid pixels keep their colours. Windows are added up in integers, so all processors give the same bytes.
+    Solid pixels keep their colours. Windows are added up exactly, so all processors give the same bytes.
 
     Args:
         image: The filmed picture, sRGB.
@@ -50,7 +50,7 @@ def foreground_colors(image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray
 
 
 def soft_pixels(matte: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The pixels whose colours `foreground_colors` estimates: neither empty nor solid."""
+    """Return the pixels whose colours `foreground_colors` estimates: neither empty nor solid."""
     return (matte > 0) & (matte < _SOLID)
 
 

@@ -210,19 +210,18 @@ class Targets:
         image = self._resize(capture.images[timestep, camera])
         if not self._cleaned:
             return image
-        kept = self._soft.get((timestep, camera))
+        image, kept = np.array(image), self._soft.get((timestep, camera))
         if kept is None:
-            # Copies: the pages of a mapped file are given back.
-            image, matte = np.array(image), np.array(self._resize(capture.mattes[timestep, camera]))
+            # A copy: the pages of a mapped file are given back.
+            matte = np.array(self._resize(capture.mattes[timestep, camera]))
             place = np.flatnonzero(soft_pixels(matte)).astype(np.int32)
             kept = place, foreground_colors(image, matte).reshape(-1, 3)[place]
-            size = kept[0].nbytes + kept[1].nbytes
+            size = sum(part.nbytes for part in kept)
             if again and size <= self._soft_room:
                 self._soft_room -= size
                 self._soft[timestep, camera] = kept
-        else:
-            image = np.array(image)
-        image.reshape(-1, 3)[kept[0]] = kept[1]
+        place, colors = kept
+        image.reshape(-1, 3)[place] = colors
         return image
 
     @torch.no_grad()
