@@ -1,20 +1,23 @@
-# make setup | web-packages | web | demo | test | test-312 | test-exact | sanitize | fuzz | lint | docs | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# make setup | web-packages | chromium | web | demo | test | test-312 | test-exact | sanitize | fuzz | lint | docs | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 PYTHON312 ?= $(shell for python in python3.12 $(HOME)/.pyenv/versions/3.12*/bin/python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 VENV ?= .venv
 BIN := $(VENV)/bin
 NATIVE := $(wildcard native/*.*) CMakeLists.txt
-UV_VERSION := 0.13.8
+# Nothing may be left out where MIEN_STRICT is set, as in CI: not tests that a missing program skips, either (tests/needs.py).
+UNLESS_STRICT := test -z "$$MIEN_STRICT"
+UV := uv==0.13.8
+GSPLAT := gsplat==1.5.3
 
-.PHONY: setup web-packages web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native lint format docs bench gpu lock clean
+.PHONY: setup web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native lint format docs bench gpu lock clean
 setup: $(VENV)/.built
 
-$(VENV)/.packages: requirements/lock.txt
+$(VENV)/.packages: requirements/lock.txt requirements/uv.txt
 	@"$(PYTHON)" -c "" 2>/dev/null || { echo "mien needs Python 3.11 or 3.12: install it, or run 'make PYTHON=/path/to/python3.11 ...'"; exit 1; }
 	@command -v $${CXX:-g++} >/dev/null || { echo "mien needs a C++20 compiler: install g++ 11 or newer"; exit 1; }
 	test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV)
-	test -x $(BIN)/uv || $(BIN)/python -m pip install --disable-pip-version-check uv==$(UV_VERSION)
+	test -x $(BIN)/uv || $(BIN)/python -m pip install --disable-pip-version-check --require-hashes -r requirements/uv.txt
 	@echo "Installing packages (torch alone is about 3 GB to download; this is the long part) ..."
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip sync --require-hashes requirements/lock.txt
 	touch $@
@@ -29,13 +32,23 @@ $(VENV)/.built: $(VENV)/.packages pyproject.toml $(NATIVE)
 
 build: setup
 
-# The web runtime's packages, for its build and its tests. Without npm, the tests that need them are skipped.
+# The web runtime's packages, for its build and its tests. Without npm, the tests that need them are skipped; MIEN_STRICT
+# makes that an error, here and below.
 web/node_modules/.installed: web/package-lock.json
 	npm ci --prefix web --ignore-scripts --no-audit --no-fund
 	touch $@
 
 web-packages:
-	@if command -v npm >/dev/null; then $(MAKE) web/node_modules/.installed; else echo "No npm: web/ cannot be built or tested. Install Node.js 20 or newer."; fi
+	@if command -v npm >/dev/null; then $(MAKE) web/node_modules/.installed; else echo "No npm: web/ cannot be built or tested. Install Node.js 20 or newer."; $(UNLESS_STRICT); fi
+
+# The browser of the tests of pages. Debian's package is installed where that needs no password: as root, as in containers.
+BROWSER := $(or $(MIEN_CHROMIUM),chromium chromium-browser google-chrome)
+chromium:
+	@for browser in $(BROWSER); do if command -v "$$browser" >/dev/null; then exit 0; fi; done; \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	  echo "Installing Chromium for the tests of pages ..."; \
+	  { apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq chromium; } >/dev/null && exit 0; fi; \
+	echo "No Chromium: pages cannot be tested. Run 'apt-get install chromium', or set MIEN_CHROMIUM to a Chromium's path."; $(UNLESS_STRICT)
 
 # dist/mien.js, and the page that `mien export` fills, which is committed.
 web: web/node_modules/.installed
@@ -45,14 +58,14 @@ demo: setup
 	$(BIN)/mien demo --out out/demo
 
 # One process a core, each with one thread (tests/conftest.py says how many).
-test: setup
+test: setup web-packages chromium
 	MIEN_THREADS=1 $(BIN)/pytest -n auto
 
 # A broad and fast part of the suite on Python 3.12, in an environment of its own. All of it: make test VENV=.venv312 PYTHON=python3.12
 PART := needs places arrays files startup cli rasterize rasterize_contract training_native training_resume runtime export motion
 test-312:
 	@if "$(PYTHON312)" -c "" 2>/dev/null; then $(MAKE) VENV=.venv312 PYTHON="$(PYTHON312)" test-312-part; \
-	else echo "No Python 3.12: skipped. Install it, or run 'make PYTHON312=/path/to/python3.12 test-312'."; fi
+	else echo "No Python 3.12: skipped. Install it, or run 'make PYTHON312=/path/to/python3.12 test-312'."; $(UNLESS_STRICT); fi
 
 test-312-part: setup
 	MIEN_THREADS=1 $(BIN)/pytest -n auto $(PART:%=tests/test_%.py)
@@ -86,6 +99,7 @@ fuzz: setup
 	  --lines 300 --heavy 10 --findings out/fuzz/findings.jsonl
 	$(MAKE) fuzz-native
 
+# pyright's wrapper asks the package index for a newer version unless it is told not to.
 lint: setup
 	$(BIN)/ruff check src tests examples benchmarks docs/site docs/pictures
 	$(BIN)/ruff format --check src tests examples benchmarks docs/site docs/pictures
@@ -93,7 +107,7 @@ lint: setup
 	$(BIN)/python tests/sizes.py
 	$(BIN)/typos
 	$(BIN)/lint-imports
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright --pythonpath $(BIN)/python
 
 format: setup
 	$(BIN)/ruff check --fix src tests examples benchmarks docs/site docs/pictures
@@ -110,6 +124,9 @@ lock: $(VENV)/.packages
 	$(BIN)/uv pip compile pyproject.toml --group dev --overrides requirements/overrides.txt --universal \
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --custom-compile-command "make lock" \
 	  -o requirements/lock.txt
+	for package in $(UV) $(GSPLAT); do echo "$$package" | $(BIN)/uv pip compile - --no-deps --universal --python-version 3.11 \
+	  --generate-hashes --no-emit-index-url --no-annotate --custom-compile-command "make lock" \
+	  -o "requirements/$${package%%==*}.txt" || exit 1; done
 
 bench: setup
 	$(BIN)/mien bench render
@@ -117,7 +134,7 @@ bench: setup
 # On a machine with an NVIDIA GPU and the CUDA toolkit (gsplat compiles its kernels at first use): the tests marked
 # gpu, then the figures for docs/results.md, into out/gpu.
 gpu: setup
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install 'gsplat>=1.5'
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --require-hashes --no-deps -r requirements/gsplat.txt
 	$(BIN)/pytest -m gpu
 	mkdir -p out/gpu
 	$(BIN)/mien bench render --device cuda --json > out/gpu/render.json

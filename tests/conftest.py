@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from needs import NO_GPU, NO_TEST_DATA, find_test_data, skipped_lines
+from needs import NO_GPU, NO_TEST_DATA, find_test_data, is_strict, skipped_lines, unexpected
 
 torch.set_num_threads(1)
 # The same examples on every machine, however busy it is.
@@ -46,8 +46,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: -slow[item.path])
 
 
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    # With workers, only the process that started them has a terminal reporter with all results.
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter and is_strict() and unexpected(_skip_reasons(reporter)) and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    skipped = terminalreporter.stats.get("skipped", [])
+    reasons = _skip_reasons(terminalreporter)
     terminalreporter.section("skipped")
-    for line in skipped_lines(report.longrepr[2] for report in skipped):
+    for line in skipped_lines(reasons):
         terminalreporter.write_line(line)
+    if is_strict() and (missing := unexpected(reasons)):
+        terminalreporter.write_line(f"MIEN_STRICT is set, so this is an error: {'; '.join(missing)}")
+
+
+def _skip_reasons(reporter: pytest.TerminalReporter) -> list[str]:
+    return [report.longrepr[2] for report in reporter.stats.get("skipped", [])]

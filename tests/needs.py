@@ -42,6 +42,22 @@ _REMEDIES = {
 }
 
 
+_EVERYWHERE = (NO_GPU, HAS_GPU, IS_ROOT, NO_INSTRUCTIONS)
+"""Reasons that depend on the machine alone. Others are a set-up that is not complete, which MIEN_STRICT makes an error."""
+_AREAS = {
+    "pages in a browser": (NO_CHROMIUM, NO_WEBGPU),
+    "the web runtime": (NO_NODE, NO_NODE_PACKAGES, NO_VALIDATOR, NO_SPLAT_TRANSFORM, NO_TASKS_VISION),
+    "real footage": (NO_TEST_DATA,),
+    "GPUs": (NO_GPU,),
+}
+"""Parts of the product that are not tested if tests are skipped for these reasons."""
+
+
+def is_strict() -> bool:
+    """Return whether tests may be skipped only for reasons that depend on the machine alone (MIEN_STRICT)."""
+    return bool(os.environ.get("MIEN_STRICT"))
+
+
 def find_test_data() -> Path | None:
     """Return the folder that MIEN_TEST_DATA names, or else shared/data beside the checkout, if it exists."""
     named = os.environ.get("MIEN_TEST_DATA")
@@ -56,12 +72,23 @@ def use_instructions(isa: str) -> None:
 
 
 def skipped_lines(reasons: Iterable[str]) -> list[str]:
-    """Count the skipped tests by reason, one line each, with the remedy if there is one."""
-    counts = Counter(reason.removeprefix("Skipped: ") for reason in reasons)
+    """Say what was not tested, then count the skipped tests by reason, one line each, with the remedy if there is one."""
+    counts = Counter(map(_reason, reasons))
     if not counts:
         return ["No test was skipped."]
-    lines = [f"{counts.total()} tests were skipped:"]
+    areas = [area for area, starts in _AREAS.items() if any(reason.startswith(starts) for reason in counts)]
+    many = "1 test was" if counts.total() == 1 else f"{counts.total()} tests were"
+    lines = [f"{many} skipped" + (f"; not tested: {', '.join(areas)}" if areas else "") + ":"]
     for reason, count in counts.most_common():
         remedy = next((f"; {remedy}" for start, remedy in _REMEDIES.items() if reason.startswith(start)), "")
         lines.append(f"{count:6}  {reason}{remedy}")
     return lines
+
+
+def unexpected(reasons: Iterable[str]) -> list[str]:
+    """Return the reasons that a complete set-up does not have, sorted."""
+    return sorted({reason for reason in map(_reason, reasons) if not reason.startswith(_EVERYWHERE)})
+
+
+def _reason(told: str) -> str:
+    return told.removeprefix("Skipped: ")

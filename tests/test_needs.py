@@ -1,15 +1,51 @@
-"""The summary of skipped tests names reason and remedy."""
+"""The summary of skipped tests says what was not tested, why, and the remedy; strict runs fail where a set-up is not complete."""
 
-from needs import IS_ROOT, NO_INSTRUCTIONS, NO_TEST_DATA, skipped_lines
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from needs import IS_ROOT, NO_CHROMIUM, NO_GPU, NO_INSTRUCTIONS, NO_NODE, NO_TEST_DATA, skipped_lines, unexpected
+
+TESTS = Path(__file__).parent
 
 
 def test_skipped_tests_are_counted_by_reason_with_a_remedy() -> None:
     reasons = [f"Skipped: {NO_TEST_DATA}", IS_ROOT, NO_TEST_DATA, f"{NO_INSTRUCTIONS}avx512", "because"]
     assert skipped_lines(reasons) == [
-        "5 tests were skipped:",
+        "5 tests were skipped; not tested: real footage:",
         "     2  no test data; set MIEN_TEST_DATA to the folder that holds it",
         "     1  root may write everywhere; run the tests as another user",
         "     1  this processor has no avx512; run them on one that has",
         "     1  because",
     ]
     assert skipped_lines([]) == ["No test was skipped."]
+    assert skipped_lines([IS_ROOT])[0] == "1 test was skipped:"
+
+
+def test_the_first_line_says_what_was_not_tested() -> None:
+    line = skipped_lines([NO_NODE, NO_GPU, NO_CHROMIUM])[0]
+    assert line == "3 tests were skipped; not tested: pages in a browser, the web runtime, GPUs:"
+
+
+def test_only_the_machine_excuses_a_skip() -> None:
+    assert unexpected([NO_GPU, IS_ROOT, f"Skipped: {NO_INSTRUCTIONS}avx512"]) == []
+    assert unexpected([NO_GPU, f"Skipped: {NO_CHROMIUM}", NO_CHROMIUM, "because"]) == ["because", NO_CHROMIUM]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize(("reason", "strict", "code"), [(NO_NODE, "", 0), (NO_NODE, "1", 1), (NO_GPU, "1", 0)])
+def test_a_strict_run_fails_where_a_program_is_missing(
+    tmp_path: Path, reason: str, strict: str, code: int, workers: int
+) -> None:
+    (tmp_path / "conftest.py").write_text((TESTS / "conftest.py").read_text())
+    (tmp_path / "test_one.py").write_text(
+        f"import pytest\n\ndef test_skips():\n    pytest.skip({reason!r})\n\ndef test_passes():\n    pass\n"
+    )
+    environment = {**os.environ, "MIEN_STRICT": strict, "PYTHONPATH": str(TESTS)}
+    command = [sys.executable, "-m", "pytest", "-q", "-n", str(workers), "-p", "no:cacheprovider", str(tmp_path)]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stdout + done.stderr
+    assert ("MIEN_STRICT is set" in done.stdout) == bool(code)

@@ -56,6 +56,29 @@ def test_the_committed_part_of_the_page_is_that_of_a_fresh_build(built: Path) ->
     assert fresh == TEMPLATE.read_text(), "webcam.html is older than web/: run `make web`, and commit it"
 
 
+def test_the_page_carries_the_notices_of_what_it_embeds(page: Path) -> None:
+    read = """(async () => {
+  await webcam;
+  const notices = document.getElementById("notices");
+  notices.open = true;
+  return [notices.innerText, notices.querySelector("pre").getBoundingClientRect().height];
+})()"""
+    text, height = browse(page, [read], WINDOW)["results"][0]
+    for part in (
+        "MediaPipe Authors",
+        "TensorFlow",
+        "OpenCV",
+        "XNNPACK",
+        "Protocol Buffers",
+        "Emscripten",
+        f"vision {VERSION}",
+    ):
+        assert part in text
+    for licence in ("Apache License\n", "BSD 3-Clause License", "MIT License"):
+        assert licence in text
+    assert height > 50
+
+
 RECORD = """(async () => {
   const viewer = await mien, camera = await webcam, log = { frames: [], faces: [], states: [] };
   const columns = %s.map((name) => viewer.avatar.expression_names.indexOf(name));

@@ -24,7 +24,7 @@ def check_device(name: DeviceName) -> None:
     if name == "cuda" and find_spec("gsplat") is None:
         raise UserError(
             "--device cuda: needs a CUDA GPU and gsplat, which is not installed; if there is such a GPU, install "
-            "gsplat with `.venv/bin/uv pip install 'gsplat>=1.5'` (it compiles its kernels at first use, with the CUDA "
+            "gsplat with `.venv/bin/uv pip install gsplat==1.5.3` (it compiles its kernels at first use, with the CUDA "
             f"toolkit's nvcc), {_OR_CPU}"
         )
 

@@ -6,6 +6,7 @@ webcam.html beside this file is built from web/ and committed. The landmarker co
 
 import base64
 import gzip
+import html
 import json
 import os
 import zipfile
@@ -15,6 +16,8 @@ from pathlib import Path
 from mien.errors import UserError
 
 TEMPLATE = Path(__file__).with_name("webcam.html")
+NOTICES = Path(__file__).with_name("webcam_notices.txt")
+"""Copyright notices and licences of what the page embeds. A new version of the package needs another look at them."""
 PACKAGE, VERSION = "@mediapipe/tasks-vision", "0.10.35"
 """The npm package, and the version that pages are tested with. Later versions send statistics to their maker."""
 PACKAGE_VARIABLE, MODEL_VARIABLE = "MIEN_TASKS_VISION", "MIEN_FACE_LANDMARKER"
@@ -72,7 +75,8 @@ def webcam_part(files: WebcamFiles) -> str:
         f'<script type="application/octet-stream" id="webcam-{name}">{_packed(path)}</script>'
         for name, path in paths.items()
     )
-    return TEMPLATE.read_text(encoding="utf-8").replace("{{parts}}", parts)
+    page = TEMPLATE.read_text(encoding="utf-8").replace("{{notices}}", html.escape(NOTICES.read_text(encoding="utf-8")))
+    return page.replace("{{parts}}", parts)
 
 
 def _packed(path: Path) -> str:

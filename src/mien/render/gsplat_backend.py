@@ -70,6 +70,6 @@ def _import_gsplat() -> ModuleType:
     try:
         import gsplat  # pyright: ignore[reportMissingImports]  # an optional package
     except ImportError as error:
-        remedy = "install it with `.venv/bin/uv pip install 'gsplat>=1.5'`"
+        remedy = "install it with `.venv/bin/uv pip install gsplat==1.5.3`"
         raise UserError(f"rendering on a GPU needs gsplat: {remedy}") from error
     return gsplat
