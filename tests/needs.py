@@ -43,7 +43,7 @@ _REMEDIES = {
 
 
 _EVERYWHERE = (NO_GPU, HAS_GPU, IS_ROOT, NO_INSTRUCTIONS)
-"""Reasons that depend on the machine alone. Others are a set-up that is not complete, which MIEN_STRICT makes an error."""
+"""Reasons that lie in the machine alone. Others mean an incomplete set-up; MIEN_STRICT makes them an error."""
 _AREAS = {
     "pages in a browser": (NO_CHROMIUM, NO_WEBGPU),
     "the web runtime": (NO_NODE, NO_NODE_PACKAGES, NO_VALIDATOR, NO_SPLAT_TRANSFORM, NO_TASKS_VISION),
@@ -72,7 +72,7 @@ def use_instructions(isa: str) -> None:
 
 
 def skipped_lines(reasons: Iterable[str]) -> list[str]:
-    """Say what was not tested, then count the skipped tests by reason, one line each, with the remedy if there is one."""
+    """Say what was not tested, then count the skipped tests by reason: one line each, with the remedy."""
     counts = Counter(map(_reason, reasons))
     if not counts:
         return ["No test was skipped."]

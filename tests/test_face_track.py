@@ -24,7 +24,7 @@ from mien.training.trainer import tuning_for
 from toy_scene import toy_face, toy_sequence
 
 ROUNDING = 1e-8
-"""Largest error of sums over 40 float32 corrections of 4 mm, in metres: they are added in other orders by other processors."""
+"""Largest error of sums over 40 float32 corrections of 4 mm, in metres. Processors add them in different orders."""
 
 
 def test_face_track_moves_only_the_timestep_that_was_used() -> None:

@@ -1,4 +1,4 @@
-"""The summary of skipped tests says what was not tested, why, and the remedy; strict runs fail where a set-up is not complete."""
+"""The summary of skipped tests names reason and remedy, and strict runs fail where a set-up is not complete."""
 
 import os
 import subprocess
