@@ -73,13 +73,35 @@ def camera_fault(K: Any, viewmat: Any, width: object, height: object) -> str | N
         return f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}, which must be above 0 and at most {MAX_FOCAL:g} pixels"
     if np.abs(K[2] - (0, 0, 1)).max() > _RIGID:
         return "the last row of K must be 0 0 1"
-    turned = viewmat[:3, :3]
-    rigid = np.abs(turned).max() <= 2 and np.abs(_product(turned) - np.eye(3)).max() <= _RIGID
-    if not rigid or np.linalg.det(turned) < 0 or np.abs(viewmat[3] - (0, 0, 0, 1)).max() > _RIGID:
-        return "viewmat is not a rotation and translation (world to camera, OpenCV axes)"
+    fault = rigid_fault(viewmat)
+    if fault is not None:
+        return f"viewmat is not a rotation and translation (world to camera, OpenCV axes): {fault}"
     if np.abs(viewmat[:3, 3]).max() > MAX_NUMBER:
         return f"it is more than {MAX_NUMBER:g} metres away"
     return None
+
+
+def rigid_fault(matrix: Any) -> str | None:
+    """The reason why a 4x4 matrix is not a rotation and a translation, or None if it is. Units do not matter.
+
+    Coordinates are columns: the translation is in the last column, and the last row is 0 0 0 1.
+    """
+    matrix = np.asarray(matrix, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        return "it must be 4x4 finite numbers"
+    if not has_last_row(matrix):
+        if has_last_row(matrix.T):
+            return "its last column is 0 0 0 1, so it is transposed; put the translation into the last column"
+        return f"its last row is {' '.join(f'{value:g}' for value in matrix[3])}; it must be 0 0 0 1"
+    turned = matrix[:3, :3]
+    if np.abs(turned).max() > 2 or np.abs(_product(turned) - np.eye(3)).max() > _RIGID or np.linalg.det(turned) < 0:
+        return "its upper left 3x3 numbers are not a rotation"
+    return None
+
+
+def has_last_row(matrix: np.ndarray) -> bool:
+    """Whether the last row of a 4x4 matrix is 0 0 0 1, as in every matrix that maps points to points."""
+    return bool(np.abs(matrix[3] - (0, 0, 0, 1)).max() <= _RIGID)
 
 
 def _product(turned: np.ndarray) -> np.ndarray:

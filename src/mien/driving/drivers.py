@@ -51,6 +51,8 @@ def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) 
         motion = read_speech(path)
     else:
         motion = read_live_link_face(path, fps) if suffix == ".csv" else read_blendshape_json(path)
+    for note in motion.notes:
+        say(note)
     if motion.lost:
         say(f"{path}: {motion.lost} of {len(motion)} frames have no face; each repeats the frame before it")
     face, at_rest = face_of_motion(motion, face_model)

@@ -60,6 +60,8 @@ class Motion:
     """Translation of the head in metres; zeros if unknown."""
     lost: int
     """Number of recorded frames without a face. They repeat the frame before."""
+    notes: tuple[str, ...] = ()
+    """What the reader assumed or left out: a line for the user for each."""
 
     def __len__(self) -> int:
         """The number of moments, t."""
@@ -149,6 +151,37 @@ def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -
             f"{where(0)}: the times from here on give {moments:,.0f} moments, more than {MAX_MOMENTS:,}; cut the file "
             "into shorter ones"
         )
+
+
+def without_repeats(
+    seconds: Float[np.ndarray, " r"], where: Callable[[int], str], what: str, remedy: str, slack: float = 0.0
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Find the rows whose time comes after all before. Rows that repeat a time are left out.
+
+    Args:
+        seconds: The times.
+        where: Returns the name of a row's place in its file.
+        what: What the file calls a time.
+        remedy: End of the message for times that go back.
+        slack: How far a time may go back to count as a repeat, in seconds.
+
+    Returns:
+        the indices of these rows, and a line for the user if others are left out.
+
+    Raises:
+        UserError: A time goes back, or all are the same.
+    """
+    latest = np.maximum.accumulate(seconds)
+    late = np.concatenate([[False], seconds[1:] <= latest[:-1]])
+    back = np.concatenate([[False], seconds[1:] < latest[:-1] - slack])
+    if late[1:].any() and late[1:].all():
+        back[1] = True
+    if back.any():
+        raise UserError(f"{where(int(np.argmax(back)))}: its {what} does not come after the one before{remedy}")
+    count = int(late.sum())
+    rows = "row repeats the time of the row" if count == 1 else "rows repeat the times of rows"
+    line = f"{where(int(np.argmax(late)))}: {count} {rows} before, from here on, and {'is' if count == 1 else 'are'} left out"
+    return np.flatnonzero(~late), (line,) if count else ()
 
 
 def repeat_lost(rows: Float[np.ndarray, "r c"], found: np.ndarray) -> Float[np.ndarray, "r c"]:

@@ -12,6 +12,7 @@ from torch import Tensor
 from mien.bounded import open_ordinary
 from mien.errors import UserError
 from mien.gaussians import Gaussians
+from mien.limits import rigid_fault
 from mien.storage import write_atomically
 
 _MAX_HEADER_BYTES = 65536
@@ -220,7 +221,7 @@ def _pose_of(path: Path, lines: list[str]) -> Tensor | None:
         return None
     try:
         pose = torch.tensor([float(value) for value in marked[0].split(":")[-1].split()]).reshape(4, 4)
-        if not pose.isfinite().all():
+        if rigid_fault(pose.numpy()) is not None:
             raise ValueError
         return pose
     except (ValueError, RuntimeError):

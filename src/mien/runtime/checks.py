@@ -8,7 +8,7 @@ import numpy as np
 
 from mien.errors import UserError
 from mien.inside import is_one_line
-from mien.limits import MAX_NUMBER, are_indices, camera_fault, is_moderate, skeleton_fault
+from mien.limits import MAX_NUMBER, are_indices, camera_fault, is_moderate, rigid_fault, skeleton_fault
 from mien.runtime.baked import (
     AttributeNetwork,
     Attributes,
@@ -145,8 +145,9 @@ def _still_faults(baked: BlendSkinned, n: int) -> Iterator[str]:
         yield "the bone that stands still has weights or a pose, but not both"
     if baked.still_weights is not None and len(baked.still_weights) != n:
         yield f"it has {len(baked.still_weights)} weights of the bone that stands still, but {n} Gaussians"
-    if baked.still_pose is not None and baked.still_pose.shape != (4, 4):
-        yield "the shape of the pose of the bone that stands still does not fit"
+    fault = None if baked.still_pose is None else rigid_fault(baked.still_pose)
+    if fault is not None:
+        yield f"the pose of the bone that stands still cannot be one: {fault}"
 
 
 def _number_faults(value: Any) -> Iterator[str]:
