@@ -14,8 +14,8 @@ from mien.commands.stages.driving import open_driver, run_driving_stage
 from mien.errors import UserError
 from mien.tracking import Scoring, Tracking, write_scoring, write_tracking
 from mien.workspace import Workspace
+from recordings import row, write_csv
 from small_face_model import make_small_face_model
-from test_motion import row, write_csv
 from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
 

@@ -14,7 +14,7 @@ from mien.errors import UserError
 from mien.evaluation.image_folders import read_crops
 from mien.render.camera_paths import read_cameras
 from mien.storage import write_arrays
-from test_motion import row, write, write_csv
+from recordings import row, write_csv, write_json
 
 DIGITS = int("9" * 400)
 
@@ -45,7 +45,7 @@ def test_many_gaps_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_gap_in_json_is_told_with_its_frame(tmp_path: Path) -> None:
     frames = [{"timestamp_ms": time, "blendshapes": {}} for time in (0, 33, 66, 1e12)]
-    refused(read_blendshape_json, write(tmp_path / "a.json", frames), "frame 3: comes 1,000,000,000 s after")
+    refused(read_blendshape_json, write_json(tmp_path / "a.json", frames), "frame 3: comes 1,000,000,000 s after")
 
 
 def test_numbers_of_hundreds_of_digits_in_csv(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_numbers_of_hundreds_of_digits_in_json(tmp_path: Path) -> None:
             "layout of a FaceLandmarker",
         ),
     ):
-        refused(read_blendshape_json, write(path, content), words)
+        refused(read_blendshape_json, write_json(path, content), words)
     path.write_text('[{"timestamp_ms": 1' + "0" * 5000 + ', "blendshapes": {}}]')
     refused(read_blendshape_json, path, "cannot be read as json")
     path.write_text("[" * 100_000)

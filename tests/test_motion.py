@@ -1,6 +1,5 @@
 """Motion of other programs, as Live Link Face's csv or as json of blend shapes, is read, refused and applied."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -11,25 +10,14 @@ import torch
 
 from mien.camera import camera_from_fov, look_at
 from mien.driving import ARKIT_NAMES, drive, face_of_motion, read_blendshape_json, read_live_link_face
-from mien.driving.live_link_face import EYES, HEAD
 from mien.driving.motion import LOOK_ANGLE, Motion, gaze_of
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
+from recordings import COLUMNS, row, write_csv, write_json
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model
-
-COLUMNS = ["Timecode", "BlendshapeCount", *(name[0].upper() + name[1:] for name in ARKIT_NAMES), *HEAD, *EYES]
-
-
-def row(timecode: str, **values: float | str) -> list[str]:
-    return [timecode, "61", *(str(values.get(name, 0)) for name in COLUMNS[2:])]
-
-
-def write_csv(path: Path, *rows: list[str], columns: list[str] | None = None) -> Path:
-    path.write_text("\n".join(",".join(cells) for cells in (columns or COLUMNS, *rows)) + "\n")
-    return path
 
 
 def jaw(motion) -> list[float]:
@@ -109,7 +97,7 @@ def test_bad_csv_files(tmp_path: Path) -> None:
     good = row("0:00:00:01.0")
     without = [name for name in COLUMNS if name not in ("JawOpen", "TongueOut")]
     for rows, columns, part in (
-        ([good[: len(without)]], without, "lacks the columns JawOpen, TongueOut"),
+        ([good[: len(without)]], without, "lacks the columns JawOpen; give"),
         ([good, row("0:00:00:02.0", JawOpen="nan")], COLUMNS, "line 3: JawOpen is nan"),
         ([row("0:00:00:02.0", JawOpen="")], COLUMNS, "line 2: JawOpen is ''"),
         ([row("0:00:00:02.0", JawOpen=45)], COLUMNS, "line 2: JawOpen is 45; coefficients go from 0 to 1"),
@@ -127,16 +115,11 @@ def test_bad_csv_files(tmp_path: Path) -> None:
         read_live_link_face(tmp_path / "b.csv")
 
 
-def write(path: Path, content: object) -> Path:
-    path.write_text(json.dumps(content))
-    return path
-
-
 def test_plain_json(tmp_path: Path) -> None:
     """Plain json of blend shapes is read, and a frame without a face repeats the one before."""
     frames = [{"timestamp_ms": 40 * i, "blendshapes": {"jawOpen": i / 4, "_neutral": 0.9}} for i in range(4)]
     frames[2]["blendshapes"] = None
-    motion = read_blendshape_json(write(tmp_path / "a.json", frames))
+    motion = read_blendshape_json(write_json(tmp_path / "a.json", frames))
     assert motion.fps == pytest.approx(25)
     assert jaw(motion) == [0, 0.25, 0.25, 0.75]
     assert motion.lost == 1
@@ -152,12 +135,12 @@ def test_face_landmarker_results(tmp_path: Path) -> None:
         "faceBlendshapes": [{"headIndex": -1, "categories": [{"index": 25, "score": 0.5, "categoryName": "jawOpen"}]}],
         "facialTransformationMatrixes": [{"rows": 4, "columns": 4, "data": matrix.T.flatten().tolist()}],
     }
-    motion = read_blendshape_json(write(tmp_path / "a.json", result))
+    motion = read_blendshape_json(write_json(tmp_path / "a.json", result))
     assert jaw(motion) == [0.5]
     np.testing.assert_allclose(motion.head_rotation[0], [0.1, -0.4, 0.2], atol=1e-5)
     np.testing.assert_allclose(motion.head_translation[0], [0.01, 0.02, -0.45], atol=1e-6)
     none = {"faceBlendshapes": [], "facialTransformationMatrixes": []}
-    assert read_blendshape_json(write(tmp_path / "b.json", [none, result])).lost == 1
+    assert read_blendshape_json(write_json(tmp_path / "b.json", [none, result])).lost == 1
 
 
 def test_bad_json_files(tmp_path: Path) -> None:
@@ -182,7 +165,7 @@ def test_bad_json_files(tmp_path: Path) -> None:
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [0] * 16}]}], "is not a rotation"),
     ):
         with pytest.raises(UserError, match=part):
-            read_blendshape_json(write(tmp_path / "a.json", content))
+            read_blendshape_json(write_json(tmp_path / "a.json", content))
     (tmp_path / "a.json").write_text("[{")
     with pytest.raises(UserError, match="cannot be read as json"):
         read_blendshape_json(tmp_path / "a.json")

@@ -13,7 +13,7 @@ from mien import runtime
 from mien.driving import drive, face_of_motion, read_blendshape_json, read_live_link_face
 from mien.export import write_page
 from mien.face import FaceParams, load_face_model
-from test_motion import row, write_csv
+from recordings import row, write_csv
 from web_case import WEB, browse, build, chromium, drawn_head, node
 
 EQUAL = 1e-4

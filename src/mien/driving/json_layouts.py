@@ -138,9 +138,7 @@ def _named_weights(content: dict[str, Any], path: Path) -> Recorded:
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise UserError(f'{path}: "frames" is not a list of frames; give [{{"weights": [..], "time": seconds}}, ...]')
     names, notes = _known_names(content["names"], path)
-    scores = [
-        _by_name(names, frame.get("weights"), f"{path}, frame {index}") for index, frame in enumerate(frames)
-    ]
+    scores = [_by_name(names, frame.get("weights"), f"{path}, frame {index}") for index, frame in enumerate(frames)]
     if any(frame.get("rotation") for frame in frames):
         notes = (*notes, f'{path}: "rotation" is not read, so the head keeps still')
     key, units, times = _times(frames)

@@ -179,8 +179,7 @@ def without_repeats(
     if back.any():
         raise UserError(f"{where(int(np.argmax(back)))}: its {what} does not come after the one before{remedy}")
     count = int(late.sum())
-    rows = "row repeats the time of the row" if count == 1 else "rows repeat the times of rows"
-    line = f"{where(int(np.argmax(late)))}: {count} {rows} before, from here on, and {'is' if count == 1 else 'are'} left out"
+    line = f"{where(int(np.argmax(late)))}: has the time of a row before it and is left out; {count} in all"
     return np.flatnonzero(~late), (line,) if count else ()
 
 
