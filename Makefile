@@ -1,4 +1,4 @@
-# make setup | web-packages | chromium | web | demo | test | test-312 | test-exact | sanitize | fuzz | lint | docs | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# make setup | web-packages | chromium | web | demo | test | test-312 | test-exact | sanitize | fuzz | kills | lint | docs | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 PYTHON312 ?= $(shell for python in python3.12 $(HOME)/.pyenv/versions/3.12*/bin/python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
@@ -10,7 +10,7 @@ UNLESS_STRICT := test -z "$$MIEN_STRICT"
 UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
 
-.PHONY: setup web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native lint format docs bench gpu lock clean
+.PHONY: setup web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native kills lint format docs bench gpu lock clean
 setup: $(VENV)/.built
 
 $(VENV)/.packages: requirements/lock.txt requirements/uv.txt
@@ -98,6 +98,11 @@ fuzz: setup
 	PYTHONPATH=tests $(BIN)/python -m fuzzing --self-check --seed $(SEED) --cases 5000 --minutes $(MINUTES) --workers 2 \
 	  --lines 300 --heavy 10 --findings out/fuzz/findings.jsonl
 	$(MAKE) fuzz-native
+
+# Commands that are killed at random moments and run again, until there are KILLS kills; findings go to out/fuzz/kills.jsonl.
+KILLS ?= 200
+kills: setup
+	PYTHONPATH=tests $(BIN)/python -m fuzzing.kills --kills $(KILLS) --seed $(SEED) --findings out/fuzz/kills.jsonl
 
 # pyright's wrapper asks the package index for a newer version unless it is told not to.
 lint: setup

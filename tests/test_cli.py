@@ -176,6 +176,9 @@ def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: pytest.CaptureF
     assert f"mien capture VIDEO --out {tmp_path} --name me" in told
 
 
+STOPPED = "mien: stopped; the same command continues where it stopped, or starts again\n"
+
+
 def test_a_terminated_command_removes_what_is_unfinished(tmp_path: Path) -> None:
     """A terminated command removes unfinished files, as after Ctrl-C, even if a second signal comes meanwhile.
 
@@ -207,7 +210,7 @@ sys.modules["mien.commands.demo"] = types.SimpleNamespace(Command=Command)
 sys.exit(main(["demo"]))
 """
     ended = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (143, "cleaned up\n", "")
+    assert (ended.returncode, ended.stdout, ended.stderr) == (143, "cleaned up\n", STOPPED)
     assert list(tmp_path.iterdir()) == []
 
 

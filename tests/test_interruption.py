@@ -21,6 +21,7 @@ from toy_workspace import write_toy_workspace
 FRAMES = 6
 LOOK = ["--frames", str(FRAMES), "--size", "32"]
 EVALUATE = ["--no-perceptual", "--json"]
+CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 143, signal.SIGINT: 130}
 SLOWLY = """
 import signal, sys, time
 from mien.capture.video import read_video_frames
@@ -105,12 +106,14 @@ def test_interrupted_rendering(
     ]
 
 
-@pytest.mark.parametrize(("name", "how"), [("a.mp4", signal.SIGKILL), ("pictures", signal.SIGINT)])
+@pytest.mark.parametrize(
+    ("name", "how"), [("a.mp4", signal.SIGKILL), ("a.mp4", signal.SIGTERM), ("pictures", signal.SIGINT)]
+)
 def test_stopped_rendering_ends_alike_the_next_time(
     name: str, how: signal.Signals, workspace: Path, tmp_path: Path
 ) -> None:
     command, out = ["render", str(workspace), *LOOK, "--out"], tmp_path / "out" / name
-    assert stop([*command, str(out)], 2, how) == (130 if how == signal.SIGINT else -signal.SIGKILL)
+    assert stop([*command, str(out)], 2, how) == CODES[how]
     assert visible(tmp_path / "out") == (["pictures"] if name == "pictures" else [])
     for path in out.glob("[0-9]*.png"):
         assert cv2.imread(str(path)) is not None

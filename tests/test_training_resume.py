@@ -3,17 +3,24 @@
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 import train_toy
 from mien import _native
+from mien.avatar import METHODS, Avatar, MethodConfig
 from mien.benchmarking.train_step import SETTINGS as BENCHMARK_SETTINGS
 from mien.benchmarking.train_step import training_case
 from mien.errors import UserError
 from mien.face import load_face_model
+from mien.stops import Terminated
+from mien.storage import read_tensors, write_tensors
 from mien.training import read_curves, read_training_summary, train
 from mien.training.checkpoint import checkpoint_files
 from mien.training.trainer import step
@@ -82,6 +89,87 @@ def test_goes_on_from_the_older_checkpoint_if_the_newest_is_damaged(tmp_path: Pa
     newest.write_bytes(newest.read_bytes()[:1000])
     train_toy.main(tmp_path, STEPS)
     assert_same_results(tmp_path, undisturbed)
+
+
+def train_until_step(
+    run_dir: Path, last: int, stop: Callable[[], None], config: MethodConfig = train_toy.CONFIG, **changed: Any
+) -> None:
+    """Train in this process, and call `stop` after a step."""
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    steps = iter(range(1, STEPS + 1))
+
+    def watch(avatar: Avatar) -> None:
+        if next(steps) == last:
+            stop()
+
+    train([sequence], face_model, config, replace(train_toy.SETTINGS, **changed), run_dir, watch=watch)
+
+
+@pytest.mark.parametrize(("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
+def test_a_stop_before_the_first_record(
+    number: signal.Signals, kind: type[BaseException], tmp_path: Path, undisturbed: Path
+) -> None:
+    """Ctrl-C and SIGTERM leave a checkpoint of their step. Its curves are empty, and the run continues from it."""
+    with pytest.raises(kind):
+        train_until_step(tmp_path, 1, partial(signal.raise_signal, number))
+    assert [path.stem for path in checkpoint_files(tmp_path / "checkpoints")] == ["step_0000001"]
+    train_toy.main(tmp_path, STEPS)
+    assert_same_results(tmp_path, undisturbed)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_continues_after_a_termination(method: str, tmp_path: Path) -> None:
+    config, settings = METHODS[method].config(), {"steps": 4, "record_every": 10, "checkpoint_every": 1000}
+    with pytest.raises(Terminated):
+        train_until_step(tmp_path, 1, partial(signal.raise_signal, signal.SIGTERM), config, **settings)
+    begun = int(checkpoint_files(tmp_path / "checkpoints")[-1].stem.removeprefix("step_"))
+    assert 1 <= begun < 4
+    train_until_step(tmp_path, 99, list, config, **settings)
+    assert read_training_summary(tmp_path)["steps"] == read_curves(tmp_path)["step"].tolist()[0] == 4
+
+
+def test_a_kill_before_the_first_record(tmp_path: Path, undisturbed: Path) -> None:
+    def killed() -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        train_until_step(tmp_path, 3, killed, checkpoint_every=1)
+    assert [path.stem for path in checkpoint_files(tmp_path / "checkpoints")] == ["step_0000001", "step_0000002"]
+    train_toy.main(tmp_path, STEPS)
+    assert_same_results(tmp_path, undisturbed)
+
+
+@pytest.mark.parametrize("last", [3, 8])
+def test_a_checkpoint_that_has_lost_its_curves_is_refused(last: int, tmp_path: Path) -> None:
+    """Curves are empty only before the first record, which is at step 3."""
+    with pytest.raises(KeyboardInterrupt):
+        train_until_step(tmp_path, last, partial(signal.raise_signal, signal.SIGINT))
+    path = checkpoint_files(tmp_path / "checkpoints")[-1]
+    tensors = {name: tensor for name, tensor in read_tensors(path).items() if not name.startswith("curves.")}
+    write_tensors(path, tensors, {"format": "mien.checkpoint", "version": "1"})
+    with pytest.raises(UserError, match="its curves are incomplete"):
+        train_toy.main(tmp_path, STEPS)
+
+
+def test_time_and_memory_add_up_over_stops(tmp_path: Path) -> None:
+    """What a run sums up over its steps counts the processes before a stop: time, peak memory, records, steps."""
+    for last in (2, 4):  # the second process takes four steps, up to step 6
+        with pytest.raises(KeyboardInterrupt):
+            train_until_step(tmp_path, last, partial(signal.raise_signal, signal.SIGINT))
+    path = checkpoint_files(tmp_path / "checkpoints")[-1]
+    assert path.stem == "step_0000006"
+    tensors = read_tensors(path)
+    two_stops = float(tensors["seconds"])
+    assert two_stops > sum(tensors["curves.step_ms"].tolist()) / 1000 > 0
+    tensors |= {"seconds": torch.tensor(1e6 + two_stops, dtype=torch.float64)}
+    tensors |= {"peak_memory_mb": torch.tensor(7e6, dtype=torch.float64)}
+    write_tensors(path, tensors, {"format": "mien.checkpoint", "version": "1"})
+    train_toy.main(tmp_path, STEPS)
+    summary, curves = read_training_summary(tmp_path), read_curves(tmp_path)
+    assert 1e6 + two_stops < summary["seconds"] < 1e6 + two_stops + 600
+    assert (summary["steps"], summary["peak_memory_mb"]) == (STEPS, 7e6)
+    assert curves["step"].tolist() == list(range(3, STEPS + 1, 3))
+    assert curves["step_ms"][:2].tolist() == tensors["curves.step_ms"].tolist()
 
 
 def test_finished_run_is_loaded(undisturbed: Path, capsys: pytest.CaptureFixture[str]) -> None:

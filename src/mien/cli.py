@@ -9,7 +9,6 @@ import io
 import os
 import re
 import shlex
-import signal
 import sys
 import tempfile
 import traceback
@@ -19,6 +18,7 @@ from pathlib import Path
 import mien
 from mien.bounded import MAX_SIDE
 from mien.errors import UserError
+from mien.stops import EXIT_INTERRUPTED, EXIT_TERMINATED, Terminated, orderly_stops
 from mien.terminal import drop_output, open_closed_streams, printable, show, tell
 from mien.threads import asked_threads
 
@@ -45,10 +45,8 @@ COMMANDS = {
 """
 
 EXIT_USER_ERROR = 2
-EXIT_INTERRUPTED = 130
 EXIT_CLOSED_PIPE = 141
 """Exit code of a program that the system ends because nobody reads its output any more (`mien ... | head -1`)."""
-EXIT_TERMINATED = 143
 _OPENCVS_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
 """OpenCV reads this variable when it is imported."""
 _USERS_ERRNOS = frozenset(
@@ -76,8 +74,8 @@ _INDENT_OF_DESCRIPTION = 8
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one sub-command and return the exit code.
 
-    The code is 0 on success, 2 after a user's mistake, 1 after a bug in mien, 130 after Ctrl-C, and 141 if nobody reads
-    the output any more.
+    The code is 0 on success, 2 after a user's mistake, 1 after a bug in mien, 130 after Ctrl-C, 143 after SIGTERM, and
+    141 if nobody reads the output any more.
     """
     open_closed_streams()
     _print_what_can_be_printed()
@@ -101,9 +99,9 @@ def _main(arguments: list[str]) -> int:
         return _dispatch(arguments)
     except UserError as error:
         return _complain(str(error))
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Terminated) as stop:
         tell("mien: stopped; the same command continues where it stopped, or starts again")
-        return EXIT_INTERRUPTED
+        return EXIT_TERMINATED if isinstance(stop, Terminated) else EXIT_INTERRUPTED
     except BrokenPipeError:
         raise
     except MemoryError as error:
@@ -195,21 +193,11 @@ def _run(name: str, rest: list[str]) -> int:
     sys.stderr.write(printable(complaints.getvalue(), lines=True))
     asked_threads()
     command.check()
-    with contextlib.suppress(ValueError):  # signal handlers work only in the main thread
-        signal.signal(signal.SIGTERM, _terminated)
-    _use_one_torch_thread()
-    _check_instruction_set()
-    command.run()
+    with orderly_stops():
+        _use_one_torch_thread()
+        _check_instruction_set()
+        command.run()
     return 0
-
-
-def _terminated(number: int, frame: object) -> None:
-    """Stop as Ctrl-C does, so that unfinished files are removed. The exit code is that of a terminated process.
-
-    Further signals are ignored, since they would interrupt the removal and the wait for threads in native code.
-    """
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise SystemExit(EXIT_TERMINATED)
 
 
 def _in_one_line(box: str) -> str:

@@ -10,6 +10,7 @@ os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS
 
 import json
 import resource
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ def prepare(request: dict[str, Any]) -> None:
     """Turn this process into the one that a request asks for."""
     os.environ.clear()
     os.environ.update(request["env"])
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell starts in the background
     broken = request["stdout"] == "broken"
     apply_limits({**request, "stdout": os.devnull if broken else request["stdout"]})
     if broken:

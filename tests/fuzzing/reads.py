@@ -88,7 +88,7 @@ def read_partial(root: Path, file: Path) -> Any:
 def resume_run(root: Path, file: Path) -> Any:
     face_model, sequence = toy_sequence(timesteps=5, size=32)
     state = start([sequence], face_model, CONFIG, replace(SETTINGS, split="tail"))
-    resume(root / RUN / "checkpoints", state)
+    resume(root / RUN / "checkpoints", state, SETTINGS.record_every)
     return state.avatar
 
 

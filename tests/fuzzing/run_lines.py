@@ -58,17 +58,26 @@ class Server:
 
     def run(self, request: dict[str, Any], line: Line) -> tuple[int | None, int]:
         """Run a line, and return its exit code (None if it hung) and the most megabytes that it took."""
+        in_time = _wait(self.start(request), line, request, self.ended)
+        code, megabytes = self.result()
+        return (code if in_time else None), megabytes
+
+    def start(self, request: dict[str, Any]) -> int:
+        """Start a command, and return the number of its process."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(request).encode() + b"\n")
-        child = int(self._process.stdout.readline())
+        return int(self._process.stdout.readline())
 
-        def ended(seconds: float) -> bool:
-            return bool(select.select([self._process.stdout], [], [], seconds)[0])
+    def ended(self, seconds: float) -> bool:
+        """Wait at most so long for the command that was started last; return whether it has ended."""
+        return bool(select.select([self._process.stdout], [], [], seconds)[0])
 
-        in_time = _wait(child, line, request, ended)
+    def result(self) -> tuple[int, int]:
+        """Return the exit code of the command that has ended, and the most megabytes that it took."""
+        assert self._process.stdout is not None
         code, megabytes = json.loads(self._process.stdout.readline())
-        return (code if in_time else None), megabytes
+        return code, megabytes
 
     def close(self) -> None:
         """Stop the server."""

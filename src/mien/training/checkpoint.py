@@ -1,5 +1,6 @@
 """Checkpoints: everything that the rest of a run depends on. Each is one file, written atomically."""
 
+import resource
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -40,7 +41,9 @@ class TrainingState:
     step: int = 0
     """Number of steps done."""
     seconds: float = 0.0
-    """Time spent on these steps, in seconds."""
+    """Time spent on these steps, in seconds, by all processes that have trained the run."""
+    peak_memory_mb: float = 0.0
+    """Most memory that one of these processes has taken, in MB, when it was last measured."""
     unseen: Unseen | None = None
     """What no training picture shows, if it is filled. It depends on the data alone, so checkpoints lack it."""
     inside: Inside | None = None
@@ -49,6 +52,11 @@ class TrainingState:
     """Views from aside, if sides are filled. Checkpoints lack it for the same reason."""
     hair: HairSurface | None = None
     """The surface of the hair, if sides are filled."""
+
+    def measure_memory(self) -> None:
+        """Bring `peak_memory_mb` up to date."""
+        own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        self.peak_memory_mb = max(self.peak_memory_mb, own)
 
     def follow_hair(self) -> None:
         """Let what is known of the surface follow the hair."""
@@ -62,6 +70,7 @@ class TrainingState:
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
     """Write a checkpoint into `folder` and delete all but the newest two."""
+    state.measure_memory()
     tensors = {f"avatar.{name}": tensor for name, tensor in state.avatar.state_dict().items()}
     tensors |= {f"density.{name}": tensor for name, tensor in state.density.state().items()}
     tensors |= {f"track.{name}": tensor for name, tensor in state.track.state().items()}
@@ -76,6 +85,7 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
     tensors |= {
         "step": torch.tensor(state.step),
         "seconds": torch.tensor(state.seconds, dtype=torch.float64),
+        "peak_memory_mb": torch.tensor(state.peak_memory_mb, dtype=torch.float64),
         "gaussians": torch.tensor(len(state.avatar.gaussian_store())),
     }
     write_tensors(folder / f"step_{state.step:07d}.safetensors", tensors, {"format": "mien.checkpoint", "version": "1"})
@@ -89,10 +99,10 @@ def checkpoint_files(folder: Path) -> list[Path]:
     return sorted(folder.glob("step_*.safetensors"))
 
 
-def resume(folder: Path, state: TrainingState) -> None:
+def resume(folder: Path, state: TrainingState, first_record: int) -> None:
     """Restore the newest readable checkpoint into `state`, which is that of the run's start. There may be none.
 
-    Reports damaged checkpoints, and where training continues instead.
+    Reports damaged checkpoints, and where training continues instead. Curves are empty before step `first_record`.
 
     Raises:
         UserError: a checkpoint belongs to another method or to other settings.
@@ -106,7 +116,7 @@ def resume(folder: Path, state: TrainingState) -> None:
             damaged = True
             continue
         with expect_whole(path, "delete it and run the same command again"):
-            _restore(path, state, tensors)
+            _restore(path, state, tensors, first_record)
         if damaged:
             say(f"training continues from the older checkpoint {path.name}, step {state.step}")
         return
@@ -114,7 +124,7 @@ def resume(folder: Path, state: TrainingState) -> None:
         say(f"{folder}: no checkpoint can be read; training starts again from the first step")
 
 
-def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> None:
+def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor], first_record: int) -> None:
     def part(prefix: str) -> dict[str, Tensor]:
         return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
@@ -144,10 +154,13 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
         state.hair.load_state(part("hair."))
         state.follow_hair()
     state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
+    if "peak_memory_mb" in tensors:  # Versions before it have left none.
+        state.peak_memory_mb = float(tensors["peak_memory_mb"])
     curves = part("curves.")
     if state.step < 0 or state.seconds < 0 or any(curve.ndim != 1 for curve in curves.values()):
         raise ValueError("its step, its time or a curve is not valid")
-    if len({len(curve) for curve in curves.values()}) > 1 or not (curves.keys() >= CURVES or state.step == 0):
+    empty = not curves and state.step < first_record
+    if len({len(curve) for curve in curves.values()}) > 1 or not (curves.keys() >= CURVES or empty):
         raise ValueError("its curves are incomplete")
     state.curves = {name: curve.tolist() for name, curve in curves.items()}
 

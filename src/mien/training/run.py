@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import resource
 import sys
 from collections.abc import Mapping
 from collections.abc import Sequence as Items
@@ -216,12 +215,13 @@ def write_results(run_dir: Path, state: TrainingState, covered: Coverage) -> Non
     write_coverage(run_dir, covered)
     curves = {name: torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     write_tensors(run_dir / "curves.safetensors", curves)
+    state.measure_memory()
     summary = {
         "steps": state.step,
         "seconds": round(state.seconds, 1),
         "gaussians": len(state.avatar.gaussian_store()),
         "step_ms_median": round(float(np.median(state.curves["step_ms"])), 3),
-        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        "peak_memory_mb": round(state.peak_memory_mb, 1),
     }
     write_json(run_dir / "training.json", _SUMMARY, _VERSION, summary)
 

@@ -1,7 +1,5 @@
 """The training loop, for every method."""
 
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Items
@@ -33,6 +31,7 @@ from mien.locks import hold
 from mien.perceptual import load_training_features
 from mien.progress import Advance, progress_bar
 from mien.render.validation import CannotDrawError
+from mien.stops import Put, stops_put_off
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.ahead import targets_ahead
@@ -99,6 +98,7 @@ def train(
             another run, or another process writes it; the face model differs from that of the tracking; the sequences
             were not tracked together; or no frame is left to train on.
         KeyboardInterrupt: after Ctrl-C, once a checkpoint is written.
+        Terminated: after SIGTERM, once a checkpoint is written.
     """
     method_config.check()
     settings.check()
@@ -145,16 +145,16 @@ def _train_to_the_end(
     watch: Watch | None,
 ) -> None:
     """Continue from the newest checkpoint, if there is one, and take all steps that are left."""
-    resume(run_dir / "checkpoints", state)
+    resume(run_dir / "checkpoints", state, min(settings.record_every, settings.steps))
     with (
         one_torch_thread(),
         _native_threads(settings.threads),
-        _deferred_interrupt() as interrupted,
+        stops_put_off() as stop,
         targets_ahead(data.order, data.targets, settings) as ahead,
     ):
         data = replace(data, ahead=ahead)
         if state.step == 0 and state.avatar.lesson_count > 0:
-            _teach(state, settings, progress, interrupted)
+            _teach(state, settings, progress, stop)
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
                 before = state.step
@@ -165,25 +165,21 @@ def _train_to_the_end(
                 advance(state.step - before, status)
                 if watch is not None:
                     watch(state.avatar)
-                if passed(before, state.step, settings.checkpoint_every) or interrupted():
+                if passed(before, state.step, settings.checkpoint_every) or stop.asked():
                     _check_finite(run_dir, state)
                     write_checkpoint(run_dir / "checkpoints", state)
-                if interrupted():
-                    raise KeyboardInterrupt
+                stop.follow()
         _check_finite(run_dir, state)
 
 
-def _teach(
-    state: TrainingState, settings: TrainSettings, progress: ProgressBar, interrupted: Callable[[], bool]
-) -> None:
+def _teach(state: TrainingState, settings: TrainSettings, progress: ProgressBar, stop: Put) -> None:
     """Give the avatar its lessons. A run that stops here starts again, as nothing was trained."""
     avatar = state.avatar
     with torch.random.fork_rng(devices=[]), progress("lessons in the face's motion", avatar.lesson_count, 0) as advance:
         torch.manual_seed(settings.seed)
         for _ in avatar.lessons(state.track.params()):
             advance()
-            if interrupted():
-                raise KeyboardInterrupt
+            stop.follow()
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:
@@ -373,17 +369,3 @@ def _native_threads(count: int) -> Iterator[None]:
     finally:
         if count > 0:
             _native.set_thread_count(before)
-
-
-@contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C into a function that reports it between steps, so that no step is left half done."""
-    asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked.is_set
-        return
-    before = signal.signal(signal.SIGINT, lambda *_: asked.set())
-    try:
-        yield asked.is_set
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,108 @@
+"""Orderly stops: SIGTERM ends a command as Ctrl-C does, and work that must not be left half done puts both off."""
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
+"""Exit codes by convention: 128 and the number of the signal."""
+
+
+class Terminated(SystemExit):
+    """SIGTERM has asked the process to end. Nothing catches it by mistake, as nothing catches a KeyboardInterrupt."""
+
+    def __init__(self) -> None:
+        super().__init__(EXIT_TERMINATED)
+
+
+_KINDS: dict[int, type[BaseException]] = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+_PATIENCE_SECONDS = 0.05
+"""Time after which a stop that a library has dropped is repeated, in seconds."""
+
+
+class Put:
+    """A stop that is put off: the work asks for it between two of its steps."""
+
+    def __init__(self) -> None:
+        self._number: int | None = None
+
+    def ask(self, number: int, frame: object = None) -> None:
+        """Note a signal; the first one counts."""
+        self._number = self._number or number
+
+    def asked(self) -> bool:
+        """Whether the process was asked to stop."""
+        return self._number is not None
+
+    def follow(self) -> None:
+        """Stop now if that was asked for.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed.
+            Terminated: SIGTERM has come.
+        """
+        if self._number is not None:
+            raise _KINDS[self._number]
+
+
+@contextmanager
+def orderly_stops() -> Iterator[None]:
+    """Let SIGTERM and Ctrl-C raise `Terminated` and KeyboardInterrupt, so that unfinished files are removed.
+
+    Signals after the first are ignored, since they would interrupt the removal and the wait for threads in native code.
+    If the exception is raised where Python can only report it (in a callback of a library), the stop is repeated.
+    """
+    if threading.current_thread() is not threading.main_thread():  # signal handlers work only there
+        yield
+        return
+    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in _KINDS}
+    # A shell lets what it starts in the background ignore Ctrl-C.
+    heard = [number for number in _KINDS if number == signal.SIGTERM or before[number] == signal.default_int_handler]
+    hook = sys.unraisablehook
+
+    def listen() -> None:
+        for number in heard:
+            signal.signal(number, stop)
+
+    def stop(number: int, frame: object) -> None:
+        for each in heard:
+            signal.signal(each, signal.SIG_IGN)
+        raise _KINDS[number]
+
+    def repeat(dropped: "sys.UnraisableHookArgs") -> None:
+        number = next((number for number, kind in _KINDS.items() if issubclass(dropped.exc_type, kind)), None)
+        if number is None:
+            hook(dropped)
+            return
+        listen()
+        again = threading.Timer(_PATIENCE_SECONDS, signal.pthread_kill, [threading.get_ident(), number])
+        again.daemon = True
+        again.start()
+
+    listen()
+    sys.unraisablehook = repeat
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        for number in heard:
+            signal.signal(number, before[number])
+
+
+@contextmanager
+def stops_put_off() -> Iterator[Put]:
+    """Put Ctrl-C and SIGTERM off, so that no exception comes in the middle of a step. They take effect at the end."""
+    put = Put()
+    if threading.current_thread() is not threading.main_thread():
+        yield put
+        return
+    before = {number: signal.signal(number, put.ask) or signal.SIG_DFL for number in _KINDS}
+    try:
+        yield put
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    put.follow()

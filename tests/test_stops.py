@@ -1,0 +1,114 @@
+"""SIGTERM and Ctrl-C stop work in an orderly way: once, at a moment that suits, and even if a library drops them."""
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from mien.stops import EXIT_TERMINATED, Put, Terminated, orderly_stops, stops_put_off
+
+KINDS = [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)]
+
+
+@pytest.mark.parametrize(("number", "kind"), KINDS)
+def test_a_second_signal_does_not_interrupt_the_removal(number: signal.Signals, kind: type[BaseException]) -> None:
+    before = [signal.getsignal(each) for each, _ in KINDS]
+    removed = []
+
+    def work() -> None:
+        try:
+            signal.raise_signal(number)
+        finally:
+            for each, _ in KINDS:
+                signal.raise_signal(each)
+            removed.append("half a file")
+
+    with pytest.raises(kind), orderly_stops():
+        work()
+    assert removed == ["half a file"]
+    assert [signal.getsignal(each) for each, _ in KINDS] == before
+
+
+@pytest.mark.parametrize(("number", "kind"), KINDS)
+def test_a_stop_that_is_dropped_comes_again(number: signal.Signals, kind: type[BaseException]) -> None:
+    """Python can only report an exception in a callback of a library, or in a finaliser. The stop is not lost."""
+
+    class Finalised:
+        def __del__(self) -> None:
+            signal.raise_signal(number)
+
+    def work() -> None:
+        Finalised()
+        for _ in range(200):
+            time.sleep(0.05)
+
+    hook = sys.unraisablehook
+    with pytest.raises(kind), orderly_stops():
+        work()
+    assert sys.unraisablehook is hook
+
+
+def test_other_errors_in_callbacks_are_reported_as_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Finalised:
+        def __del__(self) -> None:
+            raise ZeroDivisionError
+
+    reported = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda dropped: reported.append(dropped.exc_type))
+    with orderly_stops():
+        Finalised()
+    assert reported == [ZeroDivisionError]
+
+
+@pytest.mark.parametrize(("number", "kind"), KINDS)
+def test_a_stop_is_put_off(number: signal.Signals, kind: type[BaseException]) -> None:
+    done = []
+
+    def work(stop: Put) -> None:
+        for step in range(4):
+            if step == 1:
+                signal.raise_signal(number)
+                signal.raise_signal(signal.SIGINT)
+            done.append((step, stop.asked()))
+            stop.follow()
+
+    with pytest.raises(kind), stops_put_off() as stop:
+        work(stop)
+    assert done == [(0, False), (1, True)]
+
+
+def test_a_stop_in_the_last_step_is_not_lost() -> None:
+    with pytest.raises(Terminated), stops_put_off():
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_without_a_command_a_stop_ends_the_process() -> None:
+    """A program that trains without the command line ends as a terminated process does, without a traceback."""
+    program = "import signal; from mien.stops import stops_put_off as off\nwith off(): signal.raise_signal(15)"
+    ended = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True)
+    assert (ended.returncode, ended.stderr) == (EXIT_TERMINATED, b"")
+
+
+def test_background_commands_go_on_ignoring_ctrl_c() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with orderly_stops():
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_other_threads_leave_signals_alone() -> None:
+    before, seen = signal.getsignal(signal.SIGTERM), []
+
+    def work() -> None:
+        with orderly_stops(), stops_put_off() as stop:
+            seen.extend([signal.getsignal(signal.SIGTERM), stop.asked()])
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [before, False]
