@@ -194,6 +194,8 @@ def run_chain(case: str, stage: str, place: Place, tally: Tally) -> None:
         text = place.told.read_text(errors="replace")
         told.append(f"{signal.Signals(number).name} after {moment:.2f} s{', apart' * apart}: {code}; {text[-1500:]}")
         if code == 0:
+            # It took less time than the last one: other programs may have used the cores then.
+            place.seconds[stage] = min(place.seconds[stage], moment)
             tally.late += 1
             continue
         tally.kills[stage, signal.Signals(number).name] += 1
@@ -201,7 +203,9 @@ def run_chain(case: str, stage: str, place: Place, tally: Tally) -> None:
         if number != signal.SIGKILL:
             tally.slowest = max(tally.slowest, after)
         faults += _faults(number, code, text)
+    began = time.monotonic()
     code, _ = place.run(stage, apart=False)
+    place.seconds[stage] = max(place.seconds[stage], time.monotonic() - began)
     told.append(f"then: {code}; {place.told.read_text(errors='replace')[-1500:]}")
     tally.chains[stage] += 1
     if code != 0:
