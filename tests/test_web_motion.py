@@ -11,9 +11,10 @@ import torch
 
 from mien import runtime
 from mien.driving import drive, face_of_motion, read_blendshape_json, read_live_link_face
+from mien.driving.sides import PAIRS
 from mien.export import write_page
 from mien.face import FaceParams, load_face_model
-from recordings import row, write_csv
+from recordings import COLUMNS, LAYOUTS, row, write_csv, write_json
 from web_case import WEB, browse, build, chromium, drawn_head, node
 
 EQUAL = 1e-4
@@ -95,6 +96,48 @@ def test_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> None:
             np.testing.assert_allclose(found[name], expected, rtol=0, atol=EQUAL, err_msg=f"{recording.name}: {name}")
 
 
+def test_every_layout_is_read_as_in_python(built: Path, tmp_path: Path) -> None:
+    """Each coefficient goes to the same side, in every layout of every source."""
+    names = [name for pair in PAIRS for name in pair]
+    for write in (write for writers in LAYOUTS.values() for write in writers):
+        recording = write(tmp_path, [{}, *({name: 0.5} for name in names), {"jawOpen": 0.5}])
+        found = read_by_node(built, tmp_path, recording)
+        assert found["notes"] == []
+        fps, face = driven_by_python(recording)
+        assert found["fps"] == pytest.approx(fps, rel=1e-6)
+        expected = face.expression.numpy().reshape(-1)
+        np.testing.assert_allclose(found["expression"], expected, rtol=0, atol=EQUAL, err_msg=recording.name)
+
+
+def test_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> None:
+    """Midnight, repeats, gaps, faces that are lost at first, decimal commas, and matrices that are transposed."""
+    codes = ("23:59:59:56", "23:59:59:58", "23:59:59:58", "0:00:00:00", "0:00:00:06", "0:00:00:08")
+    rows = [row(code, JawOpen=index / 8, MouthLeft=0.5, HeadYaw=0.1 * index) for index, code in enumerate(codes)]
+    keep = [index for index, name in enumerate(COLUMNS) if name != "TongueOut"]
+    lines = [";".join(cells[index].replace(".", ",") for index in keep) for cells in (COLUMNS, *rows)]
+    table = tmp_path / "take.csv"
+    lost = ";".join(["23:59:59:54", "0"])
+    table.write_text("\n".join(["sep=;", lines[0], lost, *lines[1:]]), encoding="utf-8-sig")
+    turn = [[0.8, 0.6, 0, 0], [-0.6, 0.8, 0, 0], [0, 0, 1, 0], [1, 2, -40, 1]]
+    results = [
+        {
+            "time": time,
+            "face_blendshapes": [[{"category_name": "mouthLeft", "score": time}]],
+            "facial_transformation_matrixes": [turn if time else np.eye(4).tolist()],
+        }
+        for time in (0.0, 0.1, 0.2, 0.5, 0.5)
+    ]
+    task = write_json(tmp_path / "task.json", results)
+    for recording, notes in ((table, 2), (task, 2)):
+        found = read_by_node(built, tmp_path, recording)
+        assert len(found["notes"]) == notes, found
+        fps, face = driven_by_python(recording)
+        assert found["fps"] == pytest.approx(fps, rel=1e-6)
+        for name in ("expression", "head_rotation"):
+            expected = getattr(face, name).numpy().reshape(-1)
+            np.testing.assert_allclose(found[name], expected, rtol=0, atol=EQUAL, err_msg=f"{recording.name}: {name}")
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -105,6 +148,24 @@ def test_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> None:
         ("a.json", "[{", "is no json"),
         ("a.json", "[]", "has no frame with blend shapes"),
         ("a.json", '[{"blendshapes": {"jawOpen": "wide"}}]', "has a value that is no number in frame 0"),
+        ("a.csv", "Timecode,JawOpen\n1:0:0:5,0\n1:0:0:5,0\n", "has times that do not increase"),
+        ("a.csv", "Timecode,JawOpen\n1:0:0:5,0\n1:2:0:5,0\n", "has a gap of more than 60 s"),
+        (
+            "a.json",
+            json.dumps([{"timestamp_ms": i / 30, "blendshapes": {"jawOpen": 0}} for i in range(3)]),
+            'has 30000 frames in a second; give milliseconds, or call seconds "time"',
+        ),
+        (
+            "a.json",
+            json.dumps([{"time": 33 * i, "blendshapes": {"jawOpen": 0}} for i in range(3)]),
+            'has frames of 33 s; give seconds, or call milliseconds "timestamp_ms"',
+        ),
+        (
+            "a.json",
+            json.dumps([{"face_blendshapes": [[]], "facial_transformation_matrixes": [[[1] * 4] * 4]}]),
+            "has a matrix whose last row is not 0 0 0 1 in frame 0",
+        ),
+        ("a.json", '{"names": ["jawOpen"], "frames": [{"weights": []}]}', "has other numbers of names and weights"),
         ("a.json", '[{"blendshapes": {"smile": 1}}]', "has none of this avatar's expressions"),
     ],
 )

@@ -102,7 +102,9 @@ function addMotion(viewer: Viewer, moveSliders: () => void): void {
     const message = find("message");
     message.textContent = "";
     try {
-      viewer.setMotion(readSeries(await given.text(), viewer.avatar));
+      const notes: string[] = [];
+      viewer.setMotion(readSeries(await given.text(), viewer.avatar, notes));
+      message.textContent = notes.map((note) => `${given.name} ${note}.`).join(" ");
       take();
       toggle();
     } catch (error) {

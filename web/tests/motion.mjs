@@ -1,5 +1,5 @@
 // Reads a recording for an avatar as a page does, for tests/test_web_motion.py:
-//   node motion.mjs MIEN.JS MOTION.JS AVATAR.mien RECORDING OUT   writes fps and the arrays of the motion as json
+//   node motion.mjs MIEN.JS MOTION.JS AVATAR.mien RECORDING OUT   writes fps, the arrays of the motion and the notes as json
 import { readFileSync, writeFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
 
@@ -10,8 +10,9 @@ const bytes = readFileSync(path);
 const avatar = readMien(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength));
 let told;
 try {
-  const motion = readSeries(readFileSync(recording, "utf8"), avatar);
+  const notes = [], motion = readSeries(readFileSync(recording, "utf8"), avatar, notes);
   told = Object.fromEntries(Object.entries(motion).map(([name, values]) => [name, typeof values === "number" ? values : Array.from(values)]));
+  told.notes = notes;
 } catch (error) {
   told = { error: error.message };
 }
