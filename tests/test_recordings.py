@@ -145,6 +145,7 @@ def test_names_that_are_not_arkits(tmp_path: Path) -> None:
         ),
         ({**weights, "facsNames": None}, "has no list of names"),
         ({**weights, "exportFps": -1}, "exportFps is -1; give frames per second"),
+        ({**weights, "exportFps": 1e-320}, "give frames per second, from 1 to 500"),
         ({**weights, "weightMat": [[0.5]]}, "frame 0: has 1 weights for 3 names"),
         ({**weights, "weightMat": [[0.5, "wide", 0]]}, "mouthSmile_L is 'wide'"),
         ({**weights, "weightMat": {}}, '"weightMat" is not a list of frames'),

@@ -46,7 +46,7 @@ function framesOf(content: any): [Frame[], number | undefined] {
 
 function rateOf(fps: unknown): number | undefined {
   if (fps === undefined || fps === null) return undefined;
-  if (typeof fps !== "number" || !(fps > 0 && fps <= 1000)) throw new AvatarError(`has ${fps} frames per second`);
+  if (typeof fps !== "number" || !(fps >= 1 && fps <= 500)) throw new AvatarError(`has ${fps} frames per second`);
   return fps;
 }
 

@@ -30,7 +30,7 @@ _MATRICES = ("facialTransformationMatrixes", "facial_transformation_matrixes")
 _CATEGORY = ("categoryName", "category_name")
 _MAX_MATRIX_ENTRY = 1e6
 """Largest number in a transformation matrix (translations are in centimetres)."""
-_MAX_FPS = 1000.0
+_MIN_FPS, _MAX_FPS = 1.0, 500.0
 _LEAST_KNOWN = 0.5
 """Least share of ARKit's names among the names of a file whose other names are left out."""
 
@@ -159,8 +159,8 @@ def _audio2face(content: dict[str, Any], path: Path) -> Recorded:
 def _rate(value: Any, key: str, path: Path) -> float | None:
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= _MAX_FPS:
-        raise UserError(f"{path}: {key} is {short(value)}; give frames per second, up to {_MAX_FPS:g}")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not _MIN_FPS <= value <= _MAX_FPS:
+        raise UserError(f"{path}: {key} is {short(value)}; give frames per second, from {_MIN_FPS:g} to {_MAX_FPS:g}")
     return float(value)
 
 
