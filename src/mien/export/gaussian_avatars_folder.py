@@ -6,6 +6,9 @@ folder: FLAME, with the parameters in flame_param.npz, is assumed. Avatars on ot
 beside them (face_model.json and face_model.safetensors), unless its licence forbids copies.
 """
 
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +27,7 @@ from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.inside import open_to_read
 from mien.limits import MAX_NUMBER
 from mien.runtime.baked import MeshBound
-from mien.storage import write_atomically
+from mien.storage import cannot_write, write_atomically
 
 POINTS, PARAMETERS, MODEL = "point_cloud.ply", "flame_param.npz", "face_model"
 """Names of the files. The face model's are MODEL.json and MODEL.safetensors."""
@@ -54,8 +57,8 @@ def write_gaussian_avatars_folder(folder: Path, avatar: Avatar, face: FaceParams
         face: The subject at any number of timesteps.
 
     Raises:
-        UserError: the avatar's Gaussians are not bound to triangles, or change with the expression, or a value is NaN
-            or infinite.
+        UserError: the avatar's Gaussians are not bound to triangles, or change with the expression, a value is NaN or
+            infinite, or a file cannot be written. Earlier files are then kept.
     """
     baked = avatar.bake()
     if not isinstance(baked, MeshBound):
@@ -68,14 +71,11 @@ def write_gaussian_avatars_folder(folder: Path, avatar: Avatar, face: FaceParams
             f"{folder}: GaussianAvatars' folder cannot hold Gaussians that change with the expression "
             "(--method.expression-rank); export a .mien instead, or train a run with rank 0"
         )
-    model = avatar.face_model
-    write_flame_params(folder / PARAMETERS, model, face)
-    if model.shareable:
-        write_face_model(folder / MODEL, model)
-    else:
-        for name in _MODEL_FILES:  # of another avatar that was exported here before
-            (folder / name).unlink(missing_ok=True)
-    _write_points(folder / POINTS, baked)
+    with _replaced_together(folder) as aside:
+        write_flame_params(aside / PARAMETERS, avatar.face_model, face)
+        if avatar.face_model.shareable:
+            write_face_model(aside / MODEL, avatar.face_model)
+        _write_points(aside / POINTS, baked)
 
 
 def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = None) -> GaussianAvatarsFolder:
@@ -126,6 +126,30 @@ def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = No
     own = {key: trained.get(key.rpartition(".")[2], binding) for key in avatar.state_dict()}
     overwrite(avatar, own, len(binding), path)
     return GaussianAvatarsFolder(avatar, face)
+
+
+@contextmanager
+def _replaced_together(folder: Path) -> Iterator[Path]:
+    """A hidden folder for new files, which replace those of an earlier export when all of them are written.
+
+    Raises:
+        UserError: a file cannot be written. The earlier files are kept.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".partial-") as name:
+            aside = Path(name)
+            try:
+                yield aside
+            except UserError as error:
+                raise UserError(str(error).replace(str(aside), str(folder))) from None
+            for file in (PARAMETERS, *_MODEL_FILES, POINTS):
+                if (aside / file).exists():
+                    (aside / file).replace(folder / file)
+                else:  # of another avatar that was exported here before
+                    (folder / file).unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from None
 
 
 def _write_points(path: Path, baked: MeshBound) -> None:

@@ -1,9 +1,13 @@
 """USD files with a ParticleField3DGaussianSplat (OpenUSD 26.03 or newer, by usd-core): a pose, or a sequence."""
 
+import errno
 import importlib
 import math
+import os
 import tempfile
-from collections.abc import Iterable
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,42 +32,30 @@ def write_usd(path: Path, poses: Iterable[Gaussians], fps: float | None = None) 
     there is one pose and no time. The ending of `path` chooses the container (`USD_ENDINGS`).
 
     Raises:
-        UserError: usd-core is missing or too old, or a value is NaN or infinite.
+        UserError: usd-core is missing or too old, a value is NaN or infinite, or the file cannot be written.
     """
     check_usd(path)
-    Sdf, Usd, UsdGeom, UsdUtils, UsdVol = _pxr("Sdf", "Usd", "UsdGeom", "UsdUtils", "UsdVol")
+    Usd, UsdVol = _pxr("Usd", "UsdVol")
 
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         version = ".".join(map(str, Usd.GetVersion()))
         raise UserError(f"{path}: needs usd-core 26.3 or newer, not {version}; run `pip install -U 'mien[usd]'`")
-    with tempfile.TemporaryDirectory() as folder:
-        # A package is made of a finished file.
-        inner = Path(folder) / (path.with_suffix(".usdc").name if path.suffix.lower() == ".usdz" else path.name)
-        stage = Usd.Stage.CreateNew(str(inner))
-        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        root = UsdGeom.Xform.Define(stage, _ROOT)
-        stage.SetDefaultPrim(root.GetPrim())
-        Usd.ModelAPI(root.GetPrim()).SetKind("component")
-        field = UsdVol.ParticleField3DGaussianSplat.Define(stage, _SPLATS)
-        count = 0
-        for count, gaussians in enumerate(poses, 1):  # noqa: B007
-            _add_pose(path, field, gaussians, None if fps is None else float(count - 1))
-        if fps is not None:
-            stage.SetTimeCodesPerSecond(fps)
-            stage.SetFramesPerSecond(fps)
-            stage.SetStartTimeCode(0)
-            stage.SetEndTimeCode(max(count - 1, 0))
-        stage.GetRootLayer().Save()
-        del stage
+    count = 0
 
-        def finish(temporary: Path) -> None:
-            if inner.suffix != path.suffix:
-                UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inner)), str(temporary))
+    def write(temporary: Path) -> None:
+        nonlocal count
+        # USD writes its files beside the output, so that only one disk can be full. It replaces files by renaming.
+        with tempfile.TemporaryDirectory(dir=temporary.parent.absolute(), prefix=".usd-") as folder, _usd_errors():
+            # A package is made of a finished file.
+            packed = path.suffix.lower() == ".usdz"
+            inner = Path(folder) / (path.with_suffix(".usdc").name if packed else path.name)
+            count = _write_stage(path, inner, poses, fps)
+            if packed:
+                _write_package(inner, temporary)
             else:
-                temporary.write_bytes(inner.read_bytes())
+                inner.replace(temporary)
 
-        write_atomically(path, finish)
+    write_atomically(path, write)
     return count
 
 
@@ -100,6 +92,58 @@ def read_usd(path: Path, time: float | None = None) -> Gaussians:
 def _pxr(*names: str) -> list[Any]:
     """Modules of usd-core, which have no types."""
     return [importlib.import_module(f"pxr.{name}") for name in names]
+
+
+@contextmanager
+def _usd_errors() -> Iterator[None]:
+    """Raise errors of USD as the system's error that is named in their text."""
+    (Tf,) = _pxr("Tf")
+    try:
+        yield
+    except Tf.ErrorException as error:
+        code = next((code for code in errno.errorcode if os.strerror(code) in str(error)), errno.EIO)
+        raise OSError(code, os.strerror(code)) from None
+
+
+def _write_stage(path: Path, file: Path, poses: Iterable[Gaussians], fps: float | None) -> int:
+    """Write the poses into `file`, and return their number. Messages name `path`."""
+    Usd, UsdGeom, UsdVol = _pxr("Usd", "UsdGeom", "UsdVol")
+
+    stage = Usd.Stage.CreateNew(str(file))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    root = UsdGeom.Xform.Define(stage, _ROOT)
+    stage.SetDefaultPrim(root.GetPrim())
+    Usd.ModelAPI(root.GetPrim()).SetKind("component")
+    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, _SPLATS)
+    count = 0
+    for count, gaussians in enumerate(poses, 1):  # noqa: B007
+        _add_pose(path, field, gaussians, None if fps is None else float(count - 1))
+    if fps is not None:
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetFramesPerSecond(fps)
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(max(count - 1, 0))
+    stage.GetRootLayer().Save()
+    return count
+
+
+def _write_package(stage: Path, package: Path) -> None:
+    """Write the package of a stage's file.
+
+    Raises:
+        OSError: the package is not whole. USD gives no reason, and the usual one is a full disk.
+    """
+    Sdf, UsdUtils = _pxr("Sdf", "UsdUtils")
+
+    whole = UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(stage)), str(package))
+    try:
+        with zipfile.ZipFile(package) as members:
+            whole = whole and members.testzip() is None
+    except zipfile.BadZipFile:
+        whole = False
+    if not whole:
+        raise OSError(errno.ENOSPC, "its package is incomplete")
 
 
 def _add_pose(path: Path, field: Any, gaussians: Gaussians, time: float | None) -> None:
