@@ -2,8 +2,10 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -69,6 +71,23 @@ def test_what_is_scored_is_known_to_be(workspace: tuple[Path, Path]) -> None:
     (run_dir / "report.html").unlink()
     assert not is_evaluated(run_dir, [folder], quick)
     evaluate(run_dir, [folder])
+
+
+def test_figures_of_other_scoring_masks_are_not_kept(workspace: tuple[Path, Path], tmp_path: Path) -> None:
+    """The masks of a sequence are written anew, and larger."""
+    folder, run_dir = tmp_path / "clip", tmp_path / "run"
+    shutil.copytree(workspace[0], folder)
+    shutil.copytree(workspace[1], run_dir)
+    quick = EvaluationSettings(perceptual=False, baselines=False, video_frames=0)
+    before = evaluate(run_dir, [folder], quick)
+    shutil.rmtree(folder / "scoring")
+    scoring = make_experiment().scorings[0]
+    write_scoring(folder / "scoring", replace(scoring, masks=np.full_like(scoring.masks, 255)))
+    assert not is_evaluated(run_dir, [folder], quick)
+    after = evaluate(run_dir, [folder], quick)
+    assert after["fingerprints"] != before["fingerprints"], "figures of an interrupted evaluation are kept by these"
+    old, new = (result["protocols"]["self_reenactment"]["per_frame"]["psnr"] for result in (before, after))
+    assert all(first != second for first, second in zip(old, new, strict=True))
 
 
 def test_held_out_frames_are_those_training_left_out(workspace: tuple[Path, Path]) -> None:

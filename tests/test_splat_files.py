@@ -110,6 +110,31 @@ def test_round_trip(
     assert len(read(tmp_path / f"none{ending}")) == 0
 
 
+QUATS_IN_SPZ = {
+    (1.0, 0.0, 0.0, 0.0): 3 << 30,
+    (0.8, 0.6, 0.0, 0.0): 3 << 30 | 434 << 20,
+    (0.8, 0.0, -0.6, 0.0): 3 << 30 | (1 << 9 | 434) << 10,
+    (0.8, 0.0, 0.0, 0.6): 3 << 30 | 434,
+    (0.0, 1.0, 0.0, 0.0): 0,
+    (0.6, -0.8, 0.0, 0.0): 1 << 9 | 434,
+    (0.0, 0.6, 0.0, 0.8): 2 << 30 | 434 << 20,
+}
+"""Quaternions wxyz, and their 32 bits in version 3 of .spz: the index of the largest component of xyzw, then the other three in
+that order, a sign and 9 bits of size in steps of sqrt(1/2) / 511 each. 0.6 is 434 steps."""
+
+
+def test_quaternions_lie_in_spz_in_the_order_of_its_specification(tmp_path: Path) -> None:
+    """Writer and reader could swap components alike, which no round trip would see."""
+    one = replace(some(len(QUATS_IN_SPZ), 1), quats=torch.tensor(list(QUATS_IN_SPZ)))
+    write_spz(tmp_path / "a.spz", one)
+    content = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    words = np.frombuffer(content[-4 * len(one) :], "<u4")
+    assert [f"{word:032b}" for word in words.tolist()] == [f"{word:032b}" for word in QUATS_IN_SPZ.values()]
+    found = read_spz(tmp_path / "a.spz").quats
+    same = (found * torch.tensor(list(QUATS_IN_SPZ))).sum(-1).abs()
+    torch.testing.assert_close(same, torch.ones(len(one)), atol=1e-4, rtol=0)
+
+
 @pytest.mark.parametrize("coefficients", [1, 4, 16])
 def test_another_program_opens_spz(tmp_path: Path, coefficients: int) -> None:
     """It knows that .spz has +y up, and turns its .ply into the frame of captures."""

@@ -179,6 +179,18 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert naive / rounds < 0.85
 
 
+def test_few_participants_have_wider_intervals_by_student_s_factor() -> None:
+    """Three people, 12.5 judgements' worth of evidence: (1.96 / 4.30)^2 of it counts, which leaves 2.6."""
+    shares = np.array([0.4, 0.5, 0.75])
+    share, variance = float(shares.mean()), float(np.var(shares, ddof=1)) / 3
+    evidence = share * (1 - share) / variance
+    assert 3 < evidence < 30
+    z = 1.959964
+    wanted = wilson(share, evidence * (z / 4.3027) ** 2, z)
+    assert interval(shares, 10) == pytest.approx(wanted, abs=0.005)
+    assert wanted[1] - wanted[0] > 1.5 * np.ptp(wilson(share, evidence, z)), "what the factor is about"
+
+
 def test_intervals_at_the_edges() -> None:
     low, high = interval(np.zeros(15), 10)
     assert low == 0

@@ -50,6 +50,7 @@ def test_short_clips_have_a_fifth_block_too(timesteps: int, expected: list[int])
 
 def test_tail_holds_out_the_last_fifth() -> None:
     assert held_out(101, "tail").nonzero()[:, 0].tolist() == list(range(81, 101))
+    assert int(held_out(104, "tail").sum()) == 21, "20.8 timesteps are rounded, not cut"
     assert not held_out(101, "none").any()
 
 

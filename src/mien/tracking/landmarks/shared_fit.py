@@ -62,25 +62,17 @@ def _fit_jointly(
     terms: Sequence[LandmarkTerm], start: Fit, lenses: Sequence[int | None], settings: TrackingSettings
 ) -> Fit:
     bounds, damping = terms[0].model.layout.bounds, 1e-3
-    precision = _precision(start, lenses, settings)
+    precision = precision_of_shared(start, lenses, settings)
     free = len(precision) - len(start.subject.shared)
-
-    def cost(candidate: _Joint) -> float:
-        fit = candidate.fit
-        total = (precision * _shared_values(candidate) ** 2).sum()
-        for term, own in zip(terms, fit.sequences, strict=True):
-            total = total + term.cost(own.state, fit.subject, own.cameras).sum()
-        return float(total)
-
     at = _Joint(start, start.subject.identity.new_zeros(free))
-    best = cost(at)
+    best = joint_cost(terms, at.fit, precision, _shared_values(at))
     for _ in range(_ITERATIONS):
         frames, shared = _equations(terms, at.fit, lenses, free)
         shared = shared.with_prior(precision, _shared_values(at))
         state = torch.cat([own.state for own in at.fit.sequences])
         step, shared_step = solve_arrow(frames, shared, bounds.held(state, frames.gradient), damping)
         candidate = _move(at, step, shared_step, start, lenses, bounds, terms[0].model.response)
-        candidate_cost = cost(candidate)
+        candidate_cost = joint_cost(terms, candidate.fit, precision, _shared_values(candidate))
         if candidate_cost < best:
             at, best, damping = candidate, candidate_cost, damping / 5
         else:
@@ -88,7 +80,17 @@ def _fit_jointly(
     return at.fit
 
 
-def _precision(fit: Fit, lenses: Sequence[int | None], settings: TrackingSettings) -> Float[Tensor, " s"]:
+def joint_cost(
+    terms: Sequence[LandmarkTerm], fit: Fit, precision: Float[Tensor, " s"], shared: Float[Tensor, " s"]
+) -> float:
+    """The cost of all timesteps and of the shared parameters, whose prior has these precisions and mean zero."""
+    total = (precision * shared**2).sum()
+    for term, own in zip(terms, fit.sequences, strict=True):
+        total = total + term.cost(own.state, fit.subject, own.cameras).sum()
+    return float(total)
+
+
+def precision_of_shared(fit: Fit, lenses: Sequence[int | None], settings: TrackingSettings) -> Float[Tensor, " s"]:
     """Precisions of the priors of `Subject.shared` and the free focal lengths."""
     subject = torch.ones_like(fit.subject.shared)
     subject[: len(fit.subject.identity)] = settings.identity_weight
