@@ -44,8 +44,8 @@ def test_values_times_and_turns(tmp_path: Path) -> None:
 
 
 def test_the_rate_is_the_lowest_that_has_the_frame_numbers(tmp_path: Path) -> None:
-    """Frames of 30 a second have the numbers 0 to 29, so the number 30 means 60."""
-    for largest, rate in ((29, 30), (30, 60)):
+    """Frames of 30 a second have the numbers 0 to 29, so the number 30 means 48, the next rate."""
+    for largest, rate in ((29, 30), (30, 48)):
         rows = [row(f"0:00:0{second}:{frame:02d}.0") for second in (0, 1) for frame in range(largest + 1)]
         motion = read_live_link_face(write_csv(tmp_path / "a.csv", *rows))
         assert (len(motion) - 1) / motion.fps == pytest.approx(1 + largest / rate, abs=0.02)

@@ -119,8 +119,8 @@ QUATS_IN_SPZ = {
     (0.6, -0.8, 0.0, 0.0): 1 << 9 | 434,
     (0.0, 0.6, 0.0, 0.8): 2 << 30 | 434 << 20,
 }
-"""Quaternions wxyz, and their 32 bits in version 3 of .spz: the index of the largest component of xyzw, then the other three in
-that order, a sign and 9 bits of size in steps of sqrt(1/2) / 511 each. 0.6 is 434 steps."""
+"""Quaternions wxyz, and their 32 bits in version 3 of .spz: the index of the largest component of xyzw, then the other
+three in that order, a sign and 9 bits of size each, in steps of sqrt(1/2) / 511. 0.6 is 434 steps."""
 
 
 def test_quaternions_lie_in_spz_in_the_order_of_its_specification(tmp_path: Path) -> None:
