@@ -1,0 +1,1 @@
+"""Mutations of mien's code: small mistakes that the tests must catch."""

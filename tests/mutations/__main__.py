@@ -1,0 +1,73 @@
+"""Mutate the code, one mistake at a time, and run the tests that should catch it: `make mutate`."""
+
+import argparse
+import json
+import os
+import re
+import shutil
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from mutations.cases import CASES, Case
+from mutations.copies import MutationError, Verdict, Workshop
+
+CAUGHT_SHARE = 0.95
+"""Share of the mutations that the tests must catch."""
+
+
+def main() -> int:
+    """Try the mutations. The exit code is 1 if fewer than 95 % are caught, and 2 if one cannot be tried."""
+    parser = argparse.ArgumentParser(prog="mutations", description=__doc__)
+    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose file or text has this")
+    parser.add_argument("--workers", type=int, default=1, help="copies of the project that are mutated at once")
+    parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write all verdicts here")
+    asked = parser.parse_args()
+    cases = [case for case in CASES if asked.only in f"{case.file} {case.old}"]
+    if not cases:
+        parser.error(f"--only {asked.only}: no mutation has this in its file or text")
+    folder = Path(tempfile.mkdtemp(prefix="mien-mutate-"))
+    try:
+        verdicts = _try_all(cases, folder, asked.workers)
+    except MutationError as error:
+        print(f"mutations: {error}", file=sys.stderr)
+        return 2
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    if asked.json:
+        asked.json.parent.mkdir(parents=True, exist_ok=True)
+        asked.json.write_text(json.dumps([verdict.as_json() for verdict in verdicts], indent=1) + "\n")
+    caught = sum(verdict.caught for verdict in verdicts)
+    print(f"{caught} of {len(verdicts)} mutations are caught ({100 * caught / len(verdicts):.1f} %).")
+    for verdict in verdicts:
+        if not verdict.caught:
+            print(f"  survives: {verdict.case.file}: {verdict.case.old!r} -> {verdict.case.new!r}")
+    return int(caught < CAUGHT_SHARE * len(verdicts))
+
+
+def _try_all(cases: list[Case], folder: Path, workers: int) -> list[Verdict]:
+    """Try the cases in `workers` copies of the project, and print a line for each."""
+    workshops = [Workshop(folder / str(index)) for index in range(min(workers, len(cases)))]
+    free, done = list(workshops), 0
+
+    def attempt(case: Case) -> Verdict:
+        nonlocal done
+        workshop = free.pop()
+        began = time.monotonic()
+        verdict = workshop.attempt(case)
+        free.append(workshop)
+        done += 1
+        word = "caught" if verdict.caught else "SURVIVES"
+        took, by = time.monotonic() - began, re.sub(r" - .*", "", verdict.by)
+        print(f"{done:3}/{len(cases)} {word:8} {took:4.0f} s  {case.file}: {case.new}  {by}", flush=True)
+        return verdict
+
+    with ThreadPoolExecutor(len(workshops)) as pool:
+        return list(pool.map(attempt, cases))
+
+
+if __name__ == "__main__":
+    os.nice(5)
+    sys.exit(main())
