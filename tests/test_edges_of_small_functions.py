@@ -1,0 +1,127 @@
+"""Edges of small functions that larger tests do not reach: first and last entries, limits, signs, directions."""
+
+import math
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mien.camera import camera_from_fov
+from mien.capture.matte import guided_filter
+from mien.errors import UserError
+from mien.face.checks import check_face_model
+from mien.face.mirror import triangle_geometry
+from mien.face.npz import read_npz
+from mien.limits import MAX_NUMBER
+from mien.ranges import Range
+from mien.render.camera_paths import sway
+from mien.threads import MAX_THREADS, VARIABLE, asked_threads
+from mien.tracking.fitting.views import Views
+from mien.tracking.scoring import cut_matte
+from small_face_model import make_small_face_model
+from toy_scene import toy_camera, toy_face
+
+
+def test_a_fitted_view_keeps_its_middle() -> None:
+    camera = camera_from_fov(0.5, 100, 200)
+    axis = torch.tensor([[0.0, 0.0, 1.0]])
+    for zoom in (1.0, 0.7, 2.5):
+        fitted = camera.fitted(300, 90, zoom)
+        torch.testing.assert_close(fitted.project(axis)[0], torch.tensor([[150.0, 45.0]]))
+        assert float(fitted.K[0, 0]) == pytest.approx(float(camera.K[0, 0]) * zoom * 90 / 200)
+
+
+def test_ascending_numbers_may_not_repeat() -> None:
+    ascending = Range(0, 1, ascending=True)
+    assert ascending.holds((0.2, 0.3))
+    assert not ascending.holds((0.2, 0.2))
+
+
+@pytest.mark.parametrize(("text", "number"), [("1", 1), (str(MAX_THREADS), MAX_THREADS), ("0", None), ("1025", None)])
+def test_the_most_threads_may_be_asked_for(text: str, number: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, text)
+    if number is None:
+        with pytest.raises(UserError, match=f"{VARIABLE}={text}: give a number from 1 to {MAX_THREADS}"):
+            asked_threads()
+    else:
+        assert asked_threads() == number
+
+
+def test_the_last_timestep_can_be_taken_by_minus_one() -> None:
+    face = toy_face(4)
+    for index, wanted in ((-1, 3), (0, 0), (-2, 2)):
+        assert len(face[index]) == 1
+        assert torch.equal(face[index].expression[0], face.expression[wanted])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_huge_numbers_of_a_face_model_are_refused_with_either_sign(sign: float) -> None:
+    model = make_small_face_model()
+    check_face_model(model, "here", "bake it again")
+    template = model.template.clone()
+    template[3, 1] = sign * 2 * MAX_NUMBER
+    with pytest.raises(UserError, match="template holds NaN or numbers beyond"):
+        check_face_model(replace(model, template=template), "here", "bake it again")
+
+
+@pytest.mark.parametrize("length", [0, 300, 65535])
+def test_an_archive_may_have_a_comment(tmp_path: Path, length: int) -> None:
+    np.savez(tmp_path / "a.npz", v=np.arange(3.0))
+    with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive:
+        archive.comment = b"c" * length
+    assert read_npz(tmp_path / "a.npz", {"v"})[1]["v"].tolist() == [0, 1, 2]
+
+
+def test_normals_of_triangles_point_to_where_corners_run_counterclockwise() -> None:
+    vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 1, 0]])
+    middle, area, normal = triangle_geometry(vertices, torch.tensor([[0, 1, 2]]))
+    torch.testing.assert_close(normal, torch.tensor([[0.0, 0, 1]]))
+    torch.testing.assert_close(area, torch.tensor([1.0]))
+    torch.testing.assert_close(middle, torch.tensor([[2 / 3, 1 / 3, 0]]))
+
+
+def test_a_figure_eight_crosses_itself_in_the_middle_and_an_oval_does_not() -> None:
+    camera, centre = toy_camera(64), torch.tensor([0.0, 0.0, -0.5])
+    for crossing in (True, False):
+        places = torch.stack([view.position for view in sway(camera, centre, 8, 0.6, 0.2, crossing)])
+        height, side = places[:, 1], places[:, 0]
+        assert float(side[2]) > 0.1 > -0.1 > float(side[6])
+        # A quarter of the way it is farthest to one side. A figure eight is at half its height there.
+        assert float(height[2]) == pytest.approx(0, abs=1e-6)
+        assert float(height[[1, 3]].prod()) == pytest.approx(-float(height[1].square()), rel=1e-3)
+        extremes = (1, 3) if crossing else (0, 4)
+        angles = [math.asin(float(height[index]) / 0.5) for index in extremes]
+        assert [abs(angle) for angle in angles] == pytest.approx([0.1, 0.1], abs=1e-3)
+
+
+def test_the_first_of_chosen_timesteps_keeps_its_pictures() -> None:
+    views = Views(
+        torch.arange(10.0).reshape(5, 1, 2), torch.tensor([0, 0, 1, 2, 3]), torch.tensor([0, 1, 0, 1, 0]), torch.ones(5)
+    )
+    some = views.at(torch.tensor([3, 0]))
+    assert some.row.tolist() == [1, 1, 0]
+    assert some.camera.tolist() == [0, 1, 0]
+    assert some.detected[:, 0, 0].tolist() == [0, 2, 8]
+
+
+def test_a_guided_filter_is_the_locally_affine_fit_to_colours() -> None:
+    """Values that are affine in the guide stay, with channels that vary together, as in real pictures."""
+    random = np.random.default_rng(5)
+    grey = random.random((40, 40, 1))
+    guide = (0.7 * grey + 0.3 * random.random((40, 40, 3))).astype(np.float32)
+    guide = np.repeat(np.repeat(guide, 2, 0), 2, 1)  # The filter works on every second pixel.
+    values = guide @ np.array([0.6, -0.4, 0.8], np.float32) + 0.1
+    found = guided_filter(guide, values, 8, 1e-7)
+    np.testing.assert_allclose(found[8:-8, 8:-8], values[8:-8, 8:-8], atol=2e-3)
+
+
+def test_the_matte_beside_the_head_is_whole_within_a_margin() -> None:
+    """A head of 201 columns has a margin of 3 pixels, in which the matte is not cut."""
+    head = np.zeros((300, 300), bool)
+    head[50:250, 50:251] = True
+    cut = cut_matte(np.full((300, 300), 255, np.uint8), head, np.full((300, 300), 0.5, np.float32))
+    assert cut[150, 253] == 255
+    assert cut[150, 254] == 128
