@@ -95,6 +95,13 @@ def test_crops_lie_in_the_picture_and_visit_every_part() -> None:
     assert drawn_crop(target, 512, crop_random(settings, 0)) == (0, 0, 80, 60)
 
 
+def test_crops_of_low_pictures_are_as_wide_as_asked() -> None:
+    """A picture of 128 x 64 has no square of 100 pixels, so the crop is 100 wide and 64 high."""
+    target = replace(some_target((), 64, 128), picture=torch.full((64, 128, 3), 90, dtype=torch.uint8))
+    goal = perceptual_goal(target, PerceptualLoss(crop=100), crop_random(TrainSettings(), 0))
+    assert target.picture[goal.crop].shape == (64, 100, 3)
+
+
 def test_weight_of_a_pixel_is_that_of_the_whole_picture() -> None:
     """The same crop counts half as much in a picture that is twice as large."""
     losses = []

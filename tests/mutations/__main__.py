@@ -11,7 +11,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from mutations.cases import CASES, Case
+from mutations.cases import Case, read_cases
 from mutations.copies import MutationError, Verdict, Workshop
 
 CAUGHT_SHARE = 0.95
@@ -25,7 +25,7 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=1, help="copies of the project that are mutated at once")
     parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write all verdicts here")
     asked = parser.parse_args()
-    cases = [case for case in CASES if asked.only in f"{case.file} {case.old}"]
+    cases = [case for case in read_cases() if asked.only in f"{case.file} {case.old}"]
     if not cases:
         parser.error(f"--only {asked.only}: no mutation has this in its file or text")
     folder = Path(tempfile.mkdtemp(prefix="mien-mutate-"))
