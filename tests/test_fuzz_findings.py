@@ -185,7 +185,7 @@ def test_moments_of_another_type(run: Path, tmp_path: Path) -> None:
     model, sequence = toy_sequence(timesteps=5, size=32)
     state = trainer.start([sequence], model, train_toy.CONFIG, train_toy.SETTINGS)
     with pytest.raises(UserError, match="the moments of means have another type"):
-        resume(tmp_path, state)
+        resume(tmp_path, state, first_record=1)
 
 
 def test_a_tracking_of_another_size_names_its_folder(tmp_path: Path) -> None:
