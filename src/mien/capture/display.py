@@ -1,39 +1,42 @@
-"""Step 1: convert decoded video frames to what an sRGB screen shows (matrix, range, HDR, pixel aspect, rotation)."""
+"""Step 1: convert decoded video frames to what an sRGB screen shows (colours, HDR, pixel aspect, rotation)."""
 
 from typing import Any
 
 import av
 import numpy as np
 from av.sidedata.sidedata import Type as SideDataType
-from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
+from av.video.reformatter import Interpolation, VideoReformatter
 from jaxtyping import UInt8
 
-from mien.capture.tone import HLG, PQ, ToneMapper
+from mien.capture.colours import UNSPECIFIED, Colours, colours_of
+from mien.capture.tone import ToneMapper
 from mien.capture.video_file import MAX_FRAME_PIXELS, TOO_MANY_PIXELS
 from mien.errors import UserError
 
 ACCURATE = Interpolation.BICUBIC | Interpolation.FULL_CHR_H_INT | Interpolation.ACCURATE_RND
 """Without accurate rounding swscale is five times faster, but it darkens pictures by a whole level."""
 _SHRINKING = Interpolation.AREA | Interpolation.ACCURATE_RND
-_UNSPECIFIED_COLORSPACE = 2
-_HIGH_DEFINITION_HEIGHT = 720
 _ASPECT_TOLERANCE = 0.01
 
 
 class Display:
     """Converts the frames of one clip to one size, which the first frame decides."""
 
-    def __init__(self, name: str, pixel_aspect: float = 1.0, longest_side: int = 0) -> None:
+    def __init__(
+        self, name: str, pixel_aspect: float = 1.0, longest_side: int = 0, container: Colours = UNSPECIFIED
+    ) -> None:
         """Create the converter of one clip.
 
         Args:
             name: name of the clip, for messages.
             pixel_aspect: width of a pixel over its height. Frames are stretched, never shrunk, to square pixels.
             longest_side: side in pixels to which larger pictures are shrunk (area-averaged). 0 keeps the size.
+            container: colours that the clip's container states.
         """
         self._name = name
         self._pixel_aspect = pixel_aspect
         self._longest_side = longest_side
+        self._container = container
         self._reformatter = VideoReformatter()
         self._tone_mappers: dict[int, ToneMapper] = {}
         self._matrix: list[int] = []
@@ -47,20 +50,20 @@ class Display:
             UserError: the aspect ratio differs from that of earlier frames, or the converted frame has too many pixels.
         """
         self._fit(frame)
-        is_hdr = frame.color_trc in (PQ, HLG)
+        colours = colours_of(frame, self._container)
         same_size = self._size == (frame.width, frame.height)
         shrinks = self._size[0] < frame.width or self._size[1] < frame.height
         converted = self._reformatter.reformat(
             frame,
             width=self._size[0],
             height=self._size[1],
-            format="rgb48le" if is_hdr else "rgb24",
-            src_colorspace=_colorspace(frame, is_hdr),
+            format="rgb48le" if colours.hdr else "rgb24",
+            src_colorspace=colours.matrix,
+            src_color_range=colours.range,
             interpolation=_SHRINKING if shrinks and not same_size else ACCURATE,
         ).to_ndarray()
-        if is_hdr:
-            transfer = int(frame.color_trc)
-            mapper = self._tone_mappers.setdefault(transfer, ToneMapper(transfer))
+        if colours.hdr:
+            mapper = self._tone_mappers.setdefault(colours.transfer, ToneMapper(colours.transfer))
             converted = mapper.to_srgb(converted)
         return _turn(converted, self._matrix) if self._matrix else converted
 
@@ -88,15 +91,6 @@ def _display_size(width: int, height: int, pixel_aspect: float, longest_side: in
     square = (width * max(1.0, pixel_aspect), height / min(1.0, pixel_aspect))
     scale = min(1.0, longest_side / max(square)) if longest_side else 1.0
     return max(1, round(square[0] * scale)), max(1, round(square[1] * scale))
-
-
-def _colorspace(frame: av.VideoFrame, is_hdr: bool) -> int:
-    if frame.colorspace != _UNSPECIFIED_COLORSPACE:
-        return frame.colorspace
-    if is_hdr:
-        return Colorspace.BT2020
-    # Players assume BT.709 from 720 lines up and BT.601 below if a file does not name its matrix.
-    return Colorspace.ITU709 if frame.height >= _HIGH_DEFINITION_HEIGHT else Colorspace.ITU601
 
 
 def _display_matrix(frame: av.VideoFrame) -> list[int]:

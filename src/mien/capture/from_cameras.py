@@ -36,6 +36,7 @@ from mien.capture.room import check_room
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import CaptureData, finish_capture, partial_folder, read_capture
 from mien.capture.survey import Survey, survey_source
+from mien.capture.video_kind import kind_report, tell_fields, tell_kind
 from mien.errors import UserError
 from mien.inside import remove_tree
 from mien.locks import hold
@@ -198,7 +199,9 @@ def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folde
     views = []
     for job, camera in zip(jobs, cameras, strict=True):
         landmarks = read_given(job.settings, job.frames).landmarks
+        tell_kind(job.frames)
         survey = survey_source(job.frames, folder / camera.camera_id, landmarks)
+        tell_fields(job.frames, survey)
         fitted = camera.for_pictures(*(int(side) for side in survey.picture_size))
         views.append(_View(camera.camera_id, job, survey, choose_person(survey), fitted))
     _check_counts({view.camera_id: len(view.survey.timestamps) for view in views})
@@ -287,6 +290,7 @@ def _finish(
         "frames": len(timestamps),
         "frames_without_face": int((~data.valid.any(axis=1)).sum()),
         "faces_by_camera": dict(zip(layout.camera_ids, found.tolist(), strict=True)),
+        "kind_by_camera": {view.camera_id: kind_report(view.job.frames, view.survey) for view in views},
         **quality_report(whole.name, quality),
     }
     digests = {FRAMES: _joined_arrays(chunks, "frame_digests"), MATTES: _joined_arrays(chunks, "matte_digests")}

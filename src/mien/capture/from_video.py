@@ -24,6 +24,7 @@ from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, FrameSource, open_source
 from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, partial_folder, read_capture
 from mien.capture.survey import Survey, check_upright, survey_source
+from mien.capture.video_kind import tell_fields, tell_kind
 from mien.errors import UserError
 from mien.inside import check_tree, has_other_names, remove_tree
 from mien.locks import hold
@@ -31,7 +32,7 @@ from mien.progress import say
 from mien.storage import cannot_write, file_digest, read_json, write_json
 from mien.terminal import plain_name
 
-RECIPE = 4
+RECIPE = 5
 """Recipe version, raised whenever the same video would give another capture, so that old ones are made again."""
 STATE, _CHUNKS = "state.json", "chunks"
 
@@ -150,7 +151,7 @@ def open_job(source: Path, settings: CaptureSettings, name: str | None, replace_
     """
     settings.check()
     selection = FrameSelection(settings.start, settings.end, settings.stride, settings.max_frames)
-    frames = open_source(source, selection, settings.fps, settings.turn // 90)
+    frames = open_source(source, selection, settings.fps, settings.turn // 90, settings.deinterlace)
     name = name or plain_name(source.resolve().stem)
     # Files enter the key by their content, not by their path.
     contents = {
@@ -261,9 +262,9 @@ def _leads_out(work: Path) -> bool:
 
 
 def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> Survey:
-    if job.frames.hdr:
-        say(f"{job.frames.path}: HDR video ({job.frames.hdr}); its pictures are tone-mapped to sRGB")
+    tell_kind(job.frames)
     survey = survey_source(job.frames, prepare(folder, job.key), given.landmarks)
+    tell_fields(job.frames, survey)
     if given.landmarks is None:
         check_upright(job.frames, survey, job.settings.turn)
     return survey

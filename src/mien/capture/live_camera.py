@@ -19,8 +19,9 @@ from av.container import InputContainer
 from jaxtyping import UInt8
 
 from mien.capture.camera_names import CameraName, remedy
+from mien.capture.colours import UNSPECIFIED
 from mien.capture.display import Display
-from mien.capture.video_file import open_video
+from mien.capture.video_file import open_video, read_container_tags
 from mien.errors import UserError
 
 MOST_SIDE = 640
@@ -147,7 +148,8 @@ class LiveCamera:
 
     def _read(self, frames: Iterator[tuple[float, av.VideoFrame]]) -> None:
         """Keep each frame when it comes, until the end or an error of the device."""
-        display = Display(str(self.name), 1.0, MOST_SIDE)
+        container = read_container_tags(Path(self.name.device))[0] if self.name.is_file else UNSPECIFIED
+        display = Display(str(self.name), 1.0, MOST_SIDE, container)
         began: float | None = None
         with contextlib.suppress(av.error.FFmpegError, OSError):
             for due, frame in frames:

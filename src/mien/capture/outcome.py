@@ -15,6 +15,7 @@ from mien.capture.quality import quality_report, relative_quality
 from mien.capture.source import FrameSource
 from mien.capture.store import CaptureData, finish_capture
 from mien.capture.survey import no_face
+from mien.capture.video_kind import kind_report
 from mien.inside import remove_tree
 from mien.progress import say
 
@@ -81,7 +82,7 @@ def finish_part(
         "frames_without_face": int((~valid).sum()),
         "frames_with_several_faces": int(part.person.crowded.sum()),
         "landmark_jitter_px": jitter if np.isfinite(jitter) else None,
-        "hdr": origin.frames.hdr or None,
+        **kind_report(origin.frames, survey),
         **_pace(part.name, timestamps),
     }
     if not valid.all():

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from mien.bounded import MAX_SIDE
+from mien.capture.fields import Deinterlace
 from mien.errors import UserError
 
 _MIN_SIZE = 32
@@ -36,6 +37,9 @@ class CaptureSettings:
     it whole."""
     shortest_part: float = 1.0
     """Shortest shot to keep in a video with cuts, in seconds. Shorter shots are left out."""
+    deinterlace: Deinterlace = "auto"
+    """Which frames of an interlaced video become progressive pictures, one for each frame. auto: those that are marked
+    as interlaced. always: all, for a video that lost the mark. never: none, for one that was filmed progressively."""
     clean_plate: Path | None = None
     """A picture of the scene without the person, from the same camera in the same place. It gives better mattes."""
     mattes: Path | None = None

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mien.capture.fields import Deinterlace
 from mien.capture.picture import decode_picture
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.errors import UserError
@@ -45,6 +46,10 @@ class SourceFrame(NamedTuple):
     """Time since the first frame taken, in seconds."""
     picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
     """Makes the sRGB picture. This is the costly part, so call it only if the picture is needed."""
+    is_deinterlaced: bool
+    """Whether the picture is made of an interlaced frame."""
+    combs: Callable[[], float]
+    """Measures the combs of the frame as stored, as a part of its pixels (`mien.capture.fields.combs`)."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,10 @@ class FrameSource:
     """HDR transfer function: PQ, HLG, or empty for ordinary pictures."""
     quarter_turns: int = 0
     """Number of quarter turns clockwise, besides the file's own rotation flag."""
+    deinterlace: Deinterlace = "auto"
+    """Which frames of a video are deinterlaced."""
+    has_field_pictures: bool = False
+    """Whether the pictures are single fields of interlaced video, of half the height (HEVC)."""
 
     def frames(self, longest_side: int = 0) -> Iterator[SourceFrame]:
         """Yield the frames taken. Pictures are shrunk to `longest_side` pixels unless that is 0.
@@ -73,9 +82,9 @@ class FrameSource:
         if self.path.is_dir():
             everything = _read_images(self.path, self.fps * self.selection.stride, longest_side)
         else:
-            everything = read_lazily(self.path, longest_side)
+            everything = read_lazily(self.path, longest_side, self.deinterlace)
         taken, candidates, first, origin = 0, 0, 0.0, 0.0
-        for number, (seconds, picture) in enumerate(everything):
+        for number, (seconds, picture, is_deinterlaced, combs) in enumerate(everything):
             if number < self.selection.offset:
                 continue
             origin = seconds if number == self.selection.offset and number else origin
@@ -89,7 +98,7 @@ class FrameSource:
                 continue
             first = seconds if taken == 0 else first
             turned = partial(_turned, picture, self.quarter_turns) if self.quarter_turns else picture
-            yield SourceFrame(number, seconds - first, turned)
+            yield SourceFrame(number, seconds - first, turned, is_deinterlaced, combs)
             taken += 1
             if taken == self.selection.max_frames:
                 break
@@ -107,7 +116,9 @@ class FrameSource:
         return len(list_images(self.path)) if self.path.is_dir() else count_frames(self.path)
 
 
-def open_source(path: Path, selection: FrameSelection, fps: float, quarter_turns: int = 0) -> FrameSource:
+def open_source(
+    path: Path, selection: FrameSelection, fps: float, quarter_turns: int = 0, deinterlace: Deinterlace = "auto"
+) -> FrameSource:
     """Open a source without reading its frames.
 
     Args:
@@ -115,18 +126,19 @@ def open_source(path: Path, selection: FrameSelection, fps: float, quarter_turns
         selection: which frames to take.
         fps: frame rate of a folder of images, in frames per second. A video has its own.
         quarter_turns: number of quarter turns clockwise.
+        deinterlace: which frames of a video are deinterlaced.
 
     Raises:
         UserError: the source is missing, is no video, or holds no images.
     """
-    hdr = ""
+    hdr, has_field_pictures = "", False
     if path.is_dir():
         images = list_images(path)
         total = len(images)
         content_hash = _hash_files(images, with_names=True)
     else:
         info = probe_video(path)
-        fps, total, hdr = info.fps, info.frames, info.hdr
+        fps, total, hdr, has_field_pictures = info.fps, info.frames, info.hdr, info.has_field_pictures
         content_hash = _hash_files([path], with_names=False)
     last = min(total, round(selection.end * fps)) if selection.end else total
     last = min(last, max(0, total - selection.offset))
@@ -134,7 +146,17 @@ def open_source(path: Path, selection: FrameSelection, fps: float, quarter_turns
     expected = -(-remaining // selection.stride)
     if selection.max_frames:
         expected = min(expected, selection.max_frames) if total else selection.max_frames
-    return FrameSource(path, selection, fps / selection.stride, expected, content_hash, hdr, quarter_turns)
+    return FrameSource(
+        path,
+        selection,
+        fps / selection.stride,
+        expected,
+        content_hash,
+        hdr,
+        quarter_turns,
+        deinterlace,
+        has_field_pictures,
+    )
 
 
 def _turned(picture: Callable[[], np.ndarray], quarter_turns: int) -> UInt8[np.ndarray, "h w 3"]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
 
 from mien.capture.faces import MAX_FACES, FaceFinder
 from mien.capture.source import FrameSource, SourceFrame
@@ -23,6 +23,8 @@ SURVEY_SIZE = 512
 """Longest side in pixels of the pictures in which faces are searched. The detectors see at most 192 pixels."""
 _CHUNK = 1000
 """Frames after which progress is saved."""
+_COMB_STRIDE = 5
+"""Combs are measured in every fifth frame."""
 _THUMBNAIL = (32, 18)
 """Width and height of thumbnails in pixels, whatever the picture's shape."""
 _GRID = 3
@@ -53,6 +55,10 @@ class Survey:
     colours: Float[np.ndarray, "t f p"]
     """Mean colours of each face, 0..1."""
     thumbnails: UInt8[np.ndarray, "t h w 3"]
+    deinterlaced: Bool[np.ndarray, " t"]
+    """Frames whose picture is made of an interlaced frame."""
+    combs: Float[np.ndarray, " t"]
+    """Part of each frame as stored in which lines alternate between two moments, 0..1; NaN where it is not measured."""
     picture_size: Int64[np.ndarray, " 2"]
     """Width and height of the source in pixels."""
 
@@ -107,7 +113,7 @@ def _read(path: Path) -> Survey:
     kinds = {
         "numbers": ((t,), np.int64), "timestamps": ((t,), np.float64), "boxes": ((t, MAX_FACES, 4), np.float64),
         "looks": ((t, MAX_FACES, 3 * _GRID**2), np.float64), "thumbnails": ((t, *side, 3), np.uint8),
-        "picture_size": ((2,), np.int64),
+        "deinterlaced": ((t,), np.bool_), "combs": ((t,), np.float64), "picture_size": ((2,), np.int64),
     }  # fmt: skip
     with expect_whole(path, "delete its folder and run `mien capture` again"):
         for name, (shape, dtype) in kinds.items():
@@ -144,7 +150,7 @@ def _look_up(landmarks: Float[np.ndarray, "n l 2"]) -> _Find:
 
 def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advance: Advance) -> Survey | None:
     """Survey the frames of a stream; None if it is at its end."""
-    rows: list[tuple[int, float, np.ndarray, np.ndarray, np.ndarray]] = []
+    rows: list[tuple[int, float, np.ndarray, np.ndarray, np.ndarray, bool, float]] = []
     for frame in stream:
         image = frame.picture()
         found = find(frame.number, image)
@@ -153,12 +159,13 @@ def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advan
         boxes[: len(largest)] = found[largest]
         colours = np.stack([_mean_colours(image, box) for box in boxes])
         thumbnail = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
-        rows.append((frame.number, frame.seconds, boxes, colours, thumbnail))
+        measured = frame.combs() if len(rows) % _COMB_STRIDE == 0 else np.nan
+        rows.append((frame.number, frame.seconds, boxes, colours, thumbnail, frame.is_deinterlaced, measured))
         advance()
     if not rows:
         return None
-    numbers, timestamps, boxes, colours, thumbnails = (np.array(column) for column in zip(*rows, strict=True))
-    return Survey(numbers.astype(np.int64), timestamps, boxes, colours, thumbnails, size)
+    numbers, *arrays = (np.array(column) for column in zip(*rows, strict=True))
+    return Survey(numbers.astype(np.int64), *arrays, size)
 
 
 def _mean_colours(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:

@@ -1,5 +1,6 @@
 """Step 1: read video files one frame at a time, and write them, with PyAV (no system ffmpeg)."""
 
+import contextlib
 import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -16,16 +17,19 @@ from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
+from mien.capture.colours import Colours, colours_of
 from mien.capture.display import ACCURATE, Display
+from mien.capture.fields import Deinterlace, FieldOrder, combs, deinterlace, no_combs
 from mien.capture.sound import add_sound
-from mien.capture.tone import HLG, PQ
-from mien.capture.video_file import TOO_MANY_PIXELS, create_video, open_video
+from mien.capture.video_file import TOO_MANY_PIXELS, create_video, open_video, read_container_tags
 from mien.errors import UserError
 from mien.progress import say
 from mien.storage import write_atomically
 
 _THREADS = 2
 _DEFAULT_FPS = 25.0
+_MAX_PROBED = 100
+"""Packets at the beginning in which a probe looks for a picture."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,8 @@ class VideoInfo:
     """Expected number of frames; 0 if the file does not state it."""
     hdr: str
     """HDR transfer function: PQ, HLG, or empty for ordinary video."""
+    has_field_pictures: bool
+    """Whether its pictures are single fields of interlaced video, of half the height (HEVC)."""
 
 
 class LazyFrame(NamedTuple):
@@ -47,6 +53,10 @@ class LazyFrame(NamedTuple):
     """Time since the first frame, in seconds."""
     picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
     """Makes the sRGB picture."""
+    is_deinterlaced: bool = False
+    """Whether the picture is made of an interlaced frame."""
+    combs: Callable[[], float] = no_combs
+    """Measures the combs of the frame as stored, as a part of its pixels (`mien.capture.fields.combs`)."""
 
 
 def probe_video(path: Path) -> VideoInfo:
@@ -61,8 +71,29 @@ def probe_video(path: Path) -> VideoInfo:
             seconds = float(stream.duration * stream.time_base)
         else:
             seconds = (container.duration or 0) / av.time_base
-        hdr = {PQ: "PQ", HLG: "HLG"}.get(int(stream.codec_context.color_trc), "")
-        return VideoInfo(fps, stream.frames or round(seconds * fps), hdr)
+        colours, order = _container_tags(path, stream)
+        first = _first_frame(container, stream)
+        hdr = colours_of(first, colours).hdr if first is not None else ""
+        has_field_pictures = first is not None and first.interlaced_frame and order.has_field_pictures
+        return VideoInfo(fps, stream.frames or round(seconds * fps), hdr, has_field_pictures)
+
+
+def _container_tags(path: Path, stream: VideoStream) -> tuple[Colours, FieldOrder]:
+    colours, order = read_container_tags(path)
+    return colours, FieldOrder(stream.codec_context.name, order)
+
+
+def _first_frame(container: InputContainer, stream: VideoStream) -> av.VideoFrame | None:
+    """Return the first frame that can be decoded, or None if the beginning is damaged.
+
+    Only frames say for sure what the codec states.
+    """
+    with contextlib.suppress(av.error.FFmpegError, OSError):
+        for packet in itertools.islice(container.demux(stream), _MAX_PROBED):
+            with contextlib.suppress(av.error.FFmpegError):
+                for frame in packet.decode():
+                    return frame
+    return None
 
 
 def count_frames(path: Path) -> int:
@@ -82,8 +113,8 @@ def count_frames(path: Path) -> int:
 def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
     """Yield every frame in display order: its time in seconds from the first frame, and its sRGB picture.
 
-    The file's rotation and mirror flags and its pixel aspect are applied; HDR is tone-mapped (`mien.capture.tone`).
-    Damaged parts are skipped with a warning.
+    The file's rotation and mirror flags and its pixel aspect are applied; HDR is tone-mapped (`mien.capture.tone`), and
+    interlaced frames are deinterlaced, one picture for each frame (`mien.capture.fields`). Damaged parts are skipped with a warning.
 
     Args:
         path: path of the video.
@@ -96,7 +127,7 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
         yield frame.seconds, frame.picture()
 
 
-def read_lazily(path: Path, longest_side: int = 0) -> Iterator[LazyFrame]:
+def read_lazily(path: Path, longest_side: int = 0, mode: Deinterlace = "auto") -> Iterator[LazyFrame]:
     """Yield frames as `read_video_frames` does, but convert only pictures that are requested.
 
     The conversion is most of the work.
@@ -108,8 +139,9 @@ def read_lazily(path: Path, longest_side: int = 0) -> Iterator[LazyFrame]:
         first: float | None = None
         latest = -interval
         aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
-        display = Display(str(path), float(aspect) if aspect else 1.0, longest_side)
-        for frame in _decode(path, container, stream):
+        colours, order = _container_tags(path, stream)
+        display = Display(str(path), float(aspect) if aspect else 1.0, longest_side, colours)
+        for frame, shown, is_deinterlaced in deinterlace(_decode(path, container, stream), order, mode):
             if frame.pts is None or frame.time_base is None:
                 seconds = latest + interval
             else:
@@ -118,7 +150,7 @@ def read_lazily(path: Path, longest_side: int = 0) -> Iterator[LazyFrame]:
                 seconds = absolute - first
             # Times must increase for everything that differentiates over time, but broken files repeat them.
             latest = seconds if seconds > latest else latest + interval
-            yield LazyFrame(latest, partial(display.show, frame))
+            yield LazyFrame(latest, partial(display.show, shown), is_deinterlaced, partial(combs, frame))
 
 
 def write_video(

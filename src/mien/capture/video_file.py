@@ -19,6 +19,7 @@ from av.container import InputContainer, OutputContainer
 from av.stream import Disposition
 from av.video.stream import VideoStream
 
+from mien.capture.colours import Colours, stated_colours
 from mien.errors import UserError
 
 MAX_FRAME_PIXELS = 8192 * 4608
@@ -73,6 +74,19 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         yield container, stream
 
 
+def read_container_tags(path: Path) -> tuple[Colours, int]:
+    """Return the colours of a video and the order of its fields (FFmpeg's code) as its container states them.
+
+    FFmpeg replaces them by what the first pictures say as soon as it may decode them, so it may not here.
+
+    Raises:
+        UserError: as `open_video` does.
+    """
+    with _open_container(path, "video", {"codec_whitelist": "none"}) as container:
+        context = _moving_pictures(path, container).codec_context
+        return stated_colours(context), context.field_order
+
+
 @contextmanager
 def open_sound(path: Path) -> Iterator[tuple[InputContainer, AudioStream]]:
     """Open a file and its first stream of sound, ready to be decoded.
@@ -88,7 +102,8 @@ def open_sound(path: Path) -> Iterator[tuple[InputContainer, AudioStream]]:
 
 
 @contextmanager
-def _open_container(path: Path, kind: str) -> Iterator[InputContainer]:
+def _open_container(path: Path, kind: str, also: dict[str, str] | None = None) -> Iterator[InputContainer]:
+    """Open a file. `also` is further options of the container."""
     if not path.exists():
         raise UserError(f"{path}: no such file; check the path")
     if not path.is_file():
@@ -107,7 +122,9 @@ def _open_container(path: Path, kind: str) -> Iterator[InputContainer]:
                 # FFmpeg does not report a size that it refuses. Somewhat larger sizes are let through here, so that the
                 # message can name them.
                 options={"max_pixels": str(4 * MAX_FRAME_PIXELS)},
-                container_options={"format_whitelist": ",".join(_CONTAINERS), "protocol_whitelist": "none"},
+                container_options={
+                    "format_whitelist": ",".join(_CONTAINERS), "protocol_whitelist": "none", **(also or {})
+                },
                 buffer_size=_BUFFER,
                 **_ANY_TITLE,
             )

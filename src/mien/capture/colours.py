@@ -1,0 +1,70 @@
+"""Step 1: decide what the numbers in a video's pictures mean: primaries, transfer function, matrix and range.
+
+A video states its colours in two places, the codec's header and the container, and often only in one of them. This is
+the only module that chooses, for the report and for the pictures alike:
+
+1. The codec's header counts, as in FFmpeg's players, value by value.
+2. A value that the header leaves unspecified comes from the container: the `colr` box of .mov and .mp4, the `Colour`
+   element of .mkv and .webm. FFmpeg's decoders of ProRes, HEVC and VP9 forget those.
+3. Without either, HDR has the matrix of BT.2020, and other pictures BT.709 from 720 lines up and BT.601 below.
+
+The range needs care: many decoders report limited range when the header says nothing. So full range in the container
+counts if the header states no colours at all.
+"""
+
+from typing import NamedTuple
+
+import av
+from av.video.codeccontext import VideoCodecContext
+from av.video.reformatter import ColorRange, Colorspace
+
+from mien.capture.tone import HLG, PQ
+
+_HDR_NAMES = {PQ: "PQ", HLG: "HLG"}
+_RGB, _UNSPECIFIED = 0, 2
+_UNKNOWN = (_UNSPECIFIED, 0, 3)
+"""Codes that name nothing: reserved ones, and 0, which ProRes writes for an unknown value. As a matrix, 0 is RGB."""
+_HIGH_DEFINITION_HEIGHT = 720
+
+
+class Colours(NamedTuple):
+    """Codes of a picture's colours (ITU-T H.273), as FFmpeg numbers them."""
+
+    primaries: int = _UNSPECIFIED
+    transfer: int = _UNSPECIFIED
+    matrix: int = _UNSPECIFIED
+    range: int = ColorRange.UNSPECIFIED
+
+    @property
+    def hdr(self) -> str:
+        """HDR transfer function: PQ, HLG, or empty for ordinary pictures."""
+        return _HDR_NAMES.get(self.transfer, "")
+
+
+UNSPECIFIED = Colours()
+
+
+def stated_colours(tagged: av.VideoFrame | VideoCodecContext) -> Colours:
+    """Return the tags of a frame or of a codec context."""
+    return Colours(int(tagged.color_primaries), int(tagged.color_trc), int(tagged.colorspace), int(tagged.color_range))
+
+
+def colours_of(frame: av.VideoFrame, container: Colours) -> Colours:
+    """Return the colours of a decoded frame whose container states `container`. The matrix is always specified."""
+    header = stated_colours(frame)
+    if header.matrix == _RGB and not frame.format.is_rgb:
+        header = header._replace(matrix=_UNSPECIFIED)
+    says_nothing = all(code in _UNKNOWN for code in (header.primaries, header.transfer, header.matrix))
+    takes_range = header.range == ColorRange.UNSPECIFIED or (says_nothing and container.range == ColorRange.JPEG)
+    known = Colours(
+        *(theirs if ours in _UNKNOWN else ours for ours, theirs in zip(header[:3], container[:3], strict=True)),
+        container.range if takes_range else header.range,
+    )
+    return known if known.matrix not in _UNKNOWN else known._replace(matrix=_guessed_matrix(known, frame.height))
+
+
+def _guessed_matrix(colours: Colours, height: int) -> int:
+    if colours.hdr:
+        return Colorspace.BT2020
+    # Players assume BT.709 from 720 lines up and BT.601 below if a file does not name its matrix.
+    return Colorspace.ITU709 if height >= _HIGH_DEFINITION_HEIGHT else Colorspace.ITU601
