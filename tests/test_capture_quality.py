@@ -1,5 +1,6 @@
-"""Blur, darkness and over-exposure of a face are reported; good pictures raise no complaint."""
+"""Blur, darkness, over-exposure and casts of a face are reported; good pictures raise no complaint."""
 
+import itertools
 import json
 
 import cv2
@@ -8,9 +9,14 @@ import pytest
 
 from capture_helpers import face_picture
 from mien.capture import CaptureSettings, capture_video
-from mien.capture.quality import measure_face, relative_quality
-from mien.capture.video import write_video
+from mien.capture.faces import LandmarkDetector
+from mien.capture.quality import measure_face, quality_report, relative_quality, skin_colours
+from mien.capture.tone import srgb_signal
+from mien.capture.video import read_lazily, read_video_frames, write_video
 from mien.cli import main
+from mien.synthetic.captures import write_synthetic_video
+from mien.synthetic.recipe import SyntheticRecipe
+from test_capture_pictures import light_of
 
 SIDE = 240
 FACE = np.array([[0.27 * SIDE, 0.2 * SIDE], [0.73 * SIDE, 0.76 * SIDE]])
@@ -87,6 +93,69 @@ def test_dark_and_overexposed_clips_are_warned_of(face, tmp_path, capsys, gain, 
     assert (report["dark"], report["overexposed"]) == flags
     warned = [line for line in said.splitlines() if line.startswith("warning:")]
     assert [warning in line and "record the video again" in line for line in warned] == ([True] if warning else [])
+
+
+TINTS = {"green": (0.3, 1.0, 0.4), "blue": (0.15, 0.4, 1.5)}
+"""Light of these colours, linear."""
+
+
+def lit(picture: np.ndarray, light: tuple[float, float, float]) -> np.ndarray:
+    """Return an sRGB picture in coloured or dim light."""
+    return np.rint(255 * srgb_signal(np.clip(light_of(picture.astype(np.float64)) * np.array(light), 0, 1))).astype(np.uint8)
+
+
+@pytest.mark.parametrize("cast", ["green", "blue", ""])
+def test_a_cast_is_told_with_its_remedy_and_is_in_the_report(face, tmp_path, capsys, cast):
+    wide = np.pad(face, ((30, 30), (60, 60), (0, 0)), mode="edge")
+    said, report = capture_said(tmp_path, capsys, [lit(wide, TINTS.get(cast, (1.0, 1.0, 1.0)))] * 4)
+    assert report["colour_cast"] == (cast or None)
+    warned = [line.removeprefix("warning: clip: ") for line in said.splitlines() if line.startswith("warning:")]
+    assert report["hints"] == warned
+    assert len(warned) == bool(cast)
+    if cast:
+        assert warned[0].startswith(f"the skin is {cast} (red ")
+        assert "white balance" in warned[0]
+
+
+def seen_at(picture: np.ndarray, corners: np.ndarray) -> tuple[str, bool]:
+    """Return the cast of a face in a picture, and whether it counts as dark."""
+    measured = measure_face(picture, corners)
+    report = quality_report("clip", relative_quality(measured[None]), skin_colours(measured[None]))
+    return report["colour_cast"] or "", report["dark"]
+
+
+def check_light(picture: np.ndarray, corners: np.ndarray) -> None:
+    """Check that a face has no cast as it is and in black and white, and that coloured and dim light are told."""
+    assert seen_at(picture, corners) == ("", False)
+    grey = np.repeat(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
+    assert seen_at(grey, corners) == ("", False)
+    for cast, light in TINTS.items():
+        assert seen_at(lit(picture, light), corners)[0] == cast
+    assert seen_at(lit(picture, (0.05, 0.05, 0.05)), corners) == ("", True)
+
+
+@pytest.mark.parametrize("clip", ["d3", "d6", "d9", "d14", "d18", "s18", "wojtek"])
+def test_casts_and_darkness_of_real_clips(test_data, clip):
+    path = test_data / "footage" / f"{clip}.mp4"
+    with LandmarkDetector(False) as detector:
+        for frame in itertools.islice(read_lazily(path), 0, 120, 40):
+            picture = frame.picture()
+            check_light(picture, detector.detect(picture)[0])
+
+
+@pytest.mark.slow
+def test_casts_and_darkness_of_drawn_people(tmp_path):
+    """Drawn people of light and dark skin have no cast unless the light has one."""
+    tones = set()
+    for seed in (0, 2):
+        path = tmp_path / f"{seed}.mp4"
+        recipe = SyntheticRecipe(width=192, height=192, seconds=0.1, fps=10.0, supersample=1, texture_size=256)
+        write_synthetic_video(recipe, path, seed)
+        _, picture = next(read_video_frames(path))
+        with LandmarkDetector(False) as detector:
+            check_light(picture, detector.detect(picture)[0])
+        tones.add(round(float(picture.mean())))
+    assert len(tones) == 2
 
 
 def test_blurred_frames_are_named_and_not_usable(face, tmp_path, capsys):

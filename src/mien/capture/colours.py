@@ -1,4 +1,4 @@
-"""Step 1: decide what the numbers in a video's pictures mean: primaries, transfer function, matrix and range.
+"""Step 1: decide what the numbers in a video's pictures mean: transfer function, matrix and range.
 
 A video states its colours in two places, the codec's header and the container, and often only in one of them. This is
 the only module that chooses, for the report and for the pictures alike:
@@ -8,8 +8,9 @@ the only module that chooses, for the report and for the pictures alike:
    element of .mkv and .webm. FFmpeg's decoders of ProRes, HEVC and VP9 forget those.
 3. Without either, HDR has the matrix of BT.2020, and other pictures BT.709 from 720 lines up and BT.601 below.
 
-The range needs care: many decoders report limited range when the header says nothing. So full range in the container
-counts if the header states no colours at all.
+The range needs care: decoders report limited range when the header says nothing. So full range in the container counts
+if the header leaves the matrix unspecified, too. Primaries follow from the rest: HDR is taken as BT.2020, other pictures
+are shown as BT.709 (`mien.capture.tone`).
 """
 
 from typing import NamedTuple
@@ -30,7 +31,6 @@ _HIGH_DEFINITION_HEIGHT = 720
 class Colours(NamedTuple):
     """Codes of a picture's colours (ITU-T H.273), as FFmpeg numbers them."""
 
-    primaries: int = _UNSPECIFIED
     transfer: int = _UNSPECIFIED
     matrix: int = _UNSPECIFIED
     range: int = ColorRange.UNSPECIFIED
@@ -46,21 +46,22 @@ UNSPECIFIED = Colours()
 
 def stated_colours(tagged: av.VideoFrame | VideoCodecContext) -> Colours:
     """Return the tags of a frame or of a codec context."""
-    return Colours(int(tagged.color_primaries), int(tagged.color_trc), int(tagged.colorspace), int(tagged.color_range))
+    return Colours(int(tagged.color_trc), int(tagged.colorspace), int(tagged.color_range))
 
 
 def colours_of(frame: av.VideoFrame, container: Colours) -> Colours:
     """Return the colours of a decoded frame whose container states `container`. The matrix is always specified."""
     header = stated_colours(frame)
-    if header.matrix == _RGB and not frame.format.is_rgb:
-        header = header._replace(matrix=_UNSPECIFIED)
-    says_nothing = all(code in _UNKNOWN for code in (header.primaries, header.transfer, header.matrix))
-    takes_range = header.range == ColorRange.UNSPECIFIED or (says_nothing and container.range == ColorRange.JPEG)
+    if header.matrix == _RGB and frame.format.is_rgb:
+        return header
+    is_silent = header.matrix in _UNKNOWN
+    takes_range = header.range == ColorRange.UNSPECIFIED or (is_silent and container.range == ColorRange.JPEG)
     known = Colours(
-        *(theirs if ours in _UNKNOWN else ours for ours, theirs in zip(header[:3], container[:3], strict=True)),
-        container.range if takes_range else header.range,
+        transfer=container.transfer if header.transfer in _UNKNOWN else header.transfer,
+        matrix=container.matrix if is_silent else header.matrix,
+        range=container.range if takes_range else header.range,
     )
-    return known if known.matrix not in _UNKNOWN else known._replace(matrix=_guessed_matrix(known, frame.height))
+    return known._replace(matrix=_guessed_matrix(known, frame.height)) if known.matrix in _UNKNOWN else known
 
 
 def _guessed_matrix(colours: Colours, height: int) -> int:

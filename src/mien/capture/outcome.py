@@ -11,7 +11,7 @@ from mien.capture.faces import second_difference_jitter
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
 from mien.capture.parts import Part
 from mien.capture.process import Chunk
-from mien.capture.quality import quality_report, relative_quality
+from mien.capture.quality import quality_report, relative_quality, skin_colours
 from mien.capture.source import FrameSource
 from mien.capture.store import CaptureData, finish_capture
 from mien.capture.survey import no_face
@@ -52,7 +52,8 @@ def finish_part(
         raise no_face(origin.frames.path, len(valid))
     survey, crop = part.survey, part.crop
     timestamps = survey.timestamps - survey.timestamps[0]
-    quality = relative_quality(np.concatenate([chunk.quality for chunk in chunks]))
+    measured = np.concatenate([chunk.quality for chunk in chunks])
+    quality = relative_quality(measured)
     data = CaptureData(
         name=part.name,
         camera_ids=layout.camera_ids,
@@ -87,7 +88,7 @@ def finish_part(
     }
     if not valid.all():
         say(f"{part.name}: no face in {report['frames_without_face']} of {len(valid)} frames; they are left out")
-    report |= quality_report(part.name, quality)
+    report |= quality_report(part.name, quality, skin_colours(measured))
     for name in scaffolding:
         path = layout.folder / name
         remove_tree(path)

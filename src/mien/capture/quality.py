@@ -16,7 +16,8 @@ _MIN_SHARPNESS = 0.65
 that, or by 5 pixels in a face of 130. Turned heads and closed eyes stay above it (docs/log.md)."""
 _DIRECTIONS = 4
 """Directions in which detail is measured: across, down and both diagonals. Motion removes it only along itself."""
-MEASURES = _DIRECTIONS + 2
+_CHANNELS = 3
+MEASURES = _DIRECTIONS + 2 + _CHANNELS
 """Number of values that `measure_face` returns."""
 _CLIPPED_LEVEL = 250
 """Level (of 255) from which a channel counts as clipped."""
@@ -24,6 +25,15 @@ _MIN_BRIGHTNESS = 0.18
 """Mean level of the face (0..1, sRGB) below which a clip counts as dark."""
 _MAX_CLIPPED = 0.1
 """Clipped part of the face above which a clip counts as over-exposed."""
+_SKIN_ROWS, _SKIN_COLUMNS = (0.1, 0.8), (0.15, 0.85)
+"""Rows and columns of the face's box that are mostly skin, as fractions."""
+_CELLS = 8
+"""Cells along each side of that part. The median over cells leaves out eyes, brows, mouth and glasses."""
+_MAX_CAST = 0.92
+"""Level of green or blue, relative to red, from which skin counts as tinted. Skin has up to 0.85 of green and 0.83 of
+blue in seven clips, and up to 0.77 and 0.67 in ten drawn people (docs/log.md)."""
+_MIN_COLOUR = 0.05
+"""Relative difference of the channels below which a picture counts as grey: black and white film has no cast."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +54,7 @@ class FrameQuality:
 
 
 def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " m"]:
-    """Return detail in each direction (arbitrary units), brightness and clipped part.
+    """Return detail in each direction (arbitrary units), brightness, clipped part, and the skin's colour (0..1, sRGB).
 
     They are NaN if the face lies outside the picture.
     """
@@ -55,7 +65,7 @@ def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray,
         return np.full(MEASURES, np.nan)
     face = image[top:bottom, left:right]
     clipped = float((face.max(axis=-1) >= _CLIPPED_LEVEL).mean())
-    return np.array([*_detail(face), float(face.mean()) / 255, clipped])
+    return np.array([*_detail(face), float(face.mean()) / 255, clipped, *_skin_colour(face)])
 
 
 def _detail(face: UInt8[np.ndarray, "h w 3"]) -> list[float]:
@@ -71,6 +81,14 @@ def _detail(face: UInt8[np.ndarray, "h w 3"]) -> list[float]:
     return [float(np.abs(bend).mean()) / contrast for bend in (across, down, diagonal + mixed, diagonal - mixed)]
 
 
+def _skin_colour(face: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
+    height, width = face.shape[:2]
+    top, bottom = (int(part * height) for part in _SKIN_ROWS)
+    left, right = (int(part * width) for part in _SKIN_COLUMNS)
+    cells = cv2.resize(face[top:bottom, left:right], (_CELLS, _CELLS), interpolation=cv2.INTER_AREA)
+    return np.median(cells.reshape(-1, _CHANNELS), axis=0) / 255
+
+
 def relative_quality(measured: Float[np.ndarray, "t m"]) -> FrameQuality:
     """Return the quality of a clip's frames from the results of `measure_face`."""
     values = measured.astype(np.float32)
@@ -78,27 +96,34 @@ def relative_quality(measured: Float[np.ndarray, "t m"]) -> FrameQuality:
     seen = np.isfinite(detail[:, 0])
     usual = np.median(detail[seen], axis=0) if seen.any() else np.ones(_DIRECTIONS, np.float32)
     sharpness = (detail / np.maximum(usual, 1e-6)).min(axis=1, keepdims=True)
-    return FrameQuality(sharpness, others[:, :1], others[:, 1:])
+    return FrameQuality(sharpness, others[:, :1], others[:, 1:2])
 
 
-def quality_report(name: str, quality: FrameQuality) -> dict[str, Any]:
-    """Return figures for the capture's report, and tell the user what is wrong with the clip."""
+def skin_colours(measured: Float[np.ndarray, "t m"]) -> Float[np.ndarray, "t 3"]:
+    """Return the skin's colour in every frame (0..1, sRGB) from the results of `measure_face`; NaN for no face."""
+    return measured[:, -_CHANNELS:]
+
+
+def quality_report(name: str, quality: FrameQuality, skin: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
+    """Return figures for the capture's report, and tell the user what is wrong with the clip.
+
+    Args:
+        name: name of the capture, for messages.
+        quality: quality of all frames.
+        skin: colours of the skin in all pictures (`skin_colours`).
+    """
     seen = np.isfinite(quality.brightness)
     brightness, clipped = (
         float(np.median(values[seen])) if seen.any() else 0.0 for values in (quality.brightness, quality.clipped)
     )
     blurred = np.flatnonzero(quality.blurred.any(axis=1)).tolist()
+    known = skin[np.isfinite(skin).all(axis=1)]
+    colour = np.median(known, axis=0) if len(known) else np.zeros(_CHANNELS)
+    cast = find_cast(colour)
     is_dark, is_overexposed = brightness < _MIN_BRIGHTNESS, clipped > _MAX_CLIPPED
-    if is_dark:
-        say(
-            f"warning: {name}: the face is dark (mean level {brightness:.0%}); the avatar will be noisy; record the "
-            "video again with more light on the face"
-        )
-    if is_overexposed:
-        say(
-            f"warning: {name}: the face is over-exposed ({clipped:.0%} of it is white); white parts have no detail; "
-            "record the video again with less exposure"
-        )
+    hints = _hints(brightness if is_dark else None, clipped if is_overexposed else None, cast, colour)
+    for hint in hints:
+        say(f"warning: {name}: {hint}")
     if blurred:
         say(
             f"{name}: the face is blurred in {len(blurred)} of {len(quality.sharpness)} frames (report.json names them)"
@@ -108,6 +133,45 @@ def quality_report(name: str, quality: FrameQuality) -> dict[str, Any]:
         "blurred_frames": blurred,
         "face_brightness": round(brightness, 4),
         "face_clipped": round(clipped, 4),
+        "skin_colour": [round(float(level), 4) for level in colour],
         "dark": is_dark,
         "overexposed": is_overexposed,
+        "colour_cast": cast or None,
+        "hints": hints,
     }
+
+
+def find_cast(colour: Float[np.ndarray, " 3"]) -> str:
+    """Return the cast that skin of this colour has: green, blue, or empty for none.
+
+    Skin of everybody has more red than green, and more green than blue or about as much, unless the light or the
+    camera's white balance is wrong.
+    """
+    red, green, blue = (float(level) for level in colour)
+    strongest = max(green, blue)
+    if strongest <= _MAX_CAST * red or max(red, strongest) - min(red, green, blue) < _MIN_COLOUR * max(red, strongest):
+        return ""
+    return "green" if green >= blue else "blue"
+
+
+def _hints(dark: float | None, white: float | None, cast: str, colour: Float[np.ndarray, " 3"]) -> list[str]:
+    """Return a line with a remedy for each fault: a dark face's level, an over-exposed face's white part, a cast."""
+    hints = []
+    if dark is not None:
+        hints.append(
+            f"the face is dark (mean level {dark:.0%}); the avatar will be noisy; record the video again with more "
+            "light on the face"
+        )
+    if white is not None:
+        hints.append(
+            f"the face is over-exposed ({white:.0%} of it is white); white parts have no detail; record the video "
+            "again with less exposure"
+        )
+    if cast:
+        red, green, blue = (round(255 * float(level)) for level in colour)
+        hints.append(
+            f"the skin is {cast} (red {red}, green {green}, blue {blue} of 255), and the avatar's will be; record the "
+            "video again in white light with the camera's white balance set on white paper, or correct the colours in "
+            "a video program"
+        )
+    return hints

@@ -1,0 +1,274 @@
+"""Interlaced video: frames become progressive pictures of their first moment; what is progressive stays as it is."""
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from av.filter import Graph
+
+from capture_helpers import face_picture
+from mien.capture.fields import FieldOrder, combs, deinterlace
+from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily, read_video_frames
+from mien.cli import main
+
+HEIGHT, WIDTH, FRAMES = 96, 128, 6
+FIRST = {"tff": 0, "bff": 1}
+"""Lines of the first field: the even or the odd ones."""
+
+
+@pytest.fixture(scope="module")
+def pattern() -> np.ndarray:
+    noise = np.random.default_rng(0).uniform(0, 255, (160, 320)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return np.clip((smooth - smooth.mean()) * 4 + 128, 16, 235)
+
+
+def moment(pattern: np.ndarray, field: int) -> np.ndarray:
+    """Return what the camera sees at one field: the pattern moves by four pixels."""
+    left = 8 + 4 * field
+    return pattern[20 : 20 + HEIGHT, left : left + WIDTH].astype(np.uint8)
+
+
+def woven(pattern: np.ndarray, order: str, frames: int = FRAMES) -> list[np.ndarray]:
+    pictures = []
+    for index in range(frames):
+        picture, first = moment(pattern, 2 * index + 1).copy(), FIRST[order]
+        picture[first::2] = moment(pattern, 2 * index)[first::2]
+        pictures.append(picture)
+    return pictures
+
+
+def flagged(pictures: list[np.ndarray], pixels: str, marks: list[str]) -> list[av.VideoFrame]:
+    """Return frames that are marked as tff, bff or prog: PyAV cannot set the mark itself, but a filter can."""
+    frames = []
+    for tick, (picture, mark) in enumerate(zip(pictures, marks, strict=True)):
+        rgb = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24").reformat(format=pixels)
+        frame.pts, frame.time_base = tick, Fraction(1, 25)
+        graph = Graph()
+        source = graph.add_buffer(
+            width=frame.width, height=frame.height, format=frame.format, time_base=Fraction(1, 25)
+        )
+        graph.link_nodes(source, graph.add("setfield", f"mode={mark}"), graph.add("buffersink")).configure()
+        graph.vpush(frame)
+        frames.append(graph.vpull())
+    return frames
+
+
+CODECS = {
+    "h264.mp4": ("libx264", "yuv420p", {"flags": "+ilme+ildct", "crf": "4"}),
+    "h264.ts": ("libx264", "yuv420p", {"flags": "+ilme+ildct", "crf": "4"}),
+    "prores.mov": ("prores_ks", "yuv422p10le", {"flags": "+ilme+ildct"}),
+    "mpeg2.mpg": ("mpeg2video", "yuv420p", {"flags": "+ilme+ildct", "qscale": "2"}),
+    "ffv1.mkv": ("ffv1", "yuv420p", {}),
+    "raw.mov": ("rawvideo", "uyvy422", {}),
+    "png.mov": ("png", "rgb24", {}),
+}
+CONTAINER_ORDERS = {"tff": 2, "bff": 3}
+
+
+def write(path: Path, kind: str, frames: list[av.VideoFrame], order: int = 0, rotation: int = 0) -> None:
+    codec, pixels, options = CODECS[kind]
+    options = options if any(frame.interlaced_frame for frame in frames) else {}
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25, options=options)
+        stream.width, stream.height, stream.pix_fmt = frames[0].width, frames[0].height, pixels
+        stream.codec_context.field_order = order
+        if rotation:
+            stream.set_display_rotation(rotation)
+        for frame in frames:
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def write_woven(path: Path, kind: str, pattern: np.ndarray, order: str) -> None:
+    """Write an interlaced clip. The container marks it where the codec's frames cannot."""
+    write(
+        path, kind, flagged(woven(pattern, order), CODECS[kind][1], [order] * FRAMES), CONTAINER_ORDERS[order]
+    )
+
+
+def bend_ratio(picture: np.ndarray) -> float:
+    """Return the vertical relative to the horizontal second difference: combs raise it."""
+    grey = picture.astype(float)
+    return float(np.abs(np.diff(grey, 2, axis=0)).mean() / np.abs(np.diff(grey, 2, axis=1)).mean())
+
+
+def green(frame: LazyFrame) -> np.ndarray:
+    return frame.picture()[..., 1]
+
+
+@pytest.mark.parametrize("order", ["tff", "bff"])
+@pytest.mark.parametrize("kind", CODECS)
+def test_each_interlaced_frame_becomes_one_picture_of_its_first_moment(kind, order, pattern, tmp_path):
+    path = tmp_path / kind
+    write_woven(path, kind, pattern, order)
+    frames = list(read_lazily(path))
+    assert len(frames) == count_frames(path) == FRAMES
+    np.testing.assert_allclose([frame.seconds for frame in frames], np.arange(FRAMES) / 25, atol=1e-3)
+    assert all(frame.is_deinterlaced for frame in frames)
+    stored = [bend_ratio(green(frame)) for frame in read_lazily(path, mode="never")]
+    shown = [bend_ratio(green(frame)) for frame in frames]
+    true = bend_ratio(moment(pattern, 0))
+    assert min(stored) > 4 * true
+    assert np.abs(np.array(shown) / true - 1).max() < 0.35
+    for index, frame in enumerate(frames):
+        assert frame.combs() > 0.1, "measured before the frame was deinterlaced"
+        errors = [np.abs(green(frame).astype(int) - moment(pattern, field)).mean() for field in (2 * index, 2 * index + 1)]
+        assert errors[0] < 7 < 20 < errors[1]
+
+
+@pytest.mark.parametrize("kind", ["h264.mp4", "prores.mov", "ffv1.mkv"])
+def test_progressive_frames_keep_every_bit(kind, pattern, tmp_path):
+    path = tmp_path / kind
+    pictures = [moment(pattern, field) for field in range(FRAMES)]
+    write(path, kind, flagged(pictures, CODECS[kind][1], ["prog"] * FRAMES))
+    auto, never = (list(read_lazily(path, mode=mode)) for mode in ("auto", "never"))
+    assert not any(frame.is_deinterlaced for frame in auto)
+    assert all((one.picture() == other.picture()).all() for one, other in zip(auto, never, strict=True))
+    assert max(frame.combs() for frame in auto) < 0.001
+
+
+def test_only_the_interlaced_frames_of_a_mixed_clip_change(pattern, tmp_path):
+    path = tmp_path / "mixed.mkv"
+    marks = ["prog"] * 2 + ["tff"] * 2 + ["prog"] * 2
+    pictures = [
+        moment(pattern, 2 * index) if mark == "prog" else frame
+        for index, (mark, frame) in enumerate(zip(marks, woven(pattern, "tff"), strict=True))
+    ]
+    write(path, "ffv1.mkv", flagged(pictures, "yuv420p", marks))
+    auto, never = (list(read_lazily(path, mode=mode)) for mode in ("auto", "never"))
+    assert [frame.is_deinterlaced for frame in auto] == [False, False, True, True, False, False]
+    same = [bool((one.picture() == other.picture()).all()) for one, other in zip(auto, never, strict=True)]
+    assert same == [True, True, False, False, True, True]
+    assert [frame.seconds for frame in auto] == [frame.seconds for frame in never]
+
+
+def test_a_still_picture_stays_sharp(pattern, tmp_path):
+    """Fields of one moment, as of a still head, lose nothing but single levels."""
+    path = tmp_path / "still.mkv"
+    write(path, "ffv1.mkv", flagged([moment(pattern, 0)] * 4, "yuv420p", ["tff"] * 4))
+    for frame in read_lazily(path):
+        assert frame.is_deinterlaced
+        assert frame.combs() < 0.001
+        assert np.abs(green(frame).astype(int) - moment(pattern, 0)).mean() < 2
+
+
+def test_unmarked_frames_are_deinterlaced_only_if_the_user_says_so(pattern, tmp_path):
+    path = tmp_path / "unmarked.mkv"
+    write(path, "ffv1.mkv", flagged(woven(pattern, "tff"), "yuv420p", ["prog"] * FRAMES))
+    auto, always = (list(read_lazily(path, mode=mode)) for mode in ("auto", "always"))
+    assert not any(frame.is_deinterlaced for frame in auto)
+    assert min(frame.combs() for frame in auto) > 0.1
+    assert all(frame.is_deinterlaced for frame in always)
+    assert max(bend_ratio(green(frame)) for frame in always) < min(bend_ratio(green(frame)) for frame in auto) / 4
+
+
+def test_a_turned_interlaced_clip_is_upright(pattern, tmp_path):
+    path = tmp_path / "h264.mp4"
+    write(path, "h264.mp4", flagged(woven(pattern, "tff"), "yuv420p", ["tff"] * FRAMES), rotation=90)
+    frames = list(read_lazily(path))
+    assert all(frame.is_deinterlaced for frame in frames)
+    upright = np.rot90(moment(pattern, 4), 1)
+    assert np.abs(green(frames[2]).astype(int) - upright).mean() < 7
+
+
+@pytest.mark.parametrize("pixels", ["nv12", "rgb24", "gray", "gray16le", "yuvj420p", "yuv411p", "uyvy422", "p010le"])
+@pytest.mark.parametrize("size", [(3, 9), (64, 48)])
+def test_any_format_and_size_passes(pixels, size):
+    frames = flagged([np.full((size[1], size[0]), 180, np.uint8)] * 3, pixels, ["tff"] * 3)
+    for count in (1, 2, 3):
+        found = list(deinterlace(frames[:count], FieldOrder("ffv1"), "auto"))
+        assert [frame.stored.pts for frame in found] == list(range(count))
+        for frame in found:
+            assert (frame.shown.width, frame.shown.height) == size
+            shown, stored = (which.reformat(format="rgb24").to_ndarray() for which in (frame.shown, frame.stored))
+            assert np.abs(shown.astype(int) - stored).max() <= 4
+            assert combs(frame.stored) == 0
+
+
+def test_a_clip_that_changes_its_size_passes(pattern):
+    frames = flagged(woven(pattern, "tff", 4), "yuv420p", ["tff"] * 4)
+    smaller = flagged([picture[:64, :64] for picture in woven(pattern, "tff", 4)], "yuv420p", ["tff"] * 4)
+    found = list(deinterlace(frames[:2] + smaller[:3] + frames[2:], FieldOrder("h264"), "auto"))
+    assert [frame.shown.width for frame in found] == [128, 128, 64, 64, 64, 128, 128]
+    assert [frame.stored for frame in found] == frames[:2] + smaller[:3] + frames[2:]
+
+
+def test_few_frames_are_held(pattern):
+    read = []
+    frames = flagged(woven(pattern, "tff"), "yuv420p", ["tff"] * FRAMES)
+    for index, _ in enumerate(deinterlace((read.append(frame) or frame for frame in frames), FieldOrder(""), "auto")):
+        assert len(read) <= index + 2
+
+
+# Through the command --------------------------------------------------------------------------------------------------
+
+
+def captured(path: Path, out: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[str, dict]:
+    """Return what `mien capture` says about fields, and its report."""
+    arguments = ["capture", str(path), "--out", str(out), "--capture.no-cuts", "--capture.crop", "none", *options]
+    assert main(arguments) == 0
+    report = json.loads((out / "sequences" / path.stem / "capture/report.json").read_text())
+    return " ".join(line for line in capsys.readouterr().err.splitlines() if "interlaced" in line), report
+
+
+@pytest.fixture(scope="module")
+def heads(test_data) -> list[np.ndarray]:
+    """A head that moves by five pixels a field, woven."""
+    face = face_picture(test_data, 200)
+    fields = []
+    for index in range(12):
+        picture = np.full((240, 320, 3), 190, np.uint8)
+        picture[20:220, 20 + 5 * index : 220 + 5 * index] = face
+        fields.append(picture)
+    frames = [picture.copy() for picture in fields[::2]]
+    for frame, second in zip(frames, fields[1::2], strict=True):
+        frame[1::2] = second[1::2]
+    return frames
+
+
+def test_the_capture_says_that_it_deinterlaced(heads, tmp_path, capsys):
+    path = tmp_path / "clip.mp4"
+    write(path, "h264.mp4", flagged(heads, "yuv420p", ["tff"] * 6))
+    said, report = captured(path, tmp_path / "out", capsys)
+    assert said.endswith("clip.mp4: interlaced; 6 of 6 frames are deinterlaced, each to one picture")
+    assert (report["frames"], report["frames_deinterlaced"], report["combs"]) == (6, 6, True)
+    said, report = captured(path, tmp_path / "never", capsys, "--capture.deinterlace", "never")
+    assert said == ""
+    assert (report["frames_deinterlaced"], report["combs"]) == (0, True)
+
+
+def test_a_wrong_mark_is_told_with_its_remedy(heads, tmp_path, capsys):
+    progressive = tmp_path / "psf.mp4"
+    write(progressive, "h264.mp4", flagged([heads[0][::2].repeat(2, axis=0)] * 4, "yuv420p", ["tff"] * 4))
+    said, report = captured(progressive, tmp_path / "psf", capsys)
+    assert "no combs: if the video was filmed progressively, --capture.deinterlace never keeps more detail" in said
+    assert (report["frames_deinterlaced"], report["combs"]) == (4, False)
+    unmarked = tmp_path / "unmarked.mkv"
+    write(unmarked, "ffv1.mkv", flagged(heads, "yuv420p", ["prog"] * 6))
+    said, report = captured(unmarked, tmp_path / "unmarked", capsys)
+    assert said.startswith("warning:")
+    assert "not marked as interlaced; if moving edges look like combs, add --capture.deinterlace always" in said
+    said, report = captured(unmarked, tmp_path / "always", capsys, "--capture.deinterlace", "always")
+    assert said.endswith("6 of 6 frames are deinterlaced, each to one picture")
+
+
+def test_single_fields_of_hevc_are_told(pattern, tmp_path):
+    """HEVC stores each field as a picture of its own, of half the height, which has no combs."""
+    path = tmp_path / "hevc.mp4"
+    with av.open(str(path), "w") as container:
+        options = {"x265-params": "log-level=none:interlace=tff"}
+        stream = container.add_stream("libx265", rate=50, options=options)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for field in range(4):
+            grey = np.repeat(moment(pattern, field)[..., None], 3, axis=2)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(grey), format="rgb24")))
+        container.mux(stream.encode())
+    assert probe_video(path).has_field_pictures
+    assert len(list(read_video_frames(path))) == count_frames(path) == 4
+    assert not any(frame.is_deinterlaced for frame in read_lazily(path))
