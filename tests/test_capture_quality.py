@@ -101,7 +101,8 @@ TINTS = {"green": (0.3, 1.0, 0.4), "blue": (0.15, 0.4, 1.5)}
 
 def lit(picture: np.ndarray, light: tuple[float, float, float]) -> np.ndarray:
     """Return an sRGB picture in coloured or dim light."""
-    return np.rint(255 * srgb_signal(np.clip(light_of(picture.astype(np.float64)) * np.array(light), 0, 1))).astype(np.uint8)
+    light_levels = np.clip(light_of(picture.astype(np.float64)) * np.array(light), 0, 1)
+    return np.rint(255 * srgb_signal(light_levels)).astype(np.uint8)
 
 
 @pytest.mark.parametrize("cast", ["green", "blue", ""])

@@ -87,9 +87,7 @@ def write(path: Path, kind: str, frames: list[av.VideoFrame], order: int = 0, ro
 
 def write_woven(path: Path, kind: str, pattern: np.ndarray, order: str) -> None:
     """Write an interlaced clip. The container marks it where the codec's frames cannot."""
-    write(
-        path, kind, flagged(woven(pattern, order), CODECS[kind][1], [order] * FRAMES), CONTAINER_ORDERS[order]
-    )
+    write(path, kind, flagged(woven(pattern, order), CODECS[kind][1], [order] * FRAMES), CONTAINER_ORDERS[order])
 
 
 def bend_ratio(picture: np.ndarray) -> float:
@@ -113,12 +111,13 @@ def test_each_interlaced_frame_becomes_one_picture_of_its_first_moment(kind, ord
     assert all(frame.is_deinterlaced for frame in frames)
     stored = [bend_ratio(green(frame)) for frame in read_lazily(path, mode="never")]
     shown = [bend_ratio(green(frame)) for frame in frames]
-    true = bend_ratio(moment(pattern, 0))
-    assert min(stored) > 4 * true
-    assert np.abs(np.array(shown) / true - 1).max() < 0.35
+    natural = bend_ratio(moment(pattern, 0))
+    assert min(stored) > 4 * natural
+    assert np.abs(np.array(shown) / natural - 1).max() < 0.35
     for index, frame in enumerate(frames):
         assert frame.combs() > 0.1, "measured before the frame was deinterlaced"
-        errors = [np.abs(green(frame).astype(int) - moment(pattern, field)).mean() for field in (2 * index, 2 * index + 1)]
+        moments = [moment(pattern, 2 * index + second) for second in (0, 1)]
+        errors = [np.abs(green(frame).astype(int) - true).mean() for true in moments]
         assert errors[0] < 7 < 20 < errors[1]
 
 

@@ -1,4 +1,4 @@
-"""Colours of a video: where the codec's header is silent, the container's tags count, for the probe and for pictures."""
+"""Where the codec's header is silent about colours, the container's tags count, for the probe and for pictures."""
 
 from pathlib import Path
 
@@ -67,7 +67,8 @@ def write_colour(path: Path, kind: str, true: Colours, header: Colours, containe
             state(frame, header)
             frame.pts = tick
             for plane, value in zip(frame.planes, numbers_of(true, 10 if wide else 8), strict=True):
-                plane.update(np.full(plane.buffer_size // (2 if wide else 1), value, np.uint16 if wide else np.uint8))
+                values = np.full(plane.buffer_size // (2 if wide else 1), value, np.uint16 if wide else np.uint8)
+                plane.update(values.tobytes())
             packets += stream.encode(frame)
         packets += stream.encode()
         # The muxer takes the tags of this moment, which the encoder no longer reads.
@@ -88,7 +89,7 @@ def error_of(path: Path) -> float:
     ids=["HLG", "PQ", "709 of 96 lines", "601 (PAL) of 720 lines", "601 (NTSC) of 720 lines"],
 )
 def test_tags_of_the_container_count_where_the_header_is_silent(kind, tags, height, tmp_path):
-    true = Colours(*tags, LIMITED)
+    true = Colours(tags[0], tags[1], LIMITED)
     write_colour(tmp_path / kind, kind, true, SILENT, true, height)
     assert probe_video(tmp_path / kind).hdr == {PQ: "PQ", HLG: "HLG"}.get(true.transfer, "")
     assert error_of(tmp_path / kind) <= 4

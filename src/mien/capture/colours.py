@@ -9,8 +9,8 @@ the only module that chooses, for the report and for the pictures alike:
 3. Without either, HDR has the matrix of BT.2020, and other pictures BT.709 from 720 lines up and BT.601 below.
 
 The range needs care: decoders report limited range when the header says nothing. So full range in the container counts
-if the header leaves the matrix unspecified, too. Primaries follow from the rest: HDR is taken as BT.2020, other pictures
-are shown as BT.709 (`mien.capture.tone`).
+if the header leaves the matrix unspecified. Primaries follow from the transfer function: HDR is taken as BT.2020 and
+converted (`mien.capture.tone`), other pictures are shown as BT.709.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,8 @@
 """Step 1: interlaced video. Its frames hold two moments, one in the even and one in the odd lines.
 
-Each interlaced frame becomes one picture of its first moment, by FFmpeg's bwdif. So 50 fields a second give 25 pictures:
-frames keep their number and times, which the user's mattes and landmarks are counted by, and a capture takes no more
-space and training than the file has frames. The second moments would add little: a head hardly moves in 20 ms.
+Each interlaced frame becomes one picture of its first moment, by FFmpeg's bwdif. So 50 fields a second give 25
+pictures. Frames keep their number and times, by which the user's mattes and landmarks are counted, and a capture takes
+no more space and training than before. The second moments would add little: a head hardly moves in 20 ms.
 
 Frames that do not say that they are interlaced pass unchanged, bit by bit.
 """

@@ -164,8 +164,10 @@ def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advan
         advance()
     if not rows:
         return None
-    numbers, *arrays = (np.array(column) for column in zip(*rows, strict=True))
-    return Survey(numbers.astype(np.int64), *arrays, size)
+    numbers, timestamps, boxes, colours, thumbnails, deinterlaced, combs = (
+        np.array(column) for column in zip(*rows, strict=True)
+    )
+    return Survey(numbers.astype(np.int64), timestamps, boxes, colours, thumbnails, deinterlaced, combs, size)
 
 
 def _mean_colours(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:

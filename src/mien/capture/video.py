@@ -114,7 +114,8 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
     """Yield every frame in display order: its time in seconds from the first frame, and its sRGB picture.
 
     The file's rotation and mirror flags and its pixel aspect are applied; HDR is tone-mapped (`mien.capture.tone`), and
-    interlaced frames are deinterlaced, one picture for each frame (`mien.capture.fields`). Damaged parts are skipped with a warning.
+    interlaced frames are deinterlaced, one picture for each frame (`mien.capture.fields`). Damaged parts are skipped
+    with a warning.
 
     Args:
         path: path of the video.

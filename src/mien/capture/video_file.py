@@ -123,7 +123,9 @@ def _open_container(path: Path, kind: str, also: dict[str, str] | None = None) -
                 # message can name them.
                 options={"max_pixels": str(4 * MAX_FRAME_PIXELS)},
                 container_options={
-                    "format_whitelist": ",".join(_CONTAINERS), "protocol_whitelist": "none", **(also or {})
+                    "format_whitelist": ",".join(_CONTAINERS),
+                    "protocol_whitelist": "none",
+                    **(also or {}),
                 },
                 buffer_size=_BUFFER,
                 **_ANY_TITLE,
