@@ -246,7 +246,7 @@ def test_a_wrong_mark_is_told_with_its_remedy(heads, tmp_path, capsys):
     progressive = tmp_path / "psf.mp4"
     write(progressive, "h264.mp4", flagged([heads[0][::2].repeat(2, axis=0)] * 4, "yuv420p", ["tff"] * 4))
     said, report = captured(progressive, tmp_path / "psf", capsys)
-    assert "no combs: if the video was filmed progressively, --capture.deinterlace never keeps more detail" in said
+    assert "no combs: if filmed progressively, --capture.deinterlace never keeps more detail" in said
     assert (report["frames_deinterlaced"], report["combs"]) == (4, False)
     unmarked = tmp_path / "unmarked.mkv"
     write(unmarked, "ffv1.mkv", flagged(heads, "yuv420p", ["prog"] * 6))

@@ -33,14 +33,10 @@ def tell_fields(frames: FrameSource, survey: Survey) -> None:
     """Say how many frames were deinterlaced, and whether the file seems to be marked wrongly."""
     count, total, has_combs = int(survey.deinterlaced.sum()), len(survey.numbers), _has_combs(survey)
     if count:
-        wrong = (
-            ""
-            if has_combs or frames.deinterlace == "always"
-            else (
-                "; they show no combs: if the video was filmed progressively, --capture.deinterlace never keeps more detail"
-            )
-        )
-        say(f"{frames.path}: interlaced; {count} of {total} frames are deinterlaced, each to one picture{wrong}")
+        told = f"{frames.path}: interlaced; {count} of {total} frames are deinterlaced, each to one picture"
+        if not has_combs and frames.deinterlace == "auto":
+            told += "; they show no combs: if filmed progressively, --capture.deinterlace never keeps more detail"
+        say(told)
     elif has_combs and frames.deinterlace == "auto":
         say(
             f"warning: {frames.path}: its lines alternate between two moments, but it is not marked as interlaced; if "
