@@ -9,6 +9,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from mien.overall import Overall
 from mien.terminal import printable, tell
 
 Item = TypeVar("Item")
@@ -25,6 +26,37 @@ console = _Console(stderr=True, highlight=False, markup=False, emoji=False)
 
 _PLAIN_INTERVAL_SECONDS = 10.0
 _CALLS_BEFORE_ETA = 3
+_WHOLE_INTERVAL_SECONDS = 60.0
+"""Time between two lines about the whole command, if the output is no terminal."""
+
+
+class _Whole:
+    """What progress bars tell about the whole command, of which each bar is a part."""
+
+    def __init__(self, overall: Overall) -> None:
+        self.overall = overall
+        self._told, self._stage = 0.0, 0
+
+    def tell_now_and_then(self) -> None:
+        """Print a line at the begin of each stage, and later now and then."""
+        now, stage = time.monotonic(), self.overall.stage()
+        if stage != self._stage or now - self._told >= _WHOLE_INTERVAL_SECONDS:
+            self._told, self._stage = now, stage
+            tell(self.overall.words())
+
+
+_whole: list[_Whole] = []
+"""The whole command that runs, if it has said what it will do."""
+
+
+@contextmanager
+def whole_command(overall: Overall) -> Iterator[None]:
+    """Show the remaining time of the whole command beside the progress of its parts."""
+    _whole.append(_Whole(overall))
+    try:
+        yield
+    finally:
+        _whole.pop()
 
 
 @runtime_checkable  # for beartype, which checks annotations during tests
@@ -40,10 +72,25 @@ class Advance(Protocol):
 def progress_bar(title: str, total: int, completed: int = 0) -> Iterator[Advance]:
     """A bar from `completed` to `total`. If the output is no terminal, it prints a line every ten seconds instead."""
     title = printable(title)
-    if not sys.stderr.isatty():
-        with _plain_progress(title, total, completed) as advance:
-            yield advance
-        return
+    whole = _whole[-1] if _whole and _whole[-1].overall.begin(title, completed / max(total, 1)) else None
+    bar = _bar if sys.stderr.isatty() else _plain_progress
+    done = completed
+    with bar(title, total, completed, whole) as move:
+
+        def advance(amount: int = 1, status: str = "") -> None:
+            nonlocal done
+            done += amount
+            if whole is not None:
+                whole.overall.advance(done / max(total, 1))
+            move(amount, status)
+
+        yield advance
+    if whole is not None:
+        whole.overall.end()
+
+
+@contextmanager
+def _bar(title: str, total: int, completed: int, whole: _Whole | None) -> Iterator[Advance]:
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -55,17 +102,24 @@ def progress_bar(title: str, total: int, completed: int = 0) -> Iterator[Advance
     )
     with Progress(*columns, console=console, refresh_per_second=5) as bars:
         task = bars.add_task(title, total=total, completed=completed, status="")
+        latest = ""
 
         def advance(amount: int = 1, status: str = "") -> None:
+            nonlocal latest
+            latest = printable(status) or latest
             bars.update(task, advance=amount)
-            if status:
-                bars.update(task, status=printable(status))
+            if whole is not None:
+                bars.update(task, status="; ".join(filter(None, (latest, whole.overall.words()))))
+            elif status:
+                bars.update(task, status=latest)
 
         yield advance
 
 
 @contextmanager
-def _plain_progress(title: str, total: int, completed: int) -> Iterator[Advance]:
+def _plain_progress(title: str, total: int, completed: int, whole: _Whole | None) -> Iterator[Advance]:
+    if whole is not None:
+        whole.tell_now_and_then()
     start = last = first = time.monotonic()
     done = at_first = completed
     latest, told, calls = "", "", 0
@@ -88,6 +142,8 @@ def _plain_progress(title: str, total: int, completed: int) -> Iterator[Advance]
         if time.monotonic() - last >= _PLAIN_INTERVAL_SECONDS:
             last = time.monotonic()
             report()
+            if whole is not None:
+                whole.tell_now_and_then()
 
     yield advance
     report()

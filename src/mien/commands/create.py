@@ -8,11 +8,13 @@ from typing import Annotated, Literal
 
 import tyro
 
+from mien.avatar import MethodConfig
 from mien.capture import CaptureSettings
 from mien.commands.options import TrainOptions, check_viewer
 from mien.errors import UserError
+from mien.overall import Overall
 from mien.tracking import TrackingSettings
-from mien.training import NAMED_SPLIT
+from mien.training import NAMED_SPLIT, TrainSettings
 from mien.workspace import Workspace, check_new_workspace
 
 
@@ -73,18 +75,11 @@ class Command:
 
     def run(self) -> None:
         """Run all stages and skip those whose results are current. All possible checks come before any work."""
-        from mien.commands.stages.capturing import (
-            check_camera_ids,
-            run_calibrated_capture_stage,
-            run_capture_stage,
-        )
-        from mien.commands.stages.evaluating import run_evaluation_stage
+        from mien.commands.stages.capturing import check_camera_ids
         from mien.commands.stages.face_models import face_model_of
         from mien.commands.stages.names import doubled_videos, run_name, sequence_names
-        from mien.commands.stages.tracking import run_tracking_stage
-        from mien.commands.stages.training import run_training_stage
-        from mien.progress import say
-        from mien.training import check_held_out, check_run, check_untouched
+        from mien.progress import say, whole_command
+        from mien.training import check_run, check_untouched
 
         began = time.monotonic()
         method, settings = self.options.method_config(), self.options.settings()
@@ -99,7 +94,35 @@ class Command:
             names = sequence_names(self.videos, self.name)
             for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
                 say(f"warning: {warning}")
-            videos = zip(self.videos, names, strict=True)
+        with whole_command(self._overall(settings)):
+            self._run_stages(workspace, run, method, settings)
+        which = ["--run", run] if len(workspace.run_names()) > 1 else []
+        command = shlex.join(["mien", "render", str(self.out), *which, "--out", "turntable.mp4"])
+        say(f"Done in {time.monotonic() - began:.0f} s. Next: {command}")
+
+    def _overall(self, settings: TrainSettings) -> Overall:
+        """What is to be done, with expected times."""
+        from mien.commands.stages.expected import count_captured, count_scored, expected_pieces
+        from mien.commands.stages.names import sequence_names
+
+        frames, names = [count_captured(video, self.capture) for video in self.videos], []
+        if self.calibration is None:
+            names = sequence_names(self.videos, self.name)
+        else:
+            frames = [sum(frames)]  # the cameras of one sequence
+        scored = count_scored(frames, names, settings)
+        return Overall(expected_pieces(frames, scored, self.tracking, settings, self.overlay))
+
+    def _run_stages(self, workspace: Workspace, run: str, method: MethodConfig, settings: TrainSettings) -> None:
+        from mien.commands.stages.capturing import run_calibrated_capture_stage, run_capture_stage
+        from mien.commands.stages.evaluating import run_evaluation_stage
+        from mien.commands.stages.names import sequence_names
+        from mien.commands.stages.tracking import run_tracking_stage
+        from mien.commands.stages.training import run_training_stage
+        from mien.training import check_held_out
+
+        if self.calibration is None:
+            videos = zip(self.videos, sequence_names(self.videos, self.name), strict=True)
             captured = [
                 part for video, name in videos for part in run_capture_stage(workspace, video, name, self.capture)
             ]
@@ -118,6 +141,3 @@ class Command:
         run_training_stage(workspace, together, run, method, settings, self.view)
         if settings.holds_out:
             run_evaluation_stage(workspace, run, again=False)
-        which = ["--run", run] if len(workspace.run_names()) > 1 else []
-        command = shlex.join(["mien", "render", str(self.out), *which, "--out", "turntable.mp4"])
-        say(f"Done in {time.monotonic() - began:.0f} s. Next: {command}")
