@@ -1,11 +1,13 @@
 """The remaining time of a whole command converges, on a clock that the test sets."""
 
+import sys
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from mien import progress
 from mien.capture import CaptureSettings
@@ -121,6 +123,24 @@ def test_frames_are_counted_as_the_settings_take_them(tmp_path: Path) -> None:
     assert count_captured(video, CaptureSettings(max_frames=9)) == 9
     assert count_captured(tmp_path / "pictures", CaptureSettings()) == 7
     assert count_captured(tmp_path / "broken.mp4", CaptureSettings()) == 0
+
+
+def test_a_bar_has_the_whole_command_beside_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(progress, "console", Console(file=sys.stderr, width=150, force_terminal=True))
+    clock = Clock()
+    with whole_command(Overall([Piece("capture", "capture ", 10.0), Piece("training", "training", 190.0)], clock)):
+        with progress_bar("capture me", 2) as advance:
+            clock.now += 5.0
+            advance(status="sharp")
+            advance()
+        with progress_bar("decode", 1) as advance:
+            advance(status="alone")
+    shown = capsys.readouterr().err
+    assert "sharp; all: stage 1 of 2, about 3 min" in shown
+    assert "alone; all" not in shown
 
 
 def test_a_log_has_a_line_at_each_stage_and_now_and_then(

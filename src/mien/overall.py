@@ -71,6 +71,10 @@ class Overall:
         name = self._stages[number - 1] if number else "start"
         return f"stage {number} of {len(self._stages)} ({name}), {_about(self.remaining())} left of the whole command"
 
+    def short_words(self) -> str:
+        """The same for a place beside a progress bar."""
+        return f"all: stage {self.stage()} of {len(self._stages)}, {_about(self.remaining())}"
+
     def _find(self, title: str) -> int | None:
         """The next piece of this title. A bar that comes once more, for another part of a clip, is the same piece."""
         own = [index for index, piece in enumerate(self._pieces) if title.startswith(piece.title)]

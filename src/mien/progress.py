@@ -109,7 +109,7 @@ def _bar(title: str, total: int, completed: int, whole: _Whole | None) -> Iterat
             latest = printable(status) or latest
             bars.update(task, advance=amount)
             if whole is not None:
-                bars.update(task, status="; ".join(filter(None, (latest, whole.overall.words()))))
+                bars.update(task, status="; ".join(filter(None, (latest, whole.overall.short_words()))))
             elif status:
                 bars.update(task, status=latest)
 
